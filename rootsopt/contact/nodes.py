@@ -1,0 +1,141 @@
+"""Node-against-segment gap of two outlines: the paper's Eq. 9, and the reference.
+
+This is the slow, assumption-free way: it sees two closed outlines and a pose, knows
+nothing of roll angles or conjugacy, and is what the fast search is checked against.
+NumPy only; nothing here is differentiated.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Points = NDArray[np.float64]
+
+
+def _rotate(points: Points, angle: float) -> Points:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return points @ np.array([[cos, sin], [-sin, cos]])
+
+
+def place_pair(
+    outline: Points, lobes: int, center_distance: float, phi1: float, phi2: float
+) -> tuple[Points, Points]:
+    """Both rotors in the fixed frame: rotor 1 at the origin, rotor 2 at (E, 0).
+
+    `outline` (n, 2), closed, a lobe tip on +x; angles in rad, each positive in its own
+    rotor's sense, so rotor 2 is the mirror image. At φ1 = φ2 = 0 a lobe of rotor 1
+    points at a valley of rotor 2.
+    """
+    first = _rotate(outline, phi1)
+    second = _rotate(outline, phi2 + np.pi / lobes) * [-1.0, 1.0]
+    return first, second[::-1] + [center_distance, 0.0]
+
+
+def signed_distance(nodes: Points, outline: Points, refine: bool = True) -> NDArray[np.float64]:
+    """Signed distance (n,) from `nodes` to a closed counter-clockwise `outline`.
+
+    Positive outside. Without `refine`, the distance to the nearest straight segment
+    (Eq. 9). With it, the nearest segment is replaced by the cubic through its two ends
+    with the outline's own tangents, which takes the error below the node spacing from
+    second to fourth order.
+    """
+    corners = outline[:-1] if np.allclose(outline[0], outline[-1], atol=0) else outline
+    count = len(corners)
+    nearest = _nearest_index(nodes, corners)
+    best = np.full(len(nodes), np.inf)
+    sign = np.ones(len(nodes))
+    tangents = _tangents(corners) if refine else None
+    for shift in (-1, 0):
+        start = (nearest + shift) % count
+        stop = (start + 1) % count
+        point, direction = _project(nodes, corners, start, stop, tangents)
+        offset = nodes - point
+        distance = np.hypot(offset[:, 0], offset[:, 1])
+        outside = direction[:, 0] * offset[:, 1] - direction[:, 1] * offset[:, 0] < 0
+        closer = distance < best
+        best = np.where(closer, distance, best)
+        sign = np.where(closer, np.where(outside, 1.0, -1.0), sign)
+    return sign * best
+
+
+def _nearest_index(nodes, corners, block=2_000_000):
+    rows = max(1, block // len(corners))
+    index = np.empty(len(nodes), dtype=int)
+    for i in range(0, len(nodes), rows):
+        difference = nodes[i : i + rows, None, :] - corners[None, :, :]
+        index[i : i + rows] = np.argmin(np.einsum("ijk,ijk->ij", difference, difference), axis=1)
+    return index
+
+
+def _tangents(corners):
+    """Unit tangents from the circle through each node and its two neighbours."""
+    before = corners - np.roll(corners, 1, axis=0)
+    after = np.roll(corners, -1, axis=0) - corners
+    weight = np.linalg.norm(before, axis=1)[:, None], np.linalg.norm(after, axis=1)[:, None]
+    tangent = before / weight[0] ** 2 + after / weight[1] ** 2
+    return tangent / np.linalg.norm(tangent, axis=1)[:, None]
+
+
+def _project(nodes, corners, start, stop, tangents):
+    """Foot points on the segments start → stop, and the direction of the curve there."""
+    a = corners[start]
+    chord = corners[stop] - a
+    length2 = np.einsum("ij,ij->i", chord, chord)
+    t = np.clip(np.einsum("ij,ij->i", nodes - a, chord) / length2, 0.0, 1.0)
+    if tangents is None:
+        return a + t[:, None] * chord, chord
+    length = np.sqrt(length2)[:, None]
+    m0, m1 = tangents[start] * length, tangents[stop] * length
+    c2, c3 = 3 * chord - 2 * m0 - m1, m0 + m1 - 2 * chord
+    for _ in range(4):
+        u = t[:, None]
+        point = a + u * (m0 + u * (c2 + u * c3))
+        slope = m0 + u * (2 * c2 + 3 * u * c3)
+        bend = 2 * c2 + 6 * u * c3
+        offset = nodes - point
+        residual = np.einsum("ij,ij->i", offset, slope)
+        descent = np.einsum("ij,ij->i", slope, slope) - np.einsum("ij,ij->i", offset, bend)
+        t = np.clip(t + residual / np.where(descent > 0, descent, np.inf), 0.0, 1.0)
+    u = t[:, None]
+    return a + u * (m0 + u * (c2 + u * c3)), m0 + u * (2 * c2 + 3 * u * c3)
+
+
+def pair_gap(
+    outline: Points,
+    lobes: int,
+    center_distance: float,
+    phi1: float,
+    phi2: float,
+    reach: float | None = None,
+    refine: bool = True,
+) -> float:
+    """Least signed distance between the two rotors at one pose, in the outline's unit.
+
+    `reach` limits the nodes of rotor 1 to those within that distance of rotor 2's
+    outer circle (default: all that can touch).
+    """
+    first, second = place_pair(outline, lobes, center_distance, phi1, phi2)
+    outer = np.max(np.hypot(outline[:, 0], outline[:, 1]))
+    reach = 0.05 * outer if reach is None else reach
+
+    def near(points, center):
+        return points[np.hypot(*(points - center).T) < outer + reach]
+
+    nodes = near(first[:-1], np.array([center_distance, 0.0]))
+    return _least(nodes, second, refine)
+
+
+def _least(nodes, outline, refine):
+    distance = signed_distance(nodes, outline, refine)
+    i = int(np.argmin(distance))
+    if not refine or i in (0, len(nodes) - 1):
+        return float(distance[i])
+    # Vertex of the parabola through the three nodes around the least distance.
+    left, middle, right = distance[i - 1 : i + 2]
+    before = np.linalg.norm(nodes[i] - nodes[i - 1])
+    after = np.linalg.norm(nodes[i + 1] - nodes[i])
+    slopes = (middle - left) / before, (right - middle) / after
+    curvature = (slopes[1] - slopes[0]) / (before + after)
+    if curvature <= 0 or max(before, after) > 3 * min(before, after):
+        return float(middle)
+    tangent = (slopes[0] * after + slopes[1] * before) / (before + after)
+    return float(middle - tangent**2 / (4 * curvature))

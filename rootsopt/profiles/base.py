@@ -1,0 +1,141 @@
+"""The roll-angle core: one description of a conjugate flank for every profile family.
+
+Two identical rotors with `N` lobes roll 1:1 on pitch circles of radius `r`. A family
+describes only the *addendum* of one flank, as a function of the normal angle `nu` (the
+polar angle of the outward normal in the rotor frame, measured from the lobe's axis):
+
+- `roll_angle(nu)` is β, the polar angle, on the rotor, of the pitch point at the moment
+  the flank point is in contact;
+- `contact_distance(nu)` is s, the signed distance from pitch point to contact point.
+
+The pressure angle is then ψ = β + π/2 - ν, the flank point
+
+    P = R(β) [r + s sin ψ, s cos ψ],      ds/dβ = -r cos ψ   (law of gearing),
+
+and the dedendum follows by symmetry: β → π/N - β, ψ → ψ, s → -s. The normal angle is
+used as parameter, rather than β, because a tip arc centred on the pitch circle keeps β
+constant over the whole arc (all of it meshes at one instant), while ν stays regular.
+
+Lengths are in metres, angles in radians. Everything is differentiable in the design.
+"""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class RollPoint(NamedTuple):
+    """A flank point in roll-angle form.
+
+    `beta`: roll angle (rad); `psi`: pressure angle (rad); `s`: signed distance from the
+    pitch point to the contact point (m), positive on the addendum.
+    """
+
+    beta: Float[Array, "*n"]
+    psi: Float[Array, "*n"]
+    s: Float[Array, "*n"]
+
+
+class Segment(NamedTuple):
+    """A stretch of the addendum between two normal angles, smooth inside.
+
+    `land` marks a stretch concentric with the rotor (ψ = π/2), which carries no torque
+    and therefore takes no part in the search for flank contact.
+    """
+
+    name: str
+    start: Float[Array, ""]
+    stop: Float[Array, ""]
+    land: bool
+
+
+class Profile(eqx.Module):
+    """One flank of a conjugate Roots rotor; see the module's docstring.
+
+    Subclasses give `segments`, `roll_angle` and `contact_distance` on
+    0 ≤ ν ≤ `pitch_normal`, continued analytically beyond the pitch point and, unless
+    the first segment is a land, over the tip (β odd and s even in ν).
+    """
+
+    lobes: eqx.AbstractVar[int]
+    pitch_radius: eqx.AbstractVar[Float[Array, ""]]
+
+    @abc.abstractmethod
+    def segments(self) -> tuple[Segment, ...]:
+        """The smooth stretches of the addendum, from the tip to the pitch point."""
+
+    @abc.abstractmethod
+    def roll_angle(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """β(ν) in rad, non-decreasing for a profile free of interference."""
+
+    @abc.abstractmethod
+    def contact_distance(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """s(ν) in m."""
+
+    def lever(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Moment arm r cos ψ (m) of the contact normal about the rotor's axis."""
+        return self.pitch_radius * jnp.sin(nu - self.roll_angle(nu))
+
+    def support(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Support function P·n = r sin ψ + s (m) of the addendum; its slope is -lever."""
+        arm = self.pitch_radius * jnp.cos(nu - self.roll_angle(nu))
+        return arm + self.contact_distance(nu)
+
+    @property
+    def half_pitch(self) -> float:
+        """π/2N: the polar angle between a lobe's axis and its pitch crossing (rad)."""
+        return jnp.pi / (2 * self.lobes)
+
+    @property
+    def pitch_normal(self) -> Float[Array, ""]:
+        """Normal angle at the pitch crossing (rad)."""
+        return self.segments()[-1].stop
+
+    def addendum(self, nu: Float[Array, "*n"]) -> RollPoint:
+        """The addendum point with normal angle `nu`."""
+        beta = self.roll_angle(nu)
+        return RollPoint(beta, beta + jnp.pi / 2 - nu, self.contact_distance(nu))
+
+    def dedendum(self, nu: Float[Array, "*n"]) -> RollPoint:
+        """The dedendum point that meshes with the partner's addendum point `nu`."""
+        point = self.addendum(nu)
+        return RollPoint(jnp.pi / self.lobes - point.beta, point.psi, -point.s)
+
+    def position(self, point: RollPoint) -> Float[Array, "*n 2"]:
+        """Cartesian coordinates (m) in the rotor frame, lobe tip on +x."""
+        beta, psi, s = point
+        radial = self.pitch_radius + s * jnp.sin(psi)
+        tangential = s * jnp.cos(psi)
+        cos, sin = jnp.cos(beta), jnp.sin(beta)
+        return jnp.stack(
+            [radial * cos - tangential * sin, radial * sin + tangential * cos], axis=-1
+        )
+
+    def roll_rate(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """dβ/dν, between 0 (tip arc centred on the pitch circle) and 1 (involute)."""
+        return jax.jvp(self.roll_angle, (nu,), (jnp.ones_like(nu),))[1]
+
+    def addendum_speed(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Arc length per normal angle (m/rad) on the addendum: its radius of curvature."""
+        point = self.addendum(nu)
+        sliding = self.pitch_radius * jnp.sin(point.psi)
+        return sliding * self.roll_rate(nu) + point.s
+
+    def dedendum_speed(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Arc length on the dedendum per normal angle of the partner (m/rad).
+
+        On an involute or land this is the tangential speed r sin ψ + s (1 - ψ′) of the
+        contact point per roll angle; zero is a cusp and a negative value is undercut.
+        """
+        point = self.addendum(nu)
+        sliding = self.pitch_radius * jnp.sin(point.psi)
+        return (sliding - 2 * point.s) * self.roll_rate(nu) + point.s
+
+    def dedendum_curvature_radius(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Signed radius of curvature of the dedendum (m): positive convex, negative concave."""
+        turning = 2 * self.roll_rate(nu) - 1
+        return self.dedendum_speed(nu) / turning

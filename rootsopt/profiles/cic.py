@@ -1,0 +1,112 @@
+"""CIC: circular arc, involute, circular arc."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rootsopt.profiles.base import Profile, Segment
+
+
+class CIC(Profile):
+    """The CIC rotor: tip land, tip arc, involute, and their conjugates.
+
+    The involute is the paper's Eq. 2: ψ = α, s = ℓ cot α for -u ≤ ℓ ≤ u. A tip land of
+    half angle θ1 (Eq. 1) is joined to the involute's end B by one arc tangent to both:
+    centre C on the ray θ1 at radius c = r cos α / cos(α - δ), with δ = β_u - θ1 and
+    β_u = π/2N - u/(r sin α), and radius ρ = |B - C|. Hence (α, u, θ1) are independent
+    and the outer radius c + ρ follows from them. For u = `longest_involute` the arc is
+    centred on the pitch circle (c = r), the textbook CIC.
+    """
+
+    lobes: int = eqx.field(static=True)
+    pitch_radius: Float[Array, ""]
+    pressure_angle: Float[Array, ""]
+    involute_length: Float[Array, ""]
+    tip_arc_angle: Float[Array, ""]
+
+    def __init__(self, lobes, pitch_radius, pressure_angle, involute_length, tip_arc_angle):
+        """`lobes` N; `pitch_radius` r (m), `pressure_angle` α (rad), `involute_length` u
+        (m) and `tip_arc_angle` θ1 (rad, half the angle of the tip land), scalars."""
+        self.lobes = lobes
+        self.pitch_radius = jnp.asarray(pitch_radius)
+        self.pressure_angle = jnp.asarray(pressure_angle)
+        self.involute_length = jnp.asarray(involute_length)
+        self.tip_arc_angle = jnp.asarray(tip_arc_angle)
+
+    @property
+    def longest_involute(self) -> Float[Array, ""]:
+        """u_max = r sin α (π/2N - θ1) in m: beyond it the roll angle turns back."""
+        return (
+            self.pitch_radius
+            * jnp.sin(self.pressure_angle)
+            * (self.half_pitch - self.tip_arc_angle)
+        )
+
+    @property
+    def base_radius(self) -> Float[Array, ""]:
+        """Radius r cos α of the involute's base circle (m)."""
+        return self.pitch_radius * jnp.cos(self.pressure_angle)
+
+    @property
+    def involute_start(self) -> Float[Array, ""]:
+        """Roll angle β_u at which the involute ends towards the tip (rad)."""
+        reach = self.pitch_radius * jnp.sin(self.pressure_angle)
+        return self.half_pitch - self.involute_length / reach
+
+    @property
+    def arc_center_radius(self) -> Float[Array, ""]:
+        """Distance c of the tip arc's centre from the axis (m)."""
+        offset = self.involute_start - self.tip_arc_angle
+        return self.base_radius / jnp.cos(self.pressure_angle - offset)
+
+    @property
+    def arc_radius(self) -> Float[Array, ""]:
+        """Radius ρ of the tip arc (m)."""
+        offset = self.involute_start - self.tip_arc_angle
+        slide = self.pitch_radius * jnp.sin(offset) / jnp.cos(self.pressure_angle - offset)
+        return self.involute_length / jnp.tan(self.pressure_angle) + slide
+
+    @property
+    def arc_end(self) -> Float[Array, ""]:
+        """Normal angle at which the tip arc meets the involute (rad)."""
+        return self.involute_start + jnp.pi / 2 - self.pressure_angle
+
+    def segments(self) -> tuple[Segment, ...]:
+        pitch_normal = self.half_pitch + jnp.pi / 2 - self.pressure_angle
+        zero = jnp.zeros_like(self.tip_arc_angle)
+        return (
+            Segment("tip land", zero, self.tip_arc_angle, True),
+            Segment("tip arc", self.tip_arc_angle, self.arc_end, False),
+            Segment("involute", self.arc_end, pitch_normal, False),
+        )
+
+    def _arc_slide(self, turn):
+        """Signed distance from the pitch point to the arc's centre along the normal."""
+        c, r = self.arc_center_radius, self.pitch_radius
+        return c * jnp.cos(turn) - jnp.sqrt(r**2 - (c * jnp.sin(turn)) ** 2)
+
+    def _arc_turn(self, nu):
+        """Normal angle from the arc's start, kept inside the arc."""
+        return jnp.clip(nu, self.tip_arc_angle, self.arc_end) - self.tip_arc_angle
+
+    def roll_angle(self, nu):
+        turn = self._arc_turn(nu)
+        slide = self._arc_slide(turn)
+        arc = self.tip_arc_angle + jnp.arctan2(
+            -slide * jnp.sin(turn), self.arc_center_radius - slide * jnp.cos(turn)
+        )
+        involute = nu - jnp.pi / 2 + self.pressure_angle
+        beyond_land = jnp.where(nu > self.arc_end, involute, arc)
+        return jnp.where(nu < self.tip_arc_angle, nu, beyond_land)
+
+    def contact_distance(self, nu):
+        arc = self.arc_radius + self._arc_slide(self._arc_turn(nu))
+        beta = nu - jnp.pi / 2 + self.pressure_angle
+        involute = self.base_radius * (self.half_pitch - beta)
+        return jnp.where(nu > self.arc_end, involute, arc)
+
+    def lever(self, nu):
+        # The normals of the land, arc and involute pass through the axis, through the
+        # arc's centre, and touch the base circle: no roll angle is needed.
+        arc = self.arc_center_radius * jnp.sin(self._arc_turn(nu))
+        return jnp.where(nu > self.arc_end, self.base_radius, arc)

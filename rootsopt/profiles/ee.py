@@ -1,0 +1,35 @@
+"""EE: epicycloid addendum, hypocycloid dedendum."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rootsopt.profiles.base import Profile, Segment
+
+
+class EE(Profile):
+    """The EE rotor: rolling radius r/2N, ψ = N |π/2N - β|, s = (r/N) sin(N(π/2N - β)).
+
+    The paper's Eqs. 7 and 8 with their misprints mended (sine and cosine of Eq. 7 are
+    swapped, the undefined τ of Eq. 8 is γ). It has no design parameter but its size.
+    """
+
+    lobes: int = eqx.field(static=True)
+    pitch_radius: Float[Array, ""]
+
+    def __init__(self, lobes, pitch_radius):
+        """`lobes` N; `pitch_radius` r (m), a scalar."""
+        self.lobes = lobes
+        self.pitch_radius = jnp.asarray(pitch_radius)
+
+    def segments(self) -> tuple[Segment, ...]:
+        zero = jnp.zeros_like(self.pitch_radius)
+        stop = zero + (1 + self.lobes) * self.half_pitch
+        return (Segment("epicycloid", zero, stop, False),)
+
+    def roll_angle(self, nu):
+        return nu / (1 + self.lobes)
+
+    def contact_distance(self, nu):
+        beyond_pitch = self.lobes * (self.half_pitch - self.roll_angle(nu))
+        return self.pitch_radius / self.lobes * jnp.sin(beyond_pitch)
