@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.contact.closest import FlankPair
@@ -50,8 +50,9 @@ def _weights(t):
 class MapContact(eqx.Module):
     """Gap and levers of a flank pair at a pose, from a spline map.
 
-    Call it with roll coordinate and ε (rad); see `FlankPair` for their meaning. ε is
-    held at the edges of the map, `deepest` ≤ ε; poses with ε > 0 have no contact.
+    Call it with roll coordinate and ε (rad); see `FlankPair` for their meaning. Below
+    ε = `deepest` the gap goes on linearly in ε, which keeps a simulation alive long
+    enough to see that the map must be larger.
     """
 
     coefficients: Float[Array, "m n"]
@@ -103,7 +104,7 @@ class MapContact(eqx.Module):
         folded = half - jnp.abs(centered)
         rows, columns = self.coefficients.shape
         i, x_value, x_slope, _ = self._cell(folded, self.first_roll, self.roll_step, rows)
-        j, e_value, e_slope, inside = self._cell(
+        j, e_value, e_slope, beyond = self._cell(
             relative, self.deepest, self.relative_step, columns
         )
         local = lax.dynamic_slice(self.coefficients, (i, j), (4, 4))
@@ -111,20 +112,21 @@ class MapContact(eqx.Module):
         gap, by_relative = x_value @ along
         by_roll = mirror * (x_slope @ along[:, 0]) / self.roll_step
         by_relative = by_relative / self.relative_step
+        gap = gap + by_relative * beyond
         # φ̄ = -x: ∂G/∂φ1 = -∂G/∂x / 2 - ∂G/∂ε = -lever1, ∂G/∂φ2 = lever2.
-        lever1 = by_relative + by_roll / 2
-        lever2 = by_relative - by_roll / 2
-        return gap, lever1, lever2
+        return gap, by_relative + by_roll / 2, by_relative - by_roll / 2
 
     @staticmethod
     def _cell(x, first, step, size):
+        """Index of the first of four coefficients, their weights, and how far x lies
+        beyond the map."""
         position = (x - first) / step
-        clipped = jnp.clip(position, 0.0, size - 3 - 1e-9)
-        index = lax.stop_gradient(jnp.floor(clipped)).astype(jnp.int32)
-        value, slope = _weights(clipped - index)
-        inside: Bool[Array, ""] = position == clipped
-        return index, value, slope, inside
+        held = jnp.clip(position, 0.0, size - 3 - 1e-9)
+        index = lax.stop_gradient(jnp.floor(held)).astype(jnp.int32)
+        value, slope = _weights(held - index)
+        return index, value, slope, (position - held) * step
 
 
 def _land_end(profile):
-    return profile.segments()[0].stop if profile.segments()[0].land else jnp.zeros(())
+    first = profile.segments()[0]
+    return first.stop if first.land else jnp.zeros_like(first.stop)

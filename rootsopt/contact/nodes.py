@@ -2,11 +2,12 @@
 
 This is the slow, assumption-free way: it sees two closed outlines and a pose, knows
 nothing of roll angles or conjugacy, and is what the fast search is checked against.
-NumPy only; nothing here is differentiated.
+NumPy and SciPy only; nothing here is differentiated.
 """
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 Points = NDArray[np.float64]
 
@@ -40,7 +41,7 @@ def signed_distance(nodes: Points, outline: Points, refine: bool = True) -> NDAr
     """
     corners = outline[:-1] if np.allclose(outline[0], outline[-1], atol=0) else outline
     count = len(corners)
-    nearest = _nearest_index(nodes, corners)
+    nearest = cKDTree(corners).query(nodes)[1]
     best = np.full(len(nodes), np.inf)
     sign = np.ones(len(nodes))
     tangents = _tangents(corners) if refine else None
@@ -55,15 +56,6 @@ def signed_distance(nodes: Points, outline: Points, refine: bool = True) -> NDAr
         best = np.where(closer, distance, best)
         sign = np.where(closer, np.where(outside, 1.0, -1.0), sign)
     return sign * best
-
-
-def _nearest_index(nodes, corners, block=2_000_000):
-    rows = max(1, block // len(corners))
-    index = np.empty(len(nodes), dtype=int)
-    for i in range(0, len(nodes), rows):
-        difference = nodes[i : i + rows, None, :] - corners[None, :, :]
-        index[i : i + rows] = np.argmin(np.einsum("ijk,ijk->ij", difference, difference), axis=1)
-    return index
 
 
 def _tangents(corners):

@@ -16,6 +16,11 @@ class CIC(Profile):
     β_u = π/2N - u/(r sin α), and radius ρ = |B - C|. Hence (α, u, θ1) are independent
     and the outer radius c + ρ follows from them. For u = `longest_involute` the arc is
     centred on the pitch circle (c = r), the textbook CIC.
+
+    `longest_involute` u_max = r sin α (π/2N - θ1) (m): beyond it the roll angle turns back;
+    `base_radius` r cos α (m); `involute_start` β_u (rad); `arc_center_radius` c and
+    `arc_radius` ρ (m); `arc_end`, `involute_end`: normal angles (rad) at which the arc
+    meets the involute and the involute the pitch circle.
     """
 
     lobes: int = eqx.field(static=True)
@@ -23,61 +28,39 @@ class CIC(Profile):
     pressure_angle: Float[Array, ""]
     involute_length: Float[Array, ""]
     tip_arc_angle: Float[Array, ""]
+    longest_involute: Float[Array, ""]
+    base_radius: Float[Array, ""]
+    involute_start: Float[Array, ""]
+    arc_center_radius: Float[Array, ""]
+    arc_radius: Float[Array, ""]
+    arc_end: Float[Array, ""]
+    involute_end: Float[Array, ""]
 
     def __init__(self, lobes, pitch_radius, pressure_angle, involute_length, tip_arc_angle):
         """`lobes` N; `pitch_radius` r (m), `pressure_angle` α (rad), `involute_length` u
         (m) and `tip_arc_angle` θ1 (rad, half the angle of the tip land), scalars."""
         self.lobes = lobes
-        self.pitch_radius = jnp.asarray(pitch_radius)
-        self.pressure_angle = jnp.asarray(pressure_angle)
-        self.involute_length = jnp.asarray(involute_length)
+        r = self.pitch_radius = jnp.asarray(pitch_radius)
+        alpha = self.pressure_angle = jnp.asarray(pressure_angle)
+        u = self.involute_length = jnp.asarray(involute_length)
         self.tip_arc_angle = jnp.asarray(tip_arc_angle)
-
-    @property
-    def longest_involute(self) -> Float[Array, ""]:
-        """u_max = r sin α (π/2N - θ1) in m: beyond it the roll angle turns back."""
-        return (
-            self.pitch_radius
-            * jnp.sin(self.pressure_angle)
-            * (self.half_pitch - self.tip_arc_angle)
-        )
-
-    @property
-    def base_radius(self) -> Float[Array, ""]:
-        """Radius r cos α of the involute's base circle (m)."""
-        return self.pitch_radius * jnp.cos(self.pressure_angle)
-
-    @property
-    def involute_start(self) -> Float[Array, ""]:
-        """Roll angle β_u at which the involute ends towards the tip (rad)."""
-        reach = self.pitch_radius * jnp.sin(self.pressure_angle)
-        return self.half_pitch - self.involute_length / reach
-
-    @property
-    def arc_center_radius(self) -> Float[Array, ""]:
-        """Distance c of the tip arc's centre from the axis (m)."""
+        sin, cos = jnp.sin(alpha), jnp.cos(alpha)
+        half = self.half_pitch
+        self.longest_involute = r * sin * (half - self.tip_arc_angle)
+        self.base_radius = r * cos
+        self.involute_start = half - u / (r * sin)
         offset = self.involute_start - self.tip_arc_angle
-        return self.base_radius / jnp.cos(self.pressure_angle - offset)
-
-    @property
-    def arc_radius(self) -> Float[Array, ""]:
-        """Radius ρ of the tip arc (m)."""
-        offset = self.involute_start - self.tip_arc_angle
-        slide = self.pitch_radius * jnp.sin(offset) / jnp.cos(self.pressure_angle - offset)
-        return self.involute_length / jnp.tan(self.pressure_angle) + slide
-
-    @property
-    def arc_end(self) -> Float[Array, ""]:
-        """Normal angle at which the tip arc meets the involute (rad)."""
-        return self.involute_start + jnp.pi / 2 - self.pressure_angle
+        self.arc_center_radius = r * cos / jnp.cos(alpha - offset)
+        self.arc_radius = u * cos / sin + r * jnp.sin(offset) / jnp.cos(alpha - offset)
+        self.arc_end = self.involute_start + jnp.pi / 2 - alpha
+        self.involute_end = half + jnp.pi / 2 - alpha
 
     def segments(self) -> tuple[Segment, ...]:
-        pitch_normal = self.half_pitch + jnp.pi / 2 - self.pressure_angle
         zero = jnp.zeros_like(self.tip_arc_angle)
         return (
             Segment("tip land", zero, self.tip_arc_angle, True),
             Segment("tip arc", self.tip_arc_angle, self.arc_end, False),
-            Segment("involute", self.arc_end, pitch_normal, False),
+            Segment("involute", self.arc_end, self.involute_end, False),
         )
 
     def _arc_slide(self, turn):

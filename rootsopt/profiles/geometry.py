@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rootsopt.profiles.base import Profile, Segment
+from rootsopt.profiles.base import Profile
 
 # Gauss-Legendre per smooth segment: the integrands are analytic inside a segment, and
 # 24 points bring area and inertia of every family here to rounding error.
@@ -30,11 +30,6 @@ class Geometry(eqx.Module):
     seal_width: Float[Array, ""]
 
 
-def _quadrature(segment: Segment) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    half = (segment.stop - segment.start) / 2
-    return segment.start + half * (1 + jnp.asarray(_NODES)), half * jnp.asarray(_WEIGHTS)
-
-
 def geometry(profile: Profile) -> Geometry:
     """Area and inertia by Green's theorem on the roll-angle form; exact to rounding.
 
@@ -42,43 +37,38 @@ def geometry(profile: Profile) -> Geometry:
     ∫r² dA = ∫ |P|² h dl / 4 over the outline.
     """
     r = profile.pitch_radius
-    area = jnp.zeros_like(r)
-    moment = jnp.zeros_like(r)
-    margins = []
-    seal_angle = jnp.zeros_like(r)
-    for segment in profile.segments():
-        nu, weight = _quadrature(segment)
-        _, psi, s = profile.addendum(nu)
-        for sign, speed in ((1, profile.addendum_speed), (-1, profile.dedendum_speed)):
-            support = r * jnp.sin(psi) + sign * s
-            radius_squared = r**2 + sign * 2 * r * s * jnp.sin(psi) + s**2
-            element = support * speed(nu) * weight
-            area += jnp.sum(element) / 2
-            moment += jnp.sum(radius_squared * element) / 4
-        margins.append(_dedendum_margin(profile, segment, nu))
-        if segment.land:
-            seal_angle += 2 * (segment.stop - segment.start)
+    segments = profile.segments()
+    start = jnp.stack([s.start for s in segments])[:, None]
+    length = jnp.stack([s.stop for s in segments])[:, None] - start
+    # Each end is looked at from just inside, so that it belongs to its segment.
+    shares = np.concatenate([[1e-12], (1 + _NODES) / 2, [1 - 1e-12]])
+    weights = jnp.asarray(np.concatenate([[0.0], _WEIGHTS / 2, [0.0]])) * length
+    nu = start + length * jnp.asarray(shares)
+    _, psi, s = profile.addendum(nu)
+    sliding = r * jnp.sin(psi)
+    speed = profile.dedendum_speed(nu)
+    sides = ((s, profile.addendum_speed(nu)), (-s, speed))
+    area = sum(jnp.sum((sliding + s) * dl * weights) for s, dl in sides) / 2
+    moment = sum(
+        jnp.sum((r**2 + 2 * s * sliding + s**2) * (sliding + s) * dl * weights)
+        for s, dl in sides
+    )
     flanks = 2 * profile.lobes
+    area, moment = flanks * area, flanks * moment / 4
     reach = profile.contact_distance(jnp.zeros_like(r))
     outer_radius = r + reach
+    seal_angle = sum(2 * (s.stop - s.start) for s in segments if s.land)
+    # An absent segment (no tip land, say) sets no limit.
+    margin = jnp.min(jnp.where(length > 0, speed, jnp.inf))
     return Geometry(
         outer_radius=outer_radius,
         root_radius=r - reach,
-        area=flanks * area,
-        area_efficiency=1 - flanks * area / (jnp.pi * outer_radius**2),
-        polar_area_moment=flanks * moment,
-        undercut_margin=jnp.min(jnp.stack(margins)),
+        area=area,
+        area_efficiency=1 - area / (jnp.pi * outer_radius**2),
+        polar_area_moment=moment,
+        undercut_margin=margin,
         seal_width=outer_radius * seal_angle,
     )
-
-
-def _dedendum_margin(profile, segment, nu):
-    """Least dedendum speed on a segment, seen from inside so that its ends belong to it."""
-    inset = 1e-9 * (segment.stop - segment.start)
-    ends = jnp.stack([segment.start + inset, segment.stop - inset])
-    speed = profile.dedendum_speed(jnp.concatenate([ends[:1], nu, ends[1:]]))
-    # An absent segment (no tip land, say) sets no limit.
-    return jnp.where(segment.stop > segment.start, jnp.min(speed), jnp.inf)
 
 
 def flank_nodes(profile: Profile, points: int) -> Float[Array, " n"]:

@@ -1,0 +1,423 @@
+"""Configuration: YAML in, typed settings out.
+
+The only place that knows file formats. Keys carry their units; conversion to SI happens
+in `rootsopt.model`. Anything wrong with a file, a key or a value raises `InputError`
+with one message that names the key, the value and what is allowed.
+"""
+
+import difflib
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from rootsopt.errors import InputError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+DESIGN_KEYS = ("pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg")
+"""The design parameters of a CIC rotor, as named in the config."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class ProfileConfig(_Section):
+    """The rotor profile."""
+
+    family: Literal["cic", "ee"] = Field(description="profile family")
+    lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
+    pitch_radius_mm: Positive = Field(description="pitch radius; centre distance is twice that")
+    pressure_angle_deg: Annotated[float, Field(gt=0, lt=90)] | None = Field(
+        None, description="cic: pressure angle of the involute"
+    )
+    involute_length_mm: Positive | None = Field(None, description="cic: involute parameter u")
+    tip_arc_angle_deg: Annotated[float, Field(ge=0, lt=45)] | None = Field(
+        None, description="cic: half angle of the tip land"
+    )
+
+    @model_validator(mode="after")
+    def _family_keys(self):
+        for key in DESIGN_KEYS:
+            given = getattr(self, key) is not None
+            if self.family == "cic" and not given:
+                raise ValueError(f"`profile.{key}` is required for family cic")
+            if self.family == "ee" and given:
+                raise ValueError(f"`profile.{key}` does not belong to family ee; remove it")
+        return self
+
+
+class RotorConfig(_Section):
+    """The rotor as a body."""
+
+    length_mm: Positive = Field(description="axial length")
+    density_kg_m3: Positive = Field(description="density")
+
+
+class ContactConfig(_Section):
+    """The IMPACT contact law."""
+
+    stiffness_N_per_mm_e: Positive = Field(description="K of K·δ^e, δ in mm")
+    exponent: Annotated[float, Field(ge=1, le=5)] = Field(description="e")
+    max_damping_N_s_per_mm: NonNegative = Field(description="C, reached at full depth")
+    full_damping_depth_mm: Positive = Field(description="d")
+    clearance_mm: NonNegative = Field(0.0, description="added to every flank gap")
+    smoothing_mm: NonNegative = Field(
+        1e-4, description="rounding of the law's corners; 0 is the law as it stands"
+    )
+
+
+class LoadConfig(_Section):
+    """What opposes rotor 2."""
+
+    torque_N_m: NonNegative = Field(description="constant torque against rotor 2")
+
+
+class TimingGearConfig(_Section):
+    """Timing gear between the rotors."""
+
+    stiffness_N_m_per_rad: Positive = Field(description="torsional stiffness")
+    damping_ratio: NonNegative = Field(0.0, description="ζ on the two rotors' inertia")
+    backlash_mm: NonNegative = Field(description="total play at the pitch radius")
+
+
+class SceneConfig(_Section):
+    """What drives and loads the pair."""
+
+    speed_rpm: Positive = Field(description="speed of rotor 1")
+    drive: Literal["prescribed"] = Field("prescribed", description="how rotor 1 is driven")
+    load: LoadConfig
+    timing_gear: TimingGearConfig | None = Field(None, description="absent: flanks alone")
+
+
+class SolverConfig(_Section):
+    """How the scene is solved."""
+
+    fidelity: Literal["search", "map"] = Field(
+        "map", description="contact: search at every call (reference) or C² map of the gap"
+    )
+    map_rolls: Annotated[int, Field(ge=16, le=4096)] = Field(
+        128, description="map points over the roll angle"
+    )
+    map_relatives: Annotated[int, Field(ge=12, le=1024)] = Field(
+        24, description="map points over the relative rotation"
+    )
+    method: Literal["tsit5", "dopri5", "dopri8", "kvaerno3", "kvaerno5"] = Field(
+        "tsit5", description="explicit: tsit5, dopri5, dopri8; implicit: kvaerno3, kvaerno5"
+    )
+    rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] = Field(
+        1e-8, description="tolerance on the orbit and its statistics"
+    )
+    transient_rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] = Field(
+        1e-7, description="tolerance while the transient passes"
+    )
+    max_steps_per_period: Annotated[int, Field(ge=64, le=10**6)] = Field(
+        4096, description="solver steps allowed per mesh period"
+    )
+    max_mesh_periods: Annotated[int, Field(ge=16, le=10**6)] = Field(
+        640, description="how long the transient may last"
+    )
+    max_orbit_periods: Annotated[int, Field(ge=1, le=8)] = Field(
+        8, description="longest periodic orbit looked for, in mesh periods"
+    )
+    gradient: Literal["forward", "reverse"] = Field(
+        "forward", description="differentiation mode; both give the same gradient"
+    )
+    precision: Literal["float64"] = Field("float64", description="floating point precision")
+
+
+class ObjectiveConfig(_Section):
+    """Weighted sum of mean and peak force, each relative to the baseline."""
+
+    mean_weight: NonNegative = Field(0.5, description="weight of the mean contact force")
+    peak_weight: NonNegative = Field(0.5, description="weight of the peak contact force")
+
+    @model_validator(mode="after")
+    def _some_weight(self):
+        if self.mean_weight + self.peak_weight <= 0:
+            raise ValueError(
+                "`objective.mean_weight` and `objective.peak_weight` must not both be 0"
+            )
+        return self
+
+
+class ConstraintsConfig(_Section):
+    """What an optimised design must satisfy."""
+
+    area_efficiency_min: Literal["baseline"] | Annotated[float, Field(ge=0, lt=1)] = Field(
+        "baseline", description="floor of the area efficiency"
+    )
+    undercut_margin_min_mm: NonNegative = Field(0.0, description="floor of the undercut margin")
+    seal_width_min_mm: NonNegative = Field(
+        0.0, description="floor of the tip land's whole arc length"
+    )
+
+
+class BoundsConfig(_Section):
+    """Box of the search, (low, high) for each design parameter."""
+
+    pressure_angle_deg: tuple[float, float] = Field((30.0, 45.0))
+    involute_length_mm: tuple[float, float] | None = Field(
+        None, description="default: 10 % to 100 % of the longest involute"
+    )
+    tip_arc_angle_deg: tuple[float, float] = Field((0.5, 8.0))
+
+    @model_validator(mode="before")
+    @classmethod
+    def _pairs(cls, data):
+        # YAML has lists, not tuples.
+        if isinstance(data, dict):
+            return {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+        return data
+
+    @model_validator(mode="after")
+    def _ordered(self):
+        limits = {
+            "pressure_angle_deg": (1.0, 80.0),
+            "involute_length_mm": (1e-6, 1e6),
+            "tip_arc_angle_deg": (0.0, 44.0),
+        }
+        for key, (least, most) in limits.items():
+            pair = getattr(self, key)
+            if pair is not None and not least <= pair[0] < pair[1] <= most:
+                raise ValueError(
+                    f"`optimizer.bounds.{key}` must be two increasing numbers in "
+                    f"[{least:g}, {most:g}], but is {list(pair)}"
+                )
+        return self
+
+
+class OptimizerConfig(_Section):
+    """How the design is searched."""
+
+    method: Literal["adam", "lbfgs"] = Field("adam", description="optax update rule")
+    learning_rate: Positive = Field(0.05, description="step in the unit box of the bounds")
+    iterations: Annotated[int, Field(ge=1, le=10000)] = Field(40, description="per start")
+    starts: Annotated[int, Field(ge=1, le=64)] = Field(2, description="local searches")
+    screening: Annotated[int, Field(ge=0, le=4096)] = Field(
+        48, description="designs screened to place the starts; 0 starts at the baseline only"
+    )
+    seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of the screening sample")
+    bounds: BoundsConfig = Field(default_factory=BoundsConfig)
+
+
+class Config(_Section):
+    """Everything a run needs."""
+
+    profile: ProfileConfig
+    rotor: RotorConfig
+    contact: ContactConfig
+    scene: SceneConfig
+    solver: SolverConfig = Field(default_factory=SolverConfig)
+    objective: ObjectiveConfig = Field(default_factory=ObjectiveConfig)
+    constraints: ConstraintsConfig = Field(default_factory=ConstraintsConfig)
+    optimizer: OptimizerConfig = Field(default_factory=OptimizerConfig)
+
+    def to_yaml(self) -> str:
+        """The resolved config, every default written out."""
+        data = self.model_dump(mode="json", exclude_none=True)
+        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML with `1e5` as a number and without silently overwritten keys."""
+
+    def construct_mapping(self, node, deep=False):
+        seen = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            try:
+                repeated = key in seen
+            except TypeError:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"a key must be a plain name, but is {key!r}", key_node.start_mark
+                ) from None
+            if repeated:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key!r} stands twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(
+        r"^[-+]?(?:[0-9][0-9_]*\.?[0-9_]*(?:[eE][-+]?[0-9]+)|[0-9][0-9_]*\.[0-9_]*"
+        r"|\.[0-9_]+(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+    ),
+    list("-+0123456789."),
+)
+
+
+def load(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Config:
+    """Read a config file and apply `dotted.key=value` overrides.
+
+    Raises `InputError` for anything wrong with file, keys or values.
+    """
+    return parse(_read(Path(path)), overrides, source=str(path))
+
+
+def parse(text: str, overrides: list[str] | tuple[str, ...] = (), source: str = "config") -> Config:
+    """Like `load`, from YAML text."""
+    data = _yaml(text, source)
+    if data is None:
+        data = {}
+    if not isinstance(data, dict):
+        raise InputError(
+            f"{source}: must hold sections such as `profile:` and `scene:`, but is a "
+            f"{type(data).__name__}"
+        )
+    for override in overrides:
+        _override(data, override)
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{source}: {_explain(error)}") from None
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_bytes().decode("utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file; give the path of a config") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder; give the path of a config file") from None
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8"
+        ) from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def _yaml(text: str, source: str) -> Any:
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f" (line {mark.line + 1})" if mark is not None else ""
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise InputError(f"{source}: is not valid YAML{place}: {problem}") from None
+
+
+def _override(data: dict, override: str) -> None:
+    key, equals, value = override.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        raise InputError(f"--set {override!r}: must be dotted.key=value, as in scene.speed_rpm=1500")
+    target = data
+    for i, part in enumerate(parts[:-1]):
+        inner = target.get(part)
+        if inner is None:
+            inner = target[part] = {}
+        if not isinstance(inner, dict):
+            raise InputError(f"--set {override!r}: `{'.'.join(parts[: i + 1])}` holds no keys")
+        target = inner
+    target[parts[-1]] = _yaml(value, f"--set {override!r}")
+
+
+def _explain(error: ValidationError) -> str:
+    """One sentence for the first, most telling problem."""
+    problems = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+    first = problems[0]
+    place = [str(p) for p in first["loc"] if not _is_branch(p)]
+    key = ".".join(place)
+    kind, value, context = first["type"], first.get("input"), first.get("ctx", {})
+    if kind == "extra_forbidden":
+        return _unknown(place)
+    if kind == "missing":
+        field = _field(place)
+        note = f" ({field.description})" if field is not None and field.description else ""
+        return f"`{key}` is missing{note}; add it"
+    if kind == "value_error":
+        return str(context["error"])
+    return f"`{key}` must be {_allowed(kind, context, first['msg'])}, but is {value!r}"
+
+
+def _is_branch(part) -> bool:
+    """Whether a part of a pydantic location names a union branch rather than a key."""
+    text = str(part)
+    return "[" in text or text in ("float", "int", "tuple")
+
+
+def _allowed(kind: str, context: dict, message: str) -> str:
+    words = {
+        "float_type": "a number",
+        "float_parsing": "a number",
+        "int_type": "a whole number",
+        "int_from_float": "a whole number",
+        "finite_number": "a finite number",
+        "model_type": "a section with keys of its own",
+        "string_type": "a word",
+        "tuple_type": "two numbers [low, high]",
+    }
+    if kind in words:
+        return words[kind]
+    signs = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
+    for name, word in signs.items():
+        if name in context:
+            return f"{word} {context[name]:g}"
+    if kind == "literal_error":
+        return f"one of {context['expected']}"
+    return message[0].lower() + message[1:]
+
+
+def _section(place: list[str]) -> type[BaseModel] | None:
+    model: type[BaseModel] | None = Config
+    for part in place:
+        field = model.model_fields.get(part) if model is not None else None
+        if field is None:
+            return None
+        model = _model_of(field.annotation)
+    return model
+
+
+def _model_of(annotation: Any) -> type[BaseModel] | None:
+    candidates = [annotation, *getattr(annotation, "__args__", ())]
+    for candidate in candidates:
+        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
+            return candidate
+    return None
+
+
+def _field(place: list[str]):
+    model = _section(place[:-1])
+    return model.model_fields.get(place[-1]) if model is not None else None
+
+
+def _unknown(place: list[str]) -> str:
+    key = ".".join(place)
+    model = _section(place[:-1])
+    names = list(model.model_fields) if model is not None else []
+    near = difflib.get_close_matches(place[-1], names, n=1, cutoff=0.5)
+    elsewhere = [k for k in _all_keys(Config) if k.split(".")[-1] == place[-1]]
+    if elsewhere:
+        return f"`{key}` is not a known key; did you mean `{elsewhere[0]}`?"
+    if near:
+        return f"`{key}` is not a known key; did you mean `{'.'.join([*place[:-1], near[0]])}`?"
+    return f"`{key}` is not a known key; valid here: {', '.join(names)}"
+
+
+def _all_keys(model: type[BaseModel], prefix: str = ""):
+    for name, field in model.model_fields.items():
+        inner = _model_of(field.annotation)
+        yield f"{prefix}{name}"
+        if inner is not None:
+            yield from _all_keys(inner, f"{prefix}{name}.")
+
+
+def describe_keys() -> str:
+    """One line per key with unit and meaning, for `--help`."""
+    lines = []
+    for key in _all_keys(Config):
+        place = key.split(".")
+        field = _field(place)
+        if field is None or _model_of(field.annotation) is not None:
+            continue
+        lines.append(f"  {key:<42} {field.description or ''}".rstrip())
+    return "\n".join(lines)

@@ -1,0 +1,44 @@
+"""What may act on a rotor pair. A scene holds the parts it needs and no others."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rootsopt.contact.impact import ramp, smooth_step
+
+
+class PrescribedDrive(eqx.Module):
+    """Rotor 1 turns at the constant angular speed `speed` (rad/s) whatever the torque."""
+
+    speed: Float[Array, ""]
+
+
+class ConstantLoad(eqx.Module):
+    """A constant `torque` (N·m) that opposes rotor 2."""
+
+    torque: Float[Array, ""]
+
+
+class TimingGear(eqx.Module):
+    """Timing gear between the rotors: backlash, stiffness, damping.
+
+    The torque vanishes for |ε| ≤ `half_backlash` (rad); beyond, it is `stiffness`
+    (N·m/rad) times the excess plus `damping` (N·m·s/rad) times dε/dt. Both ends of the
+    backlash are rounded over `rounding` (rad), as the contact law is at its onset.
+    """
+
+    stiffness: Float[Array, ""]
+    damping: Float[Array, ""]
+    half_backlash: Float[Array, ""]
+    rounding: Float[Array, ""]
+
+    def __call__(self, relative: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
+        """Torque (N·m) that holds ε back, at ε = `relative` (rad), dε/dt = `rate` (rad/s)."""
+        excess = jnp.abs(relative) - self.half_backlash
+        engaged = jnp.where(
+            self.rounding > 0,
+            smooth_step(excess / jnp.where(self.rounding > 0, self.rounding, 1.0)),
+            jnp.where(excess > 0, 1.0, 0.0),
+        )
+        spring = self.stiffness * jnp.sign(relative) * ramp(excess, self.rounding)
+        return spring + self.damping * engaged * rate

@@ -1,0 +1,421 @@
+"""One design in one scene, from design vector to steady state, response and gradient."""
+
+import dataclasses
+import functools
+import time
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from rootsopt.config import Config
+from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.steady import (
+    BLOCK,
+    Orbit,
+    Transient,
+    close_orbit,
+    floquet,
+    lyapunov,
+    reverse_sensitivity,
+    settle,
+    too_deep,
+)
+from rootsopt.errors import InputError
+from rootsopt.model import MM, Model, design_keys, design_vector, integrators
+from rootsopt.profiles import Geometry
+from rootsopt.status import Status
+
+RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
+_SETTLED = 3e-3
+_SAME = 1e-4
+_CHAOS_WINDOW = 128
+
+
+@dataclasses.dataclass(frozen=True)
+class Series:
+    """Motion and force over the reported window, uniform in time (SI units, numpy)."""
+
+    time: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    relative: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    drive_force: NDArray[np.float64]
+    coast_force: NDArray[np.float64]
+
+    @property
+    def force(self) -> NDArray[np.float64]:
+        """Contact force (N): sum of the normal forces."""
+        return self.drive_force + self.coast_force
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """Everything known about one design in one scene.
+
+    `response` and `gradient` use the result file's keys (N, N per config unit);
+    `gradient` is empty where there is none to trust. `steady_state` says what kind of
+    motion it is. `series` covers `series_start` mesh periods onwards.
+    """
+
+    design: dict[str, float]
+    geometry: dict[str, float]
+    response: dict[str, float]
+    gradient: dict[str, dict[str, float]]
+    steady_state: dict[str, Any]
+    status: Status
+    message: str
+    statistics: dict[str, float]
+    series: Series | None
+    state: NDArray[np.float64] | None = None
+
+    @property
+    def usable(self) -> bool:
+        return self.status.usable
+
+    def record(self) -> dict[str, Any]:
+        """The record of the result file."""
+        return {
+            "design": self.design,
+            "geometry": self.geometry,
+            "response": self.response,
+            "gradient": self.gradient,
+            "steady_state": self.steady_state,
+            "status": self.status.label,
+            "message": self.message,
+            "statistics": self.statistics,
+        }
+
+
+class Evaluator:
+    """Evaluates designs of one config; compiled programs are shared between designs.
+
+    `rtol` overrides the orbit tolerance of the config (to check a result more tightly).
+    """
+
+    def __init__(self, config: Config, rtol: float | None = None):
+        self.config = config
+        self.model = Model.of(config)
+        self.keys = design_keys(config)
+        transient, orbit = integrators(config)
+        if rtol is not None:
+            orbit = dataclasses.replace(orbit, rtol=rtol)
+            transient = dataclasses.replace(transient, rtol=min(rtol, transient.rtol))
+        self.transient, self.orbit = transient, orbit
+
+    def __call__(
+        self,
+        design: Float[Array, " d"] | None = None,
+        start: NDArray[np.float64] | None = None,
+        series: bool = True,
+    ) -> Evaluation:
+        """Evaluate `design` (config units; default: the config's own).
+
+        `start` is the scaled state to begin from, such as the orbit of a neighbouring
+        design; by default the contract's ε = 0, dε/dt = 0 at φ = 0.
+        """
+        design = design_vector(self.config) if design is None else jnp.asarray(design)
+        began = time.perf_counter()
+        for _ in range(4):
+            outcome = self._attempt(design, start)
+            reached = outcome.reached
+            if self.model.fidelity != "map" or reached <= -float(self.model.deepest):
+                break
+            if not np.isfinite(reached):
+                break
+            # The motion left the contact map: make the map larger and begin again.
+            limit = float(outcome.pair.angle_limit)
+            deepest = -min(1.3 * reached, limit)
+            self.model = eqx.tree_at(lambda m: m.deepest, self.model, jnp.asarray(deepest))
+        return self._report(design, outcome, time.perf_counter() - began, series)
+
+    def _attempt(self, design, start):
+        pair, tangents, shape = _build(self.model, design)
+        state = jnp.zeros(2) if start is None else jnp.asarray(start)
+        solver = self.config.solver
+        used, steps, tolerance = 0, 0, _SETTLED
+        while True:
+            remaining = jnp.asarray(solver.max_mesh_periods - used)
+            transient = _settle(
+                pair, state, self.transient, jnp.asarray(tolerance), remaining,
+                solver.max_orbit_periods,
+            )
+            used += int(transient.periods)
+            steps += int(transient.steps)
+            state = transient.state
+            orbit, status = None, self._transient_status(transient)
+            if status is not None:
+                break
+            orbit = _close(pair, tangents, len(self.keys), state, transient.period, self.orbit)
+            shorter = _true_period(orbit, int(transient.period))
+            if shorter < int(transient.period):
+                transient = transient._replace(period=jnp.asarray(shorter))
+                orbit = _close(pair, tangents, len(self.keys), orbit.state, transient.period, self.orbit)
+            status = self._orbit_status(orbit, transient, tolerance)
+            steps += int(orbit.flow.steps)
+            if status is not Status.NOT_SETTLED or used >= solver.max_mesh_periods:
+                break
+            # Newton left the neighbourhood or found an unstable orbit: it was not the
+            # steady state yet. Go on, and look more closely next time.
+            tolerance /= 10
+        return _Outcome(pair, shape, transient, orbit, status, used, steps)
+
+    @staticmethod
+    def _transient_status(transient: Transient) -> Status | None:
+        if not bool(jnp.all(jnp.isfinite(transient.state))):
+            return Status.NON_FINITE
+        if bool(transient.lost):
+            return Status.PASSED_THROUGH
+        if not bool(transient.solved):
+            return Status.SOLVER_FAILED
+        return None if int(transient.period) > 0 else Status.NOT_SETTLED
+
+    def _orbit_status(self, orbit: Orbit, transient: Transient, tolerance: float) -> Status:
+        if not bool(orbit.flow.solved):
+            return Status.SOLVER_FAILED
+        numbers = jnp.concatenate([orbit.response, orbit.sensitivity.ravel(), orbit.state])
+        if not bool(jnp.all(jnp.isfinite(numbers))):
+            return Status.NON_FINITE
+        multiplier = float(jnp.max(floquet(orbit.monodromy)))
+        near = tolerance / max(1 - multiplier, 1e-3) * 10 + 100 * float(self.transient.rtol)
+        moved = float(jnp.max(jnp.abs(orbit.state - transient.state)))
+        closed = float(orbit.residual) <= max(1e-9, 1e3 * float(self.orbit.rtol))
+        stable = multiplier < 1
+        return Status.PERIODIC if closed and stable and moved <= near else Status.NOT_SETTLED
+
+    def _report(self, design, outcome: "_Outcome", seconds, with_series) -> Evaluation:
+        pair, orbit, status = outcome.pair, outcome.orbit, outcome.status
+        response: dict[str, float] = {}
+        gradient: dict[str, dict[str, float]] = {}
+        steady: dict[str, Any] = {"kind": "transient"}
+        series, state = None, None
+        statistics = {
+            "transient_mesh_periods": outcome.used,
+            "solver_steps": outcome.steps,
+        }
+        if status is Status.PERIODIC and orbit is not None:
+            period = int(outcome.transient.period)
+            response = _response(*np.asarray(orbit.response))
+            gradient = self._gradient(design, orbit, period)
+            steady = {
+                "kind": "periodic",
+                "period": period,
+                "floquet_multiplier": float(jnp.max(floquet(orbit.monodromy))),
+                "residual": float(orbit.residual),
+            }
+            state = np.asarray(orbit.state)
+            statistics |= {"newton_steps": int(orbit.newton_steps), "orbit_steps": int(orbit.flow.steps)}
+            if with_series:
+                series = _orbit_series(pair, orbit, period)
+            if bool(too_deep(_depth(pair, orbit), self.model.pitch_radius)):
+                status = Status.TOO_DEEP
+        elif status is Status.NOT_SETTLED:
+            window = _lyapunov(pair, outcome.transient.state, _CHAOS_WINDOW, self.transient)
+            status, steady, response, series = _unsettled(pair, window, with_series)
+        if status is not Status.PERIODIC:
+            gradient = {}
+        statistics["seconds"] = seconds
+        return Evaluation(
+            design=dict(zip(self.keys, map(float, design), strict=True)),
+            geometry=geometry_record(self.model, outcome.shape),
+            response=response,
+            gradient=gradient,
+            steady_state=steady,
+            status=status,
+            message=status.value,
+            statistics=statistics,
+            series=series,
+            state=state,
+        )
+
+    def _gradient(self, design, orbit: Orbit, period: int) -> dict[str, dict[str, float]]:
+        if not self.keys:
+            return {}
+        sensitivity = orbit.sensitivity
+        if self.config.solver.gradient == "reverse":
+            sensitivity = _reverse(
+                self.model, design, orbit.state, jnp.asarray(period), self.orbit
+            )
+        mean, square, peak = np.asarray(sensitivity)
+        rms = square / (2 * np.sqrt(max(float(orbit.response[1]), 1e-300)))
+        rows = zip(RESPONSES, (mean, peak, rms), strict=True)
+        return {name: dict(zip(self.keys, map(float, row), strict=True)) for name, row in rows}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Outcome:
+    pair: RotorPair
+    shape: Geometry
+    transient: Transient
+    orbit: Orbit | None
+    status: Status
+    used: int
+    steps: int
+
+    @property
+    def reached(self) -> float:
+        """Largest |ε| (rad) of the steady motion, as far as known."""
+        scale = float(self.pair.angle_scale)
+        if self.orbit is not None:
+            return scale * float(jnp.max(jnp.abs(self.orbit.flow.states[:, 0])))
+        return scale * abs(float(self.transient.state[0]))
+
+
+def geometry_record(model: Model, shape: Geometry) -> dict[str, float]:
+    """Geometry in the result file's keys and units."""
+    return {
+        "outer_radius_mm": float(shape.outer_radius) / MM,
+        "root_radius_mm": float(shape.root_radius) / MM,
+        "area_mm2": float(shape.area) / MM**2,
+        "area_efficiency": float(shape.area_efficiency),
+        "polar_inertia_kg_m2": float(model.inertia(shape)),
+        "undercut_margin_mm": float(shape.undercut_margin) / MM,
+        "seal_width_mm": float(shape.seal_width) / MM,
+    }
+
+
+def _response(mean, square, peak) -> dict[str, float]:
+    return {
+        "mean_force_N": float(mean),
+        "peak_force_N": float(peak),
+        "rms_force_N": float(np.sqrt(square)),
+    }
+
+
+@eqx.filter_jit
+def _build(model: Model, design):
+    """Pair, its stacked design tangents, and the rotor's geometry."""
+
+    def build(design):
+        pair, shape = model.pair_and_shape(design)
+        dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
+        return dynamic, (_Static(static), shape)
+
+    count = design.shape[0]
+    if count == 0:
+        dynamic, (static, shape) = build(design)
+        tangents = jax.tree.map(lambda x: jnp.zeros((0, *x.shape)), dynamic)
+    else:
+        push = functools.partial(jax.jvp, build, (design,), has_aux=True)
+        each = jax.vmap(lambda t: push((t,)), out_axes=(None, 0, None))
+        dynamic, tangents, (static, shape) = each(jnp.eye(count))
+    return eqx.combine(dynamic, static.value), tangents, shape
+
+
+class _Static(eqx.Module):
+    """Carries what is not an array through a transformation."""
+
+    value: Any = eqx.field(static=True)
+
+
+_settle = eqx.filter_jit(settle)
+_lyapunov = eqx.filter_jit(lyapunov)
+
+
+@eqx.filter_jit
+def _close(pair, tangents, directions, state, period, how: Integrator) -> Orbit:
+    return close_orbit(pair, tangents, directions, state, period, how, 1e-10)
+
+
+def _true_period(orbit: Orbit, period: int) -> int:
+    """Smallest period of a closed orbit: solver noise can hide that it repeats sooner."""
+    states = np.asarray(orbit.flow.states)
+    for shorter in range(1, period):
+        if period % shorter == 0:
+            again = states[shorter * len(states) // period]
+            if np.max(np.abs(again - states[0])) < _SAME:
+                return shorter
+    return period
+
+
+@eqx.filter_jit
+def _reverse(model: Model, design, state, period, how: Integrator):
+    return reverse_sensitivity(model.pair, design, state, period, how)
+
+
+@eqx.filter_jit
+def _contact_series(pair: RotorPair, tau, states):
+    phi, relative, rate = pair.physical(tau, states)
+    contact = jax.vmap(pair.contact_force)(phi, relative, rate)
+    return phi, relative, rate, contact
+
+
+@eqx.filter_jit
+def _depth(pair: RotorPair, orbit: Orbit):
+    tau = jnp.zeros(orbit.flow.states.shape[0])
+    count = orbit.flow.states.shape[0]
+    tau = jnp.arange(count) / count
+    _, _, _, contact = _contact_series(pair, tau, orbit.flow.states)
+    return jnp.max(contact.depth)
+
+
+def _series(pair: RotorPair, tau, states) -> Series:
+    phi, relative, rate, contact = _contact_series(pair, jnp.asarray(tau), jnp.asarray(states))
+    return Series(
+        time=np.asarray(tau) * float(pair.mesh_period),
+        rotation=np.asarray(phi),
+        relative=np.asarray(relative),
+        rate=np.asarray(rate),
+        drive_force=np.asarray(contact.drive),
+        coast_force=np.asarray(contact.coast),
+    )
+
+
+def _orbit_series(pair: RotorPair, orbit: Orbit, period: int) -> Series:
+    """The orbit repeated over at least one revolution, in whole cycles."""
+    samples = orbit.flow.states.shape[0]
+    cycles = -(-pair.lobes // period)
+    tau = period * np.arange(cycles * samples) / samples
+    return _series(pair, tau, np.tile(np.asarray(orbit.flow.states), (cycles, 1)))
+
+
+def _unsettled(pair, window, with_series):
+    """Status, steady state, response and series of a motion that has not settled."""
+    exponent, error = float(window.exponent), float(window.error)
+    flows = window.flows
+    finite = np.isfinite(np.asarray(flows.peak)).all() and np.isfinite(exponent)
+    lost = abs(float(window.state[0])) * float(pair.angle_scale) >= pair.angle_limit
+    kind = "transient"
+    if lost:
+        status = Status.PASSED_THROUGH
+    elif not finite:
+        status = Status.NON_FINITE
+    elif not bool(jnp.all(flows.solved)):
+        status = Status.SOLVER_FAILED
+    elif exponent > 3 * error:
+        status, kind = Status.CHAOTIC, "chaotic"
+    else:
+        status = Status.NOT_SETTLED
+    steady = {
+        "kind": kind,
+        "lyapunov_exponent_per_mesh_period": exponent if finite else None,
+        "lyapunov_standard_error": error if finite else None,
+        "window_mesh_periods": _CHAOS_WINDOW,
+    }
+    if status not in (Status.CHAOTIC, Status.NOT_SETTLED):
+        return status, steady, {}, None
+    response = _response(
+        np.mean(np.asarray(flows.mean)),
+        np.mean(np.asarray(flows.mean_square)),
+        np.max(np.asarray(flows.peak)),
+    )
+    series = None
+    if with_series:
+        periods, samples, _ = flows.states.shape
+        tau = np.arange(periods * samples) / samples
+        series = _series(pair, tau, np.asarray(flows.states).reshape(-1, 2))
+    return status, steady, response, series
+
+
+def evaluate(config: Config, **options) -> Evaluation:
+    """Evaluate the config's own design; see `Evaluator`."""
+    return Evaluator(config)(**options)
+
+
+__all__ = ["BLOCK", "Evaluation", "Evaluator", "InputError", "RESPONSES", "Series", "evaluate"]

@@ -1,0 +1,224 @@
+"""From config to model: units, profile, rotor pair.
+
+A design is a vector of the config's design parameters in the config's own units
+(`DESIGN_KEYS` for CIC, empty for EE), so gradients come out per config unit.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rootsopt.config import DESIGN_KEYS, Config
+from rootsopt.contact.impact import ImpactLaw
+from rootsopt.contact.map import MapContact
+from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.pair import RotorPair, SearchContact
+from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
+from rootsopt.errors import InputError
+from rootsopt.profiles import CIC, EE, Geometry, Profile, geometry
+
+MM = 1e-3
+DEG = math.pi / 180
+_OVERLENGTH = 0.02
+"""How far u may exceed u_max, relative. Past u_max the roll angle turns back and two
+points of a flank mesh at once. Node search finds no interference (< 1 nm) up to 5 % over;
+the paper's printed Table 1 is 1.2 % over."""
+
+
+class Model(eqx.Module):
+    """Everything about a config but the design: builds a rotor pair from a design.
+
+    Numbers are leaves, choices are static, so that one compiled program serves every
+    config of the same kind.
+    """
+
+    family: str = eqx.field(static=True)
+    lobes: int = eqx.field(static=True)
+    fidelity: str = eqx.field(static=True)
+    map_size: tuple[int, int] = eqx.field(static=True)
+    pitch_radius: Float[Array, ""]
+    length: Float[Array, ""]
+    density: Float[Array, ""]
+    law: ImpactLaw
+    clearance: Float[Array, ""]
+    speed: Float[Array, ""]
+    load_torque: Float[Array, ""]
+    gear: TimingGear | None
+    gear_damping_ratio: Float[Array, ""]
+    deepest: Float[Array, ""]
+
+    @classmethod
+    def of(cls, config: Config, deepest: float | None = None) -> "Model":
+        """Model of a config; `deepest` (rad < 0) is the relative rotation the contact map
+        must reach, estimated from the scene when not given."""
+        contact, scene, solver = config.contact, config.scene, config.solver
+        radius = config.profile.pitch_radius_mm * MM
+        scale = contact.exponent
+        law = ImpactLaw(
+            stiffness=jnp.asarray(contact.stiffness_N_per_mm_e / MM**scale),
+            exponent=jnp.asarray(scale),
+            damping=jnp.asarray(contact.max_damping_N_s_per_mm / MM),
+            full_damping_depth=jnp.asarray(contact.full_damping_depth_mm * MM),
+            smoothing=jnp.asarray(contact.smoothing_mm * MM),
+        )
+        gear = None
+        damping_ratio = 0.0
+        if scene.timing_gear is not None:
+            damping_ratio = scene.timing_gear.damping_ratio
+            gear = TimingGear(
+                stiffness=jnp.asarray(scene.timing_gear.stiffness_N_m_per_rad),
+                damping=jnp.asarray(0.0),
+                half_backlash=jnp.asarray(scene.timing_gear.backlash_mm * MM / (2 * radius)),
+                rounding=jnp.asarray(contact.smoothing_mm * MM / radius),
+            )
+        if deepest is None:
+            deepest = _expected_rotation(config)
+        return cls(
+            family=config.profile.family,
+            lobes=config.profile.lobes,
+            fidelity=solver.fidelity,
+            map_size=(solver.map_rolls, solver.map_relatives),
+            pitch_radius=jnp.asarray(radius),
+            length=jnp.asarray(config.rotor.length_mm * MM),
+            density=jnp.asarray(config.rotor.density_kg_m3),
+            law=law,
+            clearance=jnp.asarray(contact.clearance_mm * MM),
+            speed=jnp.asarray(scene.speed_rpm * 2 * math.pi / 60),
+            load_torque=jnp.asarray(scene.load.torque_N_m),
+            gear=gear,
+            gear_damping_ratio=jnp.asarray(damping_ratio),
+            deepest=jnp.asarray(deepest),
+        )
+
+    def profile(self, design: Float[Array, " d"]) -> Profile:
+        """The profile of a design given in config units."""
+        if self.family == "ee":
+            return EE(self.lobes, self.pitch_radius)
+        angle, length, tip = design
+        return CIC(self.lobes, self.pitch_radius, angle * DEG, length * MM, tip * DEG)
+
+    def inertia(self, shape: Geometry) -> Float[Array, ""]:
+        """Polar moment of inertia of one rotor about its axis (kg·m²)."""
+        return self.density * self.length * shape.polar_area_moment
+
+    def pair(self, design: Float[Array, " d"]) -> RotorPair:
+        """The rotor pair of a design in config units, differentiable in it."""
+        return self.pair_and_shape(design)[0]
+
+    def pair_and_shape(self, design: Float[Array, " d"]) -> tuple[RotorPair, Geometry]:
+        """The rotor pair and the geometry of one rotor."""
+        profile = self.profile(design)
+        shape = geometry(profile)
+        inertia = self.inertia(shape)
+        if self.fidelity == "map":
+            contact = MapContact.of(profile, self.deepest, *self.map_size)
+        else:
+            contact = SearchContact.of(profile)
+        gear = self.gear
+        if gear is not None:
+            # I_r = I1 I2 / (I1 + I2) of two equal rotors.
+            damping = 2 * self.gear_damping_ratio * jnp.sqrt(gear.stiffness * inertia / 2)
+            gear = eqx.tree_at(lambda g: g.damping, gear, damping)
+        force = jnp.maximum(self.load_torque, 1e-3) / self.pitch_radius
+        angle = self.law.depth_at(force) / self.pitch_radius
+        if gear is not None:
+            angle = angle + gear.half_backlash
+        pair = RotorPair(
+            lobes=self.lobes,
+            contact=contact,
+            law=self.law,
+            clearance=self.clearance,
+            inertia=inertia,
+            drive=PrescribedDrive(self.speed),
+            load=ConstantLoad(self.load_torque),
+            gear=gear,
+            angle_scale=angle,
+            force_scale=force,
+        )
+        return pair, shape
+
+
+def _expected_rotation(config: Config) -> float:
+    """Relative rotation (rad, negative) a scene is expected to reach: the backlash and
+    clearance taken up, plus an impact ten times the static contact force."""
+    contact, scene = config.contact, config.scene
+    radius = config.profile.pitch_radius_mm
+    play = contact.clearance_mm
+    if scene.timing_gear is not None:
+        play += scene.timing_gear.backlash_mm / 2
+    force = 20 * max(scene.load.torque_N_m, 0.01) / (radius * MM)
+    depth = (force / contact.stiffness_N_per_mm_e) ** (1 / contact.exponent)
+    return -min((1.3 * play + 1.5 * depth) / radius, math.pi / (8 * config.profile.lobes))
+
+
+def design_vector(config: Config) -> Float[Array, " d"]:
+    """The config's design parameters in config units: (3,) for CIC, (0,) for EE."""
+    if config.profile.family == "ee":
+        return jnp.zeros(0)
+    return jnp.asarray([getattr(config.profile, key) for key in DESIGN_KEYS])
+
+
+def design_keys(config: Config) -> tuple[str, ...]:
+    """Names of the entries of `design_vector`."""
+    return () if config.profile.family == "ee" else DESIGN_KEYS
+
+
+def integrators(config: Config) -> tuple[Integrator, Integrator]:
+    """(transient, orbit) integrators of a config."""
+    solver = config.solver
+    return (
+        Integrator(solver.method, solver.transient_rtol, solver.max_steps_per_period),
+        Integrator(solver.method, solver.rtol, solver.max_steps_per_period),
+    )
+
+
+@eqx.filter_jit
+def _measure(model: Model, design):
+    profile = model.profile(design)
+    return geometry(profile)
+
+
+def check_geometry(config: Config) -> None:
+    """Raise `InputError` unless the config's profile can be made and meshes."""
+    profile_config = config.profile
+    if profile_config.family != "cic":
+        return
+    alpha = profile_config.pressure_angle_deg
+    length = profile_config.involute_length_mm
+    tip = profile_config.tip_arc_angle_deg
+    assert alpha is not None and length is not None and tip is not None
+    half = 90.0 / profile_config.lobes
+    if tip >= half:
+        raise InputError(
+            f"`profile.tip_arc_angle_deg` must be less than {half:g} (a quarter of the lobe "
+            f"pitch) for {profile_config.lobes} lobes, but is {tip:g}"
+        )
+    longest = (
+        profile_config.pitch_radius_mm * math.sin(alpha * DEG) * (half - tip) * DEG
+    )
+    limit = longest * (1 + _OVERLENGTH)
+    if length > limit:
+        raise InputError(
+            f"`profile.involute_length_mm` must be at most {longest:.4g} at "
+            f"`profile.pressure_angle_deg` = {alpha:g} and `profile.tip_arc_angle_deg` = "
+            f"{tip:g} (up to {limit:.4g} is tolerated), but is {length:g}: the roll angle would "
+            "turn back; shorten it or raise the pressure angle"
+        )
+    shape = _measure(Model.of(config), design_vector(config))
+    margin = float(shape.undercut_margin) / MM
+    if not margin >= 0:
+        raise InputError(
+            f"`profile.involute_length_mm` must be less than "
+            f"{profile_config.pitch_radius_mm * math.sin(alpha * DEG) * math.tan(alpha * DEG):.4g} "
+            f"at `profile.pressure_angle_deg` = {alpha:g}, but is {length:g}: the dedendum is "
+            f"undercut (margin {margin:.3g} mm); shorten it or raise the pressure angle"
+        )
+    if not float(shape.root_radius) > 0:
+        raise InputError(
+            f"`profile.pressure_angle_deg` = {alpha:g} with `profile.involute_length_mm` = "
+            f"{length:g} gives a root radius of {float(shape.root_radius) / MM:.3g} mm; it must "
+            "be positive: shorten the involute or raise the pressure angle"
+        )

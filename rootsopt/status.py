@@ -1,0 +1,42 @@
+"""What can be said of a result. No number is reported without one of these."""
+
+import enum
+
+
+class Status(enum.Enum):
+    """Outcome of a simulation; the value is the advice given to the user."""
+
+    PERIODIC = "The pair settled on a stable periodic orbit."
+    CHAOTIC = (
+        "The motion is chaotic: mean and peak are averages over a finite window and have no "
+        "usable gradient. Lower the speed, load or backlash, or add damping."
+    )
+    NOT_SETTLED = (
+        "The transient has not passed. Raise solver.max_mesh_periods, or add damping."
+    )
+    PASSED_THROUGH = (
+        "The lobes passed through each other: the flanks alone cannot hold this load. Add a "
+        "scene.timing_gear, lower the load or the backlash."
+    )
+    TOO_DEEP = (
+        "The flanks penetrate beyond the validity of a contact law (2 % of the pitch radius). "
+        "Raise contact.stiffness_N_per_mm_e or lower the load."
+    )
+    SOLVER_FAILED = (
+        "The solver ran out of steps. Raise solver.max_steps_per_period, loosen solver.rtol, "
+        "or use an implicit solver.method (kvaerno5)."
+    )
+    NON_FINITE = (
+        "The simulation produced a number that is not finite. Loosen solver.rtol or check the "
+        "contact parameters."
+    )
+
+    @property
+    def usable(self) -> bool:
+        """Whether the numbers stand for a steady state with a gradient."""
+        return self is Status.PERIODIC
+
+    @property
+    def label(self) -> str:
+        """The word used in result files and tables."""
+        return self.name.lower()

@@ -1,0 +1,59 @@
+"""Test settings (float64, no display) and the fixtures shared by the geometry tests."""
+
+import os
+
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import settings
+
+settings.register_profile("rootsopt", deadline=None, derandomize=True, max_examples=25)
+settings.load_profile("rootsopt")
+
+
+def _graded_normals(profile, points):
+    """Normal angles with every segment end among them, evenly in arc length + angle.
+
+    Even arc length alone leaves wide angles between nodes where the radius of curvature
+    vanishes (pitch point of EE), and there polygon and cubic are both poor.
+    """
+    pieces = []
+    for segment in profile.segments():
+        if not float(segment.stop) > float(segment.start):
+            continue
+        nu = np.linspace(float(segment.start), float(segment.stop), 2001)
+        middle = jnp.asarray((nu[1:] + nu[:-1]) / 2)
+        addendum, dedendum = profile.addendum_speed(middle), profile.dedendum_speed(middle)
+        speed = np.maximum(np.abs(addendum), np.abs(dedendum))
+        speed = speed + 0.3 * float(profile.pitch_radius)
+        pieces.append((nu, np.concatenate([[0.0], np.cumsum(speed * np.diff(nu))])))
+    total = sum(measure[-1] for _, measure in pieces)
+    normals = []
+    for nu, measure in pieces:
+        count = max(8, int(points * measure[-1] / total)) + 1
+        normals.append(np.interp(np.linspace(0, measure[-1], count), measure, nu)[:-1])
+    return np.append(np.concatenate(normals), pieces[-1][0][-1])
+
+
+@pytest.fixture(scope="session")
+def graded_outline():
+    """Function (profile, points) → closed outline (m) with nodes crowded at high curvature."""
+
+    def build(profile, points):
+        nu = jnp.asarray(_graded_normals(profile, points))
+        addendum = np.asarray(profile.position(profile.addendum(nu)))
+        dedendum = np.asarray(profile.position(profile.dedendum(nu)))
+        flank = np.concatenate([addendum, dedendum[-2::-1]]) @ [1, 1j]
+        lobe_turn = np.exp(2j * np.pi / profile.lobes)
+        lobe = np.concatenate([flank[:-1], (np.conj(flank) * lobe_turn)[:0:-1]])
+        turns = lobe_turn ** np.arange(profile.lobes)
+        closed = np.concatenate([*(lobe * turn for turn in turns), lobe[:1]])
+        return np.stack([closed.real, closed.imag], axis=-1)
+
+    return build
