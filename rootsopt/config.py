@@ -194,7 +194,9 @@ class BoundsConfig(_Section):
 class OptimizerConfig(_Section):
     """How the design is searched."""
 
-    method: Literal["adam", "lbfgs"] = Field("adam", description="optax update rule")
+    method: Literal["adam", "rmsprop", "sgd"] = Field(
+        "adam", description="optax update rule: adam, rmsprop, sgd"
+    )
     learning_rate: Positive = Field(0.05, description="step in the unit box of the bounds")
     iterations: Annotated[int, Field(ge=1, le=10000)] = Field(40, description="per start")
     starts: Annotated[int, Field(ge=1, le=64)] = Field(2, description="local searches")
@@ -309,7 +311,9 @@ def _override(data: dict, override: str) -> None:
     key, equals, value = override.partition("=")
     parts = key.strip().split(".")
     if not equals or not all(parts):
-        raise InputError(f"--set {override!r}: must be dotted.key=value, as in scene.speed_rpm=1500")
+        raise InputError(
+            f"--set {override!r}: must be dotted.key=value, as in scene.speed_rpm=1500"
+        )
     target = data
     for i, part in enumerate(parts[:-1]):
         inner = target.get(part)

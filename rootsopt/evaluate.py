@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
@@ -40,7 +39,8 @@ _CHAOS_WINDOW = 128
 
 @dataclasses.dataclass(frozen=True)
 class Series:
-    """Motion and force over the reported window, uniform in time (SI units, numpy)."""
+    """Motion, force and penetration (negative: gap) over the reported window, uniform in
+    time (SI units, numpy)."""
 
     time: NDArray[np.float64]
     rotation: NDArray[np.float64]
@@ -48,6 +48,7 @@ class Series:
     rate: NDArray[np.float64]
     drive_force: NDArray[np.float64]
     coast_force: NDArray[np.float64]
+    depth: NDArray[np.float64]
 
     @property
     def force(self) -> NDArray[np.float64]:
@@ -96,17 +97,21 @@ class Evaluation:
 class Evaluator:
     """Evaluates designs of one config; compiled programs are shared between designs.
 
-    `rtol` overrides the orbit tolerance of the config (to check a result more tightly).
+    `rtol` overrides the orbit tolerance of the config. With `survey`, a design that
+    does not settle within a quarter of the allowed transient is given up without asking
+    what else its motion is: for a search over many designs.
     """
 
-    def __init__(self, config: Config, rtol: float | None = None):
+    def __init__(self, config: Config, rtol: float | None = None, survey: bool = False):
         self.config = config
+        self.survey = survey
+        limit = config.solver.max_mesh_periods
+        self.max_periods = max(limit // 4, 2 * BLOCK) if survey else limit
         self.model = Model.of(config)
         self.keys = design_keys(config)
         transient, orbit = integrators(config)
         if rtol is not None:
-            orbit = dataclasses.replace(orbit, rtol=rtol)
-            transient = dataclasses.replace(transient, rtol=min(rtol, transient.rtol))
+            orbit = dataclasses.replace(orbit, rtol=jnp.asarray(rtol))
         self.transient, self.orbit = transient, orbit
 
     def __call__(
@@ -141,9 +146,13 @@ class Evaluator:
         solver = self.config.solver
         used, steps, tolerance = 0, 0, _SETTLED
         while True:
-            remaining = jnp.asarray(solver.max_mesh_periods - used)
+            remaining = jnp.asarray(self.max_periods - used)
             transient = _settle(
-                pair, state, self.transient, jnp.asarray(tolerance), remaining,
+                pair,
+                state,
+                self.transient,
+                jnp.asarray(tolerance),
+                remaining,
                 solver.max_orbit_periods,
             )
             used += int(transient.periods)
@@ -156,10 +165,12 @@ class Evaluator:
             shorter = _true_period(orbit, int(transient.period))
             if shorter < int(transient.period):
                 transient = transient._replace(period=jnp.asarray(shorter))
-                orbit = _close(pair, tangents, len(self.keys), orbit.state, transient.period, self.orbit)
+                orbit = _close(
+                    pair, tangents, len(self.keys), orbit.state, transient.period, self.orbit
+                )
             status = self._orbit_status(orbit, transient, tolerance)
             steps += int(orbit.flow.steps)
-            if status is not Status.NOT_SETTLED or used >= solver.max_mesh_periods:
+            if status is not Status.NOT_SETTLED or used >= self.max_periods:
                 break
             # Newton left the neighbourhood or found an unstable orbit: it was not the
             # steady state yet. Go on, and look more closely next time.
@@ -210,12 +221,15 @@ class Evaluator:
                 "residual": float(orbit.residual),
             }
             state = np.asarray(orbit.state)
-            statistics |= {"newton_steps": int(orbit.newton_steps), "orbit_steps": int(orbit.flow.steps)}
+            statistics |= {
+                "newton_steps": int(orbit.newton_steps),
+                "orbit_steps": int(orbit.flow.steps),
+            }
             if with_series:
                 series = _orbit_series(pair, orbit, period)
-            if bool(too_deep(_depth(pair, orbit), self.model.pitch_radius)):
-                status = Status.TOO_DEEP
-        elif status is Status.NOT_SETTLED:
+                if bool(too_deep(series.depth.max(), self.model.pitch_radius)):
+                    status = Status.TOO_DEEP
+        elif status is Status.NOT_SETTLED and not self.survey:
             window = _lyapunov(pair, outcome.transient.state, _CHAOS_WINDOW, self.transient)
             status, steady, response, series = _unsettled(pair, window, with_series)
         if status is not Status.PERIODIC:
@@ -239,9 +253,7 @@ class Evaluator:
             return {}
         sensitivity = orbit.sensitivity
         if self.config.solver.gradient == "reverse":
-            sensitivity = _reverse(
-                self.model, design, orbit.state, jnp.asarray(period), self.orbit
-            )
+            sensitivity = _reverse(self.model, design, orbit.state, jnp.asarray(period), self.orbit)
         mean, square, peak = np.asarray(sensitivity)
         rms = square / (2 * np.sqrt(max(float(orbit.response[1]), 1e-300)))
         rows = zip(RESPONSES, (mean, peak, rms), strict=True)
@@ -346,15 +358,6 @@ def _contact_series(pair: RotorPair, tau, states):
     return phi, relative, rate, contact
 
 
-@eqx.filter_jit
-def _depth(pair: RotorPair, orbit: Orbit):
-    tau = jnp.zeros(orbit.flow.states.shape[0])
-    count = orbit.flow.states.shape[0]
-    tau = jnp.arange(count) / count
-    _, _, _, contact = _contact_series(pair, tau, orbit.flow.states)
-    return jnp.max(contact.depth)
-
-
 def _series(pair: RotorPair, tau, states) -> Series:
     phi, relative, rate, contact = _contact_series(pair, jnp.asarray(tau), jnp.asarray(states))
     return Series(
@@ -364,6 +367,7 @@ def _series(pair: RotorPair, tau, states) -> Series:
         rate=np.asarray(rate),
         drive_force=np.asarray(contact.drive),
         coast_force=np.asarray(contact.coast),
+        depth=np.asarray(contact.depth),
     )
 
 
@@ -418,4 +422,4 @@ def evaluate(config: Config, **options) -> Evaluation:
     return Evaluator(config)(**options)
 
 
-__all__ = ["BLOCK", "Evaluation", "Evaluator", "InputError", "RESPONSES", "Series", "evaluate"]
+__all__ = ["BLOCK", "RESPONSES", "Evaluation", "Evaluator", "InputError", "Series", "evaluate"]

@@ -7,9 +7,10 @@ A design is a vector of the config's design parameters in the config's own units
 import math
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import DESIGN_KEYS, Config
 from rootsopt.contact.impact import ImpactLaw
@@ -18,7 +19,7 @@ from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.pair import RotorPair, SearchContact
 from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
 from rootsopt.errors import InputError
-from rootsopt.profiles import CIC, EE, Geometry, Profile, geometry
+from rootsopt.profiles import CIC, EE, Geometry, Profile, geometry, outline
 
 MM = 1e-3
 DEG = math.pi / 180
@@ -166,12 +167,18 @@ def design_keys(config: Config) -> tuple[str, ...]:
     return () if config.profile.family == "ee" else DESIGN_KEYS
 
 
+def outline_mm(config: Config, design: ArrayLike | None = None) -> NDArray[np.float64]:
+    """Closed counter-clockwise outline (n, 2) in mm of a design, by default the config's."""
+    design = design_vector(config) if design is None else jnp.asarray(design)
+    return np.asarray(outline(Model.of(config).profile(design), points=240)) / MM
+
+
 def integrators(config: Config) -> tuple[Integrator, Integrator]:
     """(transient, orbit) integrators of a config."""
     solver = config.solver
     return (
-        Integrator(solver.method, solver.transient_rtol, solver.max_steps_per_period),
-        Integrator(solver.method, solver.rtol, solver.max_steps_per_period),
+        Integrator(solver.method, jnp.asarray(solver.transient_rtol), solver.max_steps_per_period),
+        Integrator(solver.method, jnp.asarray(solver.rtol), solver.max_steps_per_period),
     )
 
 
@@ -196,9 +203,7 @@ def check_geometry(config: Config) -> None:
             f"`profile.tip_arc_angle_deg` must be less than {half:g} (a quarter of the lobe "
             f"pitch) for {profile_config.lobes} lobes, but is {tip:g}"
         )
-    longest = (
-        profile_config.pitch_radius_mm * math.sin(alpha * DEG) * (half - tip) * DEG
-    )
+    longest = profile_config.pitch_radius_mm * math.sin(alpha * DEG) * (half - tip) * DEG
     limit = longest * (1 + _OVERLENGTH)
     if length > limit:
         raise InputError(

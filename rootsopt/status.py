@@ -7,13 +7,12 @@ class Status(enum.Enum):
     """Outcome of a simulation; the value is the advice given to the user."""
 
     PERIODIC = "The pair settled on a stable periodic orbit."
+    GEOMETRY_ONLY = "The profile is valid; nothing was simulated."
     CHAOTIC = (
         "The motion is chaotic: mean and peak are averages over a finite window and have no "
         "usable gradient. Lower the speed, load or backlash, or add damping."
     )
-    NOT_SETTLED = (
-        "The transient has not passed. Raise solver.max_mesh_periods, or add damping."
-    )
+    NOT_SETTLED = "The transient has not passed. Raise solver.max_mesh_periods, or add damping."
     PASSED_THROUGH = (
         "The lobes passed through each other: the flanks alone cannot hold this load. Add a "
         "scene.timing_gear, lower the load or the backlash."

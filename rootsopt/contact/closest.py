@@ -27,8 +27,8 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
 from jax import lax
+from jaxtyping import Array, Bool, Float
 
 from rootsopt.profiles.base import Profile
 
@@ -101,9 +101,7 @@ class FlankPair(eqx.Module):
         facing = jnp.pi / 2 - psi - beta
         return cls(profile, FlankNodes(normal, facing, arm[0], arm[1] + s))
 
-    def __call__(
-        self, roll: Float[Array, ""], relative: Float[Array, ""]
-    ) -> ClosestApproach:
+    def __call__(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> ClosestApproach:
         """Closest approach at roll coordinate x = `roll` and ε = `relative` (rad).
 
         `roll` is reduced to one mesh period around the middle of the flank, so any angle

@@ -29,7 +29,7 @@ class Integrator(eqx.Module):
     """
 
     method: str = eqx.field(static=True)
-    rtol: float
+    rtol: Float[Array, ""]
     max_steps: int = eqx.field(static=True)
 
     @property

@@ -191,7 +191,10 @@ def response_vector(out: Flow) -> Float[Array, "3"]:
 
 
 def reverse_sensitivity(
-    build, design: Float[Array, " d"], state: Float[Array, "2"], period: Int[Array, ""],
+    build,
+    design: Float[Array, " d"],
+    state: Float[Array, "2"],
+    period: Int[Array, ""],
     how: Integrator,
 ) -> Float[Array, "3 d"]:
     """The same sensitivity by reverse mode, through diffrax's checkpointed adjoint.
@@ -202,9 +205,7 @@ def reverse_sensitivity(
     length = period.astype(state.dtype)
 
     def run(state, design):
-        out = flow(
-            build(design), state, length, how, SAMPLES, diffrax.RecursiveCheckpointAdjoint()
-        )
+        out = flow(build(design), state, length, how, SAMPLES, diffrax.RecursiveCheckpointAdjoint())
         return jnp.concatenate([out.end, response_vector(out)])
 
     _, pull = jax.vjp(run, state, design)

@@ -93,3 +93,11 @@ class CIC(Profile):
         # arc's centre, and touch the base circle: no roll angle is needed.
         arc = self.arc_center_radius * jnp.sin(self._arc_turn(nu))
         return jnp.where(nu > self.arc_end, self.base_radius, arc)
+
+    def support(self, nu):
+        turn = self._arc_turn(nu)
+        arc = self.arc_center_radius * jnp.cos(turn) + self.arc_radius
+        beta = nu - jnp.pi / 2 + self.pressure_angle
+        reach = self.pitch_radius * jnp.sin(self.pressure_angle)
+        involute = reach + self.base_radius * (self.half_pitch - beta)
+        return jnp.where(nu > self.arc_end, involute, arc)

@@ -50,8 +50,7 @@ def geometry(profile: Profile) -> Geometry:
     sides = ((s, profile.addendum_speed(nu)), (-s, speed))
     area = sum(jnp.sum((sliding + s) * dl * weights) for s, dl in sides) / 2
     moment = sum(
-        jnp.sum((r**2 + 2 * s * sliding + s**2) * (sliding + s) * dl * weights)
-        for s, dl in sides
+        jnp.sum((r**2 + 2 * s * sliding + s**2) * (sliding + s) * dl * weights) for s, dl in sides
     )
     flanks = 2 * profile.lobes
     area, moment = flanks * area, flanks * moment / 4

@@ -1,0 +1,107 @@
+"""What the commands share: arguments, float64, exit codes, console.
+
+Exit 0: success. 2: bad input, one message on stderr. 3: the run ended without a usable
+result; the status says why.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from rootsopt.config import Config, describe_keys, load
+from rootsopt.errors import InputError
+
+OK, BAD_INPUT, NO_RESULT = 0, 2, 3
+
+
+def parser(command: str, purpose: str) -> argparse.ArgumentParser:
+    """The arguments every command takes."""
+    result = argparse.ArgumentParser(
+        prog=f"rootsopt {command}",
+        description=purpose,
+        epilog=f"config keys (for --set and the file), units in the name:\n{describe_keys()}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    result.add_argument("config", type=Path, help="YAML file, for example configs/cic.yaml")
+    result.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="result folder (default: results/CONFIG)"
+    )
+    result.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="overrides",
+        help="override a config key, as in --set scene.speed_rpm=1500; repeatable",
+    )
+    result.add_argument("--no-figures", action="store_true", help="write no figures")
+    return result
+
+
+def run(
+    command: str,
+    purpose: str,
+    body: Callable[[Config, argparse.Namespace], int],
+    argv: Sequence[str] | None,
+) -> int:
+    """Parse, load, choose float64, run `body`; turn `InputError` into exit 2."""
+    options = parser(command, purpose).parse_args(argv)
+    if options.output is None:
+        options.output = Path("results") / options.config.stem
+    try:
+        config = load(options.config, options.overrides)
+        use_float64()
+        return body(config, options)
+    except InputError as error:
+        message = " ".join(str(error).split())
+        print(f"rootsopt {command}: {message}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print(f"rootsopt {command}: stopped by the user", file=sys.stderr)
+        return NO_RESULT
+    except BrokenPipeError:
+        # The reader of our output has gone (as in `| head`); that is no error of ours.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+
+
+def use_float64() -> None:
+    """Double precision for the whole process; chosen here and nowhere in the library."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_platforms", os.environ.get("JAX_PLATFORMS", "cpu"))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The console command `rootsopt`: optimize, simulate, profile."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    commands = {
+        "optimize": "optimise a design and compare it with the baseline",
+        "simulate": "simulate one design in one scene",
+        "profile": "geometry of one design",
+    }
+    usage = "usage: rootsopt COMMAND CONFIG [options]\n\n" + "\n".join(
+        f"  {name:<10} {what}" for name, what in commands.items()
+    )
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(usage)
+        return OK if arguments else BAD_INPUT
+    name, *rest = arguments
+    if name == "--version":
+        from rootsopt import __version__
+
+        print(f"rootsopt {__version__}")
+        return OK
+    if name not in commands:
+        import difflib
+
+        near = difflib.get_close_matches(name, commands, n=1)
+        hint = f"; did you mean `{near[0]}`?" if near else f"; valid: {', '.join(commands)}"
+        print(f"rootsopt: `{name}` is not a command{hint}", file=sys.stderr)
+        return BAD_INPUT
+    import importlib
+
+    return importlib.import_module(f"rootsopt.{name}").main(rest)

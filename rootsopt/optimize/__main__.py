@@ -1,0 +1,135 @@
+"""`python -m rootsopt.optimize CONFIG`: an optimised design against the baseline."""
+
+import argparse
+import contextlib
+import sys
+import time
+from collections.abc import Iterator, Sequence
+
+from rootsopt import cli
+from rootsopt.config import Config
+
+PURPOSE = "Optimise the design parameters for low contact force and compare with the baseline."
+
+
+def body(config: Config, options: argparse.Namespace) -> int:
+    """Check, search, write, print."""
+    began = time.perf_counter()
+    from rich.console import Console
+
+    from rootsopt import files, report
+    from rootsopt.model import check_geometry
+    from rootsopt.optimize.search import Search
+    from rootsopt.timing import CompileClock
+
+    check_geometry(config)
+    folder = files.ResultFolder(options.output)
+    clock = CompileClock()
+    with clock, _progress(Console(stderr=True)) as progress:
+        result = Search(config, progress).run()
+    ran = time.perf_counter() - began
+    _write(folder, config, options, result, clock.seconds, ran)
+    out = Console()
+    if result.optimized is None:
+        out.print(report.evaluation_table(result.baseline))
+        out.print(_no_result(result))
+    else:
+        rows = result.problem.constraint_rows(result.optimized)
+        out.print(
+            report.comparison_table(result.baseline, result.optimized, rows, result.improvement)
+        )
+        out.print(f"{result.optimized.status.label}: {result.optimized.message}")
+    total = time.perf_counter() - began
+    out.print(
+        f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
+        f"reports {total - ran:.1f} s; results in {options.output}",
+        soft_wrap=True,
+    )
+    return cli.OK if result.optimized is not None else cli.NO_RESULT
+
+
+def _no_result(result) -> str:
+    if not result.baseline.usable:
+        return f"baseline {result.baseline.status.label}: {result.baseline.message}"
+    if result.verification.get("rejected"):
+        return (
+            "No better design held up when simulated again from rest at the tight tolerance. "
+            "Raise optimizer.iterations or optimizer.screening, or tighten solver.rtol."
+        )
+    return (
+        "No feasible design better than the baseline was found. Lower "
+        "constraints.area_efficiency_min, widen optimizer.bounds, or raise optimizer.screening."
+    )
+
+
+def _write(folder, config, options, result, compiled, ran) -> None:
+    from rootsopt import files
+    from rootsopt.model import outline_mm
+
+    records = {"baseline": result.baseline, "optimized": result.optimized}
+    folder.write_text("config.yaml", config.to_yaml())
+    data: dict = {name: e.record() if e is not None else None for name, e in records.items()}
+    for name, evaluation in records.items():
+        if evaluation is None:
+            continue
+        design = list(evaluation.design.values())
+        folder.write_csv(f"profile_{name}.csv", files.profile_columns(outline_mm(config, design)))
+        if evaluation.series is not None:
+            folder.write_csv(f"response_{name}.csv", files.response_columns(evaluation.series))
+    rows = result.history
+    if rows:
+        folder.write_csv("history.csv", {key: [row[key] for row in rows] for key in rows[0]})
+    data["improvement"] = result.improvement
+    data["constraints"] = (
+        result.problem.constraint_rows(result.optimized) if result.optimized is not None else []
+    )
+    data["verification"] = result.verification
+    data["statistics"] = {
+        "evaluations": len(rows),
+        "compile_seconds": compiled,
+        "run_seconds": ran - compiled,
+    }
+    data["versions"] = files.versions()
+    if not options.no_figures:
+        from rootsopt import plot
+
+        if result.optimized is not None:
+            plot.optimization_figures(folder, result.baseline, result.optimized, rows, config)
+        else:
+            plot.simulation_figures(folder, result.baseline, config)
+    folder.write_json("result.json", data)
+
+
+@contextlib.contextmanager
+def _progress(console) -> Iterator:
+    """A progress bar with the current best objective on a terminal, nothing in a pipe."""
+    if not console.is_terminal:
+        yield None
+        return
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total} designs"),
+        TextColumn("best objective {task.fields[best]}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("baseline, compiling", total=None, best="-")
+
+        def update(done: int, expected: int, best: float) -> None:
+            bar.update(
+                task, description="optimising", completed=done, total=expected, best=f"{best:.4f}"
+            )
+
+        yield update
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return cli.run("optimize", PURPOSE, body, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

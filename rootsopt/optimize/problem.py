@@ -1,0 +1,281 @@
+"""The design problem: unit box, constraints, objective.
+
+The search runs in a unit box. Pressure angle and tip arc angle map linearly onto their
+bounds; the involute length is a share of the longest involute the other two allow, so
+that u ≤ u_max holds by construction. Constraints depend on geometry alone and are cheap.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from rootsopt.config import Config
+from rootsopt.errors import InputError
+from rootsopt.evaluate import Evaluation
+from rootsopt.model import DEG, MM, Model
+from rootsopt.profiles import Geometry, geometry
+
+_SHORTEST = 0.1
+"""Least involute, as a share of the longest, where the config sets no bound."""
+_ACTIVE = 1e-6
+"""Scaled distance from its limit at which a constraint counts as active."""
+
+
+class Constraint(eqx.Module):
+    """value(geometry) ≥ limit, scaled by `scale` to order one.
+
+    `quantity`: a field of `Geometry`; `factor` turns SI into the reported `unit`.
+    """
+
+    name: str = eqx.field(static=True)
+    quantity: str = eqx.field(static=True)
+    unit: str = eqx.field(static=True)
+    limit: Float[Array, ""]
+    scale: float = eqx.field(static=True)
+    factor: float = eqx.field(static=True)
+
+    def slack(self, shape: Geometry) -> Float[Array, ""]:
+        """Scaled distance to the limit, ≥ 0 where satisfied."""
+        return (getattr(shape, self.quantity) - self.limit) / self.scale
+
+
+class Space(eqx.Module):
+    """The unit box and the constraints in it."""
+
+    model: Model
+    lower: Float[Array, "3"]
+    upper: Float[Array, "3"]
+    constraints: tuple[Constraint, ...]
+
+    def design(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Design in config units (α deg, u mm, θ1 deg) at `point` of the unit box."""
+        low, high = self.lower, self.upper
+        alpha = low[0] + (high[0] - low[0]) * point[0]
+        tip = low[2] + (high[2] - low[2]) * point[2]
+        least, most = self._lengths(alpha, tip)
+        return jnp.stack([alpha, least + (most - least) * point[1], tip])
+
+    def point(self, design: Float[Array, "3"]) -> Float[Array, "3"]:
+        """The nearest point of the unit box to a design."""
+        alpha, length, tip = jnp.clip(design, self.lower, self.upper)
+        least, most = self._lengths(alpha, tip)
+        low, high = self.lower, self.upper
+        raw = jnp.stack(
+            [
+                (alpha - low[0]) / (high[0] - low[0]),
+                (length - least) / (most - least),
+                (tip - low[2]) / (high[2] - low[2]),
+            ]
+        )
+        return jnp.clip(raw, 0.0, 1.0)
+
+    def _lengths(self, alpha, tip):
+        """Shortest and longest involute (mm) at α, θ1 (deg)."""
+        half = jnp.pi / (2 * self.model.lobes)
+        radius = self.model.pitch_radius / MM
+        longest = radius * jnp.sin(alpha * DEG) * (half - tip * DEG)
+        most = jnp.minimum(longest, self.upper[1])
+        return jnp.minimum(jnp.maximum(self.lower[1], _SHORTEST * longest), 0.999 * most), most
+
+    def slacks(self, point: Float[Array, "3"]) -> Float[Array, " m"]:
+        """Scaled slack of every constraint."""
+        shape = geometry(self.model.profile(self.design(point)))
+        return jnp.stack([c.slack(shape) for c in self.constraints])
+
+    def project(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
+        """A feasible point near `point`: Gauss-Newton steps on the violated constraints."""
+
+        def step(_, point):
+            slack = self.slacks(point)
+            jacobian = jax.jacfwd(self.slacks)(point)
+            # Aim a hair inside, so that rounding leaves the constraint satisfied.
+            violated = slack < 1e-9
+            rows = jnp.where(violated[:, None], jacobian, 0.0)
+            # Coordinates held at the box cannot take part.
+            want = jnp.where(violated, 1e-7 - slack, 0.0)
+            gram = rows @ rows.T + jnp.diag(jnp.where(violated, 1e-10, 1.0))
+            move = rows.T @ jnp.linalg.solve(gram, want)
+            return jnp.clip(point + jnp.clip(move, -0.3, 0.3), 0.0, 1.0)
+
+        return lax.fori_loop(0, 25, step, jnp.clip(point, 0.0, 1.0))
+
+
+@eqx.filter_jit
+def _look(space: Space, point):
+    return (
+        space.design(point),
+        jax.jacfwd(space.design)(point),
+        space.slacks(point),
+        jax.jacfwd(space.slacks)(point),
+    )
+
+
+@eqx.filter_jit
+def _project(space: Space, points):
+    projected = jax.vmap(space.project)(points)
+    return projected, jnp.min(jax.vmap(space.slacks)(projected), axis=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """A config's design problem against its evaluated baseline."""
+
+    config: Config
+    baseline: Evaluation
+    space: Space
+
+    @classmethod
+    def of(cls, config: Config, model: Model, baseline: Evaluation) -> "Problem":
+        """Set up bounds and floors; raises `InputError` where they leave no design."""
+        bounds, limits = config.optimizer.bounds, config.constraints
+        lengths = bounds.involute_length_mm or (0.0, np.inf)
+        rows = [bounds.pressure_angle_deg, lengths, bounds.tip_arc_angle_deg]
+        half = 90.0 / config.profile.lobes
+        if rows[2][1] >= half:
+            raise InputError(
+                f"`optimizer.bounds.tip_arc_angle_deg` must stay below {half:g} (a quarter of "
+                f"the lobe pitch), but is {list(rows[2])}"
+            )
+        floor = limits.area_efficiency_min
+        if floor == "baseline":
+            floor = baseline.geometry["area_efficiency"]
+        constraints = (
+            _constraint("area efficiency", "area_efficiency", "", floor, 0.01, 1.0),
+            _constraint(
+                "undercut margin",
+                "undercut_margin",
+                "mm",
+                limits.undercut_margin_min_mm * MM,
+                MM,
+                MM,
+            ),
+            _constraint("seal width", "seal_width", "mm", limits.seal_width_min_mm * MM, MM, MM),
+        )
+        lower, upper = np.array(rows, dtype=float).T
+        space = Space(model, jnp.asarray(lower), jnp.asarray(upper), constraints)
+        return cls(config, baseline, space)
+
+    def objective(self, evaluation: Evaluation) -> float:
+        """Weighted mean and peak force relative to the baseline (1 at the baseline);
+        NaN for a design without a usable steady state."""
+        if not evaluation.usable:
+            return float("nan")
+        return sum(w * evaluation.response[k] for k, w in self._weights().items())
+
+    def slope(self, evaluation: Evaluation, point) -> NDArray[np.float64]:
+        """Gradient of the objective in the unit box."""
+        _, jacobian, _, _ = _look(self.space, point)
+        by_design = np.zeros(3)
+        for key, weight in self._weights().items():
+            by_design += weight * np.array(list(evaluation.gradient[key].values()))
+        return by_design @ np.asarray(jacobian)
+
+    def _weights(self) -> dict[str, float]:
+        wanted = self.config.objective
+        total = wanted.mean_weight + wanted.peak_weight
+        shares = {"mean_force_N": wanted.mean_weight, "peak_force_N": wanted.peak_weight}
+        return {
+            k: w / total / max(self.baseline.response[k], 1e-12) for k, w in shares.items() if w
+        }
+
+    def design(self, point) -> Float[Array, "3"]:
+        """Design in config units at a point of the unit box."""
+        return _look(self.space, jnp.asarray(point))[0]
+
+    def project(self, points) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Feasible points near `points` (n, 3), and which of them really are feasible."""
+        projected, slack = _project(self.space, jnp.asarray(points))
+        return np.asarray(projected), np.asarray(slack) >= -_ACTIVE
+
+    def descent(self, point, slope: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The slope less what active constraints and box faces forbid.
+
+        -slope is projected onto the cone of feasible directions: the closest direction
+        that leaves no active constraint (a non-negative least-squares problem). It
+        vanishes exactly at a Karush-Kuhn-Tucker point.
+        """
+        _, _, slack, jacobian = _look(self.space, jnp.asarray(point))
+        point = np.asarray(point)
+        walls = [row for row, s in zip(np.asarray(jacobian), slack, strict=True) if s < 1e-4]
+        walls += [np.eye(3)[i] for i in range(3) if point[i] <= _ACTIVE]
+        walls += [-np.eye(3)[i] for i in range(3) if point[i] >= 1 - _ACTIVE]
+        if not walls:
+            return slope
+        normals = np.stack(walls)
+        multipliers, _ = nnls(normals.T, slope)
+        return slope - multipliers @ normals
+
+    def constraint_rows(self, optimized: Evaluation) -> list[dict]:
+        """Every constraint with its values, for report and result file."""
+        rows = []
+        keys = {
+            "area_efficiency": "area_efficiency",
+            "undercut_margin": "undercut_margin_mm",
+            "seal_width": "seal_width_mm",
+        }
+        for c in self.space.constraints:
+            before = self.baseline.geometry[keys[c.quantity]]
+            after = optimized.geometry[keys[c.quantity]]
+            limit = float(c.limit) / c.factor
+            slack = (after - limit) * c.factor / c.scale
+            rows.append(_row(c.name, before, after, limit, c.unit, slack))
+        rows.append(self._length_row(optimized))
+        return rows
+
+    def _length_row(self, optimized: Evaluation) -> dict:
+        def longest(design):
+            return (
+                float(
+                    self.space.model.profile(jnp.asarray(list(design.values()))).longest_involute  # type: ignore[attr-defined]
+                )
+                / MM
+            )
+
+        limit = longest(optimized.design)
+        after = optimized.design["involute_length_mm"]
+        row = _row(
+            "involute length",
+            self.baseline.design["involute_length_mm"],
+            after,
+            limit,
+            "mm",
+            limit - after,
+        )
+        return row | {"sense": "<="}
+
+
+def _constraint(name, quantity, unit, limit, scale, factor) -> Constraint:
+    return Constraint(name, quantity, unit, jnp.asarray(float(limit)), scale, factor)
+
+
+def _row(name, before, after, limit, unit, slack) -> dict:
+    return {
+        "name": name,
+        "baseline": before,
+        "optimized": after,
+        "limit": limit,
+        "unit": unit,
+        "sense": ">=",
+        "satisfied": bool(slack >= -1e-6),
+        "active": bool(abs(slack) < 1e-4),
+    }
+
+
+def sobol(count: int, seed: int) -> NDArray[np.float64]:
+    """`count` points (n, 3) of a scrambled Sobol sequence in the unit box."""
+    from scipy.stats import qmc
+
+    sampler = qmc.Sobol(3, rng=np.random.default_rng(seed))
+    power = max(0, int(np.ceil(np.log2(max(count, 1)))))
+    return sampler.random_base2(power)[:count]
+
+
+__all__: Sequence[str] = ["Constraint", "Problem", "Space", "sobol"]

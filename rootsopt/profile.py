@@ -1,0 +1,56 @@
+"""`python -m rootsopt.profile CONFIG`: geometry only."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from rootsopt import cli
+from rootsopt.config import Config
+
+PURPOSE = "Geometry of one design: radii, area, inertia, margins, outline, conjugacy."
+
+
+def body(config: Config, options: argparse.Namespace) -> int:
+    """Check, measure, write, print."""
+    from rich.console import Console
+
+    from rootsopt import files, report
+    from rootsopt.evaluate import geometry_record
+    from rootsopt.model import Model, check_geometry, design_keys, design_vector, outline_mm
+    from rootsopt.profiles import geometry
+    from rootsopt.status import Status
+
+    check_geometry(config)
+    folder = files.ResultFolder(options.output)
+    model, design = Model.of(config), design_vector(config)
+    shape = geometry(model.profile(design))
+    record = {
+        "design": dict(zip(design_keys(config), map(float, design), strict=True)),
+        "geometry": geometry_record(model, shape),
+        "response": {},
+        "gradient": {},
+        "steady_state": {},
+        "status": Status.GEOMETRY_ONLY.label,
+        "message": Status.GEOMETRY_ONLY.value,
+        "statistics": {},
+    }
+    folder.write_text("config.yaml", config.to_yaml())
+    folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
+    if not options.no_figures:
+        from rootsopt import plot
+
+        plot.profile_figures(folder, config, record)
+    folder.write_json("result.json", record | {"versions": files.versions()})
+    out = Console()
+    out.print(report.geometry_table(record))
+    out.print(f"results in {options.output}", soft_wrap=True)
+    return cli.OK
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return cli.run("profile", PURPOSE, body, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

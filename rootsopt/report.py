@@ -1,0 +1,214 @@
+"""Tables for the terminal: one evaluation, one geometry, or optimised against baseline.
+
+Plain ASCII and no wider than 80 columns, so that they read the same in a pipe or a log.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from rootsopt.evaluate import Evaluation
+
+DASH = "-"
+_UNITS = {
+    "_kg_m2": "kg m^2",
+    "_N_m": "N m",
+    "_mm2": "mm^2",
+    "_mm": "mm",
+    "_deg": "deg",
+    "_N": "N",
+}
+_NAMES = {
+    "seconds": ("time", "s"),
+    "kind": ("steady state", ""),
+    "period": ("period", "mesh periods"),
+    "window_mesh_periods": ("window", "mesh periods"),
+    "lyapunov_exponent_per_mesh_period": ("Lyapunov exponent", "1/mesh period"),
+    "lyapunov_standard_error": ("  its standard error", ""),
+    "floquet_multiplier": ("largest Floquet multiplier", ""),
+    "residual": ("orbit residual", ""),
+    "rms_force_N": ("RMS force", "N"),
+}
+_Rows = Iterable[tuple[str, ...]]
+
+
+def comparison_table(
+    baseline: Evaluation,
+    optimized: Evaluation,
+    constraints: list[dict[str, Any]],
+    improvement: Mapping[str, float],
+) -> RenderableType:
+    """Optimised design against baseline, change in % of the baseline.
+
+    A constraint is a row {name, baseline, optimized, limit, unit, sense, satisfied, active};
+    `improvement` holds the reductions of objective, mean and peak as fractions.
+    """
+    table = _table("Optimised rotor against baseline", "baseline", "optimised", "change")
+    first, second = baseline.record(), optimized.record()
+    _group(table, "design", _pairs(first["design"], second["design"]))
+    _group(table, "geometry", _pairs(first["geometry"], second["geometry"]))
+    response = _pairs(first["response"], second["response"])
+    _group(table, "response", [_objective(improvement), *response])
+    for heading, *rows in _gradients(first["gradient"], second["gradient"]):
+        _group(table, heading, [row[:3] for row in _pairs(*rows)])
+    _group(table, "constraints", map(_constraint, constraints))
+    _group(
+        table,
+        "status",
+        [
+            *(row[:3] for row in _pairs(first["steady_state"], second["steady_state"])),
+            ("status", _status(baseline), _status(optimized)),
+        ],
+    )
+    notes = [("baseline", baseline.message), ("optimised", optimized.message)]
+    if baseline.message == optimized.message:
+        notes = [("both", baseline.message)]
+    return Group(table, *(Text(f"{name}: {message}") for name, message in notes))
+
+
+def evaluation_table(evaluation: Evaluation) -> RenderableType:
+    """One design in one scene."""
+    record = evaluation.record()
+    table = _table("Simulation of the rotor pair", "value")
+    _group(table, "design", _singles(record["design"]))
+    _group(table, "geometry", _singles(record["geometry"]))
+    _group(table, "response", _singles(record["response"]))
+    for heading, rows in _gradients(record["gradient"]):
+        _group(table, heading, _singles(rows))
+    steady = _singles(record["steady_state"])
+    _group(table, "status", [*steady, ("status", _status(evaluation))])
+    _group(table, "statistics", _singles(record["statistics"]))
+    return Group(table, Text(evaluation.message))
+
+
+def geometry_table(record: Mapping[str, Any]) -> RenderableType:
+    """Geometry of one profile, from its result record."""
+    table = _table("Rotor profile", "value")
+    _group(table, "design", _singles(record.get("design", {})))
+    _group(table, "geometry", _singles(record.get("geometry", {})))
+    if record.get("status"):
+        _group(table, "status", [("status", str(record["status"]))])
+    return Group(table, Text(record.get("message") or ""))
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, box=box.ASCII, title_justify="left", title_style="bold")
+    table.add_column("", overflow="fold")
+    for column in columns:
+        table.add_column(column, justify="right", overflow="fold")
+    return table
+
+
+def _group(table: Table, name: str, rows: _Rows) -> None:
+    """Add a heading and its rows; a dash where there are none."""
+    rows = list(rows) or [("none", *[DASH] * (len(table.columns) - 1))]
+    table.add_section()
+    table.add_row(Text(name, style="bold"))
+    for label, *cells in rows:
+        cells = [cell if isinstance(cell, Text) else Text(cell) for cell in cells]
+        table.add_row(Text(f"  {label}"), *cells)
+
+
+def _singles(values: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    return [(_label(key), _number(value)) for key, value in values.items()]
+
+
+def _pairs(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    rows = []
+    for key in dict.fromkeys([*first, *second]):
+        a, b = first.get(key), second.get(key)
+        rows.append((_label(key), _number(a), _number(b), _change(a, b)))
+    return rows
+
+
+def _objective(improvement: Mapping[str, float]) -> tuple[str, ...]:
+    gain = improvement.get("objective")
+    label = "objective (baseline = 1)"
+    if gain is None or not math.isfinite(gain):
+        return label, DASH, DASH, DASH
+    return label, "1", _number(1 - gain), _change(1.0, 1 - gain)
+
+
+def _constraint(row: Mapping[str, Any]) -> tuple[str | Text, ...]:
+    unit = f" {row['unit']}" if row.get("unit") else ""
+    label = f"{_words(row['name'])} {row['sense']} {_number(row['limit'])}{unit}"
+    if not row["satisfied"]:
+        verdict = Text("violated", style="bold red")
+    else:
+        verdict = Text("active" if row.get("active") else "satisfied", style="green")
+    return label, _number(row["baseline"]), _number(row["optimized"]), verdict
+
+
+def _status(evaluation: Evaluation) -> Text:
+    style = "bold green" if evaluation.usable else "bold red"
+    return Text(evaluation.status.label, style=style)
+
+
+def _gradients(*gradients: Mapping[str, Mapping[str, float]]) -> list[tuple]:
+    """(heading, rows of each gradient): one heading for each response, or one empty group."""
+    found = dict.fromkeys(response for gradient in gradients for response in gradient)
+    groups = []
+    for response in found:
+        name, unit = _split(response)
+        rows = (_per_unit(gradient.get(response, {}), unit) for gradient in gradients)
+        groups.append((f"gradient of the {name}", *rows))
+    return groups or [("gradient", *({} for _ in gradients))]
+
+
+def _per_unit(row: Mapping[str, float], unit: str) -> dict[str, float]:
+    """The row with labels such as "by pressure angle, N/deg"."""
+    labels = ((key, *_split(key)) for key in row)
+    return {f"by {name}, {unit}/{per or 1}": row[key] for key, name, per in labels}
+
+
+def _split(key: str) -> tuple[str, str]:
+    """Name in words and unit of a result key."""
+    if key in _NAMES:
+        return _NAMES[key]
+    for suffix, unit in _UNITS.items():
+        if key.endswith(suffix):
+            return _words(key.removesuffix(suffix)), unit
+    return _words(key), ""
+
+
+def _label(key: str) -> str:
+    if ", " in key:  # already a label
+        return key
+    name, unit = _split(key)
+    return f"{name}, {unit}" if unit else name
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _change(first: Any, second: Any) -> str:
+    numbers = [x for x in (first, second) if isinstance(x, int | float) and math.isfinite(x)]
+    if len(numbers) < 2 or first == 0:
+        return DASH
+    change = 100 * (second - first) / abs(first)
+    return f"{change:+.2f} %" if abs(change) < 1000 else f"{change:+.3g} %"
+
+
+def _number(value: Any) -> str:
+    """Five significant digits, exponents only far from one."""
+    if value is None:
+        return DASH
+    if isinstance(value, bool | str):
+        return str(value)
+    if isinstance(value, int):
+        return str(value)
+    value = float(value)
+    if not math.isfinite(value):
+        return DASH
+    if value == 0:
+        return "0"
+    size = math.floor(math.log10(abs(value)))
+    if not -4 <= size < 7:
+        return f"{value:.3e}"
+    return f"{value:.{max(0, 4 - size)}f}"

@@ -1,0 +1,54 @@
+"""`python -m rootsopt.simulate CONFIG`: one design, one scene."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from rootsopt import cli
+from rootsopt.config import Config
+
+PURPOSE = "Simulate one design in one scene: steady state, contact force, its gradient."
+
+
+def body(config: Config, options: argparse.Namespace) -> int:
+    """Check, simulate, write, print."""
+    from rich.console import Console
+
+    from rootsopt import files, report
+    from rootsopt.evaluate import Evaluator
+    from rootsopt.model import check_geometry, outline_mm
+
+    check_geometry(config)
+    folder = files.ResultFolder(options.output)
+    console = Console(stderr=True)
+    with console.status("compiling and simulating") if console.is_terminal else _quiet():
+        evaluation = Evaluator(config)()
+    folder.write_text("config.yaml", config.to_yaml())
+    folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
+    if evaluation.series is not None:
+        folder.write_csv("response_design.csv", files.response_columns(evaluation.series))
+    if not options.no_figures:
+        from rootsopt import plot
+
+        plot.simulation_figures(folder, evaluation, config)
+    folder.write_json("result.json", evaluation.record() | {"versions": files.versions()})
+    out = Console()
+    out.print(report.evaluation_table(evaluation))
+    out.print(f"{evaluation.status.label}: {evaluation.message}")
+    out.print(f"results in {options.output}", soft_wrap=True)
+    return cli.OK if evaluation.usable else cli.NO_RESULT
+
+
+def _quiet():
+    import contextlib
+
+    return contextlib.nullcontext()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return cli.run("simulate", PURPOSE, body, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,649 @@
+"""Closest approach, its map, the IMPACT law and the timing gear. SI units throughout."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rootsopt.contact import FlankPair, ImpactLaw, ramp, smooth_step
+from rootsopt.contact.map import MapContact
+from rootsopt.contact.nodes import pair_gap
+from rootsopt.dynamics.parts import TimingGear
+from rootsopt.profiles import CIC, EE
+
+R = 0.033
+DEG = np.pi / 180
+
+
+def cic(lobes, alpha, fraction, tip):
+    """CIC with u given as a fraction of u_max."""
+    longest = R * np.sin(alpha) * (np.pi / (2 * lobes) - tip)
+    return CIC(lobes, R, alpha, fraction * longest, tip)
+
+
+PROFILES = {
+    "paper": CIC(3, R, 36.43 * DEG, 9.0e-3, 4.0 * DEG),
+    "short involute": cic(3, 0.62, 0.6, 0.06),
+    "no land": cic(3, 0.60, 0.85, 0.0),
+    "two lobes": cic(2, 0.75, 0.8, 0.08),
+    "five lobes": cic(5, 0.50, 0.8, 0.03),
+    "ee two": EE(2, R),
+    "ee three": EE(3, R),
+    "ee four": EE(4, R),
+}
+every_profile = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES.keys())
+few_profiles = pytest.mark.parametrize("profile", [PROFILES["paper"], PROFILES["ee three"]])
+
+
+def over_poses(function, subject, rolls, relatives):
+    """A jitted function of poses, its batch padded to one of two sizes: fewer compilations."""
+    count = len(rolls)
+    size = 640 if count <= 640 else 3840
+    padded = (jnp.asarray(np.resize(a, size)) for a in (rolls, relatives))
+    return jax.tree.map(lambda a: np.asarray(a)[:count], function(subject, *padded))
+
+
+@eqx.filter_jit
+def _approach(profile, rolls, relatives):
+    return jax.vmap(FlankPair.of(profile))(rolls, relatives)
+
+
+def approach(profile, rolls, relatives):
+    """Closest approaches at many poses."""
+    return over_poses(_approach, profile, rolls, relatives)
+
+
+def poses(lobes, count, seed, deepest=-0.020):
+    """Random poses: the whole mesh, and both hand-overs seen from both sides."""
+    rng = np.random.default_rng(seed)
+    whole = np.pi / lobes
+    rolls = np.concatenate(
+        [
+            rng.uniform(0, whole, count),
+            rng.uniform(-0.02, 0.05, count // 2),
+            whole + rng.uniform(-0.05, 0.02, count // 2),
+        ]
+    )
+    return rolls, rng.uniform(deepest, 0.0, len(rolls))
+
+
+# Closest approach against the node method
+
+
+@every_profile
+def test_penetration_is_that_of_two_full_outlines(profile, graded_outline):
+    """The search finds the depth that nodes of the whole outlines find, hand-over included."""
+    # Near the pitch point of EE nodes beyond 0.4 mm deep see past the medial axis of their
+    # mate: the nearest point of its outline is then no longer the one they have come through.
+    deepest = -0.020 if isinstance(profile, CIC) else -0.012
+    rolls, relatives = poses(profile.lobes, 20, 1, deepest)
+    found = approach(profile, rolls, relatives)
+    gaps = np.asarray(found.gap)
+    points = graded_outline(profile, 1000)
+    # Shallower than this the tip land, which is not searched, may be deeper.
+    deep = gaps < -1e-7
+    assert deep.sum() > 0.4 * len(gaps)
+    assert np.all(np.asarray(found.found)[deep])
+    nodes = [
+        pair_gap(points, profile.lobes, 2 * R, -x - e / 2, -x + e / 2)
+        for x, e in zip(rolls[deep], relatives[deep], strict=True)
+    ]
+    # 2e-5 mm, what the node method resolves with nodes 0.03 mm apart.
+    np.testing.assert_allclose(gaps[deep], nodes, rtol=0, atol=2e-8)
+
+
+@few_profiles
+def test_coast_flank_is_the_mirror_image(profile, graded_outline):
+    """At ε > 0 the pair penetrates as the mirrored drive flank says: x → -x, ε → -ε."""
+    rolls, relatives = poses(profile.lobes, 8, 2, deepest=-0.012)
+    gaps = np.asarray(approach(profile, rolls, relatives).gap)
+    points = graded_outline(profile, 1000)
+    deep = gaps < -1e-7
+    nodes = [
+        pair_gap(points, profile.lobes, 2 * R, x + e / 2, x - e / 2)
+        for x, e in zip(rolls[deep], relatives[deep], strict=True)
+    ]
+    np.testing.assert_allclose(gaps[deep], nodes, rtol=0, atol=2e-8)
+
+
+@every_profile
+def test_rolling_flanks_touch_without_penetration(profile):
+    """ε = 0: the gap vanishes all along the mesh, at the roll angle's own flank points."""
+    whole = np.pi / profile.lobes
+    # Inside the flank: where only a land passes there is no flank contact.
+    first = profile.segments()[0]
+    start = float(first.stop) if first.land else 0.0
+    rolls = np.linspace(start + 0.01, whole - start - 0.01, 101)
+    found = approach(profile, rolls, np.zeros(101))
+    # A tenth of a nanometre; the paper's baseline is 1.2 % past the longest involute and
+    # interferes by less than a nanometre.
+    np.testing.assert_allclose(found.gap, 0, atol=1e-9 if profile is PROFILES["paper"] else 1e-13)
+
+
+@every_profile
+def test_flanks_swap_under_exchange_of_the_rotors(profile):
+    """x → π/N - x exchanges the rotors: same gap, levers swapped; 2π/N is a period."""
+    rolls, relatives = poses(profile.lobes, 40, seed=3)
+    whole = np.pi / profile.lobes
+    here = approach(profile, rolls, relatives)
+    there = approach(profile, whole - rolls, relatives)
+    later = approach(profile, rolls + 6 * np.pi / profile.lobes, relatives)
+    np.testing.assert_allclose(here.gap, there.gap, atol=1e-15)
+    np.testing.assert_allclose(here.lever1, there.lever2, atol=1e-9 * R)
+    np.testing.assert_allclose(here.gap, later.gap, atol=1e-15)
+    np.testing.assert_allclose(here.lever2, later.lever2, atol=1e-9 * R)
+
+
+def test_involute_contact_in_closed_form():
+    """Involute on involute, both levers are the base radius and the gap is r cos α · ε."""
+    profile = PROFILES["short involute"]
+    start, half = float(profile.involute_start), float(profile.half_pitch)
+    rolls = np.linspace(start + 0.02, 2 * half - start - 0.02, 31)
+    for relative in (-0.02, -1e-3, -1e-6, 1e-3):
+        found = approach(profile, rolls, np.full(31, relative))
+        base = R * np.cos(0.62)
+        np.testing.assert_allclose(found.gap, base * relative, rtol=0, atol=1e-16)
+        np.testing.assert_allclose([found.lever1, found.lever2], base, rtol=1e-12)
+
+
+@every_profile
+def test_common_normal_is_stationary(profile):
+    """The result is a common normal: E cos λ equals the sum of the levers, and the gap is
+    E sin λ less both support functions, at the normal angles returned."""
+    rolls, relatives = poses(profile.lobes, 40, seed=4)
+    half = np.pi / (2 * profile.lobes)
+    folded = half - np.abs(rolls - half)
+    found = approach(profile, rolls, relatives)
+    sound = np.asarray(found.found)
+    # Rotor 1's normal points along ν1 - x - ε/2 in the fixed frame, from the line of centres.
+    direction = np.asarray(found.normal1) - folded - relatives / 2
+    reach = 2 * R * np.sin(direction)
+    offset = (reach - found.lever1 - found.lever2)[sound]
+    # The normal angle is good to 1e-6 rad, on radii of curvature below 2 R.
+    np.testing.assert_allclose(offset, 0, atol=2e-6 * R)
+    assert sound.mean() > 0.4
+
+
+# Derivatives of the closest approach
+
+
+@eqx.filter_jit
+def _gap_slopes(profile, rolls, relatives):
+    pair = FlankPair.of(profile)
+    return jax.vmap(jax.grad(lambda x, e: pair(x, e).gap, (0, 1)))(rolls, relatives)
+
+
+def gap_slopes(profile, rolls, relatives):
+    """∂G/∂x and ∂G/∂ε at many poses."""
+    return over_poses(_gap_slopes, profile, rolls, relatives)
+
+
+@every_profile
+def test_gap_derivatives_are_the_levers_and_finite_differences(profile):
+    """Envelope theorem: ∂G/∂x = lever1 - lever2, ∂G/∂ε = (lever1 + lever2) / 2."""
+    rolls, relatives = poses(profile.lobes, 60, seed=5)
+    found = approach(profile, rolls, relatives)
+    sound = np.asarray(found.gap) < 0
+    by_roll, by_relative = (d[sound] for d in gap_slopes(profile, rolls, relatives))
+    lever1, lever2 = np.asarray(found.lever1)[sound], np.asarray(found.lever2)[sound]
+    # The gap is taken before the last Newton step, the levers after it.
+    np.testing.assert_allclose(by_roll, lever1 - lever2, rtol=0, atol=1e-6 * R)
+    np.testing.assert_allclose(by_relative, (lever1 + lever2) / 2, rtol=0, atol=1e-6 * R)
+    step = 1e-6
+
+    def difference(dx, de):
+        ends = [approach(profile, rolls + k * dx, relatives + k * de).gap for k in (1, -1)]
+        return np.asarray(ends[0] - ends[1])[sound] / (2 * step)
+
+    # Rounding 1e-17 m / 1e-6; a jump of the second derivative (order r) costs its step.
+    np.testing.assert_allclose(by_roll, difference(step, 0), rtol=0, atol=3e-6 * R)
+    np.testing.assert_allclose(by_relative, difference(0, step), rtol=0, atol=3e-6 * R)
+
+
+def results(design, roll, relative):
+    found = FlankPair.of(CIC(3, R, design[0], design[1], design[2]))(roll, relative)
+    return jnp.stack([found.gap, found.lever1, found.lever2])
+
+
+forward = jax.jit(jax.vmap(jax.jacfwd(results), (None, 0, 0)))
+reverse = jax.jit(jax.vmap(jax.jacrev(results), (None, 0, 0)))
+over_designs = jax.jit(jax.vmap(jax.vmap(results, (None, 0, 0)), (0, None, None)))
+
+
+@pytest.mark.parametrize("involute", [8.0e-3, 6.0e-3])
+def test_design_derivatives_of_gap_and_levers(involute):
+    """Derivatives in (α, u, θ1) agree with central differences, forward with reverse mode."""
+    design = jnp.array([36.43 * DEG, involute, 4.0 * DEG])
+    rolls = jnp.asarray(np.linspace(0.085, np.pi / 3 - 0.085, 41))
+    relatives = jnp.asarray(-(10.0 ** np.random.default_rng(6).uniform(-5, -2, 41)))
+    derivative = forward(design, rolls, relatives)
+    steps = 1e-6 * jnp.diag(design)
+    ends = over_designs(jnp.concatenate([design + steps, design - steps]), rolls, relatives)
+    differences = np.moveaxis(np.asarray((ends[:3] - ends[3:]) / 2e-6), 0, -1)
+    scaled = np.asarray(derivative * design)
+    # Per relative change of a parameter, in units of r. Gap: rounding 1e-16 / 1e-6. Levers
+    # inherit the search's own error in ν2, 1e-11 and less, divided by the step; where a
+    # joint passes under a difference it sees a kink, which two poses may.
+    np.testing.assert_allclose(scaled[:, 0], differences[:, 0], rtol=0, atol=1e-7 * R)
+    wrong = np.abs(scaled[:, 1:] - differences[:, 1:]).max(axis=(1, 2)) > 1e-4 * R
+    assert wrong.sum() <= 2
+    assert np.abs(scaled[:, 0]).max() > 1e-4 * R
+    backward = np.asarray(reverse(design, rolls, relatives) * design)
+    np.testing.assert_allclose(backward, scaled, rtol=0, atol=1e-12 * R)
+
+
+@every_profile
+def test_no_pose_gives_nan(profile):
+    """Gap, levers and slopes are finite for any roll, however large, and any ε."""
+    rng = np.random.default_rng(7)
+    rolls = np.concatenate([rng.uniform(-4, 4, 500), rng.uniform(-1e6, 1e6, 100), [0.0]])
+    relatives = np.concatenate([rng.uniform(-0.3, 0.3, 500), rng.uniform(-1e-3, 0, 100), [0.0]])
+    found = approach(profile, rolls, relatives)
+    for value in (found.gap, found.lever1, found.lever2):
+        assert np.all(np.isfinite(value))
+    assert np.all(np.isfinite(gap_slopes(profile, rolls, relatives)))
+    missed = ~np.asarray(found.found)
+    assert np.all(np.asarray(found.gap)[missed] > 0)
+    assert np.all(np.asarray(found.lever1)[missed] == 0)
+
+
+# The map
+
+DEEPEST = -4e-3
+
+
+@eqx.filter_jit
+def _tabulate(profile, rolls, relatives):
+    return MapContact.of(profile, jnp.asarray(DEEPEST), rolls, relatives)
+
+
+@functools.cache
+def tabulate(name, rolls, relatives):
+    """The map of a profile, made once."""
+    return _tabulate(PROFILES[name], rolls, relatives)
+
+
+@eqx.filter_jit
+def _look_up(table, rolls, relatives):
+    return jax.vmap(table)(rolls, relatives)
+
+
+def look_up(table, rolls, relatives):
+    """Gap and levers from a map at many poses."""
+    return over_poses(_look_up, table, rolls, relatives)
+
+
+@eqx.filter_jit
+def _map_slopes(table, rolls, relatives):
+    slopes = jax.grad(lambda x, e: table(x, e)[0], (0, 1))
+    bends = jax.jacfwd(slopes, (0, 1))
+    return jax.vmap(slopes)(rolls, relatives), jax.vmap(bends)(rolls, relatives)
+
+
+def map_slopes(table, rolls, relatives):
+    """First and second derivatives of the map's gap over the pose."""
+    return over_poses(_map_slopes, table, rolls, relatives)
+
+
+def mesh_grid(lobes, deepest=DEEPEST):
+    """Poses in contact over the mesh, off the nodes of any map."""
+    rolls = np.linspace(-0.01, np.pi / lobes + 0.01, 156)
+    relatives = deepest * np.linspace(0.013, 0.987, 23)
+    return (a.ravel() for a in np.meshgrid(rolls, relatives))
+
+
+def torque_errors(name, sizes):
+    """Relative rms error of the contact torque on rotor 2 for maps of several sizes."""
+    rolls, relatives = mesh_grid(PROFILES[name].lobes)
+    exact = approach(PROFILES[name], rolls, relatives)
+
+    def torque(gap, lever):
+        return np.maximum(0, -gap) ** 2.2 * lever
+
+    reference = torque(exact.gap, exact.lever2)
+    errors = []
+    for size in sizes:
+        gap, _, lever2 = look_up(tabulate(name, *size), rolls, relatives)
+        errors.append(np.sqrt(np.mean((torque(gap, lever2) - reference) ** 2)))
+    return np.array(errors) / np.sqrt(np.mean(reference**2))
+
+
+@pytest.mark.parametrize("name", ["paper", "short involute", "ee three"])
+def test_torque_from_the_default_map_is_accurate(name):
+    """128 × 24 points: below 5e-4 relative (rms) of the torque from the search."""
+    assert torque_errors(name, [(128, 24)])[0] < 5e-4
+
+
+@pytest.mark.parametrize("name", ["paper", "short involute"])
+def test_map_approaches_the_search_when_refined(name):
+    """The torque error falls with the size of the map."""
+    coarse, default, fine = torque_errors(name, [(64, 12), (128, 24), (256, 48)])
+    # Curvature jumps allow second order on average; the single steps scatter with where
+    # the jumps lie between the points.
+    assert coarse > default > fine
+    assert fine < coarse / 8
+
+
+few_maps = pytest.mark.parametrize("name", ["paper", "ee three"])
+
+
+@few_maps
+def test_levers_of_the_map_are_derivatives_of_its_gap(name):
+    """Forces come from a potential: levers and gap of the map agree to rounding."""
+    table = tabulate(name, 128, 24)
+    rolls, relatives = mesh_grid(PROFILES[name].lobes)
+    _, lever1, lever2 = look_up(table, rolls, relatives)
+    (by_roll, by_relative), _ = map_slopes(table, rolls, relatives)
+    np.testing.assert_allclose(lever1 - lever2, by_roll, rtol=0, atol=1e-12)
+    np.testing.assert_allclose((lever1 + lever2) / 2, by_relative, rtol=0, atol=1e-12)
+
+
+@few_maps
+def test_map_is_twice_continuously_differentiable(name):
+    """Gap, slopes and second derivatives have no jump at the nodes of the map."""
+    table = tabulate(name, 64, 12)
+    nodes = np.asarray(table.first_roll + table.roll_step * np.arange(1, 60))
+    depths = np.asarray(table.deepest + table.relative_step * np.arange(1, 8))
+    tiny = 1e-10
+    for x, e, dx, de in (
+        (nodes, np.full(59, 0.37 * DEEPEST), tiny, 0.0),
+        (np.full(7, 0.41), depths, 0.0, tiny),
+    ):
+        before = look_up(table, x - dx, e - de), *map_slopes(table, x - dx, e - de)
+        after = look_up(table, x + dx, e + de), *map_slopes(table, x + dx, e + de)
+        for left, right in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+            scale = max(R, float(np.abs(left).max()))
+            # Third derivatives are up to 1e3 times the second, over 2e-10.
+            np.testing.assert_allclose(left, right, rtol=0, atol=1e-6 * scale)
+
+
+@few_maps
+def test_map_is_smooth_where_it_is_folded(name):
+    """At the middle of the flank, where the map is mirrored, the slope over roll vanishes."""
+    half = float(PROFILES[name].half_pitch)
+    table = tabulate(name, 128, 24)
+    relatives = DEEPEST * np.linspace(0.05, 1, 9)
+    (by_roll, _), _ = map_slopes(table, np.full(9, half - 1e-9), relatives)
+    # Of levers of order r, so that a passing trajectory sees no kink above the map's error.
+    np.testing.assert_allclose(by_roll, 0, atol=1e-5 * R)
+
+
+@few_maps
+def test_map_has_the_symmetry_and_period_of_the_flank(name):
+    """x → π/N - x swaps the levers; 2π/N is a period."""
+    table = tabulate(name, 64, 12)
+    rolls, relatives = (a[::7] for a in mesh_grid(PROFILES[name].lobes))
+    gap, lever1, lever2 = look_up(table, rolls, relatives)
+    whole = np.pi / PROFILES[name].lobes
+    swapped = look_up(table, whole - rolls, relatives)
+    later = look_up(table, rolls - 4 * whole, relatives)
+    for other in (swapped[0], later[0]):
+        np.testing.assert_allclose(other, gap, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(swapped[2], lever1, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(later[2], lever2, rtol=0, atol=1e-12)
+
+
+@few_maps
+def test_map_goes_on_linearly_below_its_deepest(name):
+    """Below `deepest` the gap is continued along its tangent in ε."""
+    table = tabulate(name, 64, 12)
+    rolls = np.linspace(0.1, 0.9, 17)
+    gap, lever1, lever2 = look_up(table, rolls, np.full(17, DEEPEST))
+    tangent = (lever1 + lever2) / 2
+    for beyond in (1e-4, 1e-2, 0.3):
+        below, lower1, lower2 = look_up(table, rolls, np.full(17, DEEPEST - beyond))
+        np.testing.assert_allclose(below, gap - tangent * beyond, rtol=1e-10)
+        np.testing.assert_allclose((lower1 + lower2) / 2, tangent, rtol=1e-10)
+
+
+def test_design_derivative_of_the_map_is_that_of_the_search():
+    """Differentiating the table gives the envelope derivative at its nodes."""
+    design = jnp.array([36.43 * DEG, 8.0e-3, 4.0 * DEG])
+    rolls, relatives = jnp.linspace(0.15, 0.9, 31), jnp.full(31, -1.3e-3)
+
+    def tabulated(design):
+        profile = CIC(3, R, design[0], design[1], design[2])
+        table = MapContact.of(profile, jnp.asarray(DEEPEST), 128, 12)
+        return jax.vmap(table)(rolls, relatives)[0]
+
+    by_map = jax.jit(jax.jacfwd(tabulated))(design) * design
+    by_search = forward(design, rolls, relatives)[:, 0] * design
+    error = np.abs(by_map - by_search).max()
+    # The derivative of a gap with curvature jumps has kinks: first order in the cell.
+    assert error < 2e-2 * np.abs(by_search).max()
+
+
+# Rounded corners
+
+
+@given(x=st.floats(-5, 5), width=st.floats(1e-3, 2))
+def test_ramp_lies_under_the_corner_and_meets_it(x, width):
+    """0 ≤ ramp ≤ max(0, x), equal to it outside 0 < x < width."""
+    value = float(ramp(jnp.asarray(x), jnp.asarray(width)))
+    corner = max(0.0, x)
+    assert 0 <= value <= corner + 1e-15
+    if x <= 0 or x >= width:
+        assert value == corner
+    assert float(ramp(jnp.asarray(x), jnp.asarray(0.0))) == corner
+
+
+def test_ramp_rises_with_continuous_slope():
+    """Slope 0 at the onset and 1 from the width on, non-negative and continuous between."""
+    x = jnp.linspace(-0.5, 1.5, 4001)
+    slope = np.asarray(jax.vmap(jax.grad(ramp), (0, None))(x, jnp.asarray(0.8)))
+    assert slope.min() >= 0
+    assert np.all(slope[np.asarray(x) < 0] == 0)
+    np.testing.assert_allclose(slope[np.asarray(x) > 0.8], 1, rtol=1e-12)
+    # Greatest second derivative 4 / width, over the sample spacing.
+    assert np.abs(np.diff(slope)).max() < 1.1 * 4 / 0.8 * 5e-4
+
+
+def test_ramp_is_flat_at_its_very_onset():
+    """At x = 0 exactly, automatic differentiation gives the slope 0 that the ramp has there."""
+    slope = jax.grad(ramp)(jnp.asarray(0.0), jnp.asarray(0.8))
+    assert float(slope) == 0.0
+
+
+def test_smooth_step_is_the_clamped_cubic():
+    """3x² - 2x³ on 0 … 1, 0 and 1 outside, point symmetric, flat at both ends."""
+    x = jnp.linspace(-1, 2, 301)
+    value = np.asarray(smooth_step(x))
+    inside = np.clip(x, 0, 1)
+    np.testing.assert_allclose(value, 3 * inside**2 - 2 * inside**3, atol=1e-15)
+    np.testing.assert_allclose(value + smooth_step(1 - x), 1, atol=1e-15)
+    slope = jax.vmap(jax.grad(smooth_step))(jnp.array([-1e-9, 1e-9, 0.5, 1 - 1e-9, 1 + 1e-9]))
+    np.testing.assert_allclose(slope, [0, 0, 1.5, 0, 0], atol=1e-7)
+
+
+# The IMPACT law
+
+
+def impact_law(exponent=2.2, damping=250.0, depth=1e-5, smoothing=1e-7):
+    """About the paper's Table 2 (8 N at 0.01 mm) in SI units, with some parameters changed."""
+    values = (8.0 / 1e-5**exponent, exponent, damping, depth, smoothing)
+    return ImpactLaw(*(jnp.asarray(float(v)) for v in values))
+
+
+@jax.jit
+def forces(law, depths, rates):
+    return jax.vmap(law)(depths, rates)
+
+
+@jax.jit
+def force_slopes(law, depths, rates):
+    return jax.vmap(jax.grad(lambda d, v: law(d, v), (0, 1)))(depths, rates)
+
+
+def plain_law(law, depth, rate):
+    """IMPACT as the solver has it, in NumPy."""
+    k, e, c, d = (
+        float(v) for v in (law.stiffness, law.exponent, law.damping, law.full_damping_depth)
+    )
+    depth = np.maximum(np.asarray(depth), 0.0)
+    x = np.minimum(depth / d, 1.0)
+    total = k * depth**e + c * (3 * x**2 - 2 * x**3) * np.asarray(rate)
+    return np.where(depth > 0, np.maximum(total, 0.0), 0.0)
+
+
+def impacts():
+    """Depths around every seam and rates from fast release to fast impact."""
+    depths = np.concatenate([np.linspace(-2e-5, 4e-5, 121), np.geomspace(1e-9, 1e-4, 81)])
+    rates = np.concatenate([-np.geomspace(1e-4, 10, 15), [0.0], np.geomspace(1e-4, 10, 15)])
+    return (jnp.asarray(a.ravel()) for a in np.meshgrid(depths, rates))
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.5, 2.2])
+def test_unsmoothed_law_in_closed_form(exponent):
+    """smoothing = 0 is max(0, K δ^e + C step(δ/d) dδ/dt)."""
+    law = impact_law(exponent=exponent, smoothing=0.0)
+    depths, rates = impacts()
+    np.testing.assert_allclose(
+        forces(law, depths, rates), plain_law(law, depths, rates), rtol=1e-10, atol=1e-12
+    )
+
+
+@given(
+    depth=st.floats(-1e-4, 1e-3),
+    rate=st.floats(-20, 20),
+    exponent=st.floats(1, 3),
+    damping=st.floats(0, 1e4),
+    full=st.floats(1e-6, 1e-4),
+    smoothing=st.sampled_from([0.0, 1e-9, 1e-7, 1e-5, 1e-3]),
+)
+def test_force_is_never_adhesive(depth, rate, exponent, damping, full, smoothing):
+    """Force ≥ 0 and finite whatever the state; exactly 0 without penetration."""
+    law = impact_law(exponent, damping, full, smoothing)
+    force = float(forces(law, jnp.asarray([depth]), jnp.asarray([rate]))[0])
+    assert np.isfinite(force)
+    assert force >= 0
+    if depth <= 0:
+        assert force == 0
+
+
+def test_smoothing_leaves_the_law_alone_outside_its_zones():
+    """Equal to the plain law where δ ≥ h and the force exceeds h/d · K δ^e."""
+    law = impact_law(smoothing=5e-7)
+    depths, rates = (np.asarray(a) for a in impacts())
+    plain = plain_law(law, depths, rates)
+    elastic = float(law.stiffness) * np.maximum(depths, 0) ** float(law.exponent)
+    outside = (depths <= 0) | ((depths >= 5e-7) & (plain >= 0.05 * elastic))
+    assert 0.3 < outside.mean() < 0.99
+    smooth = np.asarray(forces(law, depths, rates))
+    np.testing.assert_allclose(smooth[outside], plain[outside], rtol=1e-10)
+    assert np.all(smooth[~outside] >= 0) and np.any(smooth[~outside] != plain[~outside])
+
+
+def seams(law, rate):
+    """Depths at which the law changes its formula, for one rate."""
+    h, d = float(law.smoothing), float(law.full_damping_depth)
+    places = [0.0, h, d]
+    depth = np.linspace(1.5 * h, 30 * d, 300001)
+    elastic = float(law.stiffness) * depth ** float(law.exponent)
+    x = np.minimum(depth / d, 1.0)
+    total = elastic + float(law.damping) * (3 * x**2 - 2 * x**3) * rate
+    for level in (total, total - h / d * elastic):
+        crossing = np.flatnonzero(np.diff(np.sign(level)))
+        places.extend(depth[crossing])
+    return places
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.5, 2.2])
+@pytest.mark.parametrize("rate", [-0.5, -0.1, 0.0, 0.5])
+def test_law_is_continuously_differentiable(exponent, rate):
+    """Force and slopes over depth and rate do not jump at any seam of the law."""
+    law = impact_law(exponent=exponent, smoothing=1e-6)
+    places = seams(law, rate)
+    assert rate >= 0 or len(places) >= 5
+    # Through each seam in steps that shrink: a jump stays, a C¹ law's change shrinks with them.
+    changes = []
+    for reach in (1e-8, 1e-10):
+        offsets = reach * np.linspace(-1, 1, 41)
+        depths = jnp.asarray((np.array(places)[:, None] + offsets).ravel())
+        slopes = force_slopes(law, depths, jnp.full_like(depths, rate))
+        table = [np.asarray(s).reshape(len(places), -1) for s in slopes]
+        changes.append(max(np.ptp(s, axis=1).max() / np.abs(s).max() for s in table))
+    assert changes[1] < 0.02
+    assert changes[1] < 0.3 * changes[0] + 1e-9
+    # The slopes are those of the force itself.
+    depths = jnp.asarray(np.array(places) + 1e-9)
+    rates = jnp.full_like(depths, rate)
+    step = 1e-12
+    numeric = (forces(law, depths + step, rates) - forces(law, depths - step, rates)) / (2 * step)
+    by_depth, _ = force_slopes(law, depths, rates)
+    scale = float(np.abs(by_depth).max())
+    np.testing.assert_allclose(numeric, by_depth, rtol=1e-3, atol=1e-3 * scale)
+
+
+def test_slopes_of_the_law_are_finite_everywhere():
+    """No NaN in the derivatives, smoothed or not, at any depth including zero."""
+    depths, rates = impacts()
+    depths = depths.at[0].set(0.0)
+    for smoothing in (0.0, 1e-7):
+        for exponent in (1.0, 2.2):
+            law = impact_law(exponent=exponent, smoothing=smoothing)
+            assert all(np.all(np.isfinite(s)) for s in force_slopes(law, depths, rates))
+
+
+def test_smoothed_law_converges_to_the_plain_one():
+    """The greatest difference falls at least in proportion to the smoothing length."""
+    depths, rates = impacts()
+    errors = []
+    for smoothing in (1e-6, 1e-7, 1e-8):
+        law = impact_law(smoothing=smoothing)
+        errors.append(np.max(np.abs(forces(law, depths, rates) - plain_law(law, depths, rates))))
+    assert errors[0] > 0
+    assert errors[1] < 0.2 * errors[0]
+    assert errors[2] < 0.2 * errors[1]
+
+
+def test_static_depth_carries_its_force():
+    """depth_at inverts the law at rest."""
+    law = impact_law()
+    loads = jnp.array([1.0, 30.0, 2000.0])
+    depths = jax.vmap(law.depth_at)(loads)
+    np.testing.assert_allclose(forces(law, depths, jnp.zeros(3)), loads, rtol=1e-12)
+
+
+# The timing gear
+
+
+def timing_gear(rounding=3e-6):
+    values = (2.0e4, 1.7, 7.5e-4, rounding)
+    return TimingGear(*(jnp.asarray(v) for v in values))
+
+
+@jax.jit
+def gear_torques(gear, relatives, rates):
+    return jax.vmap(gear)(jnp.asarray(relatives), jnp.asarray(rates))
+
+
+@pytest.mark.parametrize("rounding", [0.0, 3e-6])
+def test_timing_gear_in_closed_form(rounding):
+    """Zero inside the backlash; stiffness · excess + damping · rate beyond the rounding."""
+    gear = timing_gear(rounding)
+    rates = np.linspace(-3, 3, 41)
+    inside = gear_torques(gear, 7.5e-4 * np.linspace(-1, 1, 41), rates)
+    np.testing.assert_array_equal(inside, 0)
+    excess = rounding + np.geomspace(1e-8, 1e-2, 41)
+    for side in (1, -1):
+        torque = gear_torques(gear, side * (7.5e-4 + excess), rates)
+        np.testing.assert_allclose(torque, side * 2e4 * excess + 1.7 * rates, rtol=1e-8, atol=1e-9)
+
+
+def test_timing_gear_is_odd_and_rounded():
+    """T(-ε, -ε̇) = -T(ε, ε̇); torque and slope are continuous over the rounding."""
+    gear = timing_gear()
+    relatives = 7.5e-4 + np.linspace(-2e-6, 5e-6, 7001)[:-1] + 0.5e-9
+    rates = np.full(7000, 0.4)
+    torque = gear_torques(gear, relatives, rates)
+    np.testing.assert_array_equal(gear_torques(gear, -relatives, -rates), -torque)
+    slope = jax.jit(jax.vmap(jax.grad(gear)))(jnp.asarray(relatives), jnp.asarray(rates))
+    # Greatest second derivatives, 4 k / w and 6 c ε̇ / w², over the sample spacing of 1e-9.
+    bend = 4 * 2e4 / 3e-6 + 6 * 1.7 * 0.4 / 3e-6**2
+    assert np.abs(np.diff(slope)).max() < 1.1 * bend * 1e-9
+    assert np.abs(np.diff(torque)).max() < 1.1 * np.abs(slope).max() * 1e-9
