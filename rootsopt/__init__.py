@@ -1,1 +1,3 @@
+"""Roots rotors designed by gradient; see the README."""
+
 __version__ = "0.1.0"

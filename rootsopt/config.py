@@ -160,7 +160,7 @@ class ConstraintsConfig(_Section):
 class BoundsConfig(_Section):
     """Box of the search, (low, high) for each design parameter."""
 
-    pressure_angle_deg: tuple[float, float] = Field((30.0, 45.0))
+    pressure_angle_deg: tuple[float, float] = Field((25.0, 45.0))
     involute_length_mm: tuple[float, float] | None = Field(
         None, description="default: 10 % to 100 % of the longest involute"
     )

@@ -35,6 +35,7 @@ RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 _SETTLED = 3e-3
 _SAME = 1e-4
 _CHAOS_WINDOW = 128
+_THINNING = 6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Evaluation:
 
     `response` and `gradient` use the result file's keys (N, N per config unit);
     `gradient` is empty where there is none to trust. `steady_state` says what kind of
-    motion it is. `series` covers `series_start` mesh periods onwards.
+    motion it is. `series` covers whole orbits, at least one revolution.
     """
 
     design: dict[str, float]
@@ -411,9 +412,10 @@ def _unsettled(pair, window, with_series):
     )
     series = None
     if with_series:
-        periods, samples, _ = flows.states.shape
+        states = np.asarray(flows.states)[:, ::_THINNING]
+        periods, samples, _ = states.shape
         tau = np.arange(periods * samples) / samples
-        series = _series(pair, tau, np.asarray(flows.states).reshape(-1, 2))
+        series = _series(pair, tau, states.reshape(-1, 2))
     return status, steady, response, series
 
 

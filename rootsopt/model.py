@@ -196,7 +196,9 @@ def check_geometry(config: Config) -> None:
     alpha = profile_config.pressure_angle_deg
     length = profile_config.involute_length_mm
     tip = profile_config.tip_arc_angle_deg
-    assert alpha is not None and length is not None and tip is not None
+    assert alpha is not None
+    assert length is not None
+    assert tip is not None
     half = 90.0 / profile_config.lobes
     if tip >= half:
         raise InputError(

@@ -36,11 +36,11 @@ def body(config: Config, options: argparse.Namespace) -> int:
     }
     folder.write_text("config.yaml", config.to_yaml())
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
+    folder.write_json("result.json", record | {"versions": files.versions()})
     if not options.no_figures:
         from rootsopt import plot
 
         plot.profile_figures(folder, config, record)
-    folder.write_json("result.json", record | {"versions": files.versions()})
     out = Console()
     out.print(report.geometry_table(record))
     out.print(f"results in {options.output}", soft_wrap=True)

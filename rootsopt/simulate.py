@@ -27,14 +27,13 @@ def body(config: Config, options: argparse.Namespace) -> int:
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     if evaluation.series is not None:
         folder.write_csv("response_design.csv", files.response_columns(evaluation.series))
+    folder.write_json("result.json", evaluation.record() | {"versions": files.versions()})
     if not options.no_figures:
         from rootsopt import plot
 
         plot.simulation_figures(folder, evaluation, config)
-    folder.write_json("result.json", evaluation.record() | {"versions": files.versions()})
     out = Console()
     out.print(report.evaluation_table(evaluation))
-    out.print(f"{evaluation.status.label}: {evaluation.message}")
     out.print(f"results in {options.output}", soft_wrap=True)
     return cli.OK if evaluation.usable else cli.NO_RESULT
 

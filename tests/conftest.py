@@ -2,17 +2,14 @@
 
 import os
 
-os.environ.setdefault("MPLBACKEND", "Agg")
-
 import jax
-
-jax.config.update("jax_enable_x64", True)
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import settings
 
+os.environ.setdefault("MPLBACKEND", "Agg")
+jax.config.update("jax_enable_x64", True)
 settings.register_profile("rootsopt", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("rootsopt")
 

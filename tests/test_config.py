@@ -47,7 +47,8 @@ def refusal(text, *overrides):
     with pytest.raises(InputError) as caught:
         parse(text, overrides)
     message = str(caught.value)
-    assert message and "\n" not in message
+    assert message
+    assert "\n" not in message
     return message
 
 
@@ -158,13 +159,15 @@ def test_unknown_key_without_a_match_lists_the_valid_ones():
     """Nothing similar: the valid keys of that section are listed."""
     message = refusal(MINIMAL, "rotor.zzz=1")
     assert "`rotor.zzz`" in message
-    assert "length_mm" in message and "density_kg_m3" in message
+    assert "length_mm" in message
+    assert "density_kg_m3" in message
 
 
 def test_key_in_the_wrong_section_is_sent_to_the_right_one():
     """A known key elsewhere: the message says where it belongs."""
     message = refusal(MINIMAL, "rotor.speed_rpm=1000")
-    assert "`rotor.speed_rpm`" in message and "`scene.speed_rpm`" in message
+    assert "`rotor.speed_rpm`" in message
+    assert "`scene.speed_rpm`" in message
 
 
 @pytest.mark.parametrize(
@@ -190,7 +193,8 @@ def test_missing_section_is_named(section):
     data = yaml.safe_load(MINIMAL)
     del data[section]
     message = refusal(yaml.safe_dump(data))
-    assert f"`{section}`" in message and "missing" in message
+    assert f"`{section}`" in message
+    assert "missing" in message
 
 
 @pytest.mark.parametrize("key", ["pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg"])
@@ -198,9 +202,11 @@ def test_keys_must_belong_to_the_family(key):
     """cic needs its three keys; ee refuses them."""
     line = next(line for line in MINIMAL.splitlines(keepends=True) if key in line)
     message = refusal(with_line(line, ""))
-    assert f"`profile.{key}`" in message and "cic" in message
+    assert f"`profile.{key}`" in message
+    assert "cic" in message
     message = refusal(EE_PROFILE, f"profile.{key}=5.0")
-    assert f"`profile.{key}`" in message and "ee" in message
+    assert f"`profile.{key}`" in message
+    assert "ee" in message
 
 
 # Wrong values
@@ -272,7 +278,8 @@ def test_value_out_of_range_is_refused_with_the_range(override, limit):
 def test_nan_and_infinity_are_refused(key, value):
     """No quantity may be NaN or infinite."""
     message = refusal(MINIMAL, f"{key}={value}")
-    assert f"`{key}`" in message and value.strip("-.") in message
+    assert f"`{key}`" in message
+    assert value.strip("-.") in message
 
 
 @pytest.mark.parametrize(
@@ -288,7 +295,8 @@ def test_nan_and_infinity_are_refused(key, value):
 def test_word_outside_the_choice_is_refused_with_the_choices(key, choices):
     """A choice names what there is to choose."""
     message = refusal(MINIMAL, f"{key}=nonsense")
-    assert f"`{key}`" in message and "'nonsense'" in message
+    assert f"`{key}`" in message
+    assert "'nonsense'" in message
     assert all(choice in message for choice in choices)
 
 
@@ -296,13 +304,15 @@ def test_word_outside_the_choice_is_refused_with_the_choices(key, choices):
 def test_section_must_be_a_section(value):
     """A plain value where keys belong is refused."""
     message = refusal(MINIMAL, f"scene.timing_gear={value}")
-    assert "`scene.timing_gear`" in message and "section" in message
+    assert "`scene.timing_gear`" in message
+    assert "section" in message
 
 
 def test_objective_needs_a_weight():
     """Both weights zero leave nothing to minimise."""
     message = refusal(MINIMAL, "objective.mean_weight=0", "objective.peak_weight=0")
-    assert "objective.mean_weight" in message and "objective.peak_weight" in message
+    assert "objective.mean_weight" in message
+    assert "objective.peak_weight" in message
 
 
 @pytest.mark.parametrize(
@@ -328,7 +338,8 @@ def test_file_that_cannot_be_read_is_refused(tmp_path):
     ):
         with pytest.raises(InputError) as caught:
             load(path)
-        assert str(path) in str(caught.value) and words in str(caught.value)
+        assert str(path) in str(caught.value)
+        assert words in str(caught.value)
         assert "\n" not in str(caught.value)
 
 
@@ -372,7 +383,8 @@ def test_broken_yaml_is_refused_with_its_line(text, line):
 def test_key_given_twice_is_refused(text, key):
     """The last one does not silently win."""
     message = refusal(text)
-    assert f"'{key}'" in message and "twice" in message
+    assert f"'{key}'" in message
+    assert "twice" in message
 
 
 # Overrides
@@ -409,7 +421,9 @@ def test_override_can_take_a_part_away():
 def test_override_of_wrong_form_is_refused(override):
     """The form dotted.key=value is asked for, and what was given is shown."""
     message = refusal(MINIMAL, override)
-    assert "--set" in message and repr(override) in message and "dotted.key=value" in message
+    assert "--set" in message
+    assert repr(override) in message
+    assert "dotted.key=value" in message
 
 
 @pytest.mark.parametrize(
@@ -449,7 +463,8 @@ def test_involute_past_its_longest_is_refused():
     """u > u_max: key, value and the longest length (8.893 mm here) are named."""
     message = geometry_refusal("profile.involute_length_mm=9.2")
     assert "`profile.involute_length_mm`" in message
-    assert "8.893" in message and "9.2" in message
+    assert "8.893" in message
+    assert "9.2" in message
 
 
 def test_undercut_is_refused():
@@ -459,8 +474,10 @@ def test_undercut_is_refused():
         "profile.tip_arc_angle_deg=0",
         "profile.involute_length_mm=7.2",
     )
-    assert "`profile.involute_length_mm`" in message and "undercut" in message
-    assert "7.2" in message and "25" in message
+    assert "`profile.involute_length_mm`" in message
+    assert "undercut" in message
+    assert "7.2" in message
+    assert "25" in message
 
 
 @pytest.mark.parametrize(("lobes", "limit"), [(3, 30), (6, 15)])
@@ -468,4 +485,5 @@ def test_tip_wider_than_its_lobe_is_refused(lobes, limit):
     """θ1 must be less than π/2N."""
     message = geometry_refusal(f"profile.lobes={lobes}", f"profile.tip_arc_angle_deg={limit}")
     assert "`profile.tip_arc_angle_deg`" in message
-    assert f"less than {limit}" in message and f"but is {limit}" in message
+    assert f"less than {limit}" in message
+    assert f"but is {limit}" in message

@@ -535,7 +535,8 @@ def test_smoothing_leaves_the_law_alone_outside_its_zones():
     assert 0.3 < outside.mean() < 0.99
     smooth = np.asarray(forces(law, depths, rates))
     np.testing.assert_allclose(smooth[outside], plain[outside], rtol=1e-10)
-    assert np.all(smooth[~outside] >= 0) and np.any(smooth[~outside] != plain[~outside])
+    assert np.all(smooth[~outside] >= 0)
+    assert np.any(smooth[~outside] != plain[~outside])
 
 
 def seams(law, rate):

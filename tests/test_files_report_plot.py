@@ -33,7 +33,15 @@ def _series(periods=3, samples=64):
     drive = np.maximum(0, 30 * np.cos(2 * np.pi * tau))
     coast = np.maximum(0, -10 * np.cos(2 * np.pi * tau))
     turn = 2 * np.pi / 3 * tau
-    return Series(tau / 150, turn, -1e-4 * tau, 0 * tau, drive, coast)
+    return Series(
+        time=tau / 150,
+        rotation=turn,
+        relative=-1e-4 * tau,
+        rate=0 * tau,
+        drive_force=drive,
+        coast_force=coast,
+        depth=0 * tau,
+    )
 
 
 def _evaluation(mean=14.830332, peak=83.824854, **changes):

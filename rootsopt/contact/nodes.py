@@ -28,7 +28,7 @@ def place_pair(
     """
     first = _rotate(outline, phi1)
     second = _rotate(outline, phi2 + np.pi / lobes) * [-1.0, 1.0]
-    return first, second[::-1] + [center_distance, 0.0]
+    return first, second[::-1] + np.array([center_distance, 0.0])
 
 
 def signed_distance(nodes: Points, outline: Points, refine: bool = True) -> NDArray[np.float64]:

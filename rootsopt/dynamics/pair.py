@@ -68,7 +68,8 @@ class RotorPair(eqx.Module):
 
     `contact`: gap and levers at a pose; `law`: contact force; `clearance` (m) added to
     every flank gap; `inertia` of one rotor (kg·m²); `drive`, `load`, `gear`: parts;
-    `angle_scale` (rad) and `force_scale` (N): units the solver works in. An absent gear is None and costs nothing.
+    `angle_scale` (rad) and `force_scale` (N): units the solver works in. An absent gear
+    is None and costs nothing.
     """
 
     lobes: int = eqx.field(static=True)

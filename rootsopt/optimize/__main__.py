@@ -38,7 +38,6 @@ def body(config: Config, options: argparse.Namespace) -> int:
         out.print(
             report.comparison_table(result.baseline, result.optimized, rows, result.improvement)
         )
-        out.print(f"{result.optimized.status.label}: {result.optimized.message}")
     total = time.perf_counter() - began
     out.print(
         f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
@@ -90,6 +89,7 @@ def _write(folder, config, options, result, compiled, ran) -> None:
         "run_seconds": ran - compiled,
     }
     data["versions"] = files.versions()
+    folder.write_json("result.json", data)
     if not options.no_figures:
         from rootsopt import plot
 
@@ -97,7 +97,6 @@ def _write(folder, config, options, result, compiled, ran) -> None:
             plot.optimization_figures(folder, result.baseline, result.optimized, rows, config)
         else:
             plot.simulation_figures(folder, result.baseline, config)
-    folder.write_json("result.json", data)
 
 
 @contextlib.contextmanager

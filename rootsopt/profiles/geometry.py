@@ -17,7 +17,7 @@ class Geometry(eqx.Module):
     """Geometry of one rotor, per unit length where a length is not given (SI units).
 
     `outer_radius`, `root_radius` (m); `area` (m²); `area_efficiency` 1 - A/(π r_a²);
-    `polar_area_moment` ∫r² dA about the axis (m⁴); `undercut_margin` (m/rad), least
+    `polar_area_moment` ∫r² dA about the axis (m⁴); `undercut_margin` (m per rad), least
     `Profile.dedendum_speed`; `seal_width` (m), arc length of the whole tip land.
     """
 
@@ -77,11 +77,7 @@ def flank_nodes(profile: Profile, points: int) -> Float[Array, " n"]:
     lengths, curves = [], []
     for segment in segments:
         nu = np.linspace(float(segment.start), float(segment.stop), 401)
-        middle = jnp.asarray((nu[1:] + nu[:-1]) / 2)
-        # The longer of the two conjugate elements decides, so that both flanks are even.
-        speed = jnp.maximum(
-            jnp.abs(profile.addendum_speed(middle)), jnp.abs(profile.dedendum_speed(middle))
-        )
+        speed = _element(profile, jnp.asarray((nu[1:] + nu[:-1]) / 2))
         arc = np.concatenate([[0.0], np.cumsum(np.asarray(speed) * np.diff(nu))])
         lengths.append(arc[-1])
         curves.append((nu, arc))
@@ -94,11 +90,22 @@ def flank_nodes(profile: Profile, points: int) -> Float[Array, " n"]:
     return jnp.asarray(np.concatenate(nodes))
 
 
+@jax.jit
+def _both(profile, nu):
+    return profile.position(profile.addendum(nu)), profile.position(profile.dedendum(nu))
+
+
+@jax.jit
+def _element(profile, nu):
+    """The longer of the two conjugate elements per normal angle, so that both flanks of
+    a lobe come out even."""
+    return jnp.maximum(jnp.abs(profile.addendum_speed(nu)), jnp.abs(profile.dedendum_speed(nu)))
+
+
 def flank(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
     """Coordinates (m) of one flank from tip centre to root centre, about 2 `points` nodes."""
     nu = flank_nodes(profile, points)
-    addendum = jax.jit(lambda p, n: p.position(p.addendum(n)))(profile, nu)
-    dedendum = jax.jit(lambda p, n: p.position(p.dedendum(n)))(profile, nu)
+    addendum, dedendum = _both(profile, nu)
     return jnp.concatenate([addendum, dedendum[::-1][1:]])
 
 
