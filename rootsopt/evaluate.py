@@ -24,7 +24,6 @@ from rootsopt.dynamics.steady import (
     lyapunov,
     reverse_sensitivity,
     settle,
-    too_deep,
 )
 from rootsopt.errors import InputError
 from rootsopt.model import MM, Model, design_keys, design_vector, integrators
@@ -36,6 +35,7 @@ _SETTLED = 3e-3
 _SAME = 1e-4
 _CHAOS_WINDOW = 128
 _THINNING = 6
+_TOO_DEEP = 0.02
 
 
 @dataclasses.dataclass(frozen=True)
@@ -228,7 +228,7 @@ class Evaluator:
             }
             if with_series:
                 series = _orbit_series(pair, orbit, period)
-                if bool(too_deep(series.depth.max(), self.model.pitch_radius)):
+                if series.depth.max() > _TOO_DEEP * float(self.model.pitch_radius):
                     status = Status.TOO_DEEP
         elif status is Status.NOT_SETTLED and not self.survey:
             window = _lyapunov(pair, outcome.transient.state, _CHAOS_WINDOW, self.transient)

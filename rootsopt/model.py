@@ -182,12 +182,6 @@ def integrators(config: Config) -> tuple[Integrator, Integrator]:
     )
 
 
-@eqx.filter_jit
-def _measure(model: Model, design):
-    profile = model.profile(design)
-    return geometry(profile)
-
-
 def check_geometry(config: Config) -> None:
     """Raise `InputError` unless the config's profile can be made and meshes."""
     profile_config = config.profile
@@ -214,18 +208,13 @@ def check_geometry(config: Config) -> None:
             f"{tip:g} (up to {limit:.4g} is tolerated), but is {length:g}: the roll angle would "
             "turn back; shorten it or raise the pressure angle"
         )
-    shape = _measure(Model.of(config), design_vector(config))
-    margin = float(shape.undercut_margin) / MM
-    if not margin >= 0:
+    radius, sine = profile_config.pitch_radius_mm, math.sin(alpha * DEG)
+    # On the dedendum the involute's end is the first to be undercut.
+    uncut = radius * sine * math.tan(alpha * DEG)
+    if length > uncut * (1 + 1e-9):
         raise InputError(
-            f"`profile.involute_length_mm` must be less than "
-            f"{profile_config.pitch_radius_mm * math.sin(alpha * DEG) * math.tan(alpha * DEG):.4g} "
-            f"at `profile.pressure_angle_deg` = {alpha:g}, but is {length:g}: the dedendum is "
-            f"undercut (margin {margin:.3g} mm); shorten it or raise the pressure angle"
-        )
-    if not float(shape.root_radius) > 0:
-        raise InputError(
-            f"`profile.pressure_angle_deg` = {alpha:g} with `profile.involute_length_mm` = "
-            f"{length:g} gives a root radius of {float(shape.root_radius) / MM:.3g} mm; it must "
-            "be positive: shorten the involute or raise the pressure angle"
+            f"`profile.involute_length_mm` must be at most {uncut:.4g} at "
+            f"`profile.pressure_angle_deg` = {alpha:g}, but is {length:g}: the dedendum is "
+            f"undercut (margin {(uncut - length) / math.tan(alpha * DEG):.3g} mm); shorten it "
+            "or raise the pressure angle"
         )

@@ -161,8 +161,12 @@ class FlankPair(eqx.Module):
         # Where T falls through zero the gap has a minimum. A second one occurs near the
         # pitch point of EE and at penetrations far beyond the contact law: the deeper
         # counts, judged by dG/dλ = T, T being linear between nodes.
-        falling = (offset[:-1] >= 0) & (offset[1:] < 0)
-        share = offset[:-1] / jnp.where(falling, offset[:-1] - offset[1:], 1.0)
+        # The tolerance is for a root on a node: a compiled program may round T[i] one way
+        # as the end of one interval and another way as the start of the next.
+        slack = 1e-13 * profile.pitch_radius
+        falling = (offset[:-1] >= -slack) & (offset[1:] < slack)
+        fall = offset[:-1] - offset[1:]
+        share = jnp.clip(offset[:-1] / jnp.where(fall > 0, fall, 1.0), 0.0, 1.0)
         drop = 0.5 * offset[:-1] * share * (nodes.facing[:-1] - nodes.facing[1:])
         index = jnp.argmin(jnp.where(falling, gap[:-1] + drop, jnp.inf))
         low, high = nodes.normal[index], nodes.normal[index + 1]

@@ -16,12 +16,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def ramp(x: Float[Array, "*n"], width: Float[Array, "*n"]) -> Float[Array, "*n"]:
+def ramp(x: Float[Array, "*n"], width: Float[Array, "*#n"]) -> Float[Array, "*n"]:
     """max(0, x) with its corner rounded on 0 < x < width: 2 x²/w - x³/w², C¹ throughout."""
     safe = jnp.where(width > 0, width, 1.0)
     t = jnp.clip(x / safe, 0.0, 1.0)
     rounded = safe * t**2 * (2 - t)
-    return jnp.where((x > 0) & (x < width), rounded, jnp.maximum(x, 0.0))
+    # At x = 0 the rounded branch decides, so that the derivative there is 0, not 1/2.
+    return jnp.where(x < width, rounded, jnp.maximum(x, 0.0))
 
 
 def smooth_step(x: Float[Array, "*n"]) -> Float[Array, "*n"]:

@@ -108,11 +108,10 @@ class MapContact(eqx.Module):
             relative, self.deepest, self.relative_step, columns
         )
         local = lax.dynamic_slice(self.coefficients, (i, j), (4, 4))
-        along = local @ jnp.stack([e_value, e_slope], axis=1)
+        e_slope = e_slope / self.relative_step
+        along = local @ jnp.stack([e_value + e_slope * beyond, e_slope], axis=1)
         gap, by_relative = x_value @ along
         by_roll = mirror * (x_slope @ along[:, 0]) / self.roll_step
-        by_relative = by_relative / self.relative_step
-        gap = gap + by_relative * beyond
         # φ̄ = -x: ∂G/∂φ1 = -∂G/∂x / 2 - ∂G/∂ε = -lever1, ∂G/∂φ2 = lever2.
         return gap, by_relative + by_roll / 2, by_relative - by_roll / 2
 

@@ -24,7 +24,6 @@ SAMPLES = 2520
 """Uniform samples of an orbit; divisible by every period up to ten, so that a shorter
 period inside an orbit shows at a sample."""
 _NEWTON_STEPS = 12
-_TOO_DEEP = 0.02
 
 
 class Transient(NamedTuple):
@@ -261,8 +260,3 @@ def floquet(monodromy: Float[Array, "2 2"]) -> Float[Array, "2"]:
     real = jnp.stack([jnp.abs(half + root), jnp.abs(half - root)])
     pair = jnp.sqrt(jnp.abs(determinant)) * jnp.ones(2)
     return jnp.where(square >= 0, real, pair)
-
-
-def too_deep(depth: Float[Array, ""], pitch_radius: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether a penetration is beyond the validity of a penalty contact."""
-    return depth > _TOO_DEEP * pitch_radius

@@ -12,7 +12,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.optimize import nnls
@@ -90,23 +89,6 @@ class Space(eqx.Module):
         shape = geometry(self.model.profile(self.design(point)))
         return jnp.stack([c.slack(shape) for c in self.constraints])
 
-    def project(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
-        """A feasible point near `point`: Gauss-Newton steps on the violated constraints."""
-
-        def step(_, point):
-            slack = self.slacks(point)
-            jacobian = jax.jacfwd(self.slacks)(point)
-            # Aim a hair inside, so that rounding leaves the constraint satisfied.
-            violated = slack < 1e-9
-            rows = jnp.where(violated[:, None], jacobian, 0.0)
-            # Coordinates held at the box cannot take part.
-            want = jnp.where(violated, 1e-7 - slack, 0.0)
-            gram = rows @ rows.T + jnp.diag(jnp.where(violated, 1e-10, 1.0))
-            move = rows.T @ jnp.linalg.solve(gram, want)
-            return jnp.clip(point + jnp.clip(move, -0.3, 0.3), 0.0, 1.0)
-
-        return lax.fori_loop(0, 25, step, jnp.clip(point, 0.0, 1.0))
-
 
 @eqx.filter_jit
 def _look(space: Space, point):
@@ -116,12 +98,6 @@ def _look(space: Space, point):
         space.slacks(point),
         jax.jacfwd(space.slacks)(point),
     )
-
-
-@eqx.filter_jit
-def _project(space: Space, points):
-    projected = jax.vmap(space.project)(points)
-    return projected, jnp.min(jax.vmap(space.slacks)(projected), axis=1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,10 +166,29 @@ class Problem:
         """Design in config units at a point of the unit box."""
         return _look(self.space, jnp.asarray(point))[0]
 
-    def project(self, points) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Feasible points near `points` (n, 3), and which of them really are feasible."""
-        projected, slack = _project(self.space, jnp.asarray(points))
-        return np.asarray(projected), np.asarray(slack) >= -_ACTIVE
+    def feasible(self, point) -> bool:
+        """Whether a point of the unit box satisfies every constraint."""
+        return bool(np.min(_look(self.space, jnp.asarray(point))[2]) >= -_ACTIVE)
+
+    def project(self, point) -> NDArray[np.float64]:
+        """A feasible point near `point`: Gauss-Newton steps on the violated constraints.
+
+        The result may still be infeasible where the constraints contradict the bounds.
+        """
+        point = np.clip(np.asarray(point, dtype=float), 0.0, 1.0)
+        for _ in range(30):
+            _, _, slack, jacobian = map(np.asarray, _look(self.space, jnp.asarray(point)))
+            violated = slack < 0
+            if not violated.any():
+                break
+            # Aim a hair inside, so that rounding leaves the constraint satisfied. A
+            # coordinate already held by its bound takes no part.
+            rows, want = jacobian[violated], 1e-7 - slack[violated]
+            push = rows.T @ want
+            held = ((point <= 0) & (push < 0)) | ((point >= 1) & (push > 0))
+            move = np.linalg.lstsq(np.where(held, 0.0, rows), want, rcond=1e-8)[0]
+            point = np.clip(point + np.clip(move, -0.3, 0.3), 0.0, 1.0)
+        return point
 
     def descent(self, point, slope: NDArray[np.float64]) -> NDArray[np.float64]:
         """The slope less what active constraints and box faces forbid.

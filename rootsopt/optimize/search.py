@@ -25,8 +25,9 @@ RULES: dict[str, Callable[..., optax.GradientTransformation]] = {
     "rmsprop": optax.rmsprop,
     "sgd": optax.sgd,
 }
-_PATIENCE = 12
+_PATIENCE = 4
 _GAIN = 1e-4
+_STATIONARY = 1e-3
 _HOLDS_UP = 0.01
 """Relative change of the objective in the verification that still counts as holding up."""
 
@@ -104,17 +105,14 @@ class Search:
 
     def _starts(self, baseline_point) -> list[np.ndarray]:
         """The baseline's neighbourhood and the best screened designs, apart from each other."""
-        points, feasible = self.problem.project(
-            np.concatenate(
-                [baseline_point[None], sobol(self.settings.screening, self.settings.seed)]
-            )
-        )
-        if not feasible.any():
+        sample = [baseline_point, *sobol(self.settings.screening, self.settings.seed)]
+        points = [self.problem.project(point) for point in sample]
+        points = [point for point in points if self.problem.feasible(point)]
+        if not points:
             raise InputError(
                 "`constraints` and `optimizer.bounds` leave no feasible design; lower "
                 "`constraints.area_efficiency_min` or widen `optimizer.bounds`"
             )
-        points = points[feasible]
         if self.settings.screening:
             for point in points:
                 self._evaluate(point, start=-1, iteration=0)
@@ -141,7 +139,7 @@ class Search:
                 # No steady state there: go half way back to the last good design.
                 if last is None:
                     return
-                point = self.problem.project(((point + last.point) / 2)[None])[0][0]
+                point = self.problem.project((point + last.point) / 2)
                 orbit = None
                 continue
             last = Candidate(point, objective, evaluation)
@@ -151,16 +149,16 @@ class Search:
             if since > _PATIENCE or iteration == settings.iterations:
                 return
             slope = self.problem.descent(point, self.problem.slope(evaluation, jnp.asarray(point)))
-            if np.linalg.norm(slope) < 1e-6:
+            if np.linalg.norm(slope) < _STATIONARY:
                 return
             update, state = rule.update(jnp.asarray(slope), state)
-            point = self.problem.project((point + np.asarray(update))[None])[0][0]
+            point = self.problem.project(point + np.asarray(update))
 
     def _evaluate(self, point, start, iteration, orbit=None):
         evaluation = self.fast(self.problem.design(point), start=orbit, series=False)
         objective = self.problem.objective(evaluation)
-        _, feasible = self.problem.project(point[None])
-        if not np.isnan(objective) and feasible[0]:
+        feasible = self.problem.feasible(point)
+        if not np.isnan(objective) and feasible:
             self.candidates.append(Candidate(np.asarray(point), objective, evaluation))
         best = min((c.objective for c in self.candidates), default=float("nan"))
         self.history.append(
@@ -174,7 +172,7 @@ class Search:
                 "peak_force_N": evaluation.response.get("peak_force_N", float("nan")),
                 **evaluation.design,
                 "area_efficiency": evaluation.geometry["area_efficiency"],
-                "feasible": bool(feasible[0]),
+                "feasible": feasible,
                 "status": evaluation.status.label,
             }
         )

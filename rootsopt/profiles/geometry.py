@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from rootsopt.profiles.base import Profile
@@ -58,7 +59,10 @@ def geometry(profile: Profile) -> Geometry:
     outer_radius = r + reach
     seal_angle = sum(2 * (s.stop - s.start) for s in segments if s.land)
     # An absent segment (no tip land, say) sets no limit.
-    margin = jnp.min(jnp.where(length > 0, speed, jnp.inf))
+    candidates = jnp.where(length > 0, speed, jnp.inf).ravel()
+    # By index: the derivative of `min` compares recomputed floats, which compiled
+    # programs may round differently, and is then zero.
+    margin = candidates[lax.stop_gradient(jnp.argmin(candidates))]
     return Geometry(
         outer_radius=outer_radius,
         root_radius=r - reach,
@@ -97,9 +101,11 @@ def _both(profile, nu):
 
 @jax.jit
 def _element(profile, nu):
-    """The longer of the two conjugate elements per normal angle, so that both flanks of
-    a lobe come out even."""
-    return jnp.maximum(jnp.abs(profile.addendum_speed(nu)), jnp.abs(profile.dedendum_speed(nu)))
+    """Node density over the normal angle: the longer of the two conjugate elements, so
+    that both flanks come out even, plus a share for turning, so that a sharp spot (the
+    pitch point of EE) is resolved."""
+    longest = jnp.maximum(jnp.abs(profile.addendum_speed(nu)), jnp.abs(profile.dedendum_speed(nu)))
+    return longest + 0.3 * profile.pitch_radius
 
 
 def flank(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
