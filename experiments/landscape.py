@@ -20,6 +20,8 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
+from matplotlib.cm import ScalarMappable  # noqa: E402
+from matplotlib.colors import Normalize  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
 from rootsopt import files  # noqa: E402
@@ -81,12 +83,12 @@ def draw(rows: list[dict], optimum: dict, objective: float, path: Path) -> None:
     values = np.array([row["objective"] for row in rows])
     low, high = np.nanmin(values), np.nanpercentile(values, 95)
     order = np.argsort(-np.where(np.isnan(values), np.inf, values))
-    shown = None
+    shades = ScalarMappable(Normalize(low, high), "viridis")
     for ax, (x, y) in zip(axes, itertools.combinations(names, 2), strict=True):
         px, py = (np.array([row[k] for row in rows])[order] for k in (x, y))
         good = ~np.isnan(values[order])
         ax.plot(px[~good], py[~good], "x", color="0.6", ms=3, label="no steady state")
-        shown = ax.scatter(
+        ax.scatter(
             px[good], py[good], c=values[order][good], s=12, cmap="viridis", vmin=low, vmax=high
         )
         ax.plot(
@@ -96,7 +98,7 @@ def draw(rows: list[dict], optimum: dict, objective: float, path: Path) -> None:
         ax.set_xlabel(names[x])
         ax.set_ylabel(names[y])
     axes[0].legend(loc="best", fontsize=8)
-    figure.colorbar(shown, ax=axes, label="objective (baseline = 1), best on top")
+    figure.colorbar(shades, ax=axes, label="objective (baseline = 1), best on top")
     figure.suptitle(
         f"{len(rows)} feasible designs in the scene of the main job; best of the grid {low:.4f}"
     )
@@ -104,7 +106,9 @@ def draw(rows: list[dict], optimum: dict, objective: float, path: Path) -> None:
 
 
 def main() -> int:
-    arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    arguments = argparse.ArgumentParser(
+        description="Optimum against an exhaustive grid of designs."
+    )
     arguments.add_argument("config", nargs="?", default="configs/cic.yaml")
     arguments.add_argument("-o", "--output", type=Path, default=Path("results/landscape"))
     arguments.add_argument("--designs", type=int, default=2000)

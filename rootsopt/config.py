@@ -204,7 +204,7 @@ class OptimizerConfig(_Section):
         48, description="designs screened to place the starts; 0 starts at the baseline only"
     )
     seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of the screening sample")
-    bounds: BoundsConfig = Field(default_factory=BoundsConfig)
+    bounds: BoundsConfig = Field(default_factory=lambda: BoundsConfig.model_validate({}))
 
 
 class Config(_Section):
@@ -214,10 +214,12 @@ class Config(_Section):
     rotor: RotorConfig
     contact: ContactConfig
     scene: SceneConfig
-    solver: SolverConfig = Field(default_factory=SolverConfig)
-    objective: ObjectiveConfig = Field(default_factory=ObjectiveConfig)
-    constraints: ConstraintsConfig = Field(default_factory=ConstraintsConfig)
-    optimizer: OptimizerConfig = Field(default_factory=OptimizerConfig)
+    solver: SolverConfig = Field(default_factory=lambda: SolverConfig.model_validate({}))
+    objective: ObjectiveConfig = Field(default_factory=lambda: ObjectiveConfig.model_validate({}))
+    constraints: ConstraintsConfig = Field(
+        default_factory=lambda: ConstraintsConfig.model_validate({})
+    )
+    optimizer: OptimizerConfig = Field(default_factory=lambda: OptimizerConfig.model_validate({}))
 
     def to_yaml(self) -> str:
         """The resolved config, every default written out."""

@@ -207,7 +207,7 @@ class Evaluator:
         gradient: dict[str, dict[str, float]] = {}
         steady: dict[str, Any] = {"kind": "transient"}
         series, state = None, None
-        statistics = {
+        statistics: dict[str, float] = {
             "transient_mesh_periods": outcome.used,
             "solver_steps": outcome.steps,
         }

@@ -181,7 +181,8 @@ def amplitude_spectrum(
     amplitude = 2 * np.abs(np.fft.rfft(signal)) / len(signal)
     if len(signal) % 2 == 0:
         amplitude[-1] /= 2
-    return np.fft.rfftfreq(len(signal), step)[1:], amplitude[1:]
+    frequency = np.fft.rfftfreq(len(signal), step)
+    return np.asarray(frequency[1:], dtype=np.float64), np.asarray(amplitude[1:], dtype=np.float64)
 
 
 def plot_spectrum(
@@ -213,7 +214,11 @@ def plot_spectrum(
         ax.set_ylim(*((1e-4 * top, 2 * top) if top > 0 else (1e-4, 1)))
     per_mesh = mesh_frequency_Hz / 1e3
     orders = axes[0].secondary_xaxis(
-        "top", functions=(lambda f: f / per_mesh, lambda order: order * per_mesh)
+        "top",
+        functions=(
+            lambda f: np.asarray(f) / per_mesh,
+            lambda order: np.asarray(order) * per_mesh,
+        ),
     )
     orders.set_xlabel(f"multiple of the mesh frequency, {mesh_frequency_Hz:.4g} Hz")
     axes[-1].set_xlabel("frequency (kHz)")
@@ -258,7 +263,7 @@ def _starts(history) -> Iterator[tuple[list[Mapping[str, Any]], dict[str, Any]]]
 
 def _start(row) -> int:
     start = row.get("start")
-    return start if isinstance(start, int | np.integer) else -1
+    return int(start) if isinstance(start, int | np.integer) else -1
 
 
 def _trace(ax, rows, key, style):
@@ -370,7 +375,7 @@ def _meshing(points, config, what="rotors"):
     lobes = config.profile.lobes
     angles = np.arange(6) * 60 / lobes
     made, axes = figure(11, 5.6, 2, 3, sharex=True, sharey=True)
-    plot_meshing(axes.ravel(), points, lobes, config.profile.pitch_radius_mm, angles)
+    plot_meshing(list(axes.ravel()), points, lobes, config.profile.pitch_radius_mm, angles)
     made.supxlabel("x (mm)")
     made.supylabel("y (mm)")
     made.suptitle(f"Meshing of the {what} over one lobe pitch ({360 / lobes:g}°)")
@@ -384,17 +389,17 @@ def _force_figures(folder, designs, config) -> list[str]:
     responses, speed = {k: designs[k].response for k in series}, config.scene.speed_rpm
     count, shared = len(series), {"sharex": True, "sharey": True}
     made, axes = figure(10, 1.2 + 2.6 * count, count, 1, **shared)
-    plot_force(axes[:, 0], series, responses)
+    plot_force(list(axes[:, 0]), series, responses)
     made.suptitle(f"Contact force over time at {speed:g} rpm")
     names = [_write(folder, "force", made)]
     made, axes = figure(10, 1.4 + 2.6 * count, count, 1, **shared)
-    plot_spectrum(axes[:, 0], series, config.profile.lobes * speed / 60)
+    plot_spectrum(list(axes[:, 0]), series, config.profile.lobes * speed / 60)
     made.suptitle(f"Spectrum of the contact force at {speed:g} rpm")
     return [*names, _write(folder, "spectrum", made)]
 
 
 def _history(history):
     made, axes = figure(10, 9, 4, 1, sharex=True, gridspec_kw={"height_ratios": [2.2, 1, 1, 1]})
-    plot_history(axes[:, 0], history)
+    plot_history(list(axes[:, 0]), history)
     made.suptitle("Optimisation history")
     return made

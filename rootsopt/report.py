@@ -34,7 +34,7 @@ _NAMES = {
     "residual": ("orbit residual", ""),
     "rms_force_N": ("RMS force", "N"),
 }
-_Rows = Iterable[tuple[str, ...]]
+_Rows = Iterable[tuple[str | Text, ...]]
 
 
 def comparison_table(

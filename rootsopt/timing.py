@@ -34,6 +34,6 @@ class CompileClock:
     ) -> None:
         self._running = False
 
-    def _listen(self, event: str, duration: float, **_: object) -> None:
+    def _listen(self, event: str, duration_secs: float, **_: object) -> None:
         if self._running and event in _COMPILE_EVENTS[1:]:
-            self.seconds += duration
+            self.seconds += duration_secs

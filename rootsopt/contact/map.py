@@ -36,7 +36,7 @@ def _interpolation_matrix(count: int) -> NDArray[np.float64]:
     system[-1, -5:] = jump
     right = np.zeros((count + 2, count))
     right[1:-1] = np.eye(count)
-    return np.linalg.solve(system, right)
+    return np.asarray(np.linalg.solve(system, right), dtype=np.float64)
 
 
 def _weights(t):

@@ -7,7 +7,7 @@ NumPy and SciPy only; nothing here is differentiated.
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 Points = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ def signed_distance(nodes: Points, outline: Points, refine: bool = True) -> NDAr
     """
     corners = outline[:-1] if np.allclose(outline[0], outline[-1], atol=0) else outline
     count = len(corners)
-    nearest = cKDTree(corners).query(nodes)[1]
+    nearest = KDTree(corners).query(nodes)[1]
     best = np.full(len(nodes), np.inf)
     sign = np.ones(len(nodes))
     tangents = _tangents(corners) if refine else None

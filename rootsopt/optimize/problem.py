@@ -152,7 +152,7 @@ class Problem:
         by_design = np.zeros(3)
         for key, weight in self._weights().items():
             by_design += weight * np.array(list(evaluation.gradient[key].values()))
-        return by_design @ np.asarray(jacobian)
+        return np.asarray(by_design @ np.asarray(jacobian))
 
     def _weights(self) -> dict[str, float]:
         wanted = self.config.objective
@@ -175,7 +175,7 @@ class Problem:
 
         The result may still be infeasible where the constraints contradict the bounds.
         """
-        point = np.clip(np.asarray(point, dtype=float), 0.0, 1.0)
+        point = np.clip(np.asarray(point, dtype=np.float64), 0.0, 1.0)
         for _ in range(30):
             _, _, slack, jacobian = map(np.asarray, _look(self.space, jnp.asarray(point)))
             violated = slack < 0
@@ -188,7 +188,7 @@ class Problem:
             held = ((point <= 0) & (push < 0)) | ((point >= 1) & (push > 0))
             move = np.linalg.lstsq(np.where(held, 0.0, rows), want, rcond=1e-8)[0]
             point = np.clip(point + np.clip(move, -0.3, 0.3), 0.0, 1.0)
-        return point
+        return np.asarray(point, dtype=np.float64)
 
     def descent(self, point, slope: NDArray[np.float64]) -> NDArray[np.float64]:
         """The slope less what active constraints and box faces forbid.
@@ -203,10 +203,10 @@ class Problem:
         walls += [np.eye(3)[i] for i in range(3) if point[i] <= _ACTIVE]
         walls += [-np.eye(3)[i] for i in range(3) if point[i] >= 1 - _ACTIVE]
         if not walls:
-            return slope
+            return np.asarray(slope, dtype=np.float64)
         normals = np.stack(walls)
         multipliers, _ = nnls(normals.T, slope)
-        return slope - multipliers @ normals
+        return np.asarray(slope - multipliers @ normals, dtype=np.float64)
 
     def constraint_rows(self, optimized: Evaluation) -> list[dict]:
         """Every constraint with its values, for report and result file."""

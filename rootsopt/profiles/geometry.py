@@ -49,12 +49,14 @@ def geometry(profile: Profile) -> Geometry:
     sliding = r * jnp.sin(psi)
     speed = profile.dedendum_speed(nu)
     sides = ((s, profile.addendum_speed(nu)), (-s, speed))
-    area = sum(jnp.sum((sliding + s) * dl * weights) for s, dl in sides) / 2
-    moment = sum(
-        jnp.sum((r**2 + 2 * s * sliding + s**2) * (sliding + s) * dl * weights) for s, dl in sides
-    )
+    area = jnp.zeros_like(r)
+    moment = jnp.zeros_like(r)
+    for s, dl in sides:
+        area += jnp.sum((sliding + s) * dl * weights) / 2
+        radius_squared = r**2 + 2 * s * sliding + s**2
+        moment += jnp.sum(radius_squared * (sliding + s) * dl * weights) / 4
     flanks = 2 * profile.lobes
-    area, moment = flanks * area, flanks * moment / 4
+    area, moment = flanks * area, flanks * moment
     reach = profile.contact_distance(jnp.zeros_like(r))
     outer_radius = r + reach
     seal_angle = sum(2 * (s.stop - s.start) for s in segments if s.land)
