@@ -101,10 +101,10 @@ class SolverConfig(_Section):
         "map", description="contact: search at every call (reference) or C² map of the gap"
     )
     map_rolls: Annotated[int, Field(ge=16, le=4096)] = Field(
-        128, description="map points over the roll angle"
+        384, description="map points over the roll angle"
     )
     map_relatives: Annotated[int, Field(ge=12, le=1024)] = Field(
-        24, description="map points over the relative rotation"
+        16, description="map points over the relative rotation"
     )
     method: Literal["tsit5", "dopri5", "dopri8", "kvaerno3", "kvaerno5"] = Field(
         "tsit5", description="explicit: tsit5, dopri5, dopri8; implicit: kvaerno3, kvaerno5"

@@ -106,6 +106,7 @@ class Evaluator:
     def __init__(self, config: Config, rtol: float | None = None, survey: bool = False):
         self.config = config
         self.survey = survey
+        self.fitted = False
         limit = config.solver.max_mesh_periods
         self.max_periods = max(limit // 4, 2 * BLOCK) if survey else limit
         self.model = Model.of(config)
@@ -128,18 +129,30 @@ class Evaluator:
         """
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         began = time.perf_counter()
-        for _ in range(4):
+        for _ in range(5):
             outcome = self._attempt(design, start)
-            reached = outcome.reached
-            if self.model.fidelity != "map" or reached <= -float(self.model.deepest):
+            if not self._refit(outcome):
                 break
-            if not np.isfinite(reached):
-                break
-            # The motion left the contact map: make the map larger and begin again.
-            limit = float(outcome.pair.angle_limit)
-            deepest = -min(1.3 * reached, limit)
-            self.model = eqx.tree_at(lambda m: m.deepest, self.model, jnp.asarray(deepest))
         return self._report(design, outcome, time.perf_counter() - began, series)
+
+    def _refit(self, outcome: "_Outcome") -> bool:
+        """Fit the contact map to the motion; whether the design must be evaluated again.
+
+        A motion that left the map is not described by it; one that uses a small part of
+        it wastes its resolution (done once, so that neighbouring designs share a map).
+        """
+        reached, covered = outcome.reached, -float(self.model.deepest)
+        if self.model.fidelity != "map" or not np.isfinite(reached):
+            return False
+        wasteful = outcome.status is Status.PERIODIC and not self.fitted
+        if not (reached > covered or (wasteful and reached < 0.6 * covered)):
+            return False
+        self.fitted = True
+        deepest = -min(1.3 * reached, float(outcome.pair.angle_limit))
+        if deepest == -covered:
+            return False
+        self.model = eqx.tree_at(lambda m: m.deepest, self.model, jnp.asarray(deepest))
+        return True
 
     def _attempt(self, design, start):
         pair, tangents, shape = _build(self.model, design)

@@ -96,6 +96,7 @@ class Search:
         baseline = self.exact()
         if not baseline.usable:
             return Optimization(None, baseline, None, [], {})  # type: ignore[arg-type]
+        self.fast.model, self.fast.fitted = self.exact.model, True
         self.problem = Problem.of(self.config, self.exact.model, baseline)
         start = np.asarray(self.problem.space.point(jnp.asarray(list(baseline.design.values()))))
         for number, point in enumerate(self._starts(start)):
