@@ -648,3 +648,26 @@ def test_timing_gear_is_odd_and_rounded():
     bend = 4 * 2e4 / 3e-6 + 6 * 1.7 * 0.4 / 3e-6**2
     assert np.abs(np.diff(slope)).max() < 1.1 * bend * 1e-9
     assert np.abs(np.diff(torque)).max() < 1.1 * np.abs(slope).max() * 1e-9
+
+
+def test_no_root_is_lost_on_a_node():
+    """A root of T on a search node is found in compiled programs too: one lost grid point
+    put a spike of 2000 N into the force of this design (u near its least)."""
+    deepest = -0.00859830772827668
+    first = -2 * np.sqrt(-deepest) - 0.02
+    step = (np.pi / 6 - first) / 124
+    roll = first + step * jnp.arange(128)
+    relative = deepest - deepest / 20 * jnp.arange(24)
+    flank = np.asarray(roll) > 0.2
+    design = jnp.asarray([27.305899038181646, 0.7591908244251282, 1.267598407749901])
+
+    @jax.jit
+    def table(design):
+        angle, length, tip = design
+        profile = CIC(3, jnp.asarray(0.033), angle * np.pi / 180, length * 1e-3, tip * np.pi / 180)
+        pair = FlankPair.of(profile)
+        return jax.vmap(lambda x: jax.vmap(lambda e: pair(x, e))(relative))(roll)
+
+    contact = table(design)
+    assert np.all(np.asarray(contact.found)[flank])
+    assert np.max(np.asarray(contact.gap)[flank][:, relative <= 0]) < 1e-12
