@@ -193,12 +193,12 @@ class Evaluator:
 
     @staticmethod
     def _transient_status(transient: Transient) -> Status | None:
+        if not bool(transient.solved):
+            return Status.SOLVER_FAILED
         if not bool(jnp.all(jnp.isfinite(transient.state))):
             return Status.NON_FINITE
         if bool(transient.lost):
             return Status.PASSED_THROUGH
-        if not bool(transient.solved):
-            return Status.SOLVER_FAILED
         return None if int(transient.period) > 0 else Status.NOT_SETTLED
 
     def _orbit_status(self, orbit: Orbit, transient: Transient, tolerance: float) -> Status:
@@ -239,10 +239,10 @@ class Evaluator:
                 "newton_steps": int(orbit.newton_steps),
                 "orbit_steps": int(orbit.flow.steps),
             }
-            if with_series:
-                series = _orbit_series(pair, orbit, period)
-                if series.depth.max() > _TOO_DEEP * float(self.model.pitch_radius):
-                    status = Status.TOO_DEEP
+            motion = _orbit_series(pair, orbit, period)
+            series = motion if with_series else None
+            if motion.depth.max() > _TOO_DEEP * float(self.model.pitch_radius):
+                status = Status.TOO_DEEP
         elif status is Status.NOT_SETTLED and not self.survey:
             window = _lyapunov(pair, outcome.transient.state, _CHAOS_WINDOW, self.transient)
             status, steady, response, series = _unsettled(pair, window, with_series)

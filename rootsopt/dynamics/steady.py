@@ -94,8 +94,9 @@ def settle(
         return jnp.where(jnp.any(settled), orders[jnp.argmax(settled)], 0)
 
     def go_on(carry):
-        _, period, periods, lost, solved, _ = carry
-        return (period == 0) & ~lost & solved & (periods < max_periods)
+        state, period, periods, lost, solved, _ = carry
+        alive = ~lost & solved & jnp.all(jnp.isfinite(state))
+        return (period == 0) & alive & (periods < max_periods)
 
     def advance(carry):
         state, _, periods, _, _, steps = carry
@@ -103,9 +104,9 @@ def settle(
         end = part.states[-1]
         relative = pair.angle_scale * end[0]
         lost = jnp.abs(relative) >= pair.angle_limit
-        solved = part.solved & jnp.all(jnp.isfinite(end))
-        period = jnp.where(lost | ~solved, 0, cycle(part.states))
-        return Transient(end, period, periods + BLOCK, lost, solved, steps + part.steps)
+        sound = part.solved & ~lost & jnp.all(jnp.isfinite(end))
+        period = jnp.where(sound, cycle(part.states), 0)
+        return Transient(end, period, periods + BLOCK, lost, part.solved, steps + part.steps)
 
     zero = jnp.zeros((), int)
     no, yes = jnp.zeros((), bool), jnp.ones((), bool)
