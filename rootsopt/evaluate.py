@@ -17,6 +17,7 @@ from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import (
     BLOCK,
+    SAMPLES,
     Orbit,
     Transient,
     close_orbit,
@@ -32,7 +33,8 @@ from rootsopt.status import Status
 
 RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 _SETTLED = 3e-3
-_SAME = 1e-4
+_NEARLY = 0.05
+_RESIDUAL = 1e-9
 _CHAOS_WINDOW = 128
 _THINNING = 6
 _TOO_DEEP = 0.02
@@ -73,7 +75,7 @@ class Evaluation:
     steady_state: dict[str, Any]
     status: Status
     message: str
-    statistics: dict[str, float]
+    statistics: dict[str, int | float]
     series: Series | None
     state: NDArray[np.float64] | None = None
 
@@ -157,39 +159,53 @@ class Evaluator:
     def _attempt(self, design, start):
         pair, tangents, shape = _build(self.model, design)
         state = jnp.zeros(2) if start is None else jnp.asarray(start)
-        solver = self.config.solver
-        used, steps, tolerance = 0, 0, _SETTLED
+        how, tolerance, used, steps = self.transient, _SETTLED, 0, 0
         while True:
-            remaining = jnp.asarray(self.max_periods - used)
             transient = _settle(
                 pair,
                 state,
-                self.transient,
+                how,
                 jnp.asarray(tolerance),
-                remaining,
-                solver.max_orbit_periods,
+                jnp.asarray(self.max_periods - used),
+                self.config.solver.max_orbit_periods,
             )
             used += int(transient.periods)
             steps += int(transient.steps)
             state = transient.state
             orbit, status = None, self._transient_status(transient)
-            if status is not None:
+            if status is Status.NOT_SETTLED and float(transient.spread) < _NEARLY:
+                # Time is out, but the motion nearly repeats: noise of the coarse transient
+                # may be all that is left. Newton's method tells.
+                tolerance = float(transient.spread)
+                transient = transient._replace(period=transient.nearest)
+            elif status is not None:
                 break
-            orbit = _close(pair, tangents, len(self.keys), state, transient.period, self.orbit)
-            shorter = _true_period(orbit, int(transient.period))
-            if shorter < int(transient.period):
-                transient = transient._replace(period=jnp.asarray(shorter))
-                orbit = _close(
-                    pair, tangents, len(self.keys), orbit.state, transient.period, self.orbit
-                )
-            status = self._orbit_status(orbit, transient, tolerance)
+            transient, orbit, status = self._close(pair, tangents, transient, tolerance)
             steps += int(orbit.flow.steps)
             if status is not Status.NOT_SETTLED or used >= self.max_periods:
                 break
             # Newton left the neighbourhood or found an unstable orbit: it was not the
-            # steady state yet. Go on, and look more closely next time.
+            # steady state yet, or too coarse an image of it. Go on, and look more closely.
             tolerance /= 10
+            how = dataclasses.replace(how, rtol=jnp.maximum(how.rtol / 10, self.orbit.rtol))
         return _Outcome(pair, shape, transient, orbit, status, used, steps)
+
+    def _close(self, pair, tangents, transient: Transient, tolerance: float):
+        """Orbit the transient leads to, of the least period, and its status."""
+        orbit = _close(pair, tangents, transient.state, transient.period, self.orbit)
+        status = self._orbit_status(orbit, transient, tolerance)
+        if status is not Status.PERIODIC:
+            return transient, orbit, status
+        # Noise of the transient can hide that a motion repeats sooner.
+        for shorter in _divisors(int(transient.period)):
+            again = np.asarray(orbit.flow.states)[shorter * SAMPLES // int(transient.period)]
+            if np.max(np.abs(again - np.asarray(orbit.state))) < _NEARLY:
+                period = jnp.asarray(shorter)
+                simpler = _close(pair, tangents, orbit.state, period, self.orbit)
+                reduced = transient._replace(period=period, state=orbit.state)
+                if self._orbit_status(simpler, reduced, tolerance) is Status.PERIODIC:
+                    return reduced, simpler, Status.PERIODIC
+        return transient, orbit, status
 
     @staticmethod
     def _transient_status(transient: Transient) -> Status | None:
@@ -210,7 +226,7 @@ class Evaluator:
         multiplier = float(jnp.max(floquet(orbit.monodromy)))
         near = tolerance / max(1 - multiplier, 1e-3) * 10 + 100 * float(self.transient.rtol)
         moved = float(jnp.max(jnp.abs(orbit.state - transient.state)))
-        closed = float(orbit.residual) <= max(1e-9, 1e3 * float(self.orbit.rtol))
+        closed = float(orbit.residual) <= _RESIDUAL
         stable = multiplier < 1
         return Status.PERIODIC if closed and stable and moved <= near else Status.NOT_SETTLED
 
@@ -220,7 +236,7 @@ class Evaluator:
         gradient: dict[str, dict[str, float]] = {}
         steady: dict[str, Any] = {"kind": "transient"}
         series, state = None, None
-        statistics: dict[str, float] = {
+        statistics: dict[str, int | float] = {
             "transient_mesh_periods": outcome.used,
             "solver_steps": outcome.steps,
         }
@@ -267,7 +283,7 @@ class Evaluator:
             return {}
         sensitivity = orbit.sensitivity
         if self.config.solver.gradient == "reverse":
-            sensitivity = _reverse(self.model, design, orbit.state, jnp.asarray(period), self.orbit)
+            sensitivity = _reverse(self.model, design, orbit, jnp.asarray(period), self.orbit)
         mean, square, peak = np.asarray(sensitivity)
         rms = square / (2 * np.sqrt(max(float(orbit.response[1]), 1e-300)))
         rows = zip(RESPONSES, (mean, peak, rms), strict=True)
@@ -344,25 +360,18 @@ _settle = eqx.filter_jit(settle)
 _lyapunov = eqx.filter_jit(lyapunov)
 
 
-@eqx.filter_jit
-def _close(pair, tangents, directions, state, period, how: Integrator) -> Orbit:
-    return close_orbit(pair, tangents, directions, state, period, how, 1e-10)
+_close = eqx.filter_jit(close_orbit)
 
 
-def _true_period(orbit: Orbit, period: int) -> int:
-    """Smallest period of a closed orbit: solver noise can hide that it repeats sooner."""
-    states = np.asarray(orbit.flow.states)
-    for shorter in range(1, period):
-        if period % shorter == 0:
-            again = states[shorter * len(states) // period]
-            if np.max(np.abs(again - states[0])) < _SAME:
-                return shorter
-    return period
+def _divisors(period: int) -> list[int]:
+    """Proper divisors, ascending."""
+    return [k for k in range(1, period) if period % k == 0]
 
 
 @eqx.filter_jit
-def _reverse(model: Model, design, state, period, how: Integrator):
-    return reverse_sensitivity(model.pair, design, state, period, how)
+def _reverse(model: Model, design, orbit: Orbit, period, how: Integrator):
+    grid = orbit.flow.grid
+    return reverse_sensitivity(model.pair, design, orbit.state, period, how, grid)
 
 
 @eqx.filter_jit

@@ -90,12 +90,12 @@ def _circle(ax, center, radius, label=None):
 
 
 def plot_meshing(
-    axes: Sequence[Axes],
+    axes: Sequence[Axes] | NDArray,
     outline_mm: NDArray[np.float64],
     lobes: int,
     pitch_radius_mm: float,
-    angles_deg: Sequence[float],
-) -> Sequence[Axes]:
+    angles_deg: Sequence[float] | NDArray[np.float64],
+) -> Sequence[Axes] | NDArray:
     """The meshing pair at several angles of rotor 1, one panel each."""
     center = 2 * pitch_radius_mm
     for ax, angle in zip(axes, angles_deg, strict=True):
@@ -114,10 +114,10 @@ def plot_meshing(
 
 
 def plot_force(
-    axes: Sequence[Axes],
+    axes: Sequence[Axes] | NDArray,
     series: Mapping[str, Series],
     responses: Mapping[str, Mapping[str, float]],
-) -> Sequence[Axes]:
+) -> Sequence[Axes] | NDArray:
     """Contact force over time, one panel per design, all on one scale.
 
     Mean and peak are the given responses (`mean_force_N`, `peak_force_N`), which are finer
@@ -186,11 +186,11 @@ def amplitude_spectrum(
 
 
 def plot_spectrum(
-    axes: Sequence[Axes],
+    axes: Sequence[Axes] | NDArray,
     series: Mapping[str, Series],
     mesh_frequency_Hz: float,
     harmonics: int = 40,
-) -> Sequence[Axes]:
+) -> Sequence[Axes] | NDArray:
     """Amplitude spectrum of the contact force, one panel per design, all on one scale.
 
     Up to `harmonics` times the mesh frequency; the mean (0 Hz) is left out.
@@ -225,7 +225,9 @@ def plot_spectrum(
     return axes
 
 
-def plot_history(axes: Sequence[Axes], history: Sequence[Mapping[str, Any]]) -> Sequence[Axes]:
+def plot_history(
+    axes: Sequence[Axes] | NDArray, history: Sequence[Mapping[str, Any]]
+) -> Sequence[Axes] | NDArray:
     """Objective with best so far, then the design parameters, over the evaluations.
 
     `axes` holds four panels. A row without `start`, or with a negative one, belongs to the

@@ -267,7 +267,7 @@ def run_strobe(pair, state, periods, how):
 
 @eqx.filter_jit
 def run_flow(pair, state, how):
-    return flow(pair, state, jnp.asarray(1.0), how, 2520, ADJOINT)
+    return flow(pair, state, jnp.asarray(1.0), how, 2520)
 
 
 def statistics(out):

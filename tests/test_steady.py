@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rootsopt.config import load
-from rootsopt.dynamics.flow import Integrator, flow, strobe
+from rootsopt.dynamics.flow import Directions, Integrator, flow, strobe
 from rootsopt.dynamics.steady import floquet
 from rootsopt.evaluate import RESPONSES, Evaluator, evaluate
 from rootsopt.model import DESIGN_KEYS
@@ -240,50 +240,67 @@ def test_forward_and_reverse_gradients_agree(settled):
     assert settled["periodic"].gradient
 
 
-class FixedSteps(Integrator):
-    """A thousand equal steps a mesh period."""
-
-    @property
-    def controller(self):
-        return diffrax.ConstantStepSize()
-
-
 def test_both_modes_differentiate_the_same_motion(sharp, orbits):
     """On one sequence of steps w·(J v) is (w·J) v to rounding, search contact included.
 
-    On adaptive steps the two programs may round differently, take other steps, and then
-    differ by the error of the derivative itself (1e-3 at rtol 1e-8, 1e-5 at 1e-12).
+    J v is the variational equation on the orbit's steps, w·J diffrax's adjoint.
     """
-    state = jnp.asarray(orbits["paper"][1].state)
-    how = FixedSteps("tsit5", jnp.asarray(1e-8), 2048)
-
-    def outcome(adjoint):
-        def run(state, design):
-            out = flow(sharp.model.pair(design), state, jnp.asarray(1.0), how, 64, adjoint)
-            return jnp.concatenate([out.end, jnp.stack([out.mean, out.mean_square, out.peak])])
-
-        return run
-
-    at = state, jnp.array(DESIGNS["paper"])
+    evaluation = orbits["paper"][1]
+    state, design = jnp.asarray(evaluation.state), jnp.array(DESIGNS["paper"])
+    how, one = integrator(1e-8), jnp.asarray(1.0)
+    rng = np.random.default_rng(5)
+    along_state, along_design = (jnp.asarray(rng.normal(size=(4, n))) for n in (2, 3))
+    grid = jax.jit(lambda: flow(sharp.model.pair(design), state, one, how, 64).grid)()
 
     @jax.jit
-    def forward(tangent):
-        return jax.jvp(outcome(diffrax.ForwardMode()), at, tangent)
+    def forward():
+        moving = jax.vmap(lambda t: jax.jvp(sharp.model.pair, (design,), (t,))[1])(along_design)
+        pair = sharp.model.pair(design)
+        out = flow(pair, state, one, how, 64, Directions(along_state, moving), grid)
+        return jnp.concatenate([out.end, out.response]), out.slope
 
     @jax.jit
     def reverse(weight):
-        value, pull = jax.vjp(outcome(diffrax.RecursiveCheckpointAdjoint()), *at)
+        def run(state, design):
+            adjoint = diffrax.RecursiveCheckpointAdjoint()
+            out = flow(sharp.model.pair(design), state, one, how, 64, grid=grid, adjoint=adjoint)
+            return jnp.concatenate([out.end, out.response])
+
+        value, pull = jax.vjp(run, state, design)
         return value, pull(weight)
 
-    rng = np.random.default_rng(5)
-    for weight in np.eye(5):
-        tangent = tuple(jnp.asarray(rng.normal(size=n)) for n in (2, 3))
-        value, moved = forward(tangent)
+    value, moved = forward()
+    for row, weight in enumerate(np.eye(5)):
         same, pulled = reverse(jnp.asarray(weight))
         np.testing.assert_allclose(value, same, rtol=1e-12)
-        terms = np.concatenate([np.asarray(p) * t for p, t in zip(pulled, tangent, strict=True)])
+        terms = np.concatenate(
+            [np.asarray(p) * t for p, t in zip(pulled, (along_state, along_design), strict=True)],
+            axis=1,
+        )
         assert np.max(np.abs(terms)) > 0
-        assert weight @ moved == pytest.approx(np.sum(terms), abs=1e-8 * np.sum(np.abs(terms)))
+        np.testing.assert_allclose(
+            moved[row], terms.sum(axis=1), rtol=1e-8, atol=1e-8 * np.max(np.abs(terms))
+        )
+
+
+def test_recorded_steps_give_the_same_motion(sharp, orbits):
+    """Repeating the recorded steps changes nothing, and on them central differences of the
+    flow are its slope down to small steps, which adaptive steps would drown in noise."""
+    evaluation = orbits["shorter involute"][1]
+    state = jnp.asarray(evaluation.state)
+    pair = pair_of(sharp.model, jnp.array(DESIGNS["shorter involute"]))
+    how, one = integrator(1e-8), jnp.asarray(1.0)
+    still = jax.tree.map(lambda x: jnp.zeros((2, *x.shape)), eqx.filter(pair, eqx.is_inexact_array))
+    directions = Directions(jnp.eye(2), eqx.combine(still, pair))
+    once = eqx.filter_jit(lambda y: flow(pair, y, one, how, 64, directions))(state)
+    again = eqx.filter_jit(lambda y: flow(pair, y, one, how, 64, directions, once.grid))
+    np.testing.assert_allclose(again(state).response, once.response, rtol=1e-12)
+    np.testing.assert_allclose(again(state).slope, once.slope, rtol=1e-9)
+    for step in (1e-4, 1e-5, 1e-6):
+        ends = [again(state.at[1].add(sign * step)).end for sign in (1, -1)]
+        difference = (ends[0] - ends[1]) / (2 * step)
+        # Rounding of the search, some 1e-13, over the step; 1e-8 of step noise would give 1e-2.
+        np.testing.assert_allclose(difference, once.slope[:2, 1], atol=1e-6)
 
 
 # Statuses
@@ -292,6 +309,11 @@ def test_both_modes_differentiate_the_same_motion(sharp, orbits):
 SCENES = {
     "periodic": config_of(),
     "epicycloid": config_of(path="configs/ee.yaml"),
+    "doubled": config_of(
+        *gear(backlash=0.2, damping=0.2, load=4.775, speed=4000), "solver.fidelity=search"
+    ),
+    "tripled": config_of(*gear(backlash=0.1, damping=0.05, load=2.0, speed=6000)),
+    "noisy": config_of(*gear(backlash=0.1, damping=0.05, load=4.775, speed=6000)),
     "chaotic": config_of(*gear(backlash=0.2, damping=0.0, load=1.0)),
     "impatient": config_of(
         *gear(backlash=0.05, damping=0.05, load=1.0), "solver.max_mesh_periods=16"
@@ -303,6 +325,9 @@ SCENES = {
 OUTCOMES = {
     "periodic": {Status.PERIODIC},
     "epicycloid": {Status.PERIODIC},
+    "doubled": {Status.PERIODIC},
+    "tripled": {Status.PERIODIC},
+    "noisy": {Status.PERIODIC},
     "chaotic": {Status.CHAOTIC},
     "impatient": {Status.NOT_SETTLED},
     "no gear": {Status.PASSED_THROUGH},
@@ -370,6 +395,36 @@ def test_chaos_has_a_positive_exponent_and_no_gradient(settled):
     ends = np.asarray(run_strobe(pair, starts, 60, integrator(1e-12)))
     apart = np.linalg.norm(ends[0] - ends[1], axis=1)
     assert np.max(apart) > 1e-2
+
+
+@pytest.mark.parametrize(("name", "period"), [("doubled", 2), ("tripled", 3), ("noisy", 1)])
+def test_the_least_period_is_named(settled, name, period):
+    """Period k: neighbouring mesh periods differ, and the motion repeats after k of them.
+
+    In the noisy scene the transient, at its coarser tolerance, never repeats to the
+    settling threshold, and first seems to repeat after four periods.
+    """
+    evaluation = settled[name]
+    assert evaluation.steady_state["period"] == period
+    assert evaluation.steady_state["residual"] < 1e-12
+    assert evaluation.gradient
+    series = evaluation.series
+    per_mesh = len(series.force) // (-(-3 // period) * period)
+    force = series.force.reshape(-1, per_mesh)
+    changes = [np.max(np.abs(force[k] - force[0])) for k in range(1, len(force))]
+    peak = evaluation.response["peak_force_N"]
+    for k, change in enumerate(changes, start=1):
+        assert (change < 1e-6 * peak) if k % period == 0 else (change > 1e-2 * peak)
+
+
+def test_period_doubled_orbit_agrees_with_plain_motion(settled):
+    """The closed period-2 orbit is where a long tight integration from rest ends up."""
+    evaluation = settled["doubled"]
+    evaluator = Evaluator(SCENES["doubled"])
+    pair = pair_of(evaluator.model, jnp.array(list(evaluation.design.values())))
+    states = run_strobe(pair, jnp.zeros((1, 2)), 200, integrator(1e-10))[0][-2:]
+    nearest = np.min(np.max(np.abs(states - evaluation.state), axis=1))
+    assert nearest < 1e-3
 
 
 def test_more_time_settles_an_impatient_scene():

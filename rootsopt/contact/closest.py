@@ -18,6 +18,9 @@ it cannot be lost where curvature jumps or the flanks conform. A root at which T
 with growing ν2 is a minimum of the gap. By the envelope theorem
 ∂G/∂φ1 = -q1 and ∂G/∂φ2 = q2, which is also the virtual work of a unit contact force.
 
+Bracketing on all nodes needs no trigonometric function per node and pose: the pose turns
+every node by the same angle, so sines and cosines follow by the addition theorem.
+
 Exchanging the rotors maps x to π/N - x, so only the half with rotor 1's addendum in
 rotor 2's dedendum is searched. Coast flanks follow from mirror symmetry, x → -x, ε → -ε.
 """
@@ -27,6 +30,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -37,6 +41,8 @@ _NODES_PER_SEGMENT = 32
 # Illinois steps inside the bracket (T has a kink there when ν1 crosses a segment's end,
 # so plain Newton is not safe), before one Newton step. The tests measure the error.
 _REFINEMENTS = 5
+# Rounding of T relative to the pitch radius, by bytes of a number.
+_SLACK = {8: 1e-13, 4: 1e-6}
 
 
 class ClosestApproach(NamedTuple):
@@ -57,10 +63,17 @@ class ClosestApproach(NamedTuple):
 
 
 class FlankNodes(NamedTuple):
-    """Where T is sampled: normal angles ν2 with what does not depend on the pose."""
+    """Where T is sampled: normal angles ν2 with what does not depend on the pose.
+
+    `facing` is the direction of the common normal at x = 0, `direction` its cosine and
+    sine; `turned` the cosine and sine of `Profile.turn_ratio` times it; `lever` and
+    `support` those of rotor 2's point.
+    """
 
     normal: Float[Array, " n"]
     facing: Float[Array, " n"]
+    direction: Float[Array, "2 n"]
+    turned: Float[Array, "2 n"]
     lever: Float[Array, " n"]
     support: Float[Array, " n"]
 
@@ -68,16 +81,20 @@ class FlankNodes(NamedTuple):
 class FlankPair(eqx.Module):
     """A flank of rotor 1 against its mate on rotor 2.
 
-    `profile`: both rotors' profile; `nodes`: see `FlankNodes`. Build it with
-    `FlankPair.of(profile)` outside any time loop.
+    `profile`: both rotors' profile; `nodes`: see `FlankNodes`; `center_distance` E (m).
+    Build it with `FlankPair.of(profile)` outside any time loop.
     """
 
     profile: Profile
     nodes: FlankNodes
+    center_distance: Float[Array, ""]
 
     @classmethod
-    def of(cls, profile: Profile) -> "FlankPair":
-        """Prepare the search for `profile`; the nodes carry no derivative."""
+    def of(cls, profile: Profile, center_distance: Float[Array, ""] | None = None) -> "FlankPair":
+        """Prepare the search for `profile`; the nodes carry no derivative.
+
+        `center_distance` (m) is by default that of perfect rolling, 2r.
+        """
         frozen = lax.stop_gradient(profile)
         segments = [s for s in frozen.segments() if not s.land]
         fraction = jnp.arange(_NODES_PER_SEGMENT) / _NODES_PER_SEGMENT
@@ -99,36 +116,92 @@ class FlankPair(eqx.Module):
         beta, psi, s = _mate_point(frozen, normal)
         arm = frozen.pitch_radius * jnp.stack([jnp.cos(psi), jnp.sin(psi)])
         facing = jnp.pi / 2 - psi - beta
-        return cls(profile, FlankNodes(normal, facing, arm[0], arm[1] + s))
+        nodes = FlankNodes(
+            normal=normal,
+            facing=facing,
+            direction=_circle(facing),
+            turned=_circle(frozen.turn_ratio * facing),
+            lever=arm[0],
+            support=arm[1] + s,
+        )
+        # Else the compiler merges this with its use and does it anew at every pose.
+        nodes = lax.optimization_barrier(lax.stop_gradient(nodes))
+        nominal = 2 * profile.pitch_radius
+        return cls(profile, nodes, nominal if center_distance is None else center_distance)
 
     def __call__(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> ClosestApproach:
         """Closest approach at roll coordinate x = `roll` and ε = `relative` (rad).
 
         `roll` is reduced to one mesh period around the middle of the flank, so any angle
-        may be given. Differentiable to first order in both and in the profile; the
-        search itself is never differentiated.
+        may be given. Differentiable to any order in both, in the profile and in the
+        centre distance; the search itself is never differentiated.
         """
         half = self.profile.half_pitch
         centered = roll - half
         centered = centered - 4 * half * jnp.round(centered / (4 * half))
         mirrored = centered > 0
-        folded = half - jnp.abs(centered)
-        found, normal2, slope = lax.stop_gradient(self._search(folded, relative))
-        # One Newton step with a frozen slope: the exact derivative of ν2, and the last
-        # digits of its value. The gap needs neither (envelope theorem).
-        polished = normal2 - self._offset(normal2, folded, relative) / slope
-        gap, normal1, _, _ = self._mesh(normal2, folded, relative)
-        _, _, lever1, lever2 = self._mesh(polished, folded, relative)
-        far = self.profile.pitch_radius
-        zero = jnp.zeros_like(gap)
-        return ClosestApproach(
-            gap=jnp.where(found, gap, lax.stop_gradient(far)),
-            lever1=jnp.where(found, jnp.where(mirrored, lever2, lever1), zero),
-            lever2=jnp.where(found, jnp.where(mirrored, lever1, lever2), zero),
-            normal1=lax.stop_gradient(normal1),
-            normal2=lax.stop_gradient(polished),
-            found=found,
+        found = self._closest(half - jnp.abs(centered), relative)
+        lever1, lever2 = found.lever1, found.lever2
+        return found._replace(
+            lever1=jnp.where(mirrored, lever2, lever1), lever2=jnp.where(mirrored, lever1, lever2)
         )
+
+    def _closest(self, roll, relative) -> ClosestApproach:
+        """Closest approach for a folded `roll`, with its derivatives.
+
+        With θ the pose and the design, dG = ∂G/∂θ dθ at the root held fixed (envelope
+        theorem) and dν2 = -(∂T/∂θ dθ) / (∂T/∂ν2) (implicit function theorem). The rule is
+        itself differentiable, so second derivatives are those of the true gap.
+        """
+        dynamic, static = eqx.partition(self, eqx.is_inexact_array)
+
+        @jax.custom_jvp
+        def closest(dynamic, roll, relative):
+            pair = eqx.combine(dynamic, static)
+            found, normal2 = pair._search(roll, relative)
+            gap, normal1, lever1, lever2 = pair._mesh(normal2, roll, relative)
+            zero = jnp.zeros_like(gap)
+            return ClosestApproach(
+                gap=jnp.where(found, gap, pair.profile.pitch_radius),
+                lever1=jnp.where(found, lever1, zero),
+                lever2=jnp.where(found, lever2, zero),
+                normal1=normal1,
+                normal2=normal2,
+                found=found,
+            )
+
+        @closest.defjvp
+        def _(primals, tangents):
+            found = closest(*primals)
+
+            def offset(dynamic, normal2, roll, relative):
+                return eqx.combine(dynamic, static)._offset(normal2, roll, relative)
+
+            def mesh(dynamic, normal2, roll, relative):
+                return eqx.combine(dynamic, static)._mesh(normal2, roll, relative)
+
+            dynamic, *pose = primals
+            by_dynamic, *by_pose = tangents
+            at = dynamic, found.normal2, *pose
+            still, unit = jnp.zeros_like(found.normal2), jnp.ones_like(found.normal2)
+            _, slope = jax.jvp(lambda nu: offset(dynamic, nu, *pose), (found.normal2,), (unit,))
+            _, moved = jax.jvp(offset, at, (by_dynamic, still, *by_pose))
+            # At a point that is no minimum (no root, or flat conformity) it stays put.
+            normal2_dot = jnp.where(slope < 0, -moved / jnp.where(slope < 0, slope, -1.0), 0.0)
+            _, (gap_dot, *_) = jax.jvp(mesh, at, (by_dynamic, still, *by_pose))
+            _, (_, *rest) = jax.jvp(mesh, at, (by_dynamic, normal2_dot, *by_pose))
+            normal1_dot, lever1_dot, lever2_dot = rest
+            here = found.found
+            return found, ClosestApproach(
+                gap=jnp.where(here, gap_dot, still),
+                lever1=jnp.where(here, lever1_dot, still),
+                lever2=jnp.where(here, lever2_dot, still),
+                normal1=normal1_dot,
+                normal2=normal2_dot,
+                found=np.zeros(here.shape, jax.dtypes.float0),  # pyright: ignore[reportArgumentType]
+            )
+
+        return closest(dynamic, roll, relative)
 
     def _mesh(self, normal2, roll, relative):
         """G, ν1, q1, q2 at `normal2`, from the definition."""
@@ -138,47 +211,60 @@ class FlankPair(eqx.Module):
         facing = jnp.pi / 2 - psi - beta
         normal1 = facing + 2 * roll
         support = profile.support(normal1) + r * jnp.sin(psi) + s2
-        gap = 2 * r * jnp.cos(facing + roll - relative / 2) - support
+        gap = self.center_distance * jnp.cos(facing + roll - relative / 2) - support
         return gap, normal1, profile.lever(normal1), r * jnp.cos(psi)
 
     def _offset(self, normal2, roll, relative):
         """T alone, with as little work as possible."""
         beta, psi, _ = _mate_point(self.profile, normal2, distance=False)
         facing = jnp.pi / 2 - psi - beta
-        reach = 2 * self.profile.pitch_radius * jnp.sin(facing + roll - relative / 2)
+        reach = self.center_distance * jnp.sin(facing + roll - relative / 2)
         arms = self.profile.lever(facing + 2 * roll) + self.profile.pitch_radius * jnp.cos(psi)
         return reach - arms
 
     def _search(self, roll, relative):
-        """Bracket on the nodes, a secant and a Newton step: (found, ν2, dT/dν2)."""
-        frozen, roll, relative = lax.stop_gradient((self, roll, relative))
-        profile, nodes = frozen.profile, frozen.nodes
-        normal1 = nodes.facing + 2 * roll
-        turn = nodes.facing + roll - relative / 2
-        reach = 2 * profile.pitch_radius
-        offset = reach * jnp.sin(turn) - profile.lever(normal1) - nodes.lever
-        gap = reach * jnp.cos(turn) - profile.support(normal1) - nodes.support
+        """Bracket on the nodes, refine inside, one Newton step: (found, ν2)."""
+        profile, nodes = self.profile, self.nodes
+        ratio = profile.turn_ratio
+        turned = _rotate(nodes.turned, 2 * ratio * roll)
+        lever1, support1 = profile.arms(nodes.facing + 2 * roll, turned[0], turned[1])
+        cos, sin = _rotate(nodes.direction, roll - relative / 2)
+        offset = self.center_distance * sin - lever1 - nodes.lever
+        gap = self.center_distance * cos - support1 - nodes.support
         # Where T falls through zero the gap has a minimum. A second one occurs near the
         # pitch point of EE and at penetrations far beyond the contact law: the deeper
         # counts, judged by dG/dλ = T, T being linear between nodes.
         # The tolerance is for a root on a node: a compiled program may round T[i] one way
         # as the end of one interval and another way as the start of the next.
-        slack = 1e-13 * profile.pitch_radius
+        slack = _SLACK[offset.dtype.itemsize] * profile.pitch_radius
         falling = (offset[:-1] >= -slack) & (offset[1:] < slack)
         fall = offset[:-1] - offset[1:]
         share = jnp.clip(offset[:-1] / jnp.where(fall > 0, fall, 1.0), 0.0, 1.0)
         drop = 0.5 * offset[:-1] * share * (nodes.facing[:-1] - nodes.facing[1:])
-        index = jnp.argmin(jnp.where(falling, gap[:-1] + drop, jnp.inf))
-        low, high = nodes.normal[index], nodes.normal[index + 1]
+        depth = jnp.where(falling, gap[:-1] + drop, jnp.inf)
+        first = jnp.argmin(depth)
+        normal2 = self._refine(first, offset, roll, relative)
+        if profile.minima == 1:
+            return falling[first], normal2
+        # Two minima may be closer in depth than the estimate between nodes is good.
+        second = jnp.argmin(depth.at[first].set(jnp.inf))
+        other = self._refine(second, offset, roll, relative)
+        deeper = self._mesh(other, roll, relative)[0] < self._mesh(normal2, roll, relative)[0]
+        return falling[first], jnp.where(deeper & falling[second], other, normal2)
+
+    def _refine(self, index, offset, roll, relative):
+        """Root of T between the nodes `index` and `index` + 1."""
+        normal = self.nodes.normal
         best = _illinois(
-            lambda nu: frozen._offset(nu, roll, relative),
-            (low, high, offset[index], offset[index + 1]),
+            lambda nu: self._offset(nu, roll, relative),
+            (normal[index], normal[index + 1], offset[index], offset[index + 1]),
         )
-        _, slope = jax.jvp(
-            lambda nu: frozen._offset(nu, roll, relative), (best,), (jnp.ones_like(best),)
+        value, slope = jax.jvp(
+            lambda nu: self._offset(nu, roll, relative), (best,), (jnp.ones_like(best),)
         )
-        # No step from a point that is no minimum (no root found, or flat conformity).
-        return falling[index], best, jnp.where(slope < 0, slope, -jnp.inf)
+        polished = best - value / jnp.where(slope < 0, slope, -jnp.inf)
+        # A kink of T inside the bracket can throw the step out of it.
+        return jnp.clip(polished, normal[index], normal[index + 1])
 
 
 def _illinois(function, bracket):
@@ -201,6 +287,17 @@ def _illinois(function, bracket):
         low, high = jnp.where(above, middle, low), jnp.where(above, high, middle)
         side = jnp.where(above, 1.0, -1.0)
     return secant()
+
+
+def _circle(angle):
+    """Cosine and sine, stacked."""
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+
+
+def _rotate(directions, angle):
+    """Cosines and sines (2, n) of angles turned by one common `angle`."""
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return cos * directions[0] - sin * directions[1], cos * directions[1] + sin * directions[0]
 
 
 def _mate_point(profile, normal, distance=True):

@@ -44,7 +44,9 @@ class ImpactLaw(eqx.Module):
     full_damping_depth: Float[Array, ""]
     smoothing: Float[Array, ""]
 
-    def __call__(self, depth: Float[Array, "*n"], rate: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    def __call__(
+        self, depth: Float[Array, "*n"], rate: Float[Array, "*#n"] | float
+    ) -> Float[Array, "*n"]:
         """Normal force (N), ≥ 0, for penetration `depth` (m) growing at `rate` (m/s)."""
         delta = ramp(depth, self.smoothing)
         positive = delta > 0

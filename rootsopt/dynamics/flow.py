@@ -6,6 +6,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -57,18 +58,86 @@ class Flow(NamedTuple):
     """One stretch of motion over `periods` mesh periods.
 
     `end`: final state; `mean`, `mean_square`, `peak` of the contact force (N, N², N);
-    `peak_time` (mesh periods); `states` at uniform times, endpoint excluded;
-    `steps`: accepted and rejected solver steps; `solved`.
+    `peak_time` (mesh periods); `states` at uniform times, endpoint excluded; `grid`: ends
+    of the steps taken (mesh periods), inf beyond the last; `steps`: accepted and rejected
+    solver steps; `solved`. `slope`: derivatives of (end, mean, mean_square, peak) along
+    the directions that were asked for.
     """
 
-    end: Float[Array, "2"]
+    end: Float[Array, "n"]
     mean: Float[Array, ""]
     mean_square: Float[Array, ""]
     peak: Float[Array, ""]
     peak_time: Float[Array, ""]
-    states: Float[Array, "samples 2"]
+    states: Float[Array, "samples n"]
+    grid: Float[Array, " steps"]
     steps: Int[Array, ""]
     solved: Bool[Array, ""]
+    slope: Float[Array, "n+3 directions"]
+
+    @property
+    def response(self) -> Float[Array, "3"]:
+        """(mean, mean square, peak) of the contact force."""
+        return jnp.stack([self.mean, self.mean_square, self.peak])
+
+
+class Directions(NamedTuple):
+    """Directions to differentiate along, stacked: changes of the initial state (scaled)
+    and of the pair's parameters (the pair's own structure)."""
+
+    state: Float[Array, "directions n"]
+    pair: RotorPair
+
+
+class StepGrid(diffrax.AbstractAdaptiveStepSizeController):
+    """Adaptive steps, or a repetition of steps recorded before.
+
+    On repeated steps the discrete flow is a smooth function of state and parameters:
+    Newton's method converges to rounding, and its derivative is exactly that of the
+    variational equation on the same steps. `ends`: ends of the recorded steps (inf beyond
+    the last), used where `repeat` is true. The error is controlled on the first part of
+    the state alone, so that a derivative carried along does not change the motion.
+    """
+
+    pid: diffrax.PIDController
+    ends: Float[Array, " steps"]
+    repeat: Bool[Array, ""]
+
+    @property
+    def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.pid.rtol
+
+    @property
+    def atol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.pid.atol
+
+    @property
+    def norm(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.pid.norm
+
+    def wrap(self, direction):
+        return eqx.tree_at(lambda self: self.pid, self, self.pid.wrap(direction))
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        first, state = self.pid.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return jnp.where(self.repeat, self.ends[0], first), (state, jnp.asarray(1))
+
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state):  # pyright: ignore[reportIncompatibleMethodOverride]
+        state, count = state
+        # The choice of steps is no part of what is differentiated.
+        y0, y1_candidate, y_error = lax.stop_gradient((y0, y1_candidate, y_error))
+        keep, start, stop, jump, state, result = self.pid.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, state
+        )
+        recorded = self.ends[jnp.minimum(count, self.ends.shape[0] - 1)]
+        return (
+            keep | self.repeat,
+            jnp.where(self.repeat, t1, start),
+            jnp.where(self.repeat, recorded, stop),
+            jump & ~self.repeat,
+            (state, count + 1),
+            diffrax.RESULTS.where(self.repeat, diffrax.RESULTS.successful, result),
+        )
 
 
 def strobe(pair: RotorPair, state: Float[Array, "2"], periods: int, how: Integrator) -> Strobe:
@@ -100,89 +169,149 @@ def strobe(pair: RotorPair, state: Float[Array, "2"], periods: int, how: Integra
 
 def flow(
     pair: RotorPair,
-    state: Float[Array, "2"],
+    state: Float[Array, "n"],
     periods: Float[Array, ""],
     how: Integrator,
     samples: int,
-    adjoint: diffrax.AbstractAdjoint,
+    directions: Directions | None = None,
+    grid: Float[Array, " steps"] | None = None,
+    repeat: Bool[Array, ""] | bool = True,
+    adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> Flow:
     """Integrate over `periods` (traced) mesh periods with the force statistics.
 
     Mean and mean square are integrated along with the motion, under the same error
-    control. The peak is located between `samples` uniform ones.
+    control. The peak is located between `samples` uniform ones. With `directions` the
+    variational equation is integrated on the same steps, which gives `slope`. With `grid`
+    the steps recorded there are repeated (while `repeat`), else they are chosen anew.
+    Memory grows with `samples` × (1 + directions).
     """
+    count = state.shape[0]
     force_unit = lax.stop_gradient(pair.force_scale)
+    dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
 
-    def derivative(tau, y, pair):
-        slope, contact = pair.derivative(tau, y[:2])
+    def derivative(tau, y, dynamic):
+        slope, contact = eqx.combine(dynamic, static).derivative(tau, y[:count])
         force = contact.total / force_unit
         return jnp.concatenate([slope, jnp.stack([force, force**2])])
 
+    def with_tangents(tau, y, args):
+        base, tangents = y
+        dynamic, moved = args
+
+        def push(tangent, dynamic_tangent):
+            return jax.jvp(
+                lambda y, dynamic: derivative(tau, y, dynamic),
+                (base, dynamic),
+                (tangent, dynamic_tangent),
+            )
+
+        return jax.vmap(push, out_axes=(None, 0))(tangents, moved)
+
     start = jnp.concatenate([state, jnp.zeros(2)])
+    if directions is None:
+        # A tangent bundle of no dimensions: the same program serves both.
+        moved = jax.tree.map(lambda x: jnp.zeros((0, *x.shape)), dynamic)
+        tangents = jnp.zeros((0, count + 2))
+        term = diffrax.ODETerm(
+            lambda tau, y, args: (derivative(tau, y[0], args[0]), jnp.zeros_like(y[1]))
+        )
+    else:
+        moved = eqx.filter(directions.pair, eqx.is_inexact_array)
+        tangents = jnp.pad(directions.state, ((0, 0), (0, 2)))
+        term = diffrax.ODETerm(with_tangents)
+    controller = StepGrid(  # pyright: ignore[reportCallIssue]
+        pid=diffrax.PIDController(
+            rtol=how.rtol, atol=how.rtol, norm=lambda y: optimistix.rms_norm(y[0])
+        ),
+        ends=jnp.full(how.max_steps, jnp.inf) if grid is None else grid,
+        repeat=jnp.asarray(False if grid is None else repeat),
+    )
     times = periods * jnp.arange(samples + 1) / samples
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(derivative),
+        term,
         how.solver,
         t0=times[0],
         t1=times[-1],
         dt0=_FIRST_STEP,
-        y0=start,
-        args=pair,
-        saveat=diffrax.SaveAt(ts=times),
-        stepsize_controller=how.controller,
-        adjoint=adjoint,
+        y0=(start, tangents),
+        args=(dynamic, moved),
+        saveat=diffrax.SaveAt(
+            subs=[
+                diffrax.SubSaveAt(ts=times),
+                diffrax.SubSaveAt(steps=True, fn=lambda tau, y, args: tau),
+            ]
+        ),
+        stepsize_controller=controller,
+        adjoint=diffrax.ForwardMode() if adjoint is None else adjoint,
         max_steps=how.max_steps,
         throw=False,
     )
     assert solution.ys is not None
-    end, states = solution.ys[-1], solution.ys[:-1, :2]
-
-    def force(tau, state):
-        return pair.contact_force(*pair.physical(tau, state)).total
+    (bases, along), ends = solution.ys
+    end, states = bases[-1], bases[:-1, :count]
 
     frozen, frozen_states = lax.stop_gradient((pair, states))
     forces = jax.vmap(lambda t, y: frozen.contact_at(t, y).total)(times[:-1], frozen_states)
-    peak_time, peak = _refine_peak(pair, times, states, jnp.argmax(forces))
+    best = jnp.argmax(forces)
+    # The motion is not closed in general: stay inside the window.
+    middle = jnp.clip(best, 2, samples - 3)
+    near, near_along = (lax.dynamic_slice_in_dim(x, middle - 2, 5) for x in (states, along))
+    window = times[middle], times[1] - times[0], best - middle
+    place = _locate_peak(*lax.stop_gradient((pair, near)), *window)
+
+    def peak_at(near, dynamic):
+        return _force_between(eqx.combine(dynamic, static), near, *window[:2], place)
+
+    def push_peak(near_tangent, dynamic_tangent):
+        return jax.jvp(peak_at, (near, dynamic), (near_tangent, dynamic_tangent))
+
+    if directions is None:
+        peak, slope = peak_at(near, dynamic), jnp.zeros((count + 3, 0))
+    else:
+        near_moved = jnp.moveaxis(near_along[..., :count], 1, 0)
+        peak, peak_slope = jax.vmap(push_peak, out_axes=(None, 0))(near_moved, moved)
+        final = along[-1]
+        unit = jnp.stack([force_unit, force_unit**2]) / periods
+        slope = jnp.concatenate(
+            [final[:, :count], final[:, count:] * unit, peak_slope[:, None]], axis=1
+        ).T
     return Flow(
-        end=end[:2],
-        mean=end[2] / periods * force_unit,
-        mean_square=end[3] / periods * force_unit**2,
+        end=end[:count],
+        mean=end[count] / periods * force_unit,
+        mean_square=end[count + 1] / periods * force_unit**2,
         peak=peak,
-        peak_time=peak_time,
-        states=lax.stop_gradient(states),
+        peak_time=window[0] + place * window[1],
+        states=frozen_states,
+        grid=lax.stop_gradient(ends),
         steps=solution.stats["num_steps"],
         solved=solution.result == diffrax.RESULTS.successful,
+        slope=slope,
     )
 
 
-def _refine_peak(pair, times, states, best):
-    """Instant and size of the greatest force around the sample `best`.
+def _force_between(pair, values, time, step, place):
+    """Contact force at `place`, counted in samples from the middle of five: between
+    samples the motion is the quartic through them."""
+    x = place - jnp.arange(-2.0, 3.0)
+    others = jnp.where(jnp.eye(5, dtype=bool), 1.0, x)
+    weights = jnp.prod(others, axis=1) / jnp.asarray([24.0, -6.0, 4.0, -6.0, 24.0])
+    return pair.contact_at(time + place * step, weights @ values).total
+
+
+def _locate_peak(pair, values, time, step, best):
+    """Place of the greatest force around the sample `best` (both counted from `time`).
 
     An impact's peak can be narrower than the sampling, with a corner where the damping
-    saturates. Between samples the motion is the quartic through five of them; the peak is
-    enclosed on it by repeated subdivision. At the fixed instant the force is
-    differentiated in the motion and the design (envelope theorem).
+    saturates. The peak is enclosed by repeated subdivision. At the fixed instant the force
+    is differentiated in the motion and the design (envelope theorem).
     """
-    # The motion is not closed in general: stay inside the window.
-    middle = jnp.clip(best, 2, states.shape[0] - 3)
-    values = lax.dynamic_slice(states, (middle - 2, 0), (5, states.shape[1]))
-    step = times[1] - times[0]
-
-    def force(pair, values, place):
-        """Force at `place`, counted in samples from the middle one."""
-        x = place - jnp.arange(-2.0, 3.0)
-        others = jnp.where(jnp.eye(5, dtype=bool), 1.0, x)
-        weights = jnp.prod(others, axis=1) / jnp.asarray([24.0, -6.0, 4.0, -6.0, 24.0])
-        return pair.contact_at(times[middle] + place * step, weights @ values).total
-
-    frozen = lax.stop_gradient((pair, values))
 
     def zoom(_, window):
         center, width = window
         grid = jnp.clip(center + width * jnp.linspace(-1, 1, 17), -2.0, 2.0)
-        forces = jax.vmap(lambda place: force(*frozen, place))(grid)
+        forces = jax.vmap(lambda place: _force_between(pair, values, time, step, place))(grid)
         return grid[jnp.argmax(forces)], width / 8
 
-    start = (jnp.asarray(best - middle, times.dtype), jnp.ones_like(step))
-    place = lax.stop_gradient(lax.fori_loop(0, 5, zoom, start)[0])
-    return times[middle] + place * step, force(pair, values, place)
+    start = (jnp.asarray(best, step.dtype), jnp.ones_like(step))
+    return lax.stop_gradient(lax.fori_loop(0, 5, zoom, start)[0])

@@ -39,26 +39,27 @@ class SearchContact(eqx.Module):
 
 
 class FlankForce(NamedTuple):
-    """Contact at one instant: normal force (N), which flank, and the levers (m)."""
+    """Contact at an instant or several: normal force (N) by flank, penetration (m; negative:
+    gap) and the levers (m)."""
 
-    drive: Float[Array, ""]
-    coast: Float[Array, ""]
-    depth: Float[Array, ""]
-    lever1: Float[Array, ""]
-    lever2: Float[Array, ""]
+    drive: Float[Array, "*n"]
+    coast: Float[Array, "*n"]
+    depth: Float[Array, "*n"]
+    lever1: Float[Array, "*n"]
+    lever2: Float[Array, "*n"]
 
     @property
-    def total(self) -> Float[Array, ""]:
+    def total(self) -> Float[Array, "*n"]:
         """Sum of the normal force magnitudes (N)."""
         return self.drive + self.coast
 
     @property
-    def torque1(self) -> Float[Array, ""]:
+    def torque1(self) -> Float[Array, "*n"]:
         """Torque on rotor 1 (N·m), positive in its sense of rotation."""
         return -self.lever1 * (self.drive - self.coast)
 
     @property
-    def torque2(self) -> Float[Array, ""]:
+    def torque2(self) -> Float[Array, "*n"]:
         """Torque on rotor 2 (N·m), positive in its sense of rotation."""
         return self.lever2 * (self.drive - self.coast)
 

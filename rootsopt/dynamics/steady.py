@@ -6,6 +6,7 @@ k-fold map closes it, and the monodromy matrix tells whether it is stable. Where
 not settle, the largest Lyapunov exponent tells chaos from a long transient.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax
@@ -15,27 +16,35 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.flow import Flow, Integrator, flow, strobe
+from rootsopt.dynamics.flow import Directions, Flow, Integrator, flow, strobe
 from rootsopt.dynamics.pair import RotorPair
 
 BLOCK = 16
 """Mesh periods integrated between two looks at the transient."""
 SAMPLES = 2520
-"""Uniform samples of an orbit; divisible by every period up to ten, so that a shorter
-period inside an orbit shows at a sample."""
+"""Uniform samples of an orbit; divisible by every period up to ten, so that a sample
+falls on the end of each mesh period."""
 _NEWTON_STEPS = 12
+_CLOSED = 1e-12
+"""Residual (scaled) at which Newton stops; rounding is some 1e-15."""
+_SMALL = 1e-3
+"""Newton step (scaled) from which on the solver's steps are kept."""
 
 
 class Transient(NamedTuple):
     """End of a transient.
 
     `state`: last stroboscopic state; `period`: its cycle length k in mesh periods, 0 if
-    it has not settled; `periods`: mesh periods simulated; `lost`: lobes passed through
-    each other; `solved`: whether the solver got through; `steps`: solver steps.
+    it has not settled; `nearest`: the k with which the last states repeat best, and
+    `spread` the scaled difference that leaves; `periods`: mesh periods simulated; `lost`:
+    lobes passed through each other; `solved`: whether the solver got through; `steps`:
+    solver steps.
     """
 
     state: Float[Array, "2"]
     period: Int[Array, ""]
+    nearest: Int[Array, ""]
+    spread: Float[Array, ""]
     periods: Int[Array, ""]
     lost: Bool[Array, ""]
     solved: Bool[Array, ""]
@@ -59,16 +68,6 @@ class Orbit(NamedTuple):
     newton_steps: Int[Array, ""]
 
 
-class _Shot(NamedTuple):
-    """One evaluation of the shooting map: where, how far from closed, value, slope."""
-
-    state: Float[Array, "2"]
-    residual: Float[Array, ""]
-    value: Float[Array, "5"]
-    slope: Float[Array, "5 n"]
-    flow: Flow
-
-
 def settle(
     pair: RotorPair,
     state: Float[Array, "2"],
@@ -90,129 +89,150 @@ def settle(
             return jnp.max(jnp.abs(states[half:] - earlier))
 
         orders = jnp.arange(1, max_orbit + 1)
-        settled = jax.vmap(spread)(orders) < tolerance
-        return jnp.where(jnp.any(settled), orders[jnp.argmax(settled)], 0)
+        spreads = jax.vmap(spread)(orders)
+        settled = spreads < tolerance
+        period = jnp.where(jnp.any(settled), orders[jnp.argmax(settled)], 0)
+        nearest = jnp.argmin(spreads)
+        return period, orders[nearest], spreads[nearest]
 
     def go_on(carry):
-        state, period, periods, lost, solved, _ = carry
-        alive = ~lost & solved & jnp.all(jnp.isfinite(state))
-        return (period == 0) & alive & (periods < max_periods)
+        alive = ~carry.lost & carry.solved & jnp.all(jnp.isfinite(carry.state))
+        return (carry.period == 0) & alive & (carry.periods < max_periods)
 
     def advance(carry):
-        state, _, periods, _, _, steps = carry
-        part = strobe(pair, state, BLOCK, how)
+        part = strobe(pair, carry.state, BLOCK, how)
         end = part.states[-1]
         relative = pair.angle_scale * end[0]
         lost = jnp.abs(relative) >= pair.angle_limit
         sound = part.solved & ~lost & jnp.all(jnp.isfinite(end))
-        period = jnp.where(sound, cycle(part.states), 0)
-        return Transient(end, period, periods + BLOCK, lost, part.solved, steps + part.steps)
+        period, nearest, spread = cycle(part.states)
+        return Transient(
+            state=end,
+            period=jnp.where(sound, period, 0),
+            nearest=nearest,
+            spread=spread,
+            periods=carry.periods + BLOCK,
+            lost=lost,
+            solved=part.solved,
+            steps=carry.steps + part.steps,
+        )
 
-    zero = jnp.zeros((), int)
-    no, yes = jnp.zeros((), bool), jnp.ones((), bool)
-    return lax.while_loop(go_on, advance, Transient(state, zero, zero, no, yes, zero))
+    start = Transient(
+        state=state,
+        period=jnp.zeros((), int),
+        nearest=jnp.ones((), int),
+        spread=jnp.asarray(jnp.inf),
+        periods=jnp.zeros((), int),
+        lost=jnp.zeros((), bool),
+        solved=jnp.ones((), bool),
+        steps=jnp.zeros((), int),
+    )
+    return lax.while_loop(go_on, advance, start)
 
 
 def close_orbit(
     pair: RotorPair,
     tangents: RotorPair,
-    directions: int,
-    state: Float[Array, "2"],
+    state: Float[Array, "n"],
     period: Int[Array, ""],
     how: Integrator,
-    tolerance: float,
 ) -> Orbit:
     """Newton shooting on Φ(z) = z, then the implicit function theorem for gradients.
 
-    `tangents` holds d pair / d design, stacked along a leading axis of `directions`.
-    Forward mode: state and design directions are carried together through diffrax.
+    `tangents` holds d pair / d design, stacked along a leading axis. State and design
+    directions are integrated together (variational equation). Once Newton's steps are
+    small the solver's steps are kept, so that the map it solves is smooth and closes to
+    rounding.
     """
+    count = state.shape[0]
     length = period.astype(state.dtype)
-    adjoint = diffrax.ForwardMode()
-    dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
+    directions = _with_state_directions(pair, tangents, count)
+    designs = directions.state.shape[0] - count
 
-    def run(state, dynamic):
-        out = flow(eqx.combine(dynamic, static), state, length, how, SAMPLES, adjoint)
-        return jnp.concatenate([out.end, response_vector(out)]), out
-
-    def jacobian(state):
-        """Value and derivatives with respect to (state, design): (5, 2 + d)."""
-        along_state = (jnp.eye(2), jax.tree.map(lambda x: jnp.zeros((2, *x.shape)), dynamic))
-        along_design = (jnp.zeros((directions, 2)), tangents)
-        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), along_state, along_design)
-
-        def push(tangent):
-            value, slope, out = jax.jvp(run, (state, dynamic), tangent, has_aux=True)
-            return value, slope, out
-
-        value, slope, out = jax.vmap(push, out_axes=(None, 1, None))(both)
-        return value, slope, out
+    def shoot(state, grid, repeat):
+        return flow(pair, state, length, how, SAMPLES, directions, grid, repeat)
 
     def go_on(carry):
-        # Stop when closed, when the count is out, or when it no longer improves: the
-        # steps the adaptive solver takes depend on the state, which leaves a floor.
-        found, _, count, best = carry
-        improving = (count < 3) | (found.residual < 0.5 * best)
-        return (found.residual > tolerance) & (count < _NEWTON_STEPS) & improving
+        orbit, _, repeat, _, best = carry
+        shots = orbit.newton_steps
+        # Chosen anew, the steps depend on the state, and that leaves a floor.
+        improving = (shots < 3) | ~repeat | (orbit.residual < 0.5 * best)
+        return (orbit.residual > _CLOSED) & (shots < _NEWTON_STEPS) & improving
 
     def step(carry):
-        found, state, count, best = carry
-        value, slope, out = jacobian(state)
-        residual = jnp.max(jnp.abs(value[:2] - state))
-        correction = jnp.linalg.solve(slope[:2, :2] - jnp.eye(2), state - value[:2])
-        # Keep the first steps inside the neighbourhood the transient pointed to.
+        orbit, state, repeat, grid, best = carry
+        out = shoot(state, grid, repeat)
+        monodromy = out.slope[:count, :count]
+        miss = out.end - state
+        residual = jnp.max(jnp.abs(miss))
+        correction = jnp.linalg.solve(jnp.eye(count) - monodromy, miss)
         size = jnp.max(jnp.abs(correction))
+        # Keep the first steps inside the neighbourhood the transient pointed to.
         new = state + correction * jnp.minimum(1.0, 0.5 / jnp.maximum(size, 1e-300))
-        shot = _Shot(state, residual, value, slope, out)
-        return shot, new, count + 1, jnp.minimum(best, found.residual)
+        shots = orbit.newton_steps + 1
+        keep = repeat | (size < _SMALL) | (shots >= _NEWTON_STEPS // 2)
+        reached = orbit.residual
+        orbit = Orbit(state, out, residual, monodromy, out.response, orbit.sensitivity, shots)
+        return orbit, new, keep, out.grid, jnp.minimum(best, reached)
 
     # The loop holds the only copy of the integration: one shot is compiled, not two.
-    shapes = jax.eval_shape(jacobian, state)
-    value, slope, out = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    first = _Shot(state, jnp.asarray(jnp.inf), value, slope, out)
-    start = (first, state, jnp.zeros((), int), jnp.asarray(jnp.inf))
-    (state, residual, value, slope, out), _, count, _ = lax.while_loop(go_on, step, start)
-    monodromy = slope[:2, :2]
-    moved = jnp.linalg.solve(jnp.eye(2) - monodromy, slope[:2, 2:])
-    return Orbit(
+    grid = jnp.full(how.max_steps, jnp.inf)
+    shapes = jax.eval_shape(shoot, state, grid, jnp.zeros((), bool))
+    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    infinite = jnp.asarray(jnp.inf)
+    first = Orbit(
         state=state,
-        flow=out,
-        residual=residual,
-        monodromy=monodromy,
-        response=value[2:],
-        sensitivity=slope[2:, 2:] + slope[2:, :2] @ moved,
-        newton_steps=count,
+        flow=none,
+        residual=infinite,
+        monodromy=jnp.zeros((count, count)),
+        response=jnp.zeros(3),
+        sensitivity=jnp.zeros((3, designs)),
+        newton_steps=jnp.zeros((), int),
     )
+    start = (first, state, jnp.zeros((), bool), none.grid, infinite)
+    orbit = lax.while_loop(go_on, step, start)[0]
+    slope = orbit.flow.slope
+    moved = jnp.linalg.solve(jnp.eye(count) - orbit.monodromy, slope[:count, count:])
+    sensitivity = slope[count:, count:] + slope[count:, :count] @ moved
+    return orbit._replace(sensitivity=sensitivity)
 
 
-def response_vector(out: Flow) -> Float[Array, "3"]:
-    """(mean, mean square, peak) of the contact force."""
-    return jnp.stack([out.mean, out.mean_square, out.peak])
+def _with_state_directions(pair, tangents, count):
+    """The unit directions of the state, then those of `tangents`."""
+    stacked = eqx.filter(tangents, eqx.is_inexact_array)
+    number = jax.tree.leaves(stacked)[0].shape[0]
+    along_pair = jax.tree.map(lambda x: jnp.pad(x, [(count, 0)] + [(0, 0)] * (x.ndim - 1)), stacked)
+    along_state = jnp.eye(count + number, count)
+    return Directions(along_state, eqx.combine(along_pair, pair))
 
 
 def reverse_sensitivity(
-    build,
+    build: Callable[[Float[Array, " d"]], RotorPair],
     design: Float[Array, " d"],
-    state: Float[Array, "2"],
+    state: Float[Array, "n"],
     period: Int[Array, ""],
     how: Integrator,
+    grid: Float[Array, " steps"],
 ) -> Float[Array, "3 d"]:
     """The same sensitivity by reverse mode, through diffrax's checkpointed adjoint.
 
-    With cotangents v of a response and w of the end state, the implicit function
-    theorem asks for (I - M)ᵀ w = R_zᵀ v and gives dR/dp = R_pᵀ v + Φ_pᵀ w.
+    On the steps `grid` of the closed orbit. With cotangents v of a response and w of the
+    end state, the implicit function theorem asks for (I - M)ᵀ w = R_zᵀ v and gives
+    dR/dp = R_pᵀ v + Φ_pᵀ w.
     """
+    count = state.shape[0]
     length = period.astype(state.dtype)
+    adjoint = diffrax.RecursiveCheckpointAdjoint()
 
     def run(state, design):
-        out = flow(build(design), state, length, how, SAMPLES, diffrax.RecursiveCheckpointAdjoint())
-        return jnp.concatenate([out.end, response_vector(out)])
+        out = flow(build(design), state, length, how, SAMPLES, grid=grid, adjoint=adjoint)
+        return jnp.concatenate([out.end, out.response])
 
     _, pull = jax.vjp(run, state, design)
-    by_state, by_design = jax.vmap(pull)(jnp.eye(5))
-    monodromy, response = by_state[:2], by_state[2:]
-    weight = jnp.linalg.solve((jnp.eye(2) - monodromy).T, response.T)
-    return by_design[2:] + weight.T @ by_design[:2]
+    by_state, by_design = jax.vmap(pull)(jnp.eye(count + 3))
+    monodromy, response = by_state[:count], by_state[count:]
+    weight = jnp.linalg.solve((jnp.eye(count) - monodromy).T, response.T)
+    return by_design[count:] + weight.T @ by_design[:count]
 
 
 class Lyapunov(NamedTuple):
@@ -231,21 +251,18 @@ def lyapunov(pair: RotorPair, state: Float[Array, "2"], periods: int, how: Integ
     The standard error comes from 16 batch means.
     """
     one = jnp.ones(())
-    adjoint = diffrax.ForwardMode()
+    still = jax.tree.map(lambda x: jnp.zeros((1, *x.shape)), eqx.filter(pair, eqx.is_inexact_array))
+    moving = eqx.combine(still, pair)
 
     def step(carry, _):
         state, tangent = carry
-
-        def run(state):
-            out = flow(pair, state, one, how, SAMPLES // 4, adjoint)
-            return out.end, out
-
-        end, moved, out = jax.jvp(run, (state,), (tangent,), has_aux=True)
+        out = flow(pair, state, one, how, SAMPLES // 4, Directions(tangent[None], moving))
+        moved = out.slope[: state.shape[0], 0]
         size = jnp.linalg.norm(moved)
         safe = jnp.where(size > 0, size, 1.0)
-        return (end, moved / safe), (jnp.log(safe), out)
+        return (out.end, moved / safe), (jnp.log(safe), out)
 
-    direction = jnp.array([1.0, 0.0])
+    direction = jnp.zeros_like(state).at[0].set(1.0)
     (end, _), (growth, flows) = lax.scan(step, (state, direction), length=periods)
     batches = jnp.mean(growth.reshape(16, -1), axis=1)
     error = jnp.std(batches, ddof=1) / 4

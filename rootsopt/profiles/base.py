@@ -56,7 +56,7 @@ class Segment(NamedTuple):
 class Profile(eqx.Module):
     """One flank of a conjugate Roots rotor; see the module's docstring.
 
-    Subclasses give `segments`, `roll_angle` and `contact_distance` on
+    Subclasses give `segments`, `roll_angle`, its inverse and `contact_distance` on
     0 ≤ ν ≤ `pitch_normal`, continued analytically beyond the pitch point and, unless
     the first segment is a land, over the tip (β odd and s even in ν).
     """
@@ -76,6 +76,14 @@ class Profile(eqx.Module):
     def contact_distance(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """s(ν) in m."""
 
+    @abc.abstractmethod
+    def normal_at(self, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """ν(β) in rad: the inverse of `roll_angle` up to the pitch point, in closed form.
+
+        Where several points mesh at one instant, or the roll angle turns back, it is the
+        one nearest to the pitch point.
+        """
+
     def lever(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Moment arm r cos ψ (m) of the contact normal about the rotor's axis."""
         return self.pitch_radius * jnp.sin(nu - self.roll_angle(nu))
@@ -84,6 +92,24 @@ class Profile(eqx.Module):
         """Support function P·n = r sin ψ + s (m) of the addendum; its slope is -lever."""
         arm = self.pitch_radius * jnp.cos(nu - self.roll_angle(nu))
         return arm + self.contact_distance(nu)
+
+    @property
+    def turn_ratio(self) -> float:
+        """κ: `arms` may use the cosine and sine of κ ν, which a search over many poses
+        has at no cost."""
+        return 1.0
+
+    @property
+    def minima(self) -> int:
+        """How many minima the gap of two flanks may have within the contact law."""
+        return 2
+
+    def arms(
+        self, nu: Float[Array, "*n"], cos: Float[Array, "*n"], sin: Float[Array, "*n"]
+    ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+        """`lever` and `support` (m) at `nu`, given cos κν and sin κν."""
+        del cos, sin
+        return self.lever(nu), self.support(nu)
 
     @property
     def half_pitch(self) -> float:

@@ -82,6 +82,18 @@ class CIC(Profile):
         beyond_land = jnp.where(nu > self.arc_end, involute, arc)
         return jnp.where(nu < self.tip_arc_angle, nu, beyond_land)
 
+    def normal_at(self, roll_angle):
+        # The normals of the arc pass through its centre and the pitch point. With c ≥ r (u at
+        # or past the longest) the involute takes over from the land and the arc is skipped.
+        involute = roll_angle >= self.involute_start
+        on_arc = (roll_angle > self.tip_arc_angle) & ~involute
+        # Off the arc any turn will do that keeps the pitch point away from the centre.
+        turn = jnp.where(on_arc, roll_angle - self.tip_arc_angle, jnp.pi / 2)
+        r, c = self.pitch_radius, self.arc_center_radius
+        arc = self.tip_arc_angle + jnp.arctan2(r * jnp.sin(turn), r * jnp.cos(turn) - c)
+        before_involute = jnp.where(on_arc, arc, roll_angle)
+        return jnp.where(involute, roll_angle + jnp.pi / 2 - self.pressure_angle, before_involute)
+
     def contact_distance(self, nu):
         arc = self.arc_radius + self._arc_slide(self._arc_turn(nu))
         beta = nu - jnp.pi / 2 + self.pressure_angle
@@ -101,3 +113,19 @@ class CIC(Profile):
         reach = self.pitch_radius * jnp.sin(self.pressure_angle)
         involute = reach + self.base_radius * (self.half_pitch - beta)
         return jnp.where(nu > self.arc_end, involute, arc)
+
+    @property
+    def minima(self) -> int:
+        return 1
+
+    def arms(self, nu, cos, sin):
+        # As `lever` and `support`, with ν turned by θ1 by the addition theorem.
+        tip_cos, tip_sin = jnp.cos(self.tip_arc_angle), jnp.sin(self.tip_arc_angle)
+        c = self.arc_center_radius
+        beta = nu - jnp.pi / 2 + self.pressure_angle
+        reach = self.pitch_radius * jnp.sin(self.pressure_angle)
+        land, involute = nu < self.tip_arc_angle, nu > self.arc_end
+        lever = jnp.where(land, 0.0, c * (sin * tip_cos - cos * tip_sin))
+        support = jnp.where(land, c, c * (cos * tip_cos + sin * tip_sin)) + self.arc_radius
+        beyond = reach + self.base_radius * (self.half_pitch - beta)
+        return jnp.where(involute, self.base_radius, lever), jnp.where(involute, beyond, support)

@@ -30,6 +30,17 @@ class EE(Profile):
     def roll_angle(self, nu):
         return nu / (1 + self.lobes)
 
+    def normal_at(self, roll_angle):
+        return roll_angle * (1 + self.lobes)
+
     def contact_distance(self, nu):
         beyond_pitch = self.lobes * (self.half_pitch - self.roll_angle(nu))
         return self.pitch_radius / self.lobes * jnp.sin(beyond_pitch)
+
+    @property
+    def turn_ratio(self) -> float:
+        return self.lobes / (1 + self.lobes)
+
+    def arms(self, nu, cos, sin):
+        # ψ = π/2 - κν and β = ν / (1 + N), so that N (π/2N - β) = ψ.
+        return self.pitch_radius * sin, self.pitch_radius * (1 + 1 / self.lobes) * cos
