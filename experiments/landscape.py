@@ -87,7 +87,8 @@ def draw(rows: list[dict], optimum: dict, objective: float, path: Path) -> None:
     for ax, (x, y) in zip(axes, itertools.combinations(names, 2), strict=True):
         px, py = (np.array([row[k] for row in rows])[order] for k in (x, y))
         good = ~np.isnan(values[order])
-        ax.plot(px[~good], py[~good], "x", color="0.6", ms=3, label="no steady state")
+        if not good.all():
+            ax.plot(px[~good], py[~good], "x", color="0.6", ms=3, label="no steady state")
         ax.scatter(
             px[good], py[good], c=values[order][good], s=12, cmap="viridis", vmin=low, vmax=high
         )

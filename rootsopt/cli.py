@@ -14,6 +14,12 @@ from rootsopt.config import Config, describe_keys, load
 from rootsopt.errors import InputError
 
 OK, BAD_INPUT, NO_RESULT = 0, 2, 3
+_CACHE_BYTES = 500 * 2**20
+
+# Equinox's checks of traced values call back to Python, and a program that does so cannot
+# be kept between processes. Every integration here returns a status instead. Read once,
+# when equinox is first imported.
+os.environ.setdefault("EQX_ON_ERROR", "off")
 
 
 def parser(command: str, purpose: str) -> argparse.ArgumentParser:
@@ -37,6 +43,12 @@ def parser(command: str, purpose: str) -> argparse.ArgumentParser:
         help="override a config key, as in --set scene.speed_rpm=1500; repeatable",
     )
     result.add_argument("--no-figures", action="store_true", help="write no figures")
+    result.add_argument(
+        "--no-cache",
+        action="store_true",
+        help="compile anew, and keep no compiled programs in the user's cache folder "
+        "(ROOTSOPT_CACHE=DIR names another folder, ROOTSOPT_CACHE=off is as this option)",
+    )
     return result
 
 
@@ -53,6 +65,8 @@ def run(
     try:
         config = load(options.config, options.overrides)
         use_float64()
+        if not options.no_cache:
+            use_cache()
         return body(config, options)
     except InputError as error:
         message = " ".join(str(error).split())
@@ -73,6 +87,32 @@ def use_float64() -> None:
 
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_platforms", os.environ.get("JAX_PLATFORMS", "cpu"))
+
+
+def use_cache() -> None:
+    """Keep compiled programs between processes, in the user's cache folder.
+
+    The folder carries the versions of what compiles. An unusable folder is no error: the
+    programs are then compiled anew.
+    """
+    import jax
+    import platformdirs
+
+    choice = os.environ.get("ROOTSOPT_CACHE", "")
+    if choice.lower() in ("off", "0", "no"):
+        return
+    folder = Path(choice or platformdirs.user_cache_dir("rootsopt", appauthor=False))
+    folder = folder / f"jax-{jax.__version__}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if not os.access(folder, os.W_OK):
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    jax.config.update("jax_compilation_cache_max_size", _CACHE_BYTES)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -13,6 +13,7 @@ from jaxtyping import install_import_hook
 install_import_hook("rootsopt", "typechecking.typechecked")
 
 os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ["ROOTSOPT_CACHE"] = "off"
 jax.config.update("jax_enable_x64", True)
 settings.register_profile("rootsopt", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("rootsopt")

@@ -23,14 +23,14 @@ SMALL = [
 ]  # fmt: skip
 
 
-def command(module, *arguments):
+def command(module, *arguments, **environment):
     return subprocess.run(
         [sys.executable, "-m", f"rootsopt.{module}", *map(str, arguments)],
         capture_output=True,
         text=True,
         cwd=ROOT,
         check=False,
-        env=os.environ | {"COLUMNS": "100"},
+        env=os.environ | {"COLUMNS": "100"} | environment,
     )
 
 
@@ -156,3 +156,29 @@ def test_console_command_and_help():
     assert done.returncode == 0
     assert "scene.timing_gear.backlash_mm" in done.stdout
     assert "contact.stiffness_N_per_mm_e" in done.stdout
+
+
+def test_compiled_programs_are_kept_between_processes(tmp_path):
+    """A second run finds every large program in the cache and gives the same numbers; with
+    --no-cache, or an unusable folder, nothing is kept and the run is as good."""
+    cache = tmp_path / "cache"
+    arguments = [CIC, "--no-figures", "--set", "solver.map_rolls=96"]
+    answers = []
+    for run in ("first", "second"):
+        done = command("simulate", *arguments, "-o", tmp_path / run, ROOTSOPT_CACHE=str(cache))
+        assert done.returncode == 0, done.stderr
+        assert done.stderr == ""
+        answers.append(json.loads((tmp_path / run / "result.json").read_text())["response"])
+        kept = {path.name.split("-")[0] for path in cache.rglob("*-cache")}
+        assert {"jit__build", "jit_settle", "jit_close_orbit"} <= kept
+    assert answers[0] == answers[1]
+
+    def unkept(folder, *more):
+        done = command("simulate", *arguments, *more, "-o", tmp_path, ROOTSOPT_CACHE=str(folder))
+        assert done.returncode == 0, done.stderr
+        assert done.stderr == ""
+
+    unkept(tmp_path / "other", "--no-cache")
+    assert not (tmp_path / "other").exists()
+    (tmp_path / "file").write_text("not a folder")
+    unkept(tmp_path / "file")
