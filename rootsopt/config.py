@@ -97,8 +97,13 @@ class SceneConfig(_Section):
 class SolverConfig(_Section):
     """How the scene is solved."""
 
-    fidelity: Literal["search", "map"] = Field(
-        "map", description="contact: search at every call (reference) or C² map of the gap"
+    fidelity: Literal["search", "map", "linear", "nodes"] = Field(
+        "map",
+        description="contact: search at every call (reference), C² map of the gap, linear in "
+        "the relative rotation, or the paper's nodes against segments",
+    )
+    nodes: Annotated[int, Field(ge=16, le=20_000)] = Field(
+        400, description="nodes per flank of fidelity nodes"
     )
     map_rolls: Annotated[int, Field(ge=16, le=4096)] = Field(
         384, description="map points over the roll angle"
@@ -127,7 +132,9 @@ class SolverConfig(_Section):
     gradient: Literal["forward", "reverse"] = Field(
         "forward", description="differentiation mode; both give the same gradient"
     )
-    precision: Literal["float64"] = Field("float64", description="floating point precision")
+    precision: Literal["float64", "float32"] = Field(
+        "float64", description="of the integration; float32 holds tolerances down to 2e-6"
+    )
 
 
 class ObjectiveConfig(_Section):

@@ -1,7 +1,6 @@
 """One design in one scene, from design vector to steady state, response and gradient."""
 
 import dataclasses
-import functools
 import time
 from typing import Any
 
@@ -17,7 +16,9 @@ from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import (
     BLOCK,
+    RESIDUAL,
     SAMPLES,
+    SETTLED,
     Orbit,
     Transient,
     close_orbit,
@@ -32,9 +33,7 @@ from rootsopt.profiles import Geometry
 from rootsopt.status import Status
 
 RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
-_SETTLED = 3e-3
 _NEARLY = 0.05
-_RESIDUAL = 1e-9
 _CHAOS_WINDOW = 128
 _THINNING = 6
 _TOO_DEEP = 0.02
@@ -158,14 +157,15 @@ class Evaluator:
 
     def _attempt(self, design, start):
         pair, tangents, shape = _build(self.model, design)
-        state = jnp.zeros(2) if start is None else jnp.asarray(start)
-        how, tolerance, used, steps = self.transient, _SETTLED, 0, 0
+        dtype = pair.angle_scale.dtype
+        state = jnp.zeros(2, dtype) if start is None else jnp.asarray(start, dtype)
+        how, tolerance, used, steps = self.transient, SETTLED, 0, 0
         while True:
             transient = _settle(
                 pair,
                 state,
                 how,
-                jnp.asarray(tolerance),
+                jnp.asarray(tolerance, dtype),
                 jnp.asarray(self.max_periods - used),
                 self.config.solver.max_orbit_periods,
             )
@@ -226,7 +226,7 @@ class Evaluator:
         multiplier = float(jnp.max(floquet(orbit.monodromy)))
         near = tolerance / max(1 - multiplier, 1e-3) * 10 + 100 * float(self.transient.rtol)
         moved = float(jnp.max(jnp.abs(orbit.state - transient.state)))
-        closed = float(orbit.residual) <= _RESIDUAL
+        closed = float(orbit.residual) <= RESIDUAL[self.model.precision]
         stable = multiplier < 1
         return Status.PERIODIC if closed and stable and moved <= near else Status.NOT_SETTLED
 
@@ -330,32 +330,7 @@ def _response(mean, square, peak) -> dict[str, float]:
     }
 
 
-@eqx.filter_jit
-def _build(model: Model, design):
-    """Pair, its stacked design tangents, and the rotor's geometry."""
-
-    def build(design):
-        pair, shape = model.pair_and_shape(design)
-        dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
-        return dynamic, (_Static(static), shape)
-
-    count = design.shape[0]
-    if count == 0:
-        dynamic, (static, shape) = build(design)
-        tangents = jax.tree.map(lambda x: jnp.zeros((0, *x.shape)), dynamic)
-    else:
-        push = functools.partial(jax.jvp, build, (design,), has_aux=True)
-        each = jax.vmap(lambda t: push((t,)), out_axes=(None, 0, None))
-        dynamic, tangents, (static, shape) = each(jnp.eye(count))
-    return eqx.combine(dynamic, static.value), tangents, shape
-
-
-class _Static(eqx.Module):
-    """Carries what is not an array through a transformation."""
-
-    value: Any = eqx.field(static=True)
-
-
+_build = eqx.filter_jit(Model.pair_and_tangents)
 _settle = eqx.filter_jit(settle)
 _lyapunov = eqx.filter_jit(lyapunov)
 

@@ -4,9 +4,12 @@ A design is a vector of the config's design parameters in the config's own units
 (`DESIGN_KEYS` for CIC, empty for EE), so gradients come out per config unit.
 """
 
+import functools
 import math
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -14,9 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import DESIGN_KEYS, Config
 from rootsopt.contact.impact import ImpactLaw
+from rootsopt.contact.linear import LinearContact
 from rootsopt.contact.map import MapContact
+from rootsopt.contact.segments import NodeContact
 from rootsopt.dynamics.flow import Integrator
-from rootsopt.dynamics.pair import RotorPair, SearchContact
+from rootsopt.dynamics.pair import GapFunction, RotorPair, SearchContact
 from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
 from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, Geometry, Profile, geometry, outline
@@ -39,7 +44,9 @@ class Model(eqx.Module):
     family: str = eqx.field(static=True)
     lobes: int = eqx.field(static=True)
     fidelity: str = eqx.field(static=True)
+    precision: str = eqx.field(static=True)
     map_size: tuple[int, int] = eqx.field(static=True)
+    nodes: int = eqx.field(static=True)
     pitch_radius: Float[Array, ""]
     length: Float[Array, ""]
     density: Float[Array, ""]
@@ -81,7 +88,9 @@ class Model(eqx.Module):
             family=config.profile.family,
             lobes=config.profile.lobes,
             fidelity=solver.fidelity,
+            precision=solver.precision,
             map_size=(solver.map_rolls, solver.map_relatives),
+            nodes=solver.nodes,
             pitch_radius=jnp.asarray(radius),
             length=jnp.asarray(config.rotor.length_mm * MM),
             density=jnp.asarray(config.rotor.density_kg_m3),
@@ -105,19 +114,47 @@ class Model(eqx.Module):
         """Polar moment of inertia of one rotor about its axis (kg·m²)."""
         return self.density * self.length * shape.polar_area_moment
 
+    def contact(self, profile: Profile) -> GapFunction:
+        """Gap and levers of `profile` at this model's fidelity."""
+        if self.fidelity == "map":
+            return MapContact.of(profile, self.deepest, *self.map_size)
+        if self.fidelity == "linear":
+            return LinearContact.of(profile)
+        if self.fidelity == "nodes":
+            return NodeContact.of(profile, self.nodes)
+        return SearchContact.of(profile)
+
     def pair(self, design: Float[Array, " d"]) -> RotorPair:
         """The rotor pair of a design in config units, differentiable in it."""
         return self.pair_and_shape(design)[0]
+
+    def pair_and_tangents(
+        self, design: Float[Array, " d"]
+    ) -> tuple[RotorPair, RotorPair, Geometry]:
+        """The rotor pair, its derivatives by the design stacked along a leading axis (in the
+        pair's own structure), and the rotor's geometry."""
+
+        def build(design):
+            pair, shape = self.pair_and_shape(design)
+            dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
+            return dynamic, (_Static(static), shape)
+
+        count = design.shape[0]
+        if count == 0:
+            dynamic, (static, shape) = build(design)
+            tangents = jax.tree.map(lambda x: jnp.zeros((0, *x.shape), x.dtype), dynamic)
+        else:
+            push = functools.partial(jax.jvp, build, (design,), has_aux=True)
+            each = jax.vmap(lambda t: push((t,)), out_axes=(None, 0, None))
+            dynamic, tangents, (static, shape) = each(jnp.eye(count))
+        return eqx.combine(dynamic, static.value), tangents, shape
 
     def pair_and_shape(self, design: Float[Array, " d"]) -> tuple[RotorPair, Geometry]:
         """The rotor pair and the geometry of one rotor."""
         profile = self.profile(design)
         shape = geometry(profile)
         inertia = self.inertia(shape)
-        if self.fidelity == "map":
-            contact = MapContact.of(profile, self.deepest, *self.map_size)
-        else:
-            contact = SearchContact.of(profile)
+        contact = self.contact(profile)
         gear = self.gear
         if gear is not None:
             # I_r = I1 I2 / (I1 + I2) of two equal rotors.
@@ -139,7 +176,20 @@ class Model(eqx.Module):
             angle_scale=angle,
             force_scale=force,
         )
+        if self.precision == "float32":
+            # Built in double precision; single only where it is integrated.
+            pair = jax.tree.map(_single, pair)
         return pair, shape
+
+
+class _Static(eqx.Module):
+    """Carries what is not an array through a transformation."""
+
+    value: Any = eqx.field(static=True)
+
+
+def _single(leaf):
+    return leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf
 
 
 def _expected_rotation(config: Config) -> float:

@@ -109,9 +109,11 @@ class MapContact(eqx.Module):
         )
         local = lax.dynamic_slice(self.coefficients, (i, j), (4, 4))
         e_slope = e_slope / self.relative_step
-        along = local @ jnp.stack([e_value + e_slope * beyond, e_slope], axis=1)
-        gap, by_relative = x_value @ along
-        by_roll = mirror * (x_slope @ along[:, 0]) / self.roll_step
+        # Sums of products, which the compiler merges; a matrix product would be a call.
+        along = jnp.sum(local * (e_value + e_slope * beyond), axis=1)
+        gap = jnp.sum(x_value * along)
+        by_relative = jnp.sum(x_value * jnp.sum(local * e_slope, axis=1))
+        by_roll = mirror * jnp.sum(x_slope * along) / self.roll_step
         # φ̄ = -x: ∂G/∂φ1 = -∂G/∂x / 2 - ∂G/∂ε = -lever1, ∂G/∂φ2 = lever2.
         return gap, by_relative + by_roll / 2, by_relative - by_roll / 2
 

@@ -1,6 +1,6 @@
 """Integration of a rotor pair over whole mesh periods with diffrax."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -30,7 +30,8 @@ class Integrator(eqx.Module):
 
     `method`: a key of `METHODS` (tsit5, dopri5, dopri8 explicit; kvaerno3, kvaerno5
     implicit); `rtol`: relative tolerance, which is also the absolute one, the state
-    being scaled; `max_steps` for one mesh period.
+    being scaled; `max_steps` for one mesh period. The precision is that of the state, and
+    the tolerance is never asked to be finer than some twenty roundings of it.
     """
 
     method: str = eqx.field(static=True)
@@ -41,9 +42,11 @@ class Integrator(eqx.Module):
     def solver(self) -> diffrax.AbstractSolver:
         return METHODS[self.method]()
 
-    @property
-    def controller(self) -> diffrax.PIDController:
-        return diffrax.PIDController(rtol=self.rtol, atol=self.rtol)
+    def controller(self, dtype: Any, **options: Any) -> diffrax.PIDController:
+        """Step size control of states of type `dtype`."""
+        floor = 20 * float(jnp.finfo(dtype).eps)
+        rtol = jnp.maximum(self.rtol, floor).astype(dtype)
+        return diffrax.PIDController(rtol=rtol, atol=rtol, **options)
 
 
 class Strobe(NamedTuple):
@@ -146,17 +149,19 @@ def strobe(pair: RotorPair, state: Float[Array, "2"], periods: int, how: Integra
     Steps land on the period ends: interpolated states would carry an error far above
     the tolerance and hide that the motion repeats.
     """
-    ends = jnp.arange(1.0, periods + 1)
+    ends = jnp.arange(1, periods + 1, dtype=state.dtype)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda tau, y, pair: pair.derivative(tau, y)[0]),
         how.solver,
-        t0=0.0,
-        t1=float(periods),
-        dt0=_FIRST_STEP,
+        t0=jnp.zeros_like(ends[0]),
+        t1=ends[-1],
+        dt0=_FIRST_STEP * ends[0],
         y0=state,
         args=pair,
         saveat=diffrax.SaveAt(ts=ends),
-        stepsize_controller=diffrax.ClipStepSizeController(how.controller, step_ts=ends),
+        stepsize_controller=diffrax.ClipStepSizeController(
+            how.controller(state.dtype), step_ts=ends
+        ),
         adjoint=diffrax.ForwardMode(),
         max_steps=how.max_steps * periods,
         throw=False,
@@ -208,11 +213,11 @@ def flow(
 
         return jax.vmap(push, out_axes=(None, 0))(tangents, moved)
 
-    start = jnp.concatenate([state, jnp.zeros(2)])
+    start = jnp.pad(state, (0, 2))
     if directions is None:
         # A tangent bundle of no dimensions: the same program serves both.
-        moved = jax.tree.map(lambda x: jnp.zeros((0, *x.shape)), dynamic)
-        tangents = jnp.zeros((0, count + 2))
+        moved = jax.tree.map(lambda x: jnp.zeros((0, *x.shape), x.dtype), dynamic)
+        tangents = jnp.zeros((0, count + 2), state.dtype)
         term = diffrax.ODETerm(
             lambda tau, y, args: (derivative(tau, y[0], args[0]), jnp.zeros_like(y[1]))
         )
@@ -221,19 +226,17 @@ def flow(
         tangents = jnp.pad(directions.state, ((0, 0), (0, 2)))
         term = diffrax.ODETerm(with_tangents)
     controller = StepGrid(  # pyright: ignore[reportCallIssue]
-        pid=diffrax.PIDController(
-            rtol=how.rtol, atol=how.rtol, norm=lambda y: optimistix.rms_norm(y[0])
-        ),
-        ends=jnp.full(how.max_steps, jnp.inf) if grid is None else grid,
+        pid=how.controller(state.dtype, norm=lambda y: optimistix.rms_norm(y[0])),
+        ends=jnp.full(how.max_steps, jnp.inf, state.dtype) if grid is None else grid,
         repeat=jnp.asarray(False if grid is None else repeat),
     )
-    times = periods * jnp.arange(samples + 1) / samples
+    times = periods * (jnp.arange(samples + 1) / samples).astype(state.dtype)
     solution = diffrax.diffeqsolve(
         term,
         how.solver,
         t0=times[0],
         t1=times[-1],
-        dt0=_FIRST_STEP,
+        dt0=_FIRST_STEP * jnp.ones_like(times[0]),
         y0=(start, tangents),
         args=(dynamic, moved),
         saveat=diffrax.SaveAt(
@@ -267,7 +270,7 @@ def flow(
         return jax.jvp(peak_at, (near, dynamic), (near_tangent, dynamic_tangent))
 
     if directions is None:
-        peak, slope = peak_at(near, dynamic), jnp.zeros((count + 3, 0))
+        peak, slope = peak_at(near, dynamic), jnp.zeros((count + 3, 0), state.dtype)
     else:
         near_moved = jnp.moveaxis(near_along[..., :count], 1, 0)
         peak, peak_slope = jax.vmap(push_peak, out_axes=(None, 0))(near_moved, moved)
@@ -293,9 +296,9 @@ def flow(
 def _force_between(pair, values, time, step, place):
     """Contact force at `place`, counted in samples from the middle of five: between
     samples the motion is the quartic through them."""
-    x = place - jnp.arange(-2.0, 3.0)
+    x = place - jnp.arange(-2, 3, dtype=place.dtype)
     others = jnp.where(jnp.eye(5, dtype=bool), 1.0, x)
-    weights = jnp.prod(others, axis=1) / jnp.asarray([24.0, -6.0, 4.0, -6.0, 24.0])
+    weights = jnp.prod(others, axis=1) / jnp.asarray([24.0, -6.0, 4.0, -6.0, 24.0], x.dtype)
     return pair.contact_at(time + place * step, weights @ values).total
 
 
@@ -309,7 +312,7 @@ def _locate_peak(pair, values, time, step, best):
 
     def zoom(_, window):
         center, width = window
-        grid = jnp.clip(center + width * jnp.linspace(-1, 1, 17), -2.0, 2.0)
+        grid = jnp.clip(center + width * jnp.linspace(-1, 1, 17, dtype=step.dtype), -2.0, 2.0)
         forces = jax.vmap(lambda place: _force_between(pair, values, time, step, place))(grid)
         return grid[jnp.argmax(forces)], width / 8
 

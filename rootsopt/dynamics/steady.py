@@ -24,9 +24,13 @@ BLOCK = 16
 SAMPLES = 2520
 """Uniform samples of an orbit; divisible by every period up to ten, so that a sample
 falls on the end of each mesh period."""
+SETTLED = 3e-3
+"""Scaled difference below which successive states count as repeating."""
+RESIDUAL = {"float64": 1e-9, "float32": 1e-3}
+"""Largest residual (scaled) of an orbit that counts as closed, by precision."""
 _NEWTON_STEPS = 12
-_CLOSED = 1e-12
-"""Residual (scaled) at which Newton stops; rounding is some 1e-15."""
+_CLOSED = 4000
+"""Residual (scaled) at which Newton stops, in roundings: 1e-12 in double precision."""
 _SMALL = 1e-3
 """Newton step (scaled) from which on the solver's steps are kept."""
 
@@ -121,7 +125,7 @@ def settle(
         state=state,
         period=jnp.zeros((), int),
         nearest=jnp.ones((), int),
-        spread=jnp.asarray(jnp.inf),
+        spread=jnp.full_like(state[0], jnp.inf),
         periods=jnp.zeros((), int),
         lost=jnp.zeros((), bool),
         solved=jnp.ones((), bool),
@@ -136,28 +140,31 @@ def close_orbit(
     state: Float[Array, "n"],
     period: Int[Array, ""],
     how: Integrator,
+    samples: int = SAMPLES,
 ) -> Orbit:
     """Newton shooting on Φ(z) = z, then the implicit function theorem for gradients.
 
     `tangents` holds d pair / d design, stacked along a leading axis. State and design
-    directions are integrated together (variational equation). Once Newton's steps are
+    directions are integrated together (variational equation). `samples` must be divisible by
+    the period. Once Newton's steps are
     small the solver's steps are kept, so that the map it solves is smooth and closes to
     rounding.
     """
-    count = state.shape[0]
-    length = period.astype(state.dtype)
+    count, dtype = state.shape[0], state.dtype
+    closed = _CLOSED * float(jnp.finfo(dtype).eps)
+    length = period.astype(dtype)
     directions = _with_state_directions(pair, tangents, count)
     designs = directions.state.shape[0] - count
 
     def shoot(state, grid, repeat):
-        return flow(pair, state, length, how, SAMPLES, directions, grid, repeat)
+        return flow(pair, state, length, how, samples, directions, grid, repeat)
 
     def go_on(carry):
         orbit, _, repeat, _, best = carry
         shots = orbit.newton_steps
         # Chosen anew, the steps depend on the state, and that leaves a floor.
         improving = (shots < 3) | ~repeat | (orbit.residual < 0.5 * best)
-        return (orbit.residual > _CLOSED) & (shots < _NEWTON_STEPS) & improving
+        return (orbit.residual > closed) & (shots < _NEWTON_STEPS) & improving
 
     def step(carry):
         orbit, state, repeat, grid, best = carry
@@ -165,10 +172,10 @@ def close_orbit(
         monodromy = out.slope[:count, :count]
         miss = out.end - state
         residual = jnp.max(jnp.abs(miss))
-        correction = jnp.linalg.solve(jnp.eye(count) - monodromy, miss)
+        correction = jnp.linalg.solve(jnp.eye(count, dtype=dtype) - monodromy, miss)
         size = jnp.max(jnp.abs(correction))
         # Keep the first steps inside the neighbourhood the transient pointed to.
-        new = state + correction * jnp.minimum(1.0, 0.5 / jnp.maximum(size, 1e-300))
+        new = state + correction * jnp.minimum(1.0, 0.5 / jnp.maximum(size, 1e-30))
         shots = orbit.newton_steps + 1
         keep = repeat | (size < _SMALL) | (shots >= _NEWTON_STEPS // 2)
         reached = orbit.residual
@@ -176,23 +183,23 @@ def close_orbit(
         return orbit, new, keep, out.grid, jnp.minimum(best, reached)
 
     # The loop holds the only copy of the integration: one shot is compiled, not two.
-    grid = jnp.full(how.max_steps, jnp.inf)
+    grid = jnp.full(how.max_steps, jnp.inf, dtype)
     shapes = jax.eval_shape(shoot, state, grid, jnp.zeros((), bool))
     none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    infinite = jnp.asarray(jnp.inf)
+    infinite = jnp.asarray(jnp.inf, dtype)
     first = Orbit(
         state=state,
         flow=none,
         residual=infinite,
-        monodromy=jnp.zeros((count, count)),
-        response=jnp.zeros(3),
-        sensitivity=jnp.zeros((3, designs)),
+        monodromy=jnp.zeros((count, count), dtype),
+        response=jnp.zeros(3, dtype),
+        sensitivity=jnp.zeros((3, designs), dtype),
         newton_steps=jnp.zeros((), int),
     )
     start = (first, state, jnp.zeros((), bool), none.grid, infinite)
     orbit = lax.while_loop(go_on, step, start)[0]
     slope = orbit.flow.slope
-    moved = jnp.linalg.solve(jnp.eye(count) - orbit.monodromy, slope[:count, count:])
+    moved = jnp.linalg.solve(jnp.eye(count, dtype=dtype) - orbit.monodromy, slope[:count, count:])
     sensitivity = slope[count:, count:] + slope[count:, :count] @ moved
     return orbit._replace(sensitivity=sensitivity)
 
@@ -202,7 +209,7 @@ def _with_state_directions(pair, tangents, count):
     stacked = eqx.filter(tangents, eqx.is_inexact_array)
     number = jax.tree.leaves(stacked)[0].shape[0]
     along_pair = jax.tree.map(lambda x: jnp.pad(x, [(count, 0)] + [(0, 0)] * (x.ndim - 1)), stacked)
-    along_state = jnp.eye(count + number, count)
+    along_state = jnp.eye(count + number, count, dtype=pair.angle_scale.dtype)
     return Directions(along_state, eqx.combine(along_pair, pair))
 
 
@@ -229,9 +236,9 @@ def reverse_sensitivity(
         return jnp.concatenate([out.end, out.response])
 
     _, pull = jax.vjp(run, state, design)
-    by_state, by_design = jax.vmap(pull)(jnp.eye(count + 3))
+    by_state, by_design = jax.vmap(pull)(jnp.eye(count + 3, dtype=state.dtype))
     monodromy, response = by_state[:count], by_state[count:]
-    weight = jnp.linalg.solve((jnp.eye(count) - monodromy).T, response.T)
+    weight = jnp.linalg.solve((jnp.eye(count, dtype=state.dtype) - monodromy).T, response.T)
     return by_design[count:] + weight.T @ by_design[:count]
 
 
@@ -250,8 +257,10 @@ def lyapunov(pair: RotorPair, state: Float[Array, "2"], periods: int, how: Integ
 
     The standard error comes from 16 batch means.
     """
-    one = jnp.ones(())
-    still = jax.tree.map(lambda x: jnp.zeros((1, *x.shape)), eqx.filter(pair, eqx.is_inexact_array))
+    one = jnp.ones_like(state[0])
+    still = jax.tree.map(
+        lambda x: jnp.zeros((1, *x.shape), x.dtype), eqx.filter(pair, eqx.is_inexact_array)
+    )
     moving = eqx.combine(still, pair)
 
     def step(carry, _):

@@ -1,0 +1,131 @@
+"""Many designs at once: one compiled program over a batch.
+
+The same steps as `evaluate.Evaluator` (settle, close the orbit, differentiate), without
+its second attempts: a design that needs one is reported as not settled, and can be given
+to an `Evaluator`. Costs of a batch are shared: the slowest member sets the pace.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.steady import RESIDUAL, SETTLED, close_orbit, floquet, settle
+from rootsopt.model import Model
+from rootsopt.status import Status
+
+SAMPLES = 840
+"""Uniform samples of an orbit, among which the peak is looked for; divisible by all
+periods up to eight."""
+STATUSES = (
+    Status.PERIODIC,
+    Status.SOLVER_FAILED,
+    Status.PASSED_THROUGH,
+    Status.NON_FINITE,
+    Status.NOT_SETTLED,
+)
+
+
+class Batch(NamedTuple):
+    """Outcome of n designs with d parameters; NaN where there is no periodic orbit.
+
+    `response` (n, 3): mean, peak and RMS force (N); `gradient` (n, 3, d) per config unit;
+    `state` (n, s): scaled state of the orbit at φ1 = 0, a start for neighbouring designs;
+    `period` (mesh periods), largest Floquet `multiplier`, `residual` of the closed orbit;
+    `deepest`: least ε (rad) on the orbit; `steps` of the solver; `status`: index into
+    `STATUSES`.
+    """
+
+    response: Float[Array, "*n 3"]
+    gradient: Float[Array, "*n 3 d"]
+    state: Float[Array, "*n s"]
+    period: Int[Array, "*n"]
+    multiplier: Float[Array, "*n"]
+    residual: Float[Array, "*n"]
+    deepest: Float[Array, "*n"]
+    steps: Int[Array, "*n"]
+    status: Int[Array, "*n"]
+
+    @property
+    def usable(self) -> Bool[Array, "*n"]:
+        """Where the pair settled on a stable periodic orbit."""
+        return self.status == 0
+
+
+def respond(
+    model: Model,
+    design: Float[Array, " d"],
+    state: Float[Array, " s"],
+    transient: Integrator,
+    orbit: Integrator,
+    max_periods: int = 640,
+    max_orbit: int = 8,
+    gradient: bool = True,
+) -> Batch:
+    """Steady response of one design from the scaled `state`, as a pure function.
+
+    Traceable: map it over `design`, `state` or the leaves of `model`.
+    """
+
+    if gradient:
+        pair, tangents, _ = model.pair_and_tangents(design)
+    else:
+        pair = model.pair(design)
+        dynamic = eqx.filter(pair, eqx.is_inexact_array)
+        tangents = jax.tree.map(lambda x: jnp.zeros((0, *x.shape), x.dtype), dynamic)
+    state = state.astype(pair.angle_scale.dtype)
+    limit = jnp.asarray(max_periods)
+    settled = settle(pair, state, transient, jnp.asarray(SETTLED, state.dtype), limit, max_orbit)
+    period = jnp.maximum(settled.period, 1)
+    closed = close_orbit(pair, tangents, settled.state, period, orbit, SAMPLES)
+    multiplier = jnp.max(floquet(closed.monodromy))
+    finite = jnp.all(jnp.isfinite(closed.response)) & jnp.all(jnp.isfinite(closed.sensitivity))
+    moved = jnp.max(jnp.abs(closed.state - settled.state))
+    near = 10 * SETTLED / jnp.maximum(1 - multiplier, 1e-3)
+    found = (
+        (settled.period > 0)
+        & (closed.residual <= RESIDUAL[model.precision])
+        & (multiplier < 1)
+        & (moved <= near)
+    )
+    status = jnp.select(
+        [~(settled.solved & closed.flow.solved), settled.lost, ~finite, ~found], [1, 2, 3, 4], 0
+    )
+    usable = status == 0
+    mean, square, peak = closed.response
+    rms = jnp.sqrt(square)
+    by_mean, by_square, by_peak = closed.sensitivity
+    rows = jnp.stack([by_mean, by_peak, by_square / (2 * jnp.maximum(rms, 1e-30))])
+    return Batch(
+        response=jnp.where(usable, jnp.stack([mean, peak, rms]), jnp.nan),
+        gradient=jnp.where(usable, rows, jnp.nan),
+        state=closed.state,
+        period=period,
+        multiplier=multiplier,
+        residual=closed.residual,
+        deepest=pair.angle_scale * jnp.min(closed.flow.states[:, 0]),
+        steps=settled.steps + closed.flow.steps,
+        status=status,
+    )
+
+
+@eqx.filter_jit
+def respond_many(
+    model: Model,
+    designs: Float[Array, "n d"],
+    states: Float[Array, "n s"],
+    transient: Integrator,
+    orbit: Integrator,
+    max_periods: int = 640,
+    max_orbit: int = 8,
+    gradient: bool = True,
+) -> Batch:
+    """`respond` over designs (n, d) in config units, each from its own scaled state."""
+
+    def one(design, state):
+        return respond(model, design, state, transient, orbit, max_periods, max_orbit, gradient)
+
+    return jax.vmap(one)(designs, states)

@@ -1,0 +1,186 @@
+"""Node against straight segment: the paper's own contact, its Eq. 9.
+
+Each flank is a polyline from tip to root, and the gap is the least (p - q) · n over the
+nodes p of one flank and the segments (q, n) of the other that face them. The paper tests
+the nodes of rotor 2 only; here either flank is node and segment in turn, so that the
+result does not change when the rotors are exchanged.
+
+A segment faces the nodes between the bisectors at its two ends. There the distances to
+neighbouring segments agree, so the gap is continuous over the pose, its derivatives are
+the levers, and forces come from a potential. The levers jump from segment to segment:
+their error is of first order in the node spacing, that of the gap of second order.
+
+With a = x + ε/2 for rotor 1 and a = π/N - x + ε/2 for rotor 2, a point z of one flank
+(its own rotor's frame, tip on +x) lies at R(a) (E - R(-a′) z) in the frame of the other,
+E the centre distance: exchanging the rotors exchanges a and a′, nothing else.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from rootsopt.profiles.base import Profile
+
+# Shares of the addendum's nodes that a flank is continued by: beyond the pitch point,
+# where the other half of the flank touches near the middle of the mesh, and, on a rounded
+# tip, over its top, so that the first contact is not at an end. More of it would bend the
+# flank of EE too far for the bisection in `_facing`.
+_BEYOND_PITCH = 0.15
+_OVER_TIP = 0.03
+# Points per segment of the table that node spacing is read from.
+_TABLE = 64
+# A node this deep (in pitch radii) has come through the lobe from its other flank.
+_DEEPEST = 0.1
+
+
+class NodeContact(eqx.Module):
+    """Gap and levers of a flank pair at a pose, from two polylines.
+
+    Call it with roll coordinate and ε (rad); see `FlankPair` for their meaning. In the
+    order rotor 1, rotor 2: `nodes` (m), `tangent` (unit, of the bisectors at the nodes)
+    and `normal` (unit, outward, of the segments), each in its own rotor's frame.
+
+    Tip lands carry no torque and have no nodes. Of rotor 1 only the addendum and a
+    little more is kept and of rotor 2 its mate: the rest of the mesh follows by exchange.
+    """
+
+    nodes: Float[Array, "2 n 2"]
+    tangent: Float[Array, "2 n 2"]
+    normal: Float[Array, "2 n-1 2"]
+    pitch_radius: Float[Array, ""]
+    half_pitch: float = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, profile: Profile, nodes: int) -> "NodeContact":
+        """Place `nodes` (at least 16) per flank, half of them on the addendum.
+
+        They are spread evenly in arc length, the longer of the two mating elements, with a
+        share for turning, so that the sharp spot at the pitch point of EE is resolved.
+        """
+        if nodes < 16:
+            raise ValueError(f"Argument `nodes` must be at least 16, but is {nodes}.")
+        normal = _spread(profile, nodes // 2)
+        count = len(normal)
+        near = normal[-1 - round(_BEYOND_PITCH * count) : -1]
+        top = normal[:0]
+        if not profile.segments()[0].land:
+            top = -normal[1 : 2 + round(_OVER_TIP * count)][::-1]
+        own = jnp.concatenate([top, normal])
+        addendum, dedendum = profile.addendum, profile.dedendum
+        # From tip to root, on both rotors; node i of one meshes with node -1 - i of the other.
+        first = [profile.position(addendum(own)), profile.position(dedendum(near[::-1]))]
+        second = [profile.position(addendum(near)), profile.position(dedendum(own[::-1]))]
+        points = jnp.stack([jnp.concatenate(first), jnp.concatenate(second)])
+        chord = _unit(points[:, 1:] - points[:, :-1])
+        bisector = _unit(chord[:, 1:] + chord[:, :-1])
+        tangent = jnp.concatenate([chord[:, :1], bisector, chord[:, -1:]], axis=1)
+        outward = jnp.stack([chord[..., 1], -chord[..., 0]], axis=-1)
+        return cls(points, tangent, outward, profile.pitch_radius, profile.half_pitch)
+
+    def __call__(
+        self, roll: Float[Array, ""], relative: Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+        """Gap (m) and the levers about rotor 1 and rotor 2 (m).
+
+        The derivative is that at the pair of node and segment which is deepest. Where no
+        node faces a segment the gap is the pitch radius and the levers are zero.
+        """
+        half = self.half_pitch
+        centered = roll - half
+        centered = centered - 4 * half * jnp.round(centered / (4 * half))
+        mirrored = centered > 0
+        folded = half - jnp.abs(centered)
+        angles = jnp.stack([folded, 2 * half - folded]) + relative / 2
+        rotor, node, segment, found = lax.stop_gradient(self)._search(lax.stop_gradient(angles))
+        center = self._center(angles[rotor])
+        p = self._transfer(self.nodes[1 - rotor, node], angles[rotor], angles[1 - rotor])
+        n = self.normal[rotor, segment]
+        gap = (p - self.nodes[rotor, segment]) @ n
+        # Moment arms of the line through p along n about the two axes.
+        own, other = _cross(p, n), _cross(center - p, n)
+        swapped = mirrored != (rotor == 1)
+        zero = jnp.zeros_like(gap)
+        return (
+            jnp.where(found, gap, lax.stop_gradient(self.pitch_radius)),
+            jnp.where(found, jnp.where(swapped, other, own), zero),
+            jnp.where(found, jnp.where(swapped, own, other), zero),
+        )
+
+    def _center(self, angle):
+        """The other rotor's axis in the frame of a rotor at `angle`."""
+        return 2 * self.pitch_radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+
+    def _transfer(self, points, angle, other_angle):
+        """`points` (..., 2) of the other rotor's flank in the frame of a rotor at `angle`."""
+        turn = angle - other_angle
+        cos, sin = jnp.cos(turn), jnp.sin(turn)
+        return self._center(angle) - points @ jnp.array([[cos, sin], [-sin, cos]])
+
+    def _search(
+        self, angles: Float[Array, " 2"]
+    ) -> tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""], Bool[Array, ""]]:
+        """Deepest pair: (rotor of the segment, node, segment, whether there is any)."""
+        points = jax.vmap(self._transfer)(self.nodes[::-1], angles, angles[::-1])
+        gap, segment = jax.vmap(_facing)(points, self.nodes, self.tangent, self.normal)
+        gap = jnp.where(gap > -_DEEPEST * self.pitch_radius, gap, jnp.inf)
+        best = jnp.argmin(gap)
+        rotor, node = jnp.divmod(best, gap.shape[1])
+        return rotor, node, segment[rotor, node], jnp.isfinite(gap.ravel()[best])
+
+
+def _facing(
+    points: Float[Array, "n 2"],
+    nodes: Float[Array, "n 2"],
+    tangent: Float[Array, "n 2"],
+    normal: Float[Array, "n-1 2"],
+) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
+    """Signed distance (m) of each of `points` to the segment that faces it (inf if none),
+    and that segment's index.
+
+    By bisection over the nodes: a point near the flank is ahead of the bisectors on the
+    tip's side of its segment and behind all others, because the chord between any two
+    nodes of a flank keeps within a right angle of the tangents at both.
+    """
+    x, y = points[:, 0], points[:, 1]
+    offset = jnp.sum(nodes * tangent, axis=1)
+    base = jnp.sum(nodes[:-1] * normal, axis=1)
+
+    def ahead(index):
+        return x * tangent[index, 0] + y * tangent[index, 1] >= offset[index]
+
+    last = len(nodes) - 1
+    low = jnp.zeros(len(nodes), dtype=jnp.int32)
+
+    # A traced loop: unrolled, the compiler fuses the steps and repeats them, at twice the time.
+    def halve(step, low):
+        middle = low + jnp.left_shift(1, last.bit_length() - 1 - step).astype(low.dtype)
+        passed = (middle < last) & ahead(jnp.minimum(middle, last))
+        return jnp.where(passed, middle, low)
+
+    low = lax.fori_loop(0, last.bit_length(), halve, low)
+    gap = x * normal[low, 0] + y * normal[low, 1] - base[low]
+    return jnp.where(ahead(0) & ~ahead(last), gap, jnp.inf), low
+
+
+def _spread(profile: Profile, count: int) -> Float[Array, " n"]:
+    """Normal angles (rad) of nodes on the addendum, tip (or land's end) to pitch point."""
+    segments = [s for s in profile.segments() if not s.land]
+    share = jnp.arange(_TABLE, dtype=profile.pitch_radius.dtype) / _TABLE
+    ends = [s.start + (s.stop - s.start) * share for s in segments]
+    table = jnp.concatenate([*ends, segments[-1].stop[None]])
+    middle = (table[1:] + table[:-1]) / 2
+    speeds = profile.addendum_speed(middle), profile.dedendum_speed(middle)
+    speed = jnp.maximum(jnp.abs(speeds[0]), jnp.abs(speeds[1])) + 0.3 * profile.pitch_radius
+    measure = jnp.cumsum(jnp.append(jnp.zeros_like(speed[:1]), speed * jnp.diff(table)))
+    even = jnp.linspace(0, 1, count, dtype=measure.dtype)
+    return jnp.interp(even * measure[-1], measure, table)
+
+
+def _unit(vectors):
+    return vectors / jnp.sqrt(jnp.sum(vectors**2, axis=-1, keepdims=True))
+
+
+def _cross(a, b):
+    return a[0] * b[1] - a[1] * b[0]
