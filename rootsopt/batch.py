@@ -1,8 +1,9 @@
 """Many designs at once: one compiled program over a batch.
 
 The same steps as `evaluate.Evaluator` (settle, close the orbit, differentiate), without
-its second attempts: a design that needs one is reported as not settled, and can be given
-to an `Evaluator`. Costs of a batch are shared: the slowest member sets the pace.
+its second attempts, and with orbits closed to a tenth of the tolerance: a design that
+needs more is reported as not settled, and can be given to an `Evaluator`. Costs of a batch
+are shared: the slowest member sets the pace.
 """
 
 from typing import NamedTuple
@@ -13,10 +14,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.flow import Integrator
-from rootsopt.dynamics.steady import RESIDUAL, SETTLED, close_orbit, floquet, settle
+from rootsopt.dynamics.steady import RESIDUAL, close_orbit, floquet, settle, settled_within
 from rootsopt.model import Model
 from rootsopt.status import Status
 
+_SHOTS = 5
 SAMPLES = 840
 """Uniform samples of an orbit, among which the peak is looked for; divisible by all
 periods up to eight."""
@@ -61,7 +63,7 @@ def respond(
     state: Float[Array, " s"],
     transient: Integrator,
     orbit: Integrator,
-    max_periods: int = 640,
+    max_periods: int = 64,
     max_orbit: int = 8,
     gradient: bool = True,
 ) -> Batch:
@@ -78,16 +80,20 @@ def respond(
         tangents = jax.tree.map(lambda x: jnp.zeros((0, *x.shape), x.dtype), dynamic)
     state = state.astype(pair.angle_scale.dtype)
     limit = jnp.asarray(max_periods)
-    settled = settle(pair, state, transient, jnp.asarray(SETTLED, state.dtype), limit, max_orbit)
+    tolerance = settled_within(transient.rtol).astype(state.dtype)
+    settled = settle(pair, state, transient, tolerance, limit, max_orbit)
     period = jnp.maximum(settled.period, 1)
-    closed = close_orbit(pair, tangents, settled.state, period, orbit, SAMPLES)
+    enough = 0.1 * orbit.rtol
+    closed = close_orbit(
+        pair, tangents, settled.state, period, orbit, SAMPLES, shots=_SHOTS, closed=enough
+    )
     multiplier = jnp.max(floquet(closed.monodromy))
     finite = jnp.all(jnp.isfinite(closed.response)) & jnp.all(jnp.isfinite(closed.sensitivity))
     moved = jnp.max(jnp.abs(closed.state - settled.state))
-    near = 10 * SETTLED / jnp.maximum(1 - multiplier, 1e-3)
+    near = 10 * tolerance / jnp.maximum(1 - multiplier, 1e-3)
     found = (
         (settled.period > 0)
-        & (closed.residual <= RESIDUAL[model.precision])
+        & (closed.residual <= jnp.maximum(enough, RESIDUAL[model.precision]))
         & (multiplier < 1)
         & (moved <= near)
     )
@@ -119,7 +125,7 @@ def respond_many(
     states: Float[Array, "n s"],
     transient: Integrator,
     orbit: Integrator,
-    max_periods: int = 640,
+    max_periods: int = 64,
     max_orbit: int = 8,
     gradient: bool = True,
 ) -> Batch:

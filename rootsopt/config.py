@@ -97,19 +97,26 @@ class SceneConfig(_Section):
 class SolverConfig(_Section):
     """How the scene is solved."""
 
-    fidelity: Literal["search", "map", "linear", "nodes"] = Field(
+    fidelity: Literal["search", "map", "linear", "nodes", "auto"] = Field(
         "map",
         description="contact: search at every call (reference), C² map of the gap, linear in "
-        "the relative rotation, or the paper's nodes against segments",
+        "the relative rotation, the paper's nodes against segments, or auto: these settings "
+        "as accuracy needs",
+    )
+    accuracy: Annotated[float, Field(ge=1e-6, le=0.1)] = Field(
+        1e-3, description="relative error of mean and peak force that auto may leave"
     )
     nodes: Annotated[int, Field(ge=16, le=20_000)] = Field(
         400, description="nodes per flank of fidelity nodes"
     )
-    map_rolls: Annotated[int, Field(ge=16, le=4096)] = Field(
-        384, description="map points over the roll angle"
+    map_error: Annotated[float, Field(ge=1e-6, le=0.1)] = Field(
+        1e-4, description="error of the map's penetration, relative to the static one"
     )
-    map_relatives: Annotated[int, Field(ge=12, le=1024)] = Field(
-        16, description="map points over the relative rotation"
+    map_rolls: Annotated[int, Field(ge=16, le=4096)] | None = Field(
+        None, description="map points over the roll angle; absent: as map_error needs"
+    )
+    map_relatives: Annotated[int, Field(ge=12, le=1024)] | None = Field(
+        None, description="map points over the relative rotation; absent: as map_error needs"
     )
     method: Literal["tsit5", "dopri5", "dopri8", "kvaerno3", "kvaerno5"] = Field(
         "tsit5", description="explicit: tsit5, dopri5, dopri8; implicit: kvaerno3, kvaerno5"

@@ -1,6 +1,7 @@
 """One design in one scene, from design vector to steady state, response and gradient."""
 
 import dataclasses
+import functools
 import time
 from typing import Any
 
@@ -12,13 +13,13 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
+from rootsopt.contact.size import size_map
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import (
     BLOCK,
     RESIDUAL,
     SAMPLES,
-    SETTLED,
     Orbit,
     Transient,
     close_orbit,
@@ -26,6 +27,7 @@ from rootsopt.dynamics.steady import (
     lyapunov,
     reverse_sensitivity,
     settle,
+    settled_within,
 )
 from rootsopt.errors import InputError
 from rootsopt.model import MM, Model, design_keys, design_vector, integrators
@@ -107,9 +109,10 @@ class Evaluator:
     def __init__(self, config: Config, rtol: float | None = None, survey: bool = False):
         self.config = config
         self.survey = survey
-        self.fitted = False
+        self.fitted = self.sized = False
+        self.map_error = float("nan")
         limit = config.solver.max_mesh_periods
-        self.max_periods = max(limit // 4, 2 * BLOCK) if survey else limit
+        self.max_periods = max(limit // 4, 8 * BLOCK) if survey else limit
         self.model = Model.of(config)
         self.keys = design_keys(config)
         transient, orbit = integrators(config)
@@ -130,11 +133,40 @@ class Evaluator:
         """
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         began = time.perf_counter()
+        self._size(design)
         for _ in range(5):
             outcome = self._attempt(design, start)
+            covered = float(self.model.deepest)
             if not self._refit(outcome):
                 break
+            if float(self.model.deepest) < covered:
+                self._size(design)
         return self._report(design, outcome, time.perf_counter() - began, series)
+
+    def _size(self, design) -> None:
+        """Make the contact map large enough for `design`, where the config leaves it open.
+
+        It only grows, so that neighbouring designs share a program. A survey keeps the size
+        it was given.
+        """
+        solver = self.config.solver
+        fixed = solver.map_rolls is not None and solver.map_relatives is not None
+        if self.model.fidelity != "map" or self.survey or fixed:
+            return
+        depth = self.model.static_depth
+        found = size_map(
+            self.model.profile(design), float(self.model.deepest), solver.map_error * depth
+        )
+        rolls, relatives = self.model.map_size
+        if not self.sized:
+            rolls = relatives = 0
+        self.sized = True
+        self.map_error = found.error / depth
+        size = (
+            solver.map_rolls or max(rolls, found.rolls),
+            solver.map_relatives or max(relatives, found.relatives),
+        )
+        self.model = dataclasses.replace(self.model, map_size=size)
 
     def _refit(self, outcome: "_Outcome") -> bool:
         """Fit the contact map to the motion; whether the design must be evaluated again.
@@ -159,7 +191,8 @@ class Evaluator:
         pair, tangents, shape = _build(self.model, design)
         dtype = pair.angle_scale.dtype
         state = jnp.zeros(2, dtype) if start is None else jnp.asarray(start, dtype)
-        how, tolerance, used, steps = self.transient, SETTLED, 0, 0
+        how, used, steps = self.transient, 0, 0
+        tolerance = float(settled_within(how.rtol))
         while True:
             transient = _settle(
                 pair,
@@ -240,6 +273,11 @@ class Evaluator:
             "transient_mesh_periods": outcome.used,
             "solver_steps": outcome.steps,
         }
+        if self.model.fidelity == "map":
+            rolls, relatives = self.model.map_size
+            statistics |= {"map_rolls": rolls, "map_relatives": relatives}
+            if self.sized:
+                statistics["map_error"] = self.map_error
         if status is Status.PERIODIC and orbit is not None:
             period = int(outcome.transient.period)
             response = _response(*np.asarray(orbit.response))
@@ -358,14 +396,15 @@ def _contact_series(pair: RotorPair, tau, states):
 
 def _series(pair: RotorPair, tau, states) -> Series:
     phi, relative, rate, contact = _contact_series(pair, jnp.asarray(tau), jnp.asarray(states))
+    double = functools.partial(np.asarray, dtype=np.float64)
     return Series(
-        time=np.asarray(tau) * float(pair.mesh_period),
-        rotation=np.asarray(phi),
-        relative=np.asarray(relative),
-        rate=np.asarray(rate),
-        drive_force=np.asarray(contact.drive),
-        coast_force=np.asarray(contact.coast),
-        depth=np.asarray(contact.depth),
+        time=double(tau) * float(pair.mesh_period),
+        rotation=double(phi),
+        relative=double(relative),
+        rate=double(rate),
+        drive_force=double(contact.drive),
+        coast_force=double(contact.coast),
+        depth=double(contact.depth),
     )
 
 

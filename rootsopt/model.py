@@ -34,6 +34,10 @@ points of a flank mesh at once. Node search finds no interference (< 1 nm) up to
 the paper's printed Table 1 is 1.2 % over."""
 
 
+_ROLLS, _RELATIVES = 384, 16
+"""Map of a model nobody has sized."""
+
+
 class Model(eqx.Module):
     """Everything about a config but the design: builds a rotor pair from a design.
 
@@ -89,7 +93,7 @@ class Model(eqx.Module):
             lobes=config.profile.lobes,
             fidelity=solver.fidelity,
             precision=solver.precision,
-            map_size=(solver.map_rolls, solver.map_relatives),
+            map_size=(solver.map_rolls or _ROLLS, solver.map_relatives or _RELATIVES),
             nodes=solver.nodes,
             pitch_radius=jnp.asarray(radius),
             length=jnp.asarray(config.rotor.length_mm * MM),
@@ -110,6 +114,12 @@ class Model(eqx.Module):
         angle, length, tip = design
         return CIC(self.lobes, self.pitch_radius, angle * DEG, length * MM, tip * DEG)
 
+    @property
+    def static_depth(self) -> float:
+        """Penetration (m) that carries the load at the pitch radius."""
+        force = jnp.maximum(self.load_torque, 1e-3) / self.pitch_radius
+        return float(self.law.depth_at(force))
+
     def inertia(self, shape: Geometry) -> Float[Array, ""]:
         """Polar moment of inertia of one rotor about its axis (kg·m²)."""
         return self.density * self.length * shape.polar_area_moment
@@ -122,6 +132,11 @@ class Model(eqx.Module):
             return LinearContact.of(profile)
         if self.fidelity == "nodes":
             return NodeContact.of(profile, self.nodes)
+        if self.fidelity == "auto":
+            raise InputError(
+                "`solver.fidelity` must be chosen before a pair is built, but is auto; call "
+                "rootsopt.auto.choose first"
+            )
         return SearchContact.of(profile)
 
     def pair(self, design: Float[Array, " d"]) -> RotorPair:

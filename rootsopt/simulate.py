@@ -14,7 +14,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
     """Check, simulate, write, print."""
     from rich.console import Console
 
-    from rootsopt import files, report
+    from rootsopt import auto, files, report
     from rootsopt.evaluate import Evaluator
     from rootsopt.model import check_geometry, outline_mm
 
@@ -22,12 +22,13 @@ def body(config: Config, options: argparse.Namespace) -> int:
     folder = files.ResultFolder(options.output)
     console = Console(stderr=True)
     with console.status("compiling and simulating") if console.is_terminal else _quiet():
+        config, choice = auto.resolve(config)
         evaluation = Evaluator(config)()
     folder.write_text("config.yaml", config.to_yaml())
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     if evaluation.series is not None:
         folder.write_csv("response_design.csv", files.response_columns(evaluation.series))
-    folder.write_json("result.json", evaluation.record() | {"versions": files.versions()})
+    folder.write_json("result.json", evaluation.record() | choice | {"versions": files.versions()})
     if not options.no_figures:
         from rootsopt import plot
 

@@ -26,7 +26,9 @@ pytest.importorskip("numba")
 from experiments.baselines import numba_pair
 from experiments.baselines.numba_pair import MAP_1E3, SEARCH_1E3, SEARCH_GRADIENT_1E3, NumbaPair
 
-CONFIG = load("configs/cic.yaml", ["solver.fidelity=search", "solver.rtol=1e-10"])
+CONFIG = load(
+    "configs/cic.yaml", ["solver.fidelity=search", "solver.method=dopri8", "solver.rtol=1e-12"]
+)
 SCENE = Scene.of(CONFIG)
 BASELINE = (36.43, 9.0, 4.0)
 DESIGNS = [BASELINE, (33.0, 6.0, 3.0), (40.0, 8.0, 6.0), (37.0, 8.5, 0.5)]

@@ -170,7 +170,7 @@ def test_compiled_programs_are_kept_between_processes(tmp_path):
         assert done.stderr == ""
         answers.append(json.loads((tmp_path / run / "result.json").read_text())["response"])
         kept = {path.name.split("-")[0] for path in cache.rglob("*-cache")}
-        assert {"jit__build", "jit_settle", "jit_close_orbit"} <= kept
+        assert {"jit_pair_and_tangents", "jit_settle", "jit_close_orbit"} <= kept
     assert answers[0] == answers[1]
 
     def unkept(folder, *more):

@@ -365,7 +365,7 @@ def powers(pair, state, how):
         t1=1.0,
         dt0=None,
         y0=jnp.concatenate([state, jnp.zeros(4)]),
-        stepsize_controller=how.controller,
+        stepsize_controller=how.controller(jnp.float64),
         adjoint=ADJOINT,
         max_steps=how.max_steps,
     )

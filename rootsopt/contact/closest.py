@@ -66,8 +66,8 @@ class FlankNodes(NamedTuple):
     """Where T is sampled: normal angles ν2 with what does not depend on the pose.
 
     `facing` is the direction of the common normal at x = 0, `direction` its cosine and
-    sine; `turned` the cosine and sine of `Profile.turn_ratio` times it; `lever` and
-    `support` those of rotor 2's point.
+    sine; `turned` the cosine and sine of `Profile.turn_ratio` times it; `lever` that of
+    rotor 2's point.
     """
 
     normal: Float[Array, " n"]
@@ -75,17 +75,18 @@ class FlankNodes(NamedTuple):
     direction: Float[Array, "2 n"]
     turned: Float[Array, "2 n"]
     lever: Float[Array, " n"]
-    support: Float[Array, " n"]
 
 
 class FlankPair(eqx.Module):
     """A flank of rotor 1 against its mate on rotor 2.
 
-    `profile`: both rotors' profile; `nodes`: see `FlankNodes`; `center_distance` E (m).
+    `profile`: both rotors' profile, `frozen` the same without derivative, for the search;
+    `nodes`: see `FlankNodes`; `center_distance` E (m).
     Build it with `FlankPair.of(profile)` outside any time loop.
     """
 
     profile: Profile
+    frozen: Profile
     nodes: FlankNodes
     center_distance: Float[Array, ""]
 
@@ -113,21 +114,19 @@ class FlankPair(eqx.Module):
         beyond = 1 + jnp.arange(1, 1 + _NODES_PER_SEGMENT // 2) / _NODES_PER_SEGMENT
         pieces.append(start + (stop - start) * jnp.concatenate([near, beyond]))
         normal = jnp.concatenate(pieces)
-        beta, psi, s = _mate_point(frozen, normal)
-        arm = frozen.pitch_radius * jnp.stack([jnp.cos(psi), jnp.sin(psi)])
+        beta, psi, _ = _mate_point(frozen, normal, distance=False)
         facing = jnp.pi / 2 - psi - beta
         nodes = FlankNodes(
             normal=normal,
             facing=facing,
             direction=_circle(facing),
             turned=_circle(frozen.turn_ratio * facing),
-            lever=arm[0],
-            support=arm[1] + s,
+            lever=frozen.pitch_radius * jnp.cos(psi),
         )
-        # Else the compiler merges this with its use and does it anew at every pose.
-        nodes = lax.optimization_barrier(lax.stop_gradient(nodes))
-        nominal = 2 * profile.pitch_radius
-        return cls(profile, nodes, nominal if center_distance is None else center_distance)
+        distance = 2 * profile.pitch_radius if center_distance is None else center_distance
+        dynamic, static = eqx.partition(frozen, eqx.is_inexact_array)
+        dynamic, nodes = _materialized((dynamic, nodes), nodes.normal[-1] > -jnp.inf)
+        return cls(profile, eqx.combine(dynamic, static), nodes, distance)
 
     def __call__(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> ClosestApproach:
         """Closest approach at roll coordinate x = `roll` and ε = `relative` (rad).
@@ -158,7 +157,8 @@ class FlankPair(eqx.Module):
         @jax.custom_jvp
         def closest(dynamic, roll, relative):
             pair = eqx.combine(dynamic, static)
-            found, normal2 = pair._search(roll, relative)
+            searcher = eqx.tree_at(lambda pair: pair.profile, pair, pair.frozen)
+            found, normal2 = searcher._search(roll, relative)
             gap, normal1, lever1, lever2 = pair._mesh(normal2, roll, relative)
             zero = jnp.zeros_like(gap)
             return ClosestApproach(
@@ -225,32 +225,41 @@ class FlankPair(eqx.Module):
     def _search(self, roll, relative):
         """Bracket on the nodes, refine inside, one Newton step: (found, ν2)."""
         profile, nodes = self.profile, self.nodes
-        ratio = profile.turn_ratio
-        turned = _rotate(nodes.turned, 2 * ratio * roll)
-        lever1, support1 = profile.arms(nodes.facing + 2 * roll, turned[0], turned[1])
-        cos, sin = _rotate(nodes.direction, roll - relative / 2)
+        turned = _rotate(nodes.turned, 2 * profile.turn_ratio * roll)
+        lever1 = profile.lever_from(nodes.facing + 2 * roll, turned[0], turned[1])
+        sin = _rotate(nodes.direction, roll - relative / 2)[1]
         offset = self.center_distance * sin - lever1 - nodes.lever
-        gap = self.center_distance * cos - support1 - nodes.support
-        # Where T falls through zero the gap has a minimum. A second one occurs near the
-        # pitch point of EE and at penetrations far beyond the contact law: the deeper
-        # counts, judged by dG/dλ = T, T being linear between nodes.
-        # The tolerance is for a root on a node: a compiled program may round T[i] one way
-        # as the end of one interval and another way as the start of the next.
+        # Where T falls through zero the gap has a minimum. The tolerance is for a root on
+        # a node: a compiled program may round T[i] one way as the end of one interval and
+        # another way as the start of the next.
         slack = _SLACK[offset.dtype.itemsize] * profile.pitch_radius
         falling = (offset[:-1] >= -slack) & (offset[1:] < slack)
-        fall = offset[:-1] - offset[1:]
-        share = jnp.clip(offset[:-1] / jnp.where(fall > 0, fall, 1.0), 0.0, 1.0)
-        drop = 0.5 * offset[:-1] * share * (nodes.facing[:-1] - nodes.facing[1:])
-        depth = jnp.where(falling, gap[:-1] + drop, jnp.inf)
-        first = jnp.argmin(depth)
-        normal2 = self._refine(first, offset, roll, relative)
-        if profile.minima == 1:
-            return falling[first], normal2
-        # Two minima may be closer in depth than the estimate between nodes is good.
-        second = jnp.argmin(depth.at[first].set(jnp.inf))
-        other = self._refine(second, offset, roll, relative)
-        deeper = self._mesh(other, roll, relative)[0] < self._mesh(normal2, roll, relative)[0]
-        return falling[first], jnp.where(deeper & falling[second], other, normal2)
+        # Whole numbers, whose greatest is found at vector speed; an arg-minimum is not.
+        place = jnp.arange(falling.shape[0])
+        last = jnp.max(jnp.where(falling, place, -1))
+        found = last >= 0
+        first = jnp.min(jnp.where(falling, place, place.shape[0]))
+        ends = jnp.maximum(last, 0), jnp.minimum(first, place.shape[0] - 1)
+
+        def gap(normal2):
+            return self._mesh(normal2, roll, relative)[0]
+
+        # Two minima occur away from the nominal centre distance, and near the pitch point
+        # where ψ = 0 there: the deeper counts.
+        guesses = [self._between(index, offset) for index in ends]
+        if profile.cusp:
+            # They may be closer in depth than T taken as linear between nodes can tell.
+            guesses = [self._refine(index, offset, roll, relative) for index in ends]
+            return found, jnp.where(gap(guesses[1]) < gap(guesses[0]), guesses[1], guesses[0])
+        index = jnp.where(gap(guesses[1]) < gap(guesses[0]), ends[1], ends[0])
+        return found, self._refine(index, offset, roll, relative)
+
+    def _between(self, index, offset):
+        """Root of T between the nodes `index` and `index` + 1, T taken as linear."""
+        low, high = self.nodes.normal[index], self.nodes.normal[index + 1]
+        fall = offset[index] - offset[index + 1]
+        share = jnp.clip(offset[index] / jnp.where(fall > 0, fall, 1.0), 0.0, 1.0)
+        return low + (high - low) * share
 
     def _refine(self, index, offset, roll, relative):
         """Root of T between the nodes `index` and `index` + 1."""
@@ -287,6 +296,18 @@ def _illinois(function, bracket):
         low, high = jnp.where(above, middle, low), jnp.where(above, high, middle)
         side = jnp.where(above, 1.0, -1.0)
     return secant()
+
+
+def _materialized(tree, true):
+    """`tree` as it is, kept from being merged with its uses: XLA would compute sines of the
+    nodes anew at every pose. (It drops optimisation barriers on CPUs, but must run a loop
+    whose length it does not know.) `true`: always true, but not known to the compiler."""
+
+    def copy(carry):
+        return carry[0] + 1, tree
+
+    start = jnp.zeros((), int), jax.tree.map(jnp.zeros_like, tree)
+    return lax.while_loop(lambda carry: carry[0] < true.astype(int), copy, start)[1]
 
 
 def _circle(angle):

@@ -20,7 +20,25 @@ from rootsopt.contact.closest import FlankPair
 from rootsopt.profiles.base import Profile
 
 # Grid cells of ε beyond zero, so that the spline is in its interior where contact starts.
-_MARGIN = 3
+MARGIN = 3
+
+
+def first_roll(deepest: Float[Array, ""] | float, half_pitch: float) -> Float[Array, ""]:
+    """Roll (rad) at which a map down to ε = `deepest` begins: contact can start before the
+    tip passes the line of centres, by about √|ε|."""
+    return -jnp.minimum(0.9 * half_pitch, 2 * jnp.sqrt(-jnp.asarray(deepest)) + 0.02)
+
+
+def continued_gap(
+    pair: FlankPair, roll: Float[Array, ""], relative: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Gap (m) with a continuation where the flanks have no common normal.
+
+    There the tip land is passing; a parabola continues the gap that its end leaves.
+    """
+    contact = pair(roll, relative)
+    away = roll - lax.stop_gradient(_land_end(pair.profile)) - relative / 2
+    return jnp.where(contact.found, contact.gap, pair.profile.pitch_radius * away**2)
 
 
 @functools.lru_cache(maxsize=32)
@@ -40,11 +58,12 @@ def _interpolation_matrix(count: int) -> NDArray[np.float64]:
 
 
 def _weights(t):
-    """B-spline weights of the four coefficients around a cell and their slopes."""
+    """B-spline weights of the four coefficients around a cell, with two derivatives."""
     u = 1 - t
     value = jnp.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]) / 6
     slope = jnp.stack([-(u**2), 3 * t**2 - 4 * t, -3 * u**2 + 4 * u, t**2]) / 2
-    return value, slope
+    bend = jnp.stack([u, 3 * t - 2, 3 * u - 2, t])
+    return value, slope, bend
 
 
 class MapContact(eqx.Module):
@@ -70,28 +89,22 @@ class MapContact(eqx.Module):
         points (both at least 8)."""
         pair = FlankPair.of(profile)
         half = float(profile.half_pitch)
-        # Contact can start before the tip passes the line of centres, by about √|ε|.
-        first_roll = -jnp.minimum(0.9 * half, 2 * jnp.sqrt(-deepest) + 0.02)
+        first = first_roll(deepest, half)
         # Past the middle of the flank the map is continued by symmetry, so that the
         # spline is in its interior there as well.
-        roll_step = (half - first_roll) / (rolls - 1 - _MARGIN)
-        relative_step = -deepest / (relatives - 1 - _MARGIN)
-        roll = first_roll + roll_step * jnp.arange(rolls)
+        roll_step = (half - first) / (rolls - 1 - MARGIN)
+        relative_step = -deepest / (relatives - 1 - MARGIN)
+        roll = first + roll_step * jnp.arange(rolls)
         relative = deepest + relative_step * jnp.arange(relatives)
 
         def gap(roll, relative):
-            contact = pair(roll, relative)
-            # No common normal: the tip land is passing. A parabola continues the gap
-            # that the end of the land leaves.
-            start = lax.stop_gradient(_land_end(profile))
-            away = roll - start - relative / 2
-            return jnp.where(contact.found, contact.gap, profile.pitch_radius * away**2)
+            return continued_gap(pair, roll, relative)
 
         values = jax.vmap(lambda x: jax.vmap(lambda e: gap(x, e))(relative))(roll)
         left = jnp.asarray(_interpolation_matrix(rolls))
         right = jnp.asarray(_interpolation_matrix(relatives))
         coefficients = left @ values @ right.T
-        return cls(coefficients, first_roll, roll_step, deepest, relative_step, half)
+        return cls(coefficients, first, roll_step, deepest, relative_step, half)
 
     def __call__(
         self, roll: Float[Array, ""], relative: Float[Array, ""]
@@ -103,29 +116,55 @@ class MapContact(eqx.Module):
         mirror = jnp.where(centered > 0, -1.0, 1.0)
         folded = half - jnp.abs(centered)
         rows, columns = self.coefficients.shape
-        i, x_value, x_slope, _ = self._cell(folded, self.first_roll, self.roll_step, rows)
-        j, e_value, e_slope, beyond = self._cell(
-            relative, self.deepest, self.relative_step, columns
-        )
-        local = lax.dynamic_slice(self.coefficients, (i, j), (4, 4))
-        e_slope = e_slope / self.relative_step
-        # Sums of products, which the compiler merges; a matrix product would be a call.
-        along = jnp.sum(local * (e_value + e_slope * beyond), axis=1)
-        gap = jnp.sum(x_value * along)
-        by_relative = jnp.sum(x_value * jnp.sum(local * e_slope, axis=1))
-        by_roll = mirror * jnp.sum(x_slope * along) / self.roll_step
+        x = jnp.clip((folded - self.first_roll) / self.roll_step, 0.0, rows - 3 - 1e-6)
+        position = (relative - self.deepest) / self.relative_step
+        y = jnp.clip(position, 0.0, columns - 3 - 1e-6)
+        value, by_x, by_y, by_xy = _bicubic(self.coefficients, x, y)
+        beyond = position - y
+        by_relative = by_y / self.relative_step
+        by_roll = mirror * (by_x + by_xy * beyond) / self.roll_step
         # φ̄ = -x: ∂G/∂φ1 = -∂G/∂x / 2 - ∂G/∂ε = -lever1, ∂G/∂φ2 = lever2.
-        return gap, by_relative + by_roll / 2, by_relative - by_roll / 2
+        return value + by_y * beyond, by_relative + by_roll / 2, by_relative - by_roll / 2
 
-    @staticmethod
-    def _cell(x, first, step, size):
-        """Index of the first of four coefficients, their weights, and how far x lies
-        beyond the map."""
-        position = (x - first) / step
-        held = jnp.clip(position, 0.0, size - 3 - 1e-9)
-        index = lax.stop_gradient(jnp.floor(held)).astype(jnp.int32)
-        value, slope = _weights(held - index)
-        return index, value, slope, (position - held) * step
+
+@jax.custom_jvp
+def _bicubic(coefficients, x, y):
+    """Spline value and its derivatives ∂x, ∂y, ∂x∂y at a position counted in cells."""
+    i, j = (lax.stop_gradient(jnp.floor(t)).astype(jnp.int32) for t in (x, y))
+    return _sums(_local(coefficients, i, j), _weights(x - i), _weights(y - j))
+
+
+@_bicubic.defjvp
+def _(primals, tangents):
+    # Written out, because a derivative along many directions shares nearly all of it: the
+    # second derivatives are taken once, and only the table's own change is per direction.
+    coefficients, x, y = primals
+    changed, x_dot, y_dot = tangents
+    i, j = (lax.stop_gradient(jnp.floor(t)).astype(jnp.int32) for t in (x, y))
+    local, across, along = _local(coefficients, i, j), _weights(x - i), _weights(y - j)
+    out = _sums(local, across, along)
+    by_x = _sums(local, across[1:], along)
+    by_y = _sums(local, across, along[1:])
+    own = _sums(_local(changed, i, j), across, along)
+    moved = tuple(o + a * x_dot + b * y_dot for o, a, b in zip(own, by_x, by_y, strict=True))
+    return out, moved
+
+
+def _local(coefficients, i, j):
+    return lax.dynamic_slice(coefficients, (i, j), (4, 4))
+
+
+def _sums(local, across, along):
+    """Σ c w(x) v(y) with (w, v) the values and first derivatives in `across` and `along`:
+    f, ∂x f, ∂y f, ∂x∂y f. Sums of products, which the compiler merges; a matrix product
+    would be a call."""
+    value, slope = (jnp.sum(local * w, axis=1) for w in along[:2])
+    return (
+        jnp.sum(across[0] * value),
+        jnp.sum(across[1] * value),
+        jnp.sum(across[0] * slope),
+        jnp.sum(across[1] * slope),
+    )
 
 
 def _land_end(profile):

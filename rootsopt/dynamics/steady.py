@@ -19,13 +19,13 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.flow import Directions, Flow, Integrator, flow, strobe
 from rootsopt.dynamics.pair import RotorPair
 
-BLOCK = 16
+BLOCK = 4
 """Mesh periods integrated between two looks at the transient."""
+_MEMORY = 20
+"""Stroboscopic states remembered; more than twice the longest period looked for."""
 SAMPLES = 2520
 """Uniform samples of an orbit; divisible by every period up to ten, so that a sample
 falls on the end of each mesh period."""
-SETTLED = 3e-3
-"""Scaled difference below which successive states count as repeating."""
 RESIDUAL = {"float64": 1e-9, "float32": 1e-3}
 """Largest residual (scaled) of an orbit that counts as closed, by precision."""
 _NEWTON_STEPS = 12
@@ -72,6 +72,12 @@ class Orbit(NamedTuple):
     newton_steps: Int[Array, ""]
 
 
+def settled_within(rtol: Float[Array, ""]) -> Float[Array, ""]:
+    """Scaled difference below which states count as repeating, for a transient integrated
+    at `rtol`: the noise of adaptive steps is some hundred times the tolerance."""
+    return jnp.clip(1000 * rtol, 3e-3, 3e-2)
+
+
 def settle(
     pair: RotorPair,
     state: Float[Array, "2"],
@@ -82,35 +88,40 @@ def settle(
 ) -> Transient:
     """Integrate block by block until the last states repeat with some period k.
 
-    Settled means: over the last half block, states k periods apart differ by less than
-    `tolerance` (scaled units), for the smallest such k ≤ `max_orbit`.
+    Settled means: the last k + 1 states differ from those k periods earlier by less than
+    `tolerance` (scaled units), for the smallest such k ≤ `max_orbit` ≤ 8.
     """
-    half = BLOCK // 2
+    orders = jnp.arange(1, max_orbit + 1)
+    age = jnp.arange(_MEMORY)[::-1]
 
     def cycle(states):
         def spread(k):
-            earlier = lax.dynamic_slice(states, (half - k, 0), (half, 2))
-            return jnp.max(jnp.abs(states[half:] - earlier))
+            change = jnp.max(jnp.abs(states - jnp.roll(states, k, axis=0)), axis=1)
+            # Before the start the memory holds inf, and inf - inf is no difference.
+            change = jnp.where(jnp.isnan(change), jnp.inf, change)
+            return jnp.max(jnp.where(age <= k, change, 0.0))
 
-        orders = jnp.arange(1, max_orbit + 1)
         spreads = jax.vmap(spread)(orders)
         settled = spreads < tolerance
         period = jnp.where(jnp.any(settled), orders[jnp.argmax(settled)], 0)
         nearest = jnp.argmin(spreads)
         return period, orders[nearest], spreads[nearest]
 
-    def go_on(carry):
+    def go_on(loop):
+        carry, _ = loop
         alive = ~carry.lost & carry.solved & jnp.all(jnp.isfinite(carry.state))
         return (carry.period == 0) & alive & (carry.periods < max_periods)
 
-    def advance(carry):
+    def advance(loop):
+        carry, memory = loop
         part = strobe(pair, carry.state, BLOCK, how)
+        memory = jnp.concatenate([memory[BLOCK:], part.states])
         end = part.states[-1]
         relative = pair.angle_scale * end[0]
         lost = jnp.abs(relative) >= pair.angle_limit
         sound = part.solved & ~lost & jnp.all(jnp.isfinite(end))
-        period, nearest, spread = cycle(part.states)
-        return Transient(
+        period, nearest, spread = cycle(memory)
+        new = Transient(
             state=end,
             period=jnp.where(sound, period, 0),
             nearest=nearest,
@@ -120,6 +131,7 @@ def settle(
             solved=part.solved,
             steps=carry.steps + part.steps,
         )
+        return new, memory
 
     start = Transient(
         state=state,
@@ -131,7 +143,8 @@ def settle(
         solved=jnp.ones((), bool),
         steps=jnp.zeros((), int),
     )
-    return lax.while_loop(go_on, advance, start)
+    memory = jnp.full((_MEMORY, *state.shape), jnp.inf, state.dtype)
+    return lax.while_loop(go_on, advance, (start, memory))[0]
 
 
 def close_orbit(
@@ -141,17 +154,20 @@ def close_orbit(
     period: Int[Array, ""],
     how: Integrator,
     samples: int = SAMPLES,
+    shots: int = _NEWTON_STEPS,
+    closed: Float[Array, ""] | float = 0.0,
 ) -> Orbit:
     """Newton shooting on Φ(z) = z, then the implicit function theorem for gradients.
 
     `tangents` holds d pair / d design, stacked along a leading axis. State and design
     directions are integrated together (variational equation). `samples` must be divisible by
-    the period. Once Newton's steps are
+    the period. Newton stops after `shots` integrations, or at the residual `closed` (at
+    least some thousand roundings). Once Newton's steps are
     small the solver's steps are kept, so that the map it solves is smooth and closes to
     rounding.
     """
     count, dtype = state.shape[0], state.dtype
-    closed = _CLOSED * float(jnp.finfo(dtype).eps)
+    closed = jnp.maximum(closed, _CLOSED * float(jnp.finfo(dtype).eps)).astype(dtype)
     length = period.astype(dtype)
     directions = _with_state_directions(pair, tangents, count)
     designs = directions.state.shape[0] - count
@@ -161,10 +177,10 @@ def close_orbit(
 
     def go_on(carry):
         orbit, _, repeat, _, best = carry
-        shots = orbit.newton_steps
+        done = orbit.newton_steps
         # Chosen anew, the steps depend on the state, and that leaves a floor.
-        improving = (shots < 3) | ~repeat | (orbit.residual < 0.5 * best)
-        return (orbit.residual > closed) & (shots < _NEWTON_STEPS) & improving
+        improving = (done < 3) | ~repeat | (orbit.residual < 0.5 * best)
+        return (orbit.residual > closed) & (done < shots) & improving
 
     def step(carry):
         orbit, state, repeat, grid, best = carry
@@ -176,10 +192,10 @@ def close_orbit(
         size = jnp.max(jnp.abs(correction))
         # Keep the first steps inside the neighbourhood the transient pointed to.
         new = state + correction * jnp.minimum(1.0, 0.5 / jnp.maximum(size, 1e-30))
-        shots = orbit.newton_steps + 1
-        keep = repeat | (size < _SMALL) | (shots >= _NEWTON_STEPS // 2)
+        done = orbit.newton_steps + 1
+        keep = repeat | (size < _SMALL) | (done >= shots // 2)
         reached = orbit.residual
-        orbit = Orbit(state, out, residual, monodromy, out.response, orbit.sensitivity, shots)
+        orbit = Orbit(state, out, residual, monodromy, out.response, orbit.sensitivity, done)
         return orbit, new, keep, out.grid, jnp.minimum(best, reached)
 
     # The loop holds the only copy of the integration: one shot is compiled, not two.

@@ -17,7 +17,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
     began = time.perf_counter()
     from rich.console import Console
 
-    from rootsopt import files, report
+    from rootsopt import auto, files, report
     from rootsopt.model import check_geometry
     from rootsopt.optimize.search import Search
     from rootsopt.timing import CompileClock
@@ -26,9 +26,10 @@ def body(config: Config, options: argparse.Namespace) -> int:
     folder = files.ResultFolder(options.output)
     clock = CompileClock()
     with clock, _progress(Console(stderr=True)) as progress:
+        config, choice = auto.resolve(config)
         result = Search(config, progress).run()
     ran = time.perf_counter() - began
-    _write(folder, config, options, result, clock.seconds, ran)
+    _write(folder, config, options, result, choice, clock.seconds, ran)
     out = Console()
     if result.optimized is None:
         out.print(report.evaluation_table(result.baseline))
@@ -61,7 +62,7 @@ def _no_result(result) -> str:
     )
 
 
-def _write(folder, config, options, result, compiled, ran) -> None:
+def _write(folder, config, options, result, choice, compiled, ran) -> None:
     from rootsopt import files
     from rootsopt.model import outline_mm
 
@@ -78,6 +79,7 @@ def _write(folder, config, options, result, compiled, ran) -> None:
     rows = result.history
     if rows:
         folder.write_csv("history.csv", {key: [row[key] for row in rows] for key in rows[0]})
+    data |= choice
     data["improvement"] = result.improvement
     data["constraints"] = (
         result.problem.constraint_rows(result.optimized) if result.optimized is not None else []

@@ -100,16 +100,17 @@ class Profile(eqx.Module):
         return 1.0
 
     @property
-    def minima(self) -> int:
-        """How many minima the gap of two flanks may have within the contact law."""
-        return 2
+    def cusp(self) -> bool:
+        """Whether the flank's radius of curvature vanishes at the pitch crossing (ψ = 0),
+        where two minima of the gap may then be almost equally deep."""
+        return True
 
-    def arms(
+    def lever_from(
         self, nu: Float[Array, "*n"], cos: Float[Array, "*n"], sin: Float[Array, "*n"]
-    ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-        """`lever` and `support` (m) at `nu`, given cos κν and sin κν."""
+    ) -> Float[Array, "*n"]:
+        """`lever` (m) at `nu`, given cos κν and sin κν."""
         del cos, sin
-        return self.lever(nu), self.support(nu)
+        return self.lever(nu)
 
     @property
     def half_pitch(self) -> float:

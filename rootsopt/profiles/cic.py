@@ -20,7 +20,8 @@ class CIC(Profile):
     `longest_involute` u_max = r sin α (π/2N - θ1) (m): beyond it the roll angle turns back;
     `base_radius` r cos α (m); `involute_start` β_u (rad); `arc_center_radius` c and
     `arc_radius` ρ (m); `arc_end`, `involute_end`: normal angles (rad) at which the arc
-    meets the involute and the involute the pitch circle.
+    meets the involute and the involute the pitch circle; `tip_direction`: cosine and sine
+    of θ1.
     """
 
     lobes: int = eqx.field(static=True)
@@ -35,6 +36,7 @@ class CIC(Profile):
     arc_radius: Float[Array, ""]
     arc_end: Float[Array, ""]
     involute_end: Float[Array, ""]
+    tip_direction: Float[Array, "2"]
 
     def __init__(self, lobes, pitch_radius, pressure_angle, involute_length, tip_arc_angle):
         """`lobes` N; `pitch_radius` r (m), `pressure_angle` α (rad), `involute_length` u
@@ -54,6 +56,8 @@ class CIC(Profile):
         self.arc_radius = u * cos / sin + r * jnp.sin(offset) / jnp.cos(alpha - offset)
         self.arc_end = self.involute_start + jnp.pi / 2 - alpha
         self.involute_end = half + jnp.pi / 2 - alpha
+        tip = self.tip_arc_angle
+        self.tip_direction = jnp.stack([jnp.cos(tip), jnp.sin(tip)])
 
     def segments(self) -> tuple[Segment, ...]:
         zero = jnp.zeros_like(self.tip_arc_angle)
@@ -115,17 +119,12 @@ class CIC(Profile):
         return jnp.where(nu > self.arc_end, involute, arc)
 
     @property
-    def minima(self) -> int:
-        return 1
+    def cusp(self) -> bool:
+        return False
 
-    def arms(self, nu, cos, sin):
-        # As `lever` and `support`, with ν turned by θ1 by the addition theorem.
-        tip_cos, tip_sin = jnp.cos(self.tip_arc_angle), jnp.sin(self.tip_arc_angle)
-        c = self.arc_center_radius
-        beta = nu - jnp.pi / 2 + self.pressure_angle
-        reach = self.pitch_radius * jnp.sin(self.pressure_angle)
-        land, involute = nu < self.tip_arc_angle, nu > self.arc_end
-        lever = jnp.where(land, 0.0, c * (sin * tip_cos - cos * tip_sin))
-        support = jnp.where(land, c, c * (cos * tip_cos + sin * tip_sin)) + self.arc_radius
-        beyond = reach + self.base_radius * (self.half_pitch - beta)
-        return jnp.where(involute, self.base_radius, lever), jnp.where(involute, beyond, support)
+    def lever_from(self, nu, cos, sin):
+        # As `lever`, with ν turned by θ1 by the addition theorem.
+        tip_cos, tip_sin = self.tip_direction
+        arc = self.arc_center_radius * (sin * tip_cos - cos * tip_sin)
+        beyond_land = jnp.where(nu > self.arc_end, self.base_radius, arc)
+        return jnp.where(nu < self.tip_arc_angle, 0.0, beyond_land)

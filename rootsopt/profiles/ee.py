@@ -41,6 +41,6 @@ class EE(Profile):
     def turn_ratio(self) -> float:
         return self.lobes / (1 + self.lobes)
 
-    def arms(self, nu, cos, sin):
-        # ψ = π/2 - κν and β = ν / (1 + N), so that N (π/2N - β) = ψ.
-        return self.pitch_radius * sin, self.pitch_radius * (1 + 1 / self.lobes) * cos
+    def lever_from(self, nu, cos, sin):
+        # ψ = π/2 - κν.
+        return self.pitch_radius * sin

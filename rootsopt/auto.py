@@ -1,0 +1,116 @@
+"""`solver.fidelity: auto`: the cheapest settings that meet a stated error.
+
+The configured design is simulated from rest with the reference, contact by search at a
+tolerance far below the error asked for. Then cheaper settings are tried, cheapest first,
+and the first whose mean and peak force agree with the reference is kept: for every
+further design of the run, and in the resolved config. An estimate that is a measured
+difference holds where a rule of thumb about tolerances would not, and costs two or three
+simulations of one design.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+from rootsopt.config import Config, SolverConfig
+from rootsopt.evaluate import Evaluation, Evaluator
+from rootsopt.status import Status
+
+_JUDGED = ("mean_force_N", "peak_force_N")
+_MARGIN = 0.5
+"""Share of the requested error that a measured difference may use up."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """Chosen settings, as a config without `auto`, and the error they were seen to leave.
+
+    `error`: largest relative difference of mean and peak force to the reference, None where
+    the scene has no periodic steady state to compare on. `tried`: every candidate with its
+    error.
+    """
+
+    config: Config
+    requested: float
+    error: float | None
+    tried: list[dict[str, Any]]
+
+    def record(self) -> dict[str, Any]:
+        """For the result file."""
+        solver = self.config.solver
+        return {
+            "requested_error": self.requested,
+            "estimated_error": self.error,
+            "fidelity": solver.fidelity,
+            "map_error": solver.map_error if solver.fidelity == "map" else None,
+            "method": solver.method,
+            "rtol": solver.rtol,
+            "transient_rtol": solver.transient_rtol,
+            "tried": self.tried,
+        }
+
+
+def choose(config: Config) -> Choice:
+    """Settings for `config`, whose fidelity is `auto`, that meet `solver.accuracy`.
+
+    Where nothing cheaper agrees (as where a coarser simulation ends on another of several
+    coexisting orbits), or where the reference itself finds no periodic orbit, the
+    reference's settings are chosen.
+    """
+    wanted = config.solver.accuracy
+    reference = _with(config, fidelity="search", rtol=1e-4 * wanted)
+    truth = Evaluator(reference)(series=False)
+    tried: list[dict[str, Any]] = []
+    if truth.status is not Status.PERIODIC:
+        return Choice(reference, wanted, None, tried)
+    for candidate in _candidates(config, wanted):
+        found = Evaluator(candidate)(series=False)
+        error = difference(found, truth)
+        solver = candidate.solver
+        settings = {"fidelity": solver.fidelity, "rtol": solver.rtol}
+        tried.append(settings | {"error": error, "status": found.status.label})
+        if error is not None and error <= _MARGIN * wanted:
+            # The reference is itself off by about its tolerance's share.
+            return Choice(candidate, wanted, error + 0.01 * wanted, tried)
+    return Choice(reference, wanted, 0.01 * wanted, tried)
+
+
+def resolve(config: Config) -> tuple[Config, dict[str, Any]]:
+    """`config` without `auto`, and what the result file says of the choice (nothing where
+    there was none to make)."""
+    if config.solver.fidelity != "auto":
+        return config, {}
+    choice = choose(config)
+    return choice.config, {"solver": choice.record()}
+
+
+def _candidates(config: Config, wanted: float) -> Iterator[Config]:
+    """Cheapest first."""
+    loose, tight = 1e-2 * wanted, 1e-3 * wanted
+    if wanted >= 3e-3:
+        yield _with(config, fidelity="linear", rtol=loose)
+    for rtol in (loose, tight):
+        yield _with(config, fidelity="map", rtol=rtol, map_error=0.1 * wanted)
+    yield _with(config, fidelity="search", rtol=tight)
+
+
+def _with(config: Config, fidelity: str, rtol: float, map_error: float = 1e-4) -> Config:
+    rtol = min(max(rtol, 1e-11), 1e-4)
+    changes = {
+        "fidelity": fidelity,
+        "rtol": rtol,
+        "transient_rtol": min(rtol, 1e-6),
+        "map_error": min(max(map_error, 1e-6), 0.1),
+        # Of the explicit methods the one with the least work at this tolerance.
+        "method": "dopri8" if rtol < 1e-9 else "tsit5",
+    }
+    solver = SolverConfig.model_validate(config.solver.model_dump() | changes)
+    return config.model_copy(update={"solver": solver})
+
+
+def difference(found: Evaluation, truth: Evaluation) -> float | None:
+    """Largest relative difference of mean and peak force, None unless both are periodic."""
+    if not (found.usable and truth.usable):
+        return None
+    pairs = ((found.response[key], truth.response[key]) for key in _JUDGED)
+    return max(abs(a / b - 1) if b else abs(a) for a, b in pairs)
