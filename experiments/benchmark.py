@@ -338,8 +338,8 @@ def part_batch(job: Job) -> dict[str, Any]:
         forces = np.asarray(out.response)[:checked, :2][usable]
         found = np.asarray(out.gradient)[:checked, :2][usable]
         off = value_error(forces, truth[usable]) if usable.any() else math.nan
-        by = [gradient_error(*pair) for pair in zip(found, slope[usable], strict=True)]
-        return int(out.usable.sum()), off, by if found.size else []
+        pairs = zip(found, slope[usable], strict=True) if found.size else ()
+        return int(out.usable.sum()), off, [gradient_error(*pair) for pair in pairs]
 
     def choose() -> tuple[str, float, float]:
         """Cheapest contact and tolerance at which all designs settle and are good enough; the
