@@ -65,8 +65,8 @@ SCENES: dict[str, tuple[str, tuple[str, ...]]] = {
 TITLES = {
     "contact": "CIC: contact (tsit5)",
     "solver": "CIC: solver and precision",
-    "ee": "EE",
-    "lively": "lively CIC: 0.2 mm backlash, 2000 rpm",
+    "ee": "EE: contact (tsit5)",
+    "lively": "lively CIC: contact (tsit5)",
 }
 FORCES = {"mean": "mean_force_N", "peak": "peak_force_N"}
 REPEATS = 5
@@ -128,7 +128,7 @@ class Curve:
     def label(self, panel: str) -> str:
         """Name in a legend."""
         parts = [self.contact]
-        if panel != "contact":
+        if panel == "solver" or self.method != "tsit5":
             parts.append(self.method)
         if self.precision != "float64":
             parts.append(self.precision)
@@ -370,7 +370,7 @@ def work_precision_figure(
 ) -> Figure:
     """Error of mean (above) and peak (below) against run time, a column for each panel."""
     panels = [p for p in TITLES if any(p in curve.panels for curve, _ in measured)]
-    figure = sheet(4.6 * len(panels) + 0.4, 8.4)
+    figure = sheet(4.2 * len(panels) + 0.4, 9.6)
     axes = figure.subplots(2, len(panels), squeeze=False, sharex="col", sharey="row")
     for column, panel in enumerate(panels):
         drawn = [(curve, rows) for curve, rows in measured if panel in curve.panels]
@@ -391,7 +391,7 @@ def work_precision_figure(
                 ax.set_title(TITLES[panel], fontsize=11)
             else:
                 ax.set_xlabel("one evaluation with gradient, warm (ms)")
-                below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.14), "ncols": 2}
+                below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.14)}
                 ax.legend(fontsize=8, frameon=False, **below)
     for row, name in enumerate(FORCES):
         axes[row, 0].set_ylabel(f"relative error of the {name} force")
@@ -416,6 +416,7 @@ def plain_ticks(axis: Any) -> None:
     """Ticks of a logarithmic axis at 1, 2 and 5, without powers of ten."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter("{x:g}")
+    axis.set_tick_params(labelsize=8)
     axis.set_minor_formatter(NullFormatter())
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.flow import Integrator
-from rootsopt.dynamics.steady import RESIDUAL, close_orbit, floquet, settle, settled_within
+from rootsopt.dynamics.steady import RESIDUAL, close_orbit, settle, settled_within
 from rootsopt.model import Model
 from rootsopt.status import Status
 
@@ -87,7 +87,7 @@ def respond(
     closed = close_orbit(
         pair, tangents, settled.state, period, orbit, SAMPLES, shots=_SHOTS, closed=enough
     )
-    multiplier = jnp.max(floquet(closed.monodromy))
+    multiplier = jnp.max(closed.multipliers)
     finite = jnp.all(jnp.isfinite(closed.response)) & jnp.all(jnp.isfinite(closed.sensitivity))
     moved = jnp.max(jnp.abs(closed.state - settled.state))
     near = 10 * tolerance / jnp.maximum(1 - multiplier, 1e-3)

@@ -98,7 +98,7 @@ class SolverConfig(_Section):
     """How the scene is solved."""
 
     fidelity: Literal["search", "map", "linear", "nodes", "auto"] = Field(
-        "map",
+        "search",
         description="contact: search at every call (reference), C² map of the gap, linear in "
         "the relative rotation, the paper's nodes against segments, or auto: these settings "
         "as accuracy needs",

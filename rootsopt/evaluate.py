@@ -23,7 +23,6 @@ from rootsopt.dynamics.steady import (
     Orbit,
     Transient,
     close_orbit,
-    floquet,
     lyapunov,
     reverse_sensitivity,
     settle,
@@ -256,7 +255,7 @@ class Evaluator:
         numbers = jnp.concatenate([orbit.response, orbit.sensitivity.ravel(), orbit.state])
         if not bool(jnp.all(jnp.isfinite(numbers))):
             return Status.NON_FINITE
-        multiplier = float(jnp.max(floquet(orbit.monodromy)))
+        multiplier = float(jnp.max(orbit.multipliers))
         near = tolerance / max(1 - multiplier, 1e-3) * 10 + 100 * float(self.transient.rtol)
         moved = float(jnp.max(jnp.abs(orbit.state - transient.state)))
         closed = float(orbit.residual) <= RESIDUAL[self.model.precision]
@@ -285,17 +284,16 @@ class Evaluator:
             steady = {
                 "kind": "periodic",
                 "period": period,
-                "floquet_multiplier": float(jnp.max(floquet(orbit.monodromy))),
+                "floquet_multiplier": float(jnp.max(orbit.multipliers)),
                 "residual": float(orbit.residual),
             }
-            state = np.asarray(orbit.state)
+            state = np.asarray(orbit.state, np.float64)
             statistics |= {
                 "newton_steps": int(orbit.newton_steps),
                 "orbit_steps": int(orbit.flow.steps),
             }
-            motion = _orbit_series(pair, orbit, period)
-            series = motion if with_series else None
-            if motion.depth.max() > _TOO_DEEP * float(self.model.pitch_radius):
+            series = _orbit_series(pair, orbit, period) if with_series else None
+            if float(orbit.flow.depth) > _TOO_DEEP * float(self.model.pitch_radius):
                 status = Status.TOO_DEEP
         elif status is Status.NOT_SETTLED and not self.survey:
             window = _lyapunov(pair, outcome.transient.state, _CHAOS_WINDOW, self.transient)

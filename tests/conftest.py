@@ -2,7 +2,6 @@
 
 import os
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,7 +13,10 @@ install_import_hook("rootsopt", "typechecking.typechecked")
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ["ROOTSOPT_CACHE"] = "off"
-jax.config.update("jax_enable_x64", True)
+
+from rootsopt.cli import use_float64  # noqa: E402
+
+use_float64()
 settings.register_profile("rootsopt", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("rootsopt")
 

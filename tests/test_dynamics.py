@@ -360,7 +360,7 @@ def powers(pair, state, how):
 
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(slope),
-        how.solver,
+        how.solver(state.dtype),
         t0=0.0,
         t1=1.0,
         dt0=None,

@@ -32,6 +32,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float
 
 from rootsopt.profiles.base import Profile
@@ -41,6 +42,14 @@ _NODES_PER_SEGMENT = 32
 # Illinois steps inside the bracket (T has a kink there when ν1 crosses a segment's end,
 # so plain Newton is not safe), before one Newton step. The tests measure the error.
 _REFINEMENTS = 5
+# Newton steps from the point of perfect rolling, at most (two or three are usual). The last
+# one must be so short that the next would be lost in rounding, even across a kink of T.
+_NEWTON_STEPS = 5
+_CONVERGED = {8: 1e-8, 4: 1e-3}
+# ε (rad) down to which the tests have shown that at the nominal centre distance Newton's
+# method, where it converges, finds the closest approach and no other common normal (but for
+# a share of the flank, about √|ε|, next to a cusp at the pitch point).
+_USUAL = -5e-3
 # Rounding of T relative to the pitch radius, by bytes of a number.
 _SLACK = {8: 1e-13, 4: 1e-6}
 
@@ -81,7 +90,8 @@ class FlankPair(eqx.Module):
     """A flank of rotor 1 against its mate on rotor 2.
 
     `profile`: both rotors' profile, `frozen` the same without derivative, for the search;
-    `nodes`: see `FlankNodes`; `center_distance` E (m).
+    `nodes`: see `FlankNodes`; `center_distance` E (m); `rolling`: whether E is that of
+    perfect rolling.
     Build it with `FlankPair.of(profile)` outside any time loop.
     """
 
@@ -89,6 +99,7 @@ class FlankPair(eqx.Module):
     frozen: Profile
     nodes: FlankNodes
     center_distance: Float[Array, ""]
+    rolling: bool = eqx.field(static=True)
 
     @classmethod
     def of(cls, profile: Profile, center_distance: Float[Array, ""] | None = None) -> "FlankPair":
@@ -126,7 +137,8 @@ class FlankPair(eqx.Module):
         distance = 2 * profile.pitch_radius if center_distance is None else center_distance
         dynamic, static = eqx.partition(frozen, eqx.is_inexact_array)
         dynamic, nodes = _materialized((dynamic, nodes), nodes.normal[-1] > -jnp.inf)
-        return cls(profile, eqx.combine(dynamic, static), nodes, distance)
+        rolling = center_distance is None
+        return cls(profile, eqx.combine(dynamic, static), nodes, distance, rolling)
 
     def __call__(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> ClosestApproach:
         """Closest approach at roll coordinate x = `roll` and ε = `relative` (rad).
@@ -157,9 +169,8 @@ class FlankPair(eqx.Module):
         @jax.custom_jvp
         def closest(dynamic, roll, relative):
             pair = eqx.combine(dynamic, static)
-            searcher = eqx.tree_at(lambda pair: pair.profile, pair, pair.frozen)
-            found, normal2 = searcher._search(roll, relative)
-            gap, normal1, lever1, lever2 = pair._mesh(normal2, roll, relative)
+            found, normal2 = _found_one_by_one(pair, roll, relative)
+            _, gap, normal1, lever1, lever2 = pair._mesh(normal2, roll, relative)
             zero = jnp.zeros_like(gap)
             return ClosestApproach(
                 gap=jnp.where(found, gap, pair.profile.pitch_radius),
@@ -173,27 +184,24 @@ class FlankPair(eqx.Module):
         @closest.defjvp
         def _(primals, tangents):
             found = closest(*primals)
-
-            def offset(dynamic, normal2, roll, relative):
-                return eqx.combine(dynamic, static)._offset(normal2, roll, relative)
+            dynamic, *pose = primals
+            by_dynamic, *by_pose = tangents
+            here, normal2 = found.found, found.normal2
+            still, unit = jnp.zeros_like(normal2), jnp.ones_like(normal2)
 
             def mesh(dynamic, normal2, roll, relative):
                 return eqx.combine(dynamic, static)._mesh(normal2, roll, relative)
 
-            dynamic, *pose = primals
-            by_dynamic, *by_pose = tangents
-            at = dynamic, found.normal2, *pose
-            still, unit = jnp.zeros_like(found.normal2), jnp.ones_like(found.normal2)
-            _, slope = jax.jvp(lambda nu: offset(dynamic, nu, *pose), (found.normal2,), (unit,))
-            _, moved = jax.jvp(offset, at, (by_dynamic, still, *by_pose))
+            _, turned = jax.jvp(lambda nu: mesh(dynamic, nu, *pose), (normal2,), (unit,))
+            _, moved = jax.jvp(mesh, (dynamic, normal2, *pose), (by_dynamic, still, *by_pose))
             # At a point that is no minimum (no root, or flat conformity) it stays put.
-            normal2_dot = jnp.where(slope < 0, -moved / jnp.where(slope < 0, slope, -1.0), 0.0)
-            _, (gap_dot, *_) = jax.jvp(mesh, at, (by_dynamic, still, *by_pose))
-            _, (_, *rest) = jax.jvp(mesh, at, (by_dynamic, normal2_dot, *by_pose))
-            normal1_dot, lever1_dot, lever2_dot = rest
-            here = found.found
+            falls = turned[0] < 0
+            normal2_dot = jnp.where(falls, -moved[0] / jnp.where(falls, turned[0], -1.0), 0.0)
+            normal1_dot, lever1_dot, lever2_dot = (
+                moved[i] + turned[i] * normal2_dot for i in (2, 3, 4)
+            )
             return found, ClosestApproach(
-                gap=jnp.where(here, gap_dot, still),
+                gap=jnp.where(here, moved[1], still),
                 lever1=jnp.where(here, lever1_dot, still),
                 lever2=jnp.where(here, lever2_dot, still),
                 normal1=normal1_dot,
@@ -204,15 +212,18 @@ class FlankPair(eqx.Module):
         return closest(dynamic, roll, relative)
 
     def _mesh(self, normal2, roll, relative):
-        """G, ν1, q1, q2 at `normal2`, from the definition."""
+        """T, G, ν1, q1, q2 at `normal2`, from the definition."""
         profile = self.profile
         r = profile.pitch_radius
         beta, psi, s2 = _mate_point(profile, normal2)
         facing = jnp.pi / 2 - psi - beta
         normal1 = facing + 2 * roll
+        direction = facing + roll - relative / 2
+        lever1, lever2 = profile.lever(normal1), r * jnp.cos(psi)
         support = profile.support(normal1) + r * jnp.sin(psi) + s2
-        gap = self.center_distance * jnp.cos(facing + roll - relative / 2) - support
-        return gap, normal1, profile.lever(normal1), r * jnp.cos(psi)
+        gap = self.center_distance * jnp.cos(direction) - support
+        offset = self.center_distance * jnp.sin(direction) - lever1 - lever2
+        return offset, gap, normal1, lever1, lever2
 
     def _offset(self, normal2, roll, relative):
         """T alone, with as little work as possible."""
@@ -223,6 +234,49 @@ class FlankPair(eqx.Module):
         return reach - arms
 
     def _search(self, roll, relative):
+        """Newton's method from the point of perfect rolling; the nodes where it cannot be
+        relied on: (found, ν2)."""
+        if not self.rolling:
+            return self._scan(roll, relative)
+        certain, found, normal2 = self._directly(roll, relative)
+
+        def scan(_):
+            return jnp.ones((), bool), *self._scan(roll, relative)
+
+        # A loop of no or one turn. Unlike a conditional it stays one when vectorised: the
+        # nodes are looked at only if one of the poses asks for it.
+        return lax.while_loop(lambda carry: ~carry[0], scan, (certain, found, normal2))[1:]
+
+    def _directly(self, roll, relative):
+        """Newton's method from the point of perfect rolling: (certain, found, ν2)."""
+        profile, nodes = self.profile, self.nodes
+        low, high = nodes.normal[0], nodes.normal[-1]
+        tolerance = _CONVERGED[low.dtype.itemsize]
+
+        def go_on(carry):
+            count, _, step, _ = carry
+            return (count < _NEWTON_STEPS) & (jnp.abs(step) >= tolerance)
+
+        def newton(carry):
+            count, normal2, _, _ = carry
+            value, slope = jax.jvp(
+                lambda nu: self._offset(nu, roll, relative), (normal2,), (jnp.ones_like(normal2),)
+            )
+            step = value / jnp.where(slope < 0, slope, -jnp.inf)
+            return count + 1, jnp.clip(normal2 - step, low, high), step, slope
+
+        guess = jnp.clip(profile.normal_at(roll), low, high)
+        start = 0, guess, jnp.full_like(guess, jnp.inf), jnp.zeros_like(guess)
+        _, normal2, step, slope = lax.while_loop(go_on, newton, start)
+        inside = (normal2 > low) & (normal2 < high) & (slope < 0)
+        converged = inside & (jnp.abs(step) < tolerance)
+        absent = roll < contact_begins(relative)
+        usual = (relative <= 0) & (relative >= _USUAL)
+        if profile.cusp:
+            usual &= roll < (1 - 5 * jnp.sqrt(jnp.abs(relative))) * profile.half_pitch
+        return (converged | absent) & usual, ~absent, normal2
+
+    def _scan(self, roll, relative):
         """Bracket on the nodes, refine inside, one Newton step: (found, ν2)."""
         profile, nodes = self.profile, self.nodes
         turned = _rotate(nodes.turned, 2 * profile.turn_ratio * roll)
@@ -242,7 +296,7 @@ class FlankPair(eqx.Module):
         ends = jnp.maximum(last, 0), jnp.minimum(first, place.shape[0] - 1)
 
         def gap(normal2):
-            return self._mesh(normal2, roll, relative)[0]
+            return self._mesh(normal2, roll, relative)[1]
 
         # Two minima occur away from the nominal centre distance, and near the pitch point
         # where ψ = 0 there: the deeper counts.
@@ -276,26 +330,47 @@ class FlankPair(eqx.Module):
         return jnp.clip(polished, normal[index], normal[index + 1])
 
 
+def _found_one_by_one(pair: FlankPair, roll, relative):
+    """`FlankPair._search` on the frozen profile. On a CPU many poses are searched one after the
+    other: hardly any of them needs the nodes, all of them together nearly always do."""
+    dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
+
+    def search(dynamic, roll, relative):
+        pair = eqx.combine(dynamic, static)
+        searcher = eqx.tree_at(lambda pair: pair.profile, pair, pair.frozen)
+        return searcher._search(roll, relative)
+
+    if jax.default_backend() == "cpu":
+        search = sequential_vmap(search)
+    return search(dynamic, roll, relative)
+
+
+def contact_begins(relative: Float[Array, ""]) -> Float[Array, ""]:
+    """Roll coordinate (rad) before which flanks turned into each other by ε ≤ 0 (rad) cannot
+    touch: contact starts before the tip passes the line of centres, by about √|ε|."""
+    return -(2 * jnp.sqrt(jnp.maximum(-relative, 0.0)) + 0.02)
+
+
 def _illinois(function, bracket):
     """Root of a falling scalar function in (low, high, f(low) ≥ 0, f(high) < 0)."""
-    low, high, f_low, f_high = bracket
-    side = jnp.zeros_like(low)
 
-    def secant():
+    def secant(low, high, f_low, f_high):
         drop = f_low - f_high
         return low + (high - low) * jnp.clip(f_low / jnp.where(drop > 0, drop, 1.0), 0, 1)
 
-    # Unrolled: a traced loop costs more than its body here.
-    for _ in range(_REFINEMENTS):
-        middle = secant()
+    def step(_, carry):
+        side, (low, high, f_low, f_high) = carry
+        middle = secant(low, high, f_low, f_high)
         f = function(middle)
         above = f >= 0
         # An end that stays twice in a row has its value halved (Illinois).
         f_high = jnp.where(above, jnp.where(side > 0, f_high / 2, f_high), f)
         f_low = jnp.where(above, f, jnp.where(side < 0, f_low / 2, f_low))
         low, high = jnp.where(above, middle, low), jnp.where(above, high, middle)
-        side = jnp.where(above, 1.0, -1.0)
-    return secant()
+        return jnp.where(above, 1.0, -1.0).astype(low.dtype), (low, high, f_low, f_high)
+
+    start = jnp.zeros_like(bracket[0]), bracket
+    return secant(*lax.fori_loop(0, _REFINEMENTS, step, start)[1])
 
 
 def _materialized(tree, true):

@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.contact.closest import FlankPair
+from rootsopt.contact.closest import FlankPair, contact_begins
 from rootsopt.profiles.base import Profile
 
 # Grid cells of ε beyond zero, so that the spline is in its interior where contact starts.
@@ -24,9 +24,8 @@ MARGIN = 3
 
 
 def first_roll(deepest: Float[Array, ""] | float, half_pitch: float) -> Float[Array, ""]:
-    """Roll (rad) at which a map down to ε = `deepest` begins: contact can start before the
-    tip passes the line of centres, by about √|ε|."""
-    return -jnp.minimum(0.9 * half_pitch, 2 * jnp.sqrt(-jnp.asarray(deepest)) + 0.02)
+    """Roll (rad) at which a map down to ε = `deepest` begins."""
+    return jnp.maximum(-0.9 * half_pitch, contact_begins(jnp.asarray(deepest)))
 
 
 def continued_gap(

@@ -6,11 +6,11 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.tangent import linearized, one_step, propagated
 
 METHODS: dict[str, type[diffrax.AbstractSolver]] = {
     "tsit5": diffrax.Tsit5,
@@ -23,6 +23,8 @@ METHODS: dict[str, type[diffrax.AbstractSolver]] = {
 
 _FIRST_STEP = 1e-3
 """First step in mesh periods; too large a one is rejected by the error control."""
+_SHORTEST = 1e-9
+"""Least time (mesh periods) between the beginning of a step and a peak inside it."""
 
 
 class Integrator(eqx.Module):
@@ -38,15 +40,24 @@ class Integrator(eqx.Module):
     rtol: Float[Array, ""]
     max_steps: int = eqx.field(static=True)
 
-    @property
-    def solver(self) -> diffrax.AbstractSolver:
-        return METHODS[self.method]()
-
-    def controller(self, dtype: Any, **options: Any) -> diffrax.PIDController:
-        """Step size control of states of type `dtype`."""
+    def tolerance(self, dtype: Any) -> Float[Array, ""]:
+        """Tolerance for states of type `dtype`."""
         floor = 20 * float(jnp.finfo(dtype).eps)
-        rtol = jnp.maximum(self.rtol, floor).astype(dtype)
-        return diffrax.PIDController(rtol=rtol, atol=rtol, **options)
+        return jnp.maximum(self.rtol, floor).astype(dtype)
+
+    def solver(self, dtype: Any, loops: str = "lax") -> diffrax.AbstractSolver:
+        """The method for states of type `dtype`; `loops` over the stages of a step are
+        "lax" (forward mode only) or "bounded" (either mode)."""
+        kind = METHODS[self.method]
+        if not issubclass(kind, diffrax.AbstractImplicitSolver):
+            return kind(scan_kind=loops)
+        rtol = self.tolerance(dtype)
+        return kind(scan_kind=loops, root_finder=diffrax.VeryChord(rtol=rtol, atol=rtol))
+
+    def controller(self, dtype: Any) -> diffrax.PIDController:
+        """Step size control of states of type `dtype`."""
+        rtol = self.tolerance(dtype)
+        return diffrax.PIDController(rtol=rtol, atol=rtol)
 
 
 class Strobe(NamedTuple):
@@ -61,10 +72,12 @@ class Flow(NamedTuple):
     """One stretch of motion over `periods` mesh periods.
 
     `end`: final state; `mean`, `mean_square`, `peak` of the contact force (N, N², N);
-    `peak_time` (mesh periods); `states` at uniform times, endpoint excluded; `grid`: ends
+    `peak_time` (mesh periods); `depth`: greatest penetration (m; negative: least gap)
+    at the sampled times; `states` at uniform times, endpoint excluded; `grid`: ends
     of the steps taken (mesh periods), inf beyond the last; `steps`: accepted and rejected
-    solver steps; `solved`. `slope`: derivatives of (end, mean, mean_square, peak) along
-    the directions that were asked for.
+    solver steps; `solved`. `slope`: derivatives of (end, mean, mean_square, peak) in the
+    initial state (n columns) and along the directions that were asked for (d more), or no
+    columns at all.
     """
 
     end: Float[Array, "n"]
@@ -72,11 +85,30 @@ class Flow(NamedTuple):
     mean_square: Float[Array, ""]
     peak: Float[Array, ""]
     peak_time: Float[Array, ""]
+    depth: Float[Array, ""]
     states: Float[Array, "samples n"]
     grid: Float[Array, " steps"]
     steps: Int[Array, ""]
     solved: Bool[Array, ""]
-    slope: Float[Array, "n+3 directions"]
+    slope: Float[Array, "n+3 columns"]
+
+    @classmethod
+    def empty(cls, count: int, directions: int, samples: int, steps: int, dtype: Any) -> "Flow":
+        """A flow of `count` = n states that has not been integrated yet."""
+        nothing = jnp.zeros((), dtype)
+        return cls(
+            end=jnp.zeros(count, dtype),
+            mean=nothing,
+            mean_square=nothing,
+            peak=nothing,
+            peak_time=nothing,
+            depth=nothing,
+            states=jnp.zeros((samples, count), dtype),
+            grid=jnp.full(steps, jnp.inf, dtype),
+            steps=jnp.zeros((), int),
+            solved=jnp.zeros((), bool),
+            slope=jnp.zeros((count + 3, count + directions), dtype),
+        )
 
     @property
     def response(self) -> Float[Array, "3"]:
@@ -84,22 +116,12 @@ class Flow(NamedTuple):
         return jnp.stack([self.mean, self.mean_square, self.peak])
 
 
-class Directions(NamedTuple):
-    """Directions to differentiate along, stacked: changes of the initial state (scaled)
-    and of the pair's parameters (the pair's own structure)."""
-
-    state: Float[Array, "directions n"]
-    pair: RotorPair
-
-
 class StepGrid(diffrax.AbstractAdaptiveStepSizeController):
     """Adaptive steps, or a repetition of steps recorded before.
 
-    On repeated steps the discrete flow is a smooth function of state and parameters:
-    Newton's method converges to rounding, and its derivative is exactly that of the
-    variational equation on the same steps. `ends`: ends of the recorded steps (inf beyond
-    the last), used where `repeat` is true. The error is controlled on the first part of
-    the state alone, so that a derivative carried along does not change the motion.
+    On repeated steps the discrete flow is a smooth function of state and parameters, and
+    Newton's method converges to rounding. `ends`: ends of the recorded steps (inf beyond
+    the last), used where `repeat` is true.
     """
 
     pid: diffrax.PIDController
@@ -152,7 +174,7 @@ def strobe(pair: RotorPair, state: Float[Array, "2"], periods: int, how: Integra
     ends = jnp.arange(1, periods + 1, dtype=state.dtype)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda tau, y, pair: pair.derivative(tau, y)[0]),
-        how.solver,
+        how.solver(state.dtype),
         t0=jnp.zeros_like(ends[0]),
         t1=ends[-1],
         dt0=_FIRST_STEP * ends[0],
@@ -178,7 +200,7 @@ def flow(
     periods: Float[Array, ""],
     how: Integrator,
     samples: int,
-    directions: Directions | None = None,
+    tangents: RotorPair | None = None,
     grid: Float[Array, " steps"] | None = None,
     repeat: Bool[Array, ""] | bool = True,
     adjoint: diffrax.AbstractAdjoint | None = None,
@@ -186,63 +208,42 @@ def flow(
     """Integrate over `periods` (traced) mesh periods with the force statistics.
 
     Mean and mean square are integrated along with the motion, under the same error
-    control. The peak is located between `samples` uniform ones. With `directions` the
-    variational equation is integrated on the same steps, which gives `slope`. With `grid`
-    the steps recorded there are repeated (while `repeat`), else they are chosen anew.
-    Memory grows with `samples` × (1 + directions).
+    control. The peak is located between `samples` uniform ones. With `tangents`
+    (directions of the pair's parameters, stacked along a leading axis; there may be none)
+    every step is linearised, which gives `slope`. With `grid` the steps recorded there are
+    repeated (while `repeat`), else they are chosen anew.
     """
-    count = state.shape[0]
+    count, dtype = state.shape[0], state.dtype
     force_unit = lax.stop_gradient(pair.force_scale)
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
+    solver = how.solver(dtype, "lax" if adjoint is None else "bounded")
 
     def derivative(tau, y, dynamic):
         slope, contact = eqx.combine(dynamic, static).derivative(tau, y[:count])
         force = contact.total / force_unit
         return jnp.concatenate([slope, jnp.stack([force, force**2])])
 
-    def with_tangents(tau, y, args):
-        base, tangents = y
-        dynamic, moved = args
-
-        def push(tangent, dynamic_tangent):
-            return jax.jvp(
-                lambda y, dynamic: derivative(tau, y, dynamic),
-                (base, dynamic),
-                (tangent, dynamic_tangent),
-            )
-
-        return jax.vmap(push, out_axes=(None, 0))(tangents, moved)
-
-    start = jnp.pad(state, (0, 2))
-    if directions is None:
-        # A tangent bundle of no dimensions: the same program serves both.
-        moved = jax.tree.map(lambda x: jnp.zeros((0, *x.shape), x.dtype), dynamic)
-        tangents = jnp.zeros((0, count + 2), state.dtype)
-        term = diffrax.ODETerm(
-            lambda tau, y, args: (derivative(tau, y[0], args[0]), jnp.zeros_like(y[1]))
-        )
-    else:
-        moved = eqx.filter(directions.pair, eqx.is_inexact_array)
-        tangents = jnp.pad(directions.state, ((0, 0), (0, 2)))
-        term = diffrax.ODETerm(with_tangents)
+    term = diffrax.ODETerm(derivative)
     controller = StepGrid(  # pyright: ignore[reportCallIssue]
-        pid=how.controller(state.dtype, norm=lambda y: optimistix.rms_norm(y[0])),
-        ends=jnp.full(how.max_steps, jnp.inf, state.dtype) if grid is None else grid,
+        pid=how.controller(dtype),
+        ends=jnp.full(how.max_steps, jnp.inf, dtype) if grid is None else grid,
         repeat=jnp.asarray(False if grid is None else repeat),
     )
-    times = periods * (jnp.arange(samples + 1) / samples).astype(state.dtype)
+    times = periods * (jnp.arange(samples + 1) / samples).astype(dtype)
+    start = jnp.pad(state, (0, 2))
     solution = diffrax.diffeqsolve(
         term,
-        how.solver,
+        solver,
         t0=times[0],
         t1=times[-1],
         dt0=_FIRST_STEP * jnp.ones_like(times[0]),
-        y0=(start, tangents),
-        args=(dynamic, moved),
+        y0=start,
+        args=dynamic,
         saveat=diffrax.SaveAt(
             subs=[
-                diffrax.SubSaveAt(ts=times),
-                diffrax.SubSaveAt(steps=True, fn=lambda tau, y, args: tau),
+                diffrax.SubSaveAt(ts=times[:-1], fn=lambda tau, y, args: y[:count]),
+                diffrax.SubSaveAt(steps=True, fn=lambda tau, y, args: (tau, y)),
+                diffrax.SubSaveAt(t1=True),
             ]
         ),
         stepsize_controller=controller,
@@ -251,70 +252,86 @@ def flow(
         throw=False,
     )
     assert solution.ys is not None
-    (bases, along), ends = solution.ys
-    end, states = bases[-1], bases[:-1, :count]
+    states, (ends, after), (end,) = solution.ys
+    states, ends = lax.stop_gradient((states, ends))
+    begins = jnp.concatenate([times[:1], ends[:-1]])
+    before = jnp.concatenate([start[None], after[:-1]])
+    last = jnp.maximum(solution.stats["num_accepted_steps"] - 1, 0)
 
-    frozen, frozen_states = lax.stop_gradient((pair, states))
-    forces = jax.vmap(lambda t, y: frozen.contact_at(t, y).total)(times[:-1], frozen_states)
-    best = jnp.argmax(forces)
-    # The motion is not closed in general: stay inside the window.
-    middle = jnp.clip(best, 2, samples - 3)
-    near, near_along = (lax.dynamic_slice_in_dim(x, middle - 2, 5) for x in (states, along))
-    window = times[middle], times[1] - times[0], best - middle
-    place = _locate_peak(*lax.stop_gradient((pair, near)), *window)
+    # The step that holds the peak is taken once more, as far as the peak. At this fixed
+    # instant the force is differentiated (envelope theorem).
+    peak_time, depth = _locate_peak(lax.stop_gradient(pair), states, times)
+    holds = jnp.clip(jnp.sum(ends < peak_time), 0, last)
+    peak_time = jnp.maximum(peak_time, begins[holds] + _SHORTEST)
 
-    def peak_at(near, dynamic):
-        return _force_between(eqx.combine(dynamic, static), near, *window[:2], place)
+    def force_at_peak(y, dynamic):
+        return eqx.combine(dynamic, static).contact_at(peak_time, y).total
 
-    def push_peak(near_tangent, dynamic_tangent):
-        return jax.jvp(peak_at, (near, dynamic), (near_tangent, dynamic_tangent))
-
-    if directions is None:
-        peak, slope = peak_at(near, dynamic), jnp.zeros((count + 3, 0), state.dtype)
+    if tangents is None:
+        there = one_step(solver, term, begins[holds], peak_time, before[holds], dynamic)
+        peak, slope = force_at_peak(there[:count], dynamic), jnp.zeros((count + 3, 0), dtype)
     else:
-        near_moved = jnp.moveaxis(near_along[..., :count], 1, 0)
-        peak, peak_slope = jax.vmap(push_peak, out_axes=(None, 0))(near_moved, moved)
-        final = along[-1]
-        unit = jnp.stack([force_unit, force_unit**2]) / periods
-        slope = jnp.concatenate(
-            [final[:, :count], final[:, count:] * unit, peak_slope[:, None]], axis=1
-        ).T
+        moved = eqx.filter(tangents, eqx.is_inexact_array)
+
+        def linear_step(k):
+            partial = k > last
+            k = jnp.where(partial, holds, k)
+            stop = jnp.where(partial, peak_time, ends[k])
+
+            def step(y, dynamic):
+                return one_step(solver, term, begins[k], stop, y, dynamic)
+
+            return linearized(step, before[k], dynamic, moved, count)
+
+        columns = count + jax.tree.leaves(moved)[0].shape[0]
+        unit = jnp.eye(count + 2, columns, dtype=dtype).at[count:].set(0.0)
+        along, there, aside = propagated(linear_step, unit, last, holds)
+        peak, by_state, by_pair = linearized(force_at_peak, there[:count], dynamic, moved, count)
+        peak_slope = jnp.sum(by_state[:, None] * aside[:count], axis=0).at[count:].add(by_pair)
+        units = jnp.stack([force_unit, force_unit**2])[:, None] / periods
+        slope = jnp.concatenate([along[:count], along[count:] * units, peak_slope[None]])
     return Flow(
         end=end[:count],
         mean=end[count] / periods * force_unit,
         mean_square=end[count + 1] / periods * force_unit**2,
         peak=peak,
-        peak_time=window[0] + place * window[1],
-        states=frozen_states,
-        grid=lax.stop_gradient(ends),
+        peak_time=peak_time,
+        depth=depth,
+        states=states,
+        grid=ends,
         steps=solution.stats["num_steps"],
         solved=solution.result == diffrax.RESULTS.successful,
         slope=slope,
     )
 
 
-def _force_between(pair, values, time, step, place):
-    """Contact force at `place`, counted in samples from the middle of five: between
-    samples the motion is the quartic through them."""
-    x = place - jnp.arange(-2, 3, dtype=place.dtype)
-    others = jnp.where(jnp.eye(5, dtype=bool), 1.0, x)
-    weights = jnp.prod(others, axis=1) / jnp.asarray([24.0, -6.0, 4.0, -6.0, 24.0], x.dtype)
-    return pair.contact_at(time + place * step, weights @ values).total
-
-
-def _locate_peak(pair, values, time, step, best):
-    """Place of the greatest force around the sample `best` (both counted from `time`).
+def _locate_peak(pair, states, times):
+    """Time of the greatest force, located between the samples `states` at `times`, and the
+    greatest penetration at the samples.
 
     An impact's peak can be narrower than the sampling, with a corner where the damping
-    saturates. The peak is enclosed by repeated subdivision. At the fixed instant the force
-    is differentiated in the motion and the design (envelope theorem).
+    saturates: it is enclosed by repeated subdivision, the motion between five samples
+    being the quartic through them.
     """
+    contact = jax.vmap(pair.contact_at)(times[:-1], states)
+    best = jnp.argmax(contact.total)
+    # The motion is not closed in general: stay inside the window.
+    middle = jnp.clip(best, 2, states.shape[0] - 3)
+    values = lax.dynamic_slice_in_dim(states, middle - 2, 5)
+    time, step = times[middle], times[1] - times[0]
+    factors = jnp.asarray([24.0, -6.0, 4.0, -6.0, 24.0], step.dtype)
+
+    def force(place):
+        x = place - jnp.arange(-2, 3, dtype=step.dtype)
+        others = jnp.where(jnp.eye(5, dtype=bool), 1.0, x)
+        weights = jnp.prod(others, axis=1) / factors
+        return pair.contact_at(time + place * step, weights @ values).total
 
     def zoom(_, window):
         center, width = window
         grid = jnp.clip(center + width * jnp.linspace(-1, 1, 17, dtype=step.dtype), -2.0, 2.0)
-        forces = jax.vmap(lambda place: _force_between(pair, values, time, step, place))(grid)
-        return grid[jnp.argmax(forces)], width / 8
+        return grid[jnp.argmax(jax.vmap(force)(grid))], width / 8
 
-    start = (jnp.asarray(best, step.dtype), jnp.ones_like(step))
-    return lax.stop_gradient(lax.fori_loop(0, 5, zoom, start)[0])
+    start = ((best - middle).astype(step.dtype), jnp.ones_like(step))
+    place = lax.stop_gradient(lax.fori_loop(0, 5, zoom, start)[0])
+    return time + place * step, jnp.max(contact.depth)

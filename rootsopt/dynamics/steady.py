@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.flow import Directions, Flow, Integrator, flow, strobe
+from rootsopt.dynamics.flow import Flow, Integrator, flow, strobe
 from rootsopt.dynamics.pair import RotorPair
 
 BLOCK = 4
@@ -59,14 +59,16 @@ class Orbit(NamedTuple):
     """A closed orbit of k mesh periods with first derivatives.
 
     `state` at φ1 = 0; `flow` over the orbit; `residual` |Φ(z) - z| in scaled units;
-    `monodromy` dΦ/dz; `response`: (mean, mean square, peak); `sensitivity` (3, d): their
-    derivatives along the orbit family with respect to the design; `newton_steps`.
+    `monodromy` dΦ/dz and `multipliers`, the moduli of its eigenvalues; `response`: (mean,
+    mean square, peak); `sensitivity` (3, d): their derivatives along the orbit family with
+    respect to the design; `newton_steps`.
     """
 
     state: Float[Array, "2"]
     flow: Flow
     residual: Float[Array, ""]
     monodromy: Float[Array, "2 2"]
+    multipliers: Float[Array, "2"]
     response: Float[Array, "3"]
     sensitivity: Float[Array, "3 d"]
     newton_steps: Int[Array, ""]
@@ -159,21 +161,17 @@ def close_orbit(
 ) -> Orbit:
     """Newton shooting on Φ(z) = z, then the implicit function theorem for gradients.
 
-    `tangents` holds d pair / d design, stacked along a leading axis. State and design
-    directions are integrated together (variational equation). `samples` must be divisible by
-    the period. Newton stops after `shots` integrations, or at the residual `closed` (at
-    least some thousand roundings). Once Newton's steps are
-    small the solver's steps are kept, so that the map it solves is smooth and closes to
-    rounding.
+    `tangents` holds d pair / d design, stacked along a leading axis. `samples` must be
+    divisible by the period. Newton stops after `shots` integrations, or at the residual
+    `closed` (at least some thousand roundings). Once its steps are small those of the solver
+    are kept, so that the map it solves is smooth and closes to rounding.
     """
     count, dtype = state.shape[0], state.dtype
     closed = jnp.maximum(closed, _CLOSED * float(jnp.finfo(dtype).eps)).astype(dtype)
     length = period.astype(dtype)
-    directions = _with_state_directions(pair, tangents, count)
-    designs = directions.state.shape[0] - count
 
     def shoot(state, grid, repeat):
-        return flow(pair, state, length, how, samples, directions, grid, repeat)
+        return flow(pair, state, length, how, samples, tangents, grid, repeat)
 
     def go_on(carry):
         orbit, _, repeat, _, best = carry
@@ -195,19 +193,21 @@ def close_orbit(
         done = orbit.newton_steps + 1
         keep = repeat | (size < _SMALL) | (done >= shots // 2)
         reached = orbit.residual
-        orbit = Orbit(state, out, residual, monodromy, out.response, orbit.sensitivity, done)
+        orbit = orbit._replace(
+            state=state, flow=out, residual=residual, monodromy=monodromy, newton_steps=done
+        )
         return orbit, new, keep, out.grid, jnp.minimum(best, reached)
 
     # The loop holds the only copy of the integration: one shot is compiled, not two.
-    grid = jnp.full(how.max_steps, jnp.inf, dtype)
-    shapes = jax.eval_shape(shoot, state, grid, jnp.zeros((), bool))
-    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     infinite = jnp.asarray(jnp.inf, dtype)
+    designs = jax.tree.leaves(eqx.filter(tangents, eqx.is_inexact_array))[0].shape[0]
+    none = Flow.empty(count, designs, samples, how.max_steps, dtype)
     first = Orbit(
         state=state,
         flow=none,
         residual=infinite,
         monodromy=jnp.zeros((count, count), dtype),
+        multipliers=jnp.zeros(count, dtype),
         response=jnp.zeros(3, dtype),
         sensitivity=jnp.zeros((3, designs), dtype),
         newton_steps=jnp.zeros((), int),
@@ -217,16 +217,11 @@ def close_orbit(
     slope = orbit.flow.slope
     moved = jnp.linalg.solve(jnp.eye(count, dtype=dtype) - orbit.monodromy, slope[:count, count:])
     sensitivity = slope[count:, count:] + slope[count:, :count] @ moved
-    return orbit._replace(sensitivity=sensitivity)
-
-
-def _with_state_directions(pair, tangents, count):
-    """The unit directions of the state, then those of `tangents`."""
-    stacked = eqx.filter(tangents, eqx.is_inexact_array)
-    number = jax.tree.leaves(stacked)[0].shape[0]
-    along_pair = jax.tree.map(lambda x: jnp.pad(x, [(count, 0)] + [(0, 0)] * (x.ndim - 1)), stacked)
-    along_state = jnp.eye(count + number, count, dtype=pair.angle_scale.dtype)
-    return Directions(along_state, eqx.combine(along_pair, pair))
+    return orbit._replace(
+        multipliers=floquet(orbit.monodromy),
+        response=orbit.flow.response,
+        sensitivity=sensitivity,
+    )
 
 
 def reverse_sensitivity(
@@ -258,6 +253,13 @@ def reverse_sensitivity(
     return by_design[count:] + weight.T @ by_design[:count]
 
 
+def no_tangents(pair: RotorPair) -> RotorPair:
+    """No directions of the parameters of `pair`, stacked: derivatives in the state only."""
+    return jax.tree.map(
+        lambda x: jnp.zeros((0, *x.shape), x.dtype), eqx.filter(pair, eqx.is_inexact_array)
+    )
+
+
 class Lyapunov(NamedTuple):
     """Largest Lyapunov exponent per mesh period, its standard error, and statistics of
     the force over the window it was measured on."""
@@ -274,15 +276,12 @@ def lyapunov(pair: RotorPair, state: Float[Array, "2"], periods: int, how: Integ
     The standard error comes from 16 batch means.
     """
     one = jnp.ones_like(state[0])
-    still = jax.tree.map(
-        lambda x: jnp.zeros((1, *x.shape), x.dtype), eqx.filter(pair, eqx.is_inexact_array)
-    )
-    moving = eqx.combine(still, pair)
+    still = no_tangents(pair)
 
     def step(carry, _):
         state, tangent = carry
-        out = flow(pair, state, one, how, SAMPLES // 4, Directions(tangent[None], moving))
-        moved = out.slope[: state.shape[0], 0]
+        out = flow(pair, state, one, how, SAMPLES // 4, still)
+        moved = out.slope[: state.shape[0]] @ tangent
         size = jnp.linalg.norm(moved)
         safe = jnp.where(size > 0, size, 1.0)
         return (out.end, moved / safe), (jnp.log(safe), out)
