@@ -162,11 +162,13 @@ def row(tool: str, what: str, seconds: float, **more: Any) -> Row:
 
 def use_jax(gpu: bool = False) -> None:
     """Double precision, on the processor unless told otherwise."""
-    import jax
+    from rootsopt.cli import use_float64
 
-    jax.config.update("jax_enable_x64", True)
-    if not gpu:
-        jax.config.update("jax_platforms", "cpu")
+    use_float64()
+    if gpu:
+        import jax
+
+        jax.config.update("jax_platforms", None)
 
 
 def at(evaluator: Any, rtol: float, transient: float) -> Any:

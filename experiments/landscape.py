@@ -14,11 +14,12 @@ import sys
 import time
 from pathlib import Path
 
-import jax
-import numpy as np
+from rootsopt.cli import use_float64
 
-jax.config.update("jax_enable_x64", True)
+use_float64()
 
+import jax  # noqa: E402
+import numpy as np  # noqa: E402
 from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
 from matplotlib.cm import ScalarMappable  # noqa: E402
 from matplotlib.colors import Normalize  # noqa: E402

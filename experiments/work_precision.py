@@ -31,12 +31,12 @@ from typing import Any
 # As the commands do, before equinox is first imported.
 os.environ.setdefault("EQX_ON_ERROR", "off")
 
-import jax
-import jax.numpy as jnp
-import numpy as np
+from rootsopt.cli import use_float64
 
-jax.config.update("jax_enable_x64", True)
+use_float64()
 
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402

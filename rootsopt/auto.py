@@ -17,6 +17,8 @@ from rootsopt.evaluate import Evaluation, Evaluator
 from rootsopt.status import Status
 
 _JUDGED = ("mean_force_N", "peak_force_N")
+_LONG = 64
+"""Transient (mesh periods) from which on a map pays."""
 _MARGIN = 0.5
 """Share of the requested error that a measured difference may use up."""
 
@@ -63,7 +65,8 @@ def choose(config: Config) -> Choice:
     tried: list[dict[str, Any]] = []
     if truth.status is not Status.PERIODIC:
         return Choice(reference, wanted, None, tried)
-    for candidate in _candidates(config, wanted):
+    long = truth.statistics["transient_mesh_periods"] > _LONG
+    for candidate in _candidates(config, wanted, long):
         found = Evaluator(candidate)(series=False)
         error = difference(found, truth)
         solver = candidate.solver
@@ -84,14 +87,14 @@ def resolve(config: Config) -> tuple[Config, dict[str, Any]]:
     return choice.config, {"solver": choice.record()}
 
 
-def _candidates(config: Config, wanted: float) -> Iterator[Config]:
-    """Cheapest first."""
+def _candidates(config: Config, wanted: float, long: bool) -> Iterator[Config]:
+    """Cheapest first. A map costs more to build than it saves, unless the transient is long."""
     loose, tight = 1e-2 * wanted, 1e-3 * wanted
     if wanted >= 3e-3:
         yield _with(config, fidelity="linear", rtol=loose)
-    for rtol in (loose, tight):
-        yield _with(config, fidelity="map", rtol=rtol, map_error=0.1 * wanted)
-    yield _with(config, fidelity="search", rtol=tight)
+    for fidelity in ("map", "search") if long else ("search",):
+        for rtol in (loose, tight):
+            yield _with(config, fidelity=fidelity, rtol=rtol, map_error=0.1 * wanted)
 
 
 def _with(config: Config, fidelity: str, rtol: float, map_error: float = 1e-4) -> Config:

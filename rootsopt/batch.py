@@ -2,15 +2,18 @@
 
 The same steps as `evaluate.Evaluator` (settle, close the orbit, differentiate), without
 its second attempts, and with orbits closed to a tenth of the tolerance: a design that
-needs more is reported as not settled, and can be given to an `Evaluator`. Costs of a batch
-are shared: the slowest member sets the pace.
+needs more is reported as not settled, and can be given to an `Evaluator`.
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.flow import Integrator
@@ -118,7 +121,6 @@ def respond(
     )
 
 
-@eqx.filter_jit
 def respond_many(
     model: Model,
     designs: Float[Array, "n d"],
@@ -128,10 +130,36 @@ def respond_many(
     max_periods: int = 64,
     max_orbit: int = 8,
     gradient: bool = True,
+    workers: int | None = None,
 ) -> Batch:
-    """`respond` over designs (n, d) in config units, each from its own scaled state."""
+    """`respond` over designs (n, d) in config units, each from its own scaled state.
 
-    def one(design, state):
-        return respond(model, design, state, transient, orbit, max_periods, max_orbit, gradient)
+    On CPUs `workers` threads (default: one for each core) take the designs one by one:
+    stepping many together, each would wait for the slowest at every turn. On other devices
+    all are stepped together.
+    """
+    settings = transient, orbit, max_periods, max_orbit, gradient
+    if jax.default_backend() != "cpu":
+        return _together(model, designs, states, *settings)
+    count = designs.shape[0]
+    workers = max(1, min(workers or os.cpu_count() or 1, count))
+    size = -(-count // workers)
+    # Parts of one size share a compiled program; the last design fills the last part up.
+    index = np.minimum(np.arange(workers * size), count - 1).reshape(workers, size)
 
-    return jax.vmap(one)(designs, states)
+    def part(rows):
+        return _in_turn(model, designs[rows], states[rows], *settings)
+
+    with ThreadPoolExecutor(workers) as pool:
+        parts = list(pool.map(part, index))
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *parts)
+
+
+@eqx.filter_jit
+def _together(model, designs, states, *settings) -> Batch:
+    return jax.vmap(lambda design, state: respond(model, design, state, *settings))(designs, states)
+
+
+@eqx.filter_jit
+def _in_turn(model, designs, states, *settings) -> Batch:
+    return lax.map(lambda at: respond(model, *at, *settings), (designs, states))

@@ -65,8 +65,15 @@ class Model(eqx.Module):
     @classmethod
     def of(cls, config: Config, deepest: float | None = None) -> "Model":
         """Model of a config; `deepest` (rad < 0) is the relative rotation the contact map
-        must reach, estimated from the scene when not given."""
+        must reach, estimated from the scene when not given.
+
+        Raises RuntimeError where the config asks for a precision JAX is not set to."""
         contact, scene, solver = config.contact, config.scene, config.solver
+        if solver.precision == "float64" and not jax.config.read("jax_enable_x64"):
+            raise RuntimeError(
+                "JAX computes in single precision here: call rootsopt.cli.use_float64() before "
+                "anything else, or set solver.precision to float32"
+            )
         radius = config.profile.pitch_radius_mm * MM
         scale = contact.exponent
         law = ImpactLaw(

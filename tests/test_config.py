@@ -63,7 +63,7 @@ def test_minimal_config_loads_with_its_values_and_defaults():
     assert config.scene.load.torque_N_m == 1.0
     assert config.scene.timing_gear is None
     assert config.contact.clearance_mm == 0.0
-    assert config.solver.fidelity == "map"
+    assert config.solver.fidelity == "search"
 
 
 def test_whole_numbers_serve_as_numbers():

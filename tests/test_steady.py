@@ -63,7 +63,7 @@ def force_at(pair, start, times, how):
     """Force at ascending `times` (mesh periods), each the end of a solver step."""
     states = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda tau, y, _: pair.derivative(tau, y)[0]),
-        how.solver(state.dtype),
+        how.solver(times.dtype),
         t0=0.0,
         t1=times[-1],
         dt0=1e-4,

@@ -1,5 +1,6 @@
 """Integration of a rotor pair over whole mesh periods with diffrax."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -12,13 +13,14 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.tangent import linearized, one_step, propagated
 
-METHODS: dict[str, type[diffrax.AbstractSolver]] = {
+METHODS: dict[str, Callable[..., diffrax.AbstractSolver]] = {
     "tsit5": diffrax.Tsit5,
     "dopri5": diffrax.Dopri5,
     "dopri8": diffrax.Dopri8,
     "kvaerno3": diffrax.Kvaerno3,
     "kvaerno5": diffrax.Kvaerno5,
 }
+IMPLICIT = ("kvaerno3", "kvaerno5")
 
 
 _FIRST_STEP = 1e-3
@@ -48,11 +50,11 @@ class Integrator(eqx.Module):
     def solver(self, dtype: Any, loops: str = "lax") -> diffrax.AbstractSolver:
         """The method for states of type `dtype`; `loops` over the stages of a step are
         "lax" (forward mode only) or "bounded" (either mode)."""
-        kind = METHODS[self.method]
-        if not issubclass(kind, diffrax.AbstractImplicitSolver):
-            return kind(scan_kind=loops)
-        rtol = self.tolerance(dtype)
-        return kind(scan_kind=loops, root_finder=diffrax.VeryChord(rtol=rtol, atol=rtol))
+        method = METHODS[self.method]
+        if self.method not in IMPLICIT:
+            return method(scan_kind=loops)
+        rtol: Any = self.tolerance(dtype)
+        return method(scan_kind=loops, root_finder=diffrax.VeryChord(rtol=rtol, atol=rtol))
 
     def controller(self, dtype: Any) -> diffrax.PIDController:
         """Step size control of states of type `dtype`."""
@@ -90,7 +92,7 @@ class Flow(NamedTuple):
     grid: Float[Array, " steps"]
     steps: Int[Array, ""]
     solved: Bool[Array, ""]
-    slope: Float[Array, "n+3 columns"]
+    slope: Float[Array, "rows columns"]
 
     @classmethod
     def empty(cls, count: int, directions: int, samples: int, steps: int, dtype: Any) -> "Flow":

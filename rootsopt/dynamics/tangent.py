@@ -86,10 +86,10 @@ def propagated(
         [Int[Array, ""]],
         tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, "m d"]],
     ],
-    start: Float[Array, "m n+d"],
+    start: Float[Array, "m columns"],
     last: Int[Array, ""],
     branch: Int[Array, ""],
-) -> tuple[Float[Array, "m n+d"], Float[Array, " m"], Float[Array, "m n+d"]]:
+) -> tuple[Float[Array, "m columns"], Float[Array, " m"], Float[Array, "m columns"]]:
     """Derivatives of y along the n unit directions of the initial state and d parameters:
     after the step `last`, and with the value itself after the step last + 1, which does
     not go on from there but branches off before the step `branch`.
