@@ -256,7 +256,8 @@ class Evaluator:
         if not bool(jnp.all(jnp.isfinite(numbers))):
             return Status.NON_FINITE
         multiplier = float(jnp.max(orbit.multipliers))
-        near = tolerance / max(1 - multiplier, 1e-3) * 10 + 100 * float(self.transient.rtol)
+        noise = max(float(self.transient.rtol), float(self.orbit.rtol))
+        near = tolerance / max(1 - multiplier, 1e-3) * 10 + 100 * noise
         moved = float(jnp.max(jnp.abs(orbit.state - transient.state)))
         closed = float(orbit.residual) <= RESIDUAL[self.model.precision]
         stable = multiplier < 1

@@ -157,6 +157,17 @@ class FlankPair(eqx.Module):
             lever1=jnp.where(mirrored, lever2, lever1), lever2=jnp.where(mirrored, lever1, lever2)
         )
 
+    def switches(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> Bool[Array, " s"]:
+        """Which pieces of the flanks are closest: where an entry changes, derivatives of the
+        gap jump (its second ones in the pose, the first ones of the levers in the design)."""
+        found = self(roll, relative)
+        ends = jnp.stack([segment.stop for segment in self.frozen.segments()[:-1]] or [0.0])
+        normals = jnp.stack([found.normal1, found.normal2])
+        beyond = (normals[:, None] > ends).ravel()
+        half = self.profile.half_pitch
+        mirrored = jnp.sin(jnp.pi / 2 * (roll - half) / half) > 0
+        return jnp.concatenate([jnp.stack([found.found, mirrored]), beyond])
+
     def _closest(self, roll, relative) -> ClosestApproach:
         """Closest approach for a folded `roll`, with its derivatives.
 

@@ -13,7 +13,7 @@ outside these two zones, never adhesive, and exactly zero without penetration.
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
 def ramp(x: Float[Array, "*n"], width: Float[Array, "*#n"]) -> Float[Array, "*n"]:
@@ -48,14 +48,26 @@ class ImpactLaw(eqx.Module):
         self, depth: Float[Array, "*n"], rate: Float[Array, "*#n"] | float
     ) -> Float[Array, "*n"]:
         """Normal force (N), ≥ 0, for penetration `depth` (m) growing at `rate` (m/s)."""
+        positive, force, width = self._unreleased(depth, rate)
+        return jnp.where(positive, ramp(force, width), 0.0)
+
+    def switches(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Bool[Array, "5"]:
+        """On which of its smooth pieces the law is: in contact, beyond the rounding of the
+        onset, fully damped, not released, beyond the rounding of the release."""
+        positive, force, width = self._unreleased(depth, rate)
+        depths = jnp.stack([jnp.zeros_like(depth), self.smoothing, self.full_damping_depth])
+        forces = jnp.stack([jnp.zeros_like(width), width])
+        return jnp.concatenate([depth > depths, positive & (force > forces)])
+
+    def _unreleased(self, depth, rate):
+        """Whether there is contact, the force before its release, and the rounding of that."""
         delta = ramp(depth, self.smoothing)
         positive = delta > 0
         safe = jnp.where(positive, delta, self.full_damping_depth)
         elastic = self.stiffness * safe**self.exponent
         damped = self.damping * smooth_step(safe / self.full_damping_depth) * rate
         share = jnp.minimum(self.smoothing / self.full_damping_depth, 1.0)
-        force = ramp(elastic + damped, share * elastic)
-        return jnp.where(positive, force, 0.0)
+        return positive, elastic + damped, share * elastic
 
     def depth_at(self, force: Float[Array, ""]) -> Float[Array, ""]:
         """Static penetration (m) that carries `force` (N)."""

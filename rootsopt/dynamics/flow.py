@@ -27,6 +27,14 @@ _FIRST_STEP = 1e-3
 """First step in mesh periods; too large a one is rejected by the error control."""
 _SHORTEST = 1e-9
 """Least time (mesh periods) between the beginning of a step and a peak inside it."""
+_SWITCHES = 48
+"""Changes of the equation's smooth piece looked for in one stretch of motion, at most."""
+_BRIEF, _PARTS = 0.05, 8
+"""Changes less than `_BRIEF` mesh periods apart have `_PARTS` steps between them."""
+_ASIDE = 1e-6
+"""Half a step (mesh periods) that holds a change."""
+_APART = 1e-9
+"""Ends of steps closer than this (mesh periods) are one."""
 
 
 class Integrator(eqx.Module):
@@ -305,6 +313,55 @@ def flow(
         solved=solution.result == diffrax.RESULTS.successful,
         slope=slope,
     )
+
+
+def with_switches(pair: RotorPair, out: Flow, periods: Float[Array, ""]) -> Float[Array, " steps"]:
+    """The grid of `out`, integrated over `periods` mesh periods, with steps that end where the
+    equation changes from one smooth piece to another.
+
+    A method of high order sees a kink of the equation as an error of low order, and a jump of
+    its derivatives (where the contact moves on to the next piece of a flank) costs the
+    linearised motion far more than the motion itself.
+    """
+    samples = out.states.shape[0]
+    stride = next(n for n in (10, 8, 6, 5, 4, 3, 2, 1) if samples % n == 0)
+    width = periods / samples
+
+    def flags(place):
+        """Pieces at a time counted in samples; between two the motion is a straight line."""
+        index = jnp.clip(jnp.floor(place).astype(int), 0, samples - 1)
+        low = out.states[index]
+        # The orbit's end is its beginning, nearly.
+        high = jnp.where(index + 1 < samples, out.states[(index + 1) % samples], out.end)
+        return pair.switches(place * width, low + (place - index) * (high - low))
+
+    places = jnp.arange(0, samples + 1, stride).astype(width.dtype)
+    at = jax.vmap(flags)(places)
+    changed = at[1:] != at[:-1]
+    interval, which = jnp.nonzero(changed, size=_SWITCHES, fill_value=-1)
+    before = at[interval, which]
+
+    def halve(_, ends):
+        low, high = ends
+        middle = (low + high) / 2
+        same = jax.vmap(flags)(middle)[jnp.arange(_SWITCHES), which] == before
+        return jnp.where(same, middle, low), jnp.where(same, high, middle)
+
+    start = places[interval], places[interval] + stride
+    _, found = lax.fori_loop(0, 14, halve, start)
+    found = jnp.sort(jnp.where(interval >= 0, found * width, jnp.inf))
+    # Between two changes close together the contact crosses a whole piece of the flank.
+    brief = jnp.diff(found, append=jnp.inf)
+    share = jnp.arange(1, _PARTS, dtype=found.dtype) / _PARTS
+    inside = found[:, None] + jnp.where(brief < _BRIEF, brief, jnp.inf)[:, None] * share
+    # A change lies inside a step too short to matter: no stage is evaluated beside it, where
+    # rounding would decide on which side.
+    added = [found - _ASIDE, found + _ASIDE, inside.ravel()]
+    merged = jnp.sort(jnp.concatenate([out.grid, *added]))
+    # Nearly equal ends would make steps of no length.
+    close = jnp.diff(merged, prepend=-jnp.inf) < _APART
+    close |= ~((merged > 0) & (merged <= periods))
+    return jnp.sort(jnp.where(close, jnp.inf, merged))[: out.grid.shape[0]]
 
 
 def _locate_peak(pair, states, times):

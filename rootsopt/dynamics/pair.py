@@ -11,7 +11,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.impact import ImpactLaw
@@ -36,6 +36,10 @@ class SearchContact(eqx.Module):
     def __call__(self, roll, relative):
         contact = self.pair(roll, relative)
         return contact.gap, contact.lever1, contact.lever2
+
+    def switches(self, roll, relative):
+        """See `FlankPair.switches`."""
+        return self.pair.switches(roll, relative)
 
 
 class FlankForce(NamedTuple):
@@ -112,12 +116,7 @@ class RotorPair(eqx.Module):
         can touch when ε < 0 and only the coast flank when ε > 0, so one search is
         enough; the force is exactly zero on both sides of ε = 0.
         """
-        side = jnp.where(relative < 0, 1.0, -1.0)
-        mean = phi + relative / 2
-        gap, lever1, lever2 = self.contact(-side * mean, side * relative)
-        speed = self.drive.speed
-        depth = -gap - self.clearance
-        closing = side * (lever1 * speed - lever2 * (speed + rate))
+        _, depth, closing, lever1, lever2 = self._approach(phi, relative, rate)
         force = self.law(depth, closing)
         drives = relative < 0
         return FlankForce(
@@ -128,9 +127,30 @@ class RotorPair(eqx.Module):
             lever2=lever2,
         )
 
+    def _approach(self, phi, relative, rate):
+        """Side (1 drive, -1 coast), penetration, its rate and the levers."""
+        side = jnp.where(relative < 0, 1.0, -1.0)
+        gap, lever1, lever2 = self.contact(-side * (phi + relative / 2), side * relative)
+        speed = self.drive.speed
+        closing = side * (lever1 * speed - lever2 * (speed + rate))
+        return side, -gap - self.clearance, closing, lever1, lever2
+
     def contact_at(self, tau: Float[Array, ""], state: Float[Array, "2"]) -> FlankForce:
         """Flank contact at time `tau` (mesh periods) and scaled `state`."""
         return self.contact_force(*self.physical(tau, state))
+
+    def switches(self, tau: Float[Array, ""], state: Float[Array, "2"]) -> Bool[Array, " s"]:
+        """Which of its smooth pieces the equation is on, at time `tau` (mesh periods) and
+        scaled `state`: side and pieces of the flanks, of the contact law, of the gear."""
+        phi, relative, rate = self.physical(tau, state)
+        side, depth, closing, *_ = self._approach(phi, relative, rate)
+        flags = [jnp.stack([relative < 0]), self.law.switches(depth, closing)]
+        if self.gear is not None:
+            flags.append(self.gear.switches(relative))
+        of_contact = getattr(self.contact, "switches", None)
+        if of_contact is not None:
+            flags.append(of_contact(-side * (phi + relative / 2), side * relative))
+        return jnp.concatenate(flags)
 
     def derivative(
         self, tau: Float[Array, ""], state: Float[Array, "2"]

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rootsopt.contact.impact import ramp, smooth_step
 
@@ -42,3 +42,8 @@ class TimingGear(eqx.Module):
         )
         spring = self.stiffness * jnp.sign(relative) * ramp(excess, self.rounding)
         return spring + self.damping * engaged * rate
+
+    def switches(self, relative: Float[Array, ""]) -> Bool[Array, "2"]:
+        """On which of its smooth pieces the gear is: engaged, beyond the rounding."""
+        excess = jnp.abs(relative) - self.half_backlash
+        return excess > jnp.stack([jnp.zeros_like(self.rounding), self.rounding])

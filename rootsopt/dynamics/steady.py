@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.flow import Flow, Integrator, flow, strobe
+from rootsopt.dynamics.flow import Flow, Integrator, flow, strobe, with_switches
 from rootsopt.dynamics.pair import RotorPair
 
 BLOCK = 4
@@ -31,8 +31,9 @@ RESIDUAL = {"float64": 1e-9, "float32": 1e-3}
 _NEWTON_STEPS = 12
 _CLOSED = 4000
 """Residual (scaled) at which Newton stops, in roundings: 1e-12 in double precision."""
-_SMALL = 1e-3
-"""Newton step (scaled) from which on the solver's steps are kept."""
+_SMALL = 1e-6, 1e-3
+"""Newton step (scaled) from which on the solver's steps are kept: a thousand times its
+tolerance, but within these."""
 
 
 class Transient(NamedTuple):
@@ -164,24 +165,27 @@ def close_orbit(
     `tangents` holds d pair / d design, stacked along a leading axis. `samples` must be
     divisible by the period. Newton stops after `shots` integrations, or at the residual
     `closed` (at least some thousand roundings). Once its steps are small those of the solver
-    are kept, so that the map it solves is smooth and closes to rounding.
+    are kept, with ends added where the equation is not smooth: so the map it solves is
+    smooth and closes to rounding, and its derivative is as accurate as the motion.
     """
     count, dtype = state.shape[0], state.dtype
     closed = jnp.maximum(closed, _CLOSED * float(jnp.finfo(dtype).eps)).astype(dtype)
     length = period.astype(dtype)
 
+    frozen = lax.stop_gradient(pair)
+
     def shoot(state, grid, repeat):
         return flow(pair, state, length, how, samples, tangents, grid, repeat)
 
     def go_on(carry):
-        orbit, _, repeat, _, best = carry
+        orbit, _, _, repeated, _, best = carry
         done = orbit.newton_steps
         # Chosen anew, the steps depend on the state, and that leaves a floor.
-        improving = (done < 3) | ~repeat | (orbit.residual < 0.5 * best)
-        return (orbit.residual > closed) & (done < shots) & improving
+        improving = (done < 3) | (orbit.residual < 0.5 * best)
+        return (((orbit.residual > closed) & improving) | ~repeated) & (done < shots)
 
     def step(carry):
-        orbit, state, repeat, grid, best = carry
+        orbit, state, repeat, _, grid, best = carry
         out = shoot(state, grid, repeat)
         monodromy = out.slope[:count, :count]
         miss = out.end - state
@@ -191,12 +195,18 @@ def close_orbit(
         # Keep the first steps inside the neighbourhood the transient pointed to.
         new = state + correction * jnp.minimum(1.0, 0.5 / jnp.maximum(size, 1e-30))
         done = orbit.newton_steps + 1
-        keep = repeat | (size < _SMALL) | (done >= shots // 2)
-        reached = orbit.residual
+        known = size < jnp.clip(1000 * how.rtol, *_SMALL)
+        following = repeat | known | (done >= shots // 3)
+        reached = jnp.where(repeat, orbit.residual, jnp.inf)
         orbit = orbit._replace(
             state=state, flow=out, residual=residual, monodromy=monodromy, newton_steps=done
         )
-        return orbit, new, keep, out.grid, jnp.minimum(best, reached)
+        grid = lax.cond(
+            following & ~repeat,
+            lambda: with_switches(frozen, out, length),
+            lambda: out.grid,
+        )
+        return orbit, new, following, repeat, grid, jnp.minimum(best, reached)
 
     # The loop holds the only copy of the integration: one shot is compiled, not two.
     infinite = jnp.asarray(jnp.inf, dtype)
@@ -212,7 +222,8 @@ def close_orbit(
         sensitivity=jnp.zeros((3, designs), dtype),
         newton_steps=jnp.zeros((), int),
     )
-    start = (first, state, jnp.zeros((), bool), none.grid, infinite)
+    no = jnp.zeros((), bool)
+    start = (first, state, no, no, none.grid, infinite)
     orbit = lax.while_loop(go_on, step, start)[0]
     slope = orbit.flow.slope
     moved = jnp.linalg.solve(jnp.eye(count, dtype=dtype) - orbit.monodromy, slope[:count, count:])
