@@ -409,7 +409,8 @@ def test_the_least_period_is_named(settled, name, period):
     """
     evaluation = settled[name]
     assert evaluation.steady_state["period"] == period
-    assert evaluation.steady_state["residual"] < 1e-12
+    # A gap of some 1e-5 m is the difference of lengths of 0.1 m: forces round at 1e-12.
+    assert evaluation.steady_state["residual"] < 1e-11
     assert evaluation.gradient
     series = evaluation.series
     per_mesh = len(series.force) // (-(-3 // period) * period)

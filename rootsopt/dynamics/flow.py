@@ -268,14 +268,13 @@ def flow(
     before = jnp.concatenate([start[None], after[:-1]])
     last = jnp.maximum(solution.stats["num_accepted_steps"] - 1, 0)
 
-    # The step that holds the peak is taken once more, as far as the peak. At this fixed
-    # instant the force is differentiated (envelope theorem).
+    # The step that holds the peak is taken once more, as far as the peak.
     peak_time, depth = _locate_peak(lax.stop_gradient(pair), states, times)
     holds = jnp.clip(jnp.sum(ends < peak_time), 0, last)
     peak_time = jnp.maximum(peak_time, begins[holds] + _SHORTEST)
 
     def force_at_peak(y, dynamic):
-        return eqx.combine(dynamic, static).contact_at(peak_time, y).total
+        return _force_at_peak(eqx.combine(dynamic, static), peak_time, y)
 
     if tangents is None:
         there = one_step(solver, term, begins[holds], peak_time, before[holds], dynamic)
@@ -313,6 +312,34 @@ def flow(
         solved=solution.result == diffrax.RESULTS.successful,
         slope=slope,
     )
+
+
+def _force_at_peak(pair, time, state):
+    """Greatest force, at the instant `time` and the `state` there, with its derivatives.
+
+    Where the force is smooth at its peak, they are those at the fixed instant (envelope
+    theorem). Where it has a corner, the peak stays on the corner as that moves, and of the
+    derivatives on both sides the mean counts for which the force is stationary in time.
+    """
+    frozen, held = lax.stop_gradient((pair, state))
+    rate = frozen.derivative(time, held)[0]
+    aside = (_ASIDE if state.dtype.itemsize == 8 else 1e3 * _ASIDE) * jnp.asarray([-1.0, 1.0])
+
+    def beside(step):
+        at = time + step
+
+        def force(at, state):
+            return frozen.contact_at(at, state).total
+
+        near = held + step * rate
+        in_time = jax.jvp(force, (at, near), (jnp.ones_like(at), rate))[1]
+        return pair.contact_at(at, state + step * rate).total, lax.stop_gradient(in_time)
+
+    forces, (before, after) = jax.vmap(beside)(aside.astype(state.dtype))
+    corner = (before > 0) & (after < 0)
+    share = jnp.where(corner, before / jnp.where(corner, before - after, 1.0), 0.5)
+    mean = (1 - share) * forces[0] + share * forces[1]
+    return frozen.contact_at(time, held).total + mean - lax.stop_gradient(mean)
 
 
 def with_switches(pair: RotorPair, out: Flow, periods: Float[Array, ""]) -> Float[Array, " steps"]:
