@@ -154,7 +154,8 @@ def test_objective_slope_agrees_with_finite_differences():
     search = Search(settings)
     base = search.exact(series=False)
     problem = Problem.of(settings, search.exact.model, base)
-    point = np.array([0.5, 0.6, 0.4])
+    # Away from designs whose peak falls on a corner of the force (see test_steady).
+    point = np.array([0.2, 0.3, 0.4])
 
     def objective(at):
         return problem.objective(search.exact(problem.design(at), series=False))

@@ -306,6 +306,22 @@ def test_recorded_steps_give_the_same_motion(sharp, orbits):
         np.testing.assert_allclose(difference, once.slope[:2, 1], atol=1e-6)
 
 
+def test_peak_on_a_corner_has_its_gradient():
+    """Where the contact moves from the involute to the tip arc the force has a corner, and here
+    its peak: the derivative is neither of the two beside it."""
+    evaluator = Evaluator(load("configs/cic.yaml"))
+    design, step = jnp.array([35.0, 5.602843, 3.5]), 1e-3
+
+    def peak(at):
+        return evaluator(at, series=False).response["peak_force_N"]
+
+    slope = np.array(list(evaluator(design, series=False).gradient["peak_force_N"].values()))
+    difference = [
+        (peak(design + step * unit) - peak(design - step * unit)) / (2 * step) for unit in np.eye(3)
+    ]
+    np.testing.assert_allclose(slope, difference, atol=1e-3 * np.max(np.abs(slope)))
+
+
 # Statuses
 
 

@@ -33,6 +33,8 @@ _BRIEF, _PARTS = 0.05, 8
 """Changes less than `_BRIEF` mesh periods apart have `_PARTS` steps between them."""
 _ASIDE = 1e-6
 """Half a step (mesh periods) that holds a change."""
+_BESIDE = {8: 1e-7, 4: 1e-3}
+"""Time (mesh periods) from a peak to either side of it, by bytes of a number."""
 _APART = 1e-9
 """Ends of steps closer than this (mesh periods) are one."""
 
@@ -323,7 +325,7 @@ def _force_at_peak(pair, time, state):
     """
     frozen, held = lax.stop_gradient((pair, state))
     rate = frozen.derivative(time, held)[0]
-    aside = (_ASIDE if state.dtype.itemsize == 8 else 1e3 * _ASIDE) * jnp.asarray([-1.0, 1.0])
+    aside = _BESIDE[state.dtype.itemsize] * jnp.asarray([-1.0, 1.0])
 
     def beside(step):
         at = time + step
