@@ -77,8 +77,9 @@ def test_gap_is_that_of_nodes_far_out(graded_outline, name, error_mm):
     rng = np.random.default_rng(1)
     checked = 0
     for _ in range(40):
-        mean, relative = jnp.asarray(rng.uniform([0, -0.02], [2 * np.pi, 0.02]))
-        drive, coast = (float(gap_of(pair, sign * mean, -sign * relative)) for sign in (-1, 1))
+        mean, relative = rng.uniform(0, 2 * np.pi), rng.uniform(-0.02, 0.02)
+        drive = float(gap_of(pair, jnp.asarray(-mean), jnp.asarray(relative)))
+        coast = float(gap_of(pair, jnp.asarray(mean), jnp.asarray(-relative)))
         flank = min(drive, coast)
         # Lands pass at the centre distance's error; only what is deeper is a flank's.
         if flank > -2e-5:
