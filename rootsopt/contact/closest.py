@@ -157,10 +157,10 @@ class FlankPair(eqx.Module):
             lever1=jnp.where(mirrored, lever2, lever1), lever2=jnp.where(mirrored, lever1, lever2)
         )
 
-    def switches(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> Bool[Array, " s"]:
-        """Which pieces of the flanks are closest: where an entry changes, derivatives of the
-        gap jump (its second ones in the pose, the first ones of the levers in the design)."""
-        found = self(roll, relative)
+    def switches(self, roll: Float[Array, ""], found: ClosestApproach) -> Bool[Array, " s"]:
+        """Which pieces of the flanks are closest in the approach `found` at `roll`: where an
+        entry changes, derivatives of the gap jump (its second ones in the pose, the first ones
+        of the levers in the design)."""
         ends = jnp.stack([segment.stop for segment in self.frozen.segments()[:-1]] or [0.0])
         normals = jnp.stack([found.normal1, found.normal2])
         beyond = (normals[:, None] > ends).ravel()

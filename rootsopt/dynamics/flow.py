@@ -324,7 +324,7 @@ def _force_at_peak(pair, time, state):
     derivatives on both sides the mean counts for which the force is stationary in time.
     """
     frozen, held = lax.stop_gradient((pair, state))
-    rate = frozen.derivative(time, held)[0]
+    rate, contact = frozen.derivative(time, held)
     aside = _BESIDE[state.dtype.itemsize] * jnp.asarray([-1.0, 1.0])
 
     def beside(step):
@@ -341,7 +341,7 @@ def _force_at_peak(pair, time, state):
     corner = (before > 0) & (after < 0)
     share = jnp.where(corner, before / jnp.where(corner, before - after, 1.0), 0.5)
     mean = (1 - share) * forces[0] + share * forces[1]
-    return frozen.contact_at(time, held).total + mean - lax.stop_gradient(mean)
+    return contact.total + mean - lax.stop_gradient(mean)
 
 
 def with_switches(pair: RotorPair, out: Flow, periods: Float[Array, ""]) -> Float[Array, " steps"]:

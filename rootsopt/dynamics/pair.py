@@ -34,12 +34,12 @@ class SearchContact(eqx.Module):
         return cls(FlankPair.of(profile))
 
     def __call__(self, roll, relative):
-        contact = self.pair(roll, relative)
-        return contact.gap, contact.lever1, contact.lever2
+        return self.with_switches(roll, relative)[0]
 
-    def switches(self, roll, relative):
-        """See `FlankPair.switches`."""
-        return self.pair.switches(roll, relative)
+    def with_switches(self, roll, relative):
+        """Gap and levers, and `FlankPair.switches`."""
+        found = self.pair(roll, relative)
+        return (found.gap, found.lever1, found.lever2), self.pair.switches(roll, found)
 
 
 class FlankForce(NamedTuple):
@@ -116,7 +116,9 @@ class RotorPair(eqx.Module):
         can touch when ε < 0 and only the coast flank when ε > 0, so one search is
         enough; the force is exactly zero on both sides of ε = 0.
         """
-        _, depth, closing, lever1, lever2 = self._approach(phi, relative, rate)
+        side = jnp.where(relative < 0, 1.0, -1.0)
+        geometry = self.contact(-side * (phi + relative / 2), side * relative)
+        depth, closing, lever1, lever2 = self._approach(side, geometry, rate)
         force = self.law(depth, closing)
         drives = relative < 0
         return FlankForce(
@@ -127,13 +129,12 @@ class RotorPair(eqx.Module):
             lever2=lever2,
         )
 
-    def _approach(self, phi, relative, rate):
-        """Side (1 drive, -1 coast), penetration, its rate and the levers."""
-        side = jnp.where(relative < 0, 1.0, -1.0)
-        gap, lever1, lever2 = self.contact(-side * (phi + relative / 2), side * relative)
+    def _approach(self, side, geometry, rate):
+        """Penetration and its rate on a side (1 drive, -1 coast), and the levers."""
+        gap, lever1, lever2 = geometry
         speed = self.drive.speed
         closing = side * (lever1 * speed - lever2 * (speed + rate))
-        return side, -gap - self.clearance, closing, lever1, lever2
+        return -gap - self.clearance, closing, lever1, lever2
 
     def contact_at(self, tau: Float[Array, ""], state: Float[Array, "2"]) -> FlankForce:
         """Flank contact at time `tau` (mesh periods) and scaled `state`."""
@@ -143,13 +144,16 @@ class RotorPair(eqx.Module):
         """Which of its smooth pieces the equation is on, at time `tau` (mesh periods) and
         scaled `state`: side and pieces of the flanks, of the contact law, of the gear."""
         phi, relative, rate = self.physical(tau, state)
-        side, depth, closing, *_ = self._approach(phi, relative, rate)
-        flags = [jnp.stack([relative < 0]), self.law.switches(depth, closing)]
+        side = jnp.where(relative < 0, 1.0, -1.0)
+        pose = -side * (phi + relative / 2), side * relative
+        if isinstance(self.contact, SearchContact):
+            geometry, pieces = self.contact.with_switches(*pose)
+        else:
+            geometry, pieces = self.contact(*pose), jnp.zeros(0, bool)
+        depth, closing, *_ = self._approach(side, geometry, rate)
+        flags = [jnp.stack([relative < 0]), self.law.switches(depth, closing), pieces]
         if self.gear is not None:
             flags.append(self.gear.switches(relative))
-        of_contact = getattr(self.contact, "switches", None)
-        if of_contact is not None:
-            flags.append(of_contact(-side * (phi + relative / 2), side * relative))
         return jnp.concatenate(flags)
 
     def derivative(
