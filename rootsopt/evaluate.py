@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import threading
 import time
 from typing import Any
 
@@ -108,7 +109,7 @@ class Evaluator:
     def __init__(self, config: Config, rtol: float | None = None, survey: bool = False):
         self.config = config
         self.survey = survey
-        self.fitted = self.sized = False
+        self.fitted = self.sized = self.compiled = False
         self.map_error = float("nan")
         limit = config.solver.max_mesh_periods
         self.max_periods = max(limit // 4, 8 * BLOCK) if survey else limit
@@ -191,6 +192,12 @@ class Evaluator:
         dtype = pair.angle_scale.dtype
         state = jnp.zeros(2, dtype) if start is None else jnp.asarray(start, dtype)
         how, used, steps = self.transient, 0, 0
+        aside = threading.Thread(
+            target=_close, args=(pair, tangents, state, jnp.ones((), int), self.orbit)
+        )
+        if not self.compiled:
+            # The program for the orbit is compiled beside that for the transient.
+            aside.start()
         tolerance = float(settled_within(how.rtol))
         while True:
             transient = _settle(
@@ -201,6 +208,9 @@ class Evaluator:
                 jnp.asarray(self.max_periods - used),
                 self.config.solver.max_orbit_periods,
             )
+            if not self.compiled:
+                aside.join()
+                self.compiled = True
             used += int(transient.periods)
             steps += int(transient.steps)
             state = transient.state
