@@ -130,19 +130,17 @@ def respond_many(
     max_periods: int = 64,
     max_orbit: int = 8,
     gradient: bool = True,
-    workers: int | None = None,
 ) -> Batch:
     """`respond` over designs (n, d) in config units, each from its own scaled state.
 
-    On CPUs `workers` threads (default: one for each core) take the designs one by one:
-    stepping many together, each would wait for the slowest at every turn. On other devices
-    all are stepped together.
+    On CPUs a thread for each core takes the designs one by one: stepping many together, each
+    would wait for the slowest at every turn. On other devices all are stepped together.
     """
     settings = transient, orbit, max_periods, max_orbit, gradient
     if jax.default_backend() != "cpu":
         return _together(model, designs, states, *settings)
     count = designs.shape[0]
-    workers = max(1, min(workers or os.cpu_count() or 1, count))
+    workers = max(1, min(os.cpu_count() or 1, count))
     size = -(-count // workers)
     # Parts of one size share a compiled program; the last design fills the last part up.
     index = np.minimum(np.arange(workers * size), count - 1).reshape(workers, size)

@@ -13,10 +13,12 @@ common direction
     G = E sin λ - h1(ν1) - h2(ν2)      normal gap (negative: penetration),
 
 q the levers, h the support functions, E the centre distance. The closest approach is
-the root of T, bracketed on a fixed set of nodes and refined inside its bracket, so that
-it cannot be lost where curvature jumps or the flanks conform. A root at which T falls
-with growing ν2 is a minimum of the gap. By the envelope theorem
-∂G/∂φ1 = -q1 and ∂G/∂φ2 = q2, which is also the virtual work of a unit contact force.
+the root of T. Newton's method looks for it from the point of perfect rolling; where it
+does not converge, or might find another root, the root is bracketed on a fixed set of
+nodes and refined inside its bracket, so that it cannot be lost where curvature jumps or
+the flanks conform. A root at which T falls with growing ν2 is a minimum of the gap. By the
+envelope theorem ∂G/∂φ1 = -q1 and ∂G/∂φ2 = q2, which is also the virtual work of a unit
+contact force.
 
 Bracketing on all nodes needs no trigonometric function per node and pose: the pose turns
 every node by the same angle, so sines and cosines follow by the addition theorem.
@@ -39,13 +41,14 @@ from rootsopt.profiles.base import Profile
 
 # Nodes per smooth segment; they only have to separate the roots of T.
 _NODES_PER_SEGMENT = 32
-# Illinois steps inside the bracket (T has a kink there when ν1 crosses a segment's end,
-# so plain Newton is not safe), before one Newton step. The tests measure the error.
-_REFINEMENTS = 5
 # Newton steps from the point of perfect rolling, at most (two or three are usual). The last
 # one must be so short that the next would be lost in rounding, even across a kink of T.
 _NEWTON_STEPS = 5
 _CONVERGED = {8: 1e-8, 4: 1e-3}
+# Steps inside a bracket, at most: halving alone needs about fifty.
+_GUARDED_STEPS = 60
+# Added to the number of attempts when the closest approach has been found.
+_DONE = 8
 # ε (rad) down to which the tests have shown that at the nominal centre distance Newton's
 # method, where it converges, finds the closest approach and no other common normal (but for
 # a share of the flank, about √|ε|, next to a cusp at the pitch point).
@@ -59,8 +62,9 @@ class ClosestApproach(NamedTuple):
 
     `gap` (m, negative when the flanks penetrate); `lever1`, `lever2` (m): moment arms of
     the common normal about rotor 1 and rotor 2, so that d gap = -lever1 dφ1 + lever2 dφ2;
-    `normal1`, `normal2` (rad): ν1 and ν2; `found`: whether the flanks have a common
-    normal at all (otherwise the gap is +inf-like and the levers are zero).
+    `normal1`, `normal2` (rad): ν1 and ν2; `found`: whether a common normal was
+    found (otherwise the gap is a pitch radius and the levers are zero). It is not looked for
+    where the flanks cannot touch yet, see `contact_begins`.
     """
 
     gap: Float[Array, ""]
@@ -179,18 +183,7 @@ class FlankPair(eqx.Module):
 
         @jax.custom_jvp
         def closest(dynamic, roll, relative):
-            pair = eqx.combine(dynamic, static)
-            found, normal2 = _found_one_by_one(pair, roll, relative)
-            _, gap, normal1, lever1, lever2 = pair._mesh(normal2, roll, relative)
-            zero = jnp.zeros_like(gap)
-            return ClosestApproach(
-                gap=jnp.where(found, gap, pair.profile.pitch_radius),
-                lever1=jnp.where(found, lever1, zero),
-                lever2=jnp.where(found, lever2, zero),
-                normal1=normal1,
-                normal2=normal2,
-                found=found,
-            )
+            return _search_one_by_one(eqx.combine(dynamic, static), roll, relative)
 
         @closest.defjvp
         def _(primals, tangents):
@@ -244,104 +237,109 @@ class FlankPair(eqx.Module):
         arms = self.profile.lever(facing + 2 * roll) + self.profile.pitch_radius * jnp.cos(psi)
         return reach - arms
 
-    def _search(self, roll, relative):
-        """Newton's method from the point of perfect rolling; the nodes where it cannot be
-        relied on: (found, ν2)."""
-        if not self.rolling:
-            return self._scan(roll, relative)
-        certain, found, normal2 = self._directly(roll, relative)
+    def _search(self, roll, relative, attempt=0):
+        """Closest approach at a folded `roll`, and the attempts it took.
 
-        def scan(_):
-            return jnp.ones((), bool), *self._scan(roll, relative)
-
-        # A loop of no or one turn. Unlike a conditional it stays one when vectorised: the
-        # nodes are looked at only if one of the poses asks for it.
-        return lax.while_loop(lambda carry: ~carry[0], scan, (certain, found, normal2))[1:]
-
-    def _directly(self, roll, relative):
-        """Newton's method from the point of perfect rolling: (certain, found, ν2)."""
-        profile, nodes = self.profile, self.nodes
-        low, high = nodes.normal[0], nodes.normal[-1]
-        tolerance = _CONVERGED[low.dtype.itemsize]
-
-        def go_on(carry):
-            count, _, step, _ = carry
-            return (count < _NEWTON_STEPS) & (jnp.abs(step) >= tolerance)
-
-        def newton(carry):
-            count, normal2, _, _ = carry
-            value, slope = jax.jvp(
-                lambda nu: self._offset(nu, roll, relative), (normal2,), (jnp.ones_like(normal2),)
-            )
-            step = value / jnp.where(slope < 0, slope, -jnp.inf)
-            return count + 1, jnp.clip(normal2 - step, low, high), step, slope
-
-        guess = jnp.clip(profile.normal_at(roll), low, high)
-        start = 0, guess, jnp.full_like(guess, jnp.inf), jnp.zeros_like(guess)
-        _, normal2, step, slope = lax.while_loop(go_on, newton, start)
-        inside = (normal2 > low) & (normal2 < high) & (slope < 0)
-        converged = inside & (jnp.abs(step) < tolerance)
+        Attempt 0 is Newton's method from the point of perfect rolling. Where it cannot be relied
+        on, attempts 1 and 2 follow: two minima occur away from the nominal centre distance and
+        next to a cusp, and are the last and the first interval of the nodes where T falls
+        through zero; the deeper counts. (One loop for all, so that it is compiled once.)
+        """
+        nothing = jnp.zeros_like(roll)
+        none = ClosestApproach(
+            gap=jnp.full_like(roll, self.profile.pitch_radius),
+            lever1=nothing,
+            lever2=nothing,
+            normal1=nothing,
+            normal2=nothing,
+            found=jnp.zeros(roll.shape, bool),
+        )
+        low, high = self.nodes.normal[0], self.nodes.normal[-1]
         absent = roll < contact_begins(relative)
+        rolling = (low, high), jnp.clip(self.profile.normal_at(roll), low, high), ~absent, ~absent
         usual = (relative <= 0) & (relative >= _USUAL)
-        if profile.cusp:
-            usual &= roll < (1 - 5 * jnp.sqrt(jnp.abs(relative))) * profile.half_pitch
-        return (converged | absent) & usual, ~absent, normal2
+        if self.profile.cusp:
+            usual &= roll < (1 - 5 * jnp.sqrt(jnp.abs(relative))) * self.profile.half_pitch
 
-    def _scan(self, roll, relative):
-        """Bracket on the nodes, refine inside, one Newton step: (found, ν2)."""
+        def look(carry):
+            attempt, best = carry
+            direct = attempt == 0
+            bracket, guess, present, single = lax.cond(
+                direct, lambda: rolling, lambda: self._bracket(attempt, roll, relative)
+            )
+            normal2, converged = self._root(bracket, guess, ~direct, roll, relative)
+            _, gap, normal1, lever1, lever2 = self._mesh(normal2, roll, relative)
+            new = ClosestApproach(gap, lever1, lever2, normal1, normal2, present)
+            better = present & ((gap < best.gap) | (attempt < 2))
+            best = jax.tree.map(lambda x, y: jnp.where(better, x, y), new, best)
+            certain = usual & (converged | absent)
+            done = jnp.where(direct, certain, single)
+            best = jax.tree.map(lambda x, y: jnp.where(direct & ~done, x, y), none, best)
+            return jnp.where(done, _DONE, 0) + attempt + 1, best
+
+        start = jnp.asarray(attempt if self.rolling else max(attempt, 1)), none
+        attempts, best = lax.while_loop(lambda carry: carry[0] < 3, look, start)
+        return attempts % _DONE, best
+
+    def _bracket(self, attempt, roll, relative):
+        """Interval between nodes where T falls through zero, the last (`attempt` 1) or the first:
+        (low, high), first guess, whether there is one, whether there is but one."""
         profile, nodes = self.profile, self.nodes
         turned = _rotate(nodes.turned, 2 * profile.turn_ratio * roll)
         lever1 = profile.lever_from(nodes.facing + 2 * roll, turned[0], turned[1])
         sin = _rotate(nodes.direction, roll - relative / 2)[1]
         offset = self.center_distance * sin - lever1 - nodes.lever
-        # Where T falls through zero the gap has a minimum. The tolerance is for a root on
-        # a node: a compiled program may round T[i] one way as the end of one interval and
-        # another way as the start of the next.
+        # The tolerance is for a root on a node: a compiled program may round T[i] one way as the
+        # end of one interval and another way as the start of the next.
         slack = _SLACK[offset.dtype.itemsize] * profile.pitch_radius
         falling = (offset[:-1] >= -slack) & (offset[1:] < slack)
         # Whole numbers, whose greatest is found at vector speed; an arg-minimum is not.
         place = jnp.arange(falling.shape[0])
         last = jnp.max(jnp.where(falling, place, -1))
-        found = last >= 0
         first = jnp.min(jnp.where(falling, place, place.shape[0]))
-        ends = jnp.maximum(last, 0), jnp.minimum(first, place.shape[0] - 1)
-
-        def gap(normal2):
-            return self._mesh(normal2, roll, relative)[1]
-
-        # Two minima occur away from the nominal centre distance, and near the pitch point
-        # where ψ = 0 there: the deeper counts.
-        guesses = [self._between(index, offset) for index in ends]
-        if profile.cusp:
-            # They may be closer in depth than T taken as linear between nodes can tell.
-            guesses = [self._refine(index, offset, roll, relative) for index in ends]
-            return found, jnp.where(gap(guesses[1]) < gap(guesses[0]), guesses[1], guesses[0])
-        index = jnp.where(gap(guesses[1]) < gap(guesses[0]), ends[1], ends[0])
-        return found, self._refine(index, offset, roll, relative)
-
-    def _between(self, index, offset):
-        """Root of T between the nodes `index` and `index` + 1, T taken as linear."""
-        low, high = self.nodes.normal[index], self.nodes.normal[index + 1]
+        present = last >= 0
+        index = jnp.where(present, jnp.where(attempt == 1, last, first), 0)
+        low, high = nodes.normal[index], nodes.normal[index + 1]
         fall = offset[index] - offset[index + 1]
         share = jnp.clip(offset[index] / jnp.where(fall > 0, fall, 1.0), 0.0, 1.0)
-        return low + (high - low) * share
+        return (low, high), low + (high - low) * share, present, first >= last
 
-    def _refine(self, index, offset, roll, relative):
-        """Root of T between the nodes `index` and `index` + 1."""
-        normal = self.nodes.normal
-        best = _illinois(
-            lambda nu: self._offset(nu, roll, relative),
-            (normal[index], normal[index + 1], offset[index], offset[index + 1]),
-        )
-        value, slope = jax.jvp(
-            lambda nu: self._offset(nu, roll, relative), (best,), (jnp.ones_like(best),)
-        )
-        polished = best - value / jnp.where(slope < 0, slope, -jnp.inf)
-        # A kink of T inside the bracket can throw the step out of it.
-        return jnp.clip(polished, normal[index], normal[index + 1])
+    def _root(self, bracket, guess, guarded, roll, relative):
+        """Root of T by Newton's method from `guess`, and whether it converged.
+
+        `guarded`: T falls through zero in the bracket, and the bracket shrinks around the root;
+        it is halved where Newton's step leaves it or is no shorter than half the last one. (T has
+        a kink where ν1 crosses a segment's end.)
+        """
+        tolerance = _CONVERGED[guess.dtype.itemsize]
+        limit = jnp.where(guarded, _GUARDED_STEPS, _NEWTON_STEPS)
+
+        def go_on(carry):
+            count, _, step, _, _ = carry
+            return (count < limit) & (jnp.abs(step) >= tolerance)
+
+        def newton(carry):
+            count, normal2, before, _, (low, high) = carry
+            value, slope = jax.jvp(
+                lambda nu: self._offset(nu, roll, relative), (normal2,), (jnp.ones_like(normal2),)
+            )
+            step = value / jnp.where(slope < 0, slope, -jnp.inf)
+            left = guarded & (value >= 0)
+            low, high = jnp.where(left, normal2, low), jnp.where(guarded & ~left, normal2, high)
+            new = normal2 - step
+            slow = (slope >= 0) | (jnp.abs(step) > 0.5 * jnp.abs(before))
+            halve = guarded & (slow | (new < low) | (new > high))
+            new = jnp.where(halve, (low + high) / 2, jnp.clip(new, low, high))
+            step = jnp.where(halve, (high - low) / 2, step)
+            return count + 1, new, step, slope, (low, high)
+
+        start = 0, guess, jnp.full_like(guess, jnp.inf), jnp.zeros_like(guess), bracket
+        _, normal2, step, slope, (low, high) = lax.while_loop(go_on, newton, start)
+        inside = (normal2 > low) & (normal2 < high) & (slope < 0)
+        return normal2, inside & (jnp.abs(step) < tolerance)
 
 
-def _found_one_by_one(pair: FlankPair, roll, relative):
+def _search_one_by_one(pair: FlankPair, roll, relative):
     """`FlankPair._search` on the frozen profile. On a CPU many poses are searched one after the
     other: hardly any of them needs the nodes, all of them together nearly always do."""
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
@@ -349,7 +347,7 @@ def _found_one_by_one(pair: FlankPair, roll, relative):
     def search(dynamic, roll, relative):
         pair = eqx.combine(dynamic, static)
         searcher = eqx.tree_at(lambda pair: pair.profile, pair, pair.frozen)
-        return searcher._search(roll, relative)
+        return searcher._search(roll, relative)[1]
 
     if jax.default_backend() == "cpu":
         search = sequential_vmap(search)
@@ -360,28 +358,6 @@ def contact_begins(relative: Float[Array, ""]) -> Float[Array, ""]:
     """Roll coordinate (rad) before which flanks turned into each other by ε ≤ 0 (rad) cannot
     touch: contact starts before the tip passes the line of centres, by about √|ε|."""
     return -(2 * jnp.sqrt(jnp.maximum(-relative, 0.0)) + 0.02)
-
-
-def _illinois(function, bracket):
-    """Root of a falling scalar function in (low, high, f(low) ≥ 0, f(high) < 0)."""
-
-    def secant(low, high, f_low, f_high):
-        drop = f_low - f_high
-        return low + (high - low) * jnp.clip(f_low / jnp.where(drop > 0, drop, 1.0), 0, 1)
-
-    def step(_, carry):
-        side, (low, high, f_low, f_high) = carry
-        middle = secant(low, high, f_low, f_high)
-        f = function(middle)
-        above = f >= 0
-        # An end that stays twice in a row has its value halved (Illinois).
-        f_high = jnp.where(above, jnp.where(side > 0, f_high / 2, f_high), f)
-        f_low = jnp.where(above, f, jnp.where(side < 0, f_low / 2, f_low))
-        low, high = jnp.where(above, middle, low), jnp.where(above, high, middle)
-        return jnp.where(above, 1.0, -1.0).astype(low.dtype), (low, high, f_low, f_high)
-
-    start = jnp.zeros_like(bracket[0]), bracket
-    return secant(*lax.fori_loop(0, _REFINEMENTS, step, start)[1])
 
 
 def _materialized(tree, true):

@@ -11,7 +11,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.tangent import linearized, one_step, propagated
+from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, locate_peak, one_sided
+from rootsopt.dynamics.tangent import Linear, linearized, one_step, propagated
 
 METHODS: dict[str, Callable[..., diffrax.AbstractSolver]] = {
     "tsit5": diffrax.Tsit5,
@@ -27,16 +28,6 @@ _FIRST_STEP = 1e-3
 """First step in mesh periods; too large a one is rejected by the error control."""
 _SHORTEST = 1e-9
 """Least time (mesh periods) between the beginning of a step and a peak inside it."""
-_SWITCHES = 48
-"""Changes of the equation's smooth piece looked for in one stretch of motion, at most."""
-_BRIEF, _PARTS = 0.05, 8
-"""Changes less than `_BRIEF` mesh periods apart have `_PARTS` steps between them."""
-_ASIDE = 1e-6
-"""Half a step (mesh periods) that holds a change."""
-_BESIDE = {8: 1e-7, 4: 1e-3}
-"""Time (mesh periods) from a peak to either side of it, by bytes of a number."""
-_APART = 1e-9
-"""Ends of steps closer than this (mesh periods) are one."""
 
 
 class Integrator(eqx.Module):
@@ -270,42 +261,58 @@ def flow(
     before = jnp.concatenate([start[None], after[:-1]])
     last = jnp.maximum(solution.stats["num_accepted_steps"] - 1, 0)
 
-    # The step that holds the peak is taken once more, as far as the peak.
-    peak_time, depth = _locate_peak(lax.stop_gradient(pair), states, times)
+    # The step that holds the peak is taken once more, as far as the peak; there, just before and
+    # just after it, the force is what a step begins with.
+    peak_time, rate, depth = locate_peak(lax.stop_gradient(pair), states, times[-1])
     holds = jnp.clip(jnp.sum(ends < peak_time), 0, last)
     peak_time = jnp.maximum(peak_time, begins[holds] + _SHORTEST)
+    sides = BESIDE_UNIT[dtype.itemsize] * jnp.asarray(BESIDE, dtype)
 
-    def force_at_peak(y, dynamic):
-        return _force_at_peak(eqx.combine(dynamic, static), peak_time, y)
+    def begin_beside(there, side):
+        return jnp.pad(there[:count] + side * rate, (0, 2))
+
+    def step_between(begin, end, y, dynamic):
+        after, slope = one_step(solver, term, begin, end, y, dynamic)
+        return jnp.append(after, slope[count])
 
     if tangents is None:
-        there = one_step(solver, term, begins[holds], peak_time, before[holds], dynamic)
-        peak, slope = force_at_peak(there[:count], dynamic), jnp.zeros((count + 3, 0), dtype)
+        there = step_between(begins[holds], peak_time, before[holds], dynamic)
+
+        def force_beside(side):
+            begin = peak_time + side
+            return step_between(begin, begin + _SHORTEST, begin_beside(there, side), dynamic)[-1]
+
+        forces = jax.vmap(force_beside)(sides)
+        frozen = lax.stop_gradient(forces)
+        peak = frozen[0] + jnp.dot(one_sided(frozen), forces - frozen)
+        slope = jnp.zeros((count + 3, 0), dtype)
     else:
         moved = eqx.filter(tangents, eqx.is_inexact_array)
 
-        def linear_step(k):
-            partial = k > last
-            k = jnp.where(partial, holds, k)
-            stop = jnp.where(partial, peak_time, ends[k])
-
-            def step(y, dynamic):
-                return one_step(solver, term, begins[k], stop, y, dynamic)
-
-            return linearized(step, before[k], dynamic, moved, count)
+        def linear_step(k, there):
+            step, beside = jnp.where(k < 0, holds, k), k < -1
+            side = sides[jnp.clip(-2 - k, 0, len(BESIDE) - 1)]
+            begin = jnp.where(beside, peak_time + side, begins[step])
+            end = jnp.where(beside, begin + _SHORTEST, jnp.where(k < 0, peak_time, ends[step]))
+            y = jnp.where(beside, begin_beside(there, side), before[step])
+            return linearized(
+                lambda y, dynamic: step_between(begin, end, y, dynamic), y, dynamic, moved, count
+            )
 
         columns = count + jax.tree.leaves(moved)[0].shape[0]
         unit = jnp.eye(count + 2, columns, dtype=dtype).at[count:].set(0.0)
-        along, there, aside = propagated(linear_step, unit, last, holds)
-        peak, by_state, by_pair = linearized(force_at_peak, there[:count], dynamic, moved, count)
-        peak_slope = jnp.sum(by_state[:, None] * aside[:count], axis=0).at[count:].add(by_pair)
+        along, there, beside = propagated(linear_step, unit, last, holds, len(BESIDE))
+        slopes = jax.vmap(Linear.after, (0, None))(beside, there)[:, -1]
+        forces = beside.value[:, -1]
+        peak = forces[0]
         units = jnp.stack([force_unit, force_unit**2])[:, None] / periods
-        slope = jnp.concatenate([along[:count], along[count:] * units, peak_slope[None]])
+        rows = [along[:count], along[count:] * units]
+        slope = jnp.concatenate([*rows, force_unit * (one_sided(forces) @ slopes)[None]])
     return Flow(
         end=end[:count],
         mean=end[count] / periods * force_unit,
         mean_square=end[count + 1] / periods * force_unit**2,
-        peak=peak,
+        peak=peak * force_unit,
         peak_time=peak_time,
         depth=depth,
         states=states,
@@ -314,112 +321,3 @@ def flow(
         solved=solution.result == diffrax.RESULTS.successful,
         slope=slope,
     )
-
-
-def _force_at_peak(pair, time, state):
-    """Greatest force, at the instant `time` and the `state` there, with its derivatives.
-
-    Where the force is smooth at its peak, they are those at the fixed instant (envelope
-    theorem). Where it has a corner, the peak stays on the corner as that moves, and of the
-    derivatives on both sides the mean counts for which the force is stationary in time.
-    """
-    frozen, held = lax.stop_gradient((pair, state))
-    rate, contact = frozen.derivative(time, held)
-    aside = _BESIDE[state.dtype.itemsize] * jnp.asarray([-1.0, 1.0])
-
-    def beside(step):
-        at = time + step
-
-        def force(at, state):
-            return frozen.contact_at(at, state).total
-
-        near = held + step * rate
-        in_time = jax.jvp(force, (at, near), (jnp.ones_like(at), rate))[1]
-        return pair.contact_at(at, state + step * rate).total, lax.stop_gradient(in_time)
-
-    forces, (before, after) = jax.vmap(beside)(aside.astype(state.dtype))
-    corner = (before > 0) & (after < 0)
-    share = jnp.where(corner, before / jnp.where(corner, before - after, 1.0), 0.5)
-    mean = (1 - share) * forces[0] + share * forces[1]
-    return contact.total + mean - lax.stop_gradient(mean)
-
-
-def with_switches(pair: RotorPair, out: Flow, periods: Float[Array, ""]) -> Float[Array, " steps"]:
-    """The grid of `out`, integrated over `periods` mesh periods, with steps that end where the
-    equation changes from one smooth piece to another.
-
-    A method of high order sees a kink of the equation as an error of low order, and a jump of
-    its derivatives (where the contact moves on to the next piece of a flank) costs the
-    linearised motion far more than the motion itself.
-    """
-    samples = out.states.shape[0]
-    stride = next(n for n in (10, 8, 6, 5, 4, 3, 2, 1) if samples % n == 0)
-    width = periods / samples
-
-    def flags(place):
-        """Pieces at a time counted in samples; between two the motion is a straight line."""
-        index = jnp.clip(jnp.floor(place).astype(int), 0, samples - 1)
-        low = out.states[index]
-        # The orbit's end is its beginning, nearly.
-        high = jnp.where(index + 1 < samples, out.states[(index + 1) % samples], out.end)
-        return pair.switches(place * width, low + (place - index) * (high - low))
-
-    places = jnp.arange(0, samples + 1, stride).astype(width.dtype)
-    at = jax.vmap(flags)(places)
-    changed = at[1:] != at[:-1]
-    interval, which = jnp.nonzero(changed, size=_SWITCHES, fill_value=-1)
-    before = at[interval, which]
-
-    def halve(_, ends):
-        low, high = ends
-        middle = (low + high) / 2
-        same = jax.vmap(flags)(middle)[jnp.arange(_SWITCHES), which] == before
-        return jnp.where(same, middle, low), jnp.where(same, high, middle)
-
-    start = places[interval], places[interval] + stride
-    _, found = lax.fori_loop(0, 14, halve, start)
-    found = jnp.sort(jnp.where(interval >= 0, found * width, jnp.inf))
-    # Between two changes close together the contact crosses a whole piece of the flank.
-    brief = jnp.diff(found, append=jnp.inf)
-    share = jnp.arange(1, _PARTS, dtype=found.dtype) / _PARTS
-    inside = found[:, None] + jnp.where(brief < _BRIEF, brief, jnp.inf)[:, None] * share
-    # A change lies inside a step too short to matter: no stage is evaluated beside it, where
-    # rounding would decide on which side.
-    added = [found - _ASIDE, found + _ASIDE, inside.ravel()]
-    merged = jnp.sort(jnp.concatenate([out.grid, *added]))
-    # Nearly equal ends would make steps of no length.
-    close = jnp.diff(merged, prepend=-jnp.inf) < _APART
-    close |= ~((merged > 0) & (merged <= periods))
-    return jnp.sort(jnp.where(close, jnp.inf, merged))[: out.grid.shape[0]]
-
-
-def _locate_peak(pair, states, times):
-    """Time of the greatest force, located between the samples `states` at `times`, and the
-    greatest penetration at the samples.
-
-    An impact's peak can be narrower than the sampling, with a corner where the damping
-    saturates: it is enclosed by repeated subdivision, the motion between five samples
-    being the quartic through them.
-    """
-    contact = jax.vmap(pair.contact_at)(times[:-1], states)
-    best = jnp.argmax(contact.total)
-    # The motion is not closed in general: stay inside the window.
-    middle = jnp.clip(best, 2, states.shape[0] - 3)
-    values = lax.dynamic_slice_in_dim(states, middle - 2, 5)
-    time, step = times[middle], times[1] - times[0]
-    factors = jnp.asarray([24.0, -6.0, 4.0, -6.0, 24.0], step.dtype)
-
-    def force(place):
-        x = place - jnp.arange(-2, 3, dtype=step.dtype)
-        others = jnp.where(jnp.eye(5, dtype=bool), 1.0, x)
-        weights = jnp.prod(others, axis=1) / factors
-        return pair.contact_at(time + place * step, weights @ values).total
-
-    def zoom(_, window):
-        center, width = window
-        grid = jnp.clip(center + width * jnp.linspace(-1, 1, 17, dtype=step.dtype), -2.0, 2.0)
-        return grid[jnp.argmax(jax.vmap(force)(grid))], width / 8
-
-    start = ((best - middle).astype(step.dtype), jnp.ones_like(step))
-    place = lax.stop_gradient(lax.fori_loop(0, 5, zoom, start)[0])
-    return time + place * step, jnp.max(contact.depth)

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.flow import Flow, Integrator, flow, strobe, with_switches
+from rootsopt.dynamics.flow import Flow, Integrator, flow, strobe
 from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.switches import with_switches
 
 BLOCK = 4
 """Mesh periods integrated between two looks at the transient."""

@@ -7,7 +7,7 @@ on these steps, exact to rounding (the variational equation under the same metho
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -28,11 +28,12 @@ def one_step(
     end: Float[Array, ""],
     y: Float[Array, " m"],
     args: Any,
-) -> Float[Array, " m"]:
-    """State after one step of `solver` from `begin` to `end`."""
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """State after one step of `solver` from `begin` to `end`, and dy/dτ at its begin."""
     if not isinstance(solver, diffrax.AbstractERK):
         memory = solver.init(term, begin, end, y, args)
-        return solver.step(term, begin, end, y, args, memory, made_jump=False)[0]
+        after = solver.step(term, begin, end, y, args, memory, made_jump=False)[0]
+        return after, term.vf(begin, y, args)
     # The same sums as the solver's own step, without its error estimate and the machinery
     # for everything a step can be: several times cheaper to compile.
     tableau = solver.tableau
@@ -55,16 +56,31 @@ def one_step(
 
     slopes = jnp.zeros((stages, *y.shape), y.dtype)
     slopes, _ = lax.scan(stage, slopes, (jnp.arange(stages), lower, times))
-    return y + step * jnp.sum(weights[:, None] * slopes, axis=0)
+    return y + step * jnp.sum(weights[:, None] * slopes, axis=0), slopes[0]
+
+
+class Linear(NamedTuple):
+    """Values with their derivatives in the n entries of a state and along d directions of the
+    parameters."""
+
+    value: Float[Array, " rows"]
+    by_state: Float[Array, "rows n"]
+    by_parameters: Float[Array, "rows d"]
+
+    def after(self, before: Float[Array, "n columns"]) -> Float[Array, "rows columns"]:
+        """Derivatives by the n + d columns, from those of the state."""
+        # Written as a sum: a matrix product this small costs more in its call.
+        moved = jnp.sum(self.by_state[:, :, None] * before[None], axis=1)
+        return moved.at[:, self.by_state.shape[1] :].add(self.by_parameters)
 
 
 def linearized(
-    function: Callable[[Float[Array, " m"], Any], Float[Array, "*out"]],
+    function: Callable[[Float[Array, " m"], Any], Float[Array, " rows"]],
     y: Float[Array, " m"],
     parameters: Any,
     directions: Any,
     count: int,
-) -> tuple[Float[Array, "*out"], Float[Array, "*out n"], Float[Array, "*out d"]]:
+) -> Linear:
     """Value of `function(y, parameters)` with its derivatives in the first `count` = n
     entries of y and along the `directions` of the parameters (stacked, maybe none)."""
     # All directions in one pass, so that what they share is computed once.
@@ -78,50 +94,61 @@ def linearized(
         return jax.jvp(function, (y, parameters), (tangent, moved))
 
     value, slope = jax.vmap(push, out_axes=(None, -1))(unit, moved)
-    return value, slope[..., :count], slope[..., count:]
+    return Linear(value, slope[..., :count], slope[..., count:])
 
 
 def propagated(
-    linear_step: Callable[
-        [Int[Array, ""]],
-        tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, "m d"]],
-    ],
+    linear_step: Callable[[Int[Array, ""], Float[Array, " rows"]], Linear],
     start: Float[Array, "m columns"],
     last: Int[Array, ""],
     branch: Int[Array, ""],
-) -> tuple[Float[Array, "m columns"], Float[Array, " m"], Float[Array, "m columns"]]:
-    """Derivatives of y along the n unit directions of the initial state and d parameters:
-    after the step `last`, and with the value itself after the step last + 1, which does
-    not go on from there but branches off before the step `branch`.
+    aside: int,
+) -> tuple[Float[Array, "m columns"], Float[Array, "n columns"], Linear]:
+    """Derivatives of y along the n unit directions of the initial state and d parameters after
+    the step `last`; and what happens aside of the motion.
 
-    `linear_step(k)` gives the state after step k and its derivatives in the n first entries
-    before it, and along the parameters; the other entries are integrals that feed back on
-    nothing. `start`: derivatives before the first step.
+    `linear_step(k, there)` linearises step k: rows are y, of which the entries beyond the n of
+    the state are integrals that feed back on nothing, then whatever else is of interest. Step -1
+    branches off before the step `branch`, and its end is given as `there` (zero before that) to
+    `aside` more steps, -2, -3 …. `start`: derivatives before the first step. Returned are the
+    derivatives of y at the end, those of the state after step -1, and the steps aside (stacked).
     """
-    shapes = jax.eval_shape(linear_step, last)
-    count = shapes[1].shape[1]
+    shape = jax.eval_shape(linear_step, last, start[:, 0])
+    count = shape.by_state.shape[1]
 
     def advance(carry, step):
-        y, held, value, aside = carry
-        k, reached, by_state, by_parameters = step
+        y, held = carry
+        k, step = step
         held = jnp.where(k == branch, y, held)
-        before = jnp.where(k > last, held, y)
-        # Written as a sum: a matrix product this small costs more in its call.
-        moved = jnp.sum(by_state[:, :, None] * before[None, :count, :], axis=1)
-        moved = moved.at[count:].add(before[count:]).at[:, count:].add(by_parameters)
-        y = jnp.where(k <= last, moved, y)
-        branched = k == last + 1
-        value, aside = jnp.where(branched, reached, value), jnp.where(branched, moved, aside)
-        return (y, held, value, aside), None
+        moved = step.after(y[:count])[: y.shape[0]].at[count:].add(y[count:])
+        return (jnp.where((k >= 0) & (k <= last), moved, y), held), None
+
+    # Step -1 is the first of all; the others aside follow when it is known.
+    lanes = jnp.arange(_CHUNK)
 
     def chunk(carry):
-        first, *carried = carry
-        k = first + jnp.arange(_CHUNK)
-        steps = jax.vmap(linear_step)(jnp.minimum(k, last + 1))
-        carried, _ = lax.scan(advance, tuple(carried), (k, *steps))
-        return first + _CHUNK, *carried
+        number, motion, branching, beside = carry
+        place = number * _CHUNK + lanes
+        known = number > 0
+        k = jnp.where(known, place - 1 - aside, place - 1)
+        k = jnp.where((number == 1) & (lanes < aside), -2 - lanes, k)
+        steps = jax.vmap(linear_step, (0, None))(jnp.minimum(k, last), branching.value)
+        motion, _ = lax.scan(advance, motion, (k, steps))
 
-    nothing = jnp.zeros(shapes[0].shape, shapes[0].dtype)
-    begin = jnp.zeros((), last.dtype), start, start, nothing, start
-    _, y, _, value, aside = lax.while_loop(lambda carry: carry[0] <= last + 1, chunk, begin)
-    return y, value, aside
+        def kept(place):
+            return jax.tree.map(lambda x: x[place], steps)
+
+        def choose(condition, new, old):
+            return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
+
+        branching = choose(known, branching, kept(0))
+        beside = choose(number == 1, kept(slice(aside)), beside)
+        return number + 1, motion, branching, beside
+
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
+    several = jax.tree.map(lambda x: jnp.stack([x] * aside), nothing)
+    begin = jnp.zeros((), last.dtype), (start, start), nothing, several
+    _, (y, held), branching, beside = lax.while_loop(
+        lambda carry: (carry[0] < 2) | (carry[0] * _CHUNK - 1 - aside <= last), chunk, begin
+    )
+    return y, branching.after(held[:count])[:count], beside

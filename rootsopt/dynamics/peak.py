@@ -1,0 +1,82 @@
+"""The greatest contact force of a motion: where it is, and how it changes with the design."""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from rootsopt.dynamics.pair import RotorPair
+
+_BLOCK = 63
+"""Places looked at together."""
+_ROUNDS = 6
+"""Times the neighbourhood of the greatest force is looked at more closely."""
+BESIDE = (0.0, -1.0, -2.0, 1.0, 2.0)
+"""Times just before and after a peak, in units of `BESIDE_UNIT`."""
+BESIDE_UNIT = {8: 2e-8, 4: 1e-3}
+"""Mesh periods, by bytes of a number."""
+
+
+def motion(states: Float[Array, "samples n"], place: Float[Array, ""]) -> Float[Array, "n"]:
+    """State at a `place` counted in samples: the quartic through the five nearest."""
+    middle = jnp.clip(jnp.round(place).astype(int), 2, states.shape[0] - 3)
+    near = lax.dynamic_slice_in_dim(states, middle - 2, 5)
+    x = place - middle - jnp.arange(-2, 3, dtype=place.dtype)
+    others = jnp.where(jnp.eye(5, dtype=bool), 1.0, x)
+    factors = jnp.asarray([24.0, -6.0, 4.0, -6.0, 24.0], place.dtype)
+    return jnp.sum((jnp.prod(others, axis=1) / factors)[:, None] * near, axis=0)
+
+
+def locate_peak(
+    pair: RotorPair, states: Float[Array, "samples n"], length: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, " n"], Float[Array, ""]]:
+    """Time (mesh periods) of the greatest force, the rate of change of the state there, and the
+    greatest penetration (m) at the samples, from the `states` at uniform times over `length`
+    mesh periods.
+
+    An impact's peak can be narrower than the sampling, with a corner where the damping
+    saturates: it is enclosed by looking ever more closely around the greatest sample.
+    """
+    samples = states.shape[0]
+    width = length / samples
+    blocks = -(-samples // _BLOCK)
+    spread = jnp.linspace(-1, 1, _BLOCK, dtype=width.dtype)
+
+    # One loop for both, so that the contact is compiled once.
+    def look(i, carry):
+        greatest, best, rate, depth = carry
+        block = jnp.minimum(i * _BLOCK + jnp.arange(_BLOCK), samples - 1).astype(width.dtype)
+        reach = (2.0 / (_BLOCK - 1)) ** (i - blocks).astype(width.dtype)
+        close = jnp.clip(best + reach * spread, 0.0, samples - 1.0)
+        places = jnp.where(i < blocks, block, close)
+        rates, contact = jax.vmap(lambda at: pair.derivative(at * width, motion(states, at)))(
+            places
+        )
+        top = jnp.argmax(contact.total)
+        more = contact.total[top] > greatest
+        greatest = jnp.where(more, contact.total[top], greatest)
+        best = jnp.where(more, places[top], best)
+        rate = jnp.where(more, rates[top], rate)
+        return greatest, best, rate, jnp.maximum(depth, jnp.max(contact.depth))
+
+    least = jnp.full_like(width, -jnp.inf)
+    start = least, jnp.zeros_like(width), jnp.zeros_like(states[0]), least
+    _, best, rate, depth = lax.fori_loop(0, blocks + _ROUNDS, look, start)
+    return best * width, rate, depth
+
+
+def one_sided(forces: Float[Array, "5"]) -> Float[Array, "5"]:
+    """With which weights the derivatives of the force at the times `BESIDE` a peak make up that
+    of the peak, from the forces there.
+
+    Where the force is smooth at its peak, it is the derivative at the fixed instant (envelope
+    theorem). Where it has a corner, the peak stays on the corner as that moves, and of the
+    derivatives on both sides the mean counts for which the force is stationary in time.
+    """
+    # Each slope from its own side: the corner is not known as well as that.
+    rise, fall = forces[1] - forces[2], forces[3] - forces[4]
+    corner = (rise > 0) & (fall > 0)
+    share = rise / jnp.where(corner, rise + fall, 1.0)
+    none = jnp.zeros_like(share)
+    smooth = jnp.zeros_like(forces).at[0].set(1.0)
+    return jnp.where(corner, jnp.stack([none, 1 - share, none, share, none]), smooth)
