@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.steady import RESIDUAL, close_orbit, settle, settled_within
 from rootsopt.model import Model
+from rootsopt.programs import Program
 from rootsopt.status import Status
 
 _SHOTS = 5
@@ -153,11 +154,11 @@ def respond_many(
     return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *parts)
 
 
-@eqx.filter_jit
+@Program
 def _together(model, designs, states, *settings) -> Batch:
     return jax.vmap(lambda design, state: respond(model, design, state, *settings))(designs, states)
 
 
-@eqx.filter_jit
+@Program
 def _in_turn(model, designs, states, *settings) -> Batch:
     return lax.map(lambda at: respond(model, *at, *settings), (designs, states))

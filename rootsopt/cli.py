@@ -14,7 +14,6 @@ from rootsopt.config import Config, describe_keys, load
 from rootsopt.errors import InputError
 
 OK, BAD_INPUT, NO_RESULT = 0, 2, 3
-_CACHE_BYTES = 500 * 2**20
 
 # Equinox's checks of traced values call back to Python, and a program that does so cannot
 # be kept between processes. Every integration here returns a status instead. Read once,
@@ -107,27 +106,16 @@ def use_float64() -> None:
 def use_cache() -> None:
     """Keep compiled programs between processes, in the user's cache folder.
 
-    The folder carries the versions of what compiles. An unusable folder is no error: the
-    programs are then compiled anew.
+    An unusable folder is no error: the programs are then compiled anew.
     """
-    import jax
     import platformdirs
 
+    from rootsopt import programs
+
     choice = os.environ.get("ROOTSOPT_CACHE", "")
-    if choice.lower() in ("off", "0", "no"):
-        return
-    folder = Path(choice or platformdirs.user_cache_dir("rootsopt", appauthor=False))
-    folder = folder / f"jax-{jax.__version__}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return
-    if not os.access(folder, os.W_OK):
-        return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    jax.config.update("jax_compilation_cache_max_size", _CACHE_BYTES)
+    if choice.lower() not in ("off", "0", "no"):
+        folder = choice or platformdirs.user_cache_dir("rootsopt", appauthor=False)
+        programs.keep_in(Path(folder))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

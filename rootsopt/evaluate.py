@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import threading
 import time
 from typing import Any
 
@@ -32,6 +31,7 @@ from rootsopt.dynamics.steady import (
 from rootsopt.errors import InputError
 from rootsopt.model import MM, Model, design_keys, design_vector, integrators
 from rootsopt.profiles import Geometry
+from rootsopt.programs import Program
 from rootsopt.status import Status
 
 RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
@@ -109,7 +109,7 @@ class Evaluator:
     def __init__(self, config: Config, rtol: float | None = None, survey: bool = False):
         self.config = config
         self.survey = survey
-        self.fitted = self.sized = self.compiled = False
+        self.fitted = self.sized = self.prepared = False
         self.map_error = float("nan")
         limit = config.solver.max_mesh_periods
         self.max_periods = max(limit // 4, 8 * BLOCK) if survey else limit
@@ -133,7 +133,10 @@ class Evaluator:
         """
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         began = time.perf_counter()
-        self._size(design)
+        if self.prepared:
+            self._size(design)
+        else:
+            self.prepare(design, series)
         for _ in range(5):
             outcome = self._attempt(design, start)
             covered = float(self.model.deepest)
@@ -142,6 +145,24 @@ class Evaluator:
             if float(self.model.deepest) < covered:
                 self._size(design)
         return self._report(design, outcome, time.perf_counter() - began, series)
+
+    def prepare(self, design: Float[Array, " d"], series: bool = True) -> None:
+        """Compile what evaluating `design` (config units) takes in the background."""
+        self.prepared = True
+        self._size(design)
+        pair, tangents, _ = _build.outline(self.model, design)
+        dtype = pair.angle_scale.dtype
+        state, number = jax.ShapeDtypeStruct((2,), dtype), jax.ShapeDtypeStruct((), dtype)
+        whole = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
+        # The one that takes longest first.
+        _close.prepare(pair, tangents, state, whole, self.orbit)
+        most = self.config.solver.max_orbit_periods
+        _settle.prepare(pair, state, self.transient, number, whole, most)
+        _build.prepare(self.model, design)
+        if series:
+            count = pair.lobes * SAMPLES
+            times = jax.ShapeDtypeStruct((count,), jnp.float64)
+            _contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, 2), dtype))
 
     def _size(self, design) -> None:
         """Make the contact map large enough for `design`, where the config leaves it open.
@@ -192,12 +213,6 @@ class Evaluator:
         dtype = pair.angle_scale.dtype
         state = jnp.zeros(2, dtype) if start is None else jnp.asarray(start, dtype)
         how, used, steps = self.transient, 0, 0
-        aside = threading.Thread(
-            target=_close, args=(pair, tangents, state, jnp.ones((), int), self.orbit)
-        )
-        if not self.compiled:
-            # The program for the orbit is compiled beside that for the transient.
-            aside.start()
         tolerance = float(settled_within(how.rtol))
         while True:
             transient = _settle(
@@ -208,9 +223,6 @@ class Evaluator:
                 jnp.asarray(self.max_periods - used),
                 self.config.solver.max_orbit_periods,
             )
-            if not self.compiled:
-                aside.join()
-                self.compiled = True
             used += int(transient.periods)
             steps += int(transient.steps)
             state = transient.state
@@ -377,12 +389,10 @@ def _response(mean, square, peak) -> dict[str, float]:
     }
 
 
-_build = eqx.filter_jit(Model.pair_and_tangents)
-_settle = eqx.filter_jit(settle)
-_lyapunov = eqx.filter_jit(lyapunov)
-
-
-_close = eqx.filter_jit(close_orbit)
+_build = Program(Model.pair_and_tangents)
+_settle = Program(settle)
+_close = Program(close_orbit)
+_lyapunov = Program(lyapunov)
 
 
 def _divisors(period: int) -> list[int]:
@@ -390,13 +400,13 @@ def _divisors(period: int) -> list[int]:
     return [k for k in range(1, period) if period % k == 0]
 
 
-@eqx.filter_jit
+@Program
 def _reverse(model: Model, design, orbit: Orbit, period, how: Integrator):
     grid = orbit.flow.grid
     return reverse_sensitivity(model.pair, design, orbit.state, period, how, grid)
 
 
-@eqx.filter_jit
+@Program
 def _contact_series(pair: RotorPair, tau, states):
     phi, relative, rate = pair.physical(tau, states)
     contact = jax.vmap(pair.contact_force)(phi, relative, rate)

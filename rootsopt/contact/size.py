@@ -8,7 +8,6 @@ because every size is a program of its own to compile.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +17,7 @@ from scipy.interpolate import CubicSpline
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.map import MARGIN, continued_gap, first_roll
 from rootsopt.profiles.base import Profile
+from rootsopt.programs import Program
 
 ROLLS = (96, 128, 192, 256, 384, 512, 768, 1024, 1536)
 RELATIVES = (16, 24, 32, 48)
@@ -50,7 +50,7 @@ def size_map(profile: Profile, deepest: float, error: float) -> MapSize:
     return MapSize(rolls, relatives, total, total <= error)
 
 
-@eqx.filter_jit
+@Program
 def _probe(profile, deepest):
     """Gap (lines, points) on fine lines along the roll and along ε, with the points."""
     pair = FlankPair.of(profile)

@@ -191,7 +191,7 @@ def close_orbit(
         monodromy = out.slope[:count, :count]
         miss = out.end - state
         residual = jnp.max(jnp.abs(miss))
-        correction = jnp.linalg.solve(jnp.eye(count, dtype=dtype) - monodromy, miss)
+        correction = solved(jnp.eye(count, dtype=dtype) - monodromy, miss[:, None])[:, 0]
         size = jnp.max(jnp.abs(correction))
         # Keep the first steps inside the neighbourhood the transient pointed to.
         new = state + correction * jnp.minimum(1.0, 0.5 / jnp.maximum(size, 1e-30))
@@ -227,7 +227,7 @@ def close_orbit(
     start = (first, state, no, no, none.grid, infinite)
     orbit = lax.while_loop(go_on, step, start)[0]
     slope = orbit.flow.slope
-    moved = jnp.linalg.solve(jnp.eye(count, dtype=dtype) - orbit.monodromy, slope[:count, count:])
+    moved = solved(jnp.eye(count, dtype=dtype) - orbit.monodromy, slope[:count, count:])
     sensitivity = slope[count:, count:] + slope[count:, :count] @ moved
     return orbit._replace(
         multipliers=floquet(orbit.monodromy),
@@ -261,7 +261,7 @@ def reverse_sensitivity(
     _, pull = jax.vjp(run, state, design)
     by_state, by_design = jax.vmap(pull)(jnp.eye(count + 3, dtype=state.dtype))
     monodromy, response = by_state[:count], by_state[count:]
-    weight = jnp.linalg.solve((jnp.eye(count, dtype=state.dtype) - monodromy).T, response.T)
+    weight = solved((jnp.eye(count, dtype=state.dtype) - monodromy).T, response.T)
     return by_design[count:] + weight.T @ by_design[:count]
 
 
@@ -303,6 +303,25 @@ def lyapunov(pair: RotorPair, state: Float[Array, "2"], periods: int, how: Integ
     batches = jnp.mean(growth.reshape(16, -1), axis=1)
     error = jnp.std(batches, ddof=1) / 4
     return Lyapunov(jnp.mean(growth), error, flows, end)
+
+
+def solved(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """Solution of a few linear equations, by elimination with row pivoting.
+
+    In plain arithmetic: a call into LAPACK costs more than the solution of two equations, and
+    a program that holds one cannot be kept between processes.
+    """
+    rows = jnp.concatenate([matrix, right], axis=1)
+    count = matrix.shape[0]
+    place = jnp.arange(count)
+    for k in range(count):
+        size = jnp.where(place >= k, jnp.abs(rows[:, k]), -1.0)
+        pivot = jnp.argmax(size)
+        order = jnp.where(place == k, pivot, jnp.where(place == pivot, k, place))
+        rows = rows[order]
+        row = rows[k] / rows[k, k]
+        rows = jnp.where((place == k)[:, None], row, rows - rows[:, k : k + 1] * row)
+    return rows[:, count:]
 
 
 def floquet(monodromy: Float[Array, "2 2"]) -> Float[Array, "2"]:

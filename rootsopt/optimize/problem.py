@@ -6,6 +6,7 @@ that u ≤ u_max holds by construction. Constraints depend on geometry alone and
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -21,6 +22,7 @@ from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluation
 from rootsopt.model import DEG, MM, Model
 from rootsopt.profiles import Geometry, geometry
+from rootsopt.programs import Program
 
 _SHORTEST = 0.1
 """Least involute, as a share of the longest, where the config sets no bound."""
@@ -53,6 +55,31 @@ class Space(eqx.Module):
     lower: Float[Array, "3"]
     upper: Float[Array, "3"]
     constraints: tuple[Constraint, ...]
+
+    @classmethod
+    def of(cls, config: Config, model: Model, area_efficiency: float) -> "Space":
+        """Bounds and floors of a config whose baseline has this `area_efficiency`; raises
+        `InputError` where they leave no design."""
+        bounds, limits = config.optimizer.bounds, config.constraints
+        lengths = bounds.involute_length_mm or (0.0, np.inf)
+        rows = [bounds.pressure_angle_deg, lengths, bounds.tip_arc_angle_deg]
+        half = 90.0 / config.profile.lobes
+        if rows[2][1] >= half:
+            raise InputError(
+                f"`optimizer.bounds.tip_arc_angle_deg` must stay below {half:g} (a quarter of "
+                f"the lobe pitch), but is {list(rows[2])}"
+            )
+        floor = limits.area_efficiency_min
+        if floor == "baseline":
+            floor = area_efficiency
+        margin = limits.undercut_margin_min_mm * MM
+        constraints = (
+            _constraint("area efficiency", "area_efficiency", "", floor, 0.01, 1.0),
+            _constraint("undercut margin", "undercut_margin", "mm", margin, MM, MM),
+            _constraint("seal width", "seal_width", "mm", limits.seal_width_min_mm * MM, MM, MM),
+        )
+        lower, upper = np.array(rows, dtype=float).T
+        return cls(model, jnp.asarray(lower), jnp.asarray(upper), constraints)
 
     def design(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
         """Design in config units (α deg, u mm, θ1 deg) at `point` of the unit box."""
@@ -89,15 +116,21 @@ class Space(eqx.Module):
         shape = geometry(self.model.profile(self.design(point)))
         return jnp.stack([c.slack(shape) for c in self.constraints])
 
+    def prepare(self) -> None:
+        """Compile in the background what a search in this space takes."""
+        _look.prepare(self, jax.ShapeDtypeStruct((3,), self.lower.dtype))
 
-@eqx.filter_jit
+
+@Program
 def _look(space: Space, point):
-    return (
-        space.design(point),
-        jax.jacfwd(space.design)(point),
-        space.slacks(point),
-        jax.jacfwd(space.slacks)(point),
-    )
+    """Design, its Jacobian, slacks of the constraints, and theirs."""
+
+    def both(point):
+        values = space.design(point), space.slacks(point)
+        return values, values
+
+    (design_slope, slack_slope), (design, slack) = jax.jacfwd(both, has_aux=True)(point)
+    return design, design_slope, slack, slack_slope
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,34 +143,8 @@ class Problem:
 
     @classmethod
     def of(cls, config: Config, model: Model, baseline: Evaluation) -> "Problem":
-        """Set up bounds and floors; raises `InputError` where they leave no design."""
-        bounds, limits = config.optimizer.bounds, config.constraints
-        lengths = bounds.involute_length_mm or (0.0, np.inf)
-        rows = [bounds.pressure_angle_deg, lengths, bounds.tip_arc_angle_deg]
-        half = 90.0 / config.profile.lobes
-        if rows[2][1] >= half:
-            raise InputError(
-                f"`optimizer.bounds.tip_arc_angle_deg` must stay below {half:g} (a quarter of "
-                f"the lobe pitch), but is {list(rows[2])}"
-            )
-        floor = limits.area_efficiency_min
-        if floor == "baseline":
-            floor = baseline.geometry["area_efficiency"]
-        constraints = (
-            _constraint("area efficiency", "area_efficiency", "", floor, 0.01, 1.0),
-            _constraint(
-                "undercut margin",
-                "undercut_margin",
-                "mm",
-                limits.undercut_margin_min_mm * MM,
-                MM,
-                MM,
-            ),
-            _constraint("seal width", "seal_width", "mm", limits.seal_width_min_mm * MM, MM, MM),
-        )
-        lower, upper = np.array(rows, dtype=float).T
-        space = Space(model, jnp.asarray(lower), jnp.asarray(upper), constraints)
-        return cls(config, baseline, space)
+        """The problem whose floors are those of the config or of the `baseline`."""
+        return cls(config, baseline, Space.of(config, model, baseline.geometry["area_efficiency"]))
 
     def objective(self, evaluation: Evaluation) -> float:
         """Weighted mean and peak force relative to the baseline (1 at the baseline);
@@ -146,9 +153,21 @@ class Problem:
             return float("nan")
         return sum(w * evaluation.response[k] for k, w in self._weights().items())
 
+    def look(self, point) -> tuple[NDArray[np.float64], ...]:
+        """Design at a point of the unit box, its Jacobian, slacks, and their Jacobian."""
+        return self._look_at(tuple(np.asarray(point, dtype=np.float64)))
+
+    @functools.cached_property
+    def _look_at(self):
+        def look(point):
+            return tuple(map(np.asarray, _look(self.space, np.asarray(point))))
+
+        # The same point is asked about several times over.
+        return functools.lru_cache(maxsize=1024)(look)
+
     def slope(self, evaluation: Evaluation, point) -> NDArray[np.float64]:
         """Gradient of the objective in the unit box."""
-        _, jacobian, _, _ = _look(self.space, point)
+        _, jacobian, _, _ = self.look(point)
         by_design = np.zeros(3)
         for key, weight in self._weights().items():
             by_design += weight * np.array(list(evaluation.gradient[key].values()))
@@ -164,11 +183,11 @@ class Problem:
 
     def design(self, point) -> Float[Array, "3"]:
         """Design in config units at a point of the unit box."""
-        return _look(self.space, jnp.asarray(point))[0]
+        return jnp.asarray(self.look(point)[0])
 
     def feasible(self, point) -> bool:
         """Whether a point of the unit box satisfies every constraint."""
-        return bool(np.min(_look(self.space, jnp.asarray(point))[2]) >= -_ACTIVE)
+        return bool(np.min(self.look(point)[2]) >= -_ACTIVE)
 
     def project(self, point) -> NDArray[np.float64]:
         """A feasible point near `point`: Gauss-Newton steps on the violated constraints.
@@ -177,7 +196,7 @@ class Problem:
         """
         point = np.clip(np.asarray(point, dtype=np.float64), 0.0, 1.0)
         for _ in range(30):
-            _, _, slack, jacobian = map(np.asarray, _look(self.space, jnp.asarray(point)))
+            _, _, slack, jacobian = self.look(point)
             violated = slack < 0
             if not violated.any():
                 break
@@ -197,9 +216,9 @@ class Problem:
         that leaves no active constraint (a non-negative least-squares problem). It
         vanishes exactly at a Karush-Kuhn-Tucker point.
         """
-        _, _, slack, jacobian = _look(self.space, jnp.asarray(point))
+        _, _, slack, jacobian = self.look(point)
         point = np.asarray(point)
-        walls = [row for row, s in zip(np.asarray(jacobian), slack, strict=True) if s < 1e-4]
+        walls = [row for row, s in zip(jacobian, slack, strict=True) if s < 1e-4]
         walls += [np.eye(3)[i] for i in range(3) if point[i] <= _ACTIVE]
         walls += [-np.eye(3)[i] for i in range(3) if point[i] >= 1 - _ACTIVE]
         if not walls:

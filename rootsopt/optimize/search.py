@@ -18,7 +18,8 @@ import optax
 from rootsopt.config import Config
 from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluation, Evaluator
-from rootsopt.optimize.problem import Problem, sobol
+from rootsopt.model import design_vector
+from rootsopt.optimize.problem import Problem, Space, sobol
 
 RULES: dict[str, Callable[..., optax.GradientTransformation]] = {
     "adam": optax.adam,
@@ -93,6 +94,8 @@ class Search:
 
     def run(self) -> Optimization:
         """Baseline, screening, descents, verification."""
+        self.exact.prepare(design_vector(self.config))
+        Space.of(self.config, self.exact.model, 0.0).prepare()
         baseline = self.exact()
         if not baseline.usable:
             return Optimization(None, baseline, None, [], {})  # type: ignore[arg-type]

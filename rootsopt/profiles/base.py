@@ -146,11 +146,18 @@ class Profile(eqx.Module):
         """dβ/dν, between 0 (tip arc centred on the pitch circle) and 1 (involute)."""
         return jax.jvp(self.roll_angle, (nu,), (jnp.ones_like(nu),))[1]
 
+    def speeds(
+        self, nu: Float[Array, "*n"]
+    ) -> tuple[RollPoint, Float[Array, "*n"], Float[Array, "*n"]]:
+        """The addendum's point, and arc length per normal angle (m/rad) on the addendum and on
+        the dedendum that meshes with it."""
+        point, rate = self.addendum(nu), self.roll_rate(nu)
+        sliding = self.pitch_radius * jnp.sin(point.psi)
+        return point, sliding * rate + point.s, (sliding - 2 * point.s) * rate + point.s
+
     def addendum_speed(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Arc length per normal angle (m/rad) on the addendum: its radius of curvature."""
-        point = self.addendum(nu)
-        sliding = self.pitch_radius * jnp.sin(point.psi)
-        return sliding * self.roll_rate(nu) + point.s
+        return self.speeds(nu)[1]
 
     def dedendum_speed(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Arc length on the dedendum per normal angle of the partner (m/rad).
@@ -158,9 +165,7 @@ class Profile(eqx.Module):
         On an involute or land this is the tangential speed r sin ψ + s (1 - ψ′) of the
         contact point per roll angle; zero is a cusp and a negative value is undercut.
         """
-        point = self.addendum(nu)
-        sliding = self.pitch_radius * jnp.sin(point.psi)
-        return (sliding - 2 * point.s) * self.roll_rate(nu) + point.s
+        return self.speeds(nu)[2]
 
     def dedendum_curvature_radius(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Signed radius of curvature of the dedendum (m): positive convex, negative concave."""

@@ -1,13 +1,13 @@
 """Integral and extreme properties of a profile: area, inertia, radii, margins, outline."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
 from rootsopt.profiles.base import Profile
+from rootsopt.programs import Program
 
 # Gauss-Legendre per smooth segment: the integrands are analytic inside a segment, and
 # 24 points bring area and inertia of every family here to rounding error.
@@ -45,10 +45,9 @@ def geometry(profile: Profile) -> Geometry:
     shares = np.concatenate([[1e-12], (1 + _NODES) / 2, [1 - 1e-12]])
     weights = jnp.asarray(np.concatenate([[0.0], _WEIGHTS / 2, [0.0]])) * length
     nu = start + length * jnp.asarray(shares)
-    _, psi, s = profile.addendum(nu)
+    (_, psi, s), addendum, dedendum = profile.speeds(nu)
     sliding = r * jnp.sin(psi)
-    speed = profile.dedendum_speed(nu)
-    sides = ((s, profile.addendum_speed(nu)), (-s, speed))
+    sides = ((s, addendum), (-s, dedendum))
     area = jnp.zeros_like(r)
     moment = jnp.zeros_like(r)
     for s, dl in sides:
@@ -61,7 +60,7 @@ def geometry(profile: Profile) -> Geometry:
     outer_radius = r + reach
     seal_angle = sum(2 * (s.stop - s.start) for s in segments if s.land)
     # An absent segment (no tip land, say) sets no limit.
-    candidates = jnp.where(length > 0, speed, jnp.inf).ravel()
+    candidates = jnp.where(length > 0, dedendum, jnp.inf).ravel()
     # By index: the derivative of `min` compares recomputed floats, which compiled
     # programs may round differently, and is then zero.
     margin = candidates[lax.stop_gradient(jnp.argmin(candidates))]
@@ -96,17 +95,18 @@ def flank_nodes(profile: Profile, points: int) -> Float[Array, " n"]:
     return jnp.asarray(np.concatenate(nodes))
 
 
-@jax.jit
+@Program
 def _both(profile, nu):
     return profile.position(profile.addendum(nu)), profile.position(profile.dedendum(nu))
 
 
-@jax.jit
+@Program
 def _element(profile, nu):
     """Node density over the normal angle: the longer of the two conjugate elements, so
     that both flanks come out even, plus a share for turning, so that a sharp spot (the
     pitch point of EE) is resolved."""
-    longest = jnp.maximum(jnp.abs(profile.addendum_speed(nu)), jnp.abs(profile.dedendum_speed(nu)))
+    _, addendum, dedendum = profile.speeds(nu)
+    longest = jnp.maximum(jnp.abs(addendum), jnp.abs(dedendum))
     return longest + 0.3 * profile.pitch_radius
 
 
