@@ -153,7 +153,7 @@ class Evaluator:
         pair, tangents, _ = _build.outline(self.model, design)
         dtype = pair.angle_scale.dtype
         state, number = jax.ShapeDtypeStruct((2,), dtype), jax.ShapeDtypeStruct((), dtype)
-        whole = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
+        whole = jax.ShapeDtypeStruct((), int)
         # The one that takes longest first.
         _close.prepare(pair, tangents, state, whole, self.orbit)
         most = self.config.solver.max_orbit_periods
@@ -161,7 +161,7 @@ class Evaluator:
         _build.prepare(self.model, design)
         if series:
             count = pair.lobes * SAMPLES
-            times = jax.ShapeDtypeStruct((count,), jnp.float64)
+            times = jax.ShapeDtypeStruct((count,), float)
             _contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, 2), dtype))
 
     def _size(self, design) -> None:
@@ -211,17 +211,19 @@ class Evaluator:
     def _attempt(self, design, start):
         pair, tangents, shape = _build(self.model, design)
         dtype = pair.angle_scale.dtype
-        state = jnp.zeros(2, dtype) if start is None else jnp.asarray(start, dtype)
+        state = np.zeros(2, dtype) if start is None else np.asarray(start, dtype)
         how, used, steps = self.transient, 0, 0
         tolerance = float(settled_within(how.rtol))
         while True:
-            transient = _settle(
-                pair,
-                state,
-                how,
-                jnp.asarray(tolerance, dtype),
-                jnp.asarray(self.max_periods - used),
-                self.config.solver.max_orbit_periods,
+            transient = jax.device_get(
+                _settle(
+                    pair,
+                    state,
+                    how,
+                    np.asarray(tolerance, dtype),
+                    np.asarray(self.max_periods - used),
+                    self.config.solver.max_orbit_periods,
+                )
             )
             used += int(transient.periods)
             steps += int(transient.steps)
@@ -246,7 +248,9 @@ class Evaluator:
 
     def _close(self, pair, tangents, transient: Transient, tolerance: float):
         """Orbit the transient leads to, of the least period, and its status."""
-        orbit = _close(pair, tangents, transient.state, transient.period, self.orbit)
+        orbit = jax.device_get(
+            _close(pair, tangents, transient.state, transient.period, self.orbit)
+        )
         status = self._orbit_status(orbit, transient, tolerance)
         if status is not Status.PERIODIC:
             return transient, orbit, status
@@ -254,8 +258,8 @@ class Evaluator:
         for shorter in _divisors(int(transient.period)):
             again = np.asarray(orbit.flow.states)[shorter * SAMPLES // int(transient.period)]
             if np.max(np.abs(again - np.asarray(orbit.state))) < _NEARLY:
-                period = jnp.asarray(shorter)
-                simpler = _close(pair, tangents, orbit.state, period, self.orbit)
+                period = np.asarray(shorter)
+                simpler = jax.device_get(_close(pair, tangents, orbit.state, period, self.orbit))
                 reduced = transient._replace(period=period, state=orbit.state)
                 if self._orbit_status(simpler, reduced, tolerance) is Status.PERIODIC:
                     return reduced, simpler, Status.PERIODIC
@@ -265,7 +269,7 @@ class Evaluator:
     def _transient_status(transient: Transient) -> Status | None:
         if not bool(transient.solved):
             return Status.SOLVER_FAILED
-        if not bool(jnp.all(jnp.isfinite(transient.state))):
+        if not np.all(np.isfinite(transient.state)):
             return Status.NON_FINITE
         if bool(transient.lost):
             return Status.PASSED_THROUGH
@@ -274,13 +278,13 @@ class Evaluator:
     def _orbit_status(self, orbit: Orbit, transient: Transient, tolerance: float) -> Status:
         if not bool(orbit.flow.solved):
             return Status.SOLVER_FAILED
-        numbers = jnp.concatenate([orbit.response, orbit.sensitivity.ravel(), orbit.state])
-        if not bool(jnp.all(jnp.isfinite(numbers))):
+        numbers = np.concatenate([orbit.response, np.ravel(orbit.sensitivity), orbit.state])
+        if not np.all(np.isfinite(numbers)):
             return Status.NON_FINITE
-        multiplier = float(jnp.max(orbit.multipliers))
+        multiplier = float(np.max(orbit.multipliers))
         noise = max(float(self.transient.rtol), float(self.orbit.rtol))
         near = tolerance / max(1 - multiplier, 1e-3) * 10 + 100 * noise
-        moved = float(jnp.max(jnp.abs(orbit.state - transient.state)))
+        moved = float(np.max(np.abs(orbit.state - transient.state)))
         closed = float(orbit.residual) <= RESIDUAL[self.model.precision]
         stable = multiplier < 1
         return Status.PERIODIC if closed and stable and moved <= near else Status.NOT_SETTLED
@@ -307,7 +311,7 @@ class Evaluator:
             steady = {
                 "kind": "periodic",
                 "period": period,
-                "floquet_multiplier": float(jnp.max(orbit.multipliers)),
+                "floquet_multiplier": float(np.max(orbit.multipliers)),
                 "residual": float(orbit.residual),
             }
             state = np.asarray(orbit.state, np.float64)
@@ -342,7 +346,7 @@ class Evaluator:
             return {}
         sensitivity = orbit.sensitivity
         if self.config.solver.gradient == "reverse":
-            sensitivity = _reverse(self.model, design, orbit, jnp.asarray(period), self.orbit)
+            sensitivity = _reverse(self.model, design, orbit, np.asarray(period), self.orbit)
         mean, square, peak = np.asarray(sensitivity)
         rms = square / (2 * np.sqrt(max(float(orbit.response[1]), 1e-300)))
         rows = zip(RESPONSES, (mean, peak, rms), strict=True)
@@ -364,7 +368,7 @@ class _Outcome:
         """Largest |ε| (rad) of the steady motion, as far as known."""
         scale = float(self.pair.angle_scale)
         if self.orbit is not None:
-            return scale * float(jnp.max(jnp.abs(self.orbit.flow.states[:, 0])))
+            return scale * float(np.max(np.abs(self.orbit.flow.states[:, 0])))
         return scale * abs(float(self.transient.state[0]))
 
 
@@ -410,14 +414,14 @@ def _reverse(model: Model, design, orbit: Orbit, period, how: Integrator):
 def _contact_series(pair: RotorPair, tau, states):
     phi, relative, rate = pair.physical(tau, states)
     contact = jax.vmap(pair.contact_force)(phi, relative, rate)
-    return phi, relative, rate, contact
+    return tau * pair.mesh_period, phi, relative, rate, contact
 
 
 def _series(pair: RotorPair, tau, states) -> Series:
-    phi, relative, rate, contact = _contact_series(pair, jnp.asarray(tau), jnp.asarray(states))
+    time, phi, relative, rate, contact = _contact_series(pair, tau, states)
     double = functools.partial(np.asarray, dtype=np.float64)
     return Series(
-        time=double(tau) * float(pair.mesh_period),
+        time=double(time),
         rotation=double(phi),
         relative=double(relative),
         rate=double(rate),
@@ -446,7 +450,7 @@ def _unsettled(pair, window, with_series):
         status = Status.PASSED_THROUGH
     elif not finite:
         status = Status.NON_FINITE
-    elif not bool(jnp.all(flows.solved)):
+    elif not np.all(flows.solved):
         status = Status.SOLVER_FAILED
     elif exponent > 3 * error:
         status, kind = Status.CHAOTIC, "chaotic"

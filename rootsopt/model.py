@@ -25,6 +25,7 @@ from rootsopt.dynamics.pair import GapFunction, RotorPair, SearchContact
 from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
 from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, Geometry, Profile, geometry, outline
+from rootsopt.programs import Program
 
 MM = 1e-3
 DEG = math.pi / 180
@@ -242,7 +243,11 @@ def design_keys(config: Config) -> tuple[str, ...]:
 def outline_mm(config: Config, design: ArrayLike | None = None) -> NDArray[np.float64]:
     """Closed counter-clockwise outline (n, 2) in mm of a design, by default the config's."""
     design = design_vector(config) if design is None else jnp.asarray(design)
-    return np.asarray(outline(Model.of(config).profile(design), points=240)) / MM
+    profile = _profile(Model.of(config), design)
+    return np.asarray(outline(profile, points=240)) / MM
+
+
+_profile = Program(Model.profile)
 
 
 def integrators(config: Config) -> tuple[Integrator, Integrator]:

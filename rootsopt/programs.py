@@ -157,7 +157,10 @@ def _outline(leaf: Any) -> Any:
 def _split(args: tuple) -> tuple[list, _Kind]:
     """The arrays among the leaves of `args`, and what kind of arguments these are."""
     leaves, tree = jax.tree.flatten(args)
-    shapes = tuple((x.shape, str(x.dtype)) if _is_array(x) else None for x in leaves)
+    shapes = tuple(
+        (x.shape, str(jax.dtypes.canonicalize_dtype(x.dtype))) if _is_array(x) else None
+        for x in leaves
+    )
     others = tuple((type(x), x) for x in leaves if not _is_array(x))
     return [x for x in leaves if _is_array(x)], _Kind(tree, shapes, others)
 

@@ -110,7 +110,7 @@ def test_contradicting_constraints_are_bad_input():
     search = Search(settings)
     search.problem = Problem.of(settings, Model.of(settings), baseline(settings))
     with pytest.raises(InputError, match=r"constraints\.area_efficiency_min"):
-        search._starts(np.full(3, 0.5))
+        search._feasible(np.full(3, 0.5))
 
 
 def test_ee_has_nothing_to_optimise():

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from scipy.interpolate import CubicSpline
 
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.map import MARGIN, continued_gap, first_roll
@@ -72,6 +71,8 @@ def _smallest(
     error: float,
 ) -> tuple[int, float]:
     """Smallest number of points of the ladder that keeps within `error`, and its error."""
+    from scipy.interpolate import CubicSpline  # Half a second, for maps alone.
+
     points, lines = map(np.asarray, probed)
     inside = lines < 0
     # Not the cells next to where contact begins: beyond lies what is only continued.

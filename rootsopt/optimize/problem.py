@@ -7,6 +7,8 @@ that u ≤ u_max holds by construction. Constraints depend on geometry alone and
 
 import dataclasses
 import functools
+import importlib
+import threading
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -118,6 +120,8 @@ class Space(eqx.Module):
 
     def prepare(self) -> None:
         """Compile in the background what a search in this space takes."""
+        # Half a second to import, and only needed here.
+        threading.Thread(target=importlib.import_module, args=("scipy.stats.qmc",)).start()
         _look.prepare(self, jax.ShapeDtypeStruct((3,), self.lower.dtype))
 
 
@@ -131,6 +135,19 @@ def _look(space: Space, point):
 
     (design_slope, slack_slope), (design, slack) = jax.jacfwd(both, has_aux=True)(point)
     return design, design_slope, slack, slack_slope
+
+
+@Program
+def _nearest(space: Space, design):
+    """Point of the unit box nearest to a design."""
+    return space.point(design)
+
+
+@Program
+def _longest(space: Space, point):
+    """Longest involute (mm) at a point of the unit box, bounds aside."""
+    profile = space.model.profile(space.design(point))
+    return profile.longest_involute / MM  # type: ignore[attr-defined]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,6 +197,10 @@ class Problem:
         return {
             k: w / total / max(self.baseline.response[k], 1e-12) for k, w in shares.items() if w
         }
+
+    def point(self, design) -> NDArray[np.float64]:
+        """The nearest point of the unit box to a design in config units."""
+        return np.asarray(_nearest(self.space, np.asarray(design, dtype=np.float64)))
 
     def design(self, point) -> Float[Array, "3"]:
         """Design in config units at a point of the unit box."""
@@ -245,15 +266,8 @@ class Problem:
         return rows
 
     def _length_row(self, optimized: Evaluation) -> dict:
-        def longest(design):
-            return (
-                float(
-                    self.space.model.profile(jnp.asarray(list(design.values()))).longest_involute  # type: ignore[attr-defined]
-                )
-                / MM
-            )
-
-        limit = longest(optimized.design)
+        point = self.point(list(optimized.design.values()))
+        limit = float(_longest(self.space, point))
         after = optimized.design["involute_length_mm"]
         row = _row(
             "involute length",

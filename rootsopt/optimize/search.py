@@ -7,19 +7,25 @@ the first guess for the next. Best-so-far is kept; the winner is simulated again
 at a tighter tolerance before it is reported.
 """
 
+import copy
 import dataclasses
-from collections.abc import Callable
+import operator
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import optax
+from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluation, Evaluator
 from rootsopt.model import design_vector
 from rootsopt.optimize.problem import Problem, Space, sobol
+from rootsopt.programs import Program
 
 RULES: dict[str, Callable[..., optax.GradientTransformation]] = {
     "adam": optax.adam,
@@ -36,13 +42,22 @@ Progress = Callable[[int, int, float], None]
 """Called with (evaluations done, evaluations expected, best objective)."""
 
 
-@dataclasses.dataclass
-class Candidate:
-    """A feasible design found by the search."""
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """One evaluated design: `point` of the unit box, `start` it was reached from (-1: screening)
+    and after how many steps; `objective` (NaN without a usable steady state)."""
 
-    point: np.ndarray
-    objective: float
+    point: NDArray[np.float64]
+    start: int
+    iteration: int
     evaluation: Evaluation
+    objective: float
+    feasible: bool
+
+    @property
+    def candidate(self) -> bool:
+        """Whether the design may be what is looked for."""
+        return self.feasible and not np.isnan(self.objective)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,14 +98,13 @@ class Search:
         self.config = config
         self.settings = config.optimizer
         self.progress = progress or (lambda done, expected, best: None)
-        self.history: list[dict[str, Any]] = []
-        self.candidates: list[Candidate] = []
         self.expected = self.settings.screening + self.settings.starts * (
             self.settings.iterations + 1
         )
         # The search needs a gradient and an order of designs, not the last digits.
         self.fast = Evaluator(config, rtol=max(1e-6, config.solver.rtol), survey=True)
         self.exact = Evaluator(config)
+        self._lock, self._done, self._best = threading.Lock(), 0, float("nan")
 
     def run(self) -> Optimization:
         """Baseline, screening, descents, verification."""
@@ -99,16 +113,31 @@ class Search:
         baseline = self.exact()
         if not baseline.usable:
             return Optimization(None, baseline, None, [], {})  # type: ignore[arg-type]
-        self.fast.model, self.fast.fitted = self.exact.model, True
+        self.fast.model = self.exact.model
+        self.fast.fitted = self.fast.prepared = True
         self.problem = Problem.of(self.config, self.exact.model, baseline)
-        start = np.asarray(self.problem.space.point(jnp.asarray(list(baseline.design.values()))))
-        for number, point in enumerate(self._starts(start)):
-            self._descend(number, point)
-        optimized, verification = self._verify()
-        return Optimization(self.problem, baseline, optimized, self.history, verification)
+        start = self.problem.point(list(baseline.design.values()))
+        points = self._feasible(start)
+        trials: list[Trial] = []
+        if self.settings.screening:
+            trials = self._side_by_side(self._screen, [(point,) for point in points])
+        starts = self._starts(trials) or points[:1]
+        trials += self._side_by_side(self._descend, list(enumerate(starts)))
+        optimized, verification = self._verify(trials)
+        return Optimization(self.problem, baseline, optimized, _history(trials), verification)
 
-    def _starts(self, baseline_point) -> list[np.ndarray]:
-        """The baseline's neighbourhood and the best screened designs, apart from each other."""
+    def _side_by_side(self, work: Callable[..., list[Trial]], tasks: Sequence) -> list[Trial]:
+        """The trials of `work(evaluator, *task)` for every task, in their order. Each has its own
+        evaluator, so that the result does not depend on which is done first."""
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            done = [pool.submit(work, copy.copy(self.fast), *task) for task in tasks]
+            try:
+                return [trial for future in done for trial in future.result()]
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+    def _feasible(self, baseline_point) -> list[NDArray[np.float64]]:
+        """The baseline's neighbourhood and a Sobol sample, as far as they can be made feasible."""
         sample = [baseline_point, *sobol(self.settings.screening, self.settings.seed)]
         points = [self.problem.project(point) for point in sample]
         points = [point for point in points if self.problem.feasible(point)]
@@ -117,75 +146,67 @@ class Search:
                 "`constraints` and `optimizer.bounds` leave no feasible design; lower "
                 "`constraints.area_efficiency_min` or widen `optimizer.bounds`"
             )
-        if self.settings.screening:
-            for point in points:
-                self._evaluate(point, start=-1, iteration=0)
-        ranked = sorted(self.candidates, key=lambda c: c.objective)
-        chosen: list[np.ndarray] = []
-        for candidate in ranked:
-            apart = all(np.linalg.norm(candidate.point - p) > 0.15 for p in chosen)
-            if apart and len(chosen) < self.settings.starts:
-                chosen.append(candidate.point)
-        return chosen or [points[0]]
+        return points
 
-    def _descend(self, number: int, point: np.ndarray) -> None:
+    def _screen(self, evaluator: Evaluator, point) -> list[Trial]:
+        return [self._evaluate(evaluator, point, start=-1, iteration=0)]
+
+    def _starts(self, trials: list[Trial]) -> list[NDArray[np.float64]]:
+        """The best of the screened designs that are apart from each other."""
+        chosen: list[NDArray[np.float64]] = []
+        for trial in sorted(filter(_candidate, trials), key=_objective):
+            apart = all(np.linalg.norm(trial.point - p) > 0.15 for p in chosen)
+            if apart and len(chosen) < self.settings.starts:
+                chosen.append(trial.point)
+        return chosen
+
+    def _descend(
+        self, evaluator: Evaluator, number: int, point: NDArray[np.float64]
+    ) -> list[Trial]:
         """Local descent from `point`."""
         settings = self.settings
-        schedule = optax.cosine_decay_schedule(settings.learning_rate, settings.iterations, 0.05)
-        rule = RULES[settings.method](schedule)
-        state = rule.init(jnp.asarray(point))
+        rule = settings.method, settings.learning_rate, settings.iterations
+        state = _init(*rule, point)
         best, since = np.inf, 0
-        last: Candidate | None = None
-        orbit = None
+        trials: list[Trial] = []
+        last: Trial | None = None
         for iteration in range(settings.iterations + 1):
-            evaluation, objective = self._evaluate(point, number, iteration, orbit)
-            if np.isnan(objective):
+            orbit = last.evaluation.state if last is not None and last is trials[-1] else None
+            trial = self._evaluate(evaluator, point, number, iteration, orbit)
+            trials.append(trial)
+            if np.isnan(trial.objective):
                 # No steady state there: go half way back to the last good design.
                 if last is None:
-                    return
+                    break
                 point = self.problem.project((point + last.point) / 2)
-                orbit = None
                 continue
-            last = Candidate(point, objective, evaluation)
-            orbit = evaluation.state
-            since = 0 if objective < best * (1 - _GAIN) else since + 1
-            best = min(best, objective)
+            last = trial
+            since = 0 if trial.objective < best * (1 - _GAIN) else since + 1
+            best = min(best, trial.objective)
             if since > _PATIENCE or iteration == settings.iterations:
-                return
-            slope = self.problem.descent(point, self.problem.slope(evaluation, jnp.asarray(point)))
+                break
+            slope = self.problem.descent(point, self.problem.slope(trial.evaluation, point))
             if np.linalg.norm(slope) < _STATIONARY:
-                return
-            update, state = rule.update(jnp.asarray(slope), state)
+                break
+            update, state = _update(*rule, slope, state)
             point = self.problem.project(point + np.asarray(update))
+        return trials
 
-    def _evaluate(self, point, start, iteration, orbit=None):
-        evaluation = self.fast(self.problem.design(point), start=orbit, series=False)
+    def _evaluate(self, evaluator: Evaluator, point, start, iteration, orbit=None) -> Trial:
+        evaluation = evaluator(self.problem.design(point), start=orbit, series=False)
         objective = self.problem.objective(evaluation)
         feasible = self.problem.feasible(point)
-        if not np.isnan(objective) and feasible:
-            self.candidates.append(Candidate(np.asarray(point), objective, evaluation))
-        best = min((c.objective for c in self.candidates), default=float("nan"))
-        self.history.append(
-            {
-                "evaluation": len(self.history) + 1,
-                "start": start,
-                "iteration": iteration,
-                "objective": objective,
-                "best_objective": best,
-                "mean_force_N": evaluation.response.get("mean_force_N", float("nan")),
-                "peak_force_N": evaluation.response.get("peak_force_N", float("nan")),
-                **evaluation.design,
-                "area_efficiency": evaluation.geometry["area_efficiency"],
-                "feasible": feasible,
-                "status": evaluation.status.label,
-            }
-        )
-        self.progress(len(self.history), self.expected, best)
-        return evaluation, objective
+        trial = Trial(np.asarray(point), start, iteration, evaluation, objective, feasible)
+        with self._lock:
+            self._done += 1
+            if trial.candidate:
+                self._best = float(np.fmin(self._best, objective))
+            self.progress(self._done, self.expected, self._best)
+        return trial
 
-    def _verify(self) -> tuple[Evaluation | None, dict[str, Any]]:
+    def _verify(self, trials: list[Trial]) -> tuple[Evaluation | None, dict[str, Any]]:
         """Simulate the best designs again, from rest and tightly, until one holds up."""
-        ranked = sorted(self.candidates, key=lambda c: c.objective)
+        ranked = sorted(filter(_candidate, trials), key=_objective)
         tried: list[np.ndarray] = []
         failures = []
         for candidate in ranked:
@@ -207,3 +228,48 @@ class Search:
                 return evaluation, record | {"rejected": failures}
             failures.append(record | {"design": evaluation.design})
         return None, {"holds_up": False, "rejected": failures}
+
+
+def _rule(method: str, learning_rate: float, iterations: int) -> optax.GradientTransformation:
+    return RULES[method](optax.cosine_decay_schedule(learning_rate, iterations, 0.05))
+
+
+@Program
+def _init(method, learning_rate, iterations, point):
+    """State of an update rule at its first point."""
+    return _rule(method, learning_rate, iterations).init(point)
+
+
+@Program
+def _update(method, learning_rate, iterations, slope, state):
+    """Step of an update rule, and its next state."""
+    return _rule(method, learning_rate, iterations).update(slope, state)
+
+
+_candidate = operator.attrgetter("candidate")
+_objective = operator.attrgetter("objective")
+
+
+def _history(trials: list[Trial]) -> list[dict[str, Any]]:
+    """The rows of the history, with the best objective so far."""
+    rows, best = [], float("nan")
+    for number, trial in enumerate(trials, start=1):
+        if trial.candidate:
+            best = float(np.fmin(best, trial.objective))
+        evaluation = trial.evaluation
+        rows.append(
+            {
+                "evaluation": number,
+                "start": trial.start,
+                "iteration": trial.iteration,
+                "objective": trial.objective,
+                "best_objective": best,
+                "mean_force_N": evaluation.response.get("mean_force_N", float("nan")),
+                "peak_force_N": evaluation.response.get("peak_force_N", float("nan")),
+                **evaluation.design,
+                "area_efficiency": evaluation.geometry["area_efficiency"],
+                "feasible": trial.feasible,
+                "status": evaluation.status.label,
+            }
+        )
+    return rows

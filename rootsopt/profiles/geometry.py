@@ -82,7 +82,7 @@ def flank_nodes(profile: Profile, points: int) -> Float[Array, " n"]:
     lengths, curves = [], []
     for segment in segments:
         nu = np.linspace(float(segment.start), float(segment.stop), 401)
-        speed = _element(profile, jnp.asarray((nu[1:] + nu[:-1]) / 2))
+        speed = _element(profile, (nu[1:] + nu[:-1]) / 2)
         arc = np.concatenate([[0.0], np.cumsum(np.asarray(speed) * np.diff(nu))])
         lengths.append(arc[-1])
         curves.append((nu, arc))
@@ -113,8 +113,8 @@ def _element(profile, nu):
 def flank(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
     """Coordinates (m) of one flank from tip centre to root centre, about 2 `points` nodes."""
     nu = flank_nodes(profile, points)
-    addendum, dedendum = _both(profile, nu)
-    return jnp.concatenate([addendum, dedendum[::-1][1:]])
+    addendum, dedendum = map(np.asarray, _both(profile, nu))
+    return jnp.asarray(np.concatenate([addendum, dedendum[::-1][1:]]))
 
 
 def outline(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
