@@ -174,27 +174,32 @@ def strobe(pair: RotorPair, state: Float[Array, "2"], periods: int, how: Integra
     Steps land on the period ends: interpolated states would carry an error far above
     the tolerance and hide that the motion repeats.
     """
-    ends = jnp.arange(1, periods + 1, dtype=state.dtype)
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda tau, y, pair: pair.derivative(tau, y)[0]),
-        how.solver(state.dtype),
-        t0=jnp.zeros_like(ends[0]),
-        t1=ends[-1],
-        dt0=_FIRST_STEP * ends[0],
-        y0=state,
-        args=pair,
-        saveat=diffrax.SaveAt(ts=ends),
-        stepsize_controller=diffrax.ClipStepSizeController(
-            how.controller(state.dtype), step_ts=ends
-        ),
-        adjoint=diffrax.ForwardMode(),
-        max_steps=how.max_steps * periods,
-        throw=False,
-    )
-    assert solution.ys is not None
-    return Strobe(
-        solution.ys, solution.stats["num_steps"], solution.result == diffrax.RESULTS.successful
-    )
+
+    def one_period(state, _):
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda tau, y, pair: pair.derivative(tau, y)[0]),
+            how.solver(state.dtype),
+            t0=0.0,
+            t1=1.0,
+            dt0=_FIRST_STEP,
+            y0=state,
+            args=pair,
+            saveat=diffrax.SaveAt(t1=True),
+            stepsize_controller=how.controller(state.dtype),
+            adjoint=diffrax.ForwardMode(),
+            max_steps=how.max_steps,
+            throw=False,
+        )
+        assert solution.ys is not None
+        end = solution.ys[0]
+        return end, (
+            end,
+            solution.stats["num_steps"],
+            solution.result == diffrax.RESULTS.successful,
+        )
+
+    _, (states, steps, solved) = lax.scan(one_period, state, length=periods)
+    return Strobe(states, jnp.sum(steps), jnp.all(solved))
 
 
 def flow(
@@ -226,44 +231,46 @@ def flow(
         force = contact.total / force_unit
         return jnp.concatenate([slope, jnp.stack([force, force**2])])
 
-    term = diffrax.ODETerm(derivative)
-    controller = StepGrid(  # pyright: ignore[reportCallIssue]
-        pid=how.controller(dtype),
-        ends=jnp.full(how.max_steps, jnp.inf, dtype) if grid is None else grid,
-        repeat=jnp.asarray(False if grid is None else repeat),
-    )
-    times = periods * (jnp.arange(samples + 1) / samples).astype(dtype)
+    def whole(share, y, dynamic):
+        return periods * derivative(share * periods, y, dynamic)
+
+    # Over the unit interval: limits known when it is traced make a smaller program.
+    ends = jnp.full(how.max_steps, jnp.inf, dtype) if grid is None else grid / periods
+    repeated = jnp.asarray(False if grid is None else repeat)
     start = jnp.pad(state, (0, 2))
     solution = diffrax.diffeqsolve(
-        term,
+        diffrax.ODETerm(whole),
         solver,
-        t0=times[0],
-        t1=times[-1],
-        dt0=_FIRST_STEP * jnp.ones_like(times[0]),
+        t0=0.0,
+        t1=1.0,
+        dt0=_FIRST_STEP / periods,
         y0=start,
         args=dynamic,
         saveat=diffrax.SaveAt(
             subs=[
-                diffrax.SubSaveAt(ts=times[:-1], fn=lambda tau, y, args: y[:count]),
-                diffrax.SubSaveAt(steps=True, fn=lambda tau, y, args: (tau, y)),
+                diffrax.SubSaveAt(
+                    ts=jnp.arange(samples) / samples, fn=lambda share, y, args: y[:count]
+                ),
+                diffrax.SubSaveAt(steps=True, fn=lambda share, y, args: (share, y)),
                 diffrax.SubSaveAt(t1=True),
             ]
         ),
-        stepsize_controller=controller,
+        stepsize_controller=StepGrid(pid=how.controller(dtype), ends=ends, repeat=repeated),  # pyright: ignore[reportCallIssue]
         adjoint=diffrax.ForwardMode() if adjoint is None else adjoint,
         max_steps=how.max_steps,
         throw=False,
     )
     assert solution.ys is not None
     states, (ends, after), (end,) = solution.ys
-    states, ends = lax.stop_gradient((states, ends))
-    begins = jnp.concatenate([times[:1], ends[:-1]])
+    states, ends = lax.stop_gradient((states, ends * periods))
+    begins = jnp.concatenate([jnp.zeros_like(ends[:1]), ends[:-1]])
     before = jnp.concatenate([start[None], after[:-1]])
     last = jnp.maximum(solution.stats["num_accepted_steps"] - 1, 0)
 
+    term = diffrax.ODETerm(derivative)
     # The step that holds the peak is taken once more, as far as the peak; there, just before and
     # just after it, the force is what a step begins with.
-    peak_time, rate, depth = locate_peak(lax.stop_gradient(pair), states, times[-1])
+    peak_time, rate, depth = locate_peak(lax.stop_gradient(pair), states, periods)
     holds = jnp.clip(jnp.sum(ends < peak_time), 0, last)
     peak_time = jnp.maximum(peak_time, begins[holds] + _SHORTEST)
     sides = BESIDE_UNIT[dtype.itemsize] * jnp.asarray(BESIDE, dtype)
