@@ -11,7 +11,6 @@ import hashlib
 import os
 import pickle
 import platform
-import tempfile
 import threading
 import zlib
 from collections.abc import Callable, Iterator
@@ -92,9 +91,12 @@ class Program:
     def outline(self, *args: Any) -> Any:
         """The result with `jax.ShapeDtypeStruct` for arrays, known before it is compiled."""
         _, kind = _split(args)
-        future = self._made.get(kind)
         path = self._path(kind)
-        if future is not None and (future.done() or (path is not None and path.exists())):
+        kept = path is not None and path.exists()
+        if kept:
+            self.prepare(*args)
+        future = self._made.get(kind)
+        if future is not None and (kept or future.done()):
             return future.result().outline
         return jax.tree.map(_outline, eqx.filter_eval_shape(self.function, *args))
 
@@ -179,9 +181,12 @@ def _save(path: Path, made: _Made, number: int) -> None:
     payload, _, _ = serialize_executable.serialize(made.call)  # pyright: ignore[reportArgumentType]
     data = zlib.compress(pickle.dumps((payload, number, made.outline)), 1)
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        file.write(data)
-    os.replace(file.name, path)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        unfinished.write_bytes(data)
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
     kept = sorted(path.parent.iterdir(), key=lambda other: other.stat().st_mtime, reverse=True)
     sizes = np.cumsum([other.stat().st_size for other in kept])
     for old, total in zip(kept, sizes, strict=True):

@@ -96,13 +96,11 @@ def test_gap_is_that_of_nodes_far_out(graded_outline, name, error_mm):
 
 @eqx.filter_jit
 def both_searches(pair, roll, relative):
-    """Newton's method and the nodes at many poses, each with its gap."""
+    """Newton's method and the nodes at many poses: whether it is certain, and both results."""
 
     def one(roll, relative):
-        certain, found, normal2 = pair._directly(roll, relative)
-        bracketed, normal2_scan = pair._scan(roll, relative)
-        gaps = [pair._mesh(normal, roll, relative)[1] for normal in (normal2, normal2_scan)]
-        return certain, found, bracketed, *gaps
+        attempts, best = pair._search(roll, relative)
+        return attempts == 1, best, pair._search(roll, relative, attempt=1)[1]
 
     return jax.vmap(one)(roll, relative)
 
@@ -127,13 +125,13 @@ def test_newton_finds_what_the_nodes_find(lobes, above, share, tip, cycloid, see
     roll = jnp.asarray(rng.uniform(-half, half, 4000))
     relative = jnp.asarray(-(10 ** rng.uniform(-7, np.log10(5e-3), 4000)))
     found = both_searches(FlankPair.of(profile), roll, relative)
-    certain, direct, bracketed, gap, gap_of_nodes = map(np.asarray, found)
+    certain, best, of_nodes = jax.tree.map(np.asarray, found)
     assert np.mean(certain) > 0.5
-    both = certain & direct & bracketed
-    assert np.max(np.abs(gap - gap_of_nodes), where=both, initial=0.0) < 1e-13
-    touching = bracketed & (gap_of_nodes < 0)
-    assert not np.any(touching & certain & ~direct)
-    assert not np.any(certain & direct & ~bracketed & (gap < 0))
+    both = certain & best.found & of_nodes.found
+    assert np.max(np.abs(best.gap - of_nodes.gap), where=both, initial=0.0) < 1e-13
+    touching = of_nodes.found & (of_nodes.gap < 0)
+    assert not np.any(touching & certain & ~best.found)
+    assert not np.any(certain & best.found & ~of_nodes.found & (best.gap < 0))
 
 
 @pytest.mark.parametrize("name", ["paper", "short", "epicycloid"])

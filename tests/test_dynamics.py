@@ -379,7 +379,7 @@ def test_drive_work_is_load_work_plus_losses(path):
     state = jnp.zeros(2)
     for _ in range(12):
         start = state
-        state, works = powers(pair, state, integrator(rtol=1e-10))
+        state, works = powers(pair, state, integrator(rtol=1e-11))
     np.testing.assert_allclose(state, start, atol=1e-6)
     drive, load, flanks, gear = map(float, works)
     assert min(flanks, gear) > 1e-6 * load

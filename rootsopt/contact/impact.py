@@ -48,26 +48,33 @@ class ImpactLaw(eqx.Module):
         self, depth: Float[Array, "*n"], rate: Float[Array, "*#n"] | float
     ) -> Float[Array, "*n"]:
         """Normal force (N), ≥ 0, for penetration `depth` (m) growing at `rate` (m/s)."""
-        positive, force, width = self._unreleased(depth, rate)
-        return jnp.where(positive, ramp(force, width), 0.0)
+        positive, elastic, kept, width = self._parts(depth, rate)
+        return jnp.where(positive, elastic * ramp(kept, width), 0.0)
 
     def switches(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Bool[Array, "5"]:
         """On which of its smooth pieces the law is: in contact, beyond the rounding of the
         onset, fully damped, not released, beyond the rounding of the release."""
-        positive, force, width = self._unreleased(depth, rate)
+        positive, _, kept, width = self._parts(depth, rate)
         depths = jnp.stack([jnp.zeros_like(depth), self.smoothing, self.full_damping_depth])
-        forces = jnp.stack([jnp.zeros_like(width), width])
-        return jnp.concatenate([depth > depths, positive & (force > forces)])
+        limits = jnp.stack([jnp.zeros_like(width), width])
+        return jnp.concatenate([depth > depths, positive & (kept > limits)])
 
-    def _unreleased(self, depth, rate):
-        """Whether there is contact, the force before its release, and the rounding of that."""
+    def _parts(self, depth, rate):
+        """Whether there is contact, the elastic force, the force before its release in units of
+        that, and over which share it is rounded there.
+
+        The ratio of damping to elastic force is written out: near the onset both are so small
+        that the derivative of their quotient would overflow (in single precision).
+        """
         delta = ramp(depth, self.smoothing)
         positive = delta > 0
         safe = jnp.where(positive, delta, self.full_damping_depth)
-        elastic = self.stiffness * safe**self.exponent
-        damped = self.damping * smooth_step(safe / self.full_damping_depth) * rate
-        share = jnp.minimum(self.smoothing / self.full_damping_depth, 1.0)
-        return positive, elastic + damped, share * elastic
+        fade = safe / self.full_damping_depth
+        partial = (3 - 2 * fade) * safe ** (2 - self.exponent) / self.full_damping_depth**2
+        faded = jnp.where(fade < 1, partial, safe**-self.exponent)
+        kept = 1 + self.damping / self.stiffness * faded * rate
+        width = jnp.minimum(self.smoothing / self.full_damping_depth, 1.0)
+        return positive, self.stiffness * safe**self.exponent, kept, width
 
     def depth_at(self, force: Float[Array, ""]) -> Float[Array, ""]:
         """Static penetration (m) that carries `force` (N)."""

@@ -7,6 +7,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -55,7 +56,9 @@ class Integrator(eqx.Module):
         if self.method not in IMPLICIT:
             return method(scan_kind=loops)
         rtol: Any = self.tolerance(dtype)
-        return method(scan_kind=loops, root_finder=diffrax.VeryChord(rtol=rtol, atol=rtol))
+        # With a Jacobian for every iteration: one kept from the step's begin does not converge
+        # across a kink, and a repeated step cannot be made shorter.
+        return method(scan_kind=loops, root_finder=optimistix.Newton(rtol=rtol, atol=rtol))
 
     def controller(self, dtype: Any) -> diffrax.PIDController:
         """Step size control of states of type `dtype`."""
@@ -174,14 +177,15 @@ def strobe(pair: RotorPair, state: Float[Array, "2"], periods: int, how: Integra
     Steps land on the period ends: interpolated states would carry an error far above
     the tolerance and hide that the motion repeats.
     """
+    number = state.dtype.type
 
     def one_period(state, _):
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda tau, y, pair: pair.derivative(tau, y)[0]),
             how.solver(state.dtype),
-            t0=0.0,
-            t1=1.0,
-            dt0=_FIRST_STEP,
+            t0=number(0.0),
+            t1=number(1.0),
+            dt0=number(_FIRST_STEP),
             y0=state,
             args=pair,
             saveat=diffrax.SaveAt(t1=True),
@@ -241,15 +245,16 @@ def flow(
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(whole),
         solver,
-        t0=0.0,
-        t1=1.0,
+        t0=dtype.type(0.0),
+        t1=dtype.type(1.0),
         dt0=_FIRST_STEP / periods,
         y0=start,
         args=dynamic,
         saveat=diffrax.SaveAt(
             subs=[
                 diffrax.SubSaveAt(
-                    ts=jnp.arange(samples) / samples, fn=lambda share, y, args: y[:count]
+                    ts=(jnp.arange(samples) / samples).astype(dtype),
+                    fn=lambda share, y, args: y[:count],
                 ),
                 diffrax.SubSaveAt(steps=True, fn=lambda share, y, args: (share, y)),
                 diffrax.SubSaveAt(t1=True),
@@ -291,7 +296,8 @@ def flow(
 
         forces = jax.vmap(force_beside)(sides)
         frozen = lax.stop_gradient(forces)
-        peak = frozen[0] + jnp.dot(one_sided(frozen), forces - frozen)
+        peak, weights = one_sided(frozen)
+        peak += jnp.dot(weights, forces - frozen)
         slope = jnp.zeros((count + 3, 0), dtype)
     else:
         moved = eqx.filter(tangents, eqx.is_inexact_array)
@@ -311,10 +317,10 @@ def flow(
         along, there, beside = propagated(linear_step, unit, last, holds, len(BESIDE))
         slopes = jax.vmap(Linear.after, (0, None))(beside, there)[:, -1]
         forces = beside.value[:, -1]
-        peak = forces[0]
+        peak, weights = one_sided(forces)
         units = jnp.stack([force_unit, force_unit**2])[:, None] / periods
         rows = [along[:count], along[count:] * units]
-        slope = jnp.concatenate([*rows, force_unit * (one_sided(forces) @ slopes)[None]])
+        slope = jnp.concatenate([*rows, force_unit * (weights @ slopes)[None]])
     return Flow(
         end=end[:count],
         mean=end[count] / periods * force_unit,

@@ -11,10 +11,13 @@ _BLOCK = 63
 """Places looked at together."""
 _ROUNDS = 6
 """Times the neighbourhood of the greatest force is looked at more closely."""
-BESIDE = (0.0, -1.0, -2.0, 1.0, 2.0)
+_WIDE = 64
+BESIDE = (0.0, -1.0, -2.0, 1.0, 2.0, -_WIDE, _WIDE)
 """Times just before and after a peak, in units of `BESIDE_UNIT`."""
 BESIDE_UNIT = {8: 2e-8, 4: 1e-3}
 """Mesh periods, by bytes of a number."""
+_LEAST = 1e-9
+"""Fall of the force beside a corner, relative to it; what is less may be rounding."""
 
 
 def motion(states: Float[Array, "samples n"], place: Float[Array, ""]) -> Float[Array, "n"]:
@@ -65,18 +68,33 @@ def locate_peak(
     return best * width, rate, depth
 
 
-def one_sided(forces: Float[Array, "5"]) -> Float[Array, "5"]:
-    """With which weights the derivatives of the force at the times `BESIDE` a peak make up that
-    of the peak, from the forces there.
+def one_sided(forces: Float[Array, "7"]) -> tuple[Float[Array, ""], Float[Array, "7"]]:
+    """The peak from the forces at the times `BESIDE` it, and with which weights their
+    derivatives make up that of the peak.
 
     Where the force is smooth at its peak, it is the derivative at the fixed instant (envelope
-    theorem). Where it has a corner, the peak stays on the corner as that moves, and of the
-    derivatives on both sides the mean counts for which the force is stationary in time.
+    theorem), at the vertex of the parabola through the forces: rounding hides where exactly the
+    greatest is. Where the force has a corner, the peak stays on the corner as that moves, and of
+    the derivatives on both sides the mean counts for which the force is stationary in time. Where
+    it jumps (contact by `linear`, say), rounding decides on which side of the jump the instant
+    lies: the higher side counts.
     """
+    here, before, earlier, after, later, left, right = forces
+    none, one = jnp.zeros_like(here), jnp.ones_like(here)
     # Each slope from its own side: the corner is not known as well as that.
-    rise, fall = forces[1] - forces[2], forces[3] - forces[4]
-    corner = (rise > 0) & (fall > 0)
-    share = rise / jnp.where(corner, rise + fall, 1.0)
-    none = jnp.zeros_like(share)
-    smooth = jnp.zeros_like(forces).at[0].set(1.0)
-    return jnp.where(corner, jnp.stack([none, 1 - share, none, share, none]), smooth)
+    rise, fall = before - earlier, after - later
+    drop = rise + fall
+    # Next to a corner the force falls as fast as farther away, on a parabola a third as fast.
+    sharp = (2 * here - before - after > 0.6 * drop) & (drop > _LEAST * here)
+    continuous = jnp.abs(before - after) <= 2 * drop
+    corner = (rise > 0) & (fall > 0) & sharp & continuous
+    share = rise / jnp.where(corner, drop, 1.0)
+    at_corner = jnp.stack([none, 1 - share, none, share, none, none, none])
+    bend = 2 * here - left - right
+    vertex = (right - left) / (2 * jnp.where(bend > 0, bend, jnp.inf))
+    vertex = jnp.where(jnp.abs(vertex) * _WIDE < 4, vertex, 0.0)
+    at_vertex = jnp.stack([one, none, none, none, none, -vertex / 2, vertex / 2])
+    highest = jnp.where(corner, 0, jnp.argmax(forces[:5]))
+    single = (jnp.arange(len(BESIDE)) == highest).astype(forces.dtype)
+    weights = jnp.where(corner, at_corner, jnp.where(highest == 0, at_vertex, single))
+    return forces[highest], weights

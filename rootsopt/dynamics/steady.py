@@ -196,7 +196,7 @@ def close_orbit(
         # Keep the first steps inside the neighbourhood the transient pointed to.
         new = state + correction * jnp.minimum(1.0, 0.5 / jnp.maximum(size, 1e-30))
         done = orbit.newton_steps + 1
-        known = size < jnp.clip(1000 * how.rtol, *_SMALL)
+        known = size < jnp.clip(1000 * how.tolerance(dtype), *_SMALL)
         following = repeat | known | (done >= shots // 3)
         reached = jnp.where(repeat, orbit.residual, jnp.inf)
         orbit = orbit._replace(
