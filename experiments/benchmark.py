@@ -66,8 +66,8 @@ BATCH_SECONDS = 150.0
 """A batch expected to take longer than this, all its runs together, is not run."""
 CONTACTS = {
     "search": ("solver.fidelity=search",),
-    "map 384x16": (),
-    "map 192x12": ("solver.map_rolls=192", "solver.map_relatives=12"),
+    "map 384x16": ("solver.fidelity=map", "solver.map_rolls=384", "solver.map_relatives=16"),
+    "map 192x12": ("solver.fidelity=map", "solver.map_rolls=192", "solver.map_relatives=12"),
     "linear": ("solver.fidelity=linear",),
 }
 TOLERANCES = ((1e-4, 1e-4), (1e-5, 1e-5), (1e-6, 1e-6), (1e-5, 1e-6), (1e-7, 1e-7))
@@ -274,7 +274,7 @@ def part_single(job: Job) -> dict[str, Any]:
         )
 
     solver = load(CONFIG).solver
-    usual = "linear" if job.quick else "map 384x16"
+    usual = "linear" if job.quick else "search"
     default = evaluated("default", usual, solver.rtol, solver.transient_rtol)
     rows = [default, evaluated("cheapest", *choice)]
     design, state = jnp.asarray(BASELINE), jnp.zeros(2)
@@ -437,7 +437,7 @@ def part_revolutions(job: Job) -> dict[str, Any]:
     from rootsopt.dynamics.flow import strobe
     from rootsopt.model import Model, integrators
 
-    contact = "linear" if job.quick else "map 384x16"
+    contact = "linear" if job.quick else "search"
     config = load(CONFIG, CONTACTS[contact])
     model = Model.of(config, job.known["deepest"].get(contact))
     pair = eqx.filter_jit(Model.pair)(model, jnp.asarray(BASELINE))
@@ -472,7 +472,7 @@ def part_reverse(job: Job) -> dict[str, Any]:
     from rootsopt.dynamics.flow import Integrator, flow
     from rootsopt.model import Model
 
-    contact = "linear" if job.quick else "map 384x16"
+    contact = "linear" if job.quick else "search"
     config = load(CONFIG, CONTACTS[contact])
     model = Model.of(config, job.known["deepest"].get(contact))
     count = 3 if job.quick else 200

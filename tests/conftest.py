@@ -1,6 +1,8 @@
 """Test settings (float64, no display) and the fixtures shared by the geometry tests."""
 
 import os
+import shutil
+import tempfile
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,13 +14,22 @@ from jaxtyping import install_import_hook
 install_import_hook("rootsopt", "typechecking.typechecked")
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-os.environ["ROOTSOPT_CACHE"] = "off"
+# One folder of compiled programs for all processes of a session, new for every session.
+os.environ.setdefault("ROOTSOPT_TEST_CACHE", tempfile.mkdtemp(prefix="rootsopt-"))
+os.environ["ROOTSOPT_CACHE"] = os.environ["ROOTSOPT_TEST_CACHE"]
 
-from rootsopt.cli import use_float64  # noqa: E402
+from rootsopt.cli import use_cache, use_float64  # noqa: E402
 
 use_float64()
+use_cache()
 settings.register_profile("rootsopt", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("rootsopt")
+
+
+def pytest_sessionfinish(session):
+    """The first process, which the others inherit the folder from, removes it."""
+    if not hasattr(session.config, "workerinput"):
+        shutil.rmtree(os.environ["ROOTSOPT_TEST_CACHE"], ignore_errors=True)
 
 
 def _graded_normals(profile, points):

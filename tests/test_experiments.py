@@ -56,7 +56,7 @@ def test_work_precision(tmp_path, programs):
         # The quick run's linear contact begins with a jump, which sets a floor to the error.
         assert 0 < max(tighter) < first / 5
         assert tighter[-1] < 1e-7 < first < 1e-2
-    assert numbers(rows, "solver_steps") == sorted(numbers(rows, "solver_steps"))
+    assert numbers(rows, "orbit_steps") == sorted(numbers(rows, "orbit_steps"))
     bias = numbers(rows_of(tmp_path / "smoothing.csv"), "mean_bias")
     assert bias[0] == 0 < bias[1] < bias[2] < 0.1
     assert is_picture(tmp_path / "work_precision.png")

@@ -40,11 +40,11 @@ def solved(matrix):
 
 
 @pytest.fixture(autouse=True)
-def traced():
-    """The traces of `scaled`, from none on."""
+def traced(monkeypatch):
+    """The traces of `scaled`, from none on; no programs are kept."""
+    monkeypatch.setattr(programs, "_folder", None)
     TRACED.clear()
-    yield TRACED
-    programs.keep_in(None)
+    return TRACED
 
 
 def ask(program, power=2, size=3, name="a"):
