@@ -176,7 +176,7 @@ def test_compiled_programs_are_kept_between_processes(tmp_path):
     assert files[0] == files[1]
 
     def unkept(folder, *more):
-        done = command("simulate", *arguments, *more, "-o", tmp_path, ROOTSOPT_CACHE=str(folder))
+        done = command("profile", CIC, "-o", tmp_path / "p", *more, ROOTSOPT_CACHE=str(folder))
         assert done.returncode == 0, done.stderr
         assert done.stderr == ""
 
@@ -184,3 +184,5 @@ def test_compiled_programs_are_kept_between_processes(tmp_path):
     assert not (tmp_path / "other").exists()
     (tmp_path / "file").write_text("not a folder")
     unkept(tmp_path / "file")
+    unkept(tmp_path / "other")
+    assert list((tmp_path / "other").iterdir())
