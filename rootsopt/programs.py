@@ -27,6 +27,7 @@ from jax.experimental import serialize_executable
 
 _PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix")
 _MOST_BYTES = 200 * 2**20
+_SUFFIX = ".program"
 _folder: Path | None = None
 # Tracing is Python's work: in turn, the first asked for comes first to the compiler, which works
 # side by side.
@@ -145,7 +146,7 @@ class Program:
         if any(" at 0x" in word for word in words):
             return None  # Known by its address, which is another one next time.
         digest = hashlib.sha256("\n".join(words).encode()).hexdigest()
-        return _folder / f"{self.function.__name__}-{digest[:32]}"
+        return _folder / f"{self.function.__name__}-{digest[:32]}{_SUFFIX}"
 
 
 def _is_array(leaf: Any) -> bool:
@@ -187,7 +188,9 @@ def _save(path: Path, made: _Made, number: int) -> None:
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
-    kept = sorted(path.parent.iterdir(), key=lambda other: other.stat().st_mtime, reverse=True)
+    # Only our own files: the folder may be one that holds others.
+    ours = path.parent.glob(f"*{_SUFFIX}")
+    kept = sorted(ours, key=lambda other: other.stat().st_mtime, reverse=True)
     sizes = np.cumsum([other.stat().st_size for other in kept])
     for old, total in zip(kept, sizes, strict=True):
         if total > _MOST_BYTES:

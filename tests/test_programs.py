@@ -1,5 +1,6 @@
 """Compiled programs: called, prepared, kept between processes and thrown away."""
 
+import os
 import threading
 import time
 from typing import NamedTuple
@@ -142,15 +143,20 @@ def test_programs_that_call_out_are_not_kept(tmp_path):
 
 
 def test_the_oldest_programs_give_way(tmp_path, monkeypatch):
+    """Programs do; what else lies in the folder, older and larger, is left alone."""
     programs.keep_in(tmp_path)
     ask(Program(scaled))
     (oldest,) = tmp_path.iterdir()
+    other = tmp_path / "of the user"
+    other.write_bytes(bytes(10 * oldest.stat().st_size))
+    os.utime(other, (0, 0))
     monkeypatch.setattr(programs, "_MOST_BYTES", 2.5 * oldest.stat().st_size)
     for power in (3, 4):
         time.sleep(0.02)
         ask(Program(scaled), power=power)
     kept = list(tmp_path.iterdir())
-    assert len(kept) == 2
+    assert len(kept) == 3
+    assert other in kept
     assert oldest not in kept
 
 
