@@ -147,7 +147,7 @@ class Evaluator:
         return self._report(design, outcome, time.perf_counter() - began, series)
 
     def prepare(self, design: Float[Array, " d"], series: bool = True) -> None:
-        """Compile what evaluating `design` (config units) takes in the background."""
+        """Compile, in the background, what evaluating `design` (config units) takes."""
         self.prepared = True
         self._size(design)
         pair, tangents, _ = _build.outline(self.model, design)

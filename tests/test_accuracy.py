@@ -279,3 +279,38 @@ def test_auto_must_be_resolved_before_use():
     config = load("configs/cic.yaml", ["solver.fidelity=auto"])
     with pytest.raises(InputError, match=r"auto\.choose"):
         Model.of(config).pair(design_vector(config))
+
+
+@pytest.mark.parametrize("settles", [True, False])
+def test_auto_looks_more_closely_at_what_does_not_settle(monkeypatch, settles):
+    """A motion that the reference finds unsettled is taken at a hundredth of its tolerance
+    before it is given up."""
+    asked = []
+
+    @dataclasses.dataclass
+    class Stub:
+        config: object
+
+        def __call__(self, series):
+            asked.append(self.config.solver.rtol)
+            fine = settles and asked[-1] < 1e-8
+            found = outcome if fine else dataclasses.replace(outcome, status=Status.NOT_SETTLED)
+            return dataclasses.replace(found, statistics={"transient_mesh_periods": 4})
+
+    outcome = auto.Evaluation(
+        design={},
+        geometry={},
+        response={"mean_force_N": 1.0, "peak_force_N": 2.0},
+        gradient={},
+        steady_state={},
+        status=Status.PERIODIC,
+        message="",
+        statistics={},
+        series=None,
+    )
+    monkeypatch.setattr(auto, "Evaluator", Stub)
+    choice = auto.choose(load("configs/cic.yaml", ["solver.fidelity=auto", "solver.accuracy=1e-3"]))
+    assert asked[:2] == pytest.approx([1e-7, 1e-9])
+    assert choice.config.solver.rtol == pytest.approx(1e-9)
+    assert choice.config.solver.fidelity == "search"
+    assert (choice.error is None) == (not settles)
