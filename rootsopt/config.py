@@ -26,6 +26,21 @@ class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
+def _tuples(data: Any) -> Any:
+    """Keys of a section with tuples for lists: YAML has no tuples."""
+    if isinstance(data, dict):
+        return {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+    return data
+
+
+def _number(key: Any) -> Any:
+    """A number for a word that is one."""
+    try:
+        return float(key) if isinstance(key, str) else key
+    except ValueError:
+        return key
+
+
 class ProfileConfig(_Section):
     """The rotor profile."""
 
@@ -145,18 +160,122 @@ class SolverConfig(_Section):
 
 
 class ObjectiveConfig(_Section):
-    """Weighted sum of mean and peak force, each relative to the baseline."""
+    """Weighted sum of measures of the contact force, each relative to the baseline."""
 
     mean_weight: NonNegative = Field(0.5, description="weight of the mean contact force")
     peak_weight: NonNegative = Field(0.5, description="weight of the peak contact force")
+    rms_weight: NonNegative = Field(0.0, description="weight of the RMS contact force")
+    line_weights: dict[Positive, NonNegative] = Field(
+        default_factory=dict,
+        description="weights of spectral lines, {order: weight}, order in mesh frequencies",
+    )
+    motion: Literal["reached", "worst", "weighted", "ensemble"] = Field(
+        "reached",
+        description="motion that counts: the one reached from rest, the worst of those that "
+        "coexist, all weighted by their share of initial states, or an average over an "
+        "ensemble, which a chaotic scene needs",
+    )
+    peak_norm: Annotated[float, Field(ge=4, le=64)] | None = Field(
+        None, description="p of the p-norm that stands for the peak in the search; absent: the peak"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _orders(cls, data):
+        # The name of a key that `--set` gives, and of one in JSON, is a word.
+        if isinstance(data, dict) and isinstance(data.get("line_weights"), dict):
+            lines = {_number(k): v for k, v in data["line_weights"].items()}
+            return data | {"line_weights": lines}
+        return data
 
     @model_validator(mode="after")
     def _some_weight(self):
-        if self.mean_weight + self.peak_weight <= 0:
+        lines = sum(self.line_weights.values())
+        if self.mean_weight + self.peak_weight + self.rms_weight + lines <= 0:
             raise ValueError(
-                "`objective.mean_weight` and `objective.peak_weight` must not both be 0"
+                "`objective.mean_weight`, `objective.peak_weight`, `objective.rms_weight` and "
+                "`objective.line_weights` must not all be 0"
+            )
+        if self.motion == "ensemble" and (lines > 0 or self.peak_norm is not None):
+            raise ValueError(
+                "`objective.line_weights` and `objective.peak_norm` belong to a periodic motion; "
+                "remove them or set `objective.motion` to reached, worst or weighted"
             )
         return self
+
+
+class ResponseConfig(_Section):
+    """What is reported beside mean, peak and RMS of the contact force."""
+
+    lines: tuple[Positive, ...] = Field(
+        (), description="spectral lines of the force, orders in mesh frequencies, as [1, 2]"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lists(cls, data):
+        return _tuples(data)
+
+    @model_validator(mode="after")
+    def _few(self):
+        if len(set(self.lines)) != len(self.lines) or len(self.lines) > 32:
+            raise ValueError(
+                f"`response.lines` must be at most 32 different orders, but is {list(self.lines)}"
+            )
+        return self
+
+
+class AttractorsConfig(_Section):
+    """Initial states tried to find the motions that coexist."""
+
+    relatives: Annotated[int, Field(ge=1, le=1000)] = Field(
+        12, description="initial relative rotations tried"
+    )
+    rates: Annotated[int, Field(ge=1, le=1000)] = Field(
+        9, description="initial relative speeds tried"
+    )
+    relative_range_mrad: tuple[float, float] | None = Field(
+        None, description="(low, high) of the relative rotation; absent: the play and contact"
+    )
+    rate_range_rad_s: tuple[float, float] | None = Field(
+        None, description="(low, high) of the relative speed; absent: as impacts reach"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _pairs(cls, data):
+        return _tuples(data)
+
+    @model_validator(mode="after")
+    def _ordered(self):
+        for key in ("relative_range_mrad", "rate_range_rad_s"):
+            pair = getattr(self, key)
+            if pair is not None and not pair[0] < pair[1]:
+                raise ValueError(
+                    f"`attractors.{key}` must be two increasing numbers, but is {list(pair)}"
+                )
+        return self
+
+
+class EnsembleConfig(_Section):
+    """Motions averaged over where a single one means nothing."""
+
+    members: Annotated[int, Field(ge=4, le=100_000)] = Field(
+        32, description="motions from different initial states, per design"
+    )
+    settle_periods: Annotated[int, Field(ge=0, le=10**6)] = Field(
+        64, description="mesh periods before a motion counts"
+    )
+    periods: Annotated[int, Field(ge=1, le=10**6)] = Field(
+        64, description="mesh periods of a motion that count"
+    )
+    designs: Annotated[int, Field(ge=8, le=4096)] = Field(
+        16, description="designs around one, in pairs, from which its gradient is estimated"
+    )
+    spread: Annotated[float, Field(gt=0, le=0.5)] = Field(
+        0.05, description="standard deviation of these designs, as a share of the bounds"
+    )
+    seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of states and designs")
 
 
 class ConstraintsConfig(_Section):
@@ -183,10 +302,7 @@ class BoundsConfig(_Section):
     @model_validator(mode="before")
     @classmethod
     def _pairs(cls, data):
-        # YAML has lists, not tuples.
-        if isinstance(data, dict):
-            return {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
-        return data
+        return _tuples(data)
 
     @model_validator(mode="after")
     def _ordered(self):
@@ -233,6 +349,11 @@ class Config(_Section):
     constraints: ConstraintsConfig = Field(
         default_factory=lambda: ConstraintsConfig.model_validate({})
     )
+    response: ResponseConfig = Field(default_factory=lambda: ResponseConfig.model_validate({}))
+    attractors: AttractorsConfig = Field(
+        default_factory=lambda: AttractorsConfig.model_validate({})
+    )
+    ensemble: EnsembleConfig = Field(default_factory=lambda: EnsembleConfig.model_validate({}))
     optimizer: OptimizerConfig = Field(default_factory=lambda: OptimizerConfig.model_validate({}))
 
     def to_yaml(self) -> str:
@@ -374,7 +495,7 @@ def _allowed(kind: str, context: dict, message: str) -> str:
         "finite_number": "a finite number",
         "model_type": "a section with keys of its own",
         "string_type": "a word",
-        "tuple_type": "two numbers [low, high]",
+        "tuple_type": "a list of numbers, as [1, 2]",
     }
     if kind in words:
         return words[kind]

@@ -7,10 +7,15 @@ class Status(enum.Enum):
     """Outcome of a simulation; the value is the advice given to the user."""
 
     PERIODIC = "The pair settled on a stable periodic orbit."
+    AVERAGED = (
+        "Averages over an ensemble of motions, with standard errors; the gradient is that of the "
+        "average over a neighbourhood of the design."
+    )
     GEOMETRY_ONLY = "The profile is valid; nothing was simulated."
     CHAOTIC = (
         "The motion is chaotic: mean and peak are averages over a finite window and have no "
-        "usable gradient. Lower the speed, load or backlash, or add damping."
+        "usable gradient. Set objective.motion to ensemble to optimise what an ensemble of motions "
+        "averages to; or lower the speed, load or backlash, or add damping."
     )
     NOT_SETTLED = "The transient has not passed. Raise solver.max_mesh_periods, or add damping."
     PASSED_THROUGH = (
@@ -33,7 +38,7 @@ class Status(enum.Enum):
     @property
     def usable(self) -> bool:
         """Whether the numbers stand for a steady state with a gradient."""
-        return self is Status.PERIODIC
+        return self in (Status.PERIODIC, Status.AVERAGED)
 
     @property
     def label(self) -> str:
