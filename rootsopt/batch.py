@@ -89,9 +89,9 @@ def respond(
     period = jnp.maximum(settled.period, 1)
     enough = 0.1 * orbit.rtol
     closed = close_orbit(
-        pair, tangents, settled.state, period, orbit, SAMPLES, shots=_SHOTS, closed=enough
+        pair, tangents, settled.state, period, orbit, None, SAMPLES, _SHOTS, enough
     )
-    multiplier = jnp.max(closed.multipliers)
+    multiplier = closed.multiplier
     finite = jnp.all(jnp.isfinite(closed.response)) & jnp.all(jnp.isfinite(closed.sensitivity))
     moved = jnp.max(jnp.abs(closed.state - settled.state))
     near = 10 * tolerance / jnp.maximum(1 - multiplier, 1e-3)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rootsopt.config import Config
 from rootsopt.contact.size import size_map
 from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import (
     BLOCK,
@@ -29,7 +30,7 @@ from rootsopt.dynamics.steady import (
     settled_within,
 )
 from rootsopt.errors import InputError
-from rootsopt.model import MM, Model, design_keys, design_vector, integrators
+from rootsopt.model import MM, Model, design_keys, design_vector, integrators, measures
 from rootsopt.profiles import Geometry
 from rootsopt.programs import Program
 from rootsopt.status import Status
@@ -119,6 +120,7 @@ class Evaluator:
         if rtol is not None:
             orbit = dataclasses.replace(orbit, rtol=jnp.asarray(rtol))
         self.transient, self.orbit = transient, orbit
+        self.measures = measures(config)
 
     def __call__(
         self,
@@ -155,7 +157,7 @@ class Evaluator:
         state, number = jax.ShapeDtypeStruct((2,), dtype), jax.ShapeDtypeStruct((), dtype)
         whole = jax.ShapeDtypeStruct((), int)
         # The one that takes longest first.
-        _close.prepare(pair, tangents, state, whole, self.orbit)
+        _close.prepare(pair, tangents, state, whole, self.orbit, self.measures)
         most = self.config.solver.max_orbit_periods
         _settle.prepare(pair, state, self.transient, number, whole, most)
         _build.prepare(self.model, design)
@@ -248,8 +250,9 @@ class Evaluator:
 
     def _close(self, pair, tangents, transient: Transient, tolerance: float):
         """Orbit the transient leads to, of the least period, and its status."""
+        settings = self.orbit, self.measures
         orbit = jax.device_get(
-            _close(pair, tangents, transient.state, transient.period, self.orbit)
+            _close(pair, tangents, transient.state, transient.period, *settings)
         )
         status = self._orbit_status(orbit, transient, tolerance)
         if status is not Status.PERIODIC:
@@ -259,7 +262,7 @@ class Evaluator:
             again = np.asarray(orbit.flow.states)[shorter * SAMPLES // int(transient.period)]
             if np.max(np.abs(again - np.asarray(orbit.state))) < _NEARLY:
                 period = np.asarray(shorter)
-                simpler = jax.device_get(_close(pair, tangents, orbit.state, period, self.orbit))
+                simpler = jax.device_get(_close(pair, tangents, orbit.state, period, *settings))
                 reduced = transient._replace(period=period, state=orbit.state)
                 if self._orbit_status(simpler, reduced, tolerance) is Status.PERIODIC:
                     return reduced, simpler, Status.PERIODIC
@@ -281,7 +284,7 @@ class Evaluator:
         numbers = np.concatenate([orbit.response, np.ravel(orbit.sensitivity), orbit.state])
         if not np.all(np.isfinite(numbers)):
             return Status.NON_FINITE
-        multiplier = float(np.max(orbit.multipliers))
+        multiplier = float(orbit.multiplier)
         noise = max(float(self.transient.rtol), float(self.orbit.rtol))
         near = tolerance / max(1 - multiplier, 1e-3) * 10 + 100 * noise
         moved = float(np.max(np.abs(orbit.state - transient.state)))
@@ -306,12 +309,12 @@ class Evaluator:
                 statistics["map_error"] = self.map_error
         if status is Status.PERIODIC and orbit is not None:
             period = int(outcome.transient.period)
-            response = _response(*np.asarray(orbit.response))
-            gradient = self._gradient(design, orbit, period)
+            response, gradient = self._response(design, orbit, period)
             steady = {
                 "kind": "periodic",
                 "period": period,
-                "floquet_multiplier": float(np.max(orbit.multipliers)),
+                "floquet_multiplier": float(orbit.multiplier),
+                "floquet_multipliers": floquet(orbit.monodromy),
                 "residual": float(orbit.residual),
             }
             state = np.asarray(orbit.state, np.float64)
@@ -341,16 +344,19 @@ class Evaluator:
             state=state,
         )
 
-    def _gradient(self, design, orbit: Orbit, period: int) -> dict[str, dict[str, float]]:
-        if not self.keys:
-            return {}
+    def _response(self, design, orbit: Orbit, period: int):
+        """Response and gradient of a closed orbit in the result file's keys."""
         sensitivity = orbit.sensitivity
-        if self.config.solver.gradient == "reverse":
-            sensitivity = _reverse(self.model, design, orbit, np.asarray(period), self.orbit)
-        mean, square, peak = np.asarray(sensitivity)
-        rms = square / (2 * np.sqrt(max(float(orbit.response[1]), 1e-300)))
-        rows = zip(RESPONSES, (mean, peak, rms), strict=True)
-        return {name: dict(zip(self.keys, map(float, row), strict=True)) for name, row in rows}
+        if self.config.solver.gradient == "reverse" and self.keys:
+            settings = self.orbit, self.measures
+            sensitivity = _reverse(self.model, design, orbit, np.asarray(period), *settings)
+        rows = np.column_stack([orbit.response, sensitivity])
+        found = self.measures.named(rows, period)
+        response = {name: value for name, (value, _) in found.items()}
+        if not self.keys:
+            return response, {}
+        slopes = {name: map(float, slope) for name, (_, slope) in found.items()}
+        return response, {k: dict(zip(self.keys, v, strict=True)) for k, v in slopes.items()}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -404,10 +410,20 @@ def _divisors(period: int) -> list[int]:
     return [k for k in range(1, period) if period % k == 0]
 
 
+def floquet(monodromy) -> list[list[float]]:
+    """Floquet multipliers, the eigenvalues of a monodromy matrix (n, n), as [real, imaginary] and
+    greatest first."""
+    values = np.linalg.eigvals(np.asarray(monodromy, np.float64))
+    ordered = sorted(values, key=lambda z: (-abs(z), -z.imag))
+    return [[float(z.real), float(z.imag)] for z in ordered]
+
+
 @Program
-def _reverse(model: Model, design, orbit: Orbit, period, how: Integrator):
-    grid = orbit.flow.grid
-    return reverse_sensitivity(model.pair, design, orbit.state, period, how, grid)
+def _reverse(model: Model, design, orbit: Orbit, period, how: Integrator, measures: Measures):
+    grid, peak = orbit.flow.grid, orbit.flow.peak
+    return reverse_sensitivity(
+        model.pair, design, orbit.state, period, how, grid, measures, jnp.maximum(peak, 1e-30)
+    )
 
 
 @Program

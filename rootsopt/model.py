@@ -21,6 +21,7 @@ from rootsopt.contact.linear import LinearContact
 from rootsopt.contact.map import MapContact
 from rootsopt.contact.segments import NodeContact
 from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import GapFunction, RotorPair, SearchContact
 from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
 from rootsopt.errors import InputError
@@ -257,6 +258,15 @@ def integrators(config: Config) -> tuple[Integrator, Integrator]:
         Integrator(solver.method, jnp.asarray(solver.transient_rtol), solver.max_steps_per_period),
         Integrator(solver.method, jnp.asarray(solver.rtol), solver.max_steps_per_period),
     )
+
+
+def measures(config: Config) -> Measures:
+    """What of the force a config asks for, in its report or its objective."""
+    objective = config.objective
+    weighted = [order for order, weight in objective.line_weights.items() if weight]
+    orders = dict.fromkeys([*config.response.lines, *weighted])
+    norm = objective.peak_norm
+    return Measures(np.array([*orders], float), None if norm is None else jnp.asarray(norm))
 
 
 def check_geometry(config: Config) -> None:

@@ -33,6 +33,7 @@ _NAMES = {
     "floquet_multiplier": ("largest Floquet multiplier", ""),
     "residual": ("orbit residual", ""),
     "rms_force_N": ("RMS force", "N"),
+    "peak_norm_force_N": ("p-norm of the force", "N"),
 }
 _Rows = Iterable[tuple[str | Text, ...]]
 
@@ -115,13 +116,20 @@ def _group(table: Table, name: str, rows: _Rows) -> None:
 
 
 def _singles(values: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    return [(_label(key), _number(value)) for key, value in values.items()]
+    return [(_label(key), _number(value)) for key, value in values.items() if _single(value)]
+
+
+def _single(value: Any) -> bool:
+    """Whether a value has room in a cell; lists and records are in the result file only."""
+    return not isinstance(value, list | tuple | dict)
 
 
 def _pairs(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple[str, ...]]:
     rows = []
     for key in dict.fromkeys([*first, *second]):
         a, b = first.get(key), second.get(key)
+        if not (_single(a) and _single(b)):
+            continue
         rows.append((_label(key), _number(a), _number(b), _change(a, b)))
     return rows
 
@@ -171,6 +179,9 @@ def _split(key: str) -> tuple[str, str]:
     if key in _NAMES:
         return _NAMES[key]
     for suffix, unit in _UNITS.items():
+        if key.startswith("line_") and key.endswith(suffix):
+            order = key.removeprefix("line_").removesuffix("_force" + suffix)
+            return f"line at {order} x mesh frequency", unit
         if key.endswith(suffix):
             return _words(key.removesuffix(suffix)), unit
     return _words(key), ""

@@ -11,6 +11,7 @@ import optimistix
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, locate_peak, one_sided
 from rootsopt.dynamics.tangent import Linear, linearized, one_step, propagated
@@ -69,7 +70,7 @@ class Integrator(eqx.Module):
 class Strobe(NamedTuple):
     """States at the end of successive mesh periods, and how the solver fared."""
 
-    states: Float[Array, "periods 2"]
+    states: Float[Array, "periods n"]
     steps: Int[Array, ""]
     solved: Bool[Array, ""]
 
@@ -81,9 +82,9 @@ class Flow(NamedTuple):
     `peak_time` (mesh periods); `depth`: greatest penetration (m; negative: least gap)
     at the sampled times; `states` at uniform times, endpoint excluded; `grid`: ends
     of the steps taken (mesh periods), inf beyond the last; `steps`: accepted and rejected
-    solver steps; `solved`. `slope`: derivatives of (end, mean, mean_square, peak) in the
-    initial state (n columns) and along the directions that were asked for (d more), or no
-    columns at all.
+    solver steps; `solved`; `others`: the values of `Measures` beside mean and mean square.
+    `slope`: derivatives of (end, mean, mean_square, peak, others) in the initial state (n columns)
+    and along the directions that were asked for (d more), or no columns at all.
     """
 
     end: Float[Array, "n"]
@@ -96,10 +97,13 @@ class Flow(NamedTuple):
     grid: Float[Array, " steps"]
     steps: Int[Array, ""]
     solved: Bool[Array, ""]
+    others: Float[Array, " others"]
     slope: Float[Array, "rows columns"]
 
     @classmethod
-    def empty(cls, count: int, directions: int, samples: int, steps: int, dtype: Any) -> "Flow":
+    def empty(
+        cls, count: int, directions: int, samples: int, steps: int, measures: Measures, dtype: Any
+    ) -> "Flow":
         """A flow of `count` = n states that has not been integrated yet."""
         nothing = jnp.zeros((), dtype)
         return cls(
@@ -113,13 +117,14 @@ class Flow(NamedTuple):
             grid=jnp.full(steps, jnp.inf, dtype),
             steps=jnp.zeros((), int),
             solved=jnp.zeros((), bool),
-            slope=jnp.zeros((count + 3, count + directions), dtype),
+            others=jnp.zeros(measures.count - 2, dtype),
+            slope=jnp.zeros((count + 1 + measures.count, count + directions), dtype),
         )
 
     @property
-    def response(self) -> Float[Array, "3"]:
-        """(mean, mean square, peak) of the contact force."""
-        return jnp.stack([self.mean, self.mean_square, self.peak])
+    def response(self) -> Float[Array, " r"]:
+        """(mean, mean square, peak, others) of the contact force."""
+        return jnp.append(jnp.stack([self.mean, self.mean_square, self.peak]), self.others)
 
 
 class StepGrid(diffrax.AbstractAdaptiveStepSizeController):
@@ -171,8 +176,8 @@ class StepGrid(diffrax.AbstractAdaptiveStepSizeController):
         )
 
 
-def strobe(pair: RotorPair, state: Float[Array, "2"], periods: int, how: Integrator) -> Strobe:
-    """Integrate the bare two states over `periods` mesh periods, from φ1 = 0.
+def strobe(pair: RotorPair, state: Float[Array, "n"], periods: int, how: Integrator) -> Strobe:
+    """Integrate the bare states over `periods` mesh periods, from φ1 = 0.
 
     Steps land on the period ends: interpolated states would carry an error far above
     the tolerance and hide that the motion repeats.
@@ -216,24 +221,28 @@ def flow(
     grid: Float[Array, " steps"] | None = None,
     repeat: Bool[Array, ""] | bool = True,
     adjoint: diffrax.AbstractAdjoint | None = None,
+    measures: Measures | None = None,
+    top: Float[Array, ""] | None = None,
 ) -> Flow:
     """Integrate over `periods` (traced) mesh periods with the force statistics.
 
-    Mean and mean square are integrated along with the motion, under the same error
-    control. The peak is located between `samples` uniform ones. With `tangents`
-    (directions of the pair's parameters, stacked along a leading axis; there may be none)
-    every step is linearised, which gives `slope`. With `grid` the steps recorded there are
-    repeated (while `repeat`), else they are chosen anew.
+    Mean, mean square and what else `measures` names are integrated along with the motion, under
+    the same error control; `top` (N) is about the greatest force, for the p-norm. The peak is
+    located between `samples` uniform ones. With `tangents` (directions of the pair's parameters,
+    stacked along a leading axis; there may be none) every step is linearised, which gives `slope`.
+    With `grid` the steps recorded there are repeated (while `repeat`), else they are chosen anew.
     """
     count, dtype = state.shape[0], state.dtype
+    measures = Measures() if measures is None else measures
     force_unit = lax.stop_gradient(pair.force_scale)
+    top = jnp.ones_like(force_unit) if top is None else lax.stop_gradient(top) / force_unit
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
     solver = how.solver(dtype, "lax" if adjoint is None else "bounded")
 
     def derivative(tau, y, dynamic):
         slope, contact = eqx.combine(dynamic, static).derivative(tau, y[:count])
-        force = contact.total / force_unit
-        return jnp.concatenate([slope, jnp.stack([force, force**2])])
+        rates = measures.rates(tau, contact.total / force_unit, top)
+        return jnp.concatenate([slope, rates])
 
     def whole(share, y, dynamic):
         return periods * derivative(share * periods, y, dynamic)
@@ -241,7 +250,7 @@ def flow(
     # Over the unit interval: limits known when it is traced make a smaller program.
     ends = jnp.full(how.max_steps, jnp.inf, dtype) if grid is None else grid / periods
     repeated = jnp.asarray(False if grid is None else repeat)
-    start = jnp.pad(state, (0, 2))
+    start = jnp.pad(state, (0, measures.count))
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(whole),
         solver,
@@ -278,10 +287,11 @@ def flow(
     peak_time, rate, depth = locate_peak(lax.stop_gradient(pair), states, periods)
     holds = jnp.clip(jnp.sum(ends < peak_time), 0, last)
     peak_time = jnp.maximum(peak_time, begins[holds] + _SHORTEST)
+    averages, factors = measures.values(end[count:] / periods, force_unit, top)
     sides = BESIDE_UNIT[dtype.itemsize] * jnp.asarray(BESIDE, dtype)
 
     def begin_beside(there, side):
-        return jnp.pad(there[:count] + side * rate, (0, 2))
+        return jnp.pad(there[:count] + side * rate, (0, measures.count))
 
     def step_between(begin, end, y, dynamic):
         after, slope = one_step(solver, term, begin, end, y, dynamic)
@@ -298,7 +308,7 @@ def flow(
         frozen = lax.stop_gradient(forces)
         peak, weights = one_sided(frozen)
         peak += jnp.dot(weights, forces - frozen)
-        slope = jnp.zeros((count + 3, 0), dtype)
+        slope = jnp.zeros((count + 1 + measures.count, 0), dtype)
     else:
         moved = eqx.filter(tangents, eqx.is_inexact_array)
 
@@ -313,18 +323,18 @@ def flow(
             )
 
         columns = count + jax.tree.leaves(moved)[0].shape[0]
-        unit = jnp.eye(count + 2, columns, dtype=dtype).at[count:].set(0.0)
+        unit = jnp.eye(start.shape[0], columns, dtype=dtype).at[count:].set(0.0)
         along, there, beside = propagated(linear_step, unit, last, holds, len(BESIDE))
         slopes = jax.vmap(Linear.after, (0, None))(beside, there)[:, -1]
         forces = beside.value[:, -1]
         peak, weights = one_sided(forces)
-        units = jnp.stack([force_unit, force_unit**2])[:, None] / periods
-        rows = [along[:count], along[count:] * units]
-        slope = jnp.concatenate([*rows, force_unit * (weights @ slopes)[None]])
+        changes = along[count:] * (factors / periods)[:, None]
+        by_peak = force_unit * (weights @ slopes)[None]
+        slope = jnp.concatenate([along[:count], changes[:2], by_peak, changes[2:]])
     return Flow(
         end=end[:count],
-        mean=end[count] / periods * force_unit,
-        mean_square=end[count + 1] / periods * force_unit**2,
+        mean=averages[0],
+        mean_square=averages[1],
         peak=peak * force_unit,
         peak_time=peak_time,
         depth=depth,
@@ -332,5 +342,6 @@ def flow(
         grid=ends,
         steps=solution.stats["num_steps"],
         solved=solution.result == diffrax.RESULTS.successful,
+        others=averages[2:],
         slope=slope,
     )

@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.flow import Flow, Integrator, flow, strobe
+from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.switches import with_switches
 
@@ -47,7 +48,7 @@ class Transient(NamedTuple):
     solver steps.
     """
 
-    state: Float[Array, "2"]
+    state: Float[Array, " n"]
     period: Int[Array, ""]
     nearest: Int[Array, ""]
     spread: Float[Array, ""]
@@ -61,18 +62,18 @@ class Orbit(NamedTuple):
     """A closed orbit of k mesh periods with first derivatives.
 
     `state` at φ1 = 0; `flow` over the orbit; `residual` |Φ(z) - z| in scaled units;
-    `monodromy` dΦ/dz and `multipliers`, the moduli of its eigenvalues; `response`: (mean,
-    mean square, peak); `sensitivity` (3, d): their derivatives along the orbit family with
-    respect to the design; `newton_steps`.
+    `monodromy` dΦ/dz and `multiplier`, the greatest modulus of its eigenvalues; `response`:
+    (mean, mean square, peak, other measures); `sensitivity` (r, d): their derivatives along the
+    orbit family with respect to the design; `newton_steps`.
     """
 
-    state: Float[Array, "2"]
+    state: Float[Array, " n"]
     flow: Flow
     residual: Float[Array, ""]
-    monodromy: Float[Array, "2 2"]
-    multipliers: Float[Array, "2"]
-    response: Float[Array, "3"]
-    sensitivity: Float[Array, "3 d"]
+    monodromy: Float[Array, "n n"]
+    multiplier: Float[Array, ""]
+    response: Float[Array, " r"]
+    sensitivity: Float[Array, "r d"]
     newton_steps: Int[Array, ""]
 
 
@@ -84,7 +85,7 @@ def settled_within(rtol: Float[Array, ""]) -> Float[Array, ""]:
 
 def settle(
     pair: RotorPair,
-    state: Float[Array, "2"],
+    state: Float[Array, " n"],
     how: Integrator,
     tolerance: Float[Array, ""],
     max_periods: Int[Array, ""],
@@ -154,9 +155,10 @@ def settle(
 def close_orbit(
     pair: RotorPair,
     tangents: RotorPair,
-    state: Float[Array, "n"],
+    state: Float[Array, " n"],
     period: Int[Array, ""],
     how: Integrator,
+    measures: Measures | None = None,
     samples: int = SAMPLES,
     shots: int = _NEWTON_STEPS,
     closed: Float[Array, ""] | float = 0.0,
@@ -172,11 +174,14 @@ def close_orbit(
     count, dtype = state.shape[0], state.dtype
     closed = jnp.maximum(closed, _CLOSED * float(jnp.finfo(dtype).eps)).astype(dtype)
     length = period.astype(dtype)
-
+    measures = Measures() if measures is None else measures
     frozen = lax.stop_gradient(pair)
 
-    def shoot(state, grid, repeat):
-        return flow(pair, state, length, how, samples, tangents, grid, repeat)
+    def shoot(state, grid, repeat, peak):
+        top = jnp.where(peak > 0, peak, frozen.force_scale)
+        return flow(
+            pair, state, length, how, samples, tangents, grid, repeat, measures=measures, top=top
+        )
 
     def go_on(carry):
         orbit, _, _, repeated, _, best = carry
@@ -187,7 +192,7 @@ def close_orbit(
 
     def step(carry):
         orbit, state, repeat, _, grid, best = carry
-        out = shoot(state, grid, repeat)
+        out = shoot(state, grid, repeat, orbit.flow.peak)
         monodromy = out.slope[:count, :count]
         miss = out.end - state
         residual = jnp.max(jnp.abs(miss))
@@ -212,15 +217,15 @@ def close_orbit(
     # The loop holds the only copy of the integration: one shot is compiled, not two.
     infinite = jnp.asarray(jnp.inf, dtype)
     designs = jax.tree.leaves(eqx.filter(tangents, eqx.is_inexact_array))[0].shape[0]
-    none = Flow.empty(count, designs, samples, how.max_steps, dtype)
+    none = Flow.empty(count, designs, samples, how.max_steps, measures, dtype)
     first = Orbit(
         state=state,
         flow=none,
         residual=infinite,
         monodromy=jnp.zeros((count, count), dtype),
-        multipliers=jnp.zeros(count, dtype),
-        response=jnp.zeros(3, dtype),
-        sensitivity=jnp.zeros((3, designs), dtype),
+        multiplier=infinite,
+        response=none.response,
+        sensitivity=jnp.zeros((none.response.shape[0], designs), dtype),
         newton_steps=jnp.zeros((), int),
     )
     no = jnp.zeros((), bool)
@@ -230,7 +235,7 @@ def close_orbit(
     moved = solved(jnp.eye(count, dtype=dtype) - orbit.monodromy, slope[:count, count:])
     sensitivity = slope[count:, count:] + slope[count:, :count] @ moved
     return orbit._replace(
-        multipliers=floquet(orbit.monodromy),
+        multiplier=spectral_radius(orbit.monodromy),
         response=orbit.flow.response,
         sensitivity=sensitivity,
     )
@@ -239,27 +244,30 @@ def close_orbit(
 def reverse_sensitivity(
     build: Callable[[Float[Array, " d"]], RotorPair],
     design: Float[Array, " d"],
-    state: Float[Array, "n"],
+    state: Float[Array, " n"],
     period: Int[Array, ""],
     how: Integrator,
     grid: Float[Array, " steps"],
-) -> Float[Array, "3 d"]:
+    measures: Measures | None = None,
+    top: Float[Array, ""] | None = None,
+) -> Float[Array, "r d"]:
     """The same sensitivity by reverse mode, through diffrax's checkpointed adjoint.
 
-    On the steps `grid` of the closed orbit. With cotangents v of a response and w of the
-    end state, the implicit function theorem asks for (I - M)ᵀ w = R_zᵀ v and gives
-    dR/dp = R_pᵀ v + Φ_pᵀ w.
+    On the steps `grid` of the closed orbit, whose peak is `top` (N). With cotangents v of a
+    response and w of the end state, the implicit function theorem asks for
+    (I - M)ᵀ w = R_zᵀ v and gives dR/dp = R_pᵀ v + Φ_pᵀ w.
     """
     count = state.shape[0]
     length = period.astype(state.dtype)
     adjoint = diffrax.RecursiveCheckpointAdjoint()
 
     def run(state, design):
-        out = flow(build(design), state, length, how, SAMPLES, grid=grid, adjoint=adjoint)
+        kept = {"grid": grid, "adjoint": adjoint, "measures": measures, "top": top}
+        out = flow(build(design), state, length, how, SAMPLES, **kept)
         return jnp.concatenate([out.end, out.response])
 
-    _, pull = jax.vjp(run, state, design)
-    by_state, by_design = jax.vmap(pull)(jnp.eye(count + 3, dtype=state.dtype))
+    end, pull = jax.vjp(run, state, design)
+    by_state, by_design = jax.vmap(pull)(jnp.eye(end.shape[0], dtype=state.dtype))
     monodromy, response = by_state[:count], by_state[count:]
     weight = solved((jnp.eye(count, dtype=state.dtype) - monodromy).T, response.T)
     return by_design[count:] + weight.T @ by_design[:count]
@@ -279,10 +287,10 @@ class Lyapunov(NamedTuple):
     exponent: Float[Array, ""]
     error: Float[Array, ""]
     flows: Flow
-    state: Float[Array, "2"]
+    state: Float[Array, " n"]
 
 
-def lyapunov(pair: RotorPair, state: Float[Array, "2"], periods: int, how: Integrator) -> Lyapunov:
+def lyapunov(pair: RotorPair, state: Float[Array, " n"], periods: int, how: Integrator) -> Lyapunov:
     """Growth of a tangent vector over `periods` mesh periods, renormalised each period.
 
     The standard error comes from 16 batch means.
@@ -324,12 +332,29 @@ def solved(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Arr
     return rows[:, count:]
 
 
-def floquet(monodromy: Float[Array, "2 2"]) -> Float[Array, "2"]:
-    """Moduli of the Floquet multipliers, from trace and determinant (real arithmetic)."""
-    half = jnp.trace(monodromy) / 2
-    determinant = jnp.linalg.det(monodromy)
-    square = half**2 - determinant
-    root = jnp.sqrt(jnp.abs(square))
-    real = jnp.stack([jnp.abs(half + root), jnp.abs(half - root)])
-    pair = jnp.sqrt(jnp.abs(determinant)) * jnp.ones(2)
-    return jnp.where(square >= 0, real, pair)
+_SQUARINGS = 40
+
+
+def spectral_radius(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
+    """Greatest modulus of the eigenvalues, in real arithmetic.
+
+    Of two, from trace and determinant; of more, as the growth of the powers of the matrix, which
+    repeated squaring takes so far that nothing is left of the choice of norm.
+    """
+    if matrix.shape[0] == 2:
+        half = jnp.trace(matrix) / 2
+        determinant = jnp.linalg.det(matrix)
+        square = half**2 - determinant
+        root = jnp.sqrt(jnp.abs(square))
+        return jnp.where(square >= 0, jnp.abs(half) + root, jnp.sqrt(jnp.abs(determinant)))
+
+    def double(_, carry):
+        power, growth, share = carry
+        size = jnp.max(jnp.abs(power))
+        scaled = power / jnp.where(size > 0, size, 1.0)
+        growth = growth + share * jnp.log(size)
+        # Written as a sum: a matrix product this small costs more in its call.
+        return jnp.sum(scaled[:, :, None] * scaled[None], axis=1), growth, share / 2
+
+    start = matrix, jnp.zeros((), matrix.dtype), jnp.ones((), matrix.dtype)
+    return jnp.exp(lax.fori_loop(0, _SQUARINGS, double, start)[1])

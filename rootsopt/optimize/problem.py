@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from rootsopt.config import Config
+from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluation
 from rootsopt.model import DEG, MM, Model
@@ -28,6 +29,8 @@ from rootsopt.programs import Program
 
 _SHORTEST = 0.1
 """Least involute, as a share of the longest, where the config sets no bound."""
+_NO_LINE = 1e-9
+"""Amplitude of a spectral line, relative to the mean force, that counts as none."""
 _ACTIVE = 1e-6
 """Scaled distance from its limit at which a constraint counts as active."""
 
@@ -160,11 +163,21 @@ class Problem:
 
     @classmethod
     def of(cls, config: Config, model: Model, baseline: Evaluation) -> "Problem":
-        """The problem whose floors are those of the config or of the `baseline`."""
+        """The problem whose floors are those of the config or of the `baseline`.
+
+        Raises `InputError` where a spectral line is to fall that the baseline has not got."""
+        least = _NO_LINE * baseline.response["mean_force_N"]
+        for order, weight in config.objective.line_weights.items():
+            if weight and not baseline.response[line_name(order)] > least:
+                period = baseline.steady_state.get("period")
+                raise InputError(
+                    f"`objective.line_weights` has the order {order:g}, but the baseline's force "
+                    f"has no such line (its motion repeats every {period} mesh periods); remove it"
+                )
         return cls(config, baseline, Space.of(config, model, baseline.geometry["area_efficiency"]))
 
     def objective(self, evaluation: Evaluation) -> float:
-        """Weighted mean and peak force relative to the baseline (1 at the baseline);
+        """Weighted measures of the force relative to the baseline's (1 at the baseline);
         NaN for a design without a usable steady state."""
         if not evaluation.usable:
             return float("nan")
@@ -192,8 +205,14 @@ class Problem:
 
     def _weights(self) -> dict[str, float]:
         wanted = self.config.objective
-        total = wanted.mean_weight + wanted.peak_weight
-        shares = {"mean_force_N": wanted.mean_weight, "peak_force_N": wanted.peak_weight}
+        peak = PEAK_NORM if wanted.peak_norm is not None else "peak_force_N"
+        shares = {
+            "mean_force_N": wanted.mean_weight,
+            peak: wanted.peak_weight,
+            "rms_force_N": wanted.rms_weight,
+            **{line_name(order): weight for order, weight in wanted.line_weights.items()},
+        }
+        total = sum(shares.values())
         return {
             k: w / total / max(self.baseline.response[k], 1e-12) for k, w in shares.items() if w
         }
