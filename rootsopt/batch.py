@@ -6,8 +6,9 @@ needs more is reported as not settled, and can be given to an `Evaluator`.
 """
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -140,17 +141,24 @@ def respond_many(
     settings = transient, orbit, max_periods, max_orbit, gradient
     if jax.default_backend() != "cpu":
         return _together(model, designs, states, *settings)
-    count = designs.shape[0]
+    return on_all_cores(
+        lambda designs, states: _in_turn(model, designs, states, *settings), designs, states
+    )
+
+
+def on_all_cores(work: Callable[..., Any], *arrays: Any) -> Any:
+    """`work(*arrays)` with the leading axis (n,) of all arrays, and of its result, divided among
+    threads, one for each core.
+
+    The parts have one size, so that they share a compiled program.
+    """
+    count = arrays[0].shape[0]
     workers = max(1, min(os.cpu_count() or 1, count))
     size = -(-count // workers)
-    # Parts of one size share a compiled program; the last design fills the last part up.
+    # The last entry fills the last part up.
     index = np.minimum(np.arange(workers * size), count - 1).reshape(workers, size)
-
-    def part(rows):
-        return _in_turn(model, designs[rows], states[rows], *settings)
-
     with ThreadPoolExecutor(workers) as pool:
-        parts = list(pool.map(part, index))
+        parts = list(pool.map(lambda rows: work(*(x[rows] for x in arrays)), index))
     return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *parts)
 
 

@@ -5,13 +5,18 @@ result; the status says why.
 """
 
 import argparse
+import contextlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rootsopt.config import Config, describe_keys, load
 from rootsopt.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 OK, BAD_INPUT, NO_RESULT = 0, 2, 3
 
@@ -80,6 +85,16 @@ def run(
         return OK
 
 
+@contextlib.contextmanager
+def waiting(console: "Console", what: str) -> Iterator[None]:
+    """Say `what` goes on, on a terminal; nothing in a pipe."""
+    if not console.is_terminal:
+        yield
+        return
+    with console.status(what):
+        yield
+
+
 # XLA compiles a loop on a CPU to one function if its buffers are small; else it calls one for
 # every operation of every turn, which here costs several times the arithmetic itself.
 _LOOPS = "xla_cpu_small_while_loop_byte_threshold"
@@ -119,11 +134,12 @@ def use_cache() -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The console command `rootsopt`: optimize, simulate, profile."""
+    """The console command `rootsopt`: optimize, simulate, attractors, profile."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands = {
         "optimize": "optimise a design and compare it with the baseline",
         "simulate": "simulate one design in one scene",
+        "attractors": "the motions that coexist in one scene",
         "profile": "geometry of one design",
     }
     usage = "usage: rootsopt COMMAND CONFIG [options]\n\n" + "\n".join(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rootsopt.config import Config
 from rootsopt.contact.size import size_map
 from rootsopt.dynamics.flow import Integrator
-from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import (
     BLOCK,
@@ -148,6 +148,10 @@ class Evaluator:
                 self._size(design)
         return self._report(design, outcome, time.perf_counter() - began, series)
 
+    def pair(self, design: Float[Array, " d"]) -> RotorPair:
+        """The rotor pair of `design` (config units), as last evaluated."""
+        return _build(self.model, design)[0]
+
     def prepare(self, design: Float[Array, " d"], series: bool = True) -> None:
         """Compile, in the background, what evaluating `design` (config units) takes."""
         self.prepared = True
@@ -251,9 +255,7 @@ class Evaluator:
     def _close(self, pair, tangents, transient: Transient, tolerance: float):
         """Orbit the transient leads to, of the least period, and its status."""
         settings = self.orbit, self.measures
-        orbit = jax.device_get(
-            _close(pair, tangents, transient.state, transient.period, *settings)
-        )
+        orbit = jax.device_get(_close(pair, tangents, transient.state, transient.period, *settings))
         status = self._orbit_status(orbit, transient, tolerance)
         if status is not Status.PERIODIC:
             return transient, orbit, status
@@ -408,6 +410,20 @@ _lyapunov = Program(lyapunov)
 def _divisors(period: int) -> list[int]:
     """Proper divisors, ascending."""
     return [k for k in range(1, period) if period % k == 0]
+
+
+def objective_weights(config: Config) -> dict[str, float]:
+    """Weights of the responses in the objective, by name; they add up to 1."""
+    wanted = config.objective
+    peak = PEAK_NORM if wanted.peak_norm is not None else "peak_force_N"
+    shares = {
+        "mean_force_N": wanted.mean_weight,
+        peak: wanted.peak_weight,
+        "rms_force_N": wanted.rms_weight,
+        **{line_name(order): weight for order, weight in wanted.line_weights.items()},
+    }
+    total = sum(shares.values())
+    return {name: share / total for name, share in shares.items() if share}
 
 
 def floquet(monodromy) -> list[list[float]]:

@@ -87,6 +87,23 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
     return Group(table, Text(evaluation.message))
 
 
+def attractor_table(rows: list[dict[str, Any]], lost: Mapping[str, float]) -> RenderableType:
+    """Motions that coexist, a column each; `rows` of {attractor, share, reached, status, ...} and
+    the shares of initial states from which there is none."""
+    table = _table("Motions that coexist", *(f"motion {row['attractor']}" for row in rows))
+    labels = {
+        "share": "share of initial states",
+        "reached": "reached from rest",
+        "status": "status",
+    }
+    for key in rows[0] if rows else ():
+        if key != "attractor":
+            cells = ["yes" if row[key] is True else _number(row[key]) for row in rows]
+            table.add_row(labels.get(key, _label(key)), *(c.replace("False", "no") for c in cells))
+    notes = [f"{share:.1%} of the initial states: {label}" for label, share in lost.items()]
+    return Group(table, *map(Text, notes))
+
+
 def geometry_table(record: Mapping[str, Any]) -> RenderableType:
     """Geometry of one profile, from its result record."""
     table = _table("Rotor profile", "value")

@@ -20,8 +20,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
 
     check_geometry(config)
     folder = files.ResultFolder(options.output)
-    console = Console(stderr=True)
-    with console.status("compiling and simulating") if console.is_terminal else _quiet():
+    with cli.waiting(Console(stderr=True), "compiling and simulating"):
         config, choice = auto.resolve(config)
         evaluation = Evaluator(config)()
     folder.write_text("config.yaml", config.to_yaml())
@@ -37,12 +36,6 @@ def body(config: Config, options: argparse.Namespace) -> int:
     out.print(report.evaluation_table(evaluation))
     out.print(f"results in {options.output}", soft_wrap=True)
     return cli.OK if evaluation.usable else cli.NO_RESULT
-
-
-def _quiet():
-    import contextlib
-
-    return contextlib.nullcontext()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from rootsopt.config import Config
-from rootsopt.dynamics.measures import PEAK_NORM, line_name
+from rootsopt.dynamics.measures import line_name
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Evaluation
+from rootsopt.evaluate import Evaluation, objective_weights
 from rootsopt.model import DEG, MM, Model
 from rootsopt.profiles import Geometry, geometry
 from rootsopt.programs import Program
@@ -204,18 +204,8 @@ class Problem:
         return np.asarray(by_design @ np.asarray(jacobian))
 
     def _weights(self) -> dict[str, float]:
-        wanted = self.config.objective
-        peak = PEAK_NORM if wanted.peak_norm is not None else "peak_force_N"
-        shares = {
-            "mean_force_N": wanted.mean_weight,
-            peak: wanted.peak_weight,
-            "rms_force_N": wanted.rms_weight,
-            **{line_name(order): weight for order, weight in wanted.line_weights.items()},
-        }
-        total = sum(shares.values())
-        return {
-            k: w / total / max(self.baseline.response[k], 1e-12) for k, w in shares.items() if w
-        }
+        weights = objective_weights(self.config)
+        return {k: w / max(self.baseline.response[k], 1e-12) for k, w in weights.items()}
 
     def point(self, design) -> NDArray[np.float64]:
         """The nearest point of the unit box to a design in config units."""

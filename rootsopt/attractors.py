@@ -1,0 +1,68 @@
+"""`python -m rootsopt.attractors CONFIG`: the motions that coexist, and where they begin."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from rootsopt import cli
+from rootsopt.config import Config
+
+PURPOSE = "Find the motions that coexist in a scene and the initial states that lead to each."
+
+
+def body(config: Config, options: argparse.Namespace) -> int:
+    """Check, search, write, print."""
+    import numpy as np
+    from rich.console import Console
+
+    from rootsopt import auto, basins, files, report
+    from rootsopt.evaluate import Evaluator
+    from rootsopt.model import check_geometry
+
+    check_geometry(config)
+    folder = files.ResultFolder(options.output)
+    with cli.waiting(Console(stderr=True), "compiling and simulating"):
+        config, choice = auto.resolve(config)
+        found = basins.find(Evaluator(config), series=True)
+    folder.write_text("config.yaml", config.to_yaml())
+    data = {
+        "attractors": found.records(),
+        "lost": found.lost,
+        "status": found.status.label,
+        "message": found.status.value,
+        "versions": files.versions(),
+    }
+    folder.write_json("result.json", choice | data)
+    rows = [{"attractor": number} | row for number, row in enumerate(found.summary(), 1)]
+    folder.write_csv("attractors.csv", files.row_columns(rows))
+    relative, rate = np.meshgrid(1e3 * found.relative, found.rate)
+    columns = {
+        "relative_rotation_mrad": relative.ravel(),
+        "relative_speed_rad_s": rate.ravel(),
+        # 0: the motion is lost.
+        "attractor": found.leads_to.ravel() + 1,
+    }
+    folder.write_csv("basins.csv", columns)
+    for number, one in enumerate(found.attractors, 1):
+        if one.evaluation.series is not None:
+            response = files.response_columns(one.evaluation.series)
+            folder.write_csv(f"response_{number}.csv", response)
+    if not options.no_figures:
+        from rootsopt.plot_basins import basin_figures
+
+        basin_figures(folder, found, config)
+    out = Console()
+    out.print(report.attractor_table(rows, found.lost))
+    if not found.status.usable:
+        out.print(f"{found.status.label}: {found.status.value}", soft_wrap=True)
+    out.print(f"results in {options.output}", soft_wrap=True)
+    return cli.OK if any(a.evaluation.usable for a in found.attractors) else cli.NO_RESULT
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return cli.run("attractors", PURPOSE, body, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

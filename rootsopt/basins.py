@@ -1,0 +1,352 @@
+"""Motions that coexist: which stable ones there are, and which initial states lead to them.
+
+Quiet and noisy motions of a Roots pair can exist side by side (Mason, Homer, Wilson, J. Sound
+Vib. 308 (2007) 431-440). A grid of initial states (ε, dε/dt) is simulated until each has settled;
+those that end on the same cycle are put together, and each cycle is closed and reported once.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from rootsopt.batch import on_all_cores
+from rootsopt.config import Config
+from rootsopt.dynamics.flow import Integrator, strobe
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.steady import BLOCK, Transient, settle, settled_within
+from rootsopt.evaluate import Evaluation, Evaluator, objective_weights
+from rootsopt.model import design_vector
+from rootsopt.programs import Program
+from rootsopt.status import Status
+
+_LONGEST = 8
+"""Longest cycle looked for, in mesh periods."""
+_APART = 0.3
+"""Scaled distance beyond which two motions are never the same."""
+_TRIES = 24
+"""Motions looked at closely, at most."""
+_DEPTHS = 3.0
+"""The grid reaches so many static penetrations into the flanks."""
+_evaluate = Evaluator.__call__
+"""One motion of a design, also for evaluators that look at several."""
+_LOST = {
+    Status.PASSED_THROUGH: "passed_through",
+    Status.SOLVER_FAILED: "solver_failed",
+    Status.NON_FINITE: "non_finite",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Attractor:
+    """One motion: its `evaluation`, the `share` of initial states on the grid that lead to it,
+    whether it is the one `reached` from rest, and its stroboscopic states (k, n), scaled."""
+
+    evaluation: Evaluation
+    share: float
+    reached: bool
+    cycle: NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class Basins:
+    """What a grid of initial states leads to.
+
+    `relative` (rad) and `rate` (rad/s): axes of the grid; `leads_to` (rates, relatives): index of
+    the attractor, or -1 where the motion is lost; `attractors`: greatest share first, the last
+    ones maybe chaotic or not settled, as their status says; `lost`: shares of initial states from
+    which there is no motion, by the label of the status; `angle_scale` (rad), `mesh_period` (s):
+    units of scaled states.
+    """
+
+    relative: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    leads_to: NDArray[np.int64]
+    attractors: tuple[Attractor, ...]
+    lost: dict[str, float]
+    angle_scale: float
+    mesh_period: float
+
+    @property
+    def status(self) -> Status:
+        """Periodic if every initial state leads to a stable periodic motion; else what stands
+        against it."""
+        for status, label in _LOST.items():
+            if self.lost.get(label):
+                return status
+        for attractor in self.attractors:
+            if attractor.evaluation.status is not Status.PERIODIC:
+                return attractor.evaluation.status
+        return Status.PERIODIC
+
+    def records(self) -> list[dict[str, Any]]:
+        """The attractors for the result file."""
+        return [
+            {"share": one.share, "reached": one.reached} | one.evaluation.record()
+            for one in self.attractors
+        ]
+
+    def summary(self) -> list[dict[str, Any]]:
+        """The attractors in a line each."""
+        rows = []
+        for one in self.attractors:
+            steady, response = one.evaluation.steady_state, one.evaluation.response
+            rows.append(
+                {
+                    "share": one.share,
+                    "reached": one.reached,
+                    "status": one.evaluation.status.label,
+                    "period": steady.get("period"),
+                    "floquet_multiplier": steady.get("floquet_multiplier"),
+                    "mean_force_N": response.get("mean_force_N"),
+                    "peak_force_N": response.get("peak_force_N"),
+                }
+            )
+        return rows
+
+
+def find(
+    evaluator: Evaluator,
+    design: Float[Array, " d"] | None = None,
+    known: Iterable[NDArray[np.float64]] = (),
+    series: bool = False,
+) -> Basins:
+    """Attractors of `design` (config units; default: the config's own) and their basins.
+
+    The grid is that of the config's `attractors` section. `known`: scaled states (n,) on motions
+    of a neighbouring design, which may have too small a basin for the grid. The numbers of the
+    attractors are those of `evaluator`, with their `series` if asked for.
+    """
+    config = evaluator.config
+    design = design_vector(config) if design is None else jnp.asarray(design)
+    rest = _evaluate(evaluator, design, None, series)
+    pair = evaluator.pair(design)
+    scale, period = float(pair.angle_scale), float(pair.mesh_period)
+    relative, rate = _axes(config, pair)
+    grid = np.stack(np.meshgrid(relative / scale, rate * period / scale), axis=-1).reshape(-1, 2)
+    starts = np.concatenate([grid, *(np.atleast_2d(state) for state in known)])
+    ends = _settled(evaluator, pair, starts)
+    found = _Sorter(evaluator, design, pair, series)
+    found.add(rest, np.zeros(grid.shape[1]))
+    for k in range(len(starts)):
+        found.place(jax.tree.map(lambda x, k=k: x[k], ends))
+    numbers = np.asarray(found.numbers[: len(grid)])
+    shares = np.bincount(numbers[numbers >= 0], minlength=len(found.evaluations)) / len(grid)
+    order = sorted(range(len(shares)), key=lambda i: (not found.periodic(i), -shares[i]))
+    attractors = tuple(
+        Attractor(found.evaluations[i], float(shares[i]), i == 0, found.cycles[i])
+        for i in order
+        if found.evaluations[i].status not in _LOST
+    )
+    rank = np.full(len(shares) + 1, -1)
+    kept = [i for i in order if found.evaluations[i].status not in _LOST]
+    rank[kept] = np.arange(len(kept))
+    lost = [label for label, number in zip(found.lost, numbers, strict=False) if number < 0]
+    return Basins(
+        relative=relative,
+        rate=rate,
+        leads_to=rank[numbers].reshape(len(rate), len(relative)),
+        attractors=attractors,
+        lost={label: lost.count(label) / len(grid) for label in dict.fromkeys(lost)},
+        angle_scale=scale,
+        mesh_period=period,
+    )
+
+
+class _Sorter:
+    """Puts ends of transients to the motions they have led to."""
+
+    def __init__(self, evaluator: Evaluator, design, pair: RotorPair, series: bool):
+        self.evaluator, self.design, self.pair, self.series = evaluator, design, pair, series
+        self.evaluations: list[Evaluation] = []
+        self.cycles: list[NDArray[np.float64]] = []
+        self.numbers: list[int] = []
+        self.lost: list[str] = []
+        self.tries = 0
+
+    def periodic(self, number: int) -> bool:
+        return self.evaluations[number].usable
+
+    def add(self, evaluation: Evaluation, end) -> int:
+        """Number of the motion of an evaluation that began at `end`: a known one or a new one."""
+        cycle = np.atleast_2d(end)
+        if evaluation.usable:
+            states = _cycle(self.pair, evaluation.state, self.evaluator.orbit)
+            cycle = np.asarray(states)[: evaluation.steady_state["period"]]
+            number = self._same(cycle[0])
+        else:
+            number = self._like(evaluation.status)
+        if number is not None:
+            return number
+        self.evaluations.append(evaluation)
+        self.cycles.append(cycle)
+        return len(self.evaluations) - 1
+
+    def place(self, end: Transient) -> None:
+        """Note the motion that a transient has led to."""
+        number, label = -1, ""
+        if not bool(end.solved):
+            label = _LOST[Status.SOLVER_FAILED]
+        elif not np.all(np.isfinite(end.state)):
+            label = _LOST[Status.NON_FINITE]
+        elif bool(end.lost):
+            label = _LOST[Status.PASSED_THROUGH]
+        else:
+            number, label = self._motion(end)
+        self.numbers.append(number)
+        self.lost.append(label)
+
+    def _motion(self, end: Transient) -> tuple[int, str]:
+        settled = int(end.period) > 0
+        number = self._same(end.state) if settled else self._like(Status.CHAOTIC)
+        if number is None and self.tries < _TRIES:
+            self.tries += 1
+            state = np.asarray(end.state, np.float64)
+            evaluation = _evaluate(self.evaluator, self.design, state, self.series)
+            number = self.add(evaluation, state)
+        if number is None:
+            return -1, Status.NOT_SETTLED.label
+        status = self.evaluations[number].status
+        return (-1, _LOST[status]) if status in _LOST else (number, "")
+
+    def _same(self, state) -> int | None:
+        """The known cycle that `state` is on, as far as a transient can tell."""
+        tolerance = float(settled_within(self.evaluator.transient.rtol))
+        best, number = np.inf, None
+        for i in filter(self.periodic, range(len(self.evaluations))):
+            memory = 1 - self.evaluations[i].steady_state["floquet_multiplier"]
+            near = min(max(10 * tolerance / max(memory, 1e-3), 0.02), _APART)
+            distance = np.min(np.max(np.abs(self.cycles[i] - state), axis=1))
+            if distance < min(near, best):
+                best, number = distance, i
+        return number
+
+    def _like(self, status: Status) -> int | None:
+        """The known motion without a cycle that has this status."""
+        for i, evaluation in enumerate(self.evaluations):
+            if evaluation.status is status and not self.periodic(i):
+                return i
+        return None
+
+
+def _axes(config: Config, pair: RotorPair) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Initial ε (rad) and dε/dt (rad/s) of the grid.
+
+    By default ε covers the play and some penetration, and dε/dt twice the speed at which the load
+    closes the play, or at which the play is crossed within a mesh period.
+    """
+    wanted = config.attractors
+    radius = config.profile.pitch_radius_mm * 1e-3
+    load = max(float(pair.load.torque), 1e-3)
+    depth = float(pair.law.depth_at(jnp.asarray(load / radius)))
+    play = (float(pair.clearance) + _DEPTHS * depth) / radius
+    if pair.gear is not None:
+        play += float(pair.gear.half_backlash)
+    reach = wanted.relative_range_mrad
+    low, high = (-play, play) if reach is None else (1e-3 * reach[0], 1e-3 * reach[1])
+    fall = np.sqrt(4 * play * load / float(pair.inertia))
+    most = 2 * max(fall, 2 * play / float(pair.mesh_period))
+    slow, fast = wanted.rate_range_rad_s or (-most, most)
+    return np.linspace(low, high, wanted.relatives), np.linspace(slow, fast, wanted.rates)
+
+
+def _settled(evaluator: Evaluator, pair: RotorPair, starts) -> Transient:
+    """Ends of the transients from scaled states (m, n), with a leading axis (m,)."""
+    how = evaluator.transient
+    dtype = pair.angle_scale.dtype
+    limit = np.asarray(max(evaluator.config.solver.max_mesh_periods // 4, 8 * BLOCK))
+    tolerance = np.asarray(settled_within(how.rtol), dtype)
+    most = evaluator.config.solver.max_orbit_periods
+    states = np.asarray(starts, dtype)
+    settings = how, tolerance, limit, most
+    if jax.default_backend() == "cpu":
+        ends = on_all_cores(lambda part: _in_turn(pair, part, *settings), states)
+    else:
+        ends = _together(pair, states, *settings)
+    return jax.device_get(ends)
+
+
+@Program
+def _in_turn(pair, states, *settings) -> Transient:
+    return jax.lax.map(lambda state: settle(pair, state, *settings), states)
+
+
+@Program
+def _together(pair, states, *settings) -> Transient:
+    return jax.vmap(lambda state: settle(pair, state, *settings))(states)
+
+
+@Program
+def _cycle(pair: RotorPair, state, how: Integrator):
+    """The states at the begin of `_LONGEST` mesh periods."""
+    return jnp.concatenate([state[None], strobe(pair, state, _LONGEST - 1, how).states])
+
+
+class AttractorEvaluator(Evaluator):
+    """An `Evaluator` of what all coexisting motions of a design come to.
+
+    With `objective.motion` `worst`, the motion counts whose weighted sum of the measures in the
+    objective is greatest, each relative to `reference` (a response, usually the baseline's; by
+    default the greatest among the motions). With `weighted`, response and gradient are averages
+    with the shares of initial states as weights; how these change with the design is not in the
+    gradient. A design from which some initial states lead to no stable periodic motion has the
+    status of what they lead to, and no gradient.
+    """
+
+    reference: dict[str, float] | None = None
+
+    def __call__(self, design=None, start=None, series=True) -> Evaluation:
+        """As `Evaluator`; `start`: scaled states (m, n) on motions of a neighbouring design."""
+        known = () if start is None else tuple(np.atleast_2d(start))
+        basins = find(self, design, known, series)
+        usable = [a for a in basins.attractors if a.evaluation.usable]
+        if not usable:
+            return _evaluate(self, design, None, series)
+        chosen = max(usable, key=self._badness(usable)).evaluation
+        if self.config.objective.motion == "weighted":
+            chosen = _averaged(chosen, usable)
+        status = basins.status
+        return dataclasses.replace(
+            chosen,
+            gradient=chosen.gradient if status.usable else {},
+            steady_state=chosen.steady_state | {"attractors": basins.summary()},
+            status=status,
+            message=status.value,
+            state=np.stack([np.asarray(a.evaluation.state) for a in usable]),
+        )
+
+    def _badness(self, attractors: list[Attractor]) -> Callable[[Attractor], float]:
+        weights = objective_weights(self.config)
+        responses = [a.evaluation.response for a in attractors]
+        reference = self.reference or {k: max(r[k] for r in responses) for k in weights}
+
+        def badness(attractor: Attractor) -> float:
+            found = attractor.evaluation.response
+            return sum(w * found[k] / max(reference[k], 1e-12) for k, w in weights.items())
+
+        return badness
+
+
+def _averaged(one: Evaluation, attractors: list[Attractor]) -> Evaluation:
+    """`one` with response and gradient averaged over the attractors by share."""
+    shares = np.array([a.share for a in attractors])
+    # On a coarse grid the only motion may be one that was known before.
+    shares = shares / shares.sum() if shares.sum() > 0 else np.ones(len(shares)) / len(shares)
+    found = [a.evaluation for a in attractors]
+
+    def average(values: list[float]) -> float:
+        return float(shares @ values)
+
+    return dataclasses.replace(
+        one,
+        response={k: average([e.response[k] for e in found]) for k in one.response},
+        gradient={
+            name: {k: average([e.gradient[name][k] for e in found]) for k in row}
+            for name, row in one.gradient.items()
+        },
+    )
