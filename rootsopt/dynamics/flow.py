@@ -282,27 +282,23 @@ def flow(
     last = jnp.maximum(solution.stats["num_accepted_steps"] - 1, 0)
 
     term = diffrax.ODETerm(derivative)
-    # The step that holds the peak is taken once more, as far as the peak; there, just before and
-    # just after it, the force is what a step begins with.
-    peak_time, rate, depth = locate_peak(lax.stop_gradient(pair), states, periods)
+    # The step that holds the peak is taken once more, as far as the peak, and from there on short
+    # steps to both sides.
+    peak_time, depth = locate_peak(lax.stop_gradient(pair), states, periods)
     holds = jnp.clip(jnp.sum(ends < peak_time), 0, last)
     peak_time = jnp.maximum(peak_time, begins[holds] + _SHORTEST)
     averages, factors = measures.values(end[count:] / periods, force_unit, top)
     sides = BESIDE_UNIT[dtype.itemsize] * jnp.asarray(BESIDE, dtype)
 
-    def begin_beside(there, side):
-        return jnp.pad(there[:count] + side * rate, (0, measures.count))
-
-    def step_between(begin, end, y, dynamic):
+    def state_and_force(begin, end, y, dynamic):
         after, slope = one_step(solver, term, begin, end, y, dynamic)
         return jnp.append(after, slope[count])
 
     if tangents is None:
-        there = step_between(begins[holds], peak_time, before[holds], dynamic)
+        there = state_and_force(begins[holds], peak_time, before[holds], dynamic)[:-1]
 
         def force_beside(side):
-            begin = peak_time + side
-            return step_between(begin, begin + _SHORTEST, begin_beside(there, side), dynamic)[-1]
+            return state_and_force(peak_time, peak_time + side, there, dynamic)[-1]
 
         forces = jax.vmap(force_beside)(sides)
         frozen = lax.stop_gradient(forces)
@@ -315,11 +311,11 @@ def flow(
         def linear_step(k, there):
             step, beside = jnp.where(k < 0, holds, k), k < -1
             side = sides[jnp.clip(-2 - k, 0, len(BESIDE) - 1)]
-            begin = jnp.where(beside, peak_time + side, begins[step])
-            end = jnp.where(beside, begin + _SHORTEST, jnp.where(k < 0, peak_time, ends[step]))
-            y = jnp.where(beside, begin_beside(there, side), before[step])
+            begin = jnp.where(beside, peak_time, begins[step])
+            end = jnp.where(beside, peak_time + side, jnp.where(k < 0, peak_time, ends[step]))
+            y = jnp.where(beside, there[: start.shape[0]], before[step])
             return linearized(
-                lambda y, dynamic: step_between(begin, end, y, dynamic), y, dynamic, moved, count
+                lambda y, dynamic: state_and_force(begin, end, y, dynamic), y, dynamic, moved, count
             )
 
         columns = count + jax.tree.leaves(moved)[0].shape[0]

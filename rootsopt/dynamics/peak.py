@@ -16,6 +16,11 @@ BESIDE = (0.0, -1.0, -2.0, 1.0, 2.0, -_WIDE, _WIDE)
 """Times just before and after a peak, in units of `BESIDE_UNIT`."""
 BESIDE_UNIT = {8: 2e-8, 4: 1e-3}
 """Mesh periods, by bytes of a number."""
+_FARTHEST = {8: 32.0, 4: 1 / 16}
+"""Distance of the vertex from the located peak that is believed, in units of `_WIDE`: where the
+states between the samples bend, the peak is located no better than to some 1e-5."""
+_ROUNDINGS = 1e5
+"""Bend of the force over `_WIDE` that is more than rounding, in roundings of the force."""
 _LEAST = 1e-9
 """Fall of the force beside a corner, relative to it; what is less may be rounding."""
 
@@ -32,10 +37,9 @@ def motion(states: Float[Array, "samples n"], place: Float[Array, ""]) -> Float[
 
 def locate_peak(
     pair: RotorPair, states: Float[Array, "samples n"], length: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, " n"], Float[Array, ""]]:
-    """Time (mesh periods) of the greatest force, the rate of change of the state there, and the
-    greatest penetration (m) at the samples, from the `states` at uniform times over `length`
-    mesh periods.
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Time (mesh periods) of the greatest force, and the greatest penetration (m) at the samples,
+    from the `states` at uniform times over `length` mesh periods.
 
     An impact's peak can be narrower than the sampling, with a corner where the damping
     saturates: it is enclosed by looking ever more closely around the greatest sample.
@@ -47,25 +51,22 @@ def locate_peak(
 
     # One loop for both, so that the contact is compiled once.
     def look(i, carry):
-        greatest, best, rate, depth = carry
+        greatest, best, depth = carry
         block = jnp.minimum(i * _BLOCK + jnp.arange(_BLOCK), samples - 1).astype(width.dtype)
         reach = (2.0 / (_BLOCK - 1)) ** (i - blocks).astype(width.dtype)
         close = jnp.clip(best + reach * spread, 0.0, samples - 1.0)
         places = jnp.where(i < blocks, block, close)
-        rates, contact = jax.vmap(lambda at: pair.derivative(at * width, motion(states, at)))(
-            places
-        )
+        contact = jax.vmap(lambda at: pair.contact_at(at * width, motion(states, at)))(places)
         top = jnp.argmax(contact.total)
         more = contact.total[top] > greatest
         greatest = jnp.where(more, contact.total[top], greatest)
         best = jnp.where(more, places[top], best)
-        rate = jnp.where(more, rates[top], rate)
-        return greatest, best, rate, jnp.maximum(depth, jnp.max(contact.depth))
+        return greatest, best, jnp.maximum(depth, jnp.max(contact.depth))
 
     least = jnp.full_like(width, -jnp.inf)
-    start = least, jnp.zeros_like(width), jnp.zeros_like(states[0]), least
-    _, best, rate, depth = lax.fori_loop(0, blocks + _ROUNDS, look, start)
-    return best * width, rate, depth
+    start = least, jnp.zeros_like(width), least
+    _, best, depth = lax.fori_loop(0, blocks + _ROUNDS, look, start)
+    return best * width, depth
 
 
 def one_sided(forces: Float[Array, "7"]) -> tuple[Float[Array, ""], Float[Array, "7"]]:
@@ -91,10 +92,15 @@ def one_sided(forces: Float[Array, "7"]) -> tuple[Float[Array, ""], Float[Array,
     share = rise / jnp.where(corner, drop, 1.0)
     at_corner = jnp.stack([none, 1 - share, none, share, none, none, none])
     bend = 2 * here - left - right
-    vertex = (right - left) / (2 * jnp.where(bend > 0, bend, jnp.inf))
-    vertex = jnp.where(jnp.abs(vertex) * _WIDE < 4, vertex, 0.0)
+    rounding = float(jnp.finfo(forces.dtype).eps) * here
+    vertex = (right - left) / (2 * jnp.where(bend > _ROUNDINGS * rounding, bend, jnp.inf))
+    vertex = jnp.where(jnp.abs(vertex) < _FARTHEST[forces.dtype.itemsize], vertex, 0.0)
     at_vertex = jnp.stack([one, none, none, none, none, -vertex / 2, vertex / 2])
-    highest = jnp.where(corner, 0, jnp.argmax(forces[:5]))
+    # A jump stands out from the slope that it makes over the wide distance.
+    line = here + (right - left) / (2 * _WIDE) * jnp.asarray(BESIDE[:5], forces.dtype)
+    smooth = jnp.max(jnp.abs(forces[:5] - line)) < bend / _WIDE + 100 * rounding
+    highest = jnp.where(corner | smooth, 0, jnp.argmax(forces[:5]))
     single = (jnp.arange(len(BESIDE)) == highest).astype(forces.dtype)
     weights = jnp.where(corner, at_corner, jnp.where(highest == 0, at_vertex, single))
-    return forces[highest], weights
+    above = jnp.where(corner | (highest != 0), 0.0, bend / 2 * vertex**2)
+    return forces[highest] + above, weights

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.flow import Flow, Integrator, flow, strobe
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.switches import with_switches
+from rootsopt.dynamics.switches import margin, with_switches
 
 BLOCK = 4
 """Mesh periods integrated between two looks at the transient."""
@@ -33,7 +33,7 @@ RESIDUAL = {"float64": 1e-9, "float32": 1e-3}
 _NEWTON_STEPS = 12
 _CLOSED = 4000
 """Residual (scaled) at which Newton stops, in roundings: 1e-12 in double precision."""
-_SMALL = 1e-6, 1e-3
+_SMALL = 1e-9, 1e-3
 """Newton step (scaled) from which on the solver's steps are kept: a thousand times its
 tolerance, but within these."""
 
@@ -184,14 +184,13 @@ def close_orbit(
         )
 
     def go_on(carry):
-        orbit, _, _, repeated, _, best = carry
-        done = orbit.newton_steps
+        orbit, _, _, repeated, improving, *_ = carry
+        open_still = (orbit.residual > closed) & ((orbit.newton_steps < 3) | improving)
         # Chosen anew, the steps depend on the state, and that leaves a floor.
-        improving = (done < 3) | (orbit.residual < 0.5 * best)
-        return (((orbit.residual > closed) & improving) | ~repeated) & (done < shots)
+        return (open_still | ~repeated) & (orbit.newton_steps < shots)
 
     def step(carry):
-        orbit, state, repeat, _, grid, best = carry
+        orbit, state, repeat, _, _, grid, best = carry
         out = shoot(state, grid, repeat, orbit.flow.peak)
         monodromy = out.slope[:count, :count]
         miss = out.end - state
@@ -203,16 +202,20 @@ def close_orbit(
         done = orbit.newton_steps + 1
         known = size < jnp.clip(1000 * how.tolerance(dtype), *_SMALL)
         following = repeat | known | (done >= shots // 3)
-        reached = jnp.where(repeat, orbit.residual, jnp.inf)
+        # Kinks are looked for again where the motion still moves them out of their steps.
+        look = following & (~repeat | (size > margin(how.tolerance(dtype))))
+        improving = residual < 0.5 * best
         orbit = orbit._replace(
             state=state, flow=out, residual=residual, monodromy=monodromy, newton_steps=done
         )
         grid = lax.cond(
-            following & ~repeat,
-            lambda: with_switches(frozen, out, length),
+            look,
+            lambda: with_switches(frozen, out, length, how.tolerance(dtype)),
             lambda: out.grid,
         )
-        return orbit, new, following, repeat, grid, jnp.minimum(best, reached)
+        # Residuals compare on the same steps only.
+        best = jnp.where(look | ~repeat, jnp.inf, jnp.minimum(best, residual))
+        return orbit, new, following, repeat, improving, grid, best
 
     # The loop holds the only copy of the integration: one shot is compiled, not two.
     infinite = jnp.asarray(jnp.inf, dtype)
@@ -229,7 +232,7 @@ def close_orbit(
         newton_steps=jnp.zeros((), int),
     )
     no = jnp.zeros((), bool)
-    start = (first, state, no, no, none.grid, infinite)
+    start = (first, state, no, no, no, none.grid, infinite)
     orbit = lax.while_loop(go_on, step, start)[0]
     slope = orbit.flow.slope
     moved = solved(jnp.eye(count, dtype=dtype) - orbit.monodromy, slope[:count, count:])

@@ -18,18 +18,28 @@ _LOOKS = 252
 """Intervals in which changes are looked for (every switch for itself)."""
 _CHANGES = 48
 """Changes found in one stretch of motion, at most."""
-_HALVINGS = 14
+_HALVINGS = 24
 _BRIEF, _PARTS = 0.05, 8
 """Changes less than `_BRIEF` mesh periods apart have `_PARTS` steps between them."""
-_ASIDE = 1e-6
-"""Half a step (mesh periods) that holds a change."""
-_APART = 1e-9
+_ASIDE = 1e-9, 1e-6
+"""Half a step (mesh periods) that holds a change: so many times the tolerance of the motion as
+`_LOOSE`, but within these. What it does to the gradients is in proportion to it."""
+_LOOSE = 1e3
+_APART = 1e-10
 """Ends of steps closer than this (mesh periods) are one."""
 
 
-def with_switches(pair: RotorPair, out: Flow, periods: Float[Array, ""]) -> Float[Array, " steps"]:
-    """The grid of `out`, integrated over `periods` mesh periods, with steps that end where the
-    equation changes from one smooth piece to another."""
+def margin(tolerance: Float[Array, ""]) -> Float[Array, ""]:
+    """Distance (mesh periods) that the changes of a motion may move from where they were found,
+    at a relative `tolerance`, without leaving their steps."""
+    return jnp.clip(_LOOSE * tolerance, *_ASIDE)
+
+
+def with_switches(
+    pair: RotorPair, out: Flow, periods: Float[Array, ""], tolerance: Float[Array, ""]
+) -> Float[Array, " steps"]:
+    """The grid of `out`, integrated over `periods` mesh periods at a relative `tolerance`, with
+    steps that end where the equation changes from one smooth piece to another."""
     samples = out.states.shape[0]
     width = periods / samples
     stride = (samples - 1) / _LOOKS
@@ -74,7 +84,8 @@ def with_switches(pair: RotorPair, out: Flow, periods: Float[Array, ""]) -> Floa
     inside = found[:, None] + jnp.where(brief < _BRIEF, brief, jnp.inf)[:, None] * share
     # A change lies inside a step too short to matter: no stage is evaluated beside it, where
     # rounding would decide on which side.
-    added = [found - _ASIDE, found + _ASIDE, inside.ravel()]
+    aside = margin(tolerance)
+    added = [found - aside, found + aside, inside.ravel()]
     merged = jnp.sort(jnp.concatenate([out.grid, *added]))
     # Nearly equal ends would make steps of no length.
     close = jnp.diff(merged, prepend=-jnp.inf) < _APART

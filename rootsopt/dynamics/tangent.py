@@ -29,34 +29,35 @@ def one_step(
     y: Float[Array, " m"],
     args: Any,
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """State after one step of `solver` from `begin` to `end`, and dy/dτ at its begin."""
+    """State after one step of `solver` from `begin` to `end`, and dy/dτ there."""
     if not isinstance(solver, diffrax.AbstractERK):
         memory = solver.init(term, begin, end, y, args)
         after = solver.step(term, begin, end, y, args, memory, made_jump=False)[0]
-        return after, term.vf(begin, y, args)
+        return after, term.vf(end, after, args)
     # The same sums as the solver's own step, without its error estimate and the machinery
     # for everything a step can be: several times cheaper to compile.
     tableau = solver.tableau
     assert isinstance(tableau, diffrax.ButcherTableau)
     stages = int(np.max(np.nonzero(tableau.b_sol))) + 1
-    lower = np.zeros((stages, stages))
+    lower = np.zeros((stages + 1, stages + 1))
     for row, entries in enumerate(tableau.a_lower[: stages - 1], start=1):
         lower[row, :row] = entries
+    # The end as one stage more, so that the equation is compiled once.
+    lower[stages, :stages] = tableau.b_sol[:stages]
     times = np.concatenate([[0.0], tableau.c])[:stages]
-    lower, times, weights = (
-        jnp.asarray(x, y.dtype) for x in (lower, times, tableau.b_sol[:stages])
-    )
+    lower, times = (jnp.asarray(x, y.dtype) for x in (lower, np.append(times, 1.0)))
     step = end - begin
 
-    def stage(slopes, row):
+    def stage(carry, row):
+        slopes, _ = carry
         index, entries, time = row
         inside = y + step * jnp.sum(entries[:, None] * slopes, axis=0)
         slope = term.vf(begin + time * step, inside, args)
-        return slopes.at[index].set(slope), None
+        return (slopes.at[index].set(slope), inside), None
 
-    slopes = jnp.zeros((stages, *y.shape), y.dtype)
-    slopes, _ = lax.scan(stage, slopes, (jnp.arange(stages), lower, times))
-    return y + step * jnp.sum(weights[:, None] * slopes, axis=0), slopes[0]
+    slopes = jnp.zeros((stages + 1, *y.shape), y.dtype)
+    (slopes, after), _ = lax.scan(stage, (slopes, y), (jnp.arange(stages + 1), lower, times))
+    return after, slopes[stages]
 
 
 class Linear(NamedTuple):
