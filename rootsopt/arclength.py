@@ -57,7 +57,7 @@ class End(enum.Enum):
     NO_GEOMETRY = "No valid profile lies beyond this point."
 
 
-class Stopped(Exception):
+class StoppedError(Exception):
     """A point cannot be had, for the reason `end`."""
 
     def __init__(self, end: End):
@@ -80,7 +80,7 @@ class Look(NamedTuple):
 
 Curve = Callable[[NDArray[np.float64], Any, bool], Look]
 """From a place (n + 1,), a memory or None, and whether to look with more care than usual, to a
-look; raises `Stopped` where there is none."""
+look; raises `StoppedError` where there is none."""
 
 
 class Spot(NamedTuple):
@@ -135,13 +135,13 @@ def corrected(
     along: NDArray[np.float64],
 ) -> Spot:
     """The point of the curve in the plane through `guess` normal to `across` (n + 1,), with the
-    tangent that points the way of `along`. Raises `Stopped`."""
+    tangent that points the way of `along`. Raises `StoppedError`."""
     place, memory, careful = guess, None, False
     last, grown = math.inf, 0
     for looks in range(1, _MOST + 1):
         look = curve(place, memory, careful)
         if not (np.all(np.isfinite(look.residual)) and np.all(np.isfinite(look.jacobian))):
-            raise Stopped(End.NON_FINITE)
+            raise StoppedError(End.NON_FINITE)
         repeated = memory is not None or look.memory is None
         if repeated and np.max(np.abs(look.residual)) <= _TOLERANCE:
             return Spot(place, tangent(look.jacobian, along), look, looks)
@@ -161,12 +161,10 @@ def corrected(
             memory = look.memory
         careful = careful or looks >= _PATIENCE
         place = place + change * min(1.0, 0.3 / size) if size > 0 else place
-    raise Stopped(End.STEP_TOO_SMALL)
+    raise StoppedError(End.STEP_TOO_SMALL)
 
 
-def tangent(
-    jacobian: NDArray[np.float64], along: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def tangent(jacobian: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unit vector (n + 1,) that `jacobian` (n, n + 1) takes to zero, pointing the way of
     `along`."""
     found = np.linalg.svd(jacobian)[2][-1]
@@ -195,7 +193,7 @@ def follow_curve(
             return Path(spots, crossings, End.MAX_POINTS)
         try:
             new = _next(curve, old, step, steps)
-        except Stopped as stop:
+        except StoppedError as stop:
             step /= 2
             if step >= steps.least:
                 continue
@@ -242,7 +240,7 @@ def _next(curve: Curve, old: Spot, step: float, steps: Steps) -> Spot:
     far = np.linalg.norm(new.place - old.place) > 2 * step
     # Along one curve the orientation changes nowhere but where another one crosses it.
     if far or new.tangent @ old.tangent < _TURN or _orientation(new) != _orientation(old):
-        raise Stopped(End.STEP_TOO_SMALL)
+        raise StoppedError(End.STEP_TOO_SMALL)
     return new
 
 
@@ -255,7 +253,7 @@ def _around_corner(curve: Curve, old: Spot, steps: Steps) -> Spot | None:
         for across in np.vstack([np.eye(len(old.place)), -np.eye(len(old.place))]):
             try:
                 new = corrected(curve, old.place + size * across, across, old.tangent)
-            except Stopped:
+            except StoppedError:
                 continue
             if _orientation(new) != _orientation(old):
                 new = new._replace(tangent=-new.tangent)
@@ -291,7 +289,7 @@ def _located(curve: Curve, old: Spot, new: Spot, test: Callable[[Spot], float]) 
         share = (low * at_high - high * at_low) / (at_high - at_low)
         try:
             spot = corrected(curve, old.place + share * chord, across, old.tangent)
-        except Stopped:
+        except StoppedError:
             break
         value = test(spot)
         if math.isfinite(value) and abs(value) < abs(test(best)):

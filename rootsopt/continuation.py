@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
-from rootsopt.arclength import End, Look, Path, Spot, Steps, Stopped, corrected, follow_curve
+from rootsopt.arclength import End, Look, Path, Spot, Steps, StoppedError, corrected, follow_curve
 from rootsopt.config import DESIGN_KEYS, Config, parse
 from rootsopt.dynamics.flow import Flow, Integrator, flow
 from rootsopt.dynamics.pair import RotorPair
@@ -142,7 +142,7 @@ class Branch:
             guess = places[0] + share * (places[1] - places[0])
             try:
                 found.append(orbits.closed(guess))
-            except Stopped:
+            except StoppedError:
                 continue
         if self.points[-1].value == value:
             found.append(self.points[-1])
@@ -206,7 +206,7 @@ def follow(
     fixed = np.eye(len(place))[-1]
     try:
         start = corrected(orbits, place, fixed, fixed)
-    except Stopped as stop:
+    except StoppedError as stop:
         raise InputError(
             f"no orbit of {period} mesh periods is near the state at `{PLACES[parameter]}` = "
             f"{value:g}: {stop.end.value} Start from the state of a periodic Evaluation"
@@ -246,12 +246,12 @@ def follow_doubled(
         multipliers, vectors = np.linalg.eig(monodromy)
         flipped = np.real(vectors[:, np.argmin(np.abs(multipliers + 1))])
         across = np.append(flipped / np.linalg.norm(flipped), 0.0)
-    except Stopped:
+    except StoppedError:
         return None
     for size in _SIZES:
         try:
             start = corrected(orbits, place + size * across, across, across)
-        except Stopped:
+        except StoppedError:
             continue
         if start.look.data.half_way > 0.2 * size:
             return orbits.branch(follow_curve(orbits, start, orbits.steps, _TESTS))
@@ -323,7 +323,7 @@ class _Orbits:
         return values
 
     def closed(self, guess: NDArray[np.float64]) -> BranchPoint:
-        """The orbit near `guess` at its value of the parameter. Raises `Stopped`."""
+        """The orbit near `guess` at its value of the parameter. Raises `StoppedError`."""
         fixed = np.eye(len(guess))[-1]
         return self.point(corrected(self, guess, fixed, fixed))
 
@@ -337,15 +337,15 @@ class _Orbits:
         reach = self.unit * float(np.max(np.abs(out.states[:, 0])))
         count = len(place) - 1
         if not out.solved:
-            raise Stopped(End.SOLVER_FAILED)
+            raise StoppedError(End.SOLVER_FAILED)
         if not (np.all(np.isfinite(out.end)) and np.all(np.isfinite(out.slope[:count]))):
-            raise Stopped(End.NON_FINITE)
+            raise StoppedError(End.NON_FINITE)
         if shot.lost:
-            raise Stopped(End.LOST_MESH)
+            raise StoppedError(End.LOST_MESH)
         if out.depth > _TOO_DEEP * float(self.model.pitch_radius):
-            raise Stopped(End.TOO_DEEP)
+            raise StoppedError(End.TOO_DEEP)
         if self.model.fidelity == "map" and reach > -float(self.model.deepest):
-            raise Stopped(End.OFF_THE_MAP)
+            raise StoppedError(End.OFF_THE_MAP)
         state = _SPAN * place[:-1]
         miss = out.end - state
         monodromy = out.slope[:count, :count]
@@ -381,13 +381,13 @@ class _Orbits:
         )
 
     def _check_design(self, value: float) -> None:
-        """Raise `Stopped` where no profile can be made."""
+        """Raise `StoppedError` where no profile can be made."""
         if self.parameter in DESIGN_KEYS:
             try:
                 profile = self.config.profile.model_copy(update={self.parameter: value})
                 check_geometry(self.config.model_copy(update={"profile": profile}))
             except InputError:
-                raise Stopped(End.NO_GEOMETRY) from None
+                raise StoppedError(End.NO_GEOMETRY) from None
 
     def point(self, spot: Spot) -> BranchPoint:
         """The orbit at a spot."""
@@ -440,8 +440,7 @@ def _joined(falling: Branch, rising: Branch) -> Branch:
         dataclasses.replace(point, slope=-point.slope) for point in falling.points[:0:-1]
     )
     turned = [
-        dataclasses.replace(one, after=count - 1 - one.after)
-        for one in falling.bifurcations[::-1]
+        dataclasses.replace(one, after=count - 1 - one.after) for one in falling.bifurcations[::-1]
     ]
     moved = [dataclasses.replace(one, after=count + one.after) for one in rising.bifurcations]
     return dataclasses.replace(
