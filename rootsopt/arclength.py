@@ -15,20 +15,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-_TOLERANCE = 1e-10
+_TOLERANCE = 2e-11
 """Residual of a point on the curve."""
-_NEAR = 1e-5
+_NEAR = 1e-6
 """Newton step from which on the equations are looked at in the same way again and again."""
+_FARTHEST = 0.05
+"""Longest Newton step."""
 _PATIENCE = 4
 """Looks after which they are looked at with care."""
 _MOST = 14
 """Looks at the equations for one point."""
-_QUICK, _SLOW = 4, 7
-"""Looks up to which the step grows, and from which on it shrinks."""
-_TURN = 0.9
-"""Least cosine between the tangents of two successive points."""
-_CORNER = 3e-4, 1e-3, 3e-3, 1e-2
+_TURN, _STRAIGHT = 0.9, 0.99
+"""Least cosine between the tangents of two successive points, and from which on the step grows."""
+_ASTRAY = 0.5
+"""Greatest distance from prediction to point, in steps: what is farther is another curve."""
+_CORNER = 3e-5, 1e-4, 3e-4, 1e-3
 """Distances at which the curve is looked for beyond a corner."""
+_SAME = 1e-6
+"""Distance within which two points are the same."""
 _CLOSING = 8
 """Points after which the curve may come back to its first."""
 
@@ -101,8 +105,8 @@ class Steps:
     low: float
     high: float
     first: float = 0.01
-    least: float = 1e-5
-    greatest: float = 0.05
+    least: float = 1e-6
+    greatest: float = 0.03
     points: int = 400
 
     def __post_init__(self):
@@ -160,7 +164,7 @@ def corrected(
         elif memory is None and size <= _NEAR:
             memory = look.memory
         careful = careful or looks >= _PATIENCE
-        place = place + change * min(1.0, 0.3 / size) if size > 0 else place
+        place = place + change * min(1.0, _FARTHEST / size) if size > 0 else place
     raise StoppedError(End.STEP_TOO_SMALL)
 
 
@@ -201,24 +205,21 @@ def follow_curve(
             if beyond is None:
                 return Path(spots, crossings, stop.end)
             crossings.append((len(spots) - 1, CORNER, old))
-            spots.append(beyond)
-            step = steps.first
-            continue
+            new, step = beyond, steps.first
         for name, test in tests.items():
             if test(old) * test(new) < 0:
                 crossings.append((len(spots) - 1, name, _located(curve, old, new, test)))
         spots.append(new)
-        if _back_at_first(spots):
+        if _back_at_first(curve, spots):
             return Path(spots, crossings, End.CLOSED)
-        if new.looks <= _QUICK:
+        # Many looks are no reason to shrink: near a grazing touch every point takes as many.
+        if new.tangent @ old.tangent > _STRAIGHT:
             step = min(1.5 * step, steps.greatest)
-        elif new.looks >= _SLOW:
-            step = max(0.6 * step, steps.least)
 
 
 def _leaves(spot: Spot, steps: Steps) -> bool:
     """Whether the curve leaves the range here."""
-    value, way = spot.place[-1], spot.tangent[-1]
+    value, way = float(spot.place[-1]), float(spot.tangent[-1])
     return (value <= steps.low and way < 0) or (value >= steps.high and way > 0)
 
 
@@ -228,16 +229,16 @@ def _next(curve: Curve, old: Spot, step: float, steps: Steps) -> Spot:
     guess = old.place + step * old.tangent
     if steps.low <= guess[-1] <= steps.high:
         new = corrected(curve, guess, old.tangent, old.tangent)
-        guess = new.place
-    if not steps.low <= guess[-1] <= steps.high:
-        bound = float(np.clip(guess[-1], steps.low, steps.high))
-        share = (bound - old.place[-1]) / (guess[-1] - old.place[-1])
-        guess = old.place + share * (guess - old.place)
+    beyond = guess if new is None else new.place
+    if not steps.low <= beyond[-1] <= steps.high:
+        bound = float(np.clip(beyond[-1], steps.low, steps.high))
+        share = (bound - old.place[-1]) / (beyond[-1] - old.place[-1])
+        guess = old.place + share * (beyond - old.place)
         guess[-1] = bound
         new = corrected(curve, guess, np.eye(len(guess))[-1], old.tangent)
         new.place[-1] = bound
     assert new is not None
-    far = np.linalg.norm(new.place - old.place) > 2 * step
+    far = np.linalg.norm(new.place - guess) > _ASTRAY * step
     # Along one curve the orientation changes nowhere but where another one crosses it.
     if far or new.tangent @ old.tangent < _TURN or _orientation(new) != _orientation(old):
         raise StoppedError(End.STEP_TOO_SMALL)
@@ -266,14 +267,23 @@ def _around_corner(curve: Curve, old: Spot, steps: Steps) -> Spot | None:
 
 
 def _orientation(spot: Spot) -> float:
-    return np.sign(np.linalg.det(np.vstack([spot.look.jacobian, spot.tangent])))
+    return float(np.sign(np.linalg.det(np.vstack([spot.look.jacobian, spot.tangent]))))
 
 
-def _back_at_first(spots: list[Spot]) -> bool:
+def _back_at_first(curve: Curve, spots: list[Spot]) -> bool:
+    """Whether the first spot lies on the last step."""
     first, old, new = spots[0], spots[-2], spots[-1]
-    stride = np.linalg.norm(new.place - old.place)
-    near = np.linalg.norm(new.place - first.place) < stride
-    return len(spots) > _CLOSING and bool(near) and new.tangent @ first.tangent > 0.5
+    chord = new.place - old.place
+    share = (first.place - old.place) @ chord / (chord @ chord)
+    between = old.place + share * chord
+    far = np.linalg.norm(between - first.place) > 0.5 * np.linalg.norm(chord)
+    if len(spots) <= _CLOSING or not 0 < share <= 1 or far or new.tangent @ first.tangent < 0.5:
+        return False
+    try:
+        again = corrected(curve, between, chord / np.linalg.norm(chord), new.tangent)
+    except StoppedError:
+        return False
+    return bool(np.linalg.norm(again.place - first.place) < _SAME)
 
 
 def _located(curve: Curve, old: Spot, new: Spot, test: Callable[[Spot], float]) -> Spot:

@@ -37,7 +37,7 @@ PLACES = {
 } | {key: f"profile.{key}" for key in DESIGN_KEYS}
 """Parameters that can be followed, in the config's units, and where they stand there."""
 _GEAR = ("backlash_mm", "damping_ratio")
-_SPAN = 4.0
+_SPAN = 20.0
 """Change of the scaled state that counts as much as the whole range of the parameter."""
 _LOOKS = 504
 """Uniform times at which contact is looked for."""
@@ -47,10 +47,10 @@ _STEP = 1 / 256
 """Steps (mesh periods) are not much longer than this."""
 _TOO_DEEP = 0.02
 """Penetration, in pitch radii, beyond which a contact law means nothing."""
-_HALVED = 0.02
+_HALVED = 0.004
 """Distance (as `Steps` counts) from the state half an orbit later, where a branch that ends for
 no other reason is about to meet one of half the period."""
-_SIZES = 3e-3, 1e-2, 3e-2, 1e-3, 1e-1
+_SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
 """Distances from a bifurcation (as `Steps` counts) at which its doubled orbit is sought."""
 
 
