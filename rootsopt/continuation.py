@@ -347,8 +347,8 @@ class _Orbits:
         if self.model.fidelity == "map" and reach > -float(self.model.deepest):
             raise StoppedError(End.OFF_THE_MAP)
         state = _SPAN * place[:-1]
-        miss = out.end - state
-        monodromy = out.slope[:count, :count]
+        miss = np.asarray(out.end) - state
+        monodromy = np.asarray(out.slope)[:count, :count]
         by_share = out.slope[:count, count] * self.width / _SPAN
         seen = _Seen(
             monodromy=monodromy,
@@ -358,7 +358,7 @@ class _Orbits:
             residual=float(np.max(np.abs(miss)) / max(1.0, np.max(np.abs(state)))),
             depth=float(out.depth),
             reach=reach,
-            gap_time=_longest_gap(shot.touching) * self.period,
+            gap_time=_longest_gap(np.asarray(shot.touching)) * self.period,
         )
         jacobian = np.column_stack([monodromy - np.eye(count), by_share])
         return Look(miss / _SPAN, jacobian, shot.grid, seen)
