@@ -28,6 +28,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from matplotlib.lines import Line2D  # noqa: E402
 from matplotlib.patches import Patch  # noqa: E402
+from matplotlib.ticker import FuncFormatter  # noqa: E402
 
 from rootsopt import continuation, files  # noqa: E402
 from rootsopt.config import Config, load  # noqa: E402
@@ -38,11 +39,12 @@ from rootsopt.plot import BLUE, VERMILION  # noqa: E402
 
 STARTS = ((0.0, 0.0), (-0.2, -1.8), (-1.0, 0.0), (-3.0, 0.0), (0.8, 5.0), (-0.5, -8.0))
 """Scaled initial states tried at every value of the parameter."""
-QUIET = 0.05
+QUIET = 0.1
 """An orbit is quiet if nothing flies free for longer than this, in mesh periods."""
-POINTS, FEWEST = 120, 25
+POINTS, FEWEST = 100, 25
 """Mesh periods in all points of a branch, and the least number of points allowed."""
-MOST_BRANCHES = 8
+LONGEST, DOUBLED = 4, 2
+"""Longest orbit followed where a simulation reaches it, and where another one doubles to it."""
 CELLS = 570
 """Parts of a range in which quiet and noisy orbits are looked for."""
 LIVELY = ("scene.timing_gear.backlash_mm=0.2", "scene.timing_gear.damping_ratio=0.2")
@@ -50,7 +52,11 @@ SCENES = {
     "shipped": (),
     "livelier": LIVELY,
 }
-SLOWEST = {"shipped": 300, "livelier": 3000}
+TITLES = {
+    "shipped": "shipped scene: backlash 0.1 mm, gear damping 0.5",
+    "livelier": "livelier scene: backlash 0.2 mm, gear damping 0.2",
+}
+SLOWEST = {"shipped": 300, "livelier": 3500}
 """Lowest speed (rpm). Slower, the livelier pair bounces so often within a mesh period that its
 orbits can hardly be followed."""
 NAMES = {
@@ -109,7 +115,7 @@ def explore(
 def follow_on(diagram: Diagram, config: Config, state, period: int, forces) -> None:
     """Follow an orbit, and those it doubles to or came from, unless they are known."""
     value = continuation.value_of(config, diagram.parameter)
-    if known(diagram, value, period, forces) or len(diagram.branches) >= MOST_BRANCHES:
+    if period > LONGEST or known(diagram, value, period, forces):
         return
     try:
         first = continuation.follow(
@@ -119,14 +125,16 @@ def follow_on(diagram: Diagram, config: Config, state, period: int, forces) -> N
         print(f"{value:g}: {error}", file=sys.stderr)
         return
     queue = [first]
-    while queue and len(diagram.branches) < MOST_BRANCHES:
+    while queue:
         branch = queue.pop(0)
         diagram.branches.append(branch)
         note(diagram, branch)
         for special in branch.bifurcations:
             doubling = special.kind is Kind.PERIOD_DOUBLING
             # A longer orbit born where the simple one was unstable before is unstable too.
-            if not doubling or not any(p.stable for p in beside(branch, special)):
+            if 2 * branch.period > DOUBLED or not doubling:
+                continue
+            if not any(p.stable for p in beside(branch, special)):
                 continue
             doubled = continuation.follow_doubled(
                 branch, special, limits(diagram, 2 * branch.period)
@@ -303,7 +311,7 @@ def summary(diagrams: list[Diagram], seconds: float) -> dict[str, Any]:
             }
             for diagram in diagrams
         ],
-        "largest_residual": max(row["residual"] for row in point_rows(diagrams)),
+        "largest_residual": max((row["residual"] for row in point_rows(diagrams)), default=None),
         "seconds": seconds,
         "versions": files.versions(),
     }
@@ -377,7 +385,12 @@ def draw_grid(columns: list[list[Diagram]], titles: list[str]) -> Figure:
             for diagram in diagrams:
                 draw_branches(ax, diagram, quantity, COLORS[diagram.family])
             ax.set_yscale("log")
-            ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+            for which in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
+                which(
+                    FuncFormatter(
+                        lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "1235" else ""
+                    )
+                )
             ax.set_xlim(diagrams[0].low, diagrams[0].high)
             ax.grid(color="0.92", linewidth=0.6, which="both")
             if column == 0:
@@ -386,7 +399,7 @@ def draw_grid(columns: list[list[Diagram]], titles: list[str]) -> Figure:
         axes[1, column].set_xlabel(NAMES[diagrams[0].parameter])
     families = dict.fromkeys(d.family for diagrams in columns for d in diagrams)
     handles = legend_handles(families)
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
+    figure.legend(handles=handles, loc="outside lower center", ncols=3 * count, frameon=False)
     return figure
 
 
@@ -419,28 +432,44 @@ def draw_ranges(diagrams: list[Diagram]) -> Figure:
 # The run
 
 
-def survey(quick: bool) -> list[Diagram]:
+def survey(quick: bool) -> Iterator[Diagram]:
     configs = {
         (scene, family): load(f"configs/{family}.yaml", list(overrides))
         for scene, overrides in SCENES.items()
         for family in ("cic", "ee")
     }
     if quick:
-        return [
-            explore("livelier", configs["livelier", "cic"], "speed_rpm", 3500, 4500, 1, STARTS[1:2])
-        ]
-    diagrams = [
-        explore(scene, config, "speed_rpm", SLOWEST[scene], 6000, 12, STARTS)
+        yield explore(
+            "livelier", configs["livelier", "cic"], "speed_rpm", 3500, 4500, 1, STARTS[1:2]
+        )
+        return
+    shipped = configs["shipped", "cic"]
+    speeds = [
+        (scene, config, "speed_rpm", SLOWEST[scene], 6000, 6, STARTS[:3])
         for (scene, _), config in configs.items()
     ]
-    shipped = configs["shipped", "cic"]
-    for parameter, low, high in (
-        ("torque_N_m", 0.5, 10.0),
-        ("backlash_mm", 0.02, 0.4),
-        ("involute_length_mm", 1.0, 9.0),
+    for plan in (
+        *speeds,
+        ("shipped", shipped, "torque_N_m", 0.5, 10.0, 2, STARTS[:2]),
+        ("shipped", shipped, "backlash_mm", 0.02, 0.4, 4, STARTS[:2]),
+        ("shipped", shipped, "involute_length_mm", 1.0, 9.0, 2, STARTS[:2]),
     ):
-        diagrams.append(explore("shipped", shipped, parameter, low, high, 6, STARTS[:3]))
-    return diagrams
+        yield explore(*plan)
+
+
+def write(folder: files.ResultFolder, diagrams: list[Diagram], found: dict[str, Any]) -> None:
+    folder.write_csv("bifurcation.csv", files.row_columns(point_rows(diagrams)))
+    folder.write_csv("special_points.csv", files.row_columns(special_rows(diagrams)))
+    folder.write_json("bifurcation.json", found)
+    over_speed = [d for d in diagrams if d.parameter == "speed_rpm"]
+    scenes = list(dict.fromkeys(d.scene for d in over_speed))
+    columns = [[d for d in over_speed if d.scene == scene] for scene in scenes]
+    folder.write_figure("bifurcation_speed.png", draw_grid(columns, [TITLES[s] for s in scenes]))
+    others = [[d] for d in diagrams if d.parameter != "speed_rpm"]
+    if others:
+        figure = draw_grid(others, ["CIC, shipped scene, 3000 rpm"] * len(others))
+        folder.write_figure("bifurcation_scene.png", figure)
+    folder.write_figure("bifurcation_ranges.png", draw_ranges(over_speed))
 
 
 def main() -> int:
@@ -450,29 +479,15 @@ def main() -> int:
     options = arguments.parse_args()
     folder = files.ResultFolder(options.output)
     began = time.perf_counter()
-    diagrams = survey(options.quick)
-    found = summary(diagrams, time.perf_counter() - began)
-    folder.write_csv("bifurcation.csv", files.row_columns(point_rows(diagrams)))
-    folder.write_csv("special_points.csv", files.row_columns(special_rows(diagrams)))
-    folder.write_json("bifurcation.json", found)
-    over_speed = [d for d in diagrams if d.parameter == "speed_rpm"]
-    scenes = list(dict.fromkeys(d.scene for d in over_speed))
-    columns = [[d for d in over_speed if d.scene == scene] for scene in scenes]
-    titles = [
-        f"{scene} scene: backlash {gear.backlash_mm:g} mm, gear damping {gear.damping_ratio:g}"
-        for scene, group in zip(scenes, columns, strict=True)
-        if (gear := group[0].branches[0].config.scene.timing_gear) is not None
-    ]
-    folder.write_figure("bifurcation_speed.png", draw_grid(columns, titles))
-    others = [[d] for d in diagrams if d.parameter != "speed_rpm"]
-    if others:
-        figure = draw_grid(others, ["CIC, shipped scene, 3000 rpm"] * len(others))
-        folder.write_figure("bifurcation_scene.png", figure)
-    folder.write_figure("bifurcation_ranges.png", draw_ranges(over_speed))
-    for one in found["diagrams"]:
-        print(f"{one['scene']} {one['family']} {one['parameter']}: {one['stable']}")
-        print(f"  more than one stable orbit: {one['several_stable']}")
-    print(f"largest residual {found['largest_residual']:.1e}, {found['seconds']:.0f} s")
+    diagrams, found = [], {}
+    # Written after every diagram, so that a long run can be looked at.
+    for diagram in survey(options.quick):
+        diagrams.append(diagram)
+        found = summary(diagrams, time.perf_counter() - began)
+        write(folder, diagrams, found)
+        print(f"{diagram.scene} {diagram.family} {diagram.parameter}: {ranges(diagram)}")
+        print(f"  more than one stable orbit: {overlaps(diagram)}", flush=True)
+    print(f"largest residual {found['largest_residual']}, {found['seconds']:.0f} s")
     return 0
 
 
