@@ -39,8 +39,9 @@ from rootsopt.plot import BLUE, VERMILION  # noqa: E402
 
 STARTS = ((0.0, 0.0), (-0.2, -1.8), (-1.0, 0.0), (-3.0, 0.0), (0.8, 5.0), (-0.5, -8.0))
 """Scaled initial states tried at every value of the parameter."""
-QUIET = 0.1
-"""An orbit is quiet if nothing flies free for longer than this, in mesh periods."""
+QUIET = 4.0
+"""An orbit is quiet up to this peak force, in units of the force that carries the load at the pitch
+radius; beyond, the flanks hammer."""
 POINTS, FEWEST = 100, 25
 """Mesh periods in all points of a branch, and the least number of points allowed."""
 LONGEST, DOUBLED = 4, 2
@@ -207,13 +208,20 @@ def ranges(diagram: Diagram) -> dict[str, list[list[float]]]:
         for old, new in itertools.pairwise(branch.points):
             if not (old.stable and new.stable):
                 continue
-            (low, a), (high, b) = sorted(((old.value, old.gap_time), (new.value, new.gap_time)))
+            (low, a), (high, b) = sorted((p.value, peak_ratio(branch, p)) for p in (old, new))
             inside = (centres >= low) & (centres <= high)
-            gap = np.interp(centres[inside], [low, high], [a, b])
-            quiet[inside] |= gap <= QUIET
-            noisy[inside] |= gap > QUIET
+            ratio = np.interp(centres[inside], [low, high], [a, b])
+            quiet[inside] |= ratio <= QUIET
+            noisy[inside] |= ratio > QUIET
     found = {"quiet": quiet, "noisy": noisy, "both": quiet & noisy, "none": ~(quiet | noisy)}
     return {name: list(runs(mask, edges)) for name, mask in found.items()}
+
+
+def peak_ratio(branch: Branch, point) -> float:
+    """Peak force in units of the static one."""
+    torque = branch.config.scene.load.torque_N_m
+    torque = point.value if branch.parameter == "torque_N_m" else torque
+    return point.peak / (torque / (branch.config.profile.pitch_radius_mm * 1e-3))
 
 
 def runs(mask: np.ndarray, edges: np.ndarray) -> Iterator[list[float]]:
@@ -288,7 +296,7 @@ def orbit_row(point) -> dict[str, Any]:
 
 def summary(diagrams: list[Diagram], seconds: float) -> dict[str, Any]:
     return {
-        "quiet_longest_gap_mesh_periods": QUIET,
+        "quiet_up_to_static_forces": QUIET,
         "diagrams": [
             {
                 "scene": diagram.scene,
@@ -347,11 +355,10 @@ def draw_branches(ax, diagram: Diagram, quantity: str, color: str) -> None:
                 mfc=face, mew=1.3, zorder=4,
             )  # fmt: skip
     unsettled = sorted({value for value, status in diagram.seeds if status == "chaotic"})
-    height = 0.02 if diagram.family == "cic" else 0.05
-    ax.plot(
-        unsettled, [height] * len(unsettled), "*", color=color, ms=9, clip_on=False,
-        transform=ax.get_xaxis_transform(),
-    )  # fmt: skip
+    if unsettled:
+        height = 0.03 if diagram.family == "cic" else 0.07
+        place = {"transform": ax.get_xaxis_transform()}
+        ax.plot(unsettled, [height] * len(unsettled), "*", color=color, ms=9, **place)
 
 
 def legend_handles(families) -> list:
