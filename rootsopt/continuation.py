@@ -50,8 +50,9 @@ _TOO_DEEP = 0.02
 _HALVED = 0.004
 """Distance (as `Steps` counts) from the state half an orbit later, where a branch that ends for
 no other reason is about to meet one of half the period."""
-_SAME = 1e-7
-"""Distance from there within which it is one of half the period."""
+_SAME = 1e-5
+"""Distance from there within which it is one of half the period (states between steps are
+interpolated)."""
 _SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
 """Distances from a bifurcation (as `Steps` counts) at which its doubled orbit is sought."""
 
@@ -362,7 +363,7 @@ class _Orbits:
             reach=reach,
             gap_time=_longest_gap(np.asarray(shot.touching)) * self.period,
         )
-        if self.period % 2 == 0 and seen.half_way < _SAME and np.max(np.abs(miss)) < _SAME:
+        if self.period % 2 == 0 and seen.half_way < _SAME and seen.residual < RESIDUAL["float64"]:
             raise StoppedError(End.HALVED)
         jacobian = np.column_stack([monodromy - np.eye(count), by_share])
         return Look(miss / _SPAN, jacobian, shot.grid, seen)
