@@ -15,7 +15,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
     from rich.console import Console
 
     from rootsopt import auto, files, report
-    from rootsopt.evaluate import Evaluator
+    from rootsopt.ensemble import evaluator_for
     from rootsopt.model import check_geometry, outline_mm
 
     check_geometry(config)
@@ -23,7 +23,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
     console = Console(stderr=True)
     with console.status("compiling and simulating") if console.is_terminal else _quiet():
         config, choice = auto.resolve(config)
-        evaluation = Evaluator(config)()
+        evaluation = evaluator_for(config)()
     folder.write_text("config.yaml", config.to_yaml())
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     if evaluation.series is not None:
