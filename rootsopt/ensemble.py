@@ -139,11 +139,11 @@ class EnsembleEvaluator(Evaluator):
         """Size and seed of the ensemble."""
         return self.config.ensemble
 
-    def independent(self) -> "EnsembleEvaluator":
-        """One with another seed and `VERIFYING` times as many members, to verify what was
-        chosen by this one; it shares the model, and the compiled programs."""
+    def independent(self, number: int) -> "EnsembleEvaluator":
+        """The `number`-th of those with another seed and `VERIFYING` times as many members, to
+        judge what was chosen by this one; it shares the model, and the compiled programs."""
         settings = self.settings
-        larger = {"members": VERIFYING * settings.members, "seed": settings.seed + 1}
+        larger = {"members": VERIFYING * settings.members, "seed": settings.seed + number}
         ensemble = settings.model_copy(update=larger)
         other = EnsembleEvaluator(self.config.model_copy(update={"ensemble": ensemble}))
         other.model, other.fitted, other.prepared = self.model, self.fitted, self.prepared
@@ -329,7 +329,8 @@ class _Outcome:
 
 def _mean_and_error(values: NDArray[np.float64]):
     """Mean over the first axis of independent values, and its standard error."""
-    return np.mean(values, axis=0), np.std(values, axis=0, ddof=1) / np.sqrt(len(values))
+    spread = np.std(values, axis=0, ddof=1)
+    return np.mean(values, axis=0), spread / np.sqrt(len(values))
 
 
 def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float64]:
@@ -387,8 +388,8 @@ def fitted_slope(
     slope, *_ = np.linalg.lstsq(steps, differences, rcond=None)
     residuals = differences - steps @ slope
     variance = np.sum(residuals**2, axis=0) / (count - steps.shape[1])
-    shape = np.asarray(np.linalg.inv(steps.T @ steps), np.float64)
-    return slope.T, variance[:, None, None] * shape
+    covariance = variance[:, None, None] * np.linalg.inv(steps.T @ steps)
+    return np.asarray(slope.T, np.float64), np.asarray(covariance, np.float64)
 
 
 def run_members(

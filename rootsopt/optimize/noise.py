@@ -1,9 +1,10 @@
 """What a search owes to the noise of its objective, where that is an average over an ensemble.
 
 The best of many noisy objectives is best in part by luck. So what the search promises
-counts for nothing in the verdict: baseline and winner are averaged again, over an ensemble of
-other motions and several times as many, and the winner is accepted only if it is better
-by more than `SIGNIFICANT` combined standard errors.
+counts for nothing in the verdict: a few candidates are averaged again, over an ensemble of
+other motions and several times as many; the best of them and the baseline once more, over
+yet another; and it is accepted only if it is better by more than `SIGNIFICANT` combined
+standard errors.
 """
 
 import dataclasses
@@ -12,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from rootsopt.ensemble import ERRORS, SIGNIFICANT, EnsembleEvaluator
 from rootsopt.evaluate import Evaluation
@@ -51,11 +53,10 @@ def add_errors(rows: list[dict[str, Any]], trials: Sequence, problem: Problem) -
 
 
 def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> Verdict:
-    """Average the best candidates and the baseline again, over an independent ensemble, until
-    one is significantly better. Gradients are from ensembles of the search's size."""
-    judge = evaluator.independent()
-    judge.differentiate = False
-    baseline = judge(jnp.asarray(list(problem.baseline.design.values())))
+    """Choose among the best candidates by one larger ensemble, and compare the one chosen with
+    the baseline by another. Gradients are from ensembles of the search's size."""
+    chooser, judge = evaluator.independent(1), evaluator.independent(2)
+    chooser.differentiate = judge.differentiate = False
     settings = judge.settings
     record: dict[str, Any] = {
         "holds_up": False,
@@ -63,30 +64,39 @@ def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> 
         "seed": settings.seed,
         "required_standard_errors": SIGNIFICANT,
     }
+    tried = []
+    for searched, point in candidates(problem, trials):
+        evaluation = chooser(problem.design(point), series=False)
+        tried.append((problem.objective(evaluation), searched, point))
+    record["candidates"] = [
+        {"searched_objective": searched, "chosen_by_objective": found}
+        for found, searched, _ in tried
+    ]
+    tried = [one for one in tried if np.isfinite(one[0])]
+    if not tried:
+        return Verdict(problem, problem.baseline, None, record)
+    _, searched, point = min(tried, key=lambda one: one[0])
+    baseline = judge(jnp.asarray(list(problem.baseline.design.values())))
     if not baseline.usable:
-        return Verdict(problem, baseline, None, record | {"rejected": []})
+        return Verdict(problem, baseline, None, record)
     baseline = _with_gradient(baseline, problem.baseline)
     renewed = dataclasses.replace(problem, baseline=baseline)
-    rejected: list[dict[str, Any]] = []
-    for searched, trial in candidates(problem, trials):
-        evaluation = judge(problem.design(trial.point))
-        found = renewed.objective(evaluation)
-        errors = [standard_error(renewed, one) for one in (baseline, evaluation)]
-        combined = float(np.linalg.norm(errors))
-        holds = bool(1 - found > SIGNIFICANT * combined)
-        entry = {
-            "searched_objective": searched,
-            "verified_objective": found,
-            "combined_standard_error": combined,
-            "status": evaluation.status.label,
-            "holds_up": holds,
-        }
-        if holds:
-            search = evaluator(problem.design(trial.point), series=False)
-            evaluation = _with_gradient(evaluation, search)
-            return Verdict(renewed, baseline, evaluation, record | entry | {"rejected": rejected})
-        rejected.append(entry | {"design": evaluation.design})
-    return Verdict(renewed, baseline, None, record | {"rejected": rejected})
+    evaluation = judge(problem.design(point))
+    found = renewed.objective(evaluation)
+    errors = [standard_error(renewed, one) for one in (baseline, evaluation)]
+    combined = float(np.linalg.norm(errors))
+    holds = bool(1 - found > SIGNIFICANT * combined)
+    record |= {
+        "searched_objective": searched,
+        "verified_objective": found,
+        "combined_standard_error": combined,
+        "status": evaluation.status.label,
+        "holds_up": holds,
+    }
+    if not holds:
+        return Verdict(renewed, baseline, None, record | {"design": evaluation.design})
+    search = evaluator(problem.design(point), series=False)
+    return Verdict(renewed, baseline, _with_gradient(evaluation, search), record)
 
 
 def _with_gradient(evaluation: Evaluation, other: Evaluation) -> Evaluation:
@@ -97,26 +107,30 @@ def _with_gradient(evaluation: Evaluation, other: Evaluation) -> Evaluation:
     return dataclasses.replace(evaluation, gradient=other.gradient, steady_state=steady)
 
 
-def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, Any]]:
-    """The most promising trials, apart from each other, with the objective that the trials near
-    them give on average.
+def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[np.float64]]]:
+    """The most promising points of the unit box, apart from each other, each with the
+    objective that the trials near it give on average.
 
     Ranked by that average plus its standard error: one lucky trial among worse ones is no
     candidate.
     """
-    usable = [trial for trial in trials if trial.candidate]
+    # A start repeats the screening's trial, noise and all.
+    usable = {tuple(trial.point): trial for trial in trials if trial.candidate}
+    points = np.array(list(usable)).reshape(len(usable), -1)
+    objectives = np.array([trial.objective for trial in usable.values()])
+    errors = np.array([standard_error(problem, trial.evaluation) for trial in usable.values()])
     ranked = []
-    for trial in usable:
-        near = [t for t in usable if np.linalg.norm(t.point - trial.point) < _NEAR]
-        mean = float(np.mean([t.objective for t in near]))
-        errors = [standard_error(problem, t.evaluation) for t in near]
-        ranked.append((mean + float(np.linalg.norm(errors)) / len(near), mean, trial))
+    for point in points:
+        near = np.linalg.norm(points - point, axis=1) < _NEAR
+        mean = float(np.mean(objectives[near]))
+        error = float(np.linalg.norm(errors[near])) / np.sum(near)
+        ranked.append((mean + error, mean, point))
     ranked.sort(key=lambda entry: entry[0])
-    chosen: list[tuple[float, Any]] = []
-    for _, mean, trial in ranked:
-        apart = all(np.linalg.norm(trial.point - t.point) > _NEAR for _, t in chosen)
+    chosen: list[tuple[float, NDArray[np.float64]]] = []
+    for _, mean, point in ranked:
+        apart = all(np.linalg.norm(point - other) > _NEAR for _, other in chosen)
         if apart and mean < 1 and len(chosen) < _CANDIDATES:
-            chosen.append((mean, trial))
+            chosen.append((mean, point))
     return chosen
 
 
@@ -129,14 +143,12 @@ def message(record: dict[str, Any]) -> str:
         "Raise ensemble.members or ensemble.periods (the standard error falls with the square "
         "root of either), or optimizer.iterations."
     )
-    known = [entry for entry in record["rejected"] if np.isfinite(entry["verified_objective"])]
-    if not known:
+    found, error = record.get("verified_objective"), record.get("combined_standard_error")
+    if found is None or not np.isfinite(found):
         return f"No design promised to be better than the baseline beyond the noise. {advice}"
-    best = min(known, key=lambda entry: entry["verified_objective"])
-    found, error = best["verified_objective"], best["combined_standard_error"]
     return (
         f"The difference to the baseline is within the noise: averaged over an independent "
         f"ensemble, the best design has an objective of {found:.4g} against 1, with a combined "
-        f"standard error of {error:.2g}, and {record['required_standard_errors']:g} are asked "
-        f"for. {advice}"
+        f"standard error of {error:.2g}, and {record['required_standard_errors']:g} of these are "
+        f"asked for. {advice}"
     )
