@@ -265,16 +265,17 @@ class EnsembleEvaluator(Evaluator):
         A member that does not repeat is asked for its Lyapunov exponent, if there is one.
         """
         every = np.all(members.repeats, axis=0)
-        if self.survey:
-            return {"kind": "periodic" if every.any() else "transient"}, None
+        kind: dict[str, Any] = {"kind": "transient"}
+        if every.any():
+            kind = {"kind": "periodic", "period": int(np.argmax(every)) + 1}
+        if self.survey or (every.any() and not with_series):
+            return kind, None
         typical = int(np.argmin(np.any(members.repeats, axis=1)))
         state = jnp.asarray(members.states[typical])
         window = _lyapunov(pair, state, _CHAOS_WINDOW, self.transient)
         _, steady, _, series = _unsettled(pair, window, with_series)
         del steady["window_mesh_periods"]
-        if every.any() and steady["kind"] == "transient":
-            steady |= {"kind": "periodic", "period": int(np.argmax(every)) + 1}
-        return steady, series
+        return steady | (kind if every.any() else {}), series
 
     def _slopes(self, design, members: Members) -> tuple[Status, NDArray[np.float64] | None]:
         """A status, and (2, 3, d): gradient of each response per config unit and its standard
@@ -368,7 +369,8 @@ def neighbours(
     middle = np.clip(point, spread, 1 - spread)
     room = np.minimum(middle, 1 - middle)
     steps *= np.minimum(1.0, np.min(room / np.maximum(np.abs(steps), 1e-12), axis=1))[:, None]
-    return np.concatenate([middle + steps, middle - steps]), steps
+    points = np.concatenate([middle + steps, middle - steps])
+    return np.clip(points, 0.0, 1.0), steps  # Nothing but rounding is clipped.
 
 
 def fitted_slope(
