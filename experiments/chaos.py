@@ -7,8 +7,8 @@ motion along a line of designs, against the average over an ensemble; (b) the de
 single motion's average, against the slope estimated from an ensemble; (c) an optimisation
 of the ensemble's average, and its verification by independent ensembles; (d) how the
 standard errors fall with the members, and whether the scatter is what they say. Writes
-chaos_line.csv, chaos_pathwise.csv, chaos_history.csv, chaos_members.csv, chaos.json and
-chaos.png.
+chaos_line.csv, chaos_pathwise.csv, chaos_history.csv, chaos_members.csv,
+chaos_gradients.csv, chaos.json and chaos.png.
 """
 
 import argparse
@@ -38,7 +38,7 @@ from rootsopt.optimize.noise import standard_error  # noqa: E402
 from rootsopt.optimize.search import Optimization, Search  # noqa: E402
 from rootsopt.programs import Program  # noqa: E402
 
-BLUE, VERMILION, GREEN, BLACK = "#0072B2", "#D55E00", "#009E73", "black"
+BLUE, VERMILION, GREEN, PURPLE, BLACK = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "black"
 SCENE = (
     "scene.load.torque_N_m=1",
     "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.1, backlash_mm: 0.4}",
@@ -67,7 +67,8 @@ QUICK = (
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """Members and mesh periods of the studies beside the optimisation."""
+    """Members and mesh periods of the studies beside the optimisation; `slopes`: designs and
+    members of each gradient."""
 
     line: int
     members: int
@@ -75,12 +76,19 @@ class Size:
     pathwise: int
     large: int
     groups: tuple[int, ...]
-    slopes: tuple[int, ...]
+    slopes: tuple[tuple[int, int], ...]
+
+
+def _slopes(designs: int, members: int, count: int) -> tuple[tuple[int, int], ...]:
+    """(designs, members) of gradients: more members, then more designs, each time twice as
+    many."""
+    more = [(designs, members * 2**k) for k in range(count)]
+    return (*more, *((designs * 2**k, members) for k in range(1, count)))
 
 
 SIZES = {
-    False: Size(33, 32, 128, 96, 512, (4, 8, 16, 32, 64), (4, 8, 16, 32)),
-    True: Size(3, 4, 8, 8, 16, (4, 8), (4,)),
+    False: Size(25, 32, 128, 96, 512, (4, 8, 16, 32, 64), _slopes(16, 4, 4)),
+    True: Size(3, 4, 8, 8, 16, (4, 8), _slopes(8, 4, 1)),
 }
 
 
@@ -145,7 +153,7 @@ def pathwise(evaluator: EnsembleEvaluator, design, size: Size) -> list[dict]:
 
 def errors_by_members(config: Config, model: Model, design, size: Size) -> list[dict]:
     """Stated standard error of the mean force, and the scatter of independent groups of
-    members, taken from one large ensemble; stated standard error of the gradient."""
+    members, taken from one large ensemble, with the standard error of that scatter."""
     evaluator = resized(config, model, members=size.large)
     design = jnp.asarray(design)
     start = evaluator(design, series=False)
@@ -156,23 +164,37 @@ def errors_by_members(config: Config, model: Model, design, size: Size) -> list[
     for members in size.groups:
         groups = means[: len(means) // members * members].reshape(-1, members)
         stated = np.std(groups, axis=1, ddof=1) / np.sqrt(members)
-        row = {
-            "members": members,
-            "groups": len(groups),
-            "stated_standard_error_N": np.sqrt(np.mean(stated**2)),
-            "scatter_of_groups_N": np.std(np.mean(groups, axis=1), ddof=1),
-            "gradient_N_per_deg": None,
-            "gradient_standard_error_N_per_deg": None,
-        }
-        if members in size.slopes:
-            few = resized(config, evaluator.model, members=members)
-            few.differentiate = True
-            found = few(design, series=False)
-            errors = found.steady_state["gradient_standard_error"]
-            key = "mean_force_N", "pressure_angle_deg"
-            row["gradient_N_per_deg"] = found.gradient[key[0]][key[1]]
-            row["gradient_standard_error_N_per_deg"] = errors[key[0]][key[1]]
-        rows.append(row)
+        scatter = np.std(np.mean(groups, axis=1), ddof=1)
+        rows.append(
+            {
+                "members": members,
+                "groups": len(groups),
+                "stated_standard_error_N": np.sqrt(np.mean(stated**2)),
+                "scatter_of_groups_N": scatter,
+                "error_of_scatter_N": scatter / np.sqrt(2 * max(len(groups) - 1, 1)),
+            }
+        )
+    return rows
+
+
+def gradients(config: Config, model: Model, design, size: Size) -> list[dict]:
+    """Gradient of the mean force by the pressure angle with its stated standard error, from
+    more members or from more designs."""
+    rows = []
+    for designs, members in size.slopes:
+        evaluator = resized(config, model, members=members, designs=designs)
+        evaluator.differentiate = True
+        found = evaluator(jnp.asarray(design), series=False)
+        errors = found.steady_state["gradient_standard_error"]
+        row, column = "mean_force_N", "pressure_angle_deg"
+        rows.append(
+            {
+                "designs": designs,
+                "members": members,
+                "gradient_N_per_deg": found.gradient[row][column],
+                "standard_error_N_per_deg": errors[row][column],
+            }
+        )
     return rows
 
 
@@ -195,7 +217,7 @@ def summary(result: Optimization) -> dict[str, Any]:
     return found
 
 
-def draw(along, slopes, rows, members, result: Optimization, estimate) -> Figure:
+def draw(along, slopes, rows, members, estimates, result: Optimization) -> Figure:
     """The four panels."""
     figure = Figure(figsize=(12.5, 9), layout="constrained", dpi=150)
     FigureCanvasAgg(figure)
@@ -217,9 +239,8 @@ def draw(along, slopes, rows, members, result: Optimization, estimate) -> Figure
     window = column(slopes, "window_mesh_periods")
     by_angle = np.abs(column(slopes, "mean_force_by_pressure_angle_N_per_deg"))
     b.semilogy(window, by_angle, "-", color=VERMILION, label="one motion, differentiated")
-    slope, error = map(abs, estimate)
-    b.axhline(slope, color=BLUE, label=f"ensemble: {estimate[0]:.1f} ± {error:.1f} N/deg")
-    b.axhspan(max(slope - error, 1e-2 * slope), slope + error, color=BLUE, alpha=0.2, lw=0)
+    slope, error = (estimates[-1][k] for k in ("gradient_N_per_deg", "standard_error_N_per_deg"))
+    b.axhline(abs(slope), color=BLUE, label=f"ensemble: {slope:.1f} ± {error:.1f} N/deg")
     b.set(xlabel="window (mesh periods)", ylabel="|d mean force / d pressure angle| (N/deg)")
     b.set_title("(b) Derivative at the baseline")
     b.legend(frameon=False)
@@ -246,17 +267,25 @@ def draw(along, slopes, rows, members, result: Optimization, estimate) -> Figure
     count = column(members, "members")
     stated = column(members, "stated_standard_error_N")
     d.loglog(count, stated, "o", color=BLUE, label="stated standard error (N)")
-    d.loglog(count, column(members, "scatter_of_groups_N"), "x", color=VERMILION, ms=8,
-             label="scatter of independent groups (N)")  # fmt: skip
-    slope_error = column(members, "gradient_standard_error_N_per_deg")
-    d.loglog(count, slope_error, "s", color=GREEN, label="of the gradient (N/deg)")
-    for values in (stated, slope_error):
-        level = np.exp(np.nanmean(np.log(values * np.sqrt(count))))
-        label = "∝ 1/√members" if values is stated else None
-        d.loglog(count, level / np.sqrt(count), ":", color="0.4", lw=1, label=label)
-    d.set(xlabel="members", ylabel="standard error of the mean force")
-    d.set_xticks(count, [f"{n:g}" for n in count])
-    d.minorticks_off()
+    d.errorbar(1.04 * count, column(members, "scatter_of_groups_N"),
+               column(members, "error_of_scatter_N"), fmt="x", color=VERMILION, ms=7, capsize=2,
+               label="scatter of independent groups (N)")  # fmt: skip
+    d.loglog(count, stated[0] * np.sqrt(count[0] / count), ":", color="0.4", lw=1,
+             label="∝ 1/√(motions)")  # fmt: skip
+    least = estimates[0]["designs"]
+    for chosen, mark, color, label in (
+        ([e for e in estimates if e["designs"] == least], "s-", GREEN, "more members each"),
+        ([e for e in estimates if e["members"] == estimates[0]["members"]], "D--", PURPLE,
+         "more designs"),
+    ):  # fmt: skip
+        motions = column(chosen, "designs") * column(chosen, "members")
+        errors = column(chosen, "standard_error_N_per_deg")
+        d.loglog(motions, errors, mark, color=color, ms=5, lw=1, label=f"gradient (N/deg): {label}")
+        d.loglog(motions, errors[0] * np.sqrt(motions[0] / motions), ":", color="0.4", lw=1)
+    d.set(
+        xlabel="motions: members, or designs × members", ylabel="standard error of the mean force"
+    )
+    d.set_ylim(0.3, None)
     d.set_title("(d) Standard error of average and gradient")
     d.legend(frameon=False)
     for ax in (a, b, c, d):
@@ -297,21 +326,24 @@ def main() -> int:
     began = time.perf_counter()
     members = errors_by_members(config, model, designs[0], size)
     seconds["members"] = time.perf_counter() - began
-    last = max((row for row in members if row["gradient_N_per_deg"]), key=lambda r: r["members"])
-    estimate = last["gradient_N_per_deg"], last["gradient_standard_error_N_per_deg"]
+    began = time.perf_counter()
+    estimates = gradients(config, model, designs[0], size)
+    seconds["gradients"] = time.perf_counter() - began
     for name, rows in (
         ("line", along), ("pathwise", slopes), ("history", result.history), ("members", members),
+        ("gradients", estimates),
     ):  # fmt: skip
         folder.write_csv(f"chaos_{name}.csv", files.row_columns(rows))
     found = summary(result) | {
         "scene": list(SCENE),
         "ensemble": config.ensemble.model_dump(),
-        "gradient_at_the_baseline_N_per_deg": estimate,
         "seconds": seconds,
         "versions": files.versions(),
     }
     folder.write_json("chaos.json", found)
-    folder.write_figure("chaos.png", draw(along, slopes, result.history, members, result, estimate))
+    folder.write_figure(
+        "chaos.png", draw(along, slopes, result.history, members, estimates, result)
+    )
     for key, value in found.items():
         print(f"{key}: {value}")
     return 0
