@@ -288,7 +288,9 @@ class EnsembleEvaluator(Evaluator):
         designs, jacobian = _around(space, design, points)
         settle = -(-self.settings.settle_periods // _AGAIN)
         for _ in range(5):
-            pairs, shapes = zip(*(_pair(self.model, near) for near in designs), strict=True)
+            with ThreadPoolExecutor(os.cpu_count()) as pool:
+                built = list(pool.map(functools.partial(_pair, self.model), designs))
+            pairs, shapes = zip(*built, strict=True)
             runs = run_members(pairs, members.states, settle, self.settings.periods, self.how)
             farthest = max(runs, key=lambda run: np.max(run.reach))
             if not self._refit(_Outcome(pairs[0], shapes[0], farthest)):  # pyright: ignore[reportArgumentType]
