@@ -298,8 +298,6 @@ class AttractorEvaluator(Evaluator):
     status of what they lead to, and no gradient.
     """
 
-    reference: dict[str, float] | None = None
-
     def __call__(self, design=None, start=None, series=True) -> Evaluation:
         """As `Evaluator`; `start`: scaled states (m, n) on motions of a neighbouring design."""
         known = () if start is None else tuple(np.atleast_2d(start))

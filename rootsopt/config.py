@@ -261,7 +261,7 @@ class EnsembleConfig(_Section):
     """Motions averaged over where a single one means nothing."""
 
     members: Annotated[int, Field(ge=4, le=100_000)] = Field(
-        32, description="motions from different initial states, per design"
+        16, description="motions from different initial states, per design"
     )
     settle_periods: Annotated[int, Field(ge=0, le=10**6)] = Field(
         64, description="mesh periods before a motion counts"
@@ -269,11 +269,13 @@ class EnsembleConfig(_Section):
     periods: Annotated[int, Field(ge=1, le=10**6)] = Field(
         64, description="mesh periods of a motion that count"
     )
-    designs: Annotated[int, Field(ge=8, le=4096)] = Field(
-        16, description="designs around one, in pairs, from which its gradient is estimated"
+    designs: Annotated[int, Field(ge=12, le=4096)] = Field(
+        32, description="designs around one, in pairs, from which its gradient is estimated"
     )
     spread: Annotated[float, Field(gt=0, le=0.5)] = Field(
-        0.05, description="standard deviation of these designs, as a share of the bounds"
+        0.1,
+        description="standard deviation of these designs, as a share of the bounds, which they "
+        "stay within",
     )
     seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of states and designs")
 

@@ -551,8 +551,11 @@ def _shoot(
     _, tangent = jax.jvp(arrays, (values,), (direction,))
     tangents = jax.tree.map(lambda x: x[None], tangent)
     out = flow(pair, state, period, how, SAMPLES, tangents, grid, repeat)
+    tolerance = how.tolerance(state.dtype)
     finer = lax.cond(
-        refine, lambda: _without_long(with_switches(pair, out, period), period), lambda: grid
+        refine,
+        lambda: _without_long(with_switches(pair, out, period, tolerance), period),
+        lambda: grid,
     )
     stride = SAMPLES // _LOOKS
     times = period * jnp.arange(_LOOKS) / _LOOKS

@@ -37,9 +37,9 @@ from rootsopt.status import Status
 
 RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 _NEARLY = 0.05
-_CHAOS_WINDOW = 128
+CHAOS_WINDOW = 128
 _THINNING = 6
-_TOO_DEEP = 0.02
+TOO_DEEP = 0.02
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,10 +102,13 @@ class Evaluation:
 class Evaluator:
     """Evaluates designs of one config; compiled programs are shared between designs.
 
-    `rtol` overrides the orbit tolerance of the config. With `survey`, a design that
+    `rtol` overrides the orbit tolerance of the config. `reference`: the response that the forces
+    in the objective are relative to, where evaluators compare motions. With `survey`, a design that
     does not settle within a quarter of the allowed transient is given up without asking
     what else its motion is: for a search over many designs.
     """
+
+    reference: dict[str, float] | None = None
 
     def __init__(self, config: Config, rtol: float | None = None, survey: bool = False):
         self.config = config
@@ -325,11 +328,11 @@ class Evaluator:
                 "orbit_steps": int(orbit.flow.steps),
             }
             series = _orbit_series(pair, orbit, period) if with_series else None
-            if float(orbit.flow.depth) > _TOO_DEEP * float(self.model.pitch_radius):
+            if float(orbit.flow.depth) > TOO_DEEP * float(self.model.pitch_radius):
                 status = Status.TOO_DEEP
         elif status is Status.NOT_SETTLED and not self.survey:
-            window = _lyapunov(pair, outcome.transient.state, _CHAOS_WINDOW, self.transient)
-            status, steady, response, series = _unsettled(pair, window, with_series)
+            window = lyapunov_program(pair, outcome.transient.state, CHAOS_WINDOW, self.transient)
+            status, steady, response, series = unsettled(pair, window, with_series)
         if status is not Status.PERIODIC:
             gradient = {}
         statistics["seconds"] = seconds
@@ -404,7 +407,7 @@ def _response(mean, square, peak) -> dict[str, float]:
 _build = Program(Model.pair_and_tangents)
 _settle = Program(settle)
 _close = Program(close_orbit)
-_lyapunov = Program(lyapunov)
+lyapunov_program = Program(lyapunov)
 
 
 def _divisors(period: int) -> list[int]:
@@ -471,7 +474,7 @@ def _orbit_series(pair: RotorPair, orbit: Orbit, period: int) -> Series:
     return _series(pair, tau, np.tile(np.asarray(orbit.flow.states), (cycles, 1)))
 
 
-def _unsettled(pair, window, with_series):
+def unsettled(pair, window, with_series):
     """Status, steady state, response and series of a motion that has not settled."""
     exponent, error = float(window.exponent), float(window.error)
     flows = window.flows
@@ -492,7 +495,7 @@ def _unsettled(pair, window, with_series):
         "kind": kind,
         "lyapunov_exponent_per_mesh_period": exponent if finite else None,
         "lyapunov_standard_error": error if finite else None,
-        "window_mesh_periods": _CHAOS_WINDOW,
+        "window_mesh_periods": CHAOS_WINDOW,
     }
     if status not in (Status.CHAOTIC, Status.NOT_SETTLED):
         return status, steady, {}, None

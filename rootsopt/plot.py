@@ -141,7 +141,7 @@ def plot_force(
         ax.set(title=name, ylabel="contact force (N)", xlim=(0, len(force) * step))
         ax.grid(color="0.92", linewidth=0.6)
         ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
-    top = max(responses[name]["peak_force_N"] for name in series)
+    top = max(max(responses[k]["peak_force_N"], np.max(series[k].force)) for k in series)
     for ax in axes:
         ax.set_ylim(0, 1.12 * top if top > 0 else 1)
     axes[-1].set_xlabel("time (ms)")

@@ -57,6 +57,8 @@ def comparison_table(
     _group(table, "response", [_objective(improvement), *response])
     for heading, *rows in _gradients(first["gradient"], second["gradient"]):
         _group(table, heading, [row[:3] for row in _pairs(*rows)])
+    for heading, *rows in _errors(first["steady_state"], second["steady_state"]):
+        _group(table, heading, [row[:3] for row in _pairs(*rows)])
     _group(table, "constraints", map(_constraint, constraints))
     _group(
         table,
@@ -80,6 +82,8 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
     _group(table, "geometry", _singles(record["geometry"]))
     _group(table, "response", _singles(record["response"]))
     for heading, rows in _gradients(record["gradient"]):
+        _group(table, heading, _singles(rows))
+    for heading, rows in _errors(record["steady_state"]):
         _group(table, heading, _singles(rows))
     steady = _singles(record["steady_state"])
     _group(table, "status", [*steady, ("status", _status(evaluation))])
@@ -133,22 +137,22 @@ def _group(table: Table, name: str, rows: _Rows) -> None:
 
 
 def _singles(values: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    return [(_label(key), _number(value)) for key, value in values.items() if _single(value)]
-
-
-def _single(value: Any) -> bool:
-    """Whether a value has room in a cell; lists and records are in the result file only."""
-    return not isinstance(value, list | tuple | dict)
+    return [(_label(key), _number(value)) for key, value in _plain(values).items()]
 
 
 def _pairs(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple[str, ...]]:
     rows = []
+    first, second = _plain(first), _plain(second)
     for key in dict.fromkeys([*first, *second]):
         a, b = first.get(key), second.get(key)
-        if not (_single(a) and _single(b)):
-            continue
         rows.append((_label(key), _number(a), _number(b), _change(a, b)))
     return rows
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries that are no tables of their own; these are in the result file only."""
+    tables = Mapping, list, tuple
+    return {key: value for key, value in values.items() if not isinstance(value, tables)}
 
 
 def _objective(improvement: Mapping[str, float]) -> tuple[str, ...]:
@@ -183,6 +187,13 @@ def _gradients(*gradients: Mapping[str, Mapping[str, float]]) -> list[tuple]:
         rows = (_per_unit(gradient.get(response, {}), unit) for gradient in gradients)
         groups.append((f"gradient of the {name}", *rows))
     return groups or [("gradient", *({} for _ in gradients))]
+
+
+def _errors(*steady_states: Mapping[str, Any]) -> list[tuple]:
+    """As `_gradients`, of the standard errors, or nothing where there are none."""
+    errors = [steady.get("gradient_standard_error", {}) for steady in steady_states]
+    groups = _gradients(*errors) if any(errors) else []
+    return [(f"standard error of the {heading}", *rows) for heading, *rows in groups]
 
 
 def _per_unit(row: Mapping[str, float], unit: str) -> dict[str, float]:

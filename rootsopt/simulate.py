@@ -15,14 +15,14 @@ def body(config: Config, options: argparse.Namespace) -> int:
     from rich.console import Console
 
     from rootsopt import auto, files, report
-    from rootsopt.evaluate import Evaluator
+    from rootsopt.evaluators import evaluator_for
     from rootsopt.model import check_geometry, outline_mm
 
     check_geometry(config)
     folder = files.ResultFolder(options.output)
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
         config, choice = auto.resolve(config)
-        evaluation = Evaluator(config)()
+        evaluation = evaluator_for(config)()
     folder.write_text("config.yaml", config.to_yaml())
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     if evaluation.series is not None:

@@ -54,8 +54,12 @@ def body(config: Config, options: argparse.Namespace) -> int:
 
 
 def _no_result(result) -> str:
+    from rootsopt.optimize import noise
+
     if not result.baseline.usable:
         return f"baseline {result.baseline.status.label}: {result.baseline.message}"
+    if message := noise.message(result.verification):
+        return message
     if result.verification.get("rejected"):
         return (
             "No better design held up when simulated again from rest at the tight tolerance. "

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from rootsopt.config import Config
 from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluation, Evaluator
+from rootsopt.evaluators import evaluator_for, without_gradient
 from rootsopt.model import design_vector
 from rootsopt.optimize.problem import Problem, Space, sobol
 from rootsopt.programs import Program
@@ -102,8 +103,11 @@ class Search:
             self.settings.iterations + 1
         )
         # The search needs a gradient and an order of designs, not the last digits.
-        self.fast = Evaluator(config, rtol=max(1e-6, config.solver.rtol), survey=True)
-        self.exact = Evaluator(config)
+        self.fast = evaluator_for(config, rtol=max(1e-6, config.solver.rtol), survey=True)
+        self.exact = evaluator_for(config)
+        # Where every objective has its noise, not to have found a better one says little.
+        self.noisy = config.objective.motion == "ensemble"
+        self.patience = np.inf if self.noisy else _PATIENCE
         self._lock, self._done, self._best = threading.Lock(), 0, float("nan")
 
     def run(self) -> Optimization:
@@ -114,6 +118,8 @@ class Search:
         if not baseline.usable:
             return Optimization(None, baseline, None, [], {})  # type: ignore[arg-type]
         self.fast.model = self.exact.model
+        # What the forces of motions that coexist are relative to.
+        self.fast.reference = self.exact.reference = baseline.response
         self.fast.fitted = self.fast.prepared = True
         self.problem = Problem.of(self.config, self.exact.model, baseline)
         start = self.problem.point(list(baseline.design.values()))
@@ -123,8 +129,17 @@ class Search:
             trials = self._side_by_side(self._screen, [(point,) for point in points])
         starts = self._starts(trials) or points[:1]
         trials += self._side_by_side(self._descend, list(enumerate(starts)))
+        rows = _history(trials)
+        if self.noisy:
+            from rootsopt.ensemble import EnsembleEvaluator
+            from rootsopt.optimize import noise
+
+            assert isinstance(self.exact, EnsembleEvaluator)
+            noise.add_errors(rows, trials, self.problem)
+            found = noise.verify(self.problem, self.exact, trials)
+            return Optimization(found.problem, found.baseline, found.optimized, rows, found.record)
         optimized, verification = self._verify(trials)
-        return Optimization(self.problem, baseline, optimized, _history(trials), verification)
+        return Optimization(self.problem, baseline, optimized, rows, verification)
 
     def _side_by_side(self, work: Callable[..., list[Trial]], tasks: Sequence) -> list[Trial]:
         """The trials of `work(evaluator, *task)` for every task, in their order. Each has its own
@@ -149,7 +164,7 @@ class Search:
         return points
 
     def _screen(self, evaluator: Evaluator, point) -> list[Trial]:
-        return [self._evaluate(evaluator, point, start=-1, iteration=0)]
+        return [self._evaluate(without_gradient(evaluator), point, start=-1, iteration=0)]
 
     def _starts(self, trials: list[Trial]) -> list[NDArray[np.float64]]:
         """The best of the screened designs that are apart from each other."""
@@ -183,7 +198,7 @@ class Search:
             last = trial
             since = 0 if trial.objective < best * (1 - _GAIN) else since + 1
             best = min(best, trial.objective)
-            if since > _PATIENCE or iteration == settings.iterations:
+            if since > self.patience or iteration == settings.iterations:
                 break
             slope = self.problem.descent(point, self.problem.slope(trial.evaluation, point))
             if np.linalg.norm(slope) < _STATIONARY:

@@ -1,0 +1,438 @@
+"""Ensembles: averages and their standard errors, gradients estimated from neighbours, and what a
+search makes of noise."""
+
+import csv
+import functools
+import io
+import itertools
+import json
+import re
+import subprocess
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt import optimize, report, simulate
+from rootsopt.config import DESIGN_KEYS, EnsembleConfig, load
+from rootsopt.ensemble import (
+    ERRORS,
+    SIGNIFICANT,
+    EnsembleEvaluator,
+    Members,
+    fitted_slope,
+    neighbours,
+)
+from rootsopt.evaluate import RESPONSES, Evaluation, Evaluator
+from rootsopt.evaluators import evaluator_for, without_gradient
+from rootsopt.optimize import noise
+from rootsopt.optimize.problem import Problem
+from rootsopt.optimize.search import Trial
+from rootsopt.status import Status
+
+PERIODIC = ("ensemble.members=8", "ensemble.settle_periods=24", "ensemble.periods=8")
+GEAR = "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.1, backlash_mm: 0.4}"
+CHAOTIC = (GEAR, "scene.load.torque_N_m=1", "objective.motion=ensemble")
+INSIDE = (30.0, 4.0, 3.0)
+
+
+def config_of(*overrides):
+    return load("configs/cic.yaml", overrides)
+
+
+def averaged(*overrides, gradient=False, survey=True, design=None):
+    """Evaluation by an ensemble, without the Lyapunov exponent unless asked for."""
+    evaluator = EnsembleEvaluator(config_of(*overrides), survey=survey)
+    if not gradient:
+        evaluator = without_gradient(evaluator)
+    return evaluator(None if design is None else jnp.array(design), series=False)
+
+
+@functools.cache
+def chaotic(seed=0, members=32, periods=32):
+    """Averages in the chaotic scene."""
+    size = f"ensemble.members={members}", f"ensemble.periods={periods}", f"ensemble.seed={seed}"
+    return averaged(*CHAOTIC, "ensemble.settle_periods=24", *size)
+
+
+def numbers(evaluation):
+    """(responses, their standard errors)."""
+    errors = [evaluation.steady_state[ERRORS[name]] for name in RESPONSES]
+    return np.array([evaluation.response[name] for name in RESPONSES]), np.array(errors)
+
+
+def rows(gradient):
+    return np.array([[gradient[name][key] for key in DESIGN_KEYS] for name in RESPONSES])
+
+
+# Where the motion is periodic
+
+
+@pytest.fixture(scope="module")
+def orbit():
+    """The closed orbit of a design inside the box."""
+    return Evaluator(config_of())(jnp.array(INSIDE), series=False)
+
+
+def test_periodic_averages_are_those_of_the_orbit(orbit):
+    """All members end on the one orbit: its mean, RMS and peak, with nearly no standard error."""
+    evaluation = averaged(*PERIODIC, survey=False, design=INSIDE)
+    assert evaluation.status is Status.AVERAGED
+    steady = evaluation.steady_state
+    assert (steady["kind"], steady["period"]) == ("periodic", 1)
+    values, errors = numbers(evaluation)
+    closed = np.array([orbit.response[name] for name in RESPONSES])
+    np.testing.assert_allclose(values, closed, rtol=3e-5)
+    assert np.all(errors < 3e-5 * closed)
+    assert steady["greatest_force_N"] == pytest.approx(closed[1], rel=1e-4)
+    assert abs(steady["mean_force_drift_N"]) < 1e-4 * closed[0]
+    assert evaluation.gradient == {}
+
+
+def test_gradient_is_that_of_the_orbit(orbit):
+    """Estimated from close neighbours it agrees with the implicit function theorem within its
+    own standard error, which is small."""
+    small = "ensemble.spread=0.005", "ensemble.designs=16"
+    evaluation = averaged(*PERIODIC, *small, gradient=True, design=INSIDE)
+    found, truth = rows(evaluation.gradient), rows(orbit.gradient)
+    errors = rows(evaluation.steady_state["gradient_standard_error"])
+    size = np.max(np.abs(truth), axis=1, keepdims=True)
+    assert np.all(errors > 0)
+    assert np.all(errors < 0.05 * size)
+    assert np.all(np.abs(found - truth) < 4 * errors + 1e-3 * size)
+
+
+def test_neighbours_are_in_pairs_inside_the_box():
+    """Opposite about the middle, which is the point except within a spread of a bound."""
+    settings = EnsembleConfig(designs=64, spread=0.1, seed=3)
+    for point in np.array([[0.5, 0.4, 0.6], [0.0, 1.0, 0.5], [0.05, 0.5, 0.97]]):
+        points, steps = neighbours(point, settings)
+        assert points.shape == (64, 3)
+        assert np.all((points >= 0) & (points <= 1))
+        middle = (points[:32] + points[32:]) / 2
+        np.testing.assert_allclose(middle, np.clip(point, 0.1, 0.9) + 0 * steps, atol=1e-12)
+        np.testing.assert_allclose(points[:32] - middle, steps, atol=1e-12)
+        assert np.linalg.matrix_rank(steps) == 3
+    _, steps = neighbours(np.full(3, 0.5), settings.model_copy(update={"designs": 2048}))
+    np.testing.assert_allclose(np.cov(steps.T), 0.01 * np.eye(3), atol=5e-4)
+
+
+def test_slope_of_a_quadratic_is_exact():
+    """Curvature cancels between opposite neighbours, and leaves no error to state."""
+    rng = np.random.default_rng(0)
+    slope, bend = rng.normal(size=(2, 3)), rng.normal(size=(2, 3, 3))
+    steps = 0.1 * rng.normal(size=(8, 3))
+    both = np.concatenate([steps, -steps])
+    values = 5 + both @ slope.T + np.einsum("ni,rij,nj->nr", both, bend, both)
+    found, covariance = fitted_slope(values, steps)
+    np.testing.assert_allclose(found, slope, atol=1e-12)
+    np.testing.assert_allclose(covariance, 0, atol=1e-20)
+
+
+def test_standard_error_of_the_slope_is_honest():
+    """Over many noisy samples the slope is right on average, and scatters as it says."""
+    rng = np.random.default_rng(1)
+    slope = np.array([[1.0, -2.0, 0.5]])
+    steps = 0.1 * rng.normal(size=(8, 3))
+    both = np.concatenate([steps, -steps])
+    samples = [
+        fitted_slope(both @ slope.T + 0.05 * rng.normal(size=(16, 1)), steps) for _ in range(2000)
+    ]
+    found = np.array([one[0][0] for one in samples])
+    stated = np.mean([np.diag(one[1][0]) for one in samples], axis=0)
+    assert np.all(np.abs(np.mean(found, axis=0) - slope[0]) < 4 * np.sqrt(stated / 2000))
+    np.testing.assert_allclose(np.var(found, axis=0), stated, rtol=0.15)
+
+
+# Where it is chaotic
+
+
+def test_chaos_is_averaged_and_named():
+    """Usable, with the kind of motion and standard errors beside the averages."""
+    evaluation = averaged(
+        *CHAOTIC, "ensemble.members=8", "ensemble.periods=16", survey=False, gradient=False
+    )
+    assert evaluation.status is Status.AVERAGED
+    assert evaluation.usable
+    steady = evaluation.steady_state
+    assert steady["kind"] == "chaotic"
+    exponent = steady["lyapunov_exponent_per_mesh_period"]
+    assert exponent > 3 * steady["lyapunov_standard_error"] > 0
+    values, errors = numbers(evaluation)
+    assert 0 < values[0] < values[2] < values[1] < steady["greatest_force_N"]
+    assert np.all((errors > 1e-3 * values) & (errors < values))
+    json.dumps(evaluation.record(), allow_nan=False)
+
+
+def test_standard_errors_are_honest():
+    """Independent ensembles differ by what their standard errors say."""
+    found = [numbers(chaotic(seed=seed)) for seed in range(4)]
+    apart = []
+    for (first, by_first), (second, by_second) in itertools.combinations(found, 2):
+        apart.append(np.abs(first - second) / np.hypot(by_first, by_second))
+    assert np.max(apart) < 4
+    # Neither are they far too large.
+    assert np.max(apart) > 0.3
+
+
+def test_standard_error_falls_with_the_members():
+    """As the square root of their number."""
+    few = np.mean([numbers(chaotic(seed=s, members=8))[1] for s in range(4)], axis=0)
+    many = np.mean([numbers(chaotic(seed=s))[1] for s in range(4)], axis=0)
+    ratio = few / many
+    assert np.all((ratio > 1.4) & (ratio < 2.8))
+
+
+def test_peak_does_not_grow_with_the_window():
+    """The mean of every period's peak is the same over long and short windows; the greatest of
+    all forces is not."""
+    short, long = chaotic(periods=8), chaotic(periods=96)
+    (a, by_a), (b, by_b) = numbers(short), numbers(long)
+    assert np.all(np.abs(a - b) < 4 * np.hypot(by_a, by_b))
+    assert long.steady_state["greatest_force_N"] > short.steady_state["greatest_force_N"]
+
+
+def test_gradient_of_chaos_has_its_standard_error():
+    """Another seed gives another estimate, which differs by what the standard errors say."""
+    size = "ensemble.members=4", "ensemble.settle_periods=16", "ensemble.periods=16"
+    both = [
+        averaged(*CHAOTIC, *size, "ensemble.spread=0.2", f"ensemble.seed={seed}", gradient=True)
+        for seed in (0, 1)
+    ]
+    first, second = (rows(one.gradient) for one in both)
+    errors = [rows(one.steady_state["gradient_standard_error"]) for one in both]
+    assert not np.array_equal(first, second)
+    # Five degrees of freedom each: 6 of these are as rare as 4 of normal ones.
+    assert np.all(np.abs(first - second) < 6 * np.hypot(*errors))
+    text = render(report.evaluation_table(both[0]))
+    assert "standard error of the gradient of the peak force" in text.replace("\n", " ")
+    json.dumps(both[0].record(), allow_nan=False)
+
+
+def render(table):
+    from rich.console import Console
+
+    console = Console(width=200, record=True, file=io.StringIO())
+    console.print(table)
+    return console.export_text()
+
+
+def test_same_seed_same_numbers():
+    """The same seed gives the same numbers to the last digit, another one others."""
+    size = "ensemble.members=4", "ensemble.settle_periods=8", "ensemble.periods=8"
+    first, again, other = (averaged(*CHAOTIC, *size, f"ensemble.seed={seed}") for seed in (5, 5, 6))
+    assert first.response == again.response
+    np.testing.assert_array_equal(first.state, again.state)
+    assert first.response != other.response
+
+
+def test_start_is_continued():
+    """From the last states of a neighbour the members go on; other shapes are refused."""
+    settings = config_of(*CHAOTIC, "ensemble.members=4", "ensemble.periods=4")
+    evaluator = without_gradient(EnsembleEvaluator(settings, survey=True))
+    first = evaluator(series=False)
+    on = evaluator(start=first.state, series=False)
+    assert on.status is Status.AVERAGED
+    assert on.response != first.response
+    with pytest.raises(ValueError, match="start"):
+        evaluator(start=np.zeros(2), series=False)
+
+
+def test_no_number_without_its_status():
+    """A member that fails fails the ensemble: no averages, no gradient."""
+    free = "scene.timing_gear=null", "scene.load.torque_N_m=4.775"
+    evaluation = averaged(*free, *PERIODIC, gradient=True)
+    assert evaluation.status is Status.PASSED_THROUGH
+    assert evaluation.message == evaluation.status.value
+    assert (evaluation.response, evaluation.gradient) == ({}, {})
+    assert evaluation.steady_state == {"kind": "transient"}
+    assert evaluation.series is None
+
+
+def test_one_member_that_fails_is_enough():
+    """The status of an ensemble is that of its worst member."""
+    yes, no = np.ones(4, bool), np.zeros(4, bool)
+    one, four = np.array([True, False, False, False]), np.ones(4)
+    sound = Members(np.ones((4, 3)), *(4 * [four]), np.ones((4, 2)), np.ones((4, 8), bool), no, yes)
+    assert sound.status is Status.AVERAGED
+    assert sound._replace(lost=one).status is Status.PASSED_THROUGH
+    assert sound._replace(solved=~one).status is Status.SOLVER_FAILED
+    assert sound._replace(means=np.full((4, 3), np.nan)).status is Status.NON_FINITE
+
+
+def test_a_neighbour_that_fails_leaves_no_gradient(monkeypatch):
+    """Nor averages: they would stand for a neighbourhood that is not there."""
+    failed = lambda self, design, members: (Status.PASSED_THROUGH, None)  # noqa: E731
+    monkeypatch.setattr(EnsembleEvaluator, "_slopes", failed)
+    evaluation = averaged(*PERIODIC, gradient=True)
+    assert evaluation.status is Status.PASSED_THROUGH
+    assert (evaluation.response, evaluation.gradient, evaluation.state) == ({}, {}, None)
+
+
+def test_evaluator_of_a_motion():
+    """`objective.motion` chooses; only an ensemble has a gradient to leave out."""
+    assert type(evaluator_for(config_of())) is Evaluator
+    evaluator = evaluator_for(config_of("objective.motion=ensemble"), survey=True)
+    assert isinstance(evaluator, EnsembleEvaluator)
+    assert evaluator.survey
+    assert evaluator.differentiate
+    assert not without_gradient(evaluator).differentiate
+    other = evaluator.independent(2)
+    assert other.settings.seed == 2
+    assert other.settings.members == 4 * evaluator.settings.members
+
+
+# The search
+
+
+def made_up(objective, error=0.02, design=(30.0, 4.0, 3.0)):
+    """An evaluation whose forces are `objective` of the baseline's, with a standard error."""
+    return Evaluation(
+        design=dict(zip(DESIGN_KEYS, map(float, design), strict=True)),
+        geometry={"area_efficiency": 0.43},
+        response={name: 100.0 * objective for name in RESPONSES},
+        gradient={},
+        steady_state={key: 100.0 * error for key in ERRORS.values()},
+        status=Status.AVERAGED,
+        message="",
+        statistics={},
+        series=None,
+    )
+
+
+def trial(point, objective, error=0.02):
+    return Trial(np.asarray(point), 0, 0, made_up(objective, error), objective, True)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    settings = config_of("objective.motion=ensemble")
+    return Problem.of(settings, Evaluator(settings).model, made_up(1.0))
+
+
+def test_a_lucky_trial_is_no_candidate_on_its_own(problem):
+    """One trial far below its near neighbours ranks behind a place where all are good; what
+    is repeated counts once."""
+    good = [trial([0.2, 0.2, 0.2 + 0.01 * k], 0.7) for k in range(4)]
+    lucky = [trial([0.8, 0.8, 0.8 + 0.01 * k], 0.9 if k else 0.5) for k in range(3)]
+    found = noise.candidates(problem, [*lucky, lucky[0], lucky[0], *good])
+    assert found[0][0] == pytest.approx(0.7)
+    np.testing.assert_allclose(found[0][1][:2], 0.2)
+    assert found[1][0] == pytest.approx((0.5 + 0.9 + 0.9) / 3)
+    assert noise.candidates(problem, [trial([0.5, 0.5, 0.5], 1.2)]) == []
+
+
+class Judge(EnsembleEvaluator):
+    """An evaluator that knows the truth about every design: 1 for the baseline's."""
+
+    def __init__(self, truth, error, config):
+        self.truth, self.error, self.config, self.asked = truth, error, config, []
+
+    def independent(self, number):
+        self.asked.append(number)
+        return self
+
+    def __call__(self, design=None, start=None, series=True):
+        base = np.allclose(np.asarray(design), INSIDE)
+        return made_up(1.0 if base else self.truth, self.error, np.asarray(design))
+
+
+@pytest.mark.parametrize(("truth", "accepted"), [(0.9, True), (0.93, False), (1.1, False)])
+def test_only_a_significant_difference_holds_up(problem, truth, accepted):
+    """0.9 is beyond three combined standard errors of 0.02·√(1 + 1), 0.93 is not; whatever the
+    search promised."""
+    judge = Judge(truth, 0.02, problem.config)
+    verdict = noise.verify(problem, judge, [trial([0.5, 0.5, 0.5], 0.4)])
+    assert judge.asked == [1, 2]
+    assert (verdict.optimized is not None) == accepted
+    record = verdict.record
+    assert record["holds_up"] == accepted
+    assert record["verified_objective"] == pytest.approx(truth)
+    assert record["combined_standard_error"] == pytest.approx(0.02 * np.sqrt(2))
+    text = noise.message(record)
+    assert "within the noise" in text
+    assert "ensemble.members" in text
+    assert f"{SIGNIFICANT:g}" in text
+    assert noise.message({"holds_up": False, "rejected": []}) == ""
+
+
+def test_nothing_promised(problem):
+    """No trial below the baseline: no verdict, and a message that says what to raise."""
+    judge = Judge(1.0, 0.02, problem.config)
+    verdict = noise.verify(problem, judge, [trial([0.5, 0.5, 0.5], 1.4)])
+    assert verdict.optimized is None
+    assert "ensemble.members" in noise.message(verdict.record)
+
+
+# Commands
+
+
+def test_optimize_a_chaotic_scene(tmp_path, capsys):
+    """A small run: significant or not, it says so; the history has its standard errors."""
+    size = "ensemble.members=4", "ensemble.designs=12", "ensemble.spread=0.1"
+    window = "ensemble.settle_periods=8", "ensemble.periods=8"
+    search = "optimizer.screening=2", "optimizer.starts=1", "optimizer.iterations=2"
+    options = itertools.chain.from_iterable(
+        ("--set", key) for key in (*CHAOTIC, *size, *window, *search)
+    )
+    code = optimize.main(["configs/cic.yaml", "-o", str(tmp_path), "--no-figures", *options])
+    result = json.loads((tmp_path / "result.json").read_text())
+    verification, text = result["verification"], capsys.readouterr().out
+    assert result["baseline"]["status"] == "averaged"
+    assert result["baseline"]["gradient"]
+    with open(tmp_path / "history.csv", newline="") as file:
+        history = list(csv.DictReader(file))
+    assert len(history) >= 3
+    assert all(0 < float(row["objective_standard_error"]) < 10 for row in history)
+    assert code == (0 if verification["holds_up"] else 3)
+    if code == 0:
+        gain = 1 - verification["verified_objective"]
+        assert gain > SIGNIFICANT * verification["combined_standard_error"]
+        assert gain == pytest.approx(result["improvement"]["objective"])
+    else:
+        assert "noise" in text
+        assert result["optimized"] is None
+
+
+def test_reached_refuses_chaos_and_names_the_option(tmp_path):
+    """A single chaotic motion is refused, with the way out."""
+    options = itertools.chain.from_iterable(
+        ("--set", key) for key in (*CHAOTIC, "objective.motion=reached")
+    )
+    command = [sys.executable, "-m", "rootsopt.optimize", "configs/cic.yaml", "--no-figures"]
+    command += ["-o", str(tmp_path), *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 3, done.stderr
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["baseline"]["status"] == "chaotic"
+    assert result["baseline"]["gradient"] == {}
+    assert re.search(r"objective\.motion\s+to\s+ensemble", done.stdout)
+
+
+def test_simulate_an_ensemble(tmp_path):
+    """Exit 0, averaged, the series of one member, and figures."""
+    size = "ensemble.members=4", "ensemble.designs=12", "ensemble.periods=16"
+    options = itertools.chain.from_iterable(("--set", key) for key in (*CHAOTIC, *size))
+    assert simulate.main(["configs/cic.yaml", "-o", str(tmp_path), *options]) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["status"] == "averaged"
+    assert set(result["steady_state"]["gradient_standard_error"]) == set(RESPONSES)
+    with open(tmp_path / "response_design.csv", newline="") as file:
+        force = [float(row["contact_force_N"]) for row in csv.DictReader(file)]
+    assert 0 < np.mean(force) < max(force)
+    assert (tmp_path / "figures" / "force.png").exists()
+
+
+def test_experiment(tmp_path):
+    """The study runs, and writes its tables and its figure."""
+    command = [sys.executable, "experiments/chaos.py", "--quick", "-o", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    data = json.loads((tmp_path / "chaos.json").read_text())
+    assert data["versions"]["rootsopt"]
+    assert data["baseline"]["lyapunov_exponent_per_mesh_period"] > 0
+    assert (tmp_path / "chaos.png").read_bytes()[:4] == b"\x89PNG"
+    for name in ("line", "pathwise", "history", "members"):
+        with open(tmp_path / f"chaos_{name}.csv", newline="") as file:
+            assert len(list(csv.DictReader(file))) >= 2
