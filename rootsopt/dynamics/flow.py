@@ -28,6 +28,9 @@ IMPLICIT = ("kvaerno3", "kvaerno5")
 
 _FIRST_STEP = 1e-3
 """First step in mesh periods; too large a one is rejected by the error control."""
+_LONGEST = 1 / 32
+"""Longest step in mesh periods. In free flight the error control would let a step pass over a
+short touch of the gear without a stage inside it."""
 _SHORTEST = 1e-9
 """Least time (mesh periods) between the beginning of a step and a peak inside it."""
 
@@ -61,10 +64,12 @@ class Integrator(eqx.Module):
         # across a kink, and a repeated step cannot be made shorter.
         return method(scan_kind=loops, root_finder=optimistix.Newton(rtol=rtol, atol=rtol))
 
-    def controller(self, dtype: Any) -> diffrax.PIDController:
-        """Step size control of states of type `dtype`."""
+    def controller(
+        self, dtype: Any, periods: Float[Array, ""] | float = 1.0
+    ) -> diffrax.PIDController:
+        """Step size control of states of type `dtype` over an interval of `periods`."""
         rtol = self.tolerance(dtype)
-        return diffrax.PIDController(rtol=rtol, atol=rtol)
+        return diffrax.PIDController(rtol=rtol, atol=rtol, dtmax=_LONGEST / periods)
 
 
 class Strobe(NamedTuple):
@@ -269,7 +274,9 @@ def flow(
                 diffrax.SubSaveAt(t1=True),
             ]
         ),
-        stepsize_controller=StepGrid(pid=how.controller(dtype), ends=ends, repeat=repeated),  # pyright: ignore[reportCallIssue]
+        stepsize_controller=StepGrid(  # pyright: ignore[reportCallIssue]
+            pid=how.controller(dtype, periods), ends=ends, repeat=repeated
+        ),
         adjoint=diffrax.ForwardMode() if adjoint is None else adjoint,
         max_steps=how.max_steps,
         throw=False,

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.flow import Flow, Integrator, flow, strobe
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.switches import margin, with_switches
+from rootsopt.dynamics.switches import with_switches
 
 BLOCK = 4
 """Mesh periods integrated between two looks at the transient."""
@@ -31,8 +31,11 @@ falls on the end of each mesh period."""
 RESIDUAL = {"float64": 1e-9, "float32": 1e-3}
 """Largest residual (scaled) of an orbit that counts as closed, by precision."""
 _NEWTON_STEPS = 12
-_CLOSED = 4000
-"""Residual (scaled) at which Newton stops, in roundings: 1e-12 in double precision."""
+_CLOSED = 4000, 1e-3, 1e-10
+"""Residual (scaled) at which Newton stops: in roundings (1e-12 in double precision), or in
+tolerances of the motion up to a limit."""
+_LOOKS = 3
+"""Times that kinks are looked for while an orbit is closed, at most."""
 _SMALL = 1e-9, 1e-3
 """Newton step (scaled) from which on the solver's steps are kept: a thousand times its
 tolerance, but within these."""
@@ -167,12 +170,16 @@ def close_orbit(
 
     `tangents` holds d pair / d design, stacked along a leading axis. `samples` must be
     divisible by the period. Newton stops after `shots` integrations, or at the residual
-    `closed` (at least some thousand roundings). Once its steps are small those of the solver
-    are kept, with ends added where the equation is not smooth: so the map it solves is
-    smooth and closes to rounding, and its derivative is as accurate as the motion.
+    `closed` (at least some thousand roundings and a thousandth of the tolerance). Once its steps
+    are small those of the solver are kept, with ends added where the equation is not smooth: so
+    the map it solves is smooth and closes to rounding, and its derivative is as accurate as the
+    motion.
     """
     count, dtype = state.shape[0], state.dtype
-    closed = jnp.maximum(closed, _CLOSED * float(jnp.finfo(dtype).eps)).astype(dtype)
+    roundings, tolerances, most = _CLOSED
+    enough = jnp.minimum(tolerances * how.tolerance(dtype), most)
+    enough = jnp.maximum(roundings * float(jnp.finfo(dtype).eps), enough)
+    closed = jnp.maximum(closed, enough).astype(dtype)
     length = period.astype(dtype)
     measures = Measures() if measures is None else measures
     frozen = lax.stop_gradient(pair)
@@ -190,7 +197,7 @@ def close_orbit(
         return (open_still | ~repeated) & (orbit.newton_steps < shots)
 
     def step(carry):
-        orbit, state, repeat, _, _, grid, best = carry
+        orbit, state, repeat, _, _, grid, best, looks = carry
         out = shoot(state, grid, repeat, orbit.flow.peak)
         monodromy = out.slope[:count, :count]
         miss = out.end - state
@@ -202,9 +209,10 @@ def close_orbit(
         done = orbit.newton_steps + 1
         known = size < jnp.clip(1000 * how.tolerance(dtype), *_SMALL)
         following = repeat | known | (done >= shots // 3)
-        # Kinks are looked for again where the motion still moves them out of their steps.
-        look = following & (~repeat | (size > margin(how.tolerance(dtype))))
         improving = residual < 0.5 * best
+        # Kinks are looked for again where the motion has moved them out of their steps.
+        stalled = repeat & ~improving & (residual > closed) & (looks < _LOOKS)
+        look = following & (~repeat | stalled)
         orbit = orbit._replace(
             state=state, flow=out, residual=residual, monodromy=monodromy, newton_steps=done
         )
@@ -215,7 +223,8 @@ def close_orbit(
         )
         # Residuals compare on the same steps only.
         best = jnp.where(look | ~repeat, jnp.inf, jnp.minimum(best, residual))
-        return orbit, new, following, repeat, improving, grid, best
+        looks += look
+        return orbit, new, following, repeat, improving | look, grid, best, looks
 
     # The loop holds the only copy of the integration: one shot is compiled, not two.
     infinite = jnp.asarray(jnp.inf, dtype)
@@ -232,7 +241,7 @@ def close_orbit(
         newton_steps=jnp.zeros((), int),
     )
     no = jnp.zeros((), bool)
-    start = (first, state, no, no, no, none.grid, infinite)
+    start = (first, state, no, no, no, none.grid, infinite, jnp.zeros((), int))
     orbit = lax.while_loop(go_on, step, start)[0]
     slope = orbit.flow.slope
     moved = solved(jnp.eye(count, dtype=dtype) - orbit.monodromy, slope[:count, count:])

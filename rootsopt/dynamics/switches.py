@@ -29,12 +29,6 @@ _APART = 1e-10
 """Ends of steps closer than this (mesh periods) are one."""
 
 
-def margin(tolerance: Float[Array, ""]) -> Float[Array, ""]:
-    """Distance (mesh periods) that the changes of a motion may move from where they were found,
-    at a relative `tolerance`, without leaving their steps."""
-    return jnp.clip(_LOOSE * tolerance, *_ASIDE)
-
-
 def with_switches(
     pair: RotorPair, out: Flow, periods: Float[Array, ""], tolerance: Float[Array, ""]
 ) -> Float[Array, " steps"]:
@@ -84,7 +78,7 @@ def with_switches(
     inside = found[:, None] + jnp.where(brief < _BRIEF, brief, jnp.inf)[:, None] * share
     # A change lies inside a step too short to matter: no stage is evaluated beside it, where
     # rounding would decide on which side.
-    aside = margin(tolerance)
+    aside = jnp.clip(_LOOSE * tolerance, *_ASIDE)
     added = [found - aside, found + aside, inside.ravel()]
     merged = jnp.sort(jnp.concatenate([out.grid, *added]))
     # Nearly equal ends would make steps of no length.

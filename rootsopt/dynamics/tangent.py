@@ -39,25 +39,26 @@ def one_step(
     tableau = solver.tableau
     assert isinstance(tableau, diffrax.ButcherTableau)
     stages = int(np.max(np.nonzero(tableau.b_sol))) + 1
-    lower = np.zeros((stages + 1, stages + 1))
+    lower = np.zeros((stages + 1, stages))
     for row, entries in enumerate(tableau.a_lower[: stages - 1], start=1):
         lower[row, :row] = entries
     # The end as one stage more, so that the equation is compiled once.
-    lower[stages, :stages] = tableau.b_sol[:stages]
+    lower[stages] = tableau.b_sol[:stages]
     times = np.concatenate([[0.0], tableau.c])[:stages]
     lower, times = (jnp.asarray(x, y.dtype) for x in (lower, np.append(times, 1.0)))
     step = end - begin
 
     def stage(carry, row):
-        slopes, _ = carry
+        slopes, *_ = carry
         index, entries, time = row
         inside = y + step * jnp.sum(entries[:, None] * slopes, axis=0)
         slope = term.vf(begin + time * step, inside, args)
-        return (slopes.at[index].set(slope), inside), None
+        return (slopes.at[index].set(slope, mode="drop"), inside, slope), None
 
-    slopes = jnp.zeros((stages + 1, *y.shape), y.dtype)
-    (slopes, after), _ = lax.scan(stage, (slopes, y), (jnp.arange(stages + 1), lower, times))
-    return after, slopes[stages]
+    slopes = jnp.zeros((stages, *y.shape), y.dtype)
+    start = slopes, y, slopes[0]
+    (_, after, slope), _ = lax.scan(stage, start, (jnp.arange(stages + 1), lower, times))
+    return after, slope
 
 
 class Linear(NamedTuple):
