@@ -252,7 +252,12 @@ def _axes(config: Config, pair: RotorPair) -> tuple[NDArray[np.float64], NDArray
     fall = np.sqrt(4 * play * load / float(pair.inertia))
     most = 2 * max(fall, 2 * play / float(pair.mesh_period))
     slow, fast = wanted.rate_range_rad_s or (-most, most)
-    return np.linspace(low, high, wanted.relatives), np.linspace(slow, fast, wanted.rates)
+    return _spread(low, high, wanted.relatives), _spread(slow, fast, wanted.rates)
+
+
+def _spread(low: float, high: float, count: int) -> NDArray[np.float64]:
+    """So many numbers from `low` to `high`; a single one in the middle."""
+    return np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
 
 
 def _settled(evaluator: Evaluator, pair: RotorPair, starts) -> Transient:
