@@ -84,7 +84,7 @@ def test_initial_states_lead_where_a_long_simulation_ends(coexisting):
 
 def test_a_known_motion_is_not_lost_on_a_coarse_grid(coexisting):
     """One initial state finds one motion; a state on another motion brings that in."""
-    evaluator, basins = coexisting
+    _, basins = coexisting
     small = Evaluator(config_of(*COEXIST, "attractors.relatives=1", "attractors.rates=1"))
     alone = find(small)
     assert len(alone.attractors) < len(basins.attractors)

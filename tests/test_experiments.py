@@ -71,7 +71,7 @@ def test_benchmark(tmp_path, programs):
     rows = rows_of(tmp_path / "benchmark.csv")
     assert all(float(row["run_s"]) > 0 for row in rows)
     parts = {row["part"] for row in rows}
-    expected = {"scipy", "numba", "single", "batch 4", "table", "revolutions", "main job"}
+    expected = {"scipy", "numba", "single", "batch 4", "orbit", "table", "revolutions", "main job"}
     assert parts == expected
     for row in rows:
         if row["value_error"]:
@@ -82,7 +82,7 @@ def test_benchmark(tmp_path, programs):
     result = json.loads((tmp_path / "benchmark.json").read_text())
     assert set(result["not_measured"]) == {"reverse"}
     goals = {goal["target"]: goal for goal in result["targets"]}
-    assert len(result["targets"]) == 13
+    assert len(result["targets"]) == 14
     assert all(name.split(",")[0] in out for name in goals)
     for name in ("gap table (ms)", "gap table and Jacobian (ms)"):
         assert goals[name]["figure"] > 0

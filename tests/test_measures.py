@@ -67,21 +67,11 @@ def test_p_norm_tends_to_the_peak_as_stated():
     assert bias[-1] < 0.3 * bias[0]
 
 
-def test_lines_and_norm_have_one_gradient_in_both_modes():
-    """Forward and reverse mode agree to rounding."""
-    settings = "response.lines=[1, 3]", "objective.peak_norm=12", "solver.rtol=1e-10"
-    ways = [evaluated(*settings, f"solver.gradient={way}") for way in ("forward", "reverse")]
-    names = {"line_1_force_N", "line_3_force_N", "peak_norm_force_N"}
-    assert names < set(ways[0].gradient)
-    for name, row in ways[0].gradient.items():
-        other = ways[1].gradient[name]
-        scale = max(map(abs, row.values()))
-        assert [other[k] for k in row] == pytest.approx(list(row.values()), abs=1e-8 * scale)
-
-
 def test_what_is_not_asked_for_is_not_computed():
     """No lines, no norm: no quadrature for them in the program."""
-    plain, more = (Evaluator(load("configs/cic.yaml", over)) for over in ([], ["response.lines=[1]"]))
+    plain, more = (
+        Evaluator(load("configs/cic.yaml", over)) for over in ([], ["response.lines=[1]"])
+    )
     assert plain.measures.count == 2
     assert more.measures.count == 4
 
@@ -123,9 +113,10 @@ def test_objective_takes_the_lines_and_the_norm_as_weighted():
 
 
 def test_a_line_the_baseline_has_not_got_is_refused():
-    config = load("configs/cic.yaml", ["objective.line_weights={0.5: 1}"])
-    evaluator = Evaluator(config)
-    with pytest.raises(InputError, match="line_weights.*0.5.*repeats every 1 mesh periods"):
+    config = load("configs/cic.yaml", ["objective.line_weights={0.5: 1, 1: 1}"])
+    # Of the same kind as in the test before: nothing is compiled for it.
+    evaluator = Evaluator(load("configs/cic.yaml", ["response.lines=[0.5, 1, 2]"]))
+    with pytest.raises(InputError, match=r"line_weights.*0\.5.*repeats every 1 mesh periods"):
         Problem.of(config, evaluator.model, evaluator(series=False))
 
 
