@@ -181,7 +181,7 @@ FULL = (
     Curve("lively", ("lively",), "linear", tolerances=ROUGH),
     Curve("lively", ("lively",), "nodes 400", tolerances=NODES),
 )
-QUICK = (Curve("cic", ("contact",), "linear", tolerances=(1e-4, 1e-7, 1e-9)),)
+QUICK = (Curve("cic", ("contact",), "linear", tolerances=(1e-3, 1e-7, 1e-9)),)
 
 
 def say(text: str) -> None:

@@ -357,6 +357,14 @@ def test_weights_of_a_peak():
     value, found = weights(lambda t: 3 - 1e-9 * (t - 0.3) ** 2)
     assert value == pytest.approx(3)
     assert found @ (5 + 2 * times) == pytest.approx(5.6, rel=1e-4)
+    # A peak that was located some way off is still found, value and all.
+    value, found = weights(lambda t: 3 - 1e-9 * (t - 300) ** 2)
+    assert value == pytest.approx(3, rel=1e-12)
+    assert found @ (5 + 2 * times) == pytest.approx(605, rel=1e-6)
+    # A jump away from the peak is no bend.
+    value, found = weights(lambda t: np.where(t > -30, 4.0, 1.0))
+    assert value == 4
+    np.testing.assert_array_equal(found, [1, 0, 0, 0, 0, 0, 0])
     # Rising 2, falling 6 per unit around t = 0.1.
     value, found = weights(lambda t: np.minimum(5 + 2 * (t - 0.1), 5 - 6 * (t - 0.1)))
     assert value == pytest.approx(4.8)

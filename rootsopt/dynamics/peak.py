@@ -93,14 +93,15 @@ def one_sided(forces: Float[Array, "7"]) -> tuple[Float[Array, ""], Float[Array,
     at_corner = jnp.stack([none, 1 - share, none, share, none, none, none])
     bend = 2 * here - left - right
     rounding = float(jnp.finfo(forces.dtype).eps) * here
-    vertex = (right - left) / (2 * jnp.where(bend > _ROUNDINGS * rounding, bend, jnp.inf))
-    vertex = jnp.where(jnp.abs(vertex) < _FARTHEST[forces.dtype.itemsize], vertex, 0.0)
-    at_vertex = jnp.stack([one, none, none, none, none, -vertex / 2, vertex / 2])
     # A jump stands out from the slope that it makes over the wide distance.
     line = here + (right - left) / (2 * _WIDE) * jnp.asarray(BESIDE[:5], forces.dtype)
-    smooth = jnp.max(jnp.abs(forces[:5] - line)) < bend / _WIDE + 100 * rounding
+    smooth = jnp.max(jnp.abs(forces[:5] - line)) < bend / (8 * _WIDE) + 100 * rounding
+    vertex = (right - left) / (2 * jnp.where(bend > _ROUNDINGS * rounding, bend, jnp.inf))
+    near = jnp.abs(vertex) < _FARTHEST[forces.dtype.itemsize]
+    vertex = jnp.where(smooth & near, vertex, 0.0)
+    at_vertex = jnp.stack([one, none, none, none, none, -vertex / 2, vertex / 2])
     highest = jnp.where(corner | smooth, 0, jnp.argmax(forces[:5]))
     single = (jnp.arange(len(BESIDE)) == highest).astype(forces.dtype)
     weights = jnp.where(corner, at_corner, jnp.where(highest == 0, at_vertex, single))
-    above = jnp.where(corner | (highest != 0), 0.0, bend / 2 * vertex**2)
+    above = jnp.where(corner, 0.0, bend / 2 * vertex**2)
     return forces[highest] + above, weights
