@@ -9,7 +9,7 @@ optimize: $(VENV)/.run
 	$(BIN)/python -m rootsopt.optimize configs/cic.yaml -o results/cic
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -963,12 +963,13 @@ def whole(options: argparse.Namespace) -> int:
             run.part(name)
         if "choice" in run.known:
             run.batches("batch", (4,) if options.quick else SIZES)
-        for name in ("orbit", "table", "revolutions"):
+        for name in ("table", "revolutions"):
             run.part(name)
-        if options.quick:
-            run.failed["reverse"] = "left out of a quick run"
-        else:
-            run.part("reverse")
+        for name in ("orbit", "reverse"):
+            if options.quick:
+                run.failed[name] = "left out of a quick run"
+            else:
+                run.part(name)
         run.main_job()
         if options.gpu and "choice" in run.known:
             run.batches("gpu", GPU_SIZES)

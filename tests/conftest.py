@@ -26,6 +26,15 @@ settings.register_profile("rootsopt", deadline=None, derandomize=True, max_examp
 settings.load_profile("rootsopt")
 
 
+_LONGEST_FIRST = ("steady", "experiments", "accuracy", "ensemble", "measures", "gradients", "cli")
+
+
+def pytest_collection_modifyitems(items):
+    """Files that take longest come first, so that no process is left alone with one at the end."""
+    place = {f"test_{name}.py": number for number, name in enumerate(_LONGEST_FIRST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+
+
 def pytest_sessionfinish(session):
     """The first process, which the others inherit the folder from, removes it."""
     if not hasattr(session.config, "workerinput"):
