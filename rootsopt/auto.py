@@ -94,9 +94,10 @@ def resolve(config: Config) -> tuple[Config, dict[str, Any]]:
 def _candidates(config: Config, wanted: float, long: bool) -> Iterator[Config]:
     """Cheapest first. A map costs more to build than it saves, unless the transient is long."""
     loose, tight = 1e-2 * wanted, 1e-3 * wanted
-    if wanted >= 3e-3:
+    searched = bool(config.needs_search)
+    if wanted >= 3e-3 and not searched:
         yield _with(config, fidelity="linear", rtol=loose)
-    for fidelity in ("map", "search") if long else ("search",):
+    for fidelity in ("map", "search") if long and not searched else ("search",):
         for rtol in (loose, tight):
             yield _with(config, fidelity=fidelity, rtol=rtol, map_error=0.1 * wanted)
 

@@ -73,6 +73,29 @@ class RotorConfig(_Section):
     density_kg_m3: Positive = Field(description="density")
 
 
+class FrictionConfig(_Section):
+    """Coulomb friction between the flanks, with the transitions of multibody programs."""
+
+    static: Annotated[float, Field(ge=0, le=2)] = Field(0.2, description="static coefficient")
+    kinetic: Annotated[float, Field(ge=0, le=2)] = Field(0.1, description="kinetic coefficient")
+    stiction_speed_mm_s: Positive = Field(
+        100.0, description="sliding speed at which the static coefficient is reached"
+    )
+    friction_speed_mm_s: Positive = Field(
+        1000.0, description="sliding speed from which on the coefficient is the kinetic one"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self):
+        if self.friction_speed_mm_s <= self.stiction_speed_mm_s:
+            raise ValueError(
+                "`contact.friction.friction_speed_mm_s` must be greater than "
+                f"`contact.friction.stiction_speed_mm_s` = {self.stiction_speed_mm_s:g}, but is "
+                f"{self.friction_speed_mm_s:g}"
+            )
+        return self
+
+
 class ContactConfig(_Section):
     """The IMPACT contact law."""
 
@@ -84,12 +107,44 @@ class ContactConfig(_Section):
     smoothing_mm: NonNegative = Field(
         1e-4, description="rounding of the law's corners; 0 is the law as it stands"
     )
+    friction: FrictionConfig | None = Field(None, description="absent: frictionless flanks")
 
 
 class LoadConfig(_Section):
-    """What opposes rotor 2."""
+    """What opposes the rotors: a constant torque on rotor 2, or gas on both."""
 
-    torque_N_m: NonNegative = Field(description="constant torque against rotor 2")
+    torque_N_m: NonNegative | None = Field(None, description="constant torque against rotor 2")
+    pressure_difference_Pa: NonNegative | None = Field(
+        None, description="instead of a constant torque: gas pressure across the pair"
+    )
+
+    @model_validator(mode="after")
+    def _one(self):
+        if (self.torque_N_m is None) == (self.pressure_difference_Pa is None):
+            raise ValueError(
+                "`scene.load` must hold either `torque_N_m` or `pressure_difference_Pa`, but holds "
+                + ("neither" if self.torque_N_m is None else "both")
+            )
+        return self
+
+
+class MotorConfig(_Section):
+    """Motor on rotor 1, with a straight torque-speed line, for `drive: torque`."""
+
+    torque_N_m: NonNegative | None = Field(
+        None, description="torque at scene.speed_rpm; absent: what the load takes there"
+    )
+    slope_N_m_s_per_rad: Positive = Field(
+        description="torque lost for every rad/s above scene.speed_rpm"
+    )
+    inertia_kg_m2: NonNegative = Field(0.0, description="added to that of rotor 1")
+
+
+class SupportsConfig(_Section):
+    """Bearings that give way, the same for both rotors."""
+
+    stiffness_N_per_mm: Positive = Field(description="of a rotor against its housing, any direction")
+    damping_N_s_per_mm: NonNegative = Field(description="damping of the same motion")
 
 
 class TimingGearConfig(_Section):
@@ -103,10 +158,36 @@ class TimingGearConfig(_Section):
 class SceneConfig(_Section):
     """What drives and loads the pair."""
 
-    speed_rpm: Positive = Field(description="speed of rotor 1")
-    drive: Literal["prescribed"] = Field("prescribed", description="how rotor 1 is driven")
+    speed_rpm: Positive = Field(description="speed of rotor 1; of a motor, that of its torque_N_m")
+    drive: Literal["prescribed", "torque"] = Field(
+        "prescribed", description="how rotor 1 is driven: at its speed, or by scene.motor"
+    )
+    motor: MotorConfig | None = Field(None, description="belongs to drive torque")
     load: LoadConfig
     timing_gear: TimingGearConfig | None = Field(None, description="absent: flanks alone")
+    supports: SupportsConfig | None = Field(None, description="absent: rigid bearings")
+    center_distance_error_mm: Annotated[float, Field(ge=-1, le=1)] | None = Field(
+        None, description="centre distance beyond twice the pitch radius"
+    )
+    phase_error_mrad: Annotated[float, Field(ge=-100, le=100)] | None = Field(
+        None, description="relative rotation at the middle of the timing gear's backlash"
+    )
+
+    @model_validator(mode="after")
+    def _belong(self):
+        if (self.drive == "torque") != (self.motor is not None):
+            raise ValueError(
+                "`scene.motor` is missing; `scene.drive` = torque needs it, with "
+                "`slope_N_m_s_per_rad`"
+                if self.motor is None
+                else "`scene.motor` belongs to `scene.drive` = torque; remove it or set that"
+            )
+        if self.phase_error_mrad is not None and self.timing_gear is None:
+            raise ValueError(
+                "`scene.phase_error_mrad` is an error of mounting `scene.timing_gear`; add that "
+                "or remove it"
+            )
+        return self
 
 
 class SolverConfig(_Section):
@@ -357,6 +438,26 @@ class Config(_Section):
     )
     ensemble: EnsembleConfig = Field(default_factory=lambda: EnsembleConfig.model_validate({}))
     optimizer: OptimizerConfig = Field(default_factory=lambda: OptimizerConfig.model_validate({}))
+
+    @property
+    def needs_search(self) -> tuple[str, ...]:
+        """Keys of parts that need the place of contact, which only a search has."""
+        parts = {
+            "contact.friction": self.contact.friction,
+            "scene.supports": self.scene.supports,
+            "scene.center_distance_error_mm": self.scene.center_distance_error_mm,
+        }
+        return tuple(key for key, part in parts.items() if part is not None)
+
+    @model_validator(mode="after")
+    def _searched(self):
+        fidelity = self.solver.fidelity
+        if self.needs_search and fidelity not in ("search", "auto"):
+            raise ValueError(
+                f"`solver.fidelity` must be search (or auto) with `{self.needs_search[0]}`, which "
+                f"needs the place of contact, but is {fidelity}"
+            )
+        return self
 
     def to_yaml(self) -> str:
         """The resolved config, every default written out."""

@@ -161,7 +161,8 @@ class Evaluator:
         self._size(design)
         pair, tangents, _ = _build.outline(self.model, design)
         dtype = pair.angle_scale.dtype
-        state, number = jax.ShapeDtypeStruct((2,), dtype), jax.ShapeDtypeStruct((), dtype)
+        state = jax.ShapeDtypeStruct((pair.states,), dtype)
+        number = jax.ShapeDtypeStruct((), dtype)
         whole = jax.ShapeDtypeStruct((), int)
         # The one that takes longest first.
         _close.prepare(pair, tangents, state, whole, self.orbit, self.measures)
@@ -171,7 +172,7 @@ class Evaluator:
         if series:
             count = pair.lobes * SAMPLES
             times = jax.ShapeDtypeStruct((count,), float)
-            _contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, 2), dtype))
+            _contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, pair.states), dtype))
 
     def _size(self, design) -> None:
         """Make the contact map large enough for `design`, where the config leaves it open.
@@ -220,7 +221,7 @@ class Evaluator:
     def _attempt(self, design, start):
         pair, tangents, shape = _build(self.model, design)
         dtype = pair.angle_scale.dtype
-        state = np.zeros(2, dtype) if start is None else np.asarray(start, dtype)
+        state = np.zeros(pair.states, dtype) if start is None else np.asarray(start, dtype)
         how, used, steps = self.transient, 0, 0
         tolerance = float(settled_within(how.rtol))
         while True:
@@ -237,7 +238,7 @@ class Evaluator:
             used += int(transient.periods)
             steps += int(transient.steps)
             state = transient.state
-            orbit, status = None, self._transient_status(transient)
+            orbit, status = None, self._transient_status(pair, transient)
             if status is Status.NOT_SETTLED and float(transient.spread) < _NEARLY:
                 # Time is out, but the motion nearly repeats: noise of the coarse transient
                 # may be all that is left. Newton's method tells.
@@ -274,13 +275,13 @@ class Evaluator:
         return transient, orbit, status
 
     @staticmethod
-    def _transient_status(transient: Transient) -> Status | None:
+    def _transient_status(pair: RotorPair, transient: Transient) -> Status | None:
         if not bool(transient.solved):
             return Status.SOLVER_FAILED
         if not np.all(np.isfinite(transient.state)):
             return Status.NON_FINITE
         if bool(transient.lost):
-            return Status.PASSED_THROUGH
+            return lost_status(pair, transient.state)
         return None if int(transient.period) > 0 else Status.NOT_SETTLED
 
     def _orbit_status(self, orbit: Orbit, transient: Transient, tolerance: float) -> Status:
@@ -383,6 +384,13 @@ class _Outcome:
         return scale * abs(float(self.transient.state[0]))
 
 
+def lost_status(pair: RotorPair, state: NDArray[np.float64]) -> Status:
+    """What has become of a pair that is lost in the scaled `state`."""
+    if pair.drive.free and bool(pair.stalled(state)):
+        return Status.STALLED
+    return Status.PASSED_THROUGH
+
+
 def geometry_record(model: Model, shape: Geometry) -> dict[str, float]:
     """Geometry in the result file's keys and units."""
     return {
@@ -447,13 +455,17 @@ def _reverse(model: Model, design, orbit: Orbit, period, how: Integrator, measur
 
 @Program
 def _contact_series(pair: RotorPair, tau, states):
-    phi, relative, rate = pair.physical(tau, states)
-    contact = jax.vmap(pair.contact_force)(phi, relative, rate)
-    return tau * pair.mesh_period, phi, relative, rate, contact
+    pace = pair.pace(states) if pair.drive.free else jnp.ones_like(tau)
+    return pair.mesh_period, pace, pair.physical(tau, states), jax.vmap(pair.contact_at)(tau, states)
 
 
 def _series(pair: RotorPair, tau, states) -> Series:
-    time, phi, relative, rate, contact = _contact_series(pair, tau, states)
+    period, pace, (phi, relative, rate), contact = _contact_series(pair, tau, states)
+    time = period * tau
+    if pair.drive.free:
+        from scipy.integrate import cumulative_simpson  # Half a second, for motors alone.
+
+        time = period * cumulative_simpson(pace, x=tau, initial=0.0)
     double = functools.partial(np.asarray, dtype=np.float64)
     return Series(
         time=double(time),
@@ -479,10 +491,10 @@ def unsettled(pair, window, with_series):
     exponent, error = float(window.exponent), float(window.error)
     flows = window.flows
     finite = np.isfinite(np.asarray(flows.peak)).all() and np.isfinite(exponent)
-    lost = abs(float(window.state[0])) * float(pair.angle_scale) >= pair.angle_limit
+    lost = bool(pair.lost(window.state))
     kind = "transient"
     if lost:
-        status = Status.PASSED_THROUGH
+        status = lost_status(pair, window.state)
     elif not finite:
         status = Status.NON_FINITE
     elif not np.all(flows.solved):
@@ -509,7 +521,7 @@ def unsettled(pair, window, with_series):
         states = np.asarray(flows.states)[:, ::_THINNING]
         periods, samples, _ = states.shape
         tau = np.arange(periods * samples) / samples
-        series = _series(pair, tau, states.reshape(-1, 2))
+        series = _series(pair, tau, states.reshape(-1, states.shape[-1]))
     return status, steady, response, series
 
 

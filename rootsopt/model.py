@@ -23,7 +23,17 @@ from rootsopt.contact.segments import NodeContact
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import GapFunction, RotorPair, SearchContact
-from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
+from rootsopt.dynamics.parts import (
+    ConstantLoad,
+    Drive,
+    Friction,
+    GasLoad,
+    Load,
+    MotorDrive,
+    PrescribedDrive,
+    Supports,
+    TimingGear,
+)
 from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, Geometry, Profile, geometry, outline
 from rootsopt.programs import Program
@@ -63,6 +73,11 @@ class Model(eqx.Module):
     gear: TimingGear | None
     gear_damping_ratio: Float[Array, ""]
     deepest: Float[Array, ""]
+    pressure: Float[Array, ""] | None = None
+    motor: MotorDrive | None = None
+    friction: Friction | None = None
+    supports: Supports | None = None
+    center_distance_error: Float[Array, ""] | None = None
 
     @classmethod
     def of(cls, config: Config, deepest: float | None = None) -> "Model":
@@ -94,6 +109,7 @@ class Model(eqx.Module):
                 damping=jnp.asarray(0.0),
                 half_backlash=jnp.asarray(scene.timing_gear.backlash_mm * MM / (2 * radius)),
                 rounding=jnp.asarray(contact.smoothing_mm * MM / radius),
+                offset=_optional(scene.phase_error_mrad, 1e-3),
             )
         if deepest is None:
             deepest = _expected_rotation(config)
@@ -110,10 +126,13 @@ class Model(eqx.Module):
             law=law,
             clearance=jnp.asarray(contact.clearance_mm * MM),
             speed=jnp.asarray(scene.speed_rpm * 2 * math.pi / 60),
-            load_torque=jnp.asarray(scene.load.torque_N_m),
+            load_torque=jnp.asarray(_load_torque(config)),
             gear=gear,
             gear_damping_ratio=jnp.asarray(damping_ratio),
             deepest=jnp.asarray(deepest),
+            pressure=_optional(scene.load.pressure_difference_Pa),
+            center_distance_error=_optional(scene.center_distance_error_mm, MM),
+            **_parts(config),
         )
 
     def profile(self, design: Float[Array, " d"]) -> Profile:
@@ -133,6 +152,11 @@ class Model(eqx.Module):
         """Polar moment of inertia of one rotor about its axis (kg·m²)."""
         return self.density * self.length * shape.polar_area_moment
 
+    @property
+    def both(self) -> bool:
+        """Whether the axes may be elsewhere than at the nominal centre distance."""
+        return self.supports is not None or self.center_distance_error is not None
+
     def contact(self, profile: Profile) -> GapFunction:
         """Gap and levers of `profile` at this model's fidelity."""
         if self.fidelity == "map":
@@ -146,7 +170,28 @@ class Model(eqx.Module):
                 "`solver.fidelity` must be chosen before a pair is built, but is auto; call "
                 "rootsopt.auto.choose first"
             )
-        return SearchContact.of(profile)
+        if not self.both:
+            return SearchContact.of(profile)
+        error = self.center_distance_error
+        distance = 2 * profile.pitch_radius + (0.0 if error is None else error)
+        return SearchContact.of(profile, distance, both=True)
+
+    def _drive(self, load: Load) -> Drive:
+        """The drive; a motor without a torque of its own is given what the load takes."""
+        motor = self.motor
+        if motor is None:
+            return PrescribedDrive(self.speed)
+        twice = isinstance(load, GasLoad)
+        torque = jnp.where(jnp.isnan(motor.torque), (1 + twice) * load.torque, motor.torque)
+        return eqx.tree_at(lambda m: (m.speed, m.torque), motor, (self.speed, torque))
+
+    def _load(self, profile: Profile, shape: Geometry) -> Load:
+        if self.pressure is None:
+            return ConstantLoad(self.load_torque)
+        across = self.pressure * self.length
+        # ρ1² + ρ2² = 2 (r² + s²), and the area is π times the mean of r² + s².
+        mean = across * (shape.outer_radius**2 - shape.area / jnp.pi) / 2
+        return GasLoad(across, profile, shape.outer_radius, mean)
 
     def pair(self, design: Float[Array, " d"]) -> RotorPair:
         """The rotor pair of a design in config units, differentiable in it."""
@@ -188,17 +233,26 @@ class Model(eqx.Module):
         angle = self.law.depth_at(force) / self.pitch_radius
         if gear is not None:
             angle = angle + gear.half_backlash
+        supports = self.supports
+        if supports is not None:
+            mass = self.density * self.length * shape.area
+            unit = angle * self.pitch_radius
+            supports = eqx.tree_at(lambda s: (s.mass, s.unit), supports, (mass, unit))
+        load = self._load(profile, shape)
         pair = RotorPair(
             lobes=self.lobes,
             contact=contact,
             law=self.law,
             clearance=self.clearance,
             inertia=inertia,
-            drive=PrescribedDrive(self.speed),
-            load=ConstantLoad(self.load_torque),
+            drive=self._drive(load),
+            load=load,
             gear=gear,
             angle_scale=angle,
             force_scale=force,
+            friction=self.friction,
+            supports=supports,
+            both=self.both,
         )
         if self.precision == "float32":
             # Built in double precision; single only where it is integrated.
@@ -216,6 +270,51 @@ def _single(leaf):
     return leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf
 
 
+def _optional(value: float | None, unit: float = 1.0) -> Float[Array, ""] | None:
+    return None if value is None else jnp.asarray(value * unit)
+
+
+def _load_torque(config: Config) -> float:
+    """Torque against rotor 2 (N·m); of a gas load about the mean, for the units alone: with an
+    outer radius of 1.4 pitch radii and an area efficiency of 0.45."""
+    load = config.scene.load
+    if load.torque_N_m is not None:
+        return load.torque_N_m
+    assert load.pressure_difference_Pa is not None
+    across = load.pressure_difference_Pa * config.rotor.length_mm * MM
+    return across * (1.4 * config.profile.pitch_radius_mm * MM) ** 2 * 0.45 / 2
+
+
+def _parts(config: Config) -> dict[str, Any]:
+    """The parts of a model that a design does not change; what it does is filled in with it."""
+    scene, friction = config.scene, config.contact.friction
+    parts: dict[str, Any] = {}
+    missing = jnp.asarray(float("nan"))
+    if scene.motor is not None:
+        torque = scene.motor.torque_N_m
+        parts["motor"] = MotorDrive(
+            speed=missing,
+            torque=missing if torque is None else jnp.asarray(torque),
+            slope=jnp.asarray(scene.motor.slope_N_m_s_per_rad),
+            inertia=jnp.asarray(scene.motor.inertia_kg_m2),
+        )
+    if friction is not None:
+        parts["friction"] = Friction(
+            static=jnp.asarray(friction.static),
+            kinetic=jnp.asarray(friction.kinetic),
+            stiction_speed=jnp.asarray(friction.stiction_speed_mm_s * MM),
+            friction_speed=jnp.asarray(friction.friction_speed_mm_s * MM),
+        )
+    if scene.supports is not None:
+        parts["supports"] = Supports(
+            stiffness=jnp.asarray(scene.supports.stiffness_N_per_mm / MM),
+            damping=jnp.asarray(scene.supports.damping_N_s_per_mm / MM),
+            mass=missing,
+            unit=missing,
+        )
+    return parts
+
+
 def _expected_rotation(config: Config) -> float:
     """Relative rotation (rad, negative) a scene is expected to reach: the backlash and
     clearance taken up, plus an impact ten times the static contact force."""
@@ -224,7 +323,7 @@ def _expected_rotation(config: Config) -> float:
     play = contact.clearance_mm
     if scene.timing_gear is not None:
         play += scene.timing_gear.backlash_mm / 2
-    force = 20 * max(scene.load.torque_N_m, 0.01) / (radius * MM)
+    force = 20 * max(_load_torque(config), 0.01) / (radius * MM)
     depth = (force / contact.stiffness_N_per_mm_e) ** (1 / contact.exponent)
     return -min((1.3 * play + 1.5 * depth) / radius, math.pi / (8 * config.profile.lobes))
 

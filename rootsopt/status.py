@@ -22,6 +22,10 @@ class Status(enum.Enum):
         "The lobes passed through each other: the flanks alone cannot hold this load. Add a "
         "scene.timing_gear, lower the load or the backlash."
     )
+    STALLED = (
+        "The motor has stalled: it cannot carry the load. Raise scene.motor.torque_N_m or "
+        "slope_N_m_s_per_rad, or lower the load."
+    )
     TOO_DEEP = (
         "The flanks penetrate beyond the validity of a contact law (2 % of the pitch radius). "
         "Raise contact.stiffness_N_per_mm_e or lower the load."

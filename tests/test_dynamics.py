@@ -443,7 +443,7 @@ def test_force_is_one_sided_and_finite(touching):
     far = np.array(np.meshgrid([0.0, 1e-9, np.pi / 6, 1e6], edges, [0.0, 1e6, -1e6])).reshape(3, -1)
     pose = np.concatenate([np.stack([phi, relative, rate]), far], axis=1)
     found = contacts_at(touching, *map(jnp.asarray, pose))
-    for part in found:
+    for part in jax.tree.leaves(found):
         assert np.all(np.isfinite(part))
     drive, coast, depth = map(np.asarray, (found.drive, found.coast, found.depth))
     assert np.all(drive >= 0)

@@ -106,16 +106,23 @@ class FlankPair(eqx.Module):
     rolling: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, profile: Profile, center_distance: Float[Array, ""] | None = None) -> "FlankPair":
+    def of(
+        cls,
+        profile: Profile,
+        center_distance: Float[Array, ""] | None = None,
+        both: bool = False,
+    ) -> "FlankPair":
         """Prepare the search for `profile`; the nodes carry no derivative.
 
-        `center_distance` (m) is by default that of perfect rolling, 2r.
+        `center_distance` (m) is by default that of perfect rolling, 2r. With `both`, drive and
+        coast flanks are looked at side by side, as they can touch at once away from that: lands
+        are then searched too, up to the lobe's axis, where the other side takes over.
         """
         frozen = lax.stop_gradient(profile)
-        segments = [s for s in frozen.segments() if not s.land]
+        segments = [s for s in frozen.segments() if both or not s.land]
         fraction = jnp.arange(_NODES_PER_SEGMENT) / _NODES_PER_SEGMENT
         pieces = [s.start + (s.stop - s.start) * fraction for s in segments[:-1]]
-        if not frozen.segments()[0].land:
+        if not (both or frozen.segments()[0].land):
             # A rounded tip: at the hand-over the contact slides over its top. (A land
             # carries no torque, and contact just ends where it begins.)
             first = segments[0]
@@ -151,15 +158,19 @@ class FlankPair(eqx.Module):
         may be given. Differentiable to any order in both, in the profile and in the
         centre distance; the search itself is never differentiated.
         """
-        half = self.profile.half_pitch
-        centered = roll - half
-        centered = centered - 4 * half * jnp.round(centered / (4 * half))
-        mirrored = centered > 0
-        found = self._closest(half - jnp.abs(centered), relative)
+        folded, mirrored = self.folded(roll)
+        found = self._closest(folded, relative)
         lever1, lever2 = found.lever1, found.lever2
         return found._replace(
             lever1=jnp.where(mirrored, lever2, lever1), lever2=jnp.where(mirrored, lever1, lever2)
         )
+
+    def folded(self, roll: Float[Array, ""]) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+        """x in the half that is searched, and whether the rotors have changed places."""
+        half = self.profile.half_pitch
+        centered = roll - half
+        centered = centered - 4 * half * jnp.round(centered / (4 * half))
+        return half - jnp.abs(centered), centered > 0
 
     def switches(self, roll: Float[Array, ""], found: ClosestApproach) -> Bool[Array, " s"]:
         """Which pieces of the flanks are closest in the approach `found` at `roll`: where an
@@ -214,6 +225,15 @@ class FlankPair(eqx.Module):
             )
 
         return closest(dynamic, roll, relative)
+
+    def reach(self, normal1, normal2, roll, relative):
+        """Support functions (m) of both points on the common normal, and the part of the normal
+        along the line of centres, at a folded `roll`."""
+        profile = self.profile
+        beta, psi, s2 = _mate_point(profile, normal2)
+        direction = jnp.pi / 2 - psi - beta + roll - relative / 2
+        support2 = profile.pitch_radius * jnp.sin(psi) + s2
+        return profile.support(normal1), support2, jnp.cos(direction)
 
     def _mesh(self, normal2, roll, relative):
         """T, G, ν1, q1, q2 at `normal2`, from the definition."""

@@ -245,8 +245,12 @@ def flow(
     solver = how.solver(dtype, "lax" if adjoint is None else "bounded")
 
     def derivative(tau, y, dynamic):
-        slope, contact = eqx.combine(dynamic, static).derivative(tau, y[:count])
+        pair = eqx.combine(dynamic, static)
+        slope, contact = pair.derivative(tau, y[:count])
         rates = measures.rates(tau, contact.total / force_unit, top)
+        if pair.drive.free:
+            # Averages are over time, which passes unevenly.
+            rates = pair.pace(y[:count]) * jnp.append(rates, jnp.ones_like(force_unit))
         return jnp.concatenate([slope, rates])
 
     def whole(share, y, dynamic):
@@ -255,7 +259,7 @@ def flow(
     # Over the unit interval: limits known when it is traced make a smaller program.
     ends = jnp.full(how.max_steps, jnp.inf, dtype) if grid is None else grid / periods
     repeated = jnp.asarray(False if grid is None else repeat)
-    start = jnp.pad(state, (0, measures.count))
+    start = jnp.pad(state, (0, measures.count + pair.drive.free))
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(whole),
         solver,
@@ -294,12 +298,14 @@ def flow(
     peak_time, depth = locate_peak(lax.stop_gradient(pair), states, periods)
     holds = jnp.clip(jnp.sum(ends < peak_time), 0, last)
     peak_time = jnp.maximum(peak_time, begins[holds] + _SHORTEST)
-    averages, factors = measures.values(end[count:] / periods, force_unit, top)
+    duration = end[-1] if pair.drive.free else periods
+    raw = end[count : count + measures.count] / duration
+    averages, factors = measures.values(raw, force_unit, top)
     sides = BESIDE_UNIT[dtype.itemsize] * jnp.asarray(BESIDE, dtype)
 
     def state_and_force(begin, end, y, dynamic):
         after, slope = one_step(solver, term, begin, end, y, dynamic)
-        return jnp.append(after, slope[count])
+        return jnp.append(after, slope[count] / slope[-1] if pair.drive.free else slope[count])
 
     if tangents is None:
         there = state_and_force(begins[holds], peak_time, before[holds], dynamic)[:-1]
@@ -331,7 +337,10 @@ def flow(
         slopes = jax.vmap(Linear.after, (0, None))(beside, there)[:, -1]
         forces = beside.value[:, -1]
         peak, weights = one_sided(forces)
-        changes = along[count:] * (factors / periods)[:, None]
+        changes = along[count : count + measures.count]
+        if pair.drive.free:
+            changes = changes - raw[:, None] * along[-1]
+        changes = changes * (factors / duration)[:, None]
         by_peak = force_unit * (weights @ slopes)[None]
         slope = jnp.concatenate([along[:count], changes[:2], by_peak, changes[2:]])
     return Flow(

@@ -1,27 +1,41 @@
 """The rotor pair as an ordinary differential equation.
 
-The smallest scene has two states, ε = φ2 - φ1 and its rate. Time is counted in mesh
-periods τ (one lobe pitch of rotor 1) and ε in units of `angle_scale`, so that a solver
-sees numbers of order one.
+The smallest scene has two states, ε = φ2 - φ1 and its rate. Parts add what they need: a motor
+the speed of rotor 1, supports the displacements of both axes and their rates. The equation is
+counted in mesh periods τ of rotor 1's rotation (one lobe pitch), so that it is periodic whatever
+the speed does, ε in units of `angle_scale`, so that a solver sees numbers of order one.
 """
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from rootsopt.contact.closest import FlankPair
+from rootsopt.contact.closest import ClosestApproach, FlankPair
 from rootsopt.contact.impact import ImpactLaw
-from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
+from rootsopt.contact.point import ContactPoint, contact_point
+from rootsopt.dynamics.parts import (
+    Drive,
+    Friction,
+    Load,
+    MotorDrive,
+    Supports,
+    TimingGear,
+)
 from rootsopt.profiles.base import Profile
 
 GapFunction = Callable[
     [Float[Array, ""], Float[Array, ""]],
     tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]],
 ]
+STALLED = 0.05
+"""Share of the drive's speed below which a motor counts as stalled."""
+_DISPLACED = 0.1
+"""Displacement of an axis, relative to the centre distance, with which the mesh is lost."""
 
 
 class SearchContact(eqx.Module):
@@ -30,51 +44,79 @@ class SearchContact(eqx.Module):
     pair: FlankPair
 
     @classmethod
-    def of(cls, profile: Profile) -> "SearchContact":
-        return cls(FlankPair.of(profile))
+    def of(
+        cls,
+        profile: Profile,
+        center_distance: Float[Array, ""] | None = None,
+        both: bool = False,
+    ) -> "SearchContact":
+        return cls(FlankPair.of(profile, center_distance, both))
 
     def __call__(self, roll, relative):
-        return self.with_switches(roll, relative)[0]
-
-    def with_switches(self, roll, relative):
-        """Gap and levers, and `FlankPair.switches`."""
         found = self.pair(roll, relative)
-        return (found.gap, found.lever1, found.lever2), self.pair.switches(roll, found)
+        return found.gap, found.lever1, found.lever2
+
+    def at_distance(self, distance: Float[Array, ""]) -> "SearchContact":
+        """The same flanks at another centre distance (m)."""
+        return eqx.tree_at(lambda contact: contact.pair.center_distance, self, distance)
+
+
+class Motion(NamedTuple):
+    """Position and velocity of the pair at an instant (SI units): angle φ1 and angular speed of
+    rotor 1, ε and its rate; with supports, displacements of both axes (rotor, x and y) and their
+    velocities."""
+
+    phi: Float[Array, "*n"]
+    relative: Float[Array, "*n"]
+    rate: Float[Array, "*n"]
+    speed: Float[Array, "*n"]
+    shift: Float[Array, "*n 2 2"] | None = None
+    drift: Float[Array, "*n 2 2"] | None = None
 
 
 class FlankForce(NamedTuple):
-    """Contact at an instant or several: normal force (N) by flank, penetration (m; negative:
-    gap) and the levers (m)."""
+    """Contact at an instant or several: normal force (N) by flank, greatest penetration (m;
+    negative: gap), torques on the rotors (N·m), each positive in its rotor's sense of rotation,
+    and, where there are supports, the force on rotor 2 (N); that on rotor 1 is opposite."""
 
     drive: Float[Array, "*n"]
     coast: Float[Array, "*n"]
     depth: Float[Array, "*n"]
-    lever1: Float[Array, "*n"]
-    lever2: Float[Array, "*n"]
+    torque1: Float[Array, "*n"]
+    torque2: Float[Array, "*n"]
+    push: Float[Array, "*n 2"] | None = None
 
     @property
     def total(self) -> Float[Array, "*n"]:
         """Sum of the normal force magnitudes (N)."""
         return self.drive + self.coast
 
-    @property
-    def torque1(self) -> Float[Array, "*n"]:
-        """Torque on rotor 1 (N·m), positive in its sense of rotation."""
-        return -self.lever1 * (self.drive - self.coast)
 
-    @property
-    def torque2(self) -> Float[Array, "*n"]:
-        """Torque on rotor 2 (N·m), positive in its sense of rotation."""
-        return self.lever2 * (self.drive - self.coast)
+class _Touch(NamedTuple):
+    """A flank at a pose: penetration (m) and its rate (m/s), levers (m), what the search found,
+    and, where asked for, the place of contact, its sliding speed (m/s), normal and tangent."""
+
+    depth: Float[Array, ""]
+    closing: Float[Array, ""]
+    lever1: Float[Array, ""]
+    lever2: Float[Array, ""]
+    roll: Float[Array, ""]
+    found: ClosestApproach | None
+    point: ContactPoint | None
+    sliding: Float[Array, ""] | None
+    normal: Float[Array, "2"] | None
+    tangent: Float[Array, "2"] | None
 
 
 class RotorPair(eqx.Module):
     """Two identical rotors in mesh, rotor 1 driven, rotor 2 loaded.
 
     `contact`: gap and levers at a pose; `law`: contact force; `clearance` (m) added to
-    every flank gap; `inertia` of one rotor (kg·m²); `drive`, `load`, `gear`: parts;
-    `angle_scale` (rad) and `force_scale` (N): units the solver works in. An absent gear
-    is None and costs nothing.
+    every flank gap; `inertia` of one rotor (kg·m²); `drive`, `load`, `gear`, `friction`,
+    `supports`: parts; `angle_scale` (rad) and `force_scale` (N): units the solver works in.
+    `both`: whether drive and coast flanks can touch at once, which they cannot at the nominal
+    centre distance. A part that is absent is None and costs nothing. Friction, supports and
+    `both` need a `SearchContact`.
     """
 
     lobes: int = eqx.field(static=True)
@@ -82,15 +124,23 @@ class RotorPair(eqx.Module):
     law: ImpactLaw
     clearance: Float[Array, ""]
     inertia: Float[Array, ""]
-    drive: PrescribedDrive
-    load: ConstantLoad
+    drive: Drive
+    load: Load
     gear: TimingGear | None
     angle_scale: Float[Array, ""]
     force_scale: Float[Array, ""]
+    friction: Friction | None = None
+    supports: Supports | None = None
+    both: bool = eqx.field(static=True, default=False)
+
+    @property
+    def states(self) -> int:
+        """How many states there are: ε, its rate, a motor's speed, eight of the supports."""
+        return 2 + self.drive.free + 8 * (self.supports is not None)
 
     @property
     def mesh_period(self) -> Float[Array, ""]:
-        """Duration of one lobe pitch (s)."""
+        """Duration of one lobe pitch (s) at the drive's speed."""
         return 2 * jnp.pi / (self.lobes * self.drive.speed)
 
     @property
@@ -99,75 +149,212 @@ class RotorPair(eqx.Module):
         quarter of the angle from a lobe's axis to its flank at the pitch circle."""
         return jnp.pi / (8 * self.lobes)
 
-    def physical(
-        self, tau: Float[Array, "*n"], state: Float[Array, "*n 2"]
-    ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-        """φ1 (rad), ε (rad), dε/dt (rad/s) from time in mesh periods and scaled state."""
+    def speed(self, state: Float[Array, "*k n"]) -> Float[Array, "*#k"]:
+        """Angular speed of rotor 1 (rad/s) in a scaled state."""
+        if not self.drive.free:
+            return self.drive.speed
+        return self.drive.speed + self.angle_scale / self.mesh_period * state[..., 2]
+
+    def pace(self, state: Float[Array, "*k n"]) -> Float[Array, "*#k"]:
+        """Time (s) that a mesh period of rotation takes at a scaled state, relative to
+        `mesh_period`. A motor that has stalled is taken to creep on."""
+        creep = STALLED / 2 * self.drive.speed
+        return self.drive.speed / jnp.maximum(self.speed(state), creep)
+
+    def motion(self, tau: Float[Array, "*k"], state: Float[Array, "*k n"]) -> Motion:
+        """Position and velocity from rotation in mesh periods and scaled state."""
         relative = self.angle_scale * state[..., 0]
         rate = self.angle_scale * state[..., 1] / self.mesh_period
-        return 2 * jnp.pi / self.lobes * tau, relative, rate
+        motion = Motion(2 * jnp.pi / self.lobes * tau, relative, rate, self.speed(state))
+        if self.supports is None:
+            return motion
+        unit = self.supports.unit
+        shift, drift = (
+            state[..., -8 + 4 * i : state.shape[-1] - 4 + 4 * i].reshape(*tau.shape, 2, 2)
+            for i in (0, 1)
+        )
+        return motion._replace(shift=unit * shift, drift=unit / self.mesh_period * drift)
+
+    def physical(
+        self, tau: Float[Array, "*k"], state: Float[Array, "*k n"]
+    ) -> tuple[Float[Array, "*k"], Float[Array, "*k"], Float[Array, "*k"]]:
+        """φ1 (rad), ε (rad), dε/dt (rad/s) from rotation in mesh periods and scaled state."""
+        return self.motion(tau, state)[:3]
 
     def contact_force(
         self, phi: Float[Array, ""], relative: Float[Array, ""], rate: Float[Array, ""]
     ) -> FlankForce:
-        """Flank contact at rotor 1's angle `phi` (rad), ε and dε/dt.
+        """Flank contact at rotor 1's angle `phi` (rad), ε and dε/dt, at the drive's speed and
+        with both axes in their places."""
+        motion = Motion(phi, relative, rate, self.drive.speed)
+        if self.supports is not None:
+            rest = jnp.zeros((2, 2), self.angle_scale.dtype)
+            motion = motion._replace(shift=rest, drift=rest)
+        return self._force(motion)
+
+    def contact_at(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> FlankForce:
+        """Flank contact at rotation `tau` (mesh periods) and scaled `state`."""
+        return self._force(self.motion(tau, state))
+
+    def _force(self, motion: Motion) -> FlankForce:
+        """Contact force of a motion.
 
         With no negative clearance at the nominal centre distance, only the drive flank
         can touch when ε < 0 and only the coast flank when ε > 0, so one search is
         enough; the force is exactly zero on both sides of ε = 0.
         """
-        side = jnp.where(relative < 0, 1.0, -1.0)
-        geometry = self.contact(-side * (phi + relative / 2), side * relative)
-        depth, closing, lever1, lever2 = self._approach(side, geometry, rate)
-        force = self.law(depth, closing)
-        drives = relative < 0
-        return FlankForce(
-            drive=jnp.where(drives, force, 0.0),
-            coast=jnp.where(drives, 0.0, force),
-            depth=depth,
-            lever1=lever1,
-            lever2=lever2,
+        if self.both:
+            sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)
+            flanks = jax.vmap(self._flank_force, (0, None))(sides, motion)
+            drive, coast = flanks.drive
+            summed = jax.tree.map(lambda x: jnp.sum(x, axis=0), flanks)
+            return summed._replace(drive=drive, coast=coast, depth=jnp.max(flanks.depth))
+        drives = motion.relative < 0
+        flank = self._flank_force(jnp.where(drives, 1.0, -1.0), motion)
+        return flank._replace(
+            drive=jnp.where(drives, flank.drive, 0.0), coast=jnp.where(drives, 0.0, flank.drive)
         )
 
-    def _approach(self, side, geometry, rate):
-        """Penetration and its rate on a side (1 drive, -1 coast), and the levers."""
-        gap, lever1, lever2 = geometry
-        speed = self.drive.speed
-        closing = side * (lever1 * speed - lever2 * (speed + rate))
-        return -gap - self.clearance, closing, lever1, lever2
+    def _flank_force(self, side: Float[Array, ""], motion: Motion) -> FlankForce:
+        """Force of the flanks of one side (1 drive, -1 coast), as that of the drive flank."""
+        touch = self._touch(side, motion)
+        force = self.law(touch.depth, touch.closing)
+        none = jnp.zeros_like(force)
+        forward = side * force
+        torque1, torque2 = -touch.lever1 * forward, touch.lever2 * forward
+        push = None
+        if touch.normal is not None:
+            push = force * touch.normal
+        if self.friction is not None:
+            assert touch.point is not None
+            drag = self.friction(touch.sliding) * force
+            torque1 -= side * drag * touch.point.support1
+            torque2 += side * drag * touch.point.support2
+            if push is not None:
+                push += drag * touch.tangent
+        return FlankForce(force, none, touch.depth, torque1, torque2, push)
 
-    def contact_at(self, tau: Float[Array, ""], state: Float[Array, "2"]) -> FlankForce:
-        """Flank contact at time `tau` (mesh periods) and scaled `state`."""
-        return self.contact_force(*self.physical(tau, state))
+    def _touch(self, side: Float[Array, ""], motion: Motion) -> _Touch:
+        """The flanks of one side (1 drive, -1 coast).
 
-    def switches(self, tau: Float[Array, ""], state: Float[Array, "2"]) -> Bool[Array, " s"]:
-        """Which of its smooth pieces the equation is on, at time `tau` (mesh periods) and
-        scaled `state`: side and pieces of the flanks, of the contact law, of the gear."""
-        phi, relative, rate = self.physical(tau, state)
-        side = jnp.where(relative < 0, 1.0, -1.0)
-        pose = -side * (phi + relative / 2), side * relative
-        if isinstance(self.contact, SearchContact):
-            geometry, pieces = self.contact.with_switches(*pose)
+        In the frame with the drive side's normal n from rotor 1 to rotor 2 and the tangent t a
+        quarter turn ahead, rotor 1 slides along rotor 2 with ω1 h1 - ω2 h2 + (v1 - v2)·t; the
+        coast side is the mirror image. Displaced axes are a pair at another centre distance,
+        turned by the angle θ of its line of centres: φ1 - θ and φ2 + θ.
+        """
+        contact, distance, relative = self.contact, None, motion.relative
+        if motion.shift is not None:
+            assert isinstance(contact, SearchContact)
+            x, y = motion.shift[1] - motion.shift[0]
+            line = jnp.stack([contact.pair.center_distance + x, y])
+            distance = jnp.hypot(line[0], line[1])
+            relative = relative + 2 * jnp.arctan2(line[1], line[0])
+            contact = contact.at_distance(distance)
+        roll, turned = -side * (motion.phi + motion.relative / 2), side * relative
+        found = point = sliding = normal = tangent = None
+        if isinstance(contact, SearchContact):
+            found = contact.pair(roll, turned)
+            gap, lever1, lever2 = found.gap, found.lever1, found.lever2
         else:
-            geometry, pieces = self.contact(*pose), jnp.zeros(0, bool)
-        depth, closing, *_ = self._approach(side, geometry, rate)
-        flags = [jnp.stack([relative < 0]), self.law.switches(depth, closing), pieces]
+            gap, lever1, lever2 = contact(roll, turned)
+        other = motion.speed + motion.rate
+        closing = side * (lever1 * motion.speed - lever2 * other)
+        if self.friction is not None or distance is not None:
+            assert isinstance(contact, SearchContact)
+            assert found is not None
+            point = contact_point(contact.pair, roll, turned, found)
+            sliding = side * (motion.speed * point.support1 - other * point.support2)
+        if distance is not None:
+            assert motion.drift is not None
+            assert point is not None
+            across = side * (lever1 + lever2) / distance
+            cos, sin = line / distance
+            normal = _turned(point.radial, across, cos, sin)
+            tangent = side * _turned(-across, point.radial, cos, sin)
+            approach = motion.drift[0] - motion.drift[1]
+            closing += jnp.dot(approach, normal)
+            sliding += jnp.dot(approach, tangent)
+        depth = -gap - self.clearance
+        return _Touch(
+            depth, closing, lever1, lever2, roll, found, point, sliding, normal, tangent
+        )
+
+    def switches(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> Bool[Array, " s"]:
+        """Which of its smooth pieces the equation is on, at rotation `tau` (mesh periods) and
+        scaled `state`: side and pieces of the flanks, of the contact law, of every part."""
+        motion = self.motion(tau, state)
+
+        def of_flank(side):
+            touch = self._touch(side, motion)
+            flags = [self.law.switches(touch.depth, touch.closing)]
+            if touch.found is not None:
+                assert isinstance(self.contact, SearchContact)
+                flags.append(self.contact.pair.switches(touch.roll, touch.found))
+            if self.friction is not None:
+                flags.append(self.friction.switches(touch.sliding))
+            return jnp.concatenate(flags)
+
+        drives = motion.relative < 0
+        if self.both:
+            sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)
+            flags = [jax.vmap(of_flank)(sides).ravel()]
+        else:
+            flags = [jnp.stack([drives]), of_flank(jnp.where(drives, 1.0, -1.0))]
         if self.gear is not None:
-            flags.append(self.gear.switches(relative))
-        return jnp.concatenate(flags)
+            flags.append(self.gear.switches(motion.relative))
+        return jnp.concatenate([*flags, self.load.switches(motion.phi)])
 
     def derivative(
-        self, tau: Float[Array, ""], state: Float[Array, "2"]
-    ) -> tuple[Float[Array, "2"], FlankForce]:
+        self, tau: Float[Array, ""], state: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], FlankForce]:
         """d(state)/dτ and the contact it comes from."""
-        phi, relative, rate = self.physical(tau, state)
-        contact = self.contact_force(phi, relative, rate)
-        torque = contact.torque2 - self.load.torque
-        if self.gear is not None:
-            torque = torque - self.gear(relative, rate)
-        acceleration = torque / self.inertia * self.mesh_period**2 / self.angle_scale
+        motion = self.motion(tau, state)
+        contact = self._force(motion)
+        torque = contact.torque2 - self.load.torque2(motion.phi)
+        holding = None if self.gear is None else self.gear(motion.relative, motion.rate)
+        if holding is not None:
+            torque = torque - holding
+        acceleration = torque / self.inertia
+        unit = self.mesh_period**2 / self.angle_scale
+        slopes = [state[1:2]]
+        if isinstance(self.drive, MotorDrive):
+            torque = self.drive.torque_at(motion.speed) + contact.torque1
+            torque = torque - self.load.torque1(motion.phi)
+            if holding is not None:
+                torque = torque + holding
+            driven = torque / (self.inertia + self.drive.inertia)
+            slopes += [(unit * jnp.stack([acceleration - driven, driven]))]
+        else:
+            slopes += [jnp.stack([acceleration * unit])]
+        if self.supports is not None:
+            assert contact.push is not None
+            assert motion.drift is not None
+            force = self.supports.force(motion.shift, motion.drift)
+            force += jnp.stack([-contact.push, contact.push])
+            unit = self.mesh_period**2 / (self.supports.mass * self.supports.unit)
+            slopes += [state[-4:], unit * force.ravel()]
+        slope = jnp.concatenate(slopes)
+        if self.drive.free:
+            slope = self.pace(state) * slope
         # A pair that has lost its mesh stands still rather than run to infinity; the
         # caller reports it.
-        meshing = lax.stop_gradient(jnp.abs(relative) < self.angle_limit)
-        slope = jnp.stack([state[1], acceleration])
-        return jnp.where(meshing, slope, 0.0), contact
+        return jnp.where(lax.stop_gradient(self.lost(state)), 0.0, slope), contact
+
+    def lost(self, state: Float[Array, " n"]) -> Bool[Array, ""]:
+        """Whether a scaled state is no longer one of a running mesh: lobes have passed through
+        each other, an axis has left its place, or the motor has stalled."""
+        lost = ~(jnp.abs(self.angle_scale * state[0]) < self.angle_limit)
+        if self.supports is not None:
+            assert isinstance(self.contact, SearchContact)
+            farthest = _DISPLACED * self.contact.pair.center_distance
+            lost |= jnp.any(jnp.abs(self.supports.unit * state[-8:-4]) > farthest)
+        return lost | self.stalled(state) if self.drive.free else lost
+
+    def stalled(self, state: Float[Array, " n"]) -> Bool[Array, ""]:
+        """Whether a motor has come to a halt, all but."""
+        return self.speed(state) < STALLED * self.drive.speed
+
+
+def _turned(x, y, cos, sin):
+    """The vector (x, y), turned."""
+    return jnp.stack([cos * x - sin * y, sin * x + cos * y])

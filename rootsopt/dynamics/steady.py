@@ -47,7 +47,7 @@ class Transient(NamedTuple):
     `state`: last stroboscopic state; `period`: its cycle length k in mesh periods, 0 if
     it has not settled; `nearest`: the k with which the last states repeat best, and
     `spread` the scaled difference that leaves; `periods`: mesh periods simulated; `lost`:
-    lobes passed through each other; `solved`: whether the solver got through; `steps`:
+    `RotorPair.lost`; `solved`: whether the solver got through; `steps`:
     solver steps.
     """
 
@@ -125,8 +125,7 @@ def settle(
         part = strobe(pair, carry.state, BLOCK, how)
         memory = jnp.concatenate([memory[BLOCK:], part.states])
         end = part.states[-1]
-        relative = pair.angle_scale * end[0]
-        lost = jnp.abs(relative) >= pair.angle_limit
+        lost = pair.lost(end)
         sound = part.solved & ~lost & jnp.all(jnp.isfinite(end))
         period, nearest, spread = cycle(memory)
         new = Transient(

@@ -1,4 +1,4 @@
-"""What may act on a rotor pair. A scene holds the parts it needs and no others."""
+"""The timing gear between the rotors."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -7,33 +7,24 @@ from jaxtyping import Array, Bool, Float
 from rootsopt.contact.impact import ramp, smooth_step
 
 
-class PrescribedDrive(eqx.Module):
-    """Rotor 1 turns at the constant angular speed `speed` (rad/s) whatever the torque."""
-
-    speed: Float[Array, ""]
-
-
-class ConstantLoad(eqx.Module):
-    """A constant `torque` (N·m) that opposes rotor 2."""
-
-    torque: Float[Array, ""]
-
-
 class TimingGear(eqx.Module):
     """Timing gear between the rotors: backlash, stiffness, damping.
 
     The torque vanishes for |ε| ≤ `half_backlash` (rad); beyond, it is `stiffness`
     (N·m/rad) times the excess plus `damping` (N·m·s/rad) times dε/dt. Both ends of the
-    backlash are rounded over `rounding` (rad), as the contact law is at its onset.
+    backlash are rounded over `rounding` (rad), as the contact law is at its onset. `offset`
+    (rad): ε at the middle of the backlash, where the gear was mounted out of phase; None is none.
     """
 
     stiffness: Float[Array, ""]
     damping: Float[Array, ""]
     half_backlash: Float[Array, ""]
     rounding: Float[Array, ""]
+    offset: Float[Array, ""] | None = None
 
     def __call__(self, relative: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
         """Torque (N·m) that holds ε back, at ε = `relative` (rad), dε/dt = `rate` (rad/s)."""
+        relative = self._from_middle(relative)
         excess = jnp.abs(relative) - self.half_backlash
         engaged = jnp.where(
             self.rounding > 0,
@@ -45,5 +36,8 @@ class TimingGear(eqx.Module):
 
     def switches(self, relative: Float[Array, ""]) -> Bool[Array, "2"]:
         """On which of its smooth pieces the gear is: engaged, beyond the rounding."""
-        excess = jnp.abs(relative) - self.half_backlash
+        excess = jnp.abs(self._from_middle(relative)) - self.half_backlash
         return excess > jnp.stack([jnp.zeros_like(self.rounding), self.rounding])
+
+    def _from_middle(self, relative):
+        return relative if self.offset is None else relative - self.offset

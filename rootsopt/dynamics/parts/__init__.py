@@ -1,0 +1,19 @@
+"""What may act on a rotor pair. A scene holds the parts it needs and no others."""
+
+from rootsopt.dynamics.parts.drive import Drive, MotorDrive, PrescribedDrive
+from rootsopt.dynamics.parts.friction import Friction
+from rootsopt.dynamics.parts.gear import TimingGear
+from rootsopt.dynamics.parts.load import ConstantLoad, GasLoad, Load
+from rootsopt.dynamics.parts.supports import Supports
+
+__all__ = [
+    "ConstantLoad",
+    "Drive",
+    "Friction",
+    "GasLoad",
+    "Load",
+    "MotorDrive",
+    "PrescribedDrive",
+    "Supports",
+    "TimingGear",
+]

@@ -1,0 +1,95 @@
+"""What opposes the rotors."""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from rootsopt.profiles.base import Profile
+
+
+class Load(eqx.Module):
+    """Torques against the rotors at rotor 1's angle φ1; `torque` (N·m) is the mean of that
+    against rotor 2."""
+
+    torque: eqx.AbstractVar[Float[Array, ""]]
+
+    @abc.abstractmethod
+    def torque1(self, phi: Float[Array, ""]) -> Float[Array, ""] | float:
+        """Torque (N·m) against rotor 1 at φ1 = `phi` (rad)."""
+
+    @abc.abstractmethod
+    def torque2(self, phi: Float[Array, ""]) -> Float[Array, ""]:
+        """Torque (N·m) against rotor 2 at φ1 = `phi` (rad)."""
+
+    def switches(self, phi: Float[Array, ""]) -> Bool[Array, " s"]:
+        """On which of its smooth pieces the load is at φ1 = `phi` (rad)."""
+        del phi
+        return jnp.zeros(0, bool)
+
+
+class ConstantLoad(Load):
+    """A constant `torque` (N·m) that opposes rotor 2."""
+
+    torque: Float[Array, ""]
+
+    def torque1(self, phi):
+        del phi
+        return 0.0
+
+    def torque2(self, phi):
+        del phi
+        return self.torque
+
+
+class GasLoad(Load):
+    """Gas at a pressure difference across the pair.
+
+    The chambers on both sides are parted by the tips at the housing, at the outer radius, and
+    by the contact between the rotors, at radii ρ1 and ρ2 about their axes. Each rotor is a vane
+    from ρ to the outer radius, so the torques against the rotors are
+
+        T = Δp L (r_a² - ρ²) / 2.
+
+    ρ is that of perfect rolling at φ1 (what ε changes of it is of the order of ε). The mean
+    over a turn is, for both rotors together, the displaced volume times Δp / 2π, exactly.
+
+    `pressure` Δp (Pa) times the rotor's length L: `pressure_length` (N/m); `profile`;
+    `outer_radius` r_a (m); `torque`: mean against one rotor (N·m).
+    """
+
+    pressure_length: Float[Array, ""]
+    profile: Profile
+    outer_radius: Float[Array, ""]
+    torque: Float[Array, ""]
+
+    def torque1(self, phi):
+        return self._torque(phi, 1.0)
+
+    def torque2(self, phi):
+        return self._torque(phi, -1.0)
+
+    def _roll(self, phi):
+        """Roll angle at which the pair touches: a tip of rotor 1 at 0, one of rotor 2 at π/N."""
+        pitch = 2 * jnp.pi / self.profile.lobes
+        return jnp.abs(phi - pitch * jnp.round(phi / pitch))
+
+    def _torque(self, phi, rotor):
+        profile = self.profile
+        r, half = profile.pitch_radius, profile.half_pitch
+        roll = self._roll(phi)
+        addendum = half - jnp.abs(roll - half)
+        normal = profile.normal_at(addendum)
+        s = jnp.where(roll < half, 1.0, -1.0) * profile.contact_distance(normal)
+        across = r * jnp.cos(normal - addendum)
+        squared = r**2 + s**2 + rotor * 2 * s * across
+        return self.pressure_length * (self.outer_radius**2 - squared) / 2
+
+    def switches(self, phi):
+        half = self.profile.half_pitch
+        roll = self._roll(phi)
+        addendum = half - jnp.abs(roll - half)
+        ends = [segment.stop for segment in self.profile.segments()[:-1]]
+        passed = [self.profile.normal_at(addendum) > end for end in ends]
+        return jnp.stack([jnp.sin(phi * self.profile.lobes) > 0, roll > half, *passed])
