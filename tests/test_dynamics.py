@@ -513,7 +513,7 @@ def test_an_absent_gear_costs_nothing():
     with_gear, without = programs
     assert equations(without.jaxpr) < equations(with_gear.jaxpr)
     gear_numbers = len(jax.tree.leaves(geared.gear))
-    assert gear_numbers == len(dataclasses.fields(geared.gear))
+    assert gear_numbers == 4  # It is mounted in phase, and has no number for that.
     assert len(with_gear.jaxpr.invars) - len(without.jaxpr.invars) == gear_numbers
     transient = jax.eval_shape(
         lambda: settle(bare, jnp.zeros(2), integrator(), jnp.asarray(1e-3), jnp.asarray(64), 8)

@@ -1,0 +1,267 @@
+"""Two rotors in the plane, written from Newton's laws alone: NumPy and SciPy, nothing of the package.
+
+Every body has three coordinates; contact is a pair of points on two curves, forces are vectors
+that act there. State: φ1, φ2 (rad, each in its own sense of rotation), the displacements x1, y1,
+x2, y2 of the axes (m), then the six rates; time in seconds. Laws as DESIGN.md words them.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+NODES = 96
+"""Points at which a flank's distances are looked at first."""
+STEPS = 1e-6 * np.eye(2)
+BESIDE = np.array(np.meshgrid([0, -1, 1], [0, -1, 1])).reshape(2, 9).T
+
+
+def cross(a, b):
+    return (np.conjugate(a) * b).imag
+
+
+def dot(a, b):
+    return (np.conjugate(a) * b).real
+
+
+class Flank:
+    """Half a lobe of a CIC or EE rotor, tip on the real axis, by a parameter p from 0 (tip) to
+    `end` (root) that runs through one smooth piece from each whole number to the next.
+
+    A point is exp(iβ) (r + s sin ψ + i s cos ψ), its outward normal exp(i (β + π/2 - ψ)).
+    """
+
+    def __init__(self, profile):
+        n, r = profile.lobes, profile.pitch_radius_mm * 1e-3
+        half = np.pi / (2 * n)
+        self.lobes, self.radius = n, r
+        if profile.family == "ee":
+
+            def epicycloid(t):
+                angle = n * half * (1 - t)
+                return half * t, angle, r / n * np.sin(angle)
+
+            self.pieces = [epicycloid]
+        else:
+            alpha, tip = np.radians([profile.pressure_angle_deg, profile.tip_arc_angle_deg])
+            start = half - profile.involute_length_mm * 1e-3 / (r * np.sin(alpha))
+            length = r * np.cos(alpha) * (half - start)
+            end = np.exp(1j * start) * (r + 1j * length * np.exp(-1j * alpha))
+            normal = start + np.pi / 2 - alpha
+            radius = (end * np.exp(-1j * tip)).imag / np.sin(normal - tip)
+            center = end - radius * np.exp(1j * normal)
+
+            def land(t):
+                return tip * t, np.pi / 2, abs(center) + radius - r
+
+            def arc(t):
+                # In contact its normal passes through the pitch point.
+                nu = tip + (normal - tip) * t
+                along = dot(center, np.exp(1j * nu))
+                reach = -along + np.sqrt(along**2 - abs(center) ** 2 + r**2)
+                beta = np.angle(center + reach * np.exp(1j * nu))
+                return beta, beta + np.pi / 2 - nu, radius - reach
+
+            def involute(t):
+                beta = start + (half - start) * t
+                return beta, alpha, r * np.cos(alpha) * (half - beta)
+
+            self.pieces = [land, arc, involute]
+        self.end = 2 * len(self.pieces)
+        places = (np.arange(2 * NODES) + 0.5) * self.end / (2 * NODES)
+        self.nodes = places, *np.array([self(p, int(p)) for p in places]).T
+
+    def __call__(self, p, number):
+        """Point and outward normal at p, on the piece of that number or its continuation."""
+        count = len(self.pieces)
+        if number < count:
+            beta, psi, s = self.pieces[number](p - number)
+        else:
+            # The dedendum meshes with the addendum in reverse.
+            mate = self.end - 1 - number
+            beta, psi, s = self.pieces[mate](self.end - p - mate)
+            beta, s = np.pi / self.lobes - beta, -s
+        turn = np.exp(1j * beta)
+        place = self.radius + s * np.sin(psi) + 1j * s * np.cos(psi)
+        return turn * place, turn * np.exp(1j * (np.pi / 2 - psi))
+
+
+class Touch(NamedTuple):
+    """A closest approach: a point on each rotor, normal from rotor 1 to rotor 2, gap."""
+
+    first: complex
+    second: complex
+    normal: complex
+    gap: float
+
+
+class Planar:
+    """The equations of motion of a config's scene; `inertia` (kg·m²), `mass` (kg) of a rotor."""
+
+    def __init__(self, config, inertia, mass=None, load=None):
+        scene, law = config.scene, config.contact
+        self.flank = Flank(config.profile)
+        self.radius, self.lobes = self.flank.radius, config.profile.lobes
+        self.inertia, self.mass = inertia, mass
+        self.distance = 2 * self.radius + 1e-3 * (scene.center_distance_error_mm or 0.0)
+        self.exponent = law.exponent
+        self.stiffness = law.stiffness_N_per_mm_e * 1e3**law.exponent
+        self.damping = law.max_damping_N_s_per_mm * 1e3
+        self.full = law.full_damping_depth_mm * 1e-3
+        self.rounding = law.smoothing_mm * 1e-3
+        self.clearance = law.clearance_mm * 1e-3
+        self.friction = law.friction
+        self.speed = scene.speed_rpm * 2 * np.pi / 60
+        # Torques against the rotors at φ1.
+        self.load = load or (lambda phi: (0.0, scene.load.torque_N_m))
+        self.motor, self.supports = scene.motor, scene.supports
+        self.gear = scene.timing_gear
+        if self.gear is not None:
+            self.play = 1e-3 * self.gear.backlash_mm / (2 * self.radius)
+            stiffness = self.gear.stiffness_N_m_per_rad
+            self.gear_damping = 2 * self.gear.damping_ratio * np.sqrt(stiffness * inertia / 2)
+            self.middle = 1e-3 * (scene.phase_error_mrad or 0.0)
+
+    def ramp(self, x, width):
+        """max(0, x), rounded over `width`."""
+        if x <= 0:
+            return 0.0
+        return x if x >= width else 2 * x**2 / width - x**3 / width**2
+
+    def normal_force(self, depth, closing):
+        delta = self.ramp(depth, self.rounding)
+        if delta == 0:
+            return 0.0
+        x = min(delta / self.full, 1.0)
+        spring = self.stiffness * delta**self.exponent
+        kept = 1 + self.damping * (3 * x**2 - 2 * x**3) * closing / spring
+        return spring * self.ramp(kept, min(self.rounding / self.full, 1.0))
+
+    def coefficient(self, sliding):
+        law = self.friction
+        if law is None:
+            return 0.0
+        low, high = 1e-3 * law.stiction_speed_mm_s, 1e-3 * law.friction_speed_mm_s
+
+        def step(x, x0, h0, x1, h1):
+            t = np.clip((x - x0) / (x1 - x0), 0, 1)
+            return h0 + (h1 - h0) * t**2 * (3 - 2 * t)
+
+        if abs(sliding) < low:
+            return step(sliding, -low, -law.static, low, law.static)
+        return np.sign(sliding) * step(abs(sliding), low, law.static, high, law.kinetic)
+
+    def touches(self, angles, axes):
+        """Closest approach of the drive flanks and of the coast flanks, where there is one."""
+        found = [self.touch(side, angles, axes) for side in (1, -1)]
+        return [touch for touch in found if touch is not None]
+
+    def touch(self, side, angles, axes):
+        """The flanks nearest to the pitch point: the leading ones of rotor 1 (`side` 1) with the
+        trailing ones of rotor 2, or the other way round."""
+        lobes = np.exp(2j * np.pi * np.arange(self.lobes) / self.lobes)
+        crossing = np.exp(0.5j * np.pi / self.lobes) * self.radius
+        # In the rotors' own frames a leading flank lies ahead of the lobe's axis.
+        turn1 = np.exp(1j * angles[0]) * lobes
+        at1 = axes[0] + turn1 * (crossing if side > 0 else np.conjugate(crossing))
+        lobe = np.argmin(abs(at1 - axes[0] - self.radius))
+        turn1 = turn1[lobe]
+        # Rotor 2 is the mirror image, with a valley towards rotor 1 at angle 0.
+        turn2 = np.exp(1j * (angles[1] + np.pi / self.lobes)) * lobes
+        at2 = axes[1] - np.conjugate(turn2 * (np.conjugate(crossing) if side > 0 else crossing))
+        turn2 = turn2[np.argmin(abs(at2 - at1[lobe]))]
+
+        def first(z):
+            return turn1 * (z if side > 0 else np.conjugate(z))
+
+        def second(z):
+            return -np.conjugate(turn2 * (np.conjugate(z) if side > 0 else z))
+
+        places, nodes, normals = self.flank.nodes
+        z1, z2 = axes[0] + first(nodes), axes[1] + second(nodes)
+        n2 = second(normals)
+        apart = z1[:, None] - z2[None, :]
+        nearest = np.argmin(abs(apart), axis=1)
+        apart = apart[np.arange(len(z1)), nearest]
+        signed = dot(n2[nearest], apart)
+        signed[abs(cross(n2[nearest], apart)) > 0.05 * self.radius] = np.inf
+        # Every dip of the distance along rotor 1 may hold the least.
+        around = np.pad(signed, 1, constant_values=np.inf)
+        dips = (signed <= around[:-2]) & (signed <= around[2:]) & (signed < 0.01 * self.radius)
+
+        def at(p, pieces):
+            (a, m), (b, n) = self.flank(p[0], pieces[0]), self.flank(p[1], pieces[1])
+            a, m, b, n = axes[0] + first(a), first(m), axes[1] + second(b), second(n)
+            return Touch(a, b, m, dot(m, b - a)), np.array([cross(m, -n), cross(m, b - a) / 1e-2])
+
+        # Each pair of pieces by itself, continued beyond its ends.
+        found = []
+        for dip in np.flatnonzero(dips):
+            guess = np.array([places[dip], places[nearest[dip]]])
+            for pieces in np.floor(guess).astype(int) + BESIDE:
+                if np.any(pieces < 0) or np.any(pieces >= self.flank.end):
+                    continue
+                p = np.clip(guess, pieces, pieces + 1)
+                for _ in range(30):
+                    touch, miss = at(p, pieces)
+                    slopes = [(at(p + h, pieces)[1] - at(p - h, pieces)[1]) / 2e-6 for h in STEPS]
+                    step = np.linalg.solve(np.array(slopes).T, -miss)
+                    p = p + step
+                    if not np.all(abs(p - pieces) < 3) or np.max(abs(step)) < 1e-10:
+                        break
+                # The tip may lean over to its other flank; the root it touches is this one.
+                least = np.where(pieces == 0, -1, pieces)
+                inside = np.all((p >= least - 1e-9) & (p <= pieces + 1 + 1e-9))
+                # No other common normal than that of the dip.
+                if inside and abs(touch.gap - signed[dip]) < 3e-4 * self.radius:
+                    found.append(touch)
+        return min(found, key=lambda touch: touch.gap, default=None)
+
+    def forces(self, state):
+        """Torques on the rotors and forces on their axes, contact force, and the greatest depth."""
+        (phi1, phi2), shifts = state[:2], state[2:6]
+        (speed1, speed2), drifts = state[6:8], state[8:12]
+        axes = np.array([0, self.distance]) + shifts[::2] + 1j * shifts[1::2]
+        moving = drifts[::2] + 1j * drifts[1::2]
+        torques, pushes = np.zeros(2), np.zeros(2, complex)
+        total, deepest = 0.0, -np.inf
+        for touch in self.touches((phi1, phi2), axes):
+            arm1, arm2 = touch.first - axes[0], touch.second - axes[1]
+            slip = moving[0] + 1j * speed1 * arm1 - moving[1] + 1j * speed2 * arm2
+            depth = -touch.gap - self.clearance
+            normal = self.normal_force(depth, dot(touch.normal, slip))
+            along = 1j * touch.normal
+            drag = self.coefficient(dot(along, slip)) * normal
+            force = normal * touch.normal + drag * along
+            torques += cross(arm1, -force), -cross(arm2, force)
+            pushes += [-force, force]
+            total, deepest = total + normal, max(deepest, depth)
+        return torques, pushes, total, deepest
+
+    def __call__(self, time, state):
+        """d(state)/dt."""
+        torques, pushes, _, _ = self.forces(state)
+        torques = torques - np.array(self.load(state[0]))
+        relative, rate = state[1] - state[0], state[7] - state[6]
+        if self.gear is not None:
+            aside = relative - self.middle
+            excess = abs(aside) - self.play
+            width = self.rounding / self.radius
+            engaged = np.clip(excess / width, 0, 1)
+            engaged = engaged**2 * (3 - 2 * engaged)
+            hold = self.gear.stiffness_N_m_per_rad * np.sign(aside) * self.ramp(excess, width)
+            hold += self.gear_damping * engaged * rate
+            torques += hold, -hold
+        accelerations = torques / self.inertia
+        if self.motor is None:
+            accelerations[0] = 0.0
+        else:
+            motor = self.motor.torque_N_m
+            motor -= self.motor.slope_N_m_s_per_rad * (state[6] - self.speed)
+            accelerations[0] = (torques[0] + motor) / (self.inertia + self.motor.inertia_kg_m2)
+        along = np.zeros(4)
+        if self.supports is not None:
+            along[::2], along[1::2] = pushes.real, pushes.imag
+            along -= 1e3 * self.supports.stiffness_N_per_mm * state[2:6]
+            along -= 1e3 * self.supports.damping_N_s_per_mm * state[8:12]
+            along /= self.mass
+        return np.concatenate([state[6:], accelerations, along])
