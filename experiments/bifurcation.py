@@ -221,6 +221,7 @@ def peak_ratio(branch: Branch, point) -> float:
     """Peak force in units of the static one."""
     torque = branch.config.scene.load.torque_N_m
     torque = point.value if branch.parameter == "torque_N_m" else torque
+    assert torque is not None  # Scenes here have a constant load.
     return point.peak / (torque / (branch.config.profile.pitch_radius_mm * 1e-3))
 
 

@@ -143,7 +143,7 @@ class MotorConfig(_Section):
 class SupportsConfig(_Section):
     """Bearings that give way, the same for both rotors."""
 
-    stiffness_N_per_mm: Positive = Field(description="of a rotor against its housing, any direction")
+    stiffness_N_per_mm: Positive = Field(description="of a rotor in its housing, any way")
     damping_N_s_per_mm: NonNegative = Field(description="damping of the same motion")
 
 

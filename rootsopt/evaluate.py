@@ -384,7 +384,7 @@ class _Outcome:
         return scale * abs(float(self.transient.state[0]))
 
 
-def lost_status(pair: RotorPair, state: NDArray[np.float64]) -> Status:
+def lost_status(pair: RotorPair, state: Float[Array, " n"]) -> Status:
     """What has become of a pair that is lost in the scaled `state`."""
     if pair.drive.free and bool(pair.stalled(state)):
         return Status.STALLED
@@ -456,7 +456,8 @@ def _reverse(model: Model, design, orbit: Orbit, period, how: Integrator, measur
 @Program
 def _contact_series(pair: RotorPair, tau, states):
     pace = pair.pace(states) if pair.drive.free else jnp.ones_like(tau)
-    return pair.mesh_period, pace, pair.physical(tau, states), jax.vmap(pair.contact_at)(tau, states)
+    contact = jax.vmap(pair.contact_at)(tau, states)
+    return pair.mesh_period, pace, pair.physical(tau, states), contact
 
 
 def _series(pair: RotorPair, tau, states) -> Series:

@@ -191,7 +191,9 @@ class Model(eqx.Module):
         across = self.pressure * self.length
         # ρ1² + ρ2² = 2 (r² + s²), and the area is π times the mean of r² + s².
         mean = across * (shape.outer_radius**2 - shape.area / jnp.pi) / 2
-        return GasLoad(across, profile, shape.outer_radius, mean)
+        return GasLoad(
+            pressure_length=across, profile=profile, outer_radius=shape.outer_radius, torque=mean
+        )
 
     def pair(self, design: Float[Array, " d"]) -> RotorPair:
         """The rotor pair of a design in config units, differentiable in it."""

@@ -1,4 +1,4 @@
-"""Two rotors in the plane, written from Newton's laws alone: NumPy and SciPy, nothing of the package.
+"""Two rotors in the plane, written from Newton's laws with NumPy; nothing of the package.
 
 Every body has three coordinates; contact is a pair of points on two curves, forces are vectors
 that act there. State: φ1, φ2 (rad, each in its own sense of rotation), the displacements x1, y1,
@@ -184,9 +184,10 @@ class Planar:
         apart = apart[np.arange(len(z1)), nearest]
         signed = dot(n2[nearest], apart)
         signed[abs(cross(n2[nearest], apart)) > 0.05 * self.radius] = np.inf
-        # Every dip of the distance along rotor 1 may hold the least.
+        # Every dip of the distance along rotor 1 may hold the least; far ones do not touch.
+        reach = self.clearance + 5e-4 * self.radius
         around = np.pad(signed, 1, constant_values=np.inf)
-        dips = (signed <= around[:-2]) & (signed <= around[2:]) & (signed < 0.01 * self.radius)
+        dips = (signed <= around[:-2]) & (signed <= around[2:]) & (signed < reach)
 
         def at(p, pieces):
             (a, m), (b, n) = self.flank(p[0], pieces[0]), self.flank(p[1], pieces[1])

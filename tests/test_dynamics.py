@@ -4,8 +4,6 @@ The reference below is written from the contract alone (NumPy and SciPy; outline
 nearest points, contact law, timing gear and load are all its own).
 """
 
-import dataclasses
-
 import diffrax
 import equinox as eqx
 import jax

@@ -54,10 +54,16 @@ class Scene:
 
     @classmethod
     def of(cls, config: Config) -> "Scene":
-        """Scene of a config. Raises `ValueError` unless its family is cic."""
+        """Scene of a config. Raises `ValueError` unless its family is cic, and it has no other
+        parts than a constant load and a timing gear."""
         if config.profile.family != "cic":
             raise ValueError(f"`profile.family` must be 'cic', but is {config.profile.family!r}")
         contact, scene, gear = config.contact, config.scene, config.scene.timing_gear
+        torque = scene.load.torque_N_m
+        if config.needs_search or scene.motor or scene.phase_error_mrad or torque is None:
+            raise ValueError(
+                "`scene` must hold a constant load and a timing gear alone; remove its other parts"
+            )
         radius = config.profile.pitch_radius_mm * _MM
         return cls(
             lobes=config.profile.lobes,
@@ -71,7 +77,7 @@ class Scene:
             smoothing=contact.smoothing_mm * _MM,
             clearance=contact.clearance_mm * _MM,
             speed=scene.speed_rpm * 2 * math.pi / 60,
-            load_torque=scene.load.torque_N_m,
+            load_torque=torque,
             gear_stiffness=gear.stiffness_N_m_per_rad if gear else 0.0,
             gear_damping_ratio=gear.damping_ratio if gear else 0.0,
             half_backlash=gear.backlash_mm * _MM / (2 * radius) if gear else 0.0,

@@ -92,9 +92,19 @@ class FlankForce(NamedTuple):
         return self.drive + self.coast
 
 
+class _Sliding(NamedTuple):
+    """What friction and supports need of a contact: its place, the speed (m/s) at which rotor 1
+    slides on rotor 2, and, where there are supports, normal and tangent."""
+
+    point: ContactPoint
+    speed: Float[Array, ""]
+    normal: Float[Array, "2"] | None = None
+    tangent: Float[Array, "2"] | None = None
+
+
 class _Touch(NamedTuple):
-    """A flank at a pose: penetration (m) and its rate (m/s), levers (m), what the search found,
-    and, where asked for, the place of contact, its sliding speed (m/s), normal and tangent."""
+    """A flank at a pose: penetration (m) and its rate (m/s), levers (m), roll coordinate (rad) and
+    what a search found there; `sliding` where a part asks for it."""
 
     depth: Float[Array, ""]
     closing: Float[Array, ""]
@@ -102,10 +112,7 @@ class _Touch(NamedTuple):
     lever2: Float[Array, ""]
     roll: Float[Array, ""]
     found: ClosestApproach | None
-    point: ContactPoint | None
-    sliding: Float[Array, ""] | None
-    normal: Float[Array, "2"] | None
-    tangent: Float[Array, "2"] | None
+    sliding: _Sliding | None
 
 
 class RotorPair(eqx.Module):
@@ -219,20 +226,21 @@ class RotorPair(eqx.Module):
         """Force of the flanks of one side (1 drive, -1 coast), as that of the drive flank."""
         touch = self._touch(side, motion)
         force = self.law(touch.depth, touch.closing)
-        none = jnp.zeros_like(force)
-        forward = side * force
+        forward, sliding = side * force, touch.sliding
         torque1, torque2 = -touch.lever1 * forward, touch.lever2 * forward
-        push = None
-        if touch.normal is not None:
-            push = force * touch.normal
+        normal = tangent = push = None
+        if sliding is not None:
+            normal, tangent = sliding.normal, sliding.tangent
+        if normal is not None:
+            push = force * normal
         if self.friction is not None:
-            assert touch.point is not None
-            drag = self.friction(touch.sliding) * force
-            torque1 -= side * drag * touch.point.support1
-            torque2 += side * drag * touch.point.support2
-            if push is not None:
-                push += drag * touch.tangent
-        return FlankForce(force, none, touch.depth, torque1, torque2, push)
+            assert sliding is not None
+            drag = self.friction(sliding.speed) * force
+            torque1 -= side * drag * sliding.point.support1
+            torque2 += side * drag * sliding.point.support2
+            if push is not None and tangent is not None:
+                push += drag * tangent
+        return FlankForce(force, jnp.zeros_like(force), touch.depth, torque1, torque2, push)
 
     def _touch(self, side: Float[Array, ""], motion: Motion) -> _Touch:
         """The flanks of one side (1 drive, -1 coast).
@@ -242,16 +250,15 @@ class RotorPair(eqx.Module):
         coast side is the mirror image. Displaced axes are a pair at another centre distance,
         turned by the angle θ of its line of centres: φ1 - θ and φ2 + θ.
         """
-        contact, distance, relative = self.contact, None, motion.relative
+        contact, line, relative = self.contact, None, motion.relative
         if motion.shift is not None:
             assert isinstance(contact, SearchContact)
             x, y = motion.shift[1] - motion.shift[0]
             line = jnp.stack([contact.pair.center_distance + x, y])
-            distance = jnp.hypot(line[0], line[1])
-            relative = relative + 2 * jnp.arctan2(line[1], line[0])
-            contact = contact.at_distance(distance)
+            relative = relative + 2 * jnp.arctan2(y, line[0])
+            contact = contact.at_distance(jnp.hypot(*line))
         roll, turned = -side * (motion.phi + motion.relative / 2), side * relative
-        found = point = sliding = normal = tangent = None
+        found = sliding = None
         if isinstance(contact, SearchContact):
             found = contact.pair(roll, turned)
             gap, lever1, lever2 = found.gap, found.lever1, found.lever2
@@ -259,25 +266,25 @@ class RotorPair(eqx.Module):
             gap, lever1, lever2 = contact(roll, turned)
         other = motion.speed + motion.rate
         closing = side * (lever1 * motion.speed - lever2 * other)
-        if self.friction is not None or distance is not None:
+        if self.friction is not None or line is not None:
             assert isinstance(contact, SearchContact)
             assert found is not None
             point = contact_point(contact.pair, roll, turned, found)
-            sliding = side * (motion.speed * point.support1 - other * point.support2)
-        if distance is not None:
-            assert motion.drift is not None
-            assert point is not None
-            across = side * (lever1 + lever2) / distance
-            cos, sin = line / distance
-            normal = _turned(point.radial, across, cos, sin)
-            tangent = side * _turned(-across, point.radial, cos, sin)
-            approach = motion.drift[0] - motion.drift[1]
-            closing += jnp.dot(approach, normal)
-            sliding += jnp.dot(approach, tangent)
+            speed = side * (motion.speed * point.support1 - other * point.support2)
+            sliding = _Sliding(point, speed)
+            if line is not None:
+                assert motion.drift is not None
+                distance = contact.pair.center_distance
+                cos, sin = line / distance
+                along, across = point.radial, side * (lever1 + lever2) / distance
+                normal = jnp.stack([cos * along - sin * across, sin * along + cos * across])
+                tangent = side * jnp.stack([-normal[1], normal[0]])
+                approach = motion.drift[0] - motion.drift[1]
+                closing += jnp.dot(approach, normal)
+                speed += jnp.dot(approach, tangent)
+                sliding = _Sliding(point, speed, normal, tangent)
         depth = -gap - self.clearance
-        return _Touch(
-            depth, closing, lever1, lever2, roll, found, point, sliding, normal, tangent
-        )
+        return _Touch(depth, closing, lever1, lever2, roll, found, sliding)
 
     def switches(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> Bool[Array, " s"]:
         """Which of its smooth pieces the equation is on, at rotation `tau` (mesh periods) and
@@ -291,7 +298,8 @@ class RotorPair(eqx.Module):
                 assert isinstance(self.contact, SearchContact)
                 flags.append(self.contact.pair.switches(touch.roll, touch.found))
             if self.friction is not None:
-                flags.append(self.friction.switches(touch.sliding))
+                assert touch.sliding is not None
+                flags.append(self.friction.switches(touch.sliding.speed))
             return jnp.concatenate(flags)
 
         drives = motion.relative < 0
@@ -328,6 +336,7 @@ class RotorPair(eqx.Module):
             slopes += [jnp.stack([acceleration * unit])]
         if self.supports is not None:
             assert contact.push is not None
+            assert motion.shift is not None
             assert motion.drift is not None
             force = self.supports.force(motion.shift, motion.drift)
             force += jnp.stack([-contact.push, contact.push])
@@ -353,8 +362,3 @@ class RotorPair(eqx.Module):
     def stalled(self, state: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether a motor has come to a halt, all but."""
         return self.speed(state) < STALLED * self.drive.speed
-
-
-def _turned(x, y, cos, sin):
-    """The vector (x, y), turned."""
-    return jnp.stack([cos * x - sin * y, sin * x + cos * y])

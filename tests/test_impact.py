@@ -1,0 +1,78 @@
+"""The contact law on its own: a single impact, its laws of scale, and restitution."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from rootsopt.contact.impact import ImpactLaw
+
+K, E, C, D = 1e8, 1.5, 1000.0, 1e-3
+MASS, SPEED = 1.0, 1.0
+
+
+def law(stiffness=K, exponent=E, damping=C):
+    numbers = stiffness, exponent, damping, D, 0.0
+    return ImpactLaw(*(jnp.asarray(x) for x in numbers))
+
+
+def impact(law):
+    """Restitution, peak force (N), penetration (m), duration (s) of a mass against a wall."""
+    force = jax.jit(law.__call__)
+
+    def slope(_, state):
+        depth, rate = state
+        return [rate, -float(force(jnp.asarray(depth), jnp.asarray(rate))) / MASS]
+
+    def leaves(_, state):
+        return state[0] + 1e-12
+
+    leaves.terminal, leaves.direction = True, -1
+    found = solve_ivp(
+        slope, (0, 0.02), [0.0, SPEED], "DOP853", rtol=1e-10, atol=1e-13, events=leaves
+    )
+    times = np.linspace(0, found.t[-1], 2001)
+    dense = solve_ivp(
+        slope, (0, found.t[-1]), [0.0, SPEED], "DOP853", times, rtol=1e-10, atol=1e-13
+    )
+    depth, rate = dense.y
+    forces = np.asarray(jax.vmap(force)(jnp.asarray(depth), jnp.asarray(rate)))
+    return -found.y[1, -1] / SPEED, forces.max(), depth.max(), found.t[-1]
+
+
+def test_a_single_impact_is_that_of_the_stated_law():
+    restitution, peak, depth, duration = impact(law())
+    assert restitution == pytest.approx(0.778785, abs=2e-6)
+    assert peak == pytest.approx(1660.220, rel=1e-6)
+    assert depth == pytest.approx(0.62599e-3, rel=2e-5)
+    assert duration == pytest.approx(2.09463e-3, rel=1e-5)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.5, 2.2])
+def test_the_undamped_peak_scales_with_stiffness_and_speed(exponent):
+    """d ln F / d ln K = 1 / (n + 1), d ln F / d ln v = 2n / (n + 1), by automatic differentiation:
+    the implicit function theorem on the energy balance of the law as it is implemented."""
+
+    def balance(depth, stiffness, speed):
+        bare = law(stiffness, exponent, 0.0)
+        u = jnp.linspace(0.0, 1.0, 4001)
+        force = bare(depth * u**2, 0.0) * 2 * depth * u
+        weights = jnp.where(jnp.arange(4001) % 2 == 1, 4.0, 2.0).at[jnp.array([0, -1])].set(1.0)
+        return jnp.sum(weights * force) / 12000 - 0.5 * MASS * speed**2
+
+    balance = jax.jit(balance)
+    at = K, SPEED
+    depth = brentq(lambda x: float(balance(x, *at)), 1e-9, 1e-1, xtol=1e-16)
+    by_depth, *others = jax.grad(balance, (0, 1, 2))(depth, *at)
+
+    def peak(depth, stiffness):
+        return law(stiffness, exponent, 0.0)(depth, 0.0)
+
+    force = peak(jnp.asarray(depth), K)
+    rise, by_stiffness = jax.grad(peak, (0, 1))(depth, K)
+    slopes = [by_stiffness - rise * others[0] / by_depth, -rise * others[1] / by_depth]
+    logarithmic = np.array([slopes[0] * K / force, slopes[1] * SPEED / force])
+    expected = [1 / (exponent + 1), 2 * exponent / (exponent + 1)]
+    np.testing.assert_allclose(logarithmic, expected, rtol=1e-8)
