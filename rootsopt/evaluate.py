@@ -40,6 +40,7 @@ _NEARLY = 0.05
 CHAOS_WINDOW = 128
 _THINNING = 6
 TOO_DEEP = 0.02
+"""Penetration, in pitch radii, beyond which a contact law means nothing."""
 
 
 @dataclasses.dataclass(frozen=True)

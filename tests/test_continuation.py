@@ -24,8 +24,6 @@ from rootsopt.arclength import (
 from rootsopt.config import load
 from rootsopt.continuation import (
     Kind,
-    _longest_gap,
-    _Orbits,
     follow,
     follow_doubled,
     parameters,
@@ -34,6 +32,7 @@ from rootsopt.continuation import (
 )
 from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluator
+from rootsopt.orbits import Orbits, _longest_gap
 from rootsopt.status import Status
 
 # Curves with a closed form
@@ -214,7 +213,7 @@ def test_derivatives_are_those_of_finite_differences(branch, parameter):
     point = branch.at(4000.0)[0]
     config = config_at(4000.0)
     value = value_of(config, parameter)
-    orbits = _Orbits(config, parameter, 1, Steps(0.9 * value, 1.0 * value + 1e-3))
+    orbits = Orbits(config, parameter, 1, Steps(0.9 * value, 1.0 * value + 1e-3))
     place = orbits.place(point.state, value)
     fixed = np.eye(3)[-1]
     spot = corrected(orbits, place, fixed, fixed)
