@@ -20,12 +20,12 @@ from rootsopt.ensemble import (
     ERRORS,
     SIGNIFICANT,
     EnsembleEvaluator,
-    Members,
     fitted_slope,
     neighbours,
 )
 from rootsopt.evaluate import RESPONSES, Evaluation, Evaluator
 from rootsopt.evaluators import evaluator_for, without_gradient
+from rootsopt.members import Members
 from rootsopt.optimize import noise
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Trial
