@@ -7,6 +7,7 @@ Unstable orbits, which no simulation shows, are followed like stable ones, and f
 
 import dataclasses
 import enum
+import itertools
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -170,9 +171,11 @@ def follow_doubled(
         across = np.append(flipped / np.linalg.norm(flipped), 0.0)
     except StoppedError:
         return None
-    for size in _SIZES:
+    # Both ways lead to the one orbit, a mesh period apart: near a grazing touch one may fail.
+    for size, way in itertools.product(_SIZES, (1, -1)):
+        aside = way * across
         try:
-            start = corrected(orbits, place + size * across, across, across)
+            start = corrected(orbits, place + size * aside, aside, aside)
         except StoppedError:
             continue
         if start.look.data.half_way > 0.2 * size:
