@@ -32,9 +32,11 @@ from matplotlib.figure import Figure  # noqa: E402
 from rootsopt import files  # noqa: E402
 from rootsopt.config import Config, load  # noqa: E402
 from rootsopt.dynamics.flow import flow  # noqa: E402
-from rootsopt.ensemble import ERRORS, EnsembleEvaluator, run_members  # noqa: E402
+from rootsopt.ensemble import ERRORS, EnsembleEvaluator  # noqa: E402
+from rootsopt.members import run_members  # noqa: E402
 from rootsopt.model import Model  # noqa: E402
 from rootsopt.optimize.noise import standard_error  # noqa: E402
+from rootsopt.optimize.problem import Problem  # noqa: E402
 from rootsopt.optimize.search import Optimization, Search  # noqa: E402
 from rootsopt.programs import Program  # noqa: E402
 
@@ -198,7 +200,7 @@ def gradients(config: Config, model: Model, design, size: Size) -> list[dict]:
     return rows
 
 
-def summary(result: Optimization) -> dict[str, Any]:
+def summary(problem: Problem, result: Optimization) -> dict[str, Any]:
     """Baseline and optimum, by the verifying ensemble, and how significant their difference is."""
     found: dict[str, Any] = {"verification": result.verification}
     for name, one in (("baseline", result.baseline), ("optimized", result.optimized)):
@@ -207,8 +209,8 @@ def summary(result: Optimization) -> dict[str, Any]:
                 "design": one.design,
                 **one.response,
                 **one.steady_state,
-                "objective": result.problem.objective(one),
-                "objective_standard_error": standard_error(result.problem, one),
+                "objective": problem.objective(one),
+                "objective_standard_error": standard_error(problem, one),
             }
     record = result.verification
     if "combined_standard_error" in record:
@@ -217,7 +219,7 @@ def summary(result: Optimization) -> dict[str, Any]:
     return found
 
 
-def draw(along, slopes, rows, members, estimates, result: Optimization) -> Figure:
+def draw(along, slopes, members, estimates, problem: Problem, result: Optimization) -> Figure:
     """The four panels."""
     figure = Figure(figsize=(12.5, 9), layout="constrained", dpi=150)
     FigureCanvasAgg(figure)
@@ -245,6 +247,7 @@ def draw(along, slopes, rows, members, estimates, result: Optimization) -> Figur
     b.set_title("(b) Derivative at the baseline")
     b.legend(frameon=False)
 
+    rows = result.history
     number, objective = column(rows, "evaluation"), column(rows, "objective")
     error = column(rows, "objective_standard_error")
     screened = column(rows, "start") < 0
@@ -255,8 +258,8 @@ def draw(along, slopes, rows, members, estimates, result: Optimization) -> Figur
     verified = [("baseline, verified", result.baseline, BLACK, "s")]
     verified += [("optimum, verified", result.optimized, GREEN, "D")] if result.optimized else []
     for offset, (label, one, color, mark) in enumerate(verified):
-        c.errorbar([last + offset], [result.problem.objective(one)],
-                   [standard_error(result.problem, one)], fmt=mark, color=color, ms=7, capsize=3,
+        c.errorbar([last + offset], [problem.objective(one)],
+                   [standard_error(problem, one)], fmt=mark, color=color, ms=7, capsize=3,
                    label=label)  # fmt: skip
     c.axhline(1, color=BLACK, lw=0.8, ls=":")
     c.set(xlabel="evaluation", ylabel="objective (baseline = 1)")
@@ -305,10 +308,11 @@ def main() -> int:
     search = Search(config)
     result = search.run()
     seconds = {"optimization": time.perf_counter() - began}
-    if not result.baseline.usable:
+    problem = result.problem
+    if problem is None or not result.baseline.usable:
         print(f"baseline {result.baseline.status.label}", file=sys.stderr)
         return 3
-    model, problem = search.exact.model, result.problem
+    model = search.exact.model
     first = problem.point(list(result.baseline.design.values()))
     # Without a significant optimum (as in a quick run) the line leads to the last design.
     end = list((result.optimized or result.baseline).design.values())
@@ -334,16 +338,14 @@ def main() -> int:
         ("gradients", estimates),
     ):  # fmt: skip
         folder.write_csv(f"chaos_{name}.csv", files.row_columns(rows))
-    found = summary(result) | {
+    found = summary(problem, result) | {
         "scene": list(SCENE),
         "ensemble": config.ensemble.model_dump(),
         "seconds": seconds,
         "versions": files.versions(),
     }
     folder.write_json("chaos.json", found)
-    folder.write_figure(
-        "chaos.png", draw(along, slopes, result.history, members, estimates, result)
-    )
+    folder.write_figure("chaos.png", draw(along, slopes, members, estimates, problem, result))
     for key, value in found.items():
         print(f"{key}: {value}")
     return 0

@@ -118,7 +118,7 @@ def main() -> int:
     folder = files.ResultFolder(options.output)
     search = Search(load(options.config))
     result = search.run()
-    if result.optimized is None:
+    if result.problem is None or result.optimized is None:
         print(f"the optimiser has no result: {result.verification}", file=sys.stderr)
         return 3
     found = result.problem.objective(result.optimized)

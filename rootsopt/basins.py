@@ -20,7 +20,7 @@ from rootsopt.config import Config
 from rootsopt.dynamics.flow import Integrator, strobe
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import BLOCK, Transient, settle, settled_within
-from rootsopt.evaluate import Evaluation, Evaluator, objective_weights
+from rootsopt.evaluate import Evaluation, Evaluator, lost_status, objective_weights
 from rootsopt.model import design_vector
 from rootsopt.programs import Program
 from rootsopt.status import Status
@@ -35,11 +35,8 @@ _DEPTHS = 3.0
 """The grid reaches so many static penetrations into the flanks."""
 _evaluate = Evaluator.__call__
 """One motion of a design, also for evaluators that look at several."""
-_LOST = {
-    Status.PASSED_THROUGH: "passed_through",
-    Status.SOLVER_FAILED: "solver_failed",
-    Status.NON_FINITE: "non_finite",
-}
+_LOST = (Status.PASSED_THROUGH, Status.STALLED, Status.SOLVER_FAILED, Status.NON_FINITE)
+"""Of initial states from which there is no motion to describe."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +57,8 @@ class Basins:
     `relative` (rad) and `rate` (rad/s): axes of the grid; `leads_to` (rates, relatives): index of
     the attractor, or -1 where the motion is lost; `attractors`: greatest share first, the last
     ones maybe chaotic or not settled, as their status says; `lost`: shares of initial states from
-    which there is no motion, by the label of the status; `angle_scale` (rad), `mesh_period` (s):
+    which there is no motion, or none that was told from the others (`not_settled`), by the label of
+    the status; `angle_scale` (rad), `mesh_period` (s):
     units of scaled states.
     """
 
@@ -76,13 +74,13 @@ class Basins:
     def status(self) -> Status:
         """Periodic if every initial state leads to a stable periodic motion; else what stands
         against it."""
-        for status, label in _LOST.items():
-            if self.lost.get(label):
+        for status in _LOST:
+            if self.lost.get(status.label):
                 return status
         for attractor in self.attractors:
             if attractor.evaluation.status is not Status.PERIODIC:
                 return attractor.evaluation.status
-        return Status.PERIODIC
+        return Status.NOT_SETTLED if any(self.lost.values()) else Status.PERIODIC
 
     def records(self) -> list[dict[str, Any]]:
         """The attractors for the result file."""
@@ -129,9 +127,11 @@ def find(
     scale, period = float(pair.angle_scale), float(pair.mesh_period)
     relative, rate = _axes(config, pair)
     grid = np.stack(np.meshgrid(relative / scale, rate * period / scale), axis=-1).reshape(-1, 2)
+    # Everything else begins at rest, or at the drive's speed.
+    grid = np.pad(grid, ((0, 0), (0, pair.states - 2)))
     starts = np.concatenate([grid, *(np.atleast_2d(state) for state in known)])
     ends = _settled(evaluator, pair, starts)
-    found = _Sorter(evaluator, design, pair, series)
+    found = _Sorter(evaluator, design, series)
     found.add(rest, np.zeros(grid.shape[1]))
     for k in range(len(starts)):
         found.place(jax.tree.map(lambda x, k=k: x[k], ends))
@@ -161,8 +161,8 @@ def find(
 class _Sorter:
     """Puts ends of transients to the motions they have led to."""
 
-    def __init__(self, evaluator: Evaluator, design, pair: RotorPair, series: bool):
-        self.evaluator, self.design, self.pair, self.series = evaluator, design, pair, series
+    def __init__(self, evaluator: Evaluator, design, series: bool):
+        self.evaluator, self.design, self.series = evaluator, design, series
         self.evaluations: list[Evaluation] = []
         self.cycles: list[NDArray[np.float64]] = []
         self.numbers: list[int] = []
@@ -176,7 +176,9 @@ class _Sorter:
         """Number of the motion of an evaluation that began at `end`: a known one or a new one."""
         cycle = np.atleast_2d(end)
         if evaluation.usable:
-            states = _cycle(self.pair, evaluation.state, self.evaluator.orbit)
+            # Built anew: the evaluation may have fitted the contact map to its motion.
+            pair = self.evaluator.pair(self.design)
+            states = _cycle(pair, evaluation.state, self.evaluator.orbit)
             cycle = np.asarray(states)[: evaluation.steady_state["period"]]
             number = self._same(cycle[0])
         else:
@@ -191,11 +193,11 @@ class _Sorter:
         """Note the motion that a transient has led to."""
         number, label = -1, ""
         if not bool(end.solved):
-            label = _LOST[Status.SOLVER_FAILED]
+            label = Status.SOLVER_FAILED.label
         elif not np.all(np.isfinite(end.state)):
-            label = _LOST[Status.NON_FINITE]
+            label = Status.NON_FINITE.label
         elif bool(end.lost):
-            label = _LOST[Status.PASSED_THROUGH]
+            label = lost_status(self.evaluator.pair(self.design), end.state).label
         else:
             number, label = self._motion(end)
         self.numbers.append(number)
@@ -212,7 +214,7 @@ class _Sorter:
         if number is None:
             return -1, Status.NOT_SETTLED.label
         status = self.evaluations[number].status
-        return (-1, _LOST[status]) if status in _LOST else (number, "")
+        return (-1, status.label) if status in _LOST else (number, "")
 
     def _same(self, state) -> int | None:
         """The known cycle that `state` is on, as far as a transient can tell."""

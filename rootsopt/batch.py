@@ -33,6 +33,7 @@ STATUSES = (
     Status.PASSED_THROUGH,
     Status.NON_FINITE,
     Status.NOT_SETTLED,
+    Status.STALLED,
 )
 
 
@@ -103,7 +104,15 @@ def respond(
         & (moved <= near)
     )
     status = jnp.select(
-        [~(settled.solved & closed.flow.solved), settled.lost, ~finite, ~found], [1, 2, 3, 4], 0
+        [
+            ~(settled.solved & closed.flow.solved),
+            pair.stalled(settled.state),
+            settled.lost,
+            ~finite,
+            ~found,
+        ],
+        [1, 5, 2, 3, 4],
+        0,
     )
     usable = status == 0
     mean, square, peak = closed.response

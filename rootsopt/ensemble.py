@@ -13,20 +13,17 @@ import dataclasses
 import functools
 import os
 import time
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.config import Config, EnsembleConfig
-from rootsopt.dynamics.flow import Integrator, flow, strobe
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.evaluate import (
     CHAOS_WINDOW,
@@ -38,7 +35,14 @@ from rootsopt.evaluate import (
     lyapunov_program,
     unsettled,
 )
-from rootsopt.model import Model, design_vector
+from rootsopt.members import (
+    Members,
+    initial_states,
+    mean_and_error,
+    prepare_members,
+    run_members,
+)
+from rootsopt.model import Model
 from rootsopt.optimize.problem import Space
 from rootsopt.profiles import Geometry
 from rootsopt.programs import Program
@@ -47,14 +51,6 @@ from rootsopt.status import Status
 _RTOL = 1e-6
 """Finest tolerance worth its time: the standard errors of an ensemble are far coarser than
 what the steps leave (docs/chaos.md)."""
-_SAMPLES = 63
-"""Samples of a mesh period among which its peak is looked for."""
-_MEMBERS = 4
-"""Members in one call of the compiled program."""
-_MEMORY = 17
-"""Stroboscopic states remembered, to tell a motion that repeats."""
-_REPEATS = 1e-2
-"""Scaled difference below which a motion repeats."""
 _AGAIN = 4
 """Motions that begin where those of a neighbouring design ended settle in this part of
 `ensemble.settle_periods`."""
@@ -66,51 +62,11 @@ ERRORS = {name: name.replace("_N", "_standard_error_N") for name in RESPONSES}
 """Keys of the standard errors in `steady_state`, by response."""
 
 
-class Members(NamedTuple):
-    """What m motions of one design came to.
-
-    `means` (m, 3): mean, mean square (N²) and mean over the mesh periods of the greatest
-    force in each; `drift`: mean force in the second half of the window less that in the
-    first (N); `greatest` force (N), `reach` |ε| (rad) and penetration `depth` (m; least
-    gap if negative) of all; `states`: last scaled state; `repeats` (m, 8): whether the last
-    states repeat after 1 … 8 mesh periods; `lost`, `solved`.
-    """
-
-    means: Float[Array, "m 3"]
-    drift: Float[Array, " m"]
-    greatest: Float[Array, " m"]
-    reach: Float[Array, " m"]
-    depth: Float[Array, " m"]
-    states: Float[Array, "m 2"]
-    repeats: Bool[Array, "m 8"]
-    lost: Bool[Array, " m"]
-    solved: Bool[Array, " m"]
-
-    @property
-    def status(self) -> Status:
-        """The first failure among the members, or AVERAGED."""
-        if not np.all(self.solved):
-            return Status.SOLVER_FAILED
-        if not np.all(np.isfinite(self.means)):
-            return Status.NON_FINITE
-        return Status.PASSED_THROUGH if np.any(self.lost) else Status.AVERAGED
-
-    @property
-    def responses(self) -> NDArray[np.float64]:
-        """(3, 2): mean, peak, RMS force (N) and their standard errors, by `RESPONSES`.
-
-        The members being independent, the standard error is that of the mean of their
-        means; of the RMS, to first order.
-        """
-        values, errors = _mean_and_error(np.asarray(self.means, np.float64))
-        mean, square, peak = values
-        rms = np.sqrt(square)
-        by_rms = errors[1] / (2 * rms) if rms > 0 else 0.0
-        return np.array([[mean, errors[0]], [peak, errors[2]], [rms, by_rms]])
-
-
 class EnsembleEvaluator(Evaluator):
     """Evaluates designs of one config by an ensemble; called like an `Evaluator`.
+
+    `start` (members, n) of a call: scaled states to begin from, such as the `state` of a
+    neighbouring design's evaluation; by default they are spread over the play.
 
     An evaluation that is AVERAGED has as `response` averages over members and mesh
     periods: `mean_force_N`, `rms_force_N`, and as `peak_force_N` the **mean of the peak of
@@ -120,7 +76,7 @@ class EnsembleEvaluator(Evaluator):
     periodic if all repeat, else transient), `gradient_standard_error` (as `gradient`, per
     config unit), the size of the ensemble, and `mean_force_drift_N` within the window with its
     standard error: far from zero, `ensemble.settle_periods` is too short, or motions of
-    several kinds coexist and members still pass from one to another. `state` (members, 2):
+    several kinds coexist and members still pass from one to another. `state` (members, n):
     their last scaled states, the `start` of a neighbouring design. `series` is that of one
     member.
 
@@ -149,63 +105,35 @@ class EnsembleEvaluator(Evaluator):
         other.sized, other.map_error = self.sized, self.map_error
         return other
 
-    def __call__(
-        self,
-        design: Float[Array, " d"] | None = None,
-        start: NDArray[np.float64] | None = None,
-        series: bool = True,
-    ) -> Evaluation:
-        """Evaluate `design` (config units; default: the config's own).
-
-        `start` (members, 2): scaled states to begin from, such as the `state` of a
-        neighbouring design's evaluation; by default they are spread over the play.
-        """
-        design = design_vector(self.config) if design is None else jnp.asarray(design)
-        began = time.perf_counter()
-        if self.prepared:
-            self._size(design)
-        else:
-            self.prepare(design, series)
-        for _ in range(5):
-            outcome = self._simulate(design, start)
-            covered = float(self.model.deepest)
-            if not self._refit(outcome):  # pyright: ignore[reportArgumentType]
-                break
-            if float(self.model.deepest) < covered:
-                self._size(design)
-        return self._describe(design, outcome, began, series)
-
     def prepare(self, design: Float[Array, " d"], series: bool = True) -> None:
         """Compile, in the background, what evaluating `design` (config units) takes."""
         self.prepared = True
         self._size(design)
         pair, _ = _pair.outline(self.model, design)
-        dtype = pair.angle_scale.dtype
-        state, count = jax.ShapeDtypeStruct((2,), dtype), jax.ShapeDtypeStruct((), int)
-        states = jax.ShapeDtypeStruct((_MEMBERS, 2), dtype)
-        _in_turn.prepare(pair, states, count, count, self.how)
+        prepare_members(pair, self.how)
         if not self.survey:
+            state = jax.ShapeDtypeStruct((pair.states,), pair.angle_scale.dtype)
             lyapunov_program.prepare(pair, state, CHAOS_WINDOW, self.transient)
         _pair.prepare(self.model, design)
 
-    def _simulate(self, design, start) -> "_Outcome":
-        """The ensemble of one design."""
+    def _attempt(self, design, start) -> "_Outcome":
         pair, shape = _pair(self.model, design)
         settle = self.settings.settle_periods
         if start is None:
             states = initial_states(pair, self.settings.members, self.settings.seed)
         else:
             states, settle = np.asarray(start), -(-settle // _AGAIN)
-            if states.shape != (self.settings.members, 2):
+            if states.shape != (self.settings.members, pair.states):
                 raise ValueError(
-                    f"Argument `start` must be the states (members, 2) of an ensemble, but has "
+                    f"Argument `start` must be the states (members, n) of an ensemble, but has "
                     f"shape {states.shape}; pass None to begin anew"
                 )
-        (members,) = run_members([pair], states, settle, self.settings.periods, self.how)
-        return _Outcome(pair, shape, members)
+        runs = run_members([pair], states, settle, self.settings.periods, self.how)
+        return _Outcome(pair, shape, runs)
 
-    def _describe(self, design, outcome: "_Outcome", began, with_series) -> Evaluation:
-        pair, members, status = outcome.pair, outcome.members, outcome.status
+    def _report(self, design, outcome: "_Outcome", began: float, with_series: bool) -> Evaluation:
+        pair, status = outcome.pair, outcome.status
+        (members,) = outcome.runs
         settings = self.settings
         size = {"members": settings.members, "window_mesh_periods": settings.periods}
         steady: dict[str, Any] = {"kind": "transient"}
@@ -218,7 +146,7 @@ class EnsembleEvaluator(Evaluator):
             errors = dict(zip(ERRORS.values(), map(float, values[:, 1]), strict=True))
             greatest = float(np.max(members.greatest))
             found, series = self._kind(pair, members, with_series)
-            drift, by_drift = _mean_and_error(np.asarray(members.drift, np.float64))
+            drift, by_drift = mean_and_error(np.asarray(members.drift, np.float64))
             steady = found | size | errors
             steady |= {
                 "mean_force_drift_N": float(drift),
@@ -286,18 +214,18 @@ class EnsembleEvaluator(Evaluator):
         points, steps = neighbours(np.asarray(_point(space, design)), self.settings)
         designs, jacobian = _around(space, design, points)
         settle = -(-self.settings.settle_periods // _AGAIN)
-        for _ in range(5):
+
+        def attempt() -> _Outcome:
             with ThreadPoolExecutor(os.cpu_count()) as pool:
                 built = list(pool.map(functools.partial(_pair, self.model), designs))
             pairs, shapes = zip(*built, strict=True)
             runs = run_members(pairs, members.states, settle, self.settings.periods, self.how)
-            farthest = max(runs, key=lambda run: np.max(run.reach))
-            if not self._refit(_Outcome(pairs[0], shapes[0], farthest)):  # pyright: ignore[reportArgumentType]
-                break
-        for run in runs:
-            if run.status is not Status.AVERAGED:
-                return run.status, None
-        values = np.stack([run.responses[:, 0] for run in runs])
+            return _Outcome(pairs[0], shapes[0], runs)
+
+        around = self._fitted(design, attempt)
+        if around.status is not Status.AVERAGED:
+            return around.status, None
+        values = np.stack([run.responses[:, 0] for run in around.runs])
         slope, covariance = fitted_slope(values, steps)
         # From the unit box to config units.
         inverse = np.linalg.inv(np.asarray(jacobian))
@@ -315,40 +243,22 @@ class EnsembleEvaluator(Evaluator):
 
 @dataclasses.dataclass(frozen=True)
 class _Outcome:
+    """The members of every design, and pair and geometry of the first."""
+
     pair: RotorPair
     shape: Geometry
-    members: Members
+    runs: list[Members]
 
     @property
     def status(self) -> Status:
-        return self.members.status
+        """The first failure, or AVERAGED."""
+        statuses = (run.status for run in self.runs)
+        return next((s for s in statuses if s is not Status.AVERAGED), Status.AVERAGED)
 
     @property
     def reached(self) -> float:
         """Largest |ε| (rad)."""
-        return float(np.max(self.members.reach))
-
-
-def _mean_and_error(values: NDArray[np.float64]):
-    """Mean over the first axis of independent values, and its standard error."""
-    spread = np.std(values, axis=0, ddof=1)
-    return np.mean(values, axis=0), spread / np.sqrt(len(values))
-
-
-def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float64]:
-    """Scaled states (members, 2), a scrambled Sobol sequence over the play of the pair and
-    the speeds at which the load crosses it.
-
-    |ε| ≤ `angle_scale`, play and static penetration; |dε/dt| up to that of a fall under the
-    load through the whole of it.
-    """
-    from scipy.stats import qmc
-
-    acceleration = float(pair.load.torque / pair.inertia * pair.mesh_period**2 / pair.angle_scale)
-    fastest = max(2 * np.sqrt(acceleration), 1.0)
-    sampler = qmc.Sobol(2, rng=np.random.default_rng(seed))
-    power = int(np.ceil(np.log2(members)))
-    return (2 * sampler.random_base2(power)[:members] - 1) * np.array([1.0, fastest])
+        return max(float(np.max(run.reach)) for run in self.runs)
 
 
 def neighbours(
@@ -395,105 +305,7 @@ def fitted_slope(
     return np.asarray(slope.T, np.float64), np.asarray(covariance, np.float64)
 
 
-def run_members(
-    pairs: Sequence[RotorPair],
-    states: NDArray[np.float64] | Float[Array, "m 2"],
-    settle: int,
-    periods: int,
-    how: Integrator,
-) -> list[Members]:
-    """The `Members` of each of `pairs`, all from the same scaled `states` (m, 2), over
-    `periods` mesh periods after `settle` others.
-
-    On CPUs a thread for each core takes a few members at a time: stepping many together, each
-    would wait for the slowest at every turn. On other devices all are stepped together.
-    """
-    states = np.asarray(states, pairs[0].angle_scale.dtype)
-    counts = np.asarray(settle), np.asarray(periods)
-    if jax.default_backend() != "cpu":
-        stacked = jax.tree.map(lambda *x: jnp.stack(x), *pairs)
-        together = jax.device_get(_together(stacked, states, *counts, how))
-        return [jax.tree.map(lambda x, i=i: x[i], together) for i in range(len(pairs))]
-    # Parts of one size share a compiled program; the last member fills the last part up.
-    count = len(states)
-    parts = -(-count // _MEMBERS)
-    rows = np.minimum(np.arange(parts * _MEMBERS), count - 1).reshape(parts, _MEMBERS)
-
-    def part(task):
-        pair, rows = task
-        return jax.device_get(_in_turn(pair, states[rows], *counts, how))
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        done = list(pool.map(part, [(pair, row) for pair in pairs for row in rows]))
-    return [
-        jax.tree.map(lambda *x: np.concatenate(x)[:count], *done[k : k + parts])
-        for k in range(0, len(done), parts)
-    ]
-
-
-def member(
-    pair: RotorPair, state: Float[Array, "2"], settle: Any, periods: Any, how: Integrator
-) -> Members:
-    """One motion from the scaled `state`, as a pure function; leaves without the axis m."""
-    dtype = state.dtype
-    one, none, low = jnp.ones((), dtype), jnp.zeros((), dtype), jnp.full((), -jnp.inf, dtype)
-
-    def pass_by(_, carry):
-        state, solved = carry
-        out = strobe(pair, state, 1, how)
-        return out.states[-1], solved & out.solved
-
-    half = periods // 2
-
-    def count(index, carry):
-        state, solved, means, drift, greatest, reach, depth, memory = carry
-        out = flow(pair, state, one, how, _SAMPLES)
-        reach = jnp.maximum(reach, jnp.max(jnp.abs(out.states[:, 0])))
-        return (
-            out.end,
-            solved & out.solved,
-            means + jnp.stack([out.mean, out.mean_square, out.peak]),
-            drift + jnp.sign(2 * index - (periods - 1)) * out.mean,
-            jnp.maximum(greatest, out.peak),
-            reach,
-            jnp.maximum(depth, out.depth),
-            jnp.concatenate([memory[1:], out.end[None]]),
-        )
-
-    settled = lax.fori_loop(0, settle, pass_by, (state, jnp.ones((), bool)))
-    memory = jnp.full((_MEMORY, 2), jnp.inf, dtype)
-    start = *settled, jnp.zeros(3, dtype), none, none, none, low, memory
-    end, solved, means, drift, greatest, reach, depth, memory = lax.fori_loop(
-        0, periods, count, start
-    )
-    apart = jnp.stack(
-        [jnp.max(jnp.abs(memory[k:] - memory[:-k])[-k - 1 :]) for k in range(1, _MEMORY // 2 + 1)]
-    )
-    return Members(
-        means=means / periods,
-        drift=drift / jnp.maximum(half, 1),
-        greatest=greatest,
-        reach=pair.angle_scale * reach,
-        depth=depth,
-        states=end,
-        repeats=apart < _REPEATS,
-        lost=pair.angle_scale * jnp.abs(end[0]) >= pair.angle_limit,
-        solved=solved,
-    )
-
-
 _pair = Program(Model.pair_and_shape)
-
-
-@Program
-def _in_turn(pair, states, settle, periods, how) -> Members:
-    return lax.map(lambda state: member(pair, state, settle, periods, how), states)
-
-
-@Program
-def _together(pairs, states, settle, periods, how) -> Members:
-    run = functools.partial(member, settle=settle, periods=periods, how=how)
-    return jax.vmap(lambda pair: jax.vmap(lambda state: run(pair, state))(states))(pairs)
 
 
 @Program
@@ -513,9 +325,6 @@ __all__ = [
     "SIGNIFICANT",
     "VERIFYING",
     "EnsembleEvaluator",
-    "Members",
     "fitted_slope",
-    "initial_states",
     "neighbours",
-    "run_members",
 ]

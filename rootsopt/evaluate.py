@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import time
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -40,6 +41,7 @@ _NEARLY = 0.05
 CHAOS_WINDOW = 128
 _THINNING = 6
 TOO_DEEP = 0.02
+"""Penetration, in pitch radii, beyond which a contact law means nothing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,14 +144,8 @@ class Evaluator:
             self._size(design)
         else:
             self.prepare(design, series)
-        for _ in range(5):
-            outcome = self._attempt(design, start)
-            covered = float(self.model.deepest)
-            if not self._refit(outcome):
-                break
-            if float(self.model.deepest) < covered:
-                self._size(design)
-        return self._report(design, outcome, time.perf_counter() - began, series)
+        outcome = self._fitted(design, lambda: self._attempt(design, start))
+        return self._report(design, outcome, began, series)
 
     def pair(self, design: Float[Array, " d"]) -> RotorPair:
         """The rotor pair of `design` (config units), as last evaluated."""
@@ -199,7 +195,22 @@ class Evaluator:
         )
         self.model = dataclasses.replace(self.model, map_size=size)
 
-    def _refit(self, outcome: "_Outcome") -> bool:
+    def _fitted(self, design, attempt: Callable[[], Any]) -> Any:
+        """The outcome of `attempt`, again as long as it asks for another contact map.
+
+        An outcome has the `pair`, a `status`, and the largest |ε| `reached` (rad); the map is made
+        fine enough for `design`.
+        """
+        for _ in range(5):
+            outcome = attempt()
+            covered = float(self.model.deepest)
+            if not self._refit(outcome):
+                break
+            if float(self.model.deepest) < covered:
+                self._size(design)
+        return outcome
+
+    def _refit(self, outcome: Any) -> bool:
         """Fit the contact map to the motion; whether the design must be evaluated again.
 
         A motion that left the map is not described by it; one that uses a small part of
@@ -218,7 +229,8 @@ class Evaluator:
         self.model = eqx.tree_at(lambda m: m.deepest, self.model, jnp.asarray(deepest))
         return True
 
-    def _attempt(self, design, start):
+    def _attempt(self, design, start) -> Any:
+        """What comes of `design` with the contact map as it is."""
         pair, tangents, shape = _build(self.model, design)
         dtype = pair.angle_scale.dtype
         state = np.zeros(pair.states, dtype) if start is None else np.asarray(start, dtype)
@@ -298,7 +310,9 @@ class Evaluator:
         stable = multiplier < 1
         return Status.PERIODIC if closed and stable and moved <= near else Status.NOT_SETTLED
 
-    def _report(self, design, outcome: "_Outcome", seconds, with_series) -> Evaluation:
+    def _report(self, design, outcome: Any, began: float, with_series: bool) -> Evaluation:
+        """The evaluation that an attempt which `began` then has come to."""
+        seconds = time.perf_counter() - began
         pair, orbit, status = outcome.pair, outcome.orbit, outcome.status
         response: dict[str, float] = {}
         gradient: dict[str, dict[str, float]] = {}
@@ -386,9 +400,7 @@ class _Outcome:
 
 def lost_status(pair: RotorPair, state: Float[Array, " n"]) -> Status:
     """What has become of a pair that is lost in the scaled `state`."""
-    if pair.drive.free and bool(pair.stalled(state)):
-        return Status.STALLED
-    return Status.PASSED_THROUGH
+    return Status.STALLED if bool(pair.stalled(state)) else Status.PASSED_THROUGH
 
 
 def geometry_record(model: Model, shape: Geometry) -> dict[str, float]:

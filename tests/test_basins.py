@@ -1,13 +1,14 @@
 """Motions that coexist: attractors, basins, and objectives over all of them."""
 
 import csv
+import dataclasses
 import json
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.basins import AttractorEvaluator, find
+from rootsopt.basins import AttractorEvaluator, _Sorter, find
 from rootsopt.cli import main
 from rootsopt.config import load
 from rootsopt.dynamics.flow import Integrator, strobe
@@ -149,6 +150,45 @@ def test_a_chaotic_basin_is_no_steady_state():
     assert found.gradient == {}
     kinds = {row["status"] for row in found.steady_state["attractors"]}
     assert kinds == {"periodic", "chaotic"}
+
+
+def test_a_motion_that_is_not_told_is_no_steady_state(coexisting):
+    """Whatever is lost stands against `periodic`; a failure is named before it."""
+    _, basins = coexisting
+
+    def status(**lost):
+        return dataclasses.replace(basins, lost=lost).status
+
+    assert status() is Status.PERIODIC
+    assert status(not_settled=0.01) is Status.NOT_SETTLED
+    assert status(not_settled=0.5, solver_failed=0.1) is Status.SOLVER_FAILED
+    assert status(non_finite=0.1) is Status.NON_FINITE
+    first, *others = basins.attractors
+    wild = dataclasses.replace(first.evaluation, status=Status.CHAOTIC)
+    mixed = dataclasses.replace(first, evaluation=wild), *others
+    assert dataclasses.replace(basins, attractors=mixed).status is Status.CHAOTIC
+
+
+def test_a_cycle_is_that_of_the_pair_last_evaluated(coexisting, monkeypatch):
+    """An evaluation may fit the contact map to its motion, and the cycle must be on that map."""
+    evaluator, found = coexisting
+    built, used = [], []
+
+    class Refitting(Evaluator):
+        def pair(self, design):
+            built.append(object())
+            return built[-1]
+
+    def cycle(pair, state, how):
+        used.append(pair)
+        return np.tile(state, (8, 1))
+
+    monkeypatch.setattr("rootsopt.basins._cycle", cycle)
+    sorter = _Sorter(Refitting(evaluator.config), jnp.array([36.43, 9.0, 4.0]), False)
+    for one in found.attractors:
+        sorter.add(one.evaluation, one.cycle[0])
+    assert used == built
+    assert len({id(pair) for pair in used}) == len(found.attractors) >= 2
 
 
 def test_lost_motions_are_counted():

@@ -24,8 +24,6 @@ from rootsopt.arclength import (
 from rootsopt.config import load
 from rootsopt.continuation import (
     Kind,
-    _longest_gap,
-    _Orbits,
     follow,
     follow_doubled,
     parameters,
@@ -34,6 +32,7 @@ from rootsopt.continuation import (
 )
 from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluator
+from rootsopt.orbits import Orbits, _longest_gap
 from rootsopt.status import Status
 
 # Curves with a closed form
@@ -214,7 +213,7 @@ def test_derivatives_are_those_of_finite_differences(branch, parameter):
     point = branch.at(4000.0)[0]
     config = config_at(4000.0)
     value = value_of(config, parameter)
-    orbits = _Orbits(config, parameter, 1, Steps(0.9 * value, 1.0 * value + 1e-3))
+    orbits = Orbits(config, parameter, 1, Steps(0.9 * value, 1.0 * value + 1e-3))
     place = orbits.place(point.state, value)
     fixed = np.eye(3)[-1]
     spot = corrected(orbits, place, fixed, fixed)
@@ -245,8 +244,9 @@ def test_units_of_the_state_are_those_of_each_config(branch):
     assert alone.response["peak_force_N"] == pytest.approx(end.peak, rel=1e-6)
 
 
-def test_period_doubling_leads_to_the_doubled_orbit(branch):
-    """Below 3651 rpm the orbit is unstable and one of twice the period is born."""
+def test_period_doubling_leads_to_the_doubled_orbit(branch, monkeypatch):
+    """Below 3651 rpm the orbit is unstable and one of twice the period is born; it is found on the
+    other side where the first gives none."""
     lowest = min((p for p in branch.at(3900.0) if p.stable), key=lambda p: p.peak)
     below = follow(config_at(3900.0), "speed_rpm", lowest.state, 1, Steps(3600, 4000), ways=(-1,))
     (doubling,) = (one for one in below.bifurcations if one.kind is Kind.PERIOD_DOUBLING)
@@ -254,8 +254,19 @@ def test_period_doubling_leads_to_the_doubled_orbit(branch):
     assert doubling.value == pytest.approx(3650.23, abs=0.5)
     assert below.points[doubling.after].stable
     assert not below.points[doubling.after + 1].stable
+    asked = []
+
+    def one_side(orbits, place, *rest):
+        asked.append(orbits.period)
+        if asked == [1, 2]:
+            raise StoppedError(End.STEP_TOO_SMALL)
+        return corrected(orbits, place, *rest)
+
+    monkeypatch.setattr("rootsopt.continuation.corrected", one_side)
     doubled = follow_doubled(below, doubling, Steps(3600, 4000, points=6))
+    assert asked == [1, 2, 2]
     assert doubled is not None
+    assert doubled.ends[1] is not End.HALVED
     assert doubled.period == 2
     assert max(point.residual for point in doubled.points) < 1e-9
     simple = below.at(doubled.points[-1].value)

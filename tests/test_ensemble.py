@@ -20,12 +20,12 @@ from rootsopt.ensemble import (
     ERRORS,
     SIGNIFICANT,
     EnsembleEvaluator,
-    Members,
     fitted_slope,
     neighbours,
 )
 from rootsopt.evaluate import RESPONSES, Evaluation, Evaluator
 from rootsopt.evaluators import evaluator_for, without_gradient
+from rootsopt.members import Members
 from rootsopt.optimize import noise
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Trial
@@ -116,6 +116,10 @@ def test_neighbours_are_in_pairs_inside_the_box():
         assert np.linalg.matrix_rank(steps) == 3
     _, steps = neighbours(np.full(3, 0.5), settings.model_copy(update={"designs": 2048}))
     np.testing.assert_allclose(np.cov(steps.T), 0.01 * np.eye(3), atol=5e-4)
+    _, others = neighbours(
+        np.full(3, 0.5), settings.model_copy(update={"seed": 4, "designs": 2048})
+    )
+    assert not np.any(steps == others)
 
 
 def test_slope_of_a_quadratic_is_exact():
@@ -250,24 +254,68 @@ def test_no_number_without_its_status():
     assert evaluation.series is None
 
 
+YES, NO = np.ones(4, bool), np.zeros(4, bool)
+ONE = np.array([True, False, False, False])
+
+
+def sound(level=1.0):
+    """Four members of a motion without fault,."""
+    few = level * np.ones(4)
+    means = np.column_stack([few, few**2, 2 * few + np.arange(4)])
+    return Members(
+        means, 0 * few, 9 * few, 1e-3 * few, -1e-3 * few, np.ones((4, 2)), np.ones((4, 8), bool),
+        NO, NO, YES,
+    )  # fmt: skip
+
+
 def test_one_member_that_fails_is_enough():
     """The status of an ensemble is that of its worst member."""
-    yes, no = np.ones(4, bool), np.zeros(4, bool)
-    one, four = np.array([True, False, False, False]), np.ones(4)
-    sound = Members(np.ones((4, 3)), *(4 * [four]), np.ones((4, 2)), np.ones((4, 8), bool), no, yes)
-    assert sound.status is Status.AVERAGED
-    assert sound._replace(lost=one).status is Status.PASSED_THROUGH
-    assert sound._replace(solved=~one).status is Status.SOLVER_FAILED
-    assert sound._replace(means=np.full((4, 3), np.nan)).status is Status.NON_FINITE
+    members = sound()
+    assert members.status is Status.AVERAGED
+    assert members._replace(lost=ONE).status is Status.PASSED_THROUGH
+    assert members._replace(lost=ONE, stalled=ONE).status is Status.STALLED
+    assert members._replace(solved=~ONE).status is Status.SOLVER_FAILED
+    assert members._replace(means=np.full((4, 3), np.nan)).status is Status.NON_FINITE
+
+
+def told(monkeypatch, run, gradient=False):
+    """Evaluation of members that `run(number of the pair)` makes up."""
+    made = lambda pairs, *rest: [run(k) for k in range(len(pairs))]  # noqa: E731
+    monkeypatch.setattr("rootsopt.ensemble.run_members", made)
+    return averaged("ensemble.members=4", "ensemble.designs=12", gradient=gradient)
+
+
+def test_responses_stand_where_they_belong(monkeypatch):
+    """Mean, peak and RMS of members that are told, with the standard error of the peaks."""
+    evaluation = told(monkeypatch, lambda number: sound(3.0))
+    response, steady = evaluation.response, evaluation.steady_state
+    assert response == {"mean_force_N": 3, "peak_force_N": 7.5, "rms_force_N": 3}
+    expected = np.std(np.arange(4), ddof=1) / 2
+    assert steady[ERRORS["peak_force_N"]] == pytest.approx(expected)
+    assert steady[ERRORS["mean_force_N"]] == 0
+    assert steady["greatest_force_N"] == 27
+
+
+def test_too_deep_is_no_average(monkeypatch):
+    """One member beyond the validity of the contact law takes the result its usability."""
+    depth = np.array([-1.0, 1.0, 1.0, 1.0]) * 0.0201 * 0.033
+    evaluation = told(monkeypatch, lambda number: sound()._replace(depth=depth), gradient=True)
+    assert evaluation.status is Status.TOO_DEEP
+    assert evaluation.gradient == {}
+    allowed = sound()._replace(depth=0.99 * depth)
+    assert told(monkeypatch, lambda number: allowed).status is Status.AVERAGED
 
 
 def test_a_neighbour_that_fails_leaves_no_gradient(monkeypatch):
     """Nor averages: they would stand for a neighbourhood that is not there."""
-    failed = lambda self, design, members: (Status.PASSED_THROUGH, None)  # noqa: E731
-    monkeypatch.setattr(EnsembleEvaluator, "_slopes", failed)
-    evaluation = averaged(*PERIODIC, gradient=True)
+    failed = sound()._replace(lost=ONE)
+    runs = lambda number: failed if number == 7 else sound()  # noqa: E731
+    evaluation = told(monkeypatch, runs, gradient=True)
     assert evaluation.status is Status.PASSED_THROUGH
     assert (evaluation.response, evaluation.gradient, evaluation.state) == ({}, {}, None)
+    whole = told(monkeypatch, lambda number: sound(), gradient=True)
+    assert whole.status is Status.AVERAGED
+    assert rows(whole.gradient) == pytest.approx(0)
 
 
 def test_evaluator_of_a_motion():

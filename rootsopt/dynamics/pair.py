@@ -361,4 +361,6 @@ class RotorPair(eqx.Module):
 
     def stalled(self, state: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether a motor has come to a halt, all but."""
+        if not self.drive.free:
+            return jnp.zeros((), bool)
         return self.speed(state) < STALLED * self.drive.speed

@@ -40,10 +40,8 @@ def body(config: Config, options: argparse.Namespace) -> int:
         out.print(report.evaluation_table(result.baseline))
         out.print(_no_result(result))
     else:
-        rows = result.problem.constraint_rows(result.optimized)
-        out.print(
-            report.comparison_table(result.baseline, result.optimized, rows, result.improvement)
-        )
+        numbers = result.constraints, result.improvement
+        out.print(report.comparison_table(result.baseline, result.optimized, *numbers))
     total = time.perf_counter() - began
     out.print(
         f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
@@ -90,9 +88,7 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
         folder.write_csv("history.csv", {key: [row[key] for row in rows] for key in rows[0]})
     data |= choice
     data["improvement"] = result.improvement
-    data["constraints"] = (
-        result.problem.constraint_rows(result.optimized) if result.optimized is not None else []
-    )
+    data["constraints"] = result.constraints
     data["verification"] = result.verification
     data["statistics"] = {
         "evaluations": len(rows),

@@ -65,11 +65,12 @@ class Trial:
 class Optimization:
     """Outcome of a search.
 
-    `optimized` is None when no design better than the baseline held up. `verification`
-    says what the search promised and what the tight simulation from rest gave.
+    `problem` is None where the baseline has no usable steady state, `optimized` also when no
+    design better than the baseline held up. `verification` says what the search promised and
+    what the tight simulation from rest gave.
     """
 
-    problem: Problem
+    problem: Problem | None
     baseline: Evaluation
     optimized: Evaluation | None
     history: list[dict[str, Any]]
@@ -78,13 +79,20 @@ class Optimization:
     @property
     def improvement(self) -> dict[str, float]:
         """Reductions relative to the baseline, as fractions."""
-        if self.optimized is None:
+        if self.problem is None or self.optimized is None:
             return {}
         gains = {"objective": 1 - self.problem.objective(self.optimized)}
         for key in ("mean_force_N", "peak_force_N", "rms_force_N"):
             before, after = self.baseline.response[key], self.optimized.response[key]
             gains[key] = 1 - after / before if before > 0 else 0.0
         return gains
+
+    @property
+    def constraints(self) -> list[dict[str, Any]]:
+        """The constraints at the optimum, a row each."""
+        if self.problem is None or self.optimized is None:
+            return []
+        return self.problem.constraint_rows(self.optimized)
 
 
 class Search:
@@ -116,7 +124,7 @@ class Search:
         Space.of(self.config, self.exact.model, 0.0).prepare()
         baseline = self.exact()
         if not baseline.usable:
-            return Optimization(None, baseline, None, [], {})  # type: ignore[arg-type]
+            return Optimization(None, baseline, None, [], {})
         self.fast.model = self.exact.model
         # What the forces of motions that coexist are relative to.
         self.fast.reference = self.exact.reference = baseline.response

@@ -1,0 +1,1 @@
+"""Parts of `experiments/benchmark.py`: what each measures, and the report."""

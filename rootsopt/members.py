@@ -1,0 +1,203 @@
+"""Motions of one design from different initial states, and what they come to on average."""
+
+import functools
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+from numpy.typing import NDArray
+
+from rootsopt.dynamics.flow import Integrator, flow, strobe
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.programs import Program
+from rootsopt.status import Status
+
+_SAMPLES = 63
+"""Samples of a mesh period among which its peak is looked for."""
+_MEMBERS = 4
+"""Members in one call of the compiled program."""
+_MEMORY = 17
+"""Stroboscopic states remembered, to tell a motion that repeats."""
+_REPEATS = 1e-2
+"""Scaled difference below which a motion repeats."""
+
+
+class Members(NamedTuple):
+    """What m motions of one design came to.
+
+    `means` (m, 3): mean, mean square (N²) and mean over the mesh periods of the greatest
+    force in each; `drift`: mean force in the second half of the window less that in the
+    first (N); `greatest` force (N), `reach` |ε| (rad) and penetration `depth` (m; least
+    gap if negative) of all; `states`: last scaled state; `repeats` (m, 8): whether the last
+    states repeat after 1 … 8 mesh periods; `lost`, `stalled` (see `RotorPair`), `solved`.
+    """
+
+    means: Float[Array, "m 3"]
+    drift: Float[Array, " m"]
+    greatest: Float[Array, " m"]
+    reach: Float[Array, " m"]
+    depth: Float[Array, " m"]
+    states: Float[Array, "m n"]
+    repeats: Bool[Array, "m 8"]
+    lost: Bool[Array, " m"]
+    stalled: Bool[Array, " m"]
+    solved: Bool[Array, " m"]
+
+    @property
+    def status(self) -> Status:
+        """The first failure among the members, or AVERAGED."""
+        if not np.all(self.solved):
+            return Status.SOLVER_FAILED
+        if not np.all(np.isfinite(self.means)):
+            return Status.NON_FINITE
+        if np.any(self.stalled):
+            return Status.STALLED
+        return Status.PASSED_THROUGH if np.any(self.lost) else Status.AVERAGED
+
+    @property
+    def responses(self) -> NDArray[np.float64]:
+        """(3, 2): mean, peak, RMS force (N) and their standard errors.
+
+        The members being independent, the standard error is that of the mean of their
+        means; of the RMS, to first order.
+        """
+        values, errors = mean_and_error(np.asarray(self.means, np.float64))
+        mean, square, peak = values
+        rms = np.sqrt(square)
+        by_rms = errors[1] / (2 * rms) if rms > 0 else 0.0
+        return np.array([[mean, errors[0]], [peak, errors[2]], [rms, by_rms]])
+
+
+def mean_and_error(values: NDArray[np.float64]):
+    """Mean over the first axis of independent values, and its standard error."""
+    spread = np.std(values, axis=0, ddof=1)
+    return np.mean(values, axis=0), spread / np.sqrt(len(values))
+
+
+def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float64]:
+    """Scaled states (members, n), a scrambled Sobol sequence over the play of the pair and
+    the speeds at which the load crosses it.
+
+    |ε| ≤ `angle_scale`, play and static penetration; |dε/dt| up to that of a fall under the
+    load through the whole of it.
+    """
+    from scipy.stats import qmc
+
+    acceleration = float(pair.load.torque / pair.inertia * pair.mesh_period**2 / pair.angle_scale)
+    fastest = max(2 * np.sqrt(acceleration), 1.0)
+    sampler = qmc.Sobol(2, rng=np.random.default_rng(seed))
+    power = int(np.ceil(np.log2(members)))
+    play = (2 * sampler.random_base2(power)[:members] - 1) * np.array([1.0, fastest])
+    return np.pad(play, ((0, 0), (0, pair.states - 2)))
+
+
+def prepare_members(pair: RotorPair, how: Integrator) -> None:
+    """Compile, in the background, what `run_members` takes on CPUs for pairs like this one."""
+    states = jax.ShapeDtypeStruct((_MEMBERS, pair.states), pair.angle_scale.dtype)
+    count = jax.ShapeDtypeStruct((), int)
+    _in_turn.prepare(pair, states, count, count, how)
+
+
+def run_members(
+    pairs: Sequence[RotorPair],
+    states: NDArray[np.float64] | Float[Array, "m 2"],
+    settle: int,
+    periods: int,
+    how: Integrator,
+) -> list[Members]:
+    """The `Members` of each of `pairs`, all from the same scaled `states` (m, 2), over
+    `periods` mesh periods after `settle` others.
+
+    On CPUs a thread for each core takes a few members at a time: stepping many together, each
+    would wait for the slowest at every turn. On other devices all are stepped together.
+    """
+    states = np.asarray(states, pairs[0].angle_scale.dtype)
+    counts = np.asarray(settle), np.asarray(periods)
+    if jax.default_backend() != "cpu":
+        stacked = jax.tree.map(lambda *x: jnp.stack(x), *pairs)
+        together = jax.device_get(_together(stacked, states, *counts, how))
+        return [jax.tree.map(lambda x, i=i: x[i], together) for i in range(len(pairs))]
+    # Parts of one size share a compiled program; the last member fills the last part up.
+    count = len(states)
+    parts = -(-count // _MEMBERS)
+    rows = np.minimum(np.arange(parts * _MEMBERS), count - 1).reshape(parts, _MEMBERS)
+
+    def part(task):
+        pair, rows = task
+        return jax.device_get(_in_turn(pair, states[rows], *counts, how))
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        done = list(pool.map(part, [(pair, row) for pair in pairs for row in rows]))
+    return [
+        jax.tree.map(lambda *x: np.concatenate(x)[:count], *done[k : k + parts])
+        for k in range(0, len(done), parts)
+    ]
+
+
+def member(
+    pair: RotorPair, state: Float[Array, " n"], settle: Any, periods: Any, how: Integrator
+) -> Members:
+    """One motion from the scaled `state`, as a pure function; leaves without the axis m."""
+    dtype = state.dtype
+    one, none, low = jnp.ones((), dtype), jnp.zeros((), dtype), jnp.full((), -jnp.inf, dtype)
+
+    def pass_by(_, carry):
+        state, solved = carry
+        out = strobe(pair, state, 1, how)
+        return out.states[-1], solved & out.solved
+
+    half = periods // 2
+
+    def count(index, carry):
+        state, solved, means, drift, greatest, reach, depth, memory = carry
+        out = flow(pair, state, one, how, _SAMPLES)
+        reach = jnp.maximum(reach, jnp.max(jnp.abs(out.states[:, 0])))
+        return (
+            out.end,
+            solved & out.solved,
+            means + jnp.stack([out.mean, out.mean_square, out.peak]),
+            drift + jnp.sign(2 * index - (periods - 1)) * out.mean,
+            jnp.maximum(greatest, out.peak),
+            reach,
+            jnp.maximum(depth, out.depth),
+            jnp.concatenate([memory[1:], out.end[None]]),
+        )
+
+    settled = lax.fori_loop(0, settle, pass_by, (state, jnp.ones((), bool)))
+    memory = jnp.full((_MEMORY, *state.shape), jnp.inf, dtype)
+    start = *settled, jnp.zeros(3, dtype), none, none, none, low, memory
+    end, solved, means, drift, greatest, reach, depth, memory = lax.fori_loop(
+        0, periods, count, start
+    )
+    apart = jnp.stack(
+        [jnp.max(jnp.abs(memory[k:] - memory[:-k])[-k - 1 :]) for k in range(1, _MEMORY // 2 + 1)]
+    )
+    return Members(
+        means=means / periods,
+        drift=drift / jnp.maximum(half, 1),
+        greatest=greatest,
+        reach=pair.angle_scale * reach,
+        depth=depth,
+        states=end,
+        repeats=apart < _REPEATS,
+        lost=pair.lost(end),
+        stalled=pair.stalled(end),
+        solved=solved,
+    )
+
+
+@Program
+def _in_turn(pair, states, settle, periods, how) -> Members:
+    return lax.map(lambda state: member(pair, state, settle, periods, how), states)
+
+
+@Program
+def _together(pairs, states, settle, periods, how) -> Members:
+    run = functools.partial(member, settle=settle, periods=periods, how=how)
+    return jax.vmap(lambda pair: jax.vmap(lambda state: run(pair, state))(states))(pairs)
