@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config
 from rootsopt.contact.size import size_map
@@ -398,9 +398,10 @@ class _Outcome:
         return scale * abs(float(self.transient.state[0]))
 
 
-def lost_status(pair: RotorPair, state: Float[Array, " n"]) -> Status:
+def lost_status(pair: RotorPair, state: ArrayLike) -> Status:
     """What has become of a pair that is lost in the scaled `state`."""
-    return Status.STALLED if bool(pair.stalled(state)) else Status.PASSED_THROUGH
+    stalled = bool(pair.stalled(jnp.asarray(state)))
+    return Status.STALLED if stalled else Status.PASSED_THROUGH
 
 
 def geometry_record(model: Model, shape: Geometry) -> dict[str, float]:
@@ -504,7 +505,7 @@ def unsettled(pair, window, with_series):
     exponent, error = float(window.exponent), float(window.error)
     flows = window.flows
     finite = np.isfinite(np.asarray(flows.peak)).all() and np.isfinite(exponent)
-    lost = bool(pair.lost(window.state))
+    lost = bool(pair.lost(jnp.asarray(window.state)))
     kind = "transient"
     if lost:
         status = lost_status(pair, window.state)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-NODES = 96
+NODES = 72
 """Points at which a flank's distances are looked at first."""
 STEPS = 1e-6 * np.eye(2)
 BESIDE = np.array(np.meshgrid([0, -1, 1], [0, -1, 1])).reshape(2, 9).T
@@ -210,10 +210,14 @@ class Planar:
                     if not np.all(abs(p - pieces) < 3) or np.max(abs(step)) < 1e-10:
                         break
                 # The tip may lean over to its other flank; the root it touches is this one.
-                least = np.where(pieces == 0, -1, pieces)
-                inside = np.all((p >= least - 1e-9) & (p <= pieces + 1 + 1e-9))
-                # No other common normal than that of the dip.
-                if inside and abs(touch.gap - signed[dip]) < 3e-4 * self.radius:
+                first_end = np.where(pieces == 0, -1, pieces)
+                inside = np.all((p >= first_end - 1e-9) & (p <= pieces + 1 + 1e-9))
+                # A common normal where the distance is least, not greatest.
+                least = np.linalg.det(np.array(slopes)) > 0
+                # Through a sharp edge the nearest point is another one.
+                through = min(np.min(abs(touch.first - z2)), np.min(abs(touch.second - z1)))
+                least &= through > 0.98 * abs(touch.gap)
+                if inside and least and abs(touch.gap - signed[dip]) < 5e-4 * self.radius:
                     found.append(touch)
         return min(found, key=lambda touch: touch.gap, default=None)
 
