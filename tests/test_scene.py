@@ -200,10 +200,11 @@ def equations(jaxpr):
 
 def size(overrides):
     """States, equations and numbers of a scene's right-hand side."""
-    pair, _ = pair_of(overrides)
-    numbers, static = eqx.partition(pair, eqx.is_array)
+    config = load("configs/cic.yaml", overrides)
+    pair = eqx.filter_eval_shape(Model.pair, Model.of(config), design_vector(config))
+    numbers, static = eqx.partition(pair, lambda x: isinstance(x, jax.ShapeDtypeStruct))
     program = jax.make_jaxpr(lambda tau, y, n: eqx.combine(n, static).derivative(tau, y)[0])(
-        0.0, jnp.zeros(pair.states), numbers
+        jnp.zeros(()), jnp.zeros(pair.states), numbers
     )
     return pair.states, equations(program.jaxpr), len(program.jaxpr.invars)
 
@@ -252,7 +253,7 @@ def test_orbit_and_gradient_of_all_parts():
         for way in (-1, 1):
             moved = design.copy()
             moved[index] += way * step
-            ends.append(evaluator(moved, start=found.state, series=False).response)
+            ends.append(evaluator(jnp.asarray(moved), start=found.state, series=False).response)
         for name in ("mean_force_N", "rms_force_N"):
             slope = (ends[1][name] - ends[0][name]) / (2 * step)
             assert found.gradient[name][key] == pytest.approx(slope, rel=1e-5), (key, name)
