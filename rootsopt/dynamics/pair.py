@@ -33,6 +33,11 @@ class SearchContact(eqx.Module):
     def of(cls, profile: Profile) -> "SearchContact":
         return cls(FlankPair.of(profile))
 
+    @property
+    def jumps(self) -> bool:
+        """Whether the levers may jump, from one minimum of the gap to another as deep."""
+        return self.pair.profile.cusp or not self.pair.rolling
+
     def __call__(self, roll, relative):
         return self.with_switches(roll, relative)[0]
 
@@ -98,6 +103,11 @@ class RotorPair(eqx.Module):
         """|ε| (rad) beyond which the lobes count as having passed through each other: a
         quarter of the angle from a lobe's axis to its flank at the pitch circle."""
         return jnp.pi / (8 * self.lobes)
+
+    @property
+    def jumps(self) -> bool:
+        """Whether the contact force may jump where no other part does."""
+        return isinstance(self.contact, SearchContact) and self.contact.jumps
 
     def physical(
         self, tau: Float[Array, "*n"], state: Float[Array, "*n 2"]
