@@ -237,6 +237,8 @@ def flow(
     the same error control; `top` (N) is about the greatest force, for the p-norm. The peak is
     located between `samples` uniform ones. With `tangents` (directions of the pair's parameters,
     stacked along a leading axis; there may be none) every step is linearised, which gives `slope`.
+    Where the contact may jump, that includes the moving instant of a jump, and an `adjoint` only
+    says that the mode is reverse.
     With `grid` the steps recorded there are repeated (while `repeat`), else they are chosen anew.
     """
     count, dtype = state.shape[0], state.dtype

@@ -37,10 +37,10 @@ def saltation(
     tau: Float[Array, ""],
     step: Float[Array, ""],
     state: Float[Array, " n"],
-    first: Float[Array, " m+3"],
-    last: Float[Array, " m+3"],
-) -> Float[Array, " m"]:
-    """Zero, with the derivative that a jump inside a step of y (m numbers) adds to y after it.
+    first: Float[Array, " rows"],
+    last: Float[Array, " rows"],
+) -> Float[Array, " rows-3"]:
+    """Zero, with the derivative that a jump inside a step adds to y after it.
 
     `tau`, `state`: where the step begins, `step` its length (mesh periods); `first`, `last`: the
     slope of y with the `marks` behind, at its begin and at its end. Exact but for the length of
