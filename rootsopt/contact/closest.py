@@ -54,7 +54,7 @@ _DONE = 8
 # a share of the flank, about √|ε|, next to a cusp at the pitch point).
 _USUAL = -5e-3
 # Distance (rad) before a cusp within which a contact belongs to it: between the two minima, which
-# are tens of |ε| apart.
+# are several |ε| apart.
 _NEAR_CUSP = 1e-3
 # Rounding of T relative to the pitch radius, by bytes of a number.
 _SLACK = {8: 1e-13, 4: 1e-6}

@@ -311,7 +311,8 @@ def flow(
 
         @jax.checkpoint
         def again(y, step):
-            return one(*step, y, dynamic)[0]
+            begin, end = step
+            return one(begin, end, y, dynamic)[0]
 
         def advance(y, step):
             return lax.cond(step[1] < jnp.inf, again, lambda y, _: y, y, step), y

@@ -23,6 +23,8 @@ shorter."""
 _FASTER = 20.0
 """Change of a lever per mesh period, in pitch radii, that only a jump makes: along a flank of EE it
 is at most 2π, with any number of lobes."""
+_ROUNDINGS = 300
+"""Roundings of a lever that are no jump."""
 MARKS = 3
 """Numbers that tell a jump, beside the slope of a motion."""
 
@@ -54,7 +56,8 @@ def saltation(
     side = jnp.where(relative < 0, 1.0, -1.0)
     period = lax.stop_gradient(pair.mesh_period)
     closing = period * side * (jump[0] * speed - jump[1] * (speed + rate))
-    most = _FASTER * jnp.abs(step) * pair.contact.pair.profile.pitch_radius
+    most = _FASTER * jnp.abs(step) + _ROUNDINGS * float(jnp.finfo(step.dtype).eps)
+    most = most * pair.contact.pair.profile.pitch_radius
     jumps = (jnp.abs(step) < LONGEST) & (jnp.max(jnp.abs(jump)) > most) & (closing != 0)
     moved = (lax.stop_gradient(depth) - depth) / jnp.where(jumps, closing, jnp.inf)
     return fall * moved
