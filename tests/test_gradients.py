@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from rootsopt.config import load
+from rootsopt.contact.closest import FlankPair
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.steady import close_orbit, reverse_sensitivity, settle, settled_within
 from rootsopt.evaluate import Evaluator
 from rootsopt.model import DESIGN_KEYS, design_vector
+from rootsopt.profiles.ee import EE
 
 SHARP = ("solver.method=dopri8", "solver.rtol=1e-12")
 SCENES = {
@@ -25,7 +27,7 @@ SCENES = {
 CIC = [(36.43, 9.0, 4.0), (36.43, 8.0, 4.0), (30.0, 5.0, 2.0)]
 # Lobes of EE. The deeper of two contacts beside the cusp at the pitch point changes, and the force
 # jumps: without that in the derivative it is 4e-6 off with three lobes, 4e-5 with four.
-EE = [2, 3, 4]
+EE_LOBES = [2, 3, 4]
 MEASURES = Measures(np.array([1.0, 2.0]), jnp.asarray(16.0))
 STEP = 2e-5
 """Relative step: differences of order 4 agree from 1e-3 down to 1e-5; orbits have a noise of
@@ -117,7 +119,7 @@ def test_cic(scene, design):
     assert max(found.values()) < 1e-6, found
 
 
-@pytest.mark.parametrize("lobes", EE)
+@pytest.mark.parametrize("lobes", EE_LOBES)
 @pytest.mark.parametrize("scene", SCENES)
 def test_ee(scene, lobes):
     """The same by speed, load and backlash for a profile that has no design parameter."""
@@ -151,3 +153,22 @@ def test_jump_in_both_modes():
     # What the peak is weighted with comes from differences of the force, and these from rounding.
     assert errors[2] < 1e-6
     assert np.max(np.delete(errors, 2)) < 1e-9
+
+
+def test_jump_is_a_switch():
+    """Where the levers jump beside a cusp, twice in a mesh, a switch changes: so that a step
+    short enough for the derivative holds the jump at any tolerance."""
+    pair = FlankPair.of(EE(3, 0.033))
+    rolls = pair.profile.half_pitch + jnp.linspace(-0.02, 0.02, 801)
+
+    @jax.jit
+    def look(roll):
+        found = pair(roll, jnp.asarray(-1.2e-3))
+        return found.lever1, pair.switches(roll, found)
+
+    levers, switches = (np.asarray(x) for x in jax.lax.map(look, rolls))
+    steps = np.abs(np.diff(levers))
+    jumps = np.flatnonzero(steps > 20 * np.median(steps))
+    changes = np.any(switches[1:] != switches[:-1], axis=1)
+    assert len(jumps) == 2
+    assert np.all(changes[jumps])
