@@ -53,6 +53,9 @@ _DONE = 8
 # method, where it converges, finds the closest approach and no other common normal (but for
 # a share of the flank, about √|ε|, next to a cusp at the pitch point).
 _USUAL = -5e-3
+# Distance (rad) before a cusp within which a contact belongs to it: between the two minima, which
+# are several |ε| apart.
+_NEAR_CUSP = 1e-3
 # Rounding of T relative to the pitch radius, by bytes of a number.
 _SLACK = {8: 1e-13, 4: 1e-6}
 
@@ -181,7 +184,11 @@ class FlankPair(eqx.Module):
         beyond = (normals[:, None] > ends).ravel()
         half = self.profile.half_pitch
         mirrored = jnp.sin(jnp.pi / 2 * (roll - half) / half) > 0
-        return jnp.concatenate([jnp.stack([found.found, mirrored]), beyond])
+        pieces = [found.found, mirrored]
+        if self.profile.cusp:
+            # The second minimum lies beyond the cusp or close before it.
+            pieces.append(found.normal2 > self.frozen.pitch_normal - _NEAR_CUSP)
+        return jnp.concatenate([jnp.stack(pieces), beyond])
 
     def _closest(self, roll, relative) -> ClosestApproach:
         """Closest approach for a folded `roll`, with its derivatives.

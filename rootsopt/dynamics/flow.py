@@ -1,5 +1,6 @@
 """Integration of a rotor pair over whole mesh periods with diffrax."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ import optimistix
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.dynamics.jump import MARKS, marks, saltation
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, locate_peak, one_sided
@@ -235,6 +237,8 @@ def flow(
     the same error control; `top` (N) is about the greatest force, for the p-norm. The peak is
     located between `samples` uniform ones. With `tangents` (directions of the pair's parameters,
     stacked along a leading axis; there may be none) every step is linearised, which gives `slope`.
+    Where the contact may jump, that includes the moving instant of a jump, and an `adjoint` only
+    says that the mode is reverse.
     With `grid` the steps recorded there are repeated (while `repeat`), else they are chosen anew.
     """
     count, dtype = state.shape[0], state.dtype
@@ -243,15 +247,18 @@ def flow(
     top = jnp.ones_like(force_unit) if top is None else lax.stop_gradient(top) / force_unit
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
     solver = how.solver(dtype, "lax" if adjoint is None else "bounded")
+    # An adjoint of the solver knows nothing of jumps: then the steps are what is differentiated.
+    jumps = pair.jumps
+    retraced = jumps and adjoint is not None
 
-    def derivative(tau, y, dynamic):
+    def derivative(tau, y, dynamic, marked=False):
         pair = eqx.combine(dynamic, static)
         slope, contact = pair.derivative(tau, y[:count])
         rates = measures.rates(tau, contact.total / force_unit, top)
         if pair.drive.free:
             # Averages are over time, which passes unevenly.
             rates = pair.pace(y[:count]) * jnp.append(rates, jnp.ones_like(force_unit))
-        return jnp.concatenate([slope, rates])
+        return jnp.concatenate([slope, rates, *([marks(contact)] if marked else [])])
 
     def whole(share, y, dynamic):
         return periods * derivative(share * periods, y, dynamic)
@@ -266,8 +273,8 @@ def flow(
         t0=dtype.type(0.0),
         t1=dtype.type(1.0),
         dt0=_FIRST_STEP / periods,
-        y0=start,
-        args=dynamic,
+        y0=lax.stop_gradient(start) if retraced else start,
+        args=lax.stop_gradient(dynamic) if retraced else dynamic,
         saveat=diffrax.SaveAt(
             subs=[
                 diffrax.SubSaveAt(
@@ -281,7 +288,7 @@ def flow(
         stepsize_controller=StepGrid(  # pyright: ignore[reportCallIssue]
             pid=how.controller(dtype, periods), ends=ends, repeat=repeated
         ),
-        adjoint=diffrax.ForwardMode() if adjoint is None else adjoint,
+        adjoint=diffrax.ForwardMode() if adjoint is None or retraced else adjoint,
         max_steps=how.max_steps,
         throw=False,
     )
@@ -292,7 +299,29 @@ def flow(
     before = jnp.concatenate([start[None], after[:-1]])
     last = jnp.maximum(solution.stats["num_accepted_steps"] - 1, 0)
 
-    term = diffrax.ODETerm(derivative)
+    term = diffrax.ODETerm(functools.partial(derivative, marked=jumps))
+
+    def one(begin, end, y, dynamic):
+        """y after one step, and its slope there."""
+        if not jumps:
+            after, _, slope = one_step(solver, term, begin, end, y, dynamic)
+            return after, slope
+        after, *slopes = one_step(solver, term, begin, end, jnp.pad(y, (0, MARKS)), dynamic)
+        pair = eqx.combine(dynamic, static)
+        moved = saltation(pair, begin, end - begin, y[:count], *slopes)
+        return after[:-MARKS] + moved, slopes[1][:-MARKS]
+
+    if retraced:
+
+        @jax.checkpoint
+        def again(y, step):
+            begin, end = step
+            return one(begin, end, y, dynamic)[0]
+
+        def advance(y, step):
+            return lax.cond(step[1] < jnp.inf, again, lambda y, _: y, y, step), y
+
+        end, before = lax.scan(advance, start, (begins, ends))
     # The step that holds the peak is taken once more, as far as the peak, and from there on short
     # steps to both sides.
     peak_time, depth = locate_peak(lax.stop_gradient(pair), states, periods)
@@ -304,7 +333,7 @@ def flow(
     sides = BESIDE_UNIT[dtype.itemsize] * jnp.asarray(BESIDE, dtype)
 
     def state_and_force(begin, end, y, dynamic):
-        after, slope = one_step(solver, term, begin, end, y, dynamic)
+        after, slope = one(begin, end, y, dynamic)
         return jnp.append(after, slope[count] / slope[-1] if pair.drive.free else slope[count])
 
     if tangents is None:

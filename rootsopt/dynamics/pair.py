@@ -52,6 +52,11 @@ class SearchContact(eqx.Module):
     ) -> "SearchContact":
         return cls(FlankPair.of(profile, center_distance, both))
 
+    @property
+    def jumps(self) -> bool:
+        """Whether the levers may jump, from one minimum of the gap to another as deep."""
+        return self.pair.profile.cusp or not self.pair.rolling
+
     def __call__(self, roll, relative):
         found = self.pair(roll, relative)
         return found.gap, found.lever1, found.lever2
@@ -76,12 +81,15 @@ class Motion(NamedTuple):
 
 class FlankForce(NamedTuple):
     """Contact at an instant or several: normal force (N) by flank, greatest penetration (m;
-    negative: gap), torques on the rotors (N·m), each positive in its rotor's sense of rotation,
-    and, where there are supports, the force on rotor 2 (N); that on rotor 1 is opposite."""
+    negative: gap) with the levers (m) of that flank, torques on the rotors (N·m), each positive in
+    its rotor's sense of rotation, and, where there are supports, the force on rotor 2 (N); that on
+    rotor 1 is opposite."""
 
     drive: Float[Array, "*n"]
     coast: Float[Array, "*n"]
     depth: Float[Array, "*n"]
+    lever1: Float[Array, "*n"]
+    lever2: Float[Array, "*n"]
     torque1: Float[Array, "*n"]
     torque2: Float[Array, "*n"]
     push: Float[Array, "*n 2"] | None = None
@@ -156,6 +164,12 @@ class RotorPair(eqx.Module):
         quarter of the angle from a lobe's axis to its flank at the pitch circle."""
         return jnp.pi / (8 * self.lobes)
 
+    @property
+    def jumps(self) -> bool:
+        """Whether the contact force may jump where no other part does, and derivatives take that
+        into account."""
+        return isinstance(self.contact, SearchContact) and self.contact.jumps and not self.both
+
     def speed(self, state: Float[Array, "*k n"]) -> Float[Array, "*#k"]:
         """Angular speed of rotor 1 (rad/s) in a scaled state."""
         if not self.drive.free:
@@ -215,7 +229,14 @@ class RotorPair(eqx.Module):
             flanks = jax.vmap(self._flank_force, (0, None))(sides, motion)
             drive, coast = flanks.drive
             summed = jax.tree.map(lambda x: jnp.sum(x, axis=0), flanks)
-            return summed._replace(drive=drive, coast=coast, depth=jnp.max(flanks.depth))
+            deeper = jnp.argmax(flanks.depth)
+            return summed._replace(
+                drive=drive,
+                coast=coast,
+                depth=flanks.depth[deeper],
+                lever1=flanks.lever1[deeper],
+                lever2=flanks.lever2[deeper],
+            )
         drives = motion.relative < 0
         flank = self._flank_force(jnp.where(drives, 1.0, -1.0), motion)
         return flank._replace(
@@ -240,7 +261,16 @@ class RotorPair(eqx.Module):
             torque2 += side * drag * sliding.point.support2
             if push is not None and tangent is not None:
                 push += drag * tangent
-        return FlankForce(force, jnp.zeros_like(force), touch.depth, torque1, torque2, push)
+        return FlankForce(
+            drive=force,
+            coast=jnp.zeros_like(force),
+            depth=touch.depth,
+            lever1=touch.lever1,
+            lever2=touch.lever2,
+            torque1=torque1,
+            torque2=torque2,
+            push=push,
+        )
 
     def _touch(self, side: Float[Array, ""], motion: Motion) -> _Touch:
         """The flanks of one side (1 drive, -1 coast).

@@ -262,7 +262,8 @@ def reverse_sensitivity(
     measures: Measures | None = None,
     top: Float[Array, ""] | None = None,
 ) -> Float[Array, "r d"]:
-    """The same sensitivity by reverse mode, through diffrax's checkpointed adjoint.
+    """The same sensitivity by reverse mode, through diffrax's checkpointed adjoint (where the
+    contact may jump, which that knows nothing of, through the steps themselves).
 
     On the steps `grid` of the closed orbit, whose peak is `top` (N). With cotangents v of a
     response and w of the end state, the implicit function theorem asks for

@@ -6,7 +6,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from rootsopt.contact.impact import smooth_step
 from rootsopt.profiles.base import Profile
+
+_BRIEF = 0.01
+"""Roll angle (rad) in which a stretch of the flank takes at least to pass the seal on."""
 
 
 class Load(eqx.Module):
@@ -53,7 +57,10 @@ class GasLoad(Load):
         T = Δp L (r_a² - ρ²) / 2.
 
     ρ is that of perfect rolling at φ1 (what ε changes of it is of the order of ε). The mean
-    over a turn is, for both rotors together, the displaced volume times Δp / 2π, exactly.
+    over a turn is, for both rotors together, the displaced volume times Δp / 2π: exactly, but
+    where a tip arc meshes all at once (a canonical CIC). Its jump of ρ is spread over `_BRIEF`,
+    since gas at a wide gap does not jump, and a jump that moves with the design would have to be
+    followed for its derivatives.
 
     `pressure` Δp (Pa) times the rotor's length L: `pressure_length` (N/m); `profile`;
     `outer_radius` r_a (m); `torque`: mean against one rotor (N·m).
@@ -77,14 +84,29 @@ class GasLoad(Load):
 
     def _torque(self, phi, rotor):
         profile = self.profile
-        r, half = profile.pitch_radius, profile.half_pitch
+        half = profile.half_pitch
         roll = self._roll(phi)
         addendum = half - jnp.abs(roll - half)
+        lead = rotor * jnp.where(roll < half, 1.0, -1.0)
+
+        def vane(normal):
+            s = profile.contact_distance(normal)
+            across = profile.pitch_radius * jnp.cos(normal - profile.roll_angle(normal))
+            return self.outer_radius**2 - (profile.pitch_radius**2 + s**2 + lead * 2 * s * across)
+
         normal = profile.normal_at(addendum)
-        s = jnp.where(roll < half, 1.0, -1.0) * profile.contact_distance(normal)
-        across = r * jnp.cos(normal - addendum)
-        squared = r**2 + s**2 + rotor * 2 * s * across
-        return self.pressure_length * (self.outer_radius**2 - squared) / 2
+        squares = vane(normal)
+        for segment in profile.segments():
+            if segment.land:
+                continue
+            begin, end = profile.roll_angle(jnp.stack([segment.start, segment.stop]))
+            share = (addendum - (begin + end - _BRIEF) / 2) / _BRIEF
+            before = vane(jnp.where(addendum < jnp.minimum(begin, end), normal, segment.start))
+            after = vane(jnp.where(addendum > end, normal, segment.stop))
+            spread = before + smooth_step(share) * (after - before)
+            brief = (end - begin < _BRIEF) & (share > 0) & (share < 1)
+            squares = jnp.where(brief, spread, squares)
+        return self.pressure_length / 2 * squares
 
     def switches(self, phi):
         half = self.profile.half_pitch
