@@ -36,14 +36,21 @@ def body(config: Config, options: argparse.Namespace) -> int:
     ran = time.perf_counter() - began
     _write(folder, config, options, result, choice, clock.seconds, ran)
     out = Console()
+    baseline = result.baseline.record().get("speeds")
     if result.optimized is None:
         out.print(report.evaluation_table(result.baseline))
+        if baseline:
+            out.print(report.speeds_table(baseline))
         out.print(_no_result(result))
     else:
         rows = result.problem.constraint_rows(result.optimized)
         out.print(
             report.comparison_table(result.baseline, result.optimized, rows, result.improvement)
         )
+        if baseline:
+            optimized = result.optimized.record()["speeds"]
+            objectives = result.problem.by_speed(result.optimized)
+            out.print(report.speeds_table(baseline, optimized, objectives))
     total = time.perf_counter() - began
     out.print(
         f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
@@ -93,6 +100,8 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
     data["constraints"] = (
         result.problem.constraint_rows(result.optimized) if result.optimized is not None else []
     )
+    if result.optimized is not None and config.objective.speeds_rpm:
+        data["objective_by_speed"] = result.problem.by_speed(result.optimized)
     data["verification"] = result.verification
     data["statistics"] = {
         "evaluations": len(rows),
@@ -108,6 +117,12 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
             plot.optimization_figures(folder, result.baseline, result.optimized, rows, config)
         else:
             plot.simulation_figures(folder, result.baseline, config)
+        if config.objective.speeds_rpm:
+            from rootsopt.plot_speeds import speed_figure
+
+            names = {"baseline": result.baseline, "optimised": result.optimized}
+            designs = {name: one.parts for name, one in names.items() if one is not None}
+            speed_figure(folder, designs, "Contact force over the speeds of the objective")
 
 
 @contextlib.contextmanager

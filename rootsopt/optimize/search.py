@@ -119,7 +119,8 @@ class Search:
             return Optimization(None, baseline, None, [], {})  # type: ignore[arg-type]
         self.fast.model = self.exact.model
         # What the forces of motions that coexist are relative to.
-        self.fast.reference = self.exact.reference = baseline.response
+        self.fast.relate(baseline)
+        self.exact.relate(baseline)
         self.fast.fitted = self.fast.prepared = True
         self.problem = Problem.of(self.config, self.exact.model, baseline)
         start = self.problem.point(list(baseline.design.values()))
