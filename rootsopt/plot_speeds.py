@@ -36,9 +36,10 @@ def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[Part]], force: str) -> 
             if part.evaluation.usable and len(parts) > _FEW:
                 continue
             marker = _MARKERS.get(status, _NO_FORCE)
-            where = {} if np.isfinite(value) else {"transform": ax.get_xaxis_transform()}
             height = value if np.isfinite(value) else 0.03
-            ax.plot(part.speed_rpm, height, marker, color=color, markersize=5.5, **where)
+            (mark,) = ax.plot(part.speed_rpm, height, marker, color=color, markersize=5.5)
+            if not np.isfinite(value):
+                mark.set_transform(ax.get_xaxis_transform())
     ax.set(ylabel=LABELS.get(force, force.replace("_", " ")))
     ax.grid(color="0.92", linewidth=0.6)
     ax.set_axisbelow(True)
@@ -70,7 +71,7 @@ def speed_figure(
     """Write speeds.png, mean and peak force over speed; return its name."""
     made, axes = plot.figure(9, 6.6, 2, 1, sharex=True)
     for ax, force in zip(axes[:, 0], LABELS, strict=True):
-        plot_speeds(ax, designs, force)
+        plot_speeds(ax, designs, force).set_ylim(0, None)
     axes[-1, 0].set_xlabel("speed (rpm)")
     entries = legend_entries(designs)
     made.legend(handles=entries, loc="outside lower center", ncols=min(len(entries), 4),

@@ -94,10 +94,10 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
 
 def sweep_table(rows: list[dict[str, Any]]) -> RenderableType:
     """One design at many speeds, a row each; `rows` as `rootsopt.speeds.Part.row` gives them."""
-    columns = "mean, N", "peak, N", "RMS, N", "period", "multiplier", "status"
+    columns = "mean, N", "peak, N", "period", "multiplier", "status"
     table = _table("Contact force over speed", *columns)
     table.columns[0].header = Text("speed, rpm")
-    keys = "mean_force_N", "peak_force_N", "rms_force_N", "period", "floquet_multiplier"
+    keys = "mean_force_N", "peak_force_N", "period", "floquet_multiplier"
     for row in rows:
         table.add_row(_number(row["speed_rpm"]), *(_number(row[key]) for key in keys), _word(row))
     return table

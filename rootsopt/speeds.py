@@ -194,27 +194,26 @@ def swept_speeds(config: Config) -> list[float]:
 
 def sweep(
     evaluator: Evaluator,
+    speeds_rpm: Sequence[float],
     design: Any = None,
-    speeds_rpm: Sequence[float] | None = None,
     progress: Callable[[int, int], None] = lambda done, expected: None,
 ) -> tuple[Part, ...]:
-    """`design` (config units; default: the config's own) at each speed, by default those of the
-    config's sweep, every one from rest; equal shares.
+    """`design` (config units; default: the config's own) at each of the speeds, every one from
+    rest; equal shares.
 
     `evaluator`: one that looks at a single speed. `progress` is called with (speeds done, all).
     """
-    speeds = swept_speeds(evaluator.config) if speeds_rpm is None else list(speeds_rpm)
     parts: list[Part] = []
 
     def at(speed: float) -> Part:
         own = copy.copy(evaluator)
         own.model = at_speed(evaluator.model, speed)
-        return Part(speed, 1 / len(speeds), own(design, series=False))
+        return Part(speed, 1 / len(speeds_rpm), own(design, series=False))
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for part in pool.map(at, speeds):
+        for part in pool.map(at, speeds_rpm):
             parts.append(part)
-            progress(len(parts), len(speeds))
+            progress(len(parts), len(speeds_rpm))
     return tuple(parts)
 
 

@@ -24,7 +24,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
     with _progress(Console(stderr=True)) as progress:
         config, choice = auto.resolve(config)
         evaluator = without_gradient(evaluator_for(speeds.alone(config)))
-        parts = speeds.sweep(evaluator, progress=progress)
+        parts = speeds.sweep(evaluator, speeds.swept_speeds(config), progress=progress)
     rows = [part.row() for part in parts]
     status, message = speeds.overall(parts)
     folder.write_text("config.yaml", config.to_yaml())
