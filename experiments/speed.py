@@ -25,6 +25,7 @@ use_cache()
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from matplotlib.lines import Line2D  # noqa: E402
 from scipy.signal import find_peaks  # noqa: E402
 
 from rootsopt import files, plot  # noqa: E402
@@ -41,8 +42,8 @@ SCENES = {"shipped": (), "light": ("scene.timing_gear.damping_ratio=0.1",)}
 TITLES = {"shipped": "shipped scene", "light": "gear damping ratio 0.1"}
 OPTIMISED = {
     "at 3000 rpm": (),
-    "range, mean": ("objective.over_speeds=weighted",),
-    "range, worst": ("objective.over_speeds=worst",),
+    "over the range, mean": ("objective.over_speeds=weighted",),
+    "over the range, worst": ("objective.over_speeds=worst",),
 }
 QUICK = ("optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=1")
 PHASES = 240
@@ -191,7 +192,7 @@ def study(scene: str, speeds, listed, quick: bool) -> dict[str, Any]:
         outcome: dict[str, Any] = {"scene": scene, "optimised": name}
         if result.optimized is not None:
             design = np.array(list(result.optimized.design.values()))
-            label = f"CIC, {name}"
+            label = f"CIC, optimised {name}"
             designs[label] = sweep(evaluators["cic"], speeds, design)
             linear[label] = linearised(evaluators["cic"].pair(jnp.asarray(design)))
             pairs = zip(designs[label], base, strict=True)
@@ -218,15 +219,21 @@ def study(scene: str, speeds, listed, quick: bool) -> dict[str, Any]:
 def draw_speeds(studies: dict[str, dict]):
     """Mean and peak force over speed, a column for each scene."""
     made, axes = plot.figure(13, 7.4, 2, len(studies), sharex=True, sharey="row")
+    *shown, _ = OPTIMISED
+    labels = ["CIC", "EE", *(f"CIC, optimised {name}" for name in shown)]
+    entries = {}
+    top = dict.fromkeys(LABELS, 0.0)
     for column, (scene, found) in enumerate(studies.items()):
+        designs = {k: found["designs"][k] for k in labels if k in found["designs"]}
+        entries |= {entry.get_label(): entry for entry in legend_entries(designs)}
         for ax, force in zip(axes[:, column], LABELS, strict=True):
-            plot_speeds(ax, found["designs"], force).set_ylim(0, None)
+            plot_speeds(ax, designs, force)
+            forces = (p.evaluation.response.get(force, 0) for d in designs.values() for p in d)
+            top[force] = max(top[force], *forces)
         axes[0, column].set_title(TITLES[scene])
         axes[1, column].set_xlabel("speed (rpm)")
-    most = max((found["designs"] for found in studies.values()), key=len)
-    entries = {entry.get_label(): entry for entry in legend_entries(most)}
-    for found in studies.values():
-        entries |= {entry.get_label(): entry for entry in legend_entries(found["designs"])}
+    for ax, force in zip(axes[:, 0], LABELS, strict=True):
+        ax.set_ylim(0, 1.05 * top[force])
     made.legend(handles=list(entries.values()), loc="outside lower center", ncols=4, frameon=False)
     made.suptitle("Contact force over speed, from rest")
     return made
@@ -241,7 +248,7 @@ def draw_objective(studies: dict[str, dict], listed):
         base = found["designs"]["CIC"]
         speeds = np.array([part.speed_rpm for part in base])
         for name, (color, dashes, marker) in styles.items():
-            parts = found["designs"].get(f"CIC, {name}")
+            parts = found["designs"].get(f"CIC, optimised {name}")
             if parts is None:
                 continue
             pairs = zip(parts, base, strict=True)
@@ -268,28 +275,30 @@ def draw_objective(studies: dict[str, dict], listed):
 
 
 def draw_resonances(studies: dict[str, dict], rows: list[dict], peaks: list[dict]):
-    """Peak force of the shipped pairs with the crossings and the maxima found."""
-    made, axes = plot.figure(13, 7.6, 2, len(studies), sharex=True)
-    modes = {"contact": (plot.GREEN, "--"), "gear": (plot.PURPLE, ":")}
+    """Peak force with the crossings and the maxima found: shipped pairs, optimised CIC."""
+    shown = {
+        "CIC": plot.BLUE,
+        "EE": plot.VERMILION,
+        f"CIC, optimised {next(iter(OPTIMISED))}": plot.SKY,
+    }
+    made, axes = plot.figure(13, 10.5, len(shown), len(studies), sharex=True)
+    modes = {"contact": (plot.GREEN, "--"), "gear": (plot.PURPLE, ":"), "average": ("0.45", "-.")}
     for column, (scene, found) in enumerate(studies.items()):
-        for ax, (name, color) in zip(
-            axes[:, column], {"CIC": plot.BLUE, "EE": plot.VERMILION}.items(), strict=True
-        ):
+        for ax, (name, color) in zip(axes[:, column], shown.items(), strict=True):
+            if name not in found["designs"]:
+                continue
             here = {"scene": scene, "design": name}.items()
-            plot_speeds(ax, {name: found["designs"][name]}, "peak_force_N")
-            ax.lines[0].set_color(color)
-            for mark in ax.lines[1:]:
-                mark.set_color(color)
-            static = found["linear"][name]["static_peak_N"]
-            ax.axhline(static, color="black", linewidth=0.8, linestyle="-.")
-            top = 1.18 * max(p.evaluation.response.get("peak_force_N", 0)
-                             for p in found["designs"][name])  # fmt: skip
+            parts = found["designs"][name]
+            for line in plot_speeds(ax, {name: parts}, "peak_force_N").lines:
+                line.set_color(color)
+            ax.axhline(found["linear"][name]["static_peak_N"], color="black", linewidth=0.9)
+            top = 1.25 * max(part.evaluation.response.get("peak_force_N", 0) for part in parts)
             for row in rows:
-                if not (here <= row.items() and row["mode"] in modes and row["order"] <= 4):
+                if not here <= row.items() or row["order"] > 3:
                     continue
                 shade, dashes = modes[row["mode"]]
                 ax.axvline(row["speed_rpm"], color=shade, linestyle=dashes, linewidth=1.1)
-                height = 0.965 if row["mode"] == "contact" else 0.905
+                height = 0.97 - 0.055 * list(modes).index(row["mode"])
                 ax.text(row["speed_rpm"] + 30, height * top, str(row["order"]), color=shade,
                         va="center", fontsize=9)  # fmt: skip
             for peak in peaks:
@@ -298,7 +307,6 @@ def draw_resonances(studies: dict[str, dict], rows: list[dict], peaks: list[dict
             ax.set(title=f"{name}, {TITLES[scene]}", ylim=(0, top))
     for ax in axes[-1]:
         ax.set_xlabel("speed (rpm)")
-    from matplotlib.lines import Line2D
 
     def entry(label, **style):
         return Line2D([], [], label=label, **style)
@@ -307,9 +315,9 @@ def draw_resonances(studies: dict[str, dict], rows: list[dict], peaks: list[dict
         handles=[
             *(entry(f"k × mesh frequency = {mode} frequency", color=c, linestyle=d)
               for mode, (c, d) in modes.items()),
-            entry("peak at standstill", color="black", linewidth=0.8, linestyle="-."),
+            entry("peak at standstill", color="black", linewidth=0.9),
             entry("local maximum", color="black", linestyle="", marker="v", markersize=5),
-            entry("chaotic or not settled", color="black", linestyle="", marker="x"),
+            entry("chaotic, or not settled (+)", color="black", linestyle="", marker="x"),
         ],
         loc="outside lower center", ncols=3, frameon=False,
     )  # fmt: skip

@@ -22,8 +22,8 @@ LABELS = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
 def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[Part]], force: str) -> Axes:
     """`force` (a key of the responses) over speed, a line for each design.
 
-    A line goes through steady motions of one period only. Other motions are marked by themselves;
-    those without a force stand at the bottom.
+    A line goes through steady motions. Others are marked one by one; those without a force stand
+    at the bottom.
     """
     for (name, parts), color, dashes in zip(designs.items(), _COLORS, _DASHES * 2, strict=False):
         speeds = np.array([part.speed_rpm for part in parts])
@@ -31,15 +31,18 @@ def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[Part]], force: str) -> 
         usable = np.array([part.evaluation.usable for part in parts])
         line = np.where(usable, values, np.nan)
         ax.plot(speeds, line, color=color, linestyle=dashes, linewidth=1.5, label=name)
-        for part, value in zip(parts, values, strict=True):
-            status = part.evaluation.status.label
-            if part.evaluation.usable and len(parts) > _FEW:
+        # A single one between motions that are not steady makes no line.
+        beside = np.concatenate([[False], usable, [False]])
+        marked = ~usable | (len(parts) <= _FEW) | ~(beside[:-2] | beside[2:])
+        for part, value, mark in zip(parts, values, marked, strict=True):
+            if not mark:
                 continue
+            status = part.evaluation.status.label
             marker = _MARKERS.get(status, _NO_FORCE)
             height = value if np.isfinite(value) else 0.03
-            (mark,) = ax.plot(part.speed_rpm, height, marker, color=color, markersize=5.5)
+            (point,) = ax.plot(part.speed_rpm, height, marker, color=color, markersize=5.5)
             if not np.isfinite(value):
-                mark.set_transform(ax.get_xaxis_transform())
+                point.set_transform(ax.get_xaxis_transform())
     ax.set(ylabel=LABELS.get(force, force.replace("_", " ")))
     ax.grid(color="0.92", linewidth=0.6)
     ax.set_axisbelow(True)
@@ -51,7 +54,12 @@ def legend_entries(designs: Mapping[str, Sequence[Part]]) -> list[Line2D]:
     entries = []
     for name, color, dashes in zip(designs, _COLORS, _DASHES * 2, strict=False):
         entries.append(Line2D([], [], color=color, linestyle=dashes, linewidth=1.5, label=name))
-    found = dict.fromkeys(p.evaluation.status.label for d in designs.values() for p in d)
+    found = dict.fromkeys(
+        part.evaluation.status.label
+        for parts in designs.values()
+        for part in parts
+        if len(parts) <= _FEW or not part.evaluation.usable
+    )
     if list(found) != ["periodic"]:
         for status in found:
             words = status.replace("_", " ")
