@@ -4,9 +4,9 @@ The configured design is simulated from rest with the reference, contact by sear
 tolerance far below the error asked for. Then cheaper settings are tried, cheapest first,
 and the first whose mean and peak force agree with the reference is kept: for every
 further design of the run, and in the resolved config. With several speeds in the objective,
-they agree at every one; `rootsopt sweep` takes what is chosen so for all its speeds. An estimate that is a measured
-difference holds where a rule of thumb about tolerances would not, and costs two or three
-simulations of one design.
+they agree at every one; `rootsopt sweep` takes what is chosen so for all its speeds. An
+estimate that is a measured difference holds where a rule of thumb about tolerances would not,
+and costs two or three simulations of one design.
 """
 
 import dataclasses
