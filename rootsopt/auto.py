@@ -3,9 +3,10 @@
 The configured design is simulated from rest with the reference, contact by search at a
 tolerance far below the error asked for. Then cheaper settings are tried, cheapest first,
 and the first whose mean and peak force agree with the reference is kept: for every
-further design of the run, and in the resolved config. An estimate that is a measured
-difference holds where a rule of thumb about tolerances would not, and costs two or three
-simulations of one design.
+further design of the run, and in the resolved config. With several speeds in the objective,
+they agree at every one; `rootsopt sweep` takes what is chosen so for all its speeds. An
+estimate that is a measured difference holds where a rule of thumb about tolerances would not,
+and costs two or three simulations of one design.
 """
 
 import dataclasses
@@ -14,6 +15,7 @@ from typing import Any
 
 from rootsopt.config import Config, SolverConfig
 from rootsopt.evaluate import Evaluation, Evaluator
+from rootsopt.speeds import alone, shares
 from rootsopt.status import Status
 
 _JUDGED = ("mean_force_N", "peak_force_N")
@@ -64,22 +66,30 @@ def choose(config: Config) -> Choice:
     # Noise of the steps can keep a motion from settling, or stir it up: then more closely.
     for share in (1e-4, 1e-6):
         reference = _with(config, fidelity="search", rtol=share * wanted)
-        truth = Evaluator(reference)(series=False)
-        if truth.status not in (Status.NOT_SETTLED, Status.CHAOTIC):
+        truth = _evaluations(reference)
+        if not any(one.status in (Status.NOT_SETTLED, Status.CHAOTIC) for one in truth):
             break
-    if truth.status is not Status.PERIODIC:
+    if not all(one.status is Status.PERIODIC for one in truth):
         return Choice(reference, wanted, None, tried)
-    long = truth.statistics["transient_mesh_periods"] > _LONG
+    long = max(one.statistics["transient_mesh_periods"] for one in truth) > _LONG
     for candidate in _candidates(config, wanted, long):
-        found = Evaluator(candidate)(series=False)
-        error = difference(found, truth)
+        found = _evaluations(candidate)
+        errors = [difference(*pair) for pair in zip(found, truth, strict=True)]
+        known = [error for error in errors if error is not None]
+        error = max(known) if len(known) == len(errors) else None
+        status = next((one.status for one in found if not one.usable), found[0].status)
         solver = candidate.solver
         settings = {"fidelity": solver.fidelity, "rtol": solver.rtol}
-        tried.append(settings | {"error": error, "status": found.status.label})
+        tried.append(settings | {"error": error, "status": status.label})
         if error is not None and error <= _MARGIN * wanted:
             # The reference is itself off by about its tolerance's share.
             return Choice(candidate, wanted, error + 0.01 * wanted, tried)
     return Choice(reference, wanted, 0.01 * wanted, tried)
+
+
+def _evaluations(config: Config) -> list[Evaluation]:
+    """The config's own design at every speed of its objective."""
+    return [Evaluator(alone(config, speed))(series=False) for speed in shares(config)]
 
 
 def resolve(config: Config) -> tuple[Config, dict[str, Any]]:

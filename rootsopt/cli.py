@@ -134,11 +134,12 @@ def use_cache() -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The console command `rootsopt`: optimize, simulate, attractors, profile."""
+    """The console command `rootsopt`: optimize, simulate, sweep, attractors, profile."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands = {
         "optimize": "optimise a design and compare it with the baseline",
         "simulate": "simulate one design in one scene",
+        "sweep": "one design at many speeds",
         "attractors": "the motions that coexist in one scene",
         "profile": "geometry of one design",
     }

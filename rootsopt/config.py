@@ -259,10 +259,20 @@ class ObjectiveConfig(_Section):
     peak_norm: Annotated[float, Field(ge=4, le=64)] | None = Field(
         None, description="p of the p-norm that stands for the peak in the search; absent: the peak"
     )
+    speeds_rpm: tuple[Positive, ...] = Field(
+        (), description="speeds the objective is taken over, as [2000, 3000]; none: the scene's"
+    )
+    speed_weights: tuple[Positive, ...] = Field(
+        (), description="weights of these speeds in the objective; none: equal ones"
+    )
+    over_speeds: Literal["weighted", "worst"] = Field(
+        "weighted", description="what these speeds come to: their weighted mean or the worst"
+    )
 
     @model_validator(mode="before")
     @classmethod
     def _orders(cls, data):
+        data = _tuples(data)
         # The name of a key that `--set` gives, and of one in JSON, is a word.
         if isinstance(data, dict) and isinstance(data.get("line_weights"), dict):
             lines = {_number(k): v for k, v in data["line_weights"].items()}
@@ -281,6 +291,38 @@ class ObjectiveConfig(_Section):
             raise ValueError(
                 "`objective.line_weights` and `objective.peak_norm` belong to a periodic motion; "
                 "remove them or set `objective.motion` to reached, worst or weighted"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _speeds(self):
+        speeds, weights = self.speeds_rpm, self.speed_weights
+        if len(set(speeds)) != len(speeds) or len(speeds) > 32:
+            raise ValueError(
+                f"`objective.speeds_rpm` must be at most 32 different speeds, but is {list(speeds)}"
+            )
+        worst = self.over_speeds == "worst"
+        if not speeds and (weights or worst):
+            key = "speed_weights" if weights else "over_speeds"
+            raise ValueError(
+                f"`objective.{key}` belongs to `objective.speeds_rpm`, which has no speed; add "
+                "some or remove it"
+            )
+        if weights and len(weights) != len(speeds):
+            raise ValueError(
+                f"`objective.speed_weights` must be {len(speeds)} numbers, one for each of "
+                f"`objective.speeds_rpm`, but is {list(weights)}"
+            )
+        if weights and worst:
+            raise ValueError(
+                "`objective.speed_weights` belongs to `objective.over_speeds` weighted, but that "
+                "is worst; remove one of them"
+            )
+        if speeds and self.motion == "ensemble":
+            raise ValueError(
+                "`objective.speeds_rpm` must be empty for `objective.motion` ensemble, but is "
+                f"{list(speeds)}: the noise of an average is judged at one speed; optimise at one, "
+                "and look at the others with `rootsopt sweep`"
             )
         return self
 
@@ -361,6 +403,30 @@ class EnsembleConfig(_Section):
     seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of states and designs")
 
 
+class SweepConfig(_Section):
+    """The speeds of `rootsopt sweep`."""
+
+    speed_rpm: dict[Literal["from", "to", "points"], Positive] | None = Field(
+        None,
+        description="{from: 300, to: 6000, points: 39}; absent: `objective.speeds_rpm`, and "
+        "without these 39 from a tenth of to twice the scene's speed",
+    )
+
+    @model_validator(mode="after")
+    def _range(self):
+        wanted = self.speed_rpm
+        if wanted is None:
+            return self
+        whole = wanted.get("points", 0)
+        ordered = wanted.get("from", 0) < wanted.get("to", 0)
+        if len(wanted) < 3 or not (ordered and whole == int(whole) and 2 <= whole <= 10_000):
+            raise ValueError(
+                "`sweep.speed_rpm` must be {from: .., to: .., points: ..} with from below to and "
+                f"2 to 10000 points, but is {wanted}"
+            )
+        return self
+
+
 class ConstraintsConfig(_Section):
     """What an optimised design must satisfy."""
 
@@ -437,6 +503,7 @@ class Config(_Section):
         default_factory=lambda: AttractorsConfig.model_validate({})
     )
     ensemble: EnsembleConfig = Field(default_factory=lambda: EnsembleConfig.model_validate({}))
+    sweep: SweepConfig = Field(default_factory=lambda: SweepConfig.model_validate({}))
     optimizer: OptimizerConfig = Field(default_factory=lambda: OptimizerConfig.model_validate({}))
 
     @property
@@ -598,6 +665,7 @@ def _allowed(kind: str, context: dict, message: str) -> str:
         "finite_number": "a finite number",
         "model_type": "a section with keys of its own",
         "string_type": "a word",
+        "dict_type": "keys with values, as {a: 1, b: 2}",
         "tuple_type": "a list of numbers, as [1, 2]",
     }
     if kind in words:

@@ -127,6 +127,10 @@ class Evaluator:
         self.transient, self.orbit = transient, orbit
         self.measures = measures(config)
 
+    def relate(self, baseline: Evaluation) -> None:
+        """Take the forces of motions that are compared relative to those of the `baseline`."""
+        self.reference = baseline.response
+
     def __call__(
         self,
         design: Float[Array, " d"] | None = None,

@@ -1,4 +1,5 @@
-"""Which evaluator a config asks for: of one motion, of all that coexist, or of an ensemble."""
+"""Which evaluator a config asks for: of one motion, of all that coexist, or of an ensemble; at one
+speed or over several."""
 
 import copy
 from typing import Any
@@ -8,15 +9,22 @@ from rootsopt.evaluate import Evaluator
 
 
 def evaluator_for(config: Config, **options: Any) -> Evaluator:
-    """The evaluator that `objective.motion` asks for, with the options of an `Evaluator`."""
+    """The evaluator that `objective.motion` and `objective.speeds_rpm` ask for, with the options of
+    an `Evaluator`."""
+    several = bool(config.objective.speeds_rpm)
     if config.objective.motion == "ensemble":
         from rootsopt.ensemble import EnsembleEvaluator
 
         return EnsembleEvaluator(config, **options)
     if config.objective.motion in ("worst", "weighted"):
         from rootsopt.basins import AttractorEvaluator
+        from rootsopt.speeds import SpeedsAttractorEvaluator
 
-        return AttractorEvaluator(config, **options)
+        return (SpeedsAttractorEvaluator if several else AttractorEvaluator)(config, **options)
+    if several:
+        from rootsopt.speeds import SpeedsEvaluator
+
+        return SpeedsEvaluator(config, **options)
     return Evaluator(config, **options)
 
 

@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rootsopt.evaluate import Evaluation
+from rootsopt.status import Status
 
 DASH = "-"
 _UNITS = {
@@ -89,6 +90,42 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
     _group(table, "status", [*steady, ("status", _status(evaluation))])
     _group(table, "statistics", _singles(record["statistics"]))
     return Group(table, Text(evaluation.message))
+
+
+def sweep_table(rows: list[dict[str, Any]]) -> RenderableType:
+    """One design at many speeds, a row each; `rows` as `rootsopt.speeds.Part.row` gives them."""
+    columns = "mean, N", "peak, N", "period", "multiplier", "status"
+    table = _table("Contact force over speed", *columns)
+    table.columns[0].header = Text("speed, rpm")
+    keys = "mean_force_N", "peak_force_N", "period", "floquet_multiplier"
+    for row in rows:
+        table.add_row(_number(row["speed_rpm"]), *(_number(row[key]) for key in keys), _word(row))
+    return table
+
+
+def speeds_table(
+    baseline: list[dict[str, Any]],
+    optimized: list[dict[str, Any]] = (),  # type: ignore[assignment]
+    objectives: list[dict[str, float]] = (),  # type: ignore[assignment]
+) -> RenderableType:
+    """Optimised design against baseline at the speeds of the objective, a row each; without one
+    the baseline alone. Rows as in the result file's `speeds` and `objective_by_speed`."""
+    if not optimized:
+        return sweep_table(baseline)
+    columns = "mean, N", "opt.", "peak, N", "opt.", "objective", "status"
+    table = _table("Contact force over speed, baseline and optimised (opt.)", *columns)
+    table.columns[0].header = Text("speed, rpm")
+    for first, second, one in zip(baseline, optimized, objectives, strict=True):
+        forces = (row[key] for key in ("mean_force_N", "peak_force_N") for row in (first, second))
+        cells = (*forces, one["objective"])
+        table.add_row(_number(first["speed_rpm"]), *map(_number, cells), _word(second))
+    return table
+
+
+def _word(row: Mapping[str, Any]) -> Text:
+    """The status of a row."""
+    usable = Status[row["status"].upper()].usable
+    return Text(row["status"], style="bold green" if usable else "bold red")
 
 
 def attractor_table(rows: list[dict[str, Any]], lost: Mapping[str, float]) -> RenderableType:

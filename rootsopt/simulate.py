@@ -17,12 +17,13 @@ def body(config: Config, options: argparse.Namespace) -> int:
     from rootsopt import auto, files, report
     from rootsopt.evaluators import evaluator_for
     from rootsopt.model import check_geometry, outline_mm
+    from rootsopt.speeds import alone
 
     check_geometry(config)
     folder = files.ResultFolder(options.output)
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
         config, choice = auto.resolve(config)
-        evaluation = evaluator_for(config)()
+        evaluation = evaluator_for(alone(config))()
     folder.write_text("config.yaml", config.to_yaml())
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     if evaluation.series is not None:

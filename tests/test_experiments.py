@@ -65,6 +65,30 @@ def test_work_precision(tmp_path, programs):
     assert summary["references"]["cic"]["error"]["mean"] < 1e-7
 
 
+def test_speed(tmp_path):
+    """The slowest speed is as good as standstill; resonances lie where the harmonics meet them."""
+    run("speed", tmp_path, os.environ | {"JAX_PLATFORMS": "cpu"})
+    rows = rows_of(tmp_path / "speed.csv")
+    assert {row["status"] for row in rows} == {"periodic"}
+    summary = json.loads((tmp_path / "speed.json").read_text())
+    for design, found in summary["linearised"]["shipped"].items():
+        own = [row for row in rows if row["design"] == design]
+        assert float(own[0]["speed_rpm"]) == 300
+        assert float(own[0]["mean_force_N"]) == pytest.approx(found["static_mean_N"], rel=0.01)
+        assert float(own[0]["peak_force_N"]) == pytest.approx(found["static_peak_N"], rel=0.06)
+    resonances = rows_of(tmp_path / "speed_resonances.csv")
+    assert {row["mode"] for row in resonances} == {"contact", "gear", "average"}
+    for row in resonances:
+        harmonic = int(row["order"]) * 3 * float(row["speed_rpm"]) / 60
+        assert harmonic == pytest.approx(float(row["frequency_Hz"]), rel=1e-9)
+    outcomes = {row["optimised"]: row for row in summary["optimisations"]}
+    assert outcomes["over the range, mean"]["own_objective"] < 1
+    found = outcomes["over the range, mean"]
+    assert found["own_objective"] == pytest.approx(found["mean_over_listed"], rel=1e-6)
+    for name in ("speed", "speed_objective", "speed_resonances"):
+        assert is_picture(tmp_path / f"{name}.png")
+
+
 def test_benchmark(tmp_path, programs):
     """Every part gives rows, the tools agree, the table of targets is complete."""
     out = run("benchmark", tmp_path, programs)

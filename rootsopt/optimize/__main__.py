@@ -36,12 +36,18 @@ def body(config: Config, options: argparse.Namespace) -> int:
     ran = time.perf_counter() - began
     _write(folder, config, options, result, choice, clock.seconds, ran)
     out = Console()
+    baseline = result.baseline.record().get("speeds")
     if result.optimized is None:
         out.print(report.evaluation_table(result.baseline))
+        if baseline:
+            out.print(report.speeds_table(baseline))
         out.print(_no_result(result))
     else:
         numbers = result.constraints, result.improvement
         out.print(report.comparison_table(result.baseline, result.optimized, *numbers))
+        if baseline:
+            optimized = result.optimized.record()["speeds"]
+            out.print(report.speeds_table(baseline, optimized, result.objective_by_speed))
     total = time.perf_counter() - began
     out.print(
         f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
@@ -89,6 +95,8 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
     data |= choice
     data["improvement"] = result.improvement
     data["constraints"] = result.constraints
+    if config.objective.speeds_rpm and result.optimized is not None:
+        data["objective_by_speed"] = result.objective_by_speed
     data["verification"] = result.verification
     data["statistics"] = {
         "evaluations": len(rows),
@@ -104,6 +112,12 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
             plot.optimization_figures(folder, result.baseline, result.optimized, rows, config)
         else:
             plot.simulation_figures(folder, result.baseline, config)
+        if config.objective.speeds_rpm:
+            from rootsopt.plot_speeds import speed_figure
+
+            names = {"baseline": result.baseline, "optimised": result.optimized}
+            designs = {name: one.parts for name, one in names.items() if one is not None}
+            speed_figure(folder, designs, "Contact force over the speeds of the objective")
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ that u ≤ u_max holds by construction. Constraints depend on geometry alone and
 import dataclasses
 import functools
 import importlib
+import itertools
 import threading
 from collections.abc import Sequence
 
@@ -26,6 +27,7 @@ from rootsopt.evaluate import Evaluation, objective_weights
 from rootsopt.model import DEG, MM, Model
 from rootsopt.profiles import Geometry, geometry
 from rootsopt.programs import Program
+from rootsopt.speeds import counted, parts_of
 
 _SHORTEST = 0.1
 """Least involute, as a share of the longest, where the config sets no bound."""
@@ -166,10 +168,11 @@ class Problem:
         """The problem whose floors are those of the config or of the `baseline`.
 
         Raises `InputError` where a spectral line is to fall that the baseline has not got."""
-        least = _NO_LINE * baseline.response["mean_force_N"]
-        for order, weight in config.objective.line_weights.items():
-            if weight and not baseline.response[line_name(order)] > least:
-                period = baseline.steady_state.get("period")
+        weighted = [order for order, w in config.objective.line_weights.items() if w]
+        for order, part in itertools.product(weighted, parts_of(baseline)):
+            one = part.evaluation
+            if not one.response[line_name(order)] > _NO_LINE * one.response["mean_force_N"]:
+                period = one.steady_state.get("period")
                 raise InputError(
                     f"`objective.line_weights` has the order {order:g}, but the baseline's force "
                     f"has no such line (its motion repeats every {period} mesh periods); remove it"
@@ -177,11 +180,24 @@ class Problem:
         return cls(config, baseline, Space.of(config, model, baseline.geometry["area_efficiency"]))
 
     def objective(self, evaluation: Evaluation) -> float:
-        """Weighted measures of the force relative to the baseline's (1 at the baseline);
-        NaN for a design without a usable steady state."""
+        """Weighted measures of the force relative to the baseline's (1 at the baseline), over the
+        speeds that count; NaN for a design without a usable steady state."""
         if not evaluation.usable:
             return float("nan")
-        return sum(w * evaluation.response[k] for k, w in self._weights().items())
+        return sum(share * self._value(*pair) for share, *pair in self._counted(evaluation))
+
+    def by_speed(self, evaluation: Evaluation) -> list[dict[str, float]]:
+        """The objective at each speed by itself, if there are several."""
+        parts = zip(parts_of(evaluation), parts_of(self.baseline), strict=True)
+        return [
+            {
+                "speed_rpm": part.speed_rpm,
+                "share": part.share,
+                "objective": self._value(part.evaluation, base.evaluation),
+            }
+            for part, base in parts
+            if self.config.objective.speeds_rpm
+        ]
 
     def look(self, point) -> tuple[NDArray[np.float64], ...]:
         """Design at a point of the unit box, its Jacobian, slacks, and their Jacobian."""
@@ -199,13 +215,21 @@ class Problem:
         """Gradient of the objective in the unit box."""
         _, jacobian, _, _ = self.look(point)
         by_design = np.zeros(3)
-        for key, weight in self._weights().items():
-            by_design += weight * np.array(list(evaluation.gradient[key].values()))
+        for share, one, baseline in self._counted(evaluation):
+            for key, weight in self._weights(baseline).items():
+                by_design += share * weight * np.array(list(one.gradient[key].values()))
         return np.asarray(by_design @ np.asarray(jacobian))
 
-    def _weights(self) -> dict[str, float]:
+    def _counted(self, evaluation: Evaluation):
+        return counted(self.config, evaluation, self.baseline, self._value)
+
+    def _value(self, evaluation: Evaluation, baseline: Evaluation) -> float:
+        """Weighted measures of the force at one speed relative to the baseline's there."""
+        return sum(w * evaluation.response[k] for k, w in self._weights(baseline).items())
+
+    def _weights(self, baseline: Evaluation) -> dict[str, float]:
         weights = objective_weights(self.config)
-        return {k: w / max(self.baseline.response[k], 1e-12) for k, w in weights.items()}
+        return {k: w / max(baseline.response[k], 1e-12) for k, w in weights.items()}
 
     def point(self, design) -> NDArray[np.float64]:
         """The nearest point of the unit box to a design in config units."""

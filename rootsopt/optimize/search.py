@@ -94,6 +94,13 @@ class Optimization:
             return []
         return self.problem.constraint_rows(self.optimized)
 
+    @property
+    def objective_by_speed(self) -> list[dict[str, float]]:
+        """The objective at the optimum at each of several speeds, a row each."""
+        if self.problem is None or self.optimized is None:
+            return []
+        return self.problem.by_speed(self.optimized)
+
 
 class Search:
     """One optimisation run of a config."""
@@ -127,7 +134,8 @@ class Search:
             return Optimization(None, baseline, None, [], {})
         self.fast.model = self.exact.model
         # What the forces of motions that coexist are relative to.
-        self.fast.reference = self.exact.reference = baseline.response
+        self.fast.relate(baseline)
+        self.exact.relate(baseline)
         self.fast.fitted = self.fast.prepared = True
         self.problem = Problem.of(self.config, self.exact.model, baseline)
         start = self.problem.point(list(baseline.design.values()))

@@ -1,0 +1,225 @@
+"""One design at several speeds: for `objective.speeds_rpm`, and for `rootsopt sweep`.
+
+The speed is a number of the model, so that every speed is evaluated by the same compiled programs.
+"""
+
+import copy
+import dataclasses
+import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.basins import AttractorEvaluator
+from rootsopt.config import Config
+from rootsopt.evaluate import RESPONSES, Evaluation, Evaluator
+from rootsopt.model import Model
+from rootsopt.status import Status
+
+_STEADY = (
+    "kind",
+    "period",
+    "floquet_multiplier",
+    "lyapunov_exponent_per_mesh_period",
+    "lyapunov_standard_error",
+)
+
+
+class Part(NamedTuple):
+    """The `evaluation` at one speed, and the `share` of that speed in the objective."""
+
+    speed_rpm: float
+    share: float
+    evaluation: Evaluation
+
+    def row(self) -> dict[str, Any]:
+        """In a line, for tables: speed, forces, kind of motion, status; not the share."""
+        response, steady = self.evaluation.response, self.evaluation.steady_state
+        return {
+            "speed_rpm": self.speed_rpm,
+            **{name: response.get(name) for name in (*RESPONSES, *response)},
+            **{name: steady.get(name) for name in _STEADY},
+            "status": self.evaluation.status.label,
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class SpeedsEvaluation(Evaluation):
+    """An `Evaluation` at the scene's own speed, with the `parts` at every speed simulated.
+
+    `status` is that of the first part that is not usable, and then there is no gradient. `state`
+    (m, 1 + n): number of the part and scaled state, a row for each motion known.
+    """
+
+    parts: tuple[Part, ...] = ()
+
+    def record(self) -> dict[str, Any]:
+        return super().record() | {
+            "speeds": [part.row() | {"share": part.share} for part in self.parts]
+        }
+
+
+class SpeedsEvaluator(Evaluator):
+    """Evaluates designs at every speed of `objective.speeds_rpm` and at the scene's own.
+
+    The scene's speed is what the response is reported at. If it is not one of those of the
+    objective, it has no share in that, but its status counts.
+    """
+
+    references: Sequence[dict[str, float] | None] = ()
+
+    def relate(self, baseline: Evaluation) -> None:
+        """Take the forces at each speed relative to those of the `baseline` at that speed."""
+        self.references = [part.evaluation.response for part in parts_of(baseline)]
+
+    def __call__(self, design=None, start=None, series=True) -> SpeedsEvaluation:
+        """As `Evaluator`; `start`: the `state` of a neighbouring design's evaluation."""
+        config = self.config
+        own = config.scene.speed_rpm
+        parts = []
+        try:
+            for number, (speed, share) in enumerate(shares(config).items()):
+                self.model = at_speed(self.model, speed)
+                self.reference = self.references[number] if self.references else None
+                known = None if start is None else _rows(start, number)
+                found = super().__call__(design, known, series and speed == own)
+                parts.append(Part(speed, share, found))
+        finally:
+            self.model = at_speed(self.model, own)
+        (head,) = (part.evaluation for part in parts if part.speed_rpm == own)
+        status, message = overall(parts)
+        seconds = sum(part.evaluation.statistics["seconds"] for part in parts)
+        return SpeedsEvaluation(
+            design=head.design,
+            geometry=head.geometry,
+            response=head.response,
+            gradient=head.gradient if status.usable else {},
+            steady_state=head.steady_state,
+            status=status,
+            message=message,
+            statistics=head.statistics | {"speeds": len(parts), "seconds": seconds},
+            series=head.series,
+            state=_states(parts) if status.usable else None,
+            parts=tuple(parts),
+        )
+
+
+class SpeedsAttractorEvaluator(SpeedsEvaluator, AttractorEvaluator):
+    """A `SpeedsEvaluator` of what all motions that coexist at each speed come to."""
+
+
+def _states(parts: Sequence[Part]) -> NDArray[np.float64]:
+    rows = [np.atleast_2d(np.asarray(part.evaluation.state)) for part in parts]
+    numbered = (np.insert(states, 0, number, axis=1) for number, states in enumerate(rows))
+    return np.concatenate(list(numbered))
+
+
+def _rows(start: NDArray[np.float64], number: int) -> NDArray[np.float64]:
+    states = start[start[:, 0] == number, 1:]
+    return states[0] if len(states) == 1 else states
+
+
+def at_speed(model: Model, speed_rpm: float) -> Model:
+    """`model` at another speed."""
+    speed = jnp.asarray(speed_rpm * 2 * math.pi / 60)
+    return eqx.tree_at(lambda m: m.speed, model, speed)
+
+
+def alone(config: Config, speed_rpm: float | None = None) -> Config:
+    """`config` at one speed, by default the scene's own, with no others in its objective."""
+    speed = config.scene.speed_rpm if speed_rpm is None else speed_rpm
+    none = {"speeds_rpm": (), "speed_weights": (), "over_speeds": "weighted"}
+    return config.model_copy(
+        update={
+            "scene": config.scene.model_copy(update={"speed_rpm": speed}),
+            "objective": config.objective.model_copy(update=none),
+        }
+    )
+
+
+def shares(config: Config) -> dict[float, float]:
+    """Speeds (rpm) that a config's objective takes to be simulated, ascending, with their shares
+    in it; the scene's own is among them, with the share 0 if it is not one of the objective's."""
+    objective = config.objective
+    speeds = objective.speeds_rpm or (config.scene.speed_rpm,)
+    weights = objective.speed_weights or (1.0,) * len(speeds)
+    found = {config.scene.speed_rpm: 0.0}
+    found |= {s: w / sum(weights) for s, w in zip(speeds, weights, strict=True)}
+    return dict(sorted(found.items()))
+
+
+def parts_of(evaluation: Evaluation) -> tuple[Part, ...]:
+    """The parts of an evaluation at several speeds; of another one, itself."""
+    if isinstance(evaluation, SpeedsEvaluation):
+        return evaluation.parts
+    return (Part(math.nan, 1.0, evaluation),)
+
+
+def counted(
+    config: Config,
+    evaluation: Evaluation,
+    baseline: Evaluation,
+    value: Callable[[Evaluation, Evaluation], float],
+) -> list[tuple[float, Evaluation, Evaluation]]:
+    """(share, evaluation, baseline) at every speed that counts in the objective; the shares add
+    up to 1. Where the worst speed counts, that is the one of the greatest `value(evaluation,
+    baseline)`."""
+    pairs = [
+        (part.share, part.evaluation, base.evaluation)
+        for part, base in zip(parts_of(evaluation), parts_of(baseline), strict=True)
+        if part.share > 0
+    ]
+    if config.objective.over_speeds == "weighted":
+        return pairs
+    _, worst, base = max(pairs, key=lambda pair: value(*pair[1:]))
+    return [(1.0, worst, base)]
+
+
+def swept_speeds(config: Config) -> list[float]:
+    """Speeds (rpm) of the config's sweep, ascending."""
+    wanted = config.sweep.speed_rpm
+    if wanted is None and config.objective.speeds_rpm:
+        return sorted(config.objective.speeds_rpm)
+    if wanted is None:
+        own = config.scene.speed_rpm
+        wanted = {"from": 0.1 * own, "to": 2 * own, "points": 39}
+    return np.linspace(wanted["from"], wanted["to"], int(wanted["points"])).tolist()
+
+
+def sweep(
+    evaluator: Evaluator,
+    speeds_rpm: Sequence[float],
+    design: Any = None,
+    progress: Callable[[int, int], None] = lambda done, expected: None,
+) -> tuple[Part, ...]:
+    """`design` (config units; default: the config's own) at each of the speeds, every one from
+    rest; equal shares.
+
+    `evaluator`: one that looks at a single speed. `progress` is called with (speeds done, all).
+    """
+    parts: list[Part] = []
+
+    def at(speed: float) -> Part:
+        own = copy.copy(evaluator)
+        own.model = at_speed(evaluator.model, speed)
+        return Part(speed, 1 / len(speeds_rpm), own(design, series=False))
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for part in pool.map(at, speeds_rpm):
+            parts.append(part)
+            progress(len(parts), len(speeds_rpm))
+    return tuple(parts)
+
+
+def overall(parts: Sequence[Part]) -> tuple[Status, str]:
+    """The status of the first part that is not usable, and its message; else of them all."""
+    for part in parts:
+        if not part.evaluation.usable:
+            return part.evaluation.status, f"At {part.speed_rpm:g} rpm: {part.evaluation.message}"
+    return parts[0].evaluation.status, parts[0].evaluation.message

@@ -1,0 +1,73 @@
+"""`python -m rootsopt.sweep CONFIG`: one design at many speeds."""
+
+import argparse
+import contextlib
+import sys
+from collections.abc import Callable, Iterator, Sequence
+
+from rootsopt import cli
+from rootsopt.config import Config
+
+PURPOSE = "Simulate one design at many speeds, each from rest: contact force and kind of motion."
+
+
+def body(config: Config, options: argparse.Namespace) -> int:
+    """Check, simulate, write, print."""
+    from rich.console import Console
+
+    from rootsopt import auto, files, report, speeds
+    from rootsopt.evaluators import evaluator_for, without_gradient
+    from rootsopt.model import check_geometry, design_keys
+
+    check_geometry(config)
+    folder = files.ResultFolder(options.output)
+    with _progress(Console(stderr=True)) as progress:
+        config, choice = auto.resolve(config)
+        evaluator = without_gradient(evaluator_for(speeds.alone(config)))
+        parts = speeds.sweep(evaluator, speeds.swept_speeds(config), progress=progress)
+    rows = [part.row() for part in parts]
+    status, message = speeds.overall(parts)
+    folder.write_text("config.yaml", config.to_yaml())
+    folder.write_csv("sweep.csv", files.row_columns(rows))
+    data = {
+        "design": {key: getattr(config.profile, key) for key in design_keys(config)},
+        "geometry": parts[0].evaluation.geometry,
+        "speeds": rows,
+        "status": status.label,
+        "message": message,
+        "versions": files.versions(),
+    }
+    folder.write_json("result.json", choice | data)
+    if not options.no_figures:
+        from rootsopt.plot_speeds import speed_figure
+
+        name = config.profile.family.upper()
+        speed_figure(folder, {name: parts}, f"Contact force of the {name} pair over speed")
+    out = Console()
+    out.print(report.sweep_table(rows))
+    if not status.usable:
+        out.print(f"{status.label}: {message}", soft_wrap=True)
+    out.print(f"results in {options.output}", soft_wrap=True)
+    return cli.OK if any(part.evaluation.usable for part in parts) else cli.NO_RESULT
+
+
+@contextlib.contextmanager
+def _progress(console) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar on a terminal, nothing in a pipe."""
+    if not console.is_terminal:
+        yield lambda done, expected: None
+        return
+    from rich.progress import Progress
+
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("compiling and simulating", total=None)
+        yield lambda done, expected: bar.update(task, completed=done, total=expected)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return cli.run("sweep", PURPOSE, body, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
