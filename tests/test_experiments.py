@@ -113,3 +113,12 @@ def test_benchmark(tmp_path, programs):
         assert isinstance(goals[name]["reached"], bool)
     assert 0.5 < goals["exponent of cost over revolutions"]["figure"] < 1.6
     assert is_picture(tmp_path / "benchmark.png")
+
+
+def test_parts(tmp_path, programs):
+    """Every part costs something, and the smallest scene least."""
+    run("parts", tmp_path, programs)
+    first, *others = rows_of(tmp_path / "parts.csv")
+    assert first["states"] == "2"
+    assert all(int(row["equations"]) > int(first["equations"]) for row in others)
+    assert others[-1]["states"] == "11"
