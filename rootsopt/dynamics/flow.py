@@ -304,12 +304,12 @@ def flow(
     def one(begin, end, y, dynamic):
         """y after one step, and its slope there."""
         if not jumps:
-            after, _, slope = one_step(solver, term, begin, end, y, dynamic)
-            return after, slope
-        after, *slopes = one_step(solver, term, begin, end, jnp.pad(y, (0, MARKS)), dynamic)
-        pair = eqx.combine(dynamic, static)
-        moved = saltation(pair, begin, end - begin, y[:count], *slopes)
-        return after[:-MARKS] + moved, slopes[1][:-MARKS]
+            after, slopes = one_step(solver, term, begin, end, y, dynamic)
+            return after, slopes[-1]
+        after, slopes = one_step(solver, term, begin, end, jnp.pad(y, (0, MARKS)), dynamic)
+        period = pair.mesh_period * (pair.pace(y[:count]) if pair.drive.free else 1.0)
+        moved = saltation(end - begin, slopes, period, pair.contact.pair.profile)
+        return after[:-MARKS] + moved, slopes[-1, :-MARKS]
 
     if retraced:
 

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from rootsopt.dynamics.pair import FlankForce, RotorPair
+from rootsopt.dynamics.pair import FlankForce
+from rootsopt.profiles.base import Profile
 
 LONGEST = 4e-6
 """Longest step (mesh periods) that is looked into: all that are made around a change are
@@ -25,41 +26,40 @@ _FASTER = 20.0
 is at most 2π, with any number of lobes."""
 _ROUNDINGS = 300
 """Roundings of a lever that are no jump."""
-MARKS = 3
+_ALIKE = 0.05
+"""Share of a jump by which the levers on one side of it may differ: of a lever that changes fast,
+but all the way, some stage of the step is in between."""
+MARKS = 4
 """Numbers that tell a jump, beside the slope of a motion."""
 
 
-def marks(contact: FlankForce) -> Float[Array, "3"]:
-    """Penetration and levers (m)."""
-    return jnp.stack([contact.depth, contact.lever1, contact.lever2])
+def marks(contact: FlankForce) -> Float[Array, "4"]:
+    """Penetration (m), its rate (m/s), and levers (m)."""
+    return jnp.stack([contact.depth, contact.closing, contact.lever1, contact.lever2])
 
 
 def saltation(
-    pair: RotorPair,
-    tau: Float[Array, ""],
     step: Float[Array, ""],
-    state: Float[Array, " n"],
-    first: Float[Array, " rows"],
-    last: Float[Array, " rows"],
-) -> Float[Array, " rows-3"]:
+    slopes: Float[Array, "stages rows"],
+    period: Float[Array, ""],
+    profile: Profile,
+) -> Float[Array, " rows-4"]:
     """Zero, with the derivative that a jump inside a step adds to y after it.
 
-    `tau`, `state`: where the step begins, `step` its length (mesh periods); `first`, `last`: the
-    slope of y with the `marks` behind, at its begin and at its end. Exact but for the length of
-    the step.
+    `step`: its length (mesh periods); `slopes`: the slope of y with the `marks` behind, at the
+    stages of the step, its begin first and its end last; `period`: the time (s) by which y is
+    counted. Exact but for the length of the step.
     """
-    depth = first[-3] - last[-3]
-    fall = lax.stop_gradient(first[:-3] - last[:-3])
-    jump = lax.stop_gradient(first[-2:] - last[-2:])
-    _, relative, rate = lax.stop_gradient(pair.physical(tau, state))
-    speed = lax.stop_gradient(pair.speed(state))
-    side = jnp.where(relative < 0, 1.0, -1.0)
-    period = lax.stop_gradient(pair.mesh_period)
-    if pair.drive.free:
-        period = period * lax.stop_gradient(pair.pace(state))
-    closing = period * side * (jump[0] * speed - jump[1] * (speed + rate))
+    first, last = slopes[0], slopes[-1]
+    depth = first[-4] - last[-4]
+    frozen = lax.stop_gradient(slopes)
+    fall = frozen[0, :-4] - frozen[-1, :-4]
+    closing = lax.stop_gradient(period) * (frozen[0, -3] - frozen[-1, -3])
+    jump = jnp.max(jnp.abs(frozen[0, -2:] - frozen[-1, -2:]))
     most = _FASTER * jnp.abs(step) + _ROUNDINGS * float(jnp.finfo(step.dtype).eps)
-    most = most * pair.contact.pair.profile.pitch_radius
-    jumps = (jnp.abs(step) < LONGEST) & (jnp.max(jnp.abs(jump)) > most) & (closing != 0)
+    most = most * lax.stop_gradient(profile.pitch_radius)
+    apart = jnp.abs(frozen[:, None, -2:] - frozen[jnp.array([0, -1]), -2:])
+    between = jnp.max(jnp.min(jnp.max(apart, axis=-1), axis=-1))
+    jumps = (jnp.abs(step) < LONGEST) & (jump > most) & (between < _ALIKE * jump) & (closing != 0)
     moved = (lax.stop_gradient(depth) - depth) / jnp.where(jumps, closing, jnp.inf)
     return fall * moved

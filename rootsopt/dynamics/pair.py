@@ -81,13 +81,14 @@ class Motion(NamedTuple):
 
 class FlankForce(NamedTuple):
     """Contact at an instant or several: normal force (N) by flank, greatest penetration (m;
-    negative: gap) with the levers (m) of that flank, torques on the rotors (N·m), each positive in
-    its rotor's sense of rotation, and, where there are supports, the force on rotor 2 (N); that on
-    rotor 1 is opposite."""
+    negative: gap) with its rate (m/s) and the levers (m) of that flank, torques on the rotors
+    (N·m), each positive in its rotor's sense of rotation, and, where there are supports, the force
+    on rotor 2 (N); that on rotor 1 is opposite."""
 
     drive: Float[Array, "*n"]
     coast: Float[Array, "*n"]
     depth: Float[Array, "*n"]
+    closing: Float[Array, "*n"]
     lever1: Float[Array, "*n"]
     lever2: Float[Array, "*n"]
     torque1: Float[Array, "*n"]
@@ -166,9 +167,8 @@ class RotorPair(eqx.Module):
 
     @property
     def jumps(self) -> bool:
-        """Whether the contact force may jump where no other part does, and derivatives take that
-        into account."""
-        return isinstance(self.contact, SearchContact) and self.contact.jumps and not self.both
+        """Whether the contact force may jump where no other part does."""
+        return isinstance(self.contact, SearchContact) and self.contact.jumps
 
     def speed(self, state: Float[Array, "*k n"]) -> Float[Array, "*#k"]:
         """Angular speed of rotor 1 (rad/s) in a scaled state."""
@@ -234,6 +234,7 @@ class RotorPair(eqx.Module):
                 drive=drive,
                 coast=coast,
                 depth=flanks.depth[deeper],
+                closing=flanks.closing[deeper],
                 lever1=flanks.lever1[deeper],
                 lever2=flanks.lever2[deeper],
             )
@@ -265,6 +266,7 @@ class RotorPair(eqx.Module):
             drive=force,
             coast=jnp.zeros_like(force),
             depth=touch.depth,
+            closing=touch.closing,
             lever1=touch.lever1,
             lever2=touch.lever2,
             torque1=torque1,

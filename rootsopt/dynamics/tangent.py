@@ -28,12 +28,13 @@ def one_step(
     end: Float[Array, ""],
     y: Float[Array, " m"],
     args: Any,
-) -> tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, " m"]]:
-    """State after one step of `solver` from `begin` to `end`, and dy/dτ at both."""
+) -> tuple[Float[Array, " m"], Float[Array, "stages m"]]:
+    """State after one step of `solver` from `begin` to `end`, and dy/dτ at its stages: at `begin`
+    first, at `end` last."""
     if not isinstance(solver, diffrax.AbstractERK):
         memory = solver.init(term, begin, end, y, args)
         after = solver.step(term, begin, end, y, args, memory, made_jump=False)[0]
-        return after, term.vf(begin, y, args), term.vf(end, after, args)
+        return after, jnp.stack([term.vf(begin, y, args), term.vf(end, after, args)])
     # The same sums as the solver's own step, without its error estimate and the machinery
     # for everything a step can be: several times cheaper to compile.
     tableau = solver.tableau
@@ -58,7 +59,7 @@ def one_step(
     slopes = jnp.zeros((stages, *y.shape), y.dtype)
     start = slopes, y, slopes[0]
     (slopes, after, slope), _ = lax.scan(stage, start, (jnp.arange(stages + 1), lower, times))
-    return after, slopes[0], slope
+    return after, jnp.concatenate([slopes, slope[None]])
 
 
 class Linear(NamedTuple):
