@@ -7,7 +7,7 @@ derivatives to values that give the paper's forces.
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config, load
 from rootsopt.dynamics.flow import Integrator
@@ -30,37 +30,38 @@ from rootsopt.status import Status
 @dataclasses.dataclass(frozen=True)
 class Quantity:
     """One that the paper does not state: its key in the config, the plausible range in the
-    config's unit, and how it is written in tables and figures."""
+    config's unit, whether it is searched on a logarithmic scale, and its name in figures."""
 
     key: str
     low: float
     high: float
+    logarithmic: bool
     label: str
 
 
 QUANTITIES = (
-    Quantity("rotor.length_mm", 30.0, 400.0, "rotor length (mm)"),
-    Quantity("scene.load.torque_N_m", 0.2, 9.55, "load torque (N·m)"),
-    Quantity("scene.timing_gear.stiffness_N_m_per_rad", 1e3, 1e6, "gear stiffness (N·m/rad)"),
-    Quantity("scene.timing_gear.damping_ratio", 0.01, 1.0, "gear damping ratio"),
-    Quantity("scene.timing_gear.backlash_mm", 0.02, 1.5, "gear backlash (mm)"),
-    Quantity("contact.clearance_mm", 0.005, 0.5, "flank clearance (mm)"),
+    Quantity("rotor.length_mm", 30.0, 400.0, False, "rotor length (mm)"),
+    Quantity("scene.load.torque_N_m", 0.2, 9.55, False, "load torque (N·m)"),
+    Quantity("scene.timing_gear.stiffness_N_m_per_rad", 1e3, 1e6, True, "gear stiffness (N·m/rad)"),
+    Quantity("scene.timing_gear.damping_ratio", 0.01, 1.0, True, "gear damping ratio"),
+    Quantity("scene.timing_gear.backlash_mm", 0.02, 1.5, True, "gear backlash (mm)"),
+    Quantity("contact.clearance_mm", 0.005, 0.5, True, "flank clearance (mm)"),
 )
 """In the order of all vectors of values (p,). Ranges and their reasons: docs/paper.md."""
 FAMILIES = ("cic", "ee")
 FORCES = ("mean_force_N", "peak_force_N")
 PAPER = np.array([[102.4, 1973.3], [1047.1, 5661.4]])
 """Mean and maximum contact force (N) by pair (`FAMILIES`), from the paper's section 4."""
-TIGHT = ("solver.method=dopri8", "solver.rtol=1e-11", "solver.transient_rtol=1e-8")
 _NEAR = 0.1
 """Longest step of `polished`, in logarithms of the quantities."""
 
 
-def config_of(family: str, values: Sequence[float] | None = None, *overrides: str) -> Config:
-    """The pair's shipped config, with other values (config's units) of the quantities."""
-    at = [f"{q.key}={float(v)!r}" for q, v in zip(QUANTITIES, values, strict=True)] if (
-        values is not None
-    ) else []  # fmt: skip
+def config_of(family: str, values: ArrayLike | None = None, *overrides: str) -> Config:
+    """The pair's shipped config, with other values (p,) of the quantities (config's units)."""
+    at: list[str] = []
+    if values is not None:
+        numbers = np.asarray(values, float).tolist()
+        at = [f"{q.key}={value!r}" for q, value in zip(QUANTITIES, numbers, strict=True)]
     return load(f"configs/paper_{family}.yaml", [*at, *overrides])
 
 
@@ -113,24 +114,26 @@ class Response:
 
 
 class Pairs:
-    """Evaluates both pairs for values of the quantities; compiled programs are shared."""
+    """Evaluates both pairs for values of the quantities; compiled programs are shared.
 
-    def __init__(self, *overrides: str):
-        self.overrides = overrides
+    With `survey` a motion that settles late is given up (see `Evaluator`).
+    """
+
+    def __init__(self, survey: bool = False):
+        self.survey = survey
 
     def __call__(
         self,
-        values: Sequence[float] | NDArray[np.float64],
-        starts: Sequence[Any] = (None, None),
+        values: ArrayLike,
         slopes: bool = True,
         series: bool = False,
     ) -> Response:
-        """`values` in config's units; `starts`: scaled states to begin at, by default rest."""
+        """Both pairs from rest with `values` (p,) in the config's units."""
         values = np.asarray(values, float)
         evaluations, rows = [], []
-        for family, start in zip(FAMILIES, starts, strict=True):
-            evaluator = Evaluator(config_of(family, [*values], *self.overrides))
-            one = evaluator(start=start, series=series)
+        for family in FAMILIES:
+            evaluator = Evaluator(config_of(family, values), survey=self.survey)
+            one = evaluator(series=series)
             evaluations.append(one)
             if slopes and one.usable:
                 rows.append(_slopes(evaluator, one, values))
@@ -154,7 +157,7 @@ def _slopes(evaluator: Evaluator, one: Evaluation, values) -> NDArray[np.float64
     return np.stack([by_mean / mean, by_peak / peak]) * values
 
 
-def _pair(model: Model, design, values: Float[Array, " p"]) -> RotorPair:
+def pair_of(model: Model, design, values: Float[Array, " p"]) -> RotorPair:
     """The rotor pair with these values of the quantities (config's units)."""
     length, torque, stiffness, damping_ratio, backlash, clearance = values
     half = backlash * MM / (2 * model.pitch_radius)
@@ -175,16 +178,16 @@ def _orbit(model: Model, design, values: Float[Array, " p"], state, period, how:
     """The closed orbit, with derivatives by the values."""
 
     def arrays(values):
-        return eqx.filter(_pair(model, design, values), eqx.is_inexact_array)
+        return eqx.filter(pair_of(model, design, values), eqx.is_inexact_array)
 
     push = functools.partial(jax.jvp, arrays, (values,))
     tangents = jax.vmap(lambda direction: push((direction,))[1])(jnp.eye(values.shape[0]))
-    return close_orbit(_pair(model, design, values), tangents, state, period, how)
+    return close_orbit(pair_of(model, design, values), tangents, state, period, how)
 
 
 def polished(
     pairs: Pairs,
-    values: NDArray[np.float64],
+    values: ArrayLike,
     held: Sequence[int] = (),
     within: float = 1e-4,
     steps: int = 12,
@@ -208,7 +211,7 @@ def polished(
         # What stands at an end of its range and would leave it stays there.
         inside = [i for i in free if low[i] < place[i] + step[i] * 1e-3 < high[i]]
         step = _least_step(best.slopes.reshape(4, -1), wanted, inside)
-        step *= min(1.0, _NEAR / np.max(np.abs(step)))
+        step *= min(1.0, _NEAR / max(np.max(np.abs(step)), 1e-12))
         for _ in range(5):
             at = np.clip(place + step, low, high)
             tried = pairs(np.exp(at))
@@ -228,7 +231,7 @@ def _least_step(slopes, wanted, free: Sequence[int]) -> NDArray[np.float64]:
     return step
 
 
-def summary(response: Response) -> Mapping[str, Any]:
+def summary(response: Response) -> dict[str, Any]:
     """Values, forces, errors and regimes for a result file."""
     pairs = {}
     for family, one, row, errors in zip(

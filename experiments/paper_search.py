@@ -6,6 +6,7 @@ or so of the package on a periodic motion. SciPy's differential evolution minimi
 box of plausible values how far the four forces are from the paper's.
 """
 
+import dataclasses
 import math
 import os
 from collections.abc import Callable
@@ -38,8 +39,6 @@ _APERIODIC = 0.35
 """What a pair that does not repeat adds to the cost of a scene, in logarithms of a force."""
 _LOST = 5.0
 """Cost of a scene whose lobes pass through each other."""
-LOGARITHMIC = np.array([q.high / q.low > 60 and "torque" not in q.key for q in QUANTITIES])
-"""Quantities searched on a logarithmic scale."""
 
 
 class Rotors(NamedTuple):
@@ -115,16 +114,14 @@ def rotors_of(family: str) -> Rotors:
 def motion_at(rotors: Rotors, values: NDArray[np.float64]) -> Motion:
     """Constants of the motion with these values (p,) of the quantities."""
     length, torque, stiffness, damping_ratio, backlash, clearance = map(float, values)
-    scene = rotors.scene.__class__(
-        **{
-            **vars(rotors.scene),
-            "length": length * 1e-3,
-            "load_torque": torque,
-            "gear_stiffness": stiffness,
-            "gear_damping_ratio": damping_ratio,
-            "half_backlash": backlash * 1e-3 / (2 * rotors.scene.pitch_radius),
-            "clearance": clearance * 1e-3,
-        }
+    scene = dataclasses.replace(
+        rotors.scene,
+        length=length * 1e-3,
+        load_torque=torque,
+        gear_stiffness=stiffness,
+        gear_damping_ratio=damping_ratio,
+        half_backlash=backlash * 1e-3 / (2 * rotors.scene.pitch_radius),
+        clearance=clearance * 1e-3,
     )
     return motion_of(scene, rotors.moment)
 
@@ -183,7 +180,7 @@ def values_at(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Values (n, p) of the quantities at points (n, p) of the unit box."""
     low, high = (np.array([getattr(q, end) for q in QUANTITIES]) for end in ("low", "high"))
     logarithmic = low * (high / low) ** points
-    return np.where(LOGARITHMIC, logarithmic, low + (high - low) * points)
+    return np.where([q.logarithmic for q in QUANTITIES], logarithmic, low + (high - low) * points)
 
 
 def explore(

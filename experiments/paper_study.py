@@ -8,8 +8,17 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from experiments.paper_scene import FAMILIES, PAPER, QUANTITIES, Pairs, Response, config_of, polished
+from experiments.paper_scene import (
+    FAMILIES,
+    PAPER,
+    QUANTITIES,
+    Pairs,
+    Response,
+    config_of,
+    polished,
+)
 from rootsopt import basins
 from rootsopt.evaluate import CHAOS_WINDOW, Evaluator, lyapunov_program, unsettled
 from rootsopt.model import design_vector
@@ -18,6 +27,7 @@ WINDOWS = ((0.0, 0.1), (0.0, 0.2), (0.05, 0.2), (0.1, 0.2), (0.1, 0.8))
 """Begin and end (s) of the windows that mean and maximum may have been taken over."""
 THINNINGS = (1, 3, 15)
 """Only every so manieth of the samples of the window is kept."""
+GRID = ("attractors.relatives=24", "attractors.rates=18")
 Notify = Callable[[str], None]
 
 
@@ -37,17 +47,17 @@ def row_of(response: Response) -> dict[str, Any]:
     return row | {"misfit": response.misfit}
 
 
-def motions(values: Sequence[float]) -> list[dict[str, Any]]:
+def motions(values: ArrayLike) -> list[dict[str, Any]]:
     """The motions that coexist with these values, a row each."""
     rows = []
     for family in FAMILIES:
-        found = basins.find(Evaluator(config_of(family, values)))
+        found = basins.find(Evaluator(config_of(family, values, *GRID)))
         rows += [{"pair": family} | row for row in found.summary()]
         rows += [{"pair": family, "status": k, "share": v} for k, v in found.lost.items()]
     return rows
 
 
-def definitions(values: Sequence[float]) -> list[dict[str, Any]]:
+def definitions(values: ArrayLike) -> list[dict[str, Any]]:
     """Mean and maximum over windows of one motion from rest, start-up included or not, at
     several sampling rates: a row for each window and rate."""
     runs = []
@@ -75,7 +85,7 @@ def definitions(values: Sequence[float]) -> list[dict[str, Any]]:
 
 
 def slices(
-    pairs: Pairs, values: Sequence[float], changes: Sequence[float], notify: Notify
+    pairs: Pairs, values: ArrayLike, changes: Sequence[float], notify: Notify
 ) -> list[dict[str, Any]]:
     """Each quantity changed alone by a share of itself: a row for each change."""
     rows = []
@@ -110,7 +120,7 @@ def profile(
                 at[number] *= factor
                 if not quantity.low <= at[number] <= quantity.high:
                     break
-                last = polished(pairs, at, held=[number], within=within, steps=6)
+                last = polished(pairs, at, held=[number], within=within, steps=4)
                 change = last.values[number] / found.values[number] - 1
                 rows.append({"changed": quantity.key, "change": change} | row_of(last))
                 if last.misfit > limit:
