@@ -224,6 +224,19 @@ def polished(
     return best
 
 
+def compensated(
+    values: NDArray[np.float64], slopes: NDArray[np.float64], number: int, factor: float
+) -> NDArray[np.float64]:
+    """Values (p,) with the `number`-th times `factor`, and the others changed as little as keeps
+    the forces to first order, but not beyond their ranges."""
+    others = [i for i in range(len(values)) if i != number]
+    flat = slopes.reshape(-1, len(values))
+    step = _least_step(flat, -flat[:, number] * np.log(factor), others)
+    step[number] = np.log(factor)
+    low, high = ([getattr(q, end) for q in QUANTITIES] for end in ("low", "high"))
+    return np.clip(values * np.exp(step), low, high)
+
+
 def _least_step(slopes, wanted, free: Sequence[int]) -> NDArray[np.float64]:
     """Shortest step (p,) of the `free` quantities that changes the forces as `wanted`."""
     step = np.zeros(slopes.shape[1])

@@ -9,7 +9,7 @@ box of plausible values how far the four forces are from the paper's.
 import dataclasses
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from scipy.optimize import differential_evolution
 
 from experiments.baselines import Motion, Rotor, Scene, motion_of
 from experiments.baselines.numba_pair import Search, Table, integrate
-from experiments.paper_scene import FAMILIES, PAPER, QUANTITIES, config_of
+from experiments.paper_scene import FAMILIES, PAPER, QUANTITIES, Quantity, config_of
 from rootsopt.contact.map import MapContact
 from rootsopt.model import Model, design_vector
 from rootsopt.profiles import geometry
@@ -176,9 +176,11 @@ def costs(samples: Samples) -> NDArray[np.float64]:
     return np.where(np.isfinite(cost), cost, _LOST)
 
 
-def values_at(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values (n, p) of the quantities at points (n, p) of the unit box."""
-    low, high = (np.array([getattr(q, end) for q in QUANTITIES]) for end in ("low", "high"))
+def values_at(
+    points: NDArray[np.float64], quantities: Sequence[Quantity] = QUANTITIES
+) -> NDArray[np.float64]:
+    """Values (n, p) of the quantities at points (n, p) of the unit box of their ranges."""
+    low, high = (np.array([getattr(q, end) for q in quantities]) for end in ("low", "high"))
     logarithmic = low * (high / low) ** points
     return np.where([q.logarithmic for q in QUANTITIES], logarithmic, low + (high - low) * points)
 
@@ -187,15 +189,16 @@ def explore(
     seed: int,
     generations: int,
     population: int,
+    quantities: Sequence[Quantity] = QUANTITIES,
     report: Callable[[Samples], None] = lambda samples: None,
 ) -> Samples:
-    """All scenes that differential evolution from `seed` looks at, over the box of plausible
-    values; `population` scenes for each quantity in a generation."""
+    """All scenes that differential evolution from `seed` looks at, over the box of the ranges of
+    `quantities`; `population` scenes for each quantity in a generation."""
     pairs = [rotors_of(family) for family in FAMILIES]
     parts: list[Samples] = []
 
     def cost(points):
-        parts.append(scan(pairs, values_at(points.T)))
+        parts.append(scan(pairs, values_at(points.T, quantities)))
         report(parts[-1])
         return costs(parts[-1])
 

@@ -16,6 +16,7 @@ from experiments.paper_scene import (
     QUANTITIES,
     Pairs,
     Response,
+    compensated,
     config_of,
     polished,
 )
@@ -116,11 +117,11 @@ def profile(
         for factor in (1 / (1 + step), 1 + step):
             last = found
             for _ in range(count):
-                at = last.values.copy()
-                at[number] *= factor
-                if not quantity.low <= at[number] <= quantity.high:
+                at = last.values[number] * factor
+                if last.slopes is None or not quantity.low <= at <= quantity.high:
                     break
-                last = polished(pairs, at, held=[number], within=within, steps=4)
+                guess = compensated(last.values, last.slopes, number, factor)
+                last = polished(pairs, guess, held=[number], within=within, steps=4)
                 change = last.values[number] / found.values[number] - 1
                 rows.append({"changed": quantity.key, "change": change} | row_of(last))
                 if last.misfit > limit:

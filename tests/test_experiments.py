@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -155,15 +156,15 @@ def test_polished():
     powers = np.random.default_rng(3).normal(size=(4, 6))
     start = np.array([100.0, 2.0, 2e4, 0.2, 0.3, 0.1])
 
-    def pairs(values):
+    def pairs(values) -> Any:
         forces = (PAPER.ravel() * 1.2 * np.prod((values / start) ** powers, axis=1)).reshape(2, 2)
-        evaluations = [
+        evaluations: Any = [
             SimpleNamespace(response={"mean_force_N": mean, "peak_force_N": peak})
             for mean, peak in forces
         ]
-        return Response(np.asarray(values), tuple(evaluations), powers.reshape(2, 2, 6))
+        return Response(np.asarray(values), evaluations, powers.reshape(2, 2, 6))
 
     for held in ([], [1], [0, 4]):
-        found = polished(pairs, start, held=held)
+        found = polished(cast(Any, pairs), start, held=held)
         assert found.misfit < 1e-4
         assert found.values[held] == pytest.approx(start[held], rel=1e-12)
