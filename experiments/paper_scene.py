@@ -116,11 +116,12 @@ class Response:
 class Pairs:
     """Evaluates both pairs for values of the quantities; compiled programs are shared.
 
-    With `survey` a motion that settles late is given up (see `Evaluator`).
+    With `survey` a motion that settles late is given up (see `Evaluator`); `overrides` of the
+    configs, as `dotted.key=value`.
     """
 
-    def __init__(self, survey: bool = False):
-        self.survey = survey
+    def __init__(self, *overrides: str, survey: bool = False):
+        self.overrides, self.survey = overrides, survey
 
     def __call__(
         self,
@@ -132,7 +133,7 @@ class Pairs:
         values = np.asarray(values, float)
         evaluations, rows = [], []
         for family in FAMILIES:
-            evaluator = Evaluator(config_of(family, values), survey=self.survey)
+            evaluator = Evaluator(config_of(family, values, *self.overrides), survey=self.survey)
             one = evaluator(series=series)
             evaluations.append(one)
             if slopes and one.usable:
