@@ -239,9 +239,7 @@ def search(folder: files.ResultFolder, seed: int, least_clearance: float) -> int
 def main() -> int:
     arguments = argparse.ArgumentParser(description="The paper's contact forces.")
     arguments.add_argument("-o", "--output", type=Path, default=Path("results/paper"))
-    arguments.add_argument(
-        "--quick", action="store_true", help="few, with linear contact"
-    )
+    arguments.add_argument("--quick", action="store_true", help="few, with linear contact")
     arguments.add_argument("--search", action="store_true", help="look for the values anew")
     arguments.add_argument("--seed", type=int, default=0, help="of the search")
     arguments.add_argument(
