@@ -13,6 +13,7 @@ import statistics
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from rootsopt.cli import use_float64
 
@@ -109,9 +110,11 @@ def main() -> int:
     options = parser.parse_args()
     scenes = {name: load("configs/cic.yaml", [*BARE, *more]) for name, more in PARTS.items()}
     scenes["all of them"] = load("configs/pump.yaml")
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name, config in scenes.items():
-        row = {"part": name} | right_hand_side(config, 500 if options.quick else 20000)
+        row: dict[str, Any] = {"part": name} | right_hand_side(
+            config, 500 if options.quick else 20000
+        )
         row["rhs_ratio"] = row["rhs_us"] / (rows[0] if rows else row)["rhs_us"]
         if not options.quick:
             row |= evaluation(config, 5)

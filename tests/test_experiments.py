@@ -6,8 +6,19 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
+
+from experiments.baselines import Scene
+from experiments.baselines.scipy_nodes import ScipyNodes
+from experiments.paper_scene import PAPER, Response, config_of, pair_of, polished
+from rootsopt.config import load
+from rootsopt.model import Model, design_vector
 
 pytest.importorskip("numba")
 
@@ -122,3 +133,73 @@ def test_parts(tmp_path, programs):
     assert first["states"] == "2"
     assert all(int(row["equations"]) > int(first["equations"]) for row in others)
     assert others[-1]["states"] == "11"
+
+
+def test_paper(tmp_path, programs):
+    """The shipped values give the paper's four forces (its section 4), both motions periodic; here
+    with linear contact, which is some 3 % off."""
+    run("paper", tmp_path, programs)
+    (row,) = rows_of(tmp_path / "paper.csv")
+    forces = {"cic": (102.4, 1973.3), "ee": (1047.1, 5661.4)}
+    for family, (mean, peak) in forces.items():
+        assert row[f"{family}_status"] == "periodic"
+        assert float(row[f"{family}_mean_force_N"]) == pytest.approx(mean, rel=0.035)
+        assert float(row[f"{family}_peak_force_N"]) == pytest.approx(peak, rel=0.035)
+    # Each quantity matters, and a thousandth of it changes no force by more than a hundredth.
+    rows = rows_of(tmp_path / "paper_slices.csv")
+    assert len({one["changed"] for one in rows}) == 6
+    for name in ("cic_mean_force_N", "cic_peak_force_N", "ee_mean_force_N", "ee_peak_force_N"):
+        assert numbers(rows, name) == pytest.approx([float(row[name])] * 12, rel=1e-2)
+    assert len({one["ee_mean_force_N"] for one in rows}) == 12
+    for name in ("force", "spectrum", "uniqueness"):
+        assert is_picture(tmp_path / f"paper_{name}.png")
+
+
+def test_paper_by_scipy():
+    """Another tool finds the paper's forces in the shipped scene of the CIC pair."""
+    config = load("configs/paper_cic.yaml")
+    found = ScipyNodes(Scene.of(config), nodes=400, rtol=1e-5, settle=10, window=2).simulate(
+        [36.43, 9.0, 4.0]
+    )
+    assert found.mean == pytest.approx(102.4, rel=1e-3)
+    assert found.peak == pytest.approx(1973.3, rel=1e-3)
+
+
+def test_paper_scene_is_shared():
+    """Both pairs stand in one scene."""
+    cic, ee = (load(f"configs/paper_{family}.yaml").model_dump() for family in ("cic", "ee"))
+    assert cic.pop("profile") != ee.pop("profile")
+    assert cic == ee
+
+
+def test_pair_of_quantities():
+    """What is differentiated by the quantities is the pair of the config with these values."""
+    values = np.array([123.0, 4.5, 6.7e4, 0.21, 0.43, 0.065])
+    config = config_of("ee", values, "solver.fidelity=linear")
+    design = design_vector(config)
+    expected = jax.tree.leaves(Model.of(config).pair(design))
+    shipped = Model.of(config_of("ee", None, "solver.fidelity=linear"))
+    found = jax.tree.leaves(pair_of(shipped, design, jnp.asarray(values)))
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        assert np.asarray(one) == pytest.approx(np.asarray(other), rel=1e-12)
+
+
+def test_polished():
+    """Gauss-Newton steps solve for forces that are powers of the quantities, inside their ranges
+    and with what is held left alone."""
+    powers = np.random.default_rng(3).normal(size=(4, 6))
+    start = np.array([100.0, 2.0, 2e4, 0.2, 0.3, 0.1])
+
+    def pairs(values) -> Any:
+        forces = (PAPER.ravel() * 1.2 * np.prod((values / start) ** powers, axis=1)).reshape(2, 2)
+        evaluations: Any = [
+            SimpleNamespace(response={"mean_force_N": mean, "peak_force_N": peak})
+            for mean, peak in forces
+        ]
+        return Response(np.asarray(values), evaluations, powers.reshape(2, 2, 6))
+
+    for held in ([], [1], [0, 4]):
+        found = polished(cast(Any, pairs), start, held=held)
+        assert found.misfit < 1e-4
+        assert found.values[held] == pytest.approx(start[held], rel=1e-12)
