@@ -332,7 +332,8 @@ class RotorPair(eqx.Module):
             if self.friction is not None:
                 assert touch.sliding is not None
                 flags.append(self.friction.switches(touch.sliding.speed))
-            return jnp.concatenate(flags)
+            # The pieces of a flank that does not touch are of no account.
+            return jnp.concatenate(flags) & (touch.depth > 0)
 
         drives = motion.relative < 0
         if self.both:
