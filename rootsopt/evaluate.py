@@ -21,9 +21,14 @@ from rootsopt.dynamics.steady import (
     BLOCK,
     RESIDUAL,
     SAMPLES,
+    TOO_DEEP,
+    UNRESOLVED,
     Orbit,
     Transient,
     close_orbit,
+    force_rounding,
+    is_idle,
+    judged,
     lyapunov,
     reverse_sensitivity,
     settle,
@@ -39,7 +44,6 @@ RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 _NEARLY = 0.05
 CHAOS_WINDOW = 128
 _THINNING = 6
-TOO_DEEP = 0.02
 
 
 @dataclasses.dataclass(frozen=True)
@@ -286,16 +290,16 @@ class Evaluator:
     def _orbit_status(self, orbit: Orbit, transient: Transient, tolerance: float) -> Status:
         if not bool(orbit.flow.solved):
             return Status.SOLVER_FAILED
+        if bool(is_idle(orbit)):
+            return Status.IDLE
         numbers = np.concatenate([orbit.response, np.ravel(orbit.sensitivity), orbit.state])
         if not np.all(np.isfinite(numbers)):
             return Status.NON_FINITE
-        multiplier = float(orbit.multiplier)
-        noise = max(float(self.transient.rtol), float(self.orbit.rtol))
-        near = tolerance / max(1 - multiplier, 1e-3) * 10 + 100 * noise
-        moved = float(np.max(np.abs(orbit.state - transient.state)))
-        closed = float(orbit.residual) <= RESIDUAL[self.model.precision]
-        stable = multiplier < 1
-        return Status.PERIODIC if closed and stable and moved <= near else Status.NOT_SETTLED
+        dtype = orbit.state.dtype
+        rtols = tuple(np.asarray(how.tolerance(dtype)) for how in (self.transient, self.orbit))
+        within, limit = (np.asarray(x, dtype) for x in (tolerance, RESIDUAL[self.model.precision]))
+        found = _judged(orbit, transient.state, within, rtols, limit)
+        return Status.PERIODIC if bool(found) else Status.NOT_SETTLED
 
     def _report(self, design, outcome: "_Outcome", seconds, with_series) -> Evaluation:
         pair, orbit, status = outcome.pair, outcome.orbit, outcome.status
@@ -328,8 +332,12 @@ class Evaluator:
                 "orbit_steps": int(orbit.flow.steps),
             }
             series = _orbit_series(pair, orbit, period) if with_series else None
+            rounding = force_rounding(orbit, self.model.law.exponent, self.model.pitch_radius)
+            statistics["force_rounding"] = float(rounding)
             if float(orbit.flow.depth) > TOO_DEEP * float(self.model.pitch_radius):
                 status = Status.TOO_DEEP
+            elif float(rounding) > UNRESOLVED:
+                status = Status.UNRESOLVED
         elif status is Status.NOT_SETTLED and not self.survey:
             window = lyapunov_program(pair, outcome.transient.state, CHAOS_WINDOW, self.transient)
             status, steady, response, series = unsettled(pair, window, with_series)
@@ -407,6 +415,7 @@ def _response(mean, square, peak) -> dict[str, float]:
 _build = Program(Model.pair_and_tangents)
 _settle = Program(settle)
 _close = Program(close_orbit)
+_judged = Program(judged)
 lyapunov_program = Program(lyapunov)
 
 

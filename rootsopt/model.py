@@ -22,6 +22,7 @@ from rootsopt.contact.map import MapContact
 from rootsopt.contact.segments import NodeContact
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.pace import Pace
 from rootsopt.dynamics.pair import GapFunction, RotorPair, SearchContact
 from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
 from rootsopt.errors import InputError
@@ -199,6 +200,7 @@ class Model(eqx.Module):
             gear=gear,
             angle_scale=angle,
             force_scale=force,
+            pace=Pace.of(self.law, gear, inertia, force, self.pitch_radius),
         )
         if self.precision == "float32":
             # Built in double precision; single only where it is integrated.

@@ -26,6 +26,15 @@ class Status(enum.Enum):
         "The flanks penetrate beyond the validity of a contact law (2 % of the pitch radius). "
         "Raise contact.stiffness_N_per_mm_e or lower the load."
     )
+    UNRESOLVED = (
+        "The flanks penetrate so little that rounding of the gap alone changes the greatest force "
+        "by more than 1 %. Set solver.precision to float64, lower contact.stiffness_N_per_mm_e or "
+        "raise scene.load.torque_N_m."
+    )
+    IDLE = (
+        "No flank touches: the pair rests anywhere within its play, without contact force and "
+        "without a gradient. Raise scene.load.torque_N_m."
+    )
     SOLVER_FAILED = (
         "The solver ran out of steps. Raise solver.max_steps_per_period, loosen solver.rtol, "
         "or use an implicit solver.method (kvaerno5)."

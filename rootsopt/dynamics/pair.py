@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.impact import ImpactLaw
+from rootsopt.dynamics.pace import Pace
 from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
 from rootsopt.profiles.base import Profile
 
@@ -73,8 +74,8 @@ class RotorPair(eqx.Module):
 
     `contact`: gap and levers at a pose; `law`: contact force; `clearance` (m) added to
     every flank gap; `inertia` of one rotor (kg·m²); `drive`, `load`, `gear`: parts;
-    `angle_scale` (rad) and `force_scale` (N): units the solver works in. An absent gear
-    is None and costs nothing.
+    `angle_scale` (rad) and `force_scale` (N): units the solver works in; `pace`: how quickly
+    it can change, None if unknown. An absent gear is None and costs nothing.
     """
 
     lobes: int = eqx.field(static=True)
@@ -87,6 +88,7 @@ class RotorPair(eqx.Module):
     gear: TimingGear | None
     angle_scale: Float[Array, ""]
     force_scale: Float[Array, ""]
+    pace: Pace | None = None
 
     @property
     def mesh_period(self) -> Float[Array, ""]:

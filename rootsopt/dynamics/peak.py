@@ -1,9 +1,11 @@
 """The greatest contact force of a motion: where it is, and how it changes with the design."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rootsopt.dynamics.pair import RotorPair
 
@@ -35,28 +37,70 @@ def motion(states: Float[Array, "samples n"], place: Float[Array, ""]) -> Float[
     return jnp.sum((jnp.prod(others, axis=1) / factors)[:, None] * near, axis=0)
 
 
+class Steps(NamedTuple):
+    """Steps of a solver: where they begin and end (mesh periods; inf beyond the last), the states
+    there, how many there are, and which has the greatest mean force."""
+
+    begins: Float[Array, " steps"]
+    ends: Float[Array, " steps"]
+    before: Float[Array, "steps n"]
+    after: Float[Array, "steps n"]
+    count: Int[Array, ""]
+    strongest: Int[Array, ""]
+
+    def motion(self, tau: Float[Array, ""]) -> Float[Array, "2"]:
+        """State (ε, dε/dτ, scaled) at time `tau` (mesh periods): the cubic through ε and its rate
+        at both ends of the step."""
+        k = jnp.clip(jnp.searchsorted(self.ends, tau), 0, self.count - 1)
+        step = self.ends[k] - self.begins[k]
+        x = (tau - self.begins[k]) / step
+        (start, rate), (end, last) = self.before[k, :2], self.after[k, :2]
+        rise = end - start
+        bend, twist = 3 * rise - step * (2 * rate + last), step * (rate + last) - 2 * rise
+        place = start + x * (step * rate + x * (bend + x * twist))
+        return jnp.stack([place, rate + x * (2 * bend + 3 * x * twist) / step])
+
+
 def locate_peak(
-    pair: RotorPair, states: Float[Array, "samples n"], length: Float[Array, ""]
+    pair: RotorPair,
+    states: Float[Array, "samples n"],
+    length: Float[Array, ""],
+    steps: Steps | None = None,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Time (mesh periods) of the greatest force, and the greatest penetration (m) at the samples,
     from the `states` at uniform times over `length` mesh periods.
 
     An impact's peak can be narrower than the sampling, with a corner where the damping
-    saturates: it is enclosed by looking ever more closely around the greatest sample.
+    saturates: it is enclosed by looking ever more closely around the greatest sample. Where the
+    `steps` of the solver are closer than the samples the motion swings between these: then it is
+    taken from the steps, and looked at around the one of greatest mean force.
     """
     samples = states.shape[0]
     width = length / samples
     blocks = -(-samples // _BLOCK)
     spread = jnp.linspace(-1, 1, _BLOCK, dtype=width.dtype)
 
+    dense = jnp.zeros((), bool) if steps is None else steps.count > samples
+
+    def state_at(place):
+        sampled = motion(states, place)
+        if steps is None:
+            return sampled
+        return jnp.where(dense, steps.motion(place * width), sampled)
+
     # One loop for both, so that the contact is compiled once.
     def look(i, carry):
         greatest, best, depth = carry
+        if steps is not None:
+            k = steps.strongest
+            middle = (steps.begins[k] + steps.ends[k]) / 2 / width
+            best = jnp.where(dense & (i == blocks), middle, best)
+            greatest = jnp.where(dense & (i == blocks), -jnp.inf, greatest)
         block = jnp.minimum(i * _BLOCK + jnp.arange(_BLOCK), samples - 1).astype(width.dtype)
         reach = (2.0 / (_BLOCK - 1)) ** (i - blocks).astype(width.dtype)
         close = jnp.clip(best + reach * spread, 0.0, samples - 1.0)
         places = jnp.where(i < blocks, block, close)
-        contact = jax.vmap(lambda at: pair.contact_at(at * width, motion(states, at)))(places)
+        contact = jax.vmap(lambda at: pair.contact_at(at * width, state_at(at)))(places)
         top = jnp.argmax(contact.total)
         more = contact.total[top] > greatest
         greatest = jnp.where(more, contact.total[top], greatest)
