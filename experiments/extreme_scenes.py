@@ -93,16 +93,22 @@ def config_of(kind: Kind, values: dict[str, float]) -> Config:
 def _design(draw: np.random.Generator, lobes: int, radius: float) -> dict[str, float]:
     """Pressure angle, u and tip arc, a fifth of the draws each on a limit."""
     half = 90 / lobes
-    angle = draw.choice([0.5, 89.5]) if draw.uniform() < 0.2 else draw.uniform(5, 85)
-    tip = draw.choice([0.0, half * (1 - 1e-9)]) if draw.uniform() < 0.2 else draw.uniform(0, half)
-    sine, tangent = math.sin(math.radians(angle)), math.tan(math.radians(angle))
-    longest = radius * sine * math.radians(half - tip) * _OVERLENGTH
-    longest = min(longest, radius * sine * tangent)
-    share = 1.0 if draw.uniform() < 0.2 else draw.uniform(0.01, 1)
+    while True:
+        angle = draw.choice([1.0, 89.0]) if draw.uniform() < 0.2 else draw.uniform(1, 89)
+        ends = 0.0, half * (1 - 1e-6)
+        tip = draw.choice(ends) if draw.uniform() < 0.2 else draw.uniform(*ends)
+        reach = radius * math.sin(math.radians(angle))
+        longest = reach * math.radians(half - tip) * _OVERLENGTH
+        longest = min(longest, reach * math.tan(math.radians(angle)))
+        shortest = reach * math.radians(half - tip - 2 * angle) + 1e-6 * radius
+        shortest = max(shortest, 0.01 * longest)
+        if shortest < longest:
+            break
+    share = draw.choice([0.0, 1.0]) if draw.uniform() < 0.3 else draw.uniform()
     return {
         "profile.pressure_angle_deg": float(angle),
         "profile.tip_arc_angle_deg": float(tip),
-        "profile.involute_length_mm": float(longest * share),
+        "profile.involute_length_mm": float(shortest + share * (longest - shortest)),
     }
 
 

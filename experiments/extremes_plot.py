@@ -18,7 +18,7 @@ COLOURS = {
     "solver_failed": "#D55E00",
     "non_finite": "#000000",
 }
-_EDGES = np.logspace(-3, 9, 13)
+_EDGES = np.logspace(-2, 8, 11)
 MARKS = "os^vD<>Pphdx*+"
 
 

@@ -21,6 +21,9 @@ BESIDE_UNIT = {8: 2e-8, 4: 1e-3}
 _FARTHEST = {8: 32.0, 4: 1 / 16}
 """Distance of the vertex from the located peak that is believed, in units of `_WIDE`: where the
 states between the samples bend, the peak is located no better than to some 1e-5."""
+_CLEARLY = 1e-4
+"""Share by which the force in a step exceeds that at the samples if they have missed it: states
+inside a step are those of a cubic."""
 _ROUNDINGS = 1e5
 """Bend of the force over `_WIDE` that is more than rounding, in roundings of the force."""
 _LEAST = 1e-9
@@ -62,55 +65,53 @@ class Steps(NamedTuple):
 
 
 def locate_peak(
-    pair: RotorPair,
-    states: Float[Array, "samples n"],
-    length: Float[Array, ""],
-    steps: Steps | None = None,
+    pair: RotorPair, states: Float[Array, "samples n"], length: Float[Array, ""], steps: Steps
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Time (mesh periods) of the greatest force, and the greatest penetration (m) at the samples,
-    from the `states` at uniform times over `length` mesh periods.
+    """Time (mesh periods) of the greatest force, and the greatest penetration (m) that was seen,
+    from the `states` at uniform times over `length` mesh periods and the `steps` of the solver.
 
     An impact's peak can be narrower than the sampling, with a corner where the damping
-    saturates: it is enclosed by looking ever more closely around the greatest sample. Where the
-    `steps` of the solver are closer than the samples the motion swings between these: then it is
-    taken from the steps, and looked at around the one of greatest mean force.
+    saturates: it is enclosed by looking ever more closely around the greatest sample. An impact
+    can also fall between two samples: the same is done around the step of greatest mean force,
+    which counts if it is clearly greater, or if the steps are closer than the samples (then the
+    motion may swing between these).
     """
     samples = states.shape[0]
     width = length / samples
     blocks = -(-samples // _BLOCK)
     spread = jnp.linspace(-1, 1, _BLOCK, dtype=width.dtype)
+    begin, end = steps.begins[steps.strongest], steps.ends[steps.strongest]
 
-    dense = jnp.zeros((), bool) if steps is None else steps.count > samples
-
-    def state_at(place):
-        sampled = motion(states, place)
-        if steps is None:
-            return sampled
-        return jnp.where(dense, steps.motion(place * width), sampled)
-
-    # One loop for both, so that the contact is compiled once.
+    # One loop for all, so that the contact is compiled once.
     def look(i, carry):
         greatest, best, depth = carry
-        if steps is not None:
-            k = steps.strongest
-            middle = (steps.begins[k] + steps.ends[k]) / 2 / width
-            best = jnp.where(dense & (i == blocks), middle, best)
-            greatest = jnp.where(dense & (i == blocks), -jnp.inf, greatest)
+        by_steps = i >= blocks + _ROUNDS
+        way = by_steps.astype(int)
+        round_ = i - blocks - way * _ROUNDS
         block = jnp.minimum(i * _BLOCK + jnp.arange(_BLOCK), samples - 1).astype(width.dtype)
-        reach = (2.0 / (_BLOCK - 1)) ** (i - blocks).astype(width.dtype)
-        close = jnp.clip(best + reach * spread, 0.0, samples - 1.0)
+        reach = (2.0 / (_BLOCK - 1)) ** round_.astype(width.dtype)
+        reach *= jnp.where(by_steps, 1.5 * (end - begin) / width, 1.0)
+        last = jnp.where(by_steps, samples, samples - 1.0)
+        close = jnp.clip(best[way] + reach * spread, 0.0, last)
         places = jnp.where(i < blocks, block, close)
-        contact = jax.vmap(lambda at: pair.contact_at(at * width, state_at(at)))(places)
-        top = jnp.argmax(contact.total)
-        more = contact.total[top] > greatest
-        greatest = jnp.where(more, contact.total[top], greatest)
-        best = jnp.where(more, places[top], best)
-        return greatest, best, jnp.maximum(depth, jnp.max(contact.depth))
+
+        def contact(place):
+            state = jnp.where(by_steps, steps.motion(place * width), motion(states, place))
+            return pair.contact_at(place * width, state)
+
+        found = jax.vmap(contact)(places)
+        top = jnp.argmax(found.total)
+        more = found.total[top] > greatest[way]
+        greatest = greatest.at[way].set(jnp.where(more, found.total[top], greatest[way]))
+        best = best.at[way].set(jnp.where(more, places[top], best[way]))
+        return greatest, best, jnp.maximum(depth, jnp.max(found.depth))
 
     least = jnp.full_like(width, -jnp.inf)
-    start = least, jnp.zeros_like(width), least
-    _, best, depth = lax.fori_loop(0, blocks + _ROUNDS, look, start)
-    return best * width, depth
+    first = jnp.stack([jnp.zeros_like(width), (begin + end) / 2 / width])
+    start = jnp.stack([least, least]), first, least
+    greatest, best, depth = lax.fori_loop(0, blocks + 2 * _ROUNDS, look, start)
+    missed = (greatest[1] > (1 + _CLEARLY) * greatest[0]) | (steps.count > samples)
+    return jnp.where(missed, best[1], best[0]) * width, depth
 
 
 def one_sided(forces: Float[Array, "7"]) -> tuple[Float[Array, ""], Float[Array, "7"]]:
