@@ -5,6 +5,7 @@ contact, solver, precision) is a `Kind`, so that all scenes of a kind share one 
 """
 
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Iterator
@@ -68,9 +69,14 @@ class Kind:
         return f"{self.family} {self.lobes}, {self.fidelity}, {self.method}, {self.precision}{gear}"
 
 
+@functools.cache
+def _shipped(family: str) -> Config:
+    return load(f"configs/{family}.yaml")
+
+
 def config_of(kind: Kind, values: dict[str, float]) -> Config:
     """The shipped config of the kind's family with `values` by dotted key."""
-    data = load(f"configs/{kind.family}.yaml").model_dump()
+    data = _shipped(kind.family).model_dump()
     fixed = {
         "profile.lobes": kind.lobes,
         "solver.fidelity": kind.fidelity,
@@ -115,7 +121,7 @@ def _design(draw: np.random.Generator, lobes: int, radius: float) -> dict[str, f
 def cloud(kind: Kind, count: int, seed: int) -> Iterator[Config]:
     """`count` random scenes of a kind; a tenth of what may vanish does."""
     draw = np.random.default_rng([seed, *kind.label.encode()])
-    radius = load(f"configs/{kind.family}.yaml").profile.pitch_radius_mm
+    radius = _shipped(kind.family).profile.pitch_radius_mm
     for _ in range(count):
         values = {
             key: float(math.exp(draw.uniform(math.log(low), math.log(high))))
@@ -153,7 +159,11 @@ def row_of(config: Config) -> dict[str, float]:
     return row
 
 
-def stacked(configs: list[Config]) -> Model:
-    """The models of scenes of one kind, their numbers stacked along a leading axis (n,)."""
-    models = [jax.tree.map(np.asarray, Model.of(config)) for config in configs]
+def stacked(configs: list[Config], precision: str) -> Model:
+    """The models of scenes with one kind of pair, at one precision, their numbers stacked along a
+    leading axis (n,)."""
+    models = [
+        jax.tree.map(np.asarray, dataclasses.replace(Model.of(config), precision=precision))
+        for config in configs
+    ]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *models)

@@ -44,7 +44,7 @@ UNRESOLVED = 1e-2
 """Relative error of the greatest force by rounding of the gap, beyond which it is no result."""
 _NOISE = 100.0
 """Noise that adaptive steps give the stroboscopic states, in tolerances and relative to them."""
-_UNKNOWN = 1e-2
+_UNKNOWN = 0.1
 """Error of an orbit (scaled) beyond which nothing is known of it."""
 _FREE = 1e-6
 """Distance of a Floquet multiplier from 1 that is none."""
