@@ -31,15 +31,15 @@ def config_of(**changes):
 # The contact law at the ends of its ranges
 
 
-def extreme_laws(dtype):
-    """Laws at every combination of limits (config units: N/mm^e, N s/mm, mm), stacked."""
+def extreme_laws():
+    """Parameters (n, 5) of laws at every combination of limits (N/mm^e, N s/mm, mm), in SI units."""
     stiffness, exponents = (1e3, 1e6, 1e9), (1.0, 1.5, 2.0, 3.0, 5.0)
     damping, depths, smoothing = (0.0, 1e-4, 10.0), (1e-5, 1e-2, 1.0), (0.0, 1e-6, 1e-4, 0.1)
     rows = [
         (k * 1e3**e, e, c * 1e3, d * 1e-3, h * 1e-3)
         for k, e, c, d, h in itertools.product(stiffness, exponents, damping, depths, smoothing)
     ]
-    return rows, ImpactLaw(*(jnp.asarray(column, dtype) for column in np.array(rows).T))
+    return np.array(rows)
 
 
 DEPTHS = np.concatenate([[-1e-3, 0.0], np.geomspace(1e-36, 1e-2, 58)])
@@ -47,22 +47,25 @@ RATES = np.concatenate([-np.geomspace(1e-9, 1e3, 9), [0.0], np.geomspace(1e-9, 1
 
 
 @jax.jit
-def values_and_slopes(laws, depths, rates):
-    def at(law, depth, rate):
-        value, slopes = jax.value_and_grad(lambda *x: x[0](*x[1:]), (0, 1, 2))(law, depth, rate)
-        return jnp.stack([value, *jax.tree.leaves(slopes)])
+def values_and_slopes(rows, depths, rates):
+    def force(row, depth, rate):
+        return ImpactLaw(*row)(depth, rate)
 
-    def one(law):
-        return jax.vmap(lambda d: jax.vmap(lambda r: at(law, d, r))(rates))(depths)
+    def at(*x):
+        value, (by_row, by_depth, by_rate) = jax.value_and_grad(force, (0, 1, 2))(*x)
+        return jnp.concatenate([jnp.stack([value, by_depth, by_rate]), by_row])
 
-    return jax.lax.map(one, laws)
+    def one(row):
+        return jax.vmap(lambda d: jax.vmap(lambda r: at(row, d, r))(rates))(depths)
+
+    return jax.lax.map(one, rows)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_law_and_its_slopes_are_finite_at_every_limit(dtype):
     """Force, and its derivatives in depth, rate and parameters, from a depth of 1e-36 m to 10 mm."""
-    rows, laws = extreme_laws(dtype)
-    found = values_and_slopes(laws, jnp.asarray(DEPTHS, dtype), jnp.asarray(RATES, dtype))
+    rows = extreme_laws()
+    found = values_and_slopes(*(jnp.asarray(x, dtype) for x in (rows, DEPTHS, RATES)))
     assert found.dtype == dtype
     wrong = np.argwhere(~np.isfinite(found))
     assert len(wrong) == 0, [(rows[i], DEPTHS[j], RATES[k], n) for i, j, k, n in wrong[:3]]
@@ -71,11 +74,11 @@ def test_law_and_its_slopes_are_finite_at_every_limit(dtype):
 
 def test_single_precision_force_is_that_of_the_law():
     """Where the law is not rounded: K δ^e + C (3x² - 2x³) dδ/dt in double, to 1e-5 of itself."""
-    rows, laws = extreme_laws(jnp.float32)
+    rows = extreme_laws()
     depths, rates = np.geomspace(1e-8, 1e-3, 21), np.array([0.0, 1e-3, 10.0])
-    single = [jnp.asarray(x, jnp.float32) for x in (depths, rates)]
-    found = np.asarray(values_and_slopes(laws, *single)[..., 0], float)
-    k, e, c, d, h = np.array(rows).T[:, :, None, None]
+    single = (jnp.asarray(x, jnp.float32) for x in (rows, depths, rates))
+    found = np.asarray(values_and_slopes(*single)[..., 0], float)
+    k, e, c, d, h = rows.T[:, :, None, None]
     place, rate = depths[None, :, None], rates[None, None, :]
     x = np.minimum(place / d, 1.0)
     plain = k * place**e + c * (3 * x**2 - 2 * x**3) * rate
@@ -87,7 +90,7 @@ def test_single_precision_force_is_that_of_the_law():
 # Steps from the scene
 
 
-def pace(play=1e-4, torque=5.0, inertia=2e-3, exponent=1.0, stiffness=1e7):
+def pace(play=1e-3, torque=5.0, inertia=2e-3, exponent=1.0, stiffness=1e7):
     """Pace of a pair of 33 mm pitch radius, a gear of 2e4 N m/rad, and its parts."""
     law = ImpactLaw(*(jnp.asarray(x) for x in (stiffness, exponent, 0.0, 1e-5, 0.0)))
     gear = TimingGear(*(jnp.asarray(x) for x in (2e4, 0.0, play / 2, 0.0)))
@@ -101,7 +104,7 @@ def test_pace_in_closed_form():
     found = pace()
     spring = 1e7 * 0.033**2 + 2e4
     assert float(found.swing) == pytest.approx(np.sqrt(2e-3 / spring), rel=1e-12)
-    assert float(found.fall) == pytest.approx(np.sqrt(2 * 1e-4 * 2e-3 / 5.0), rel=1e-12)
+    assert float(found.fall) == pytest.approx(np.sqrt(2 * 1e-3 * 2e-3 / 5.0), rel=1e-12)
 
 
 def test_impact_after_a_fall_sets_the_pace():
@@ -163,7 +166,7 @@ def test_impact_between_the_samples_is_found():
     of the solver are short there. The greatest force is where the dip is deepest."""
     config = config_of(solver__fidelity="linear", contact__max_damping_N_s_per_mm=0)
     pair = Model.of(config).pair(design_vector(config))
-    middle, width = 0.2083, 1e-3
+    middle, width = 0.7083, 1e-3
 
     def motion(tau):
         bump = -0.5 * np.exp(-(((tau - middle) / width) ** 2))
@@ -172,7 +175,7 @@ def test_impact_between_the_samples_is_found():
     samples = motion(np.arange(60) / 60)
     assert samples[:, 0].min() > 0  # no sample is in contact with this flank
     near = middle + width * np.linspace(-4, 4, 41)
-    edges = np.concatenate([np.linspace(0, 0.2, 11), near, np.linspace(0.22, 1, 11)])
+    edges = np.concatenate([np.linspace(0, 0.7, 11), near, np.linspace(0.72, 1, 11)])
     begins, ends = edges[:-1], edges[1:]
     strongest = int(np.searchsorted(ends, middle))
     steps = Steps(begins, ends, motion(begins), motion(ends), np.array(len(ends)), strongest)
@@ -312,20 +315,17 @@ def test_motion_of_many_swings_agrees_with_scipy():
         return jnp.append(slope, contact.total)
 
     start = np.append(evaluation.state, 0.0)
-    seen = []
-
-    def derivative(tau, y):
-        found = np.asarray(rates(tau, y[:2]))
-        seen.append(found[2])
-        return found
-
     scales = np.array([1e-9, 1e-9, 1e-7])
-    done = solve_ivp(derivative, (0, 1), start, "DOP853", rtol=1e-9, atol=scales, max_step=1 / 32)
+    done = solve_ivp(
+        lambda tau, y: np.asarray(rates(tau, y[:2])),
+        (0, 1), start, "DOP853", rtol=1e-9, atol=scales, max_step=1 / 32,
+    )  # fmt: skip
     np.testing.assert_allclose(done.y[:2, -1], evaluation.state, rtol=1e-5, atol=1e-5)
     mean, peak = (evaluation.response[f"{name}_force_N"] for name in ("mean", "peak"))
     assert done.y[2, -1] == pytest.approx(mean, rel=1e-5)
-    # At the solver's stages the force is near its greatest value, but never above it.
-    assert 0.98 * peak < max(seen) < peak * (1 + 1e-4)
+    # At the ends of its steps the force is near its greatest value, but never above it.
+    forces = jax.vmap(rates)(jnp.asarray(done.t), jnp.asarray(done.y[:2].T))[:, 2]
+    assert 0.98 * peak < np.max(forces) < peak * (1 + 1e-5)
 
 
 # Profiles on their limits

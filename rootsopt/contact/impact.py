@@ -49,7 +49,8 @@ class ImpactLaw(eqx.Module):
     ) -> Float[Array, "*n"]:
         """Normal force (N), ≥ 0, for penetration `depth` (m) growing at `rate` (m/s)."""
         positive, elastic, total, width = self._parts(depth, rate)
-        releasing = positive & (total > 0) & (total < width * elastic)
+        large = elastic > float(jnp.finfo(elastic.dtype).tiny) ** 0.5
+        releasing = positive & large & (total > 0) & (total < width * elastic)
         share = jnp.where(releasing, total, 1.0) / jnp.where(releasing, elastic, 1.0)
         rounded = elastic * ramp(share, width)
         return jnp.where(positive, jnp.where(releasing, rounded, jnp.maximum(total, 0.0)), 0.0)
@@ -68,13 +69,14 @@ class ImpactLaw(eqx.Module):
 
         The damping force is added to the elastic one, and divided by it only where it is no
         greater: near the onset both are so small that the derivative of their quotient would
-        overflow in single precision. An elastic force whose square is out of range is none.
+        overflow in single precision. (An elastic force whose square is out of range is not
+        rounded at its release.)
         """
         delta = ramp(depth, self.smoothing)
         safe = jnp.where(delta > 0, delta, self.full_damping_depth)
         # Not K δ^e, of which either factor may be out of range.
         elastic = (self.stiffness ** (1 / self.exponent) * safe) ** self.exponent
-        positive = (delta > 0) & (elastic > float(jnp.finfo(elastic.dtype).tiny) ** 0.5)
+        positive = delta > 0
         damping = self.damping * smooth_step(safe / self.full_damping_depth)
         width = jnp.minimum(self.smoothing / self.full_damping_depth, 1.0)
         return positive, elastic, elastic + damping * rate, width
