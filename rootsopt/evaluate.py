@@ -42,6 +42,8 @@ from rootsopt.status import Status
 
 RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 _NEARLY = 0.05
+_CLOSEST = 1e-12
+"""Scaled difference below which states repeat exactly: a closer look would show no more."""
 CHAOS_WINDOW = 128
 _THINNING = 6
 
@@ -251,7 +253,8 @@ class Evaluator:
                 break
             transient, orbit, status = self._close(pair, tangents, transient, tolerance)
             steps += int(orbit.flow.steps)
-            if status is not Status.NOT_SETTLED or used >= self.max_periods:
+            late = used >= self.max_periods or tolerance < _CLOSEST
+            if status is not Status.NOT_SETTLED or late:
                 break
             # Newton left the neighbourhood or found an unstable orbit: it was not the
             # steady state yet, or too coarse an image of it. Go on, and look more closely.
@@ -341,6 +344,9 @@ class Evaluator:
         elif status is Status.NOT_SETTLED and not self.survey:
             window = lyapunov_program(pair, outcome.transient.state, CHAOS_WINDOW, self.transient)
             status, steady, response, series = unsettled(pair, window, with_series)
+        elif status is Status.SOLVER_FAILED and pair.pace is not None:
+            swings = pair.mesh_period / (2 * np.pi * pair.pace.swing)
+            statistics["swings_per_mesh_period"] = float(swings)
         if status is not Status.PERIODIC:
             gradient = {}
         statistics["seconds"] = seconds

@@ -159,8 +159,9 @@ def settle(
 ) -> Transient:
     """Integrate block by block until the last states repeat with some period k.
 
-    What has not settled after `_PATIENCE` goes on in finer steps. Settled means: the last k + 1 states differ from those k periods earlier by less than
-    `tolerance` (scaled units), for the smallest such k ≤ `max_orbit` ≤ 8.
+    What has not settled after `_PATIENCE` goes on in finer steps. Settled means: the last k + 1
+    states differ from those k periods earlier by less than `tolerance` (scaled units; or the noise
+    of steps in states far from 0), for the smallest such k ≤ `max_orbit` ≤ 8.
     """
     orders = jnp.arange(1, max_orbit + 1)
     age = jnp.arange(_MEMORY)[::-1]
