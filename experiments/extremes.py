@@ -302,12 +302,9 @@ def refine(case: Case) -> None:
     off = np.abs(found - truth) / np.maximum(truth, case.row["static_force_N"])
     allowed = ALLOWED * case.config.solver.rtol
     if case.kind.precision == "float32":
-        rounding = force_rounding(
-            orbit,
-            np.float32(case.config.contact.exponent),
-            np.float32(case.config.profile.pitch_radius_mm / 1e3),
-        )
-        allowed = ALLOWED * max(case.config.solver.rtol, SINGLE) + 2**29 * 3 * float(rounding)
+        # Of the reference's gap in double; single rounds 2^29 times as coarsely.
+        rounding = 2**29 * float(force_rounding(orbit, model.law.exponent, model.pitch_radius))
+        allowed = ALLOWED * max(case.config.solver.rtol, SINGLE) + 3 * rounding
     case.row |= {
         "reference": "closed" if closed else "not closed",
         "reference_mean_N": float(mean),

@@ -24,6 +24,7 @@ from rootsopt.dynamics.steady import (
     UNRESOLVED,
     close_orbit,
     force_rounding,
+    is_consistent,
     is_idle,
     judged,
     settle,
@@ -111,6 +112,7 @@ def respond(
     open_by = jnp.maximum(enough, RESIDUAL[model.precision])
     found = judged(closed, settled.state, tolerance, rtols, open_by)
     rounding = force_rounding(closed, model.law.exponent, model.pitch_radius)
+    consistent = is_consistent(closed, 10 * rtols[1] * pair.force_scale)
     outcomes = (
         (~settled.solved, Status.SOLVER_FAILED),
         (settled.lost, Status.PASSED_THROUGH),
@@ -121,13 +123,13 @@ def respond(
         (~finite, Status.NON_FINITE),
         (~found, Status.NOT_SETTLED),
         (closed.flow.depth > TOO_DEEP * model.pitch_radius, Status.TOO_DEEP),
-        (rounding > UNRESOLVED, Status.UNRESOLVED),
+        ((rounding > UNRESOLVED) | ~consistent, Status.UNRESOLVED),
     )
     conditions, names = zip(*outcomes, strict=True)
     status = jnp.select(conditions, [STATUSES.index(name) for name in names], 0)
     usable = status == 0
     mean, square, peak = closed.response
-    rms = jnp.sqrt(square)
+    rms = jnp.sqrt(jnp.maximum(square, 0.0))
     by_mean, by_square, by_peak = closed.sensitivity
     rows = jnp.stack([by_mean, by_peak, by_square / (2 * jnp.maximum(rms, 1e-30))])
     return Batch(

@@ -27,6 +27,7 @@ from rootsopt.dynamics.steady import (
     Transient,
     close_orbit,
     force_rounding,
+    is_consistent,
     is_idle,
     judged,
     lyapunov,
@@ -337,9 +338,10 @@ class Evaluator:
             series = _orbit_series(pair, orbit, period) if with_series else None
             rounding = force_rounding(orbit, self.model.law.exponent, self.model.pitch_radius)
             statistics["force_rounding"] = float(rounding)
+            least = 10 * self.orbit.tolerance(orbit.state.dtype) * pair.force_scale
             if float(orbit.flow.depth) > TOO_DEEP * float(self.model.pitch_radius):
                 status = Status.TOO_DEEP
-            elif float(rounding) > UNRESOLVED:
+            elif float(rounding) > UNRESOLVED or not is_consistent(orbit, least):
                 status = Status.UNRESOLVED
         elif status is Status.NOT_SETTLED and not self.survey:
             window = lyapunov_program(pair, outcome.transient.state, CHAOS_WINDOW, self.transient)

@@ -27,9 +27,10 @@ class Status(enum.Enum):
         "Raise contact.stiffness_N_per_mm_e or lower the load."
     )
     UNRESOLVED = (
-        "The flanks penetrate so little that rounding of the gap alone changes the greatest force "
-        "by more than 1 %. Set solver.precision to float64, lower contact.stiffness_N_per_mm_e or "
-        "raise scene.load.torque_N_m."
+        "The force is lost in errors: the flanks penetrate so little that rounding of the gap "
+        "changes its greatest value by more than 1 %, or the steps are too coarse for its impacts "
+        "(mean, RMS and peak contradict each other). Set solver.precision to float64, or tighten "
+        "solver.rtol."
     )
     IDLE = (
         "No flank touches: the pair rests anywhere within its play, without contact force and "

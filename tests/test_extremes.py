@@ -17,7 +17,7 @@ from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pace import Pace
 from rootsopt.dynamics.parts import TimingGear
 from rootsopt.dynamics.peak import Steps, locate_peak
-from rootsopt.dynamics.steady import Orbit, force_rounding, is_idle, judged
+from rootsopt.dynamics.steady import Orbit, force_rounding, is_consistent, is_idle, judged
 from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluator
 from rootsopt.model import Model, check_geometry, design_vector
@@ -247,6 +247,22 @@ def test_rounding_of_the_gap():
     found = float(force_rounding(single, exponent, radius))
     assert found == pytest.approx(2 * np.finfo(np.float32).eps * 0.033 / 1e-7, rel=1e-6)
     assert float(force_rounding(orbit_of(peak=0.0, depth=-0.03), exponent, radius)) == 0
+
+
+def test_mean_rms_and_peak_must_not_contradict_each_other():
+    """mean ≤ RMS ≤ peak, but for 1 % and what is below the least force."""
+
+    def consistent(mean, square, peak, least=1e-3):
+        orbit = orbit_of(mean=mean, peak=peak)
+        numbers = jnp.array([mean, square, peak])
+        return bool(is_consistent(orbit._replace(response=numbers), jnp.asarray(least)))
+
+    assert consistent(3.0, 10.0, 4.0)
+    assert consistent(3.0, 9.0, 3.0)
+    assert not consistent(3.0, -1.0, 4.0)
+    assert not consistent(3.0, 10.0, 0.0)
+    assert not consistent(-3.0, 10.0, 4.0)
+    assert consistent(1e-4, -1e-8, 1e-4)
 
 
 def test_idle_is_without_force_and_without_return():

@@ -129,6 +129,18 @@ def judged(
     return closed & (multiplier < 1) & (gain * rtols[1] < _UNKNOWN) & (moved <= near)
 
 
+def is_consistent(orbit: Orbit, least: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether the mean force is no greater than the root of the mean square, and that no greater
+    than the peak, but for 1 % and forces of the size `least` (N).
+
+    This holds for every force. Steps too coarse for short impacts break it: the mean square they
+    add up to may even be negative.
+    """
+    mean, square, peak = orbit.response[:3]
+    ordered = (square + least**2 >= 0.98 * mean**2) & (peak**2 + least**2 >= 0.98 * square)
+    return ordered & (mean >= -least)
+
+
 def force_rounding(
     orbit: Orbit, exponent: Float[Array, ""], radius: Float[Array, ""]
 ) -> Float[Array, ""]:
