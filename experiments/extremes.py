@@ -59,7 +59,11 @@ HORIZON = 24
 STEPS = 1024
 """Solver steps for a mesh period, there."""
 ALLOWED = 100.0
-"""Deviation of a force from the truth, in units of the tolerance and relative to it."""
+"""Deviation of a force from the truth in units of the tolerance, relative to the greater of that
+force and the static one; in single precision five roundings of the gap are added."""
+CORNER = 1e-9
+"""Tolerance below which deviations are not judged: a peak on a corner of the force is known to some
+1e-8 only (docs/accuracy.md)."""
 SINGLE = 2.4e-6
 """Tolerance that single precision holds."""
 SHARP = "dopri8", 1e-12, 20_000
@@ -107,7 +111,14 @@ FULL = Study(
     evaluated=60,
     long=10,
 )
-QUICK = Study(kinds=((Kind(), 40),), gridded=False, references=0, scipy=3, evaluated=0, long=0)
+QUICK = Study(
+    kinds=((Kind(fidelity="linear"), 40),),
+    gridded=False,
+    references=0,
+    scipy=3,
+    evaluated=0,
+    long=0,
+)
 
 
 @dataclasses.dataclass
@@ -184,7 +195,7 @@ def check_equation(cases: list[Case], seed: int) -> dict[str, Any]:
         shape = kind.family, kind.lobes, kind.geared, kind.fidelity
         groups.setdefault(shape, []).append(case)
     for (family, lobes, geared, fidelity), members in groups.items():
-        if fidelity != "search" or lobes in (4, 5):
+        if fidelity == "map" or lobes in (4, 5):
             continue
         configs = [case.config for case in members]
         designs = np.stack([np.asarray(design_vector(config)) for config in configs])
@@ -300,11 +311,11 @@ def refine(case: Case) -> None:
     names = ("mean_force_N", "peak_force_N", "rms_force_N")
     found = np.array([case.row[name] for name in names])
     off = np.abs(found - truth) / np.maximum(truth, case.row["static_force_N"])
-    allowed = ALLOWED * case.config.solver.rtol
+    allowed = ALLOWED * max(case.config.solver.rtol, CORNER)
     if case.kind.precision == "float32":
         # Of the reference's gap in double; single rounds 2^29 times as coarsely.
         rounding = 2**29 * float(force_rounding(orbit, model.law.exponent, model.pitch_radius))
-        allowed = ALLOWED * max(case.config.solver.rtol, SINGLE) + 3 * rounding
+        allowed = ALLOWED * max(case.config.solver.rtol, SINGLE) + 5 * rounding
     case.row |= {
         "reference": "closed" if closed else "not closed",
         "reference_mean_N": float(mean),
@@ -321,7 +332,8 @@ def refine(case: Case) -> None:
 def by_scipy(case: Case) -> None:
     """Along the orbit (that of the reference, if there is one): how far SciPy's end is from its
     start, and its mean force."""
-    model = dataclasses.replace(Model.of(case.config), precision="float64", fidelity="search")
+    fidelity = "search" if "reference" in case.row else case.kind.fidelity
+    model = dataclasses.replace(Model.of(case.config), precision="float64", fidelity=fidelity)
     pair = _equation(model, design_vector(case.config))
     period = case.row["period"]
     done = solve_ivp(
