@@ -72,9 +72,9 @@ def locate_peak(
 
     An impact's peak can be narrower than the sampling, with a corner where the damping
     saturates: it is enclosed by looking ever more closely around the greatest sample. An impact
-    can also fall between two samples: the same is done around the step of greatest mean force,
-    which counts if it is clearly greater, or if the steps are closer than the samples (then the
-    motion may swing between these).
+    can also fall between two samples: the same is done in the step of greatest mean force, which
+    counts if the steps are about as close as the samples and it is clearly greater, or if they
+    are closer (then the motion may swing between samples).
     """
     samples = states.shape[0]
     width = length / samples
@@ -90,9 +90,13 @@ def locate_peak(
         round_ = i - blocks - way * _ROUNDS
         block = jnp.minimum(i * _BLOCK + jnp.arange(_BLOCK), samples - 1).astype(width.dtype)
         reach = (2.0 / (_BLOCK - 1)) ** round_.astype(width.dtype)
-        reach *= jnp.where(by_steps, 1.5 * (end - begin) / width, 1.0)
-        last = jnp.where(by_steps, samples, samples - 1.0)
-        close = jnp.clip(best[way] + reach * spread, 0.0, last)
+        reach *= jnp.where(by_steps, (end - begin) / (2 * width), 1.0)
+        # Not beyond the step: the force may jump at its ends.
+        first, last = (
+            jnp.where(by_steps, at / width, limit)
+            for at, limit in ((begin, 0.0), (end, samples - 1.0))
+        )
+        close = jnp.clip(best[way] + reach * spread, first, last)
         places = jnp.where(i < blocks, block, close)
 
         def contact(place):
@@ -110,7 +114,10 @@ def locate_peak(
     first = jnp.stack([jnp.zeros_like(width), (begin + end) / 2 / width])
     start = jnp.stack([least, least]), first, least
     greatest, best, depth = lax.fori_loop(0, blocks + 2 * _ROUNDS, look, start)
-    missed = (greatest[1] > (1 + _CLEARLY) * greatest[0]) | (steps.count > samples)
+    # Only where the steps are about as close as the samples: a force that jumps is higher in a
+    # step across the jump than it ever is.
+    clearly = (2 * steps.count > samples) & (greatest[1] > (1 + _CLEARLY) * greatest[0])
+    missed = clearly | (steps.count > samples)
     return jnp.where(missed, best[1], best[0]) * width, depth
 
 
