@@ -70,7 +70,7 @@ def test_extremes(tmp_path, programs):
     run("extremes", tmp_path, programs)
     rows = rows_of(tmp_path / "extremes.csv")
     assert len(rows) == 40
-    assert {row["named"] for row in rows} == {"True"}
+    assert {row["named"] for row in rows} == {"true"}
     assert {"periodic", "solver_failed"} < {row["status"] for row in rows}
     summary = json.loads((tmp_path / "extremes.json").read_text())
     assert summary["not_finite"] == summary["unnamed"] == 0
