@@ -18,7 +18,18 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.flow import Integrator
-from rootsopt.dynamics.steady import RESIDUAL, close_orbit, settle, settled_within
+from rootsopt.dynamics.steady import (
+    RESIDUAL,
+    TOO_DEEP,
+    UNRESOLVED,
+    close_orbit,
+    force_rounding,
+    is_consistent,
+    is_idle,
+    judged,
+    settle,
+    settled_within,
+)
 from rootsopt.model import Model
 from rootsopt.programs import Program
 from rootsopt.status import Status
@@ -34,6 +45,9 @@ STATUSES = (
     Status.NON_FINITE,
     Status.NOT_SETTLED,
     Status.STALLED,
+    Status.TOO_DEEP,
+    Status.IDLE,
+    Status.UNRESOLVED,
 )
 
 
@@ -90,33 +104,34 @@ def respond(
     settled = settle(pair, state, transient, tolerance, limit, max_orbit)
     period = jnp.maximum(settled.period, 1)
     enough = 0.1 * orbit.rtol
-    closed = close_orbit(
-        pair, tangents, settled.state, period, orbit, None, SAMPLES, _SHOTS, enough
-    )
-    multiplier = closed.multiplier
+    # Nothing is there to be closed where the transient has not settled.
+    shots = jnp.where(settled.period > 0, _SHOTS, 0)
+    closed = close_orbit(pair, tangents, settled.state, period, orbit, None, SAMPLES, shots, enough)
+    ran = settled.period > 0
     finite = jnp.all(jnp.isfinite(closed.response)) & jnp.all(jnp.isfinite(closed.sensitivity))
-    moved = jnp.max(jnp.abs(closed.state - settled.state))
-    near = 10 * tolerance / jnp.maximum(1 - multiplier, 1e-3)
-    found = (
-        (settled.period > 0)
-        & (closed.residual <= jnp.maximum(enough, RESIDUAL[model.precision]))
-        & (multiplier < 1)
-        & (moved <= near)
+    rtols = transient.tolerance(state.dtype), orbit.tolerance(state.dtype)
+    open_by = jnp.maximum(enough, RESIDUAL[model.precision])
+    found = judged(closed, settled.state, tolerance, rtols, open_by)
+    rounding = force_rounding(closed, model.law.exponent, model.pitch_radius)
+    consistent = is_consistent(closed, 10 * rtols[1] * pair.force_scale)
+    outcomes = (
+        (~settled.solved, Status.SOLVER_FAILED),
+        (pair.stalled(settled.state), Status.STALLED),
+        (settled.lost, Status.PASSED_THROUGH),
+        (~jnp.all(jnp.isfinite(settled.state)), Status.NON_FINITE),
+        (~ran, Status.NOT_SETTLED),
+        (~closed.flow.solved, Status.SOLVER_FAILED),
+        (is_idle(closed), Status.IDLE),
+        (~finite, Status.NON_FINITE),
+        (~found, Status.NOT_SETTLED),
+        (closed.flow.depth > TOO_DEEP * model.pitch_radius, Status.TOO_DEEP),
+        ((rounding > UNRESOLVED) | ~consistent, Status.UNRESOLVED),
     )
-    status = jnp.select(
-        [
-            ~(settled.solved & closed.flow.solved),
-            pair.stalled(settled.state),
-            settled.lost,
-            ~finite,
-            ~found,
-        ],
-        [1, 5, 2, 3, 4],
-        0,
-    )
+    conditions, names = zip(*outcomes, strict=True)
+    status = jnp.select(conditions, [STATUSES.index(name) for name in names], 0)
     usable = status == 0
     mean, square, peak = closed.response
-    rms = jnp.sqrt(square)
+    rms = jnp.sqrt(jnp.maximum(square, 0.0))
     by_mean, by_square, by_peak = closed.sensitivity
     rows = jnp.stack([by_mean, by_peak, by_square / (2 * jnp.maximum(rms, 1e-30))])
     return Batch(
@@ -124,7 +139,7 @@ def respond(
         gradient=jnp.where(usable, rows, jnp.nan),
         state=closed.state,
         period=period,
-        multiplier=multiplier,
+        multiplier=closed.multiplier,
         residual=closed.residual,
         deepest=pair.angle_scale * jnp.min(closed.flow.states[:, 0]),
         steps=settled.steps + closed.flow.steps,

@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config, EnsembleConfig
 from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.steady import TOO_DEEP
 from rootsopt.evaluate import (
     CHAOS_WINDOW,
     RESPONSES,
-    TOO_DEEP,
     Evaluation,
     Evaluator,
     geometry_record,

@@ -22,9 +22,15 @@ from rootsopt.dynamics.steady import (
     BLOCK,
     RESIDUAL,
     SAMPLES,
+    TOO_DEEP,
+    UNRESOLVED,
     Orbit,
     Transient,
     close_orbit,
+    force_rounding,
+    is_consistent,
+    is_idle,
+    judged,
     lyapunov,
     reverse_sensitivity,
     settle,
@@ -38,10 +44,10 @@ from rootsopt.status import Status
 
 RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 _NEARLY = 0.05
+_CLOSEST = 1e-12
+"""Scaled difference below which states repeat exactly: a closer look would show no more."""
 CHAOS_WINDOW = 128
 _THINNING = 6
-TOO_DEEP = 0.02
-"""Penetration, in pitch radii, beyond which a contact law means nothing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -264,7 +270,8 @@ class Evaluator:
                 break
             transient, orbit, status = self._close(pair, tangents, transient, tolerance)
             steps += int(orbit.flow.steps)
-            if status is not Status.NOT_SETTLED or used >= self.max_periods:
+            late = used >= self.max_periods or tolerance < _CLOSEST
+            if status is not Status.NOT_SETTLED or late:
                 break
             # Newton left the neighbourhood or found an unstable orbit: it was not the
             # steady state yet, or too coarse an image of it. Go on, and look more closely.
@@ -303,16 +310,16 @@ class Evaluator:
     def _orbit_status(self, orbit: Orbit, transient: Transient, tolerance: float) -> Status:
         if not bool(orbit.flow.solved):
             return Status.SOLVER_FAILED
+        if bool(is_idle(orbit)):
+            return Status.IDLE
         numbers = np.concatenate([orbit.response, np.ravel(orbit.sensitivity), orbit.state])
         if not np.all(np.isfinite(numbers)):
             return Status.NON_FINITE
-        multiplier = float(orbit.multiplier)
-        noise = max(float(self.transient.rtol), float(self.orbit.rtol))
-        near = tolerance / max(1 - multiplier, 1e-3) * 10 + 100 * noise
-        moved = float(np.max(np.abs(orbit.state - transient.state)))
-        closed = float(orbit.residual) <= RESIDUAL[self.model.precision]
-        stable = multiplier < 1
-        return Status.PERIODIC if closed and stable and moved <= near else Status.NOT_SETTLED
+        dtype = orbit.state.dtype
+        rtols = tuple(np.asarray(how.tolerance(dtype)) for how in (self.transient, self.orbit))
+        within, limit = (np.asarray(x, dtype) for x in (tolerance, RESIDUAL[self.model.precision]))
+        found = _judged(orbit, transient.state, within, rtols, limit)
+        return Status.PERIODIC if bool(found) else Status.NOT_SETTLED
 
     def _report(self, design, outcome: Any, began: float, with_series: bool) -> Evaluation:
         """The evaluation that an attempt which `began` then has come to."""
@@ -347,11 +354,19 @@ class Evaluator:
                 "orbit_steps": int(orbit.flow.steps),
             }
             series = _orbit_series(pair, orbit, period) if with_series else None
+            rounding = force_rounding(orbit, self.model.law.exponent, self.model.pitch_radius)
+            statistics["force_rounding"] = float(rounding)
+            least = 10 * self.orbit.tolerance(orbit.state.dtype) * pair.force_scale
             if float(orbit.flow.depth) > TOO_DEEP * float(self.model.pitch_radius):
                 status = Status.TOO_DEEP
+            elif float(rounding) > UNRESOLVED or not is_consistent(orbit, least):
+                status = Status.UNRESOLVED
         elif status is Status.NOT_SETTLED and not self.survey:
             window = lyapunov_program(pair, outcome.transient.state, CHAOS_WINDOW, self.transient)
             status, steady, response, series = unsettled(pair, window, with_series)
+        elif status is Status.SOLVER_FAILED and pair.pace is not None:
+            swings = pair.mesh_period / (2 * np.pi * pair.pace.swing)
+            statistics["swings_per_mesh_period"] = float(swings)
         if status is not Status.PERIODIC:
             gradient = {}
         statistics["seconds"] = seconds
@@ -432,6 +447,7 @@ def _response(mean, square, peak) -> dict[str, float]:
 _build = Program(Model.pair_and_tangents)
 _settle = Program(settle)
 _close = Program(close_orbit)
+_judged = Program(judged)
 lyapunov_program = Program(lyapunov)
 
 
@@ -472,18 +488,18 @@ def _reverse(model: Model, design, orbit: Orbit, period, how: Integrator, measur
 
 @Program
 def _contact_series(pair: RotorPair, tau, states):
-    pace = pair.pace(states) if pair.drive.free else jnp.ones_like(tau)
+    lapse = pair.lapse(states) if pair.drive.free else jnp.ones_like(tau)
     contact = jax.vmap(pair.contact_at)(tau, states)
-    return pair.mesh_period, pace, pair.physical(tau, states), contact
+    return pair.mesh_period, lapse, pair.physical(tau, states), contact
 
 
 def _series(pair: RotorPair, tau, states) -> Series:
-    period, pace, (phi, relative, rate), contact = _contact_series(pair, tau, states)
+    period, lapse, (phi, relative, rate), contact = _contact_series(pair, tau, states)
     time = period * tau
     if pair.drive.free:
         from scipy.integrate import cumulative_simpson  # Half a second, for motors alone.
 
-        time = period * cumulative_simpson(pace, x=tau, initial=0.0)
+        time = period * cumulative_simpson(lapse, x=tau, initial=0.0)
     double = functools.partial(np.asarray, dtype=np.float64)
     return Series(
         time=double(time),

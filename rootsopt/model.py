@@ -22,6 +22,7 @@ from rootsopt.contact.map import MapContact
 from rootsopt.contact.segments import NodeContact
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.pace import Pace
 from rootsopt.dynamics.pair import GapFunction, RotorPair, SearchContact
 from rootsopt.dynamics.parts import (
     ConstantLoad,
@@ -46,6 +47,9 @@ points of a flank mesh at once. Node search finds no interference (< 1 nm) up to
 the paper's printed Table 1 is 1.2 % over."""
 
 
+_CLEAR = 1e-6
+"""Least involute beyond that at which the tip arc is centred on the pitch circle a second time, in
+pitch radii."""
 _ROLLS, _RELATIVES = 384, 16
 """Map of a model nobody has sized."""
 
@@ -255,6 +259,7 @@ class Model(eqx.Module):
             friction=self.friction,
             supports=supports,
             both=self.both,
+            pace=Pace.of(self.law, gear, supports, inertia, force, self.pitch_radius),
         )
         if self.precision == "float32":
             # Built in double precision; single only where it is integrated.
@@ -397,6 +402,15 @@ def check_geometry(config: Config) -> None:
             "turn back; shorten it or raise the pressure angle"
         )
     radius, sine = profile_config.pitch_radius_mm, math.sin(alpha * DEG)
+    # The tip arc's centre must lie inside the pitch circle, which all its normals cross.
+    shortest = radius * sine * (half - tip - 2 * alpha) * DEG
+    if length < shortest + _CLEAR * radius:
+        raise InputError(
+            f"`profile.involute_length_mm` must be at least {shortest + _CLEAR * radius:.4g} at "
+            f"`profile.pressure_angle_deg` = {alpha:g} and `profile.tip_arc_angle_deg` = {tip:g}, "
+            f"but is {length:g}: the tip arc would touch nothing on the other rotor; lengthen it, "
+            "or raise the pressure angle or the tip arc"
+        )
     # On the dedendum the involute's end is the first to be undercut.
     uncut = radius * sine * math.tan(alpha * DEG)
     if length > uncut * (1 + 1e-9):

@@ -30,9 +30,20 @@ class Status(enum.Enum):
         "The flanks penetrate beyond the validity of a contact law (2 % of the pitch radius). "
         "Raise contact.stiffness_N_per_mm_e or lower the load."
     )
+    UNRESOLVED = (
+        "The force is lost in errors: the flanks penetrate so little that rounding of the gap "
+        "changes its greatest value by more than 1 %, or the steps are too coarse for its impacts "
+        "(mean, RMS and peak contradict each other). Set solver.precision to float64, or tighten "
+        "solver.rtol."
+    )
+    IDLE = (
+        "No flank touches: the pair rests anywhere within its play, without contact force and "
+        "without a gradient. Raise scene.load.torque_N_m."
+    )
     SOLVER_FAILED = (
-        "The solver ran out of steps. Raise solver.max_steps_per_period, loosen solver.rtol, "
-        "or use an implicit solver.method (kvaerno5)."
+        "The solver ran out of steps. Raise solver.max_steps_per_period (an explicit method takes "
+        "ten and more for each of statistics.swings_per_mesh_period), loosen solver.rtol, or use "
+        "an implicit solver.method (kvaerno5)."
     )
     NON_FINITE = (
         "The simulation produced a number that is not finite. Loosen solver.rtol or check the "

@@ -27,18 +27,18 @@ def test_a_motor_without_torque_of_its_own_balances_the_load():
 
 
 def test_time_passes_as_the_rotor_turns():
-    """dt/dτ is the mesh period over the speed's ratio, and a mesh period takes ∫ pace dτ."""
+    """dt/dτ is the mesh period over the speed's ratio, and a mesh period takes ∫ lapse dτ."""
     pair, _ = pair_of(MOTOR)
     assert pair.states == 3
     share = pair.angle_scale / pair.mesh_period / pair.drive.speed
     state = jnp.asarray([0.1, -0.2, 0.02 / share])
     assert float(pair.speed(state)) == pytest.approx(1.02 * float(pair.drive.speed))
-    assert float(pair.pace(state)) == pytest.approx(1 / 1.02)
+    assert float(pair.lapse(state)) == pytest.approx(1 / 1.02)
     # A stalled motor creeps on, so that τ, and with it the integration, can go on to its end.
     stalled = jnp.asarray([0.0, 0.0, -2 / share])
     assert bool(pair.stalled(stalled))
     assert bool(pair.lost(stalled))
-    assert float(pair.pace(stalled)) == pytest.approx(40.0)
+    assert float(pair.lapse(stalled)) == pytest.approx(40.0)
     assert not bool(pair.lost(state))
     slope, _ = eqx.filter_jit(pair.derivative)(jnp.asarray(0.3), stalled)
     np.testing.assert_array_equal(slope, 0)

@@ -100,6 +100,21 @@ def test_speed(tmp_path):
         assert is_picture(tmp_path / f"{name}.png")
 
 
+def test_extremes(tmp_path, programs):
+    """Every scene has a named outcome, results are finite, and SciPy finds those looked at."""
+    run("extremes", tmp_path, programs)
+    rows = rows_of(tmp_path / "extremes.csv")
+    assert len(rows) == 40
+    assert {row["named"] for row in rows} == {"true"}
+    assert {"periodic", "solver_failed"} < {row["status"] for row in rows}
+    summary = json.loads((tmp_path / "extremes.json").read_text())
+    assert summary["not_finite"] == summary["unnamed"] == 0
+    assert summary["checks"]["law"]["float32"]["values"] > 10_000
+    assert summary["scipy"]["compared"] >= 1
+    assert summary["scipy"]["worst_end"] < 1e-3
+    assert is_picture(tmp_path / "extremes.png")
+
+
 def test_benchmark(tmp_path, programs):
     """Every part gives rows, the tools agree, the table of targets is complete."""
     out = run("benchmark", tmp_path, programs)

@@ -144,7 +144,7 @@ def test_energy_balance_with_all_parts():
     def slope(tau, y, _):
         state = y[:-5]
         change, contact = pair.derivative(tau, state)
-        motion, pace = pair.motion(tau, state), pair.pace(state)
+        motion, pace = pair.motion(tau, state), pair.lapse(state)
         other = motion.speed + motion.rate
         flanks = rubbing = 0.0
         for side, force in zip(sides, (contact.drive, contact.coast), strict=True):

@@ -48,33 +48,38 @@ class ImpactLaw(eqx.Module):
         self, depth: Float[Array, "*n"], rate: Float[Array, "*#n"] | float
     ) -> Float[Array, "*n"]:
         """Normal force (N), ≥ 0, for penetration `depth` (m) growing at `rate` (m/s)."""
-        positive, elastic, kept, width = self._parts(depth, rate)
-        return jnp.where(positive, elastic * ramp(kept, width), 0.0)
+        positive, elastic, total, width = self._parts(depth, rate)
+        large = elastic > float(jnp.finfo(elastic.dtype).tiny) ** 0.5
+        releasing = positive & large & (total > 0) & (total < width * elastic)
+        share = jnp.where(releasing, total, 1.0) / jnp.where(releasing, elastic, 1.0)
+        rounded = elastic * ramp(share, width)
+        return jnp.where(positive, jnp.where(releasing, rounded, jnp.maximum(total, 0.0)), 0.0)
 
     def switches(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Bool[Array, "5"]:
         """On which of its smooth pieces the law is: in contact, beyond the rounding of the
         onset, fully damped, not released, beyond the rounding of the release."""
-        positive, _, kept, width = self._parts(depth, rate)
+        positive, elastic, total, width = self._parts(depth, rate)
         depths = jnp.stack([jnp.zeros_like(depth), self.smoothing, self.full_damping_depth])
-        limits = jnp.stack([jnp.zeros_like(width), width])
-        return jnp.concatenate([depth > depths, positive & (kept > limits)])
+        limits = jnp.stack([jnp.zeros_like(elastic), width * elastic])
+        return jnp.concatenate([depth > depths, positive & (total > limits)])
 
     def _parts(self, depth, rate):
-        """Whether there is contact, the elastic force, the force before its release in units of
-        that, and over which share it is rounded there.
+        """Whether there is contact, the elastic force, that with the damping force before its
+        release, and over which share of the elastic force it is rounded there.
 
-        The ratio of damping to elastic force is written out: near the onset both are so small
-        that the derivative of their quotient would overflow (in single precision).
+        The damping force is added to the elastic one, and divided by it only where it is no
+        greater: near the onset both are so small that the derivative of their quotient would
+        overflow in single precision. (An elastic force whose square is out of range is not
+        rounded at its release.)
         """
         delta = ramp(depth, self.smoothing)
+        safe = jnp.where(delta > 0, delta, self.full_damping_depth)
+        # Not K δ^e, of which either factor may be out of range.
+        elastic = (self.stiffness ** (1 / self.exponent) * safe) ** self.exponent
         positive = delta > 0
-        safe = jnp.where(positive, delta, self.full_damping_depth)
-        fade = safe / self.full_damping_depth
-        partial = (3 - 2 * fade) * safe ** (2 - self.exponent) / self.full_damping_depth**2
-        faded = jnp.where(fade < 1, partial, safe**-self.exponent)
-        kept = 1 + self.damping / self.stiffness * faded * rate
+        damping = self.damping * smooth_step(safe / self.full_damping_depth)
         width = jnp.minimum(self.smoothing / self.full_damping_depth, 1.0)
-        return positive, self.stiffness * safe**self.exponent, kept, width
+        return positive, elastic, elastic + damping * rate, width
 
     def depth_at(self, force: Float[Array, ""]) -> Float[Array, ""]:
         """Static penetration (m) that carries `force` (N)."""

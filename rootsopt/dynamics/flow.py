@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.jump import MARKS, marks, saltation
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, locate_peak, one_sided
+from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, Steps, locate_peak, one_sided
 from rootsopt.dynamics.tangent import Linear, linearized, one_step, propagated
 
 METHODS: dict[str, Callable[..., diffrax.AbstractSolver]] = {
@@ -28,11 +28,14 @@ METHODS: dict[str, Callable[..., diffrax.AbstractSolver]] = {
 IMPLICIT = ("kvaerno3", "kvaerno5")
 
 
-_FIRST_STEP = 1e-3
-"""First step in mesh periods; too large a one is rejected by the error control."""
-_LONGEST = 1 / 32
-"""Longest step in mesh periods. In free flight the error control would let a step pass over a
-short touch of the gear without a stage inside it."""
+_FIRST_STEP = 1e-3, 0.05
+"""First step: in mesh periods, and in units of the pair's quickest swing; the shorter counts. Too
+large a one is rejected by the error control."""
+_LONGEST = 1 / 32, 1 / 8, 4.0
+"""Longest step: in mesh periods, and in units of a fall through the play; the shorter counts. In
+free flight the error control would let a step pass over a short touch of the gear without a stage
+inside it. But steps so long must not use up more than the last of these as a share (1 / x) of
+those allowed: an implicit method takes far longer ones where the pair does not fly."""
 _SHORTEST = 1e-9
 """Least time (mesh periods) between the beginning of a step and a peak inside it."""
 
@@ -67,11 +70,29 @@ class Integrator(eqx.Module):
         return method(scan_kind=loops, root_finder=optimistix.Newton(rtol=rtol, atol=rtol))
 
     def controller(
-        self, dtype: Any, periods: Float[Array, ""] | float = 1.0
+        self,
+        dtype: Any,
+        periods: Float[Array, ""] | float = 1.0,
+        pair: RotorPair | None = None,
     ) -> diffrax.PIDController:
-        """Step size control of states of type `dtype` over an interval of `periods`."""
+        """Step size control of states of type `dtype` over an interval of `periods`, for `pair`
+        if that is known."""
         rtol = self.tolerance(dtype)
-        return diffrax.PIDController(rtol=rtol, atol=rtol, dtmax=_LONGEST / periods)
+        longest = _LONGEST[0]
+        if pair is not None and pair.pace is not None:
+            fall = pair.pace.fall / pair.mesh_period
+            flying = jnp.maximum(_LONGEST[1] * fall, _LONGEST[2] / self.max_steps)
+            longest = jnp.minimum(longest, flying).astype(dtype)
+        return diffrax.PIDController(rtol=rtol, atol=rtol, dtmax=longest / periods)
+
+
+def first_step(pair: RotorPair, dtype: Any) -> Float[Array, ""]:
+    """First step (mesh periods) to be tried."""
+    longest, share = _FIRST_STEP
+    if pair.pace is None:
+        return jnp.asarray(longest, dtype)
+    swing = lax.stop_gradient(pair.pace.swing / pair.mesh_period)
+    return jnp.minimum(longest, share * swing).astype(dtype)
 
 
 class Strobe(NamedTuple):
@@ -190,6 +211,7 @@ def strobe(pair: RotorPair, state: Float[Array, "n"], periods: int, how: Integra
     the tolerance and hide that the motion repeats.
     """
     number = state.dtype.type
+    first, control = first_step(pair, state.dtype), how.controller(state.dtype, pair=pair)
 
     def one_period(state, _):
         solution = diffrax.diffeqsolve(
@@ -197,11 +219,11 @@ def strobe(pair: RotorPair, state: Float[Array, "n"], periods: int, how: Integra
             how.solver(state.dtype),
             t0=number(0.0),
             t1=number(1.0),
-            dt0=number(_FIRST_STEP),
+            dt0=first,
             y0=state,
             args=pair,
             saveat=diffrax.SaveAt(t1=True),
-            stepsize_controller=how.controller(state.dtype),
+            stepsize_controller=control,
             adjoint=diffrax.ForwardMode(),
             max_steps=how.max_steps,
             throw=False,
@@ -257,7 +279,7 @@ def flow(
         rates = measures.rates(tau, contact.total / force_unit, top)
         if pair.drive.free:
             # Averages are over time, which passes unevenly.
-            rates = pair.pace(y[:count]) * jnp.append(rates, jnp.ones_like(force_unit))
+            rates = pair.lapse(y[:count]) * jnp.append(rates, jnp.ones_like(force_unit))
         return jnp.concatenate([slope, rates, *([marks(contact)] if marked else [])])
 
     def whole(share, y, dynamic):
@@ -272,7 +294,7 @@ def flow(
         solver,
         t0=dtype.type(0.0),
         t1=dtype.type(1.0),
-        dt0=_FIRST_STEP / periods,
+        dt0=first_step(pair, dtype) / periods,
         y0=lax.stop_gradient(start) if retraced else start,
         args=lax.stop_gradient(dynamic) if retraced else dynamic,
         saveat=diffrax.SaveAt(
@@ -286,7 +308,7 @@ def flow(
             ]
         ),
         stepsize_controller=StepGrid(  # pyright: ignore[reportCallIssue]
-            pid=how.controller(dtype, periods), ends=ends, repeat=repeated
+            pid=how.controller(dtype, periods, lax.stop_gradient(pair)), ends=ends, repeat=repeated
         ),
         adjoint=diffrax.ForwardMode() if adjoint is None or retraced else adjoint,
         max_steps=how.max_steps,
@@ -307,7 +329,7 @@ def flow(
             after, slopes = one_step(solver, term, begin, end, y, dynamic)
             return after, slopes[-1]
         after, slopes = one_step(solver, term, begin, end, jnp.pad(y, (0, MARKS)), dynamic)
-        period = pair.mesh_period * (pair.pace(y[:count]) if pair.drive.free else 1.0)
+        period = pair.mesh_period * (pair.lapse(y[:count]) if pair.drive.free else 1.0)
         moved = saltation(end - begin, slopes, period, pair.contact.pair.profile)
         return after[:-MARKS] + moved, slopes[-1, :-MARKS]
 
@@ -324,7 +346,12 @@ def flow(
         end, before = lax.scan(advance, start, (begins, ends))
     # The step that holds the peak is taken once more, as far as the peak, and from there on short
     # steps to both sides.
-    peak_time, depth = locate_peak(lax.stop_gradient(pair), states, periods)
+    pushes = (after[:, count] - before[:, count]) / (ends - begins)
+    means = jnp.where(jnp.arange(ends.shape[0]) <= last, pushes, -jnp.inf)
+    steps = lax.stop_gradient(
+        Steps(begins, ends, before[:, :count], after[:, :count], last + 1, jnp.argmax(means))
+    )
+    peak_time, depth = locate_peak(lax.stop_gradient(pair), states, periods, steps)
     holds = jnp.clip(jnp.sum(ends < peak_time), 0, last)
     peak_time = jnp.maximum(peak_time, begins[holds] + _SHORTEST)
     duration = end[-1] if pair.drive.free else periods

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 from rootsopt.contact.closest import ClosestApproach, FlankPair
 from rootsopt.contact.impact import ImpactLaw
 from rootsopt.contact.point import ContactPoint, contact_point
+from rootsopt.dynamics.pace import Pace
 from rootsopt.dynamics.parts import (
     Drive,
     Friction,
@@ -129,7 +130,8 @@ class RotorPair(eqx.Module):
 
     `contact`: gap and levers at a pose; `law`: contact force; `clearance` (m) added to
     every flank gap; `inertia` of one rotor (kg·m²); `drive`, `load`, `gear`, `friction`,
-    `supports`: parts; `angle_scale` (rad) and `force_scale` (N): units the solver works in.
+    `supports`: parts; `angle_scale` (rad) and `force_scale` (N): units the solver works in;
+    `pace`: how quickly it can change, None if unknown.
     `both`: whether drive and coast flanks can touch at once, which they cannot at the nominal
     centre distance. A part that is absent is None and costs nothing. Friction, supports and
     `both` need a `SearchContact`.
@@ -147,6 +149,7 @@ class RotorPair(eqx.Module):
     force_scale: Float[Array, ""]
     friction: Friction | None = None
     supports: Supports | None = None
+    pace: Pace | None = None
     both: bool = eqx.field(static=True, default=False)
 
     @property
@@ -176,7 +179,7 @@ class RotorPair(eqx.Module):
             return self.drive.speed
         return self.drive.speed + self.angle_scale / self.mesh_period * state[..., 2]
 
-    def pace(self, state: Float[Array, "*k n"]) -> Float[Array, "*#k"]:
+    def lapse(self, state: Float[Array, "*k n"]) -> Float[Array, "*#k"]:
         """Time (s) that a mesh period of rotation takes at a scaled state, relative to
         `mesh_period`. A motor that has stalled is taken to creep on."""
         creep = STALLED / 2 * self.drive.speed
@@ -377,7 +380,7 @@ class RotorPair(eqx.Module):
             slopes += [state[-4:], unit * force.ravel()]
         slope = jnp.concatenate(slopes)
         if self.drive.free:
-            slope = self.pace(state) * slope
+            slope = self.lapse(state) * slope
         # A pair that has lost its mesh stands still rather than run to infinity; the
         # caller reports it.
         return jnp.where(lax.stop_gradient(self.lost(state)), 0.0, slope), contact

@@ -1,9 +1,11 @@
 """The greatest contact force of a motion: where it is, and how it changes with the design."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rootsopt.dynamics.pair import RotorPair
 
@@ -19,6 +21,9 @@ BESIDE_UNIT = {8: 2e-8, 4: 1e-3}
 _FARTHEST = {8: 32.0, 4: 1 / 16}
 """Distance of the vertex from the located peak that is believed, in units of `_WIDE`: where the
 states between the samples bend, the peak is located no better than to some 1e-5."""
+_CLEARLY = 1e-4
+"""Share by which the force in a step exceeds that at the samples if they have missed it: states
+inside a step are those of a cubic."""
 _ROUNDINGS = 1e5
 """Bend of the force over `_WIDE` that is more than rounding, in roundings of the force."""
 _LEAST = 1e-9
@@ -35,38 +40,85 @@ def motion(states: Float[Array, "samples n"], place: Float[Array, ""]) -> Float[
     return jnp.sum((jnp.prod(others, axis=1) / factors)[:, None] * near, axis=0)
 
 
+class Steps(NamedTuple):
+    """Steps of a solver: where they begin and end (mesh periods; inf beyond the last), the states
+    there, how many there are, and which has the greatest mean force."""
+
+    begins: Float[Array, " steps"]
+    ends: Float[Array, " steps"]
+    before: Float[Array, "steps n"]
+    after: Float[Array, "steps n"]
+    count: Int[Array, ""]
+    strongest: Int[Array, ""]
+
+    def motion(self, tau: Float[Array, ""]) -> Float[Array, "2"]:
+        """State (ε, dε/dτ, scaled) at time `tau` (mesh periods): the cubic through ε and its rate
+        at both ends of the step."""
+        k = jnp.clip(jnp.searchsorted(self.ends, tau), 0, self.count - 1)
+        step = self.ends[k] - self.begins[k]
+        x = (tau - self.begins[k]) / step
+        (start, rate), (end, last) = self.before[k, :2], self.after[k, :2]
+        rise = end - start
+        bend, twist = 3 * rise - step * (2 * rate + last), step * (rate + last) - 2 * rise
+        place = start + x * (step * rate + x * (bend + x * twist))
+        return jnp.stack([place, rate + x * (2 * bend + 3 * x * twist) / step])
+
+
 def locate_peak(
-    pair: RotorPair, states: Float[Array, "samples n"], length: Float[Array, ""]
+    pair: RotorPair, states: Float[Array, "samples n"], length: Float[Array, ""], steps: Steps
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Time (mesh periods) of the greatest force, and the greatest penetration (m) at the samples,
-    from the `states` at uniform times over `length` mesh periods.
+    """Time (mesh periods) of the greatest force, and the greatest penetration (m) that was seen,
+    from the `states` at uniform times over `length` mesh periods and the `steps` of the solver.
 
     An impact's peak can be narrower than the sampling, with a corner where the damping
-    saturates: it is enclosed by looking ever more closely around the greatest sample.
+    saturates: it is enclosed by looking ever more closely around the greatest sample. An impact
+    can also fall between two samples: the same is done in the step of greatest mean force, which
+    counts if the steps are about as close as the samples and it is clearly greater, or if they
+    are closer (then the motion may swing between samples).
     """
     samples = states.shape[0]
     width = length / samples
     blocks = -(-samples // _BLOCK)
     spread = jnp.linspace(-1, 1, _BLOCK, dtype=width.dtype)
+    begin, end = steps.begins[steps.strongest], steps.ends[steps.strongest]
 
-    # One loop for both, so that the contact is compiled once.
+    # One loop for all, so that the contact is compiled once.
     def look(i, carry):
         greatest, best, depth = carry
+        by_steps = i >= blocks + _ROUNDS
+        way = by_steps.astype(int)
+        round_ = i - blocks - way * _ROUNDS
         block = jnp.minimum(i * _BLOCK + jnp.arange(_BLOCK), samples - 1).astype(width.dtype)
-        reach = (2.0 / (_BLOCK - 1)) ** (i - blocks).astype(width.dtype)
-        close = jnp.clip(best + reach * spread, 0.0, samples - 1.0)
+        reach = (2.0 / (_BLOCK - 1)) ** round_.astype(width.dtype)
+        reach *= jnp.where(by_steps, (end - begin) / (2 * width), 1.0)
+        # Not beyond the step: the force may jump at its ends.
+        first, last = (
+            jnp.where(by_steps, at / width, limit)
+            for at, limit in ((begin, 0.0), (end, samples - 1.0))
+        )
+        close = jnp.clip(best[way] + reach * spread, first, last)
         places = jnp.where(i < blocks, block, close)
-        contact = jax.vmap(lambda at: pair.contact_at(at * width, motion(states, at)))(places)
-        top = jnp.argmax(contact.total)
-        more = contact.total[top] > greatest
-        greatest = jnp.where(more, contact.total[top], greatest)
-        best = jnp.where(more, places[top], best)
-        return greatest, best, jnp.maximum(depth, jnp.max(contact.depth))
+
+        def contact(place):
+            state = jnp.where(by_steps, steps.motion(place * width), motion(states, place))
+            return pair.contact_at(place * width, state)
+
+        found = jax.vmap(contact)(places)
+        top = jnp.argmax(found.total)
+        more = found.total[top] > greatest[way]
+        greatest = greatest.at[way].set(jnp.where(more, found.total[top], greatest[way]))
+        best = best.at[way].set(jnp.where(more, places[top], best[way]))
+        return greatest, best, jnp.maximum(depth, jnp.max(found.depth))
 
     least = jnp.full_like(width, -jnp.inf)
-    start = least, jnp.zeros_like(width), least
-    _, best, depth = lax.fori_loop(0, blocks + _ROUNDS, look, start)
-    return best * width, depth
+    first = jnp.stack([jnp.zeros_like(width), (begin + end) / 2 / width])
+    start = jnp.stack([least, least]), first, least
+    greatest, best, depth = lax.fori_loop(0, blocks + 2 * _ROUNDS, look, start)
+    # Only where the steps are about as close as the samples: a force that jumps is higher in a
+    # step across the jump than it ever is.
+    clearly = (2 * steps.count > samples) & (greatest[1] > (1 + _CLEARLY) * greatest[0])
+    missed = clearly | (steps.count > samples)
+    return jnp.where(missed, best[1], best[0]) * width, depth
 
 
 def one_sided(forces: Float[Array, "7"]) -> tuple[Float[Array, ""], Float[Array, "7"]]:

@@ -6,6 +6,7 @@ k-fold map closes it, and the monodromy matrix tells whether it is stable. Where
 not settle, the largest Lyapunov exponent tells chaos from a long transient.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -34,6 +35,19 @@ _NEWTON_STEPS = 12
 _CLOSED = 4000, 1e-3, 1e-10
 """Residual (scaled) at which Newton stops: in roundings (1e-12 in double precision), or in
 tolerances of the motion up to a limit."""
+_PATIENCE = 32, 1e-5
+"""Mesh periods after which a transient that has not settled goes on with steps at this tolerance
+at most: their noise hides that the motion repeats."""
+TOO_DEEP = 0.02
+"""Penetration in pitch radii beyond which no contact law holds."""
+UNRESOLVED = 1e-2
+"""Relative error of the greatest force by rounding of the gap, beyond which it is no result."""
+_NOISE = 100.0
+"""Noise that adaptive steps give the stroboscopic states, in tolerances and relative to them."""
+_UNKNOWN = 0.1
+"""Error of an orbit (scaled) beyond which nothing is known of it."""
+_FREE = 1e-6
+"""Distance of a Floquet multiplier from 1 that is none."""
 _LOOKS = 3
 """Times that kinks are looked for while an orbit is closed, at most."""
 _SMALL = 1e-9, 1e-3
@@ -80,6 +94,67 @@ class Orbit(NamedTuple):
     newton_steps: Int[Array, ""]
 
 
+def is_idle(orbit: Orbit) -> Bool[Array, ""]:
+    """Whether the pair floats: no flank ever touches, and nothing brings it back when it is moved.
+
+    Then it can rest anywhere, and neither Newton's method nor a derivative has an answer.
+    """
+    free = jnp.isnan(orbit.multiplier) | (orbit.multiplier > 1 - _FREE)
+    return (orbit.flow.mean == 0) & (orbit.flow.peak <= 0) & free
+
+
+def judged(
+    orbit: Orbit,
+    state: Float[Array, " n"],
+    within: Float[Array, ""] | float,
+    rtols: tuple[Float[Array, ""] | float, Float[Array, ""] | float],
+    residual: Float[Array, ""] | float,
+) -> Bool[Array, ""]:
+    """Whether an orbit is the stable motion that a transient led to, both integrated at `rtols`
+    (transient, orbit).
+
+    It is closed to a `residual`, its Floquet multipliers lie inside the unit circle, errors of the
+    size of its tolerance do not add up to anything in it (I - M is far enough from singular), and
+    it is beside the `state` that repeated `within` some distance (all scaled, and relative to
+    states beyond 1).
+    """
+    size = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.state)))
+    multiplier = orbit.multiplier
+    unit = jnp.eye(orbit.state.shape[0], dtype=orbit.state.dtype)
+    gain = jnp.max(jnp.sum(jnp.abs(solved(unit - orbit.monodromy, unit)), axis=1))
+    noise = _NOISE * jnp.maximum(*rtols) * size
+    near = 10 * within / jnp.maximum(1 - multiplier, 1e-3) + noise
+    moved = jnp.max(jnp.abs(orbit.state - state))
+    closed = orbit.residual <= residual * size
+    return closed & (multiplier < 1) & (gain * rtols[1] < _UNKNOWN) & (moved <= near)
+
+
+def is_consistent(orbit: Orbit, least: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether the mean force is no greater than the root of the mean square, and that no greater
+    than the peak, but for 1 % and forces of the size `least` (N).
+
+    This holds for every force. Steps too coarse for short impacts break it: the mean square they
+    add up to may even be negative.
+    """
+    mean, square, peak = orbit.response[:3]
+    ordered = (square + least**2 >= 0.98 * mean**2) & (peak**2 + least**2 >= 0.98 * square)
+    return ordered & (mean >= -least)
+
+
+def force_rounding(
+    orbit: Orbit, exponent: Float[Array, ""], radius: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Relative error of the greatest force of an orbit by rounding alone; 0 without contact.
+
+    The gap is the difference of lengths of the size of the pitch `radius` (m), so it is known to
+    a rounding of that, and the force is a power of it with the law's `exponent`.
+    """
+    touches = (orbit.flow.peak > 0) & (orbit.flow.depth > 0)
+    depth = jnp.where(touches, orbit.flow.depth, 1.0)
+    error = exponent * float(jnp.finfo(depth.dtype).eps) * radius / depth
+    return jnp.where(touches, error, 0.0)
+
+
 def settled_within(rtol: Float[Array, ""]) -> Float[Array, ""]:
     """Scaled difference below which states count as repeating, for a transient integrated
     at `rtol`: the noise of adaptive steps is some hundred times the tolerance."""
@@ -96,15 +171,20 @@ def settle(
 ) -> Transient:
     """Integrate block by block until the last states repeat with some period k.
 
-    Settled means: the last k + 1 states differ from those k periods earlier by less than
-    `tolerance` (scaled units), for the smallest such k ≤ `max_orbit` ≤ 8.
+    What has not settled after `_PATIENCE` goes on in finer steps. Settled means: the last k + 1
+    states differ from those k periods earlier by less than `tolerance` (scaled units; or the noise
+    of steps in states far from 0), for the smallest such k ≤ `max_orbit` ≤ 8.
     """
     orders = jnp.arange(1, max_orbit + 1)
     age = jnp.arange(_MEMORY)[::-1]
 
-    def cycle(states):
+    def cycle(states, rtol):
+        # Of states far from 0 the noise of adaptive steps is in proportion to them.
+        noise = jnp.maximum(1.0, _NOISE * rtol * jnp.abs(states) / tolerance)
+        noise = jnp.where(jnp.isfinite(noise), noise, 1.0)
+
         def spread(k):
-            change = jnp.max(jnp.abs(states - jnp.roll(states, k, axis=0)), axis=1)
+            change = jnp.max(jnp.abs(states - jnp.roll(states, k, axis=0)) / noise, axis=1)
             # Before the start the memory holds inf, and inf - inf is no difference.
             change = jnp.where(jnp.isnan(change), jnp.inf, change)
             return jnp.max(jnp.where(age <= k, change, 0.0))
@@ -122,12 +202,14 @@ def settle(
 
     def advance(loop):
         carry, memory = loop
-        part = strobe(pair, carry.state, BLOCK, how)
+        longest, fine = _PATIENCE
+        rtol = jnp.where(carry.periods < longest, how.rtol, jnp.minimum(how.rtol, fine))
+        part = strobe(pair, carry.state, BLOCK, dataclasses.replace(how, rtol=rtol))
         memory = jnp.concatenate([memory[BLOCK:], part.states])
         end = part.states[-1]
         lost = pair.lost(end)
         sound = part.solved & ~lost & jnp.all(jnp.isfinite(end))
-        period, nearest, spread = cycle(memory)
+        period, nearest, spread = cycle(memory, rtol.astype(memory.dtype))
         new = Transient(
             state=end,
             period=jnp.where(sound, period, 0),
@@ -162,7 +244,7 @@ def close_orbit(
     how: Integrator,
     measures: Measures | None = None,
     samples: int = SAMPLES,
-    shots: int = _NEWTON_STEPS,
+    shots: Int[Array, ""] | int = _NEWTON_STEPS,
     closed: Float[Array, ""] | float = 0.0,
 ) -> Orbit:
     """Newton shooting on Φ(z) = z, then the implicit function theorem for gradients.

@@ -1,0 +1,169 @@
+"""Scenes at and between the limits of what a config may ask for, as a cloud and as a grid.
+
+Everything that is a number is drawn; what decides which program runs (family, lobes, gear,
+contact, solver, precision) is a `Kind`, so that all scenes of a kind share one compiled program.
+"""
+
+import dataclasses
+import functools
+import itertools
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from rootsopt.config import DESIGN_KEYS, Config, load
+from rootsopt.model import Model
+
+_OVERLENGTH = 1.02
+"""Longest involute the program tolerates, in units of u_max."""
+SPANS: dict[str, tuple[float, float]] = {
+    "contact.stiffness_N_per_mm_e": (1e3, 1e9),
+    "contact.max_damping_N_s_per_mm": (1e-4, 10.0),
+    "contact.full_damping_depth_mm": (1e-5, 1.0),
+    "contact.smoothing_mm": (1e-6, 0.1),
+    "scene.speed_rpm": (1.0, 6e4),
+    "scene.load.torque_N_m": (1e-3, 1e3),
+    "scene.timing_gear.backlash_mm": (1e-4, 1.0),
+    "scene.timing_gear.stiffness_N_m_per_rad": (1e2, 1e6),
+    "rotor.length_mm": (1.0, 1e3),
+    "solver.rtol": (1e-12, 1e-2),
+    "solver.transient_rtol": (1e-12, 1e-2),
+}
+"""Ranges drawn from, evenly in the logarithm; also what may be 0 is drawn here."""
+EXPONENT = 1.0, 3.0
+MAY_VANISH = (
+    "contact.max_damping_N_s_per_mm",
+    "scene.load.torque_N_m",
+    "scene.timing_gear.backlash_mm",
+)
+GRID: dict[str, tuple[float, ...]] = {
+    "contact.stiffness_N_per_mm_e": (1e3, 1e6, 1e9),
+    "contact.exponent": (1.0, 2.0, 3.0),
+    "contact.max_damping_N_s_per_mm": (0.0, 0.1, 10.0),
+    "scene.speed_rpm": (1.0, 30.0, 1e3, 6e4),
+    "scene.load.torque_N_m": (0.0, 1.0, 1e3),
+    "scene.timing_gear.backlash_mm": (0.0, 0.03, 1.0),
+    "contact.full_damping_depth_mm": (1e-5, 1e-2, 1.0),
+}
+"""Corners and middle of the ranges; all else as in the shipped CIC scene."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """What scenes of one compiled program have in common."""
+
+    method: str = "tsit5"
+    precision: str = "float64"
+    lobes: int = 3
+    family: str = "cic"
+    geared: bool = True
+    fidelity: str = "search"
+
+    @property
+    def label(self) -> str:
+        """Name in tables."""
+        gear = "" if self.geared else ", no gear"
+        return f"{self.family} {self.lobes}, {self.fidelity}, {self.method}, {self.precision}{gear}"
+
+
+@functools.cache
+def _shipped(family: str) -> Config:
+    return load(f"configs/{family}.yaml")
+
+
+def config_of(kind: Kind, values: dict[str, float]) -> Config:
+    """The shipped config of the kind's family with `values` by dotted key."""
+    data = _shipped(kind.family).model_dump()
+    fixed = {
+        "profile.lobes": kind.lobes,
+        "solver.fidelity": kind.fidelity,
+        "solver.method": kind.method,
+        "solver.precision": kind.precision,
+        "solver.map_rolls": 384,
+        "solver.map_relatives": 16,
+    }
+    for key, value in (fixed | values).items():
+        *place, name = key.split(".")
+        section = data
+        for part in place:
+            section = section[part]
+        section[name] = value
+    if not kind.geared:
+        data["scene"]["timing_gear"] = None
+    return Config.model_validate(data)
+
+
+def _design(draw: np.random.Generator, lobes: int, radius: float) -> dict[str, float]:
+    """Pressure angle, u and tip arc, a fifth of the draws each on a limit."""
+    half = 90 / lobes
+    while True:
+        angle = draw.choice([1.0, 89.0]) if draw.uniform() < 0.2 else draw.uniform(1, 89)
+        ends = 0.0, half * (1 - 1e-6)
+        tip = draw.choice(ends) if draw.uniform() < 0.2 else draw.uniform(*ends)
+        reach = radius * math.sin(math.radians(angle))
+        longest = reach * math.radians(half - tip) * _OVERLENGTH
+        longest = min(longest, reach * math.tan(math.radians(angle)))
+        shortest = reach * math.radians(half - tip - 2 * angle) + 1e-6 * radius
+        shortest = max(shortest, 0.01 * longest)
+        if shortest < longest:
+            break
+    share = draw.choice([0.0, 1.0]) if draw.uniform() < 0.3 else draw.uniform()
+    return {
+        "profile.pressure_angle_deg": float(angle),
+        "profile.tip_arc_angle_deg": float(tip),
+        "profile.involute_length_mm": float(shortest + share * (longest - shortest)),
+    }
+
+
+def cloud(kind: Kind, count: int, seed: int) -> Iterator[Config]:
+    """`count` random scenes of a kind; a tenth of what may vanish does."""
+    draw = np.random.default_rng([seed, *kind.label.encode()])
+    radius = _shipped(kind.family).profile.pitch_radius_mm
+    for _ in range(count):
+        values = {
+            key: float(math.exp(draw.uniform(math.log(low), math.log(high))))
+            for key, (low, high) in SPANS.items()
+        }
+        for key in MAY_VANISH:
+            if draw.uniform() < 0.1:
+                values[key] = 0.0
+        if not kind.geared:
+            values = {key: v for key, v in values.items() if "timing_gear" not in key}
+        else:
+            values["scene.timing_gear.damping_ratio"] = float(draw.uniform(0, 1))
+        values["contact.exponent"] = float(draw.uniform(*EXPONENT))
+        if kind.family == "cic":
+            values |= _design(draw, kind.lobes, radius)
+        yield config_of(kind, values)
+
+
+def grid(kind: Kind) -> Iterator[Config]:
+    """Every combination of `GRID`."""
+    for values in itertools.product(*GRID.values()):
+        yield config_of(kind, dict(zip(GRID, values, strict=True)))
+
+
+def row_of(config: Config) -> dict[str, float]:
+    """The numbers of a scene by dotted key, for a table."""
+    data: Any = config.model_dump()
+    keys = [*SPANS, "contact.exponent", *(f"profile.{key}" for key in DESIGN_KEYS)]
+    row = {}
+    for key in keys:
+        value = data
+        for part in key.split("."):
+            value = value[part] if value is not None else None
+        row[key] = math.nan if value is None else float(value)
+    return row
+
+
+def stacked(configs: list[Config], precision: str) -> Model:
+    """The models of scenes with one kind of pair, at one precision, their numbers stacked along a
+    leading axis (n,)."""
+    models = [
+        jax.tree.map(np.asarray, dataclasses.replace(Model.of(config), precision=precision))
+        for config in configs
+    ]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *models)
