@@ -51,9 +51,9 @@ class Steps(NamedTuple):
     count: Int[Array, ""]
     strongest: Int[Array, ""]
 
-    def motion(self, tau: Float[Array, ""]) -> Float[Array, "2"]:
-        """State (ε, dε/dτ, scaled) at time `tau` (mesh periods): the cubic through ε and its rate
-        at both ends of the step."""
+    def motion(self, tau: Float[Array, ""]) -> Float[Array, " n"]:
+        """State (scaled) at time `tau` (mesh periods): ε and dε/dτ by the cubic through both at
+        the ends of the step, others in proportion."""
         k = jnp.clip(jnp.searchsorted(self.ends, tau), 0, self.count - 1)
         step = self.ends[k] - self.begins[k]
         x = (tau - self.begins[k]) / step
@@ -61,7 +61,9 @@ class Steps(NamedTuple):
         rise = end - start
         bend, twist = 3 * rise - step * (2 * rate + last), step * (rate + last) - 2 * rise
         place = start + x * (step * rate + x * (bend + x * twist))
-        return jnp.stack([place, rate + x * (2 * bend + 3 * x * twist) / step])
+        swing = jnp.stack([place, rate + x * (2 * bend + 3 * x * twist) / step])
+        others = (1 - x) * self.before[k, 2:] + x * self.after[k, 2:]
+        return jnp.concatenate([swing, others])
 
 
 def locate_peak(
