@@ -75,8 +75,8 @@ def locate_peak(
     An impact's peak can be narrower than the sampling, with a corner where the damping
     saturates: it is enclosed by looking ever more closely around the greatest sample. An impact
     can also fall between two samples: the same is done in the step of greatest mean force, which
-    counts if the steps are about as close as the samples and it is clearly greater, or if they
-    are closer (then the motion may swing between samples).
+    counts if the steps are about as close as the samples and it is clearly greater, or if the
+    motion can swing between samples.
     """
     samples = states.shape[0]
     width = length / samples
@@ -119,7 +119,11 @@ def locate_peak(
     # Only where the steps are about as close as the samples: a force that jumps is higher in a
     # step across the jump than it ever is.
     clearly = (2 * steps.count > samples) & (greatest[1] > (1 + _CLEARLY) * greatest[0])
-    missed = clearly | (steps.count > samples)
+    if pair.pace is None:
+        between = steps.count > samples
+    else:
+        between = width * pair.mesh_period > pair.pace.swing
+    missed = clearly | between
     return jnp.where(missed, best[1], best[0]) * width, depth
 
 
