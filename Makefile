@@ -3,12 +3,15 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: optimize test lint clean
+.PHONY: optimize test test-all lint clean
 
 optimize: $(VENV)/.run
 	$(BIN)/python -m rootsopt.optimize configs/cic.yaml -o results/cic
 
 test: $(VENV)/.dev
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not long"
+
+test-all: $(VENV)/.dev
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 lint: $(VENV)/.dev

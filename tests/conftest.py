@@ -14,8 +14,6 @@ from jaxtyping import install_import_hook
 install_import_hook("rootsopt", "typechecking.typechecked")
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-# Most of the tests' time is that of the compiler, a sixth less this way.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1")
 # One folder of compiled programs for all processes of a session, new for every session.
 os.environ.setdefault("ROOTSOPT_TEST_CACHE", tempfile.mkdtemp(prefix="rootsopt-"))
 os.environ["ROOTSOPT_CACHE"] = os.environ["ROOTSOPT_TEST_CACHE"]

@@ -310,6 +310,7 @@ def test_longest_gap_goes_around():
     assert _longest_gap(np.ones(4, bool)) == 0
 
 
+@pytest.mark.long
 def test_experiment(tmp_path):
     """The quick run finds a fold with two stable orbits beside it, and writes its files."""
     command = [sys.executable, "experiments/bifurcation.py", "--quick", "-o", str(tmp_path)]

@@ -27,7 +27,7 @@ PNG = b"\x89PNG"
 
 @pytest.fixture(scope="module")
 def programs(tmp_path_factory):
-    """Environment in which both scripts keep their compiled programs in one place."""
+    """Environment in which the scripts keep their compiled programs in one place."""
     return os.environ | {
         "JAX_PLATFORMS": "cpu",
         "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("programs")),
@@ -100,6 +100,7 @@ def test_speed(tmp_path):
         assert is_picture(tmp_path / f"{name}.png")
 
 
+@pytest.mark.long
 def test_extremes(tmp_path, programs):
     """Every scene has a named outcome, results are finite, and SciPy finds those looked at."""
     run("extremes", tmp_path, programs)
@@ -115,6 +116,7 @@ def test_extremes(tmp_path, programs):
     assert is_picture(tmp_path / "extremes.png")
 
 
+@pytest.mark.long
 def test_benchmark(tmp_path, programs):
     """Every part gives rows, the tools agree, the table of targets is complete."""
     out = run("benchmark", tmp_path, programs)

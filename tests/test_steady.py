@@ -232,6 +232,7 @@ def test_gradient_is_that_of_finite_differences(sharp, orbits, name):
     np.testing.assert_allclose(exact, found, rtol=1e-4)
 
 
+@pytest.mark.long
 def test_forward_and_reverse_gradients_agree(settled):
     """By the map, which compiles in a third of the time, both modes give one gradient to 1e-8
     (by the search: see below), spectral lines and p-norm included."""
@@ -376,7 +377,7 @@ def test_weights_of_a_peak():
         assert value == 4 + chosen / 9
 
 
-@pytest.mark.parametrize("method", ["tsit5", "kvaerno5"])
+@pytest.mark.parametrize("method", ["tsit5", pytest.param("kvaerno5", marks=pytest.mark.long)])
 def test_peak_where_the_force_jumps(method):
     """Linear contact begins with a jump of the force, here the peak. Implicit steps across it
     that cannot be made shorter are solved all the same."""
