@@ -123,7 +123,7 @@ class LoadConfig(_Section):
         if (self.torque_N_m is None) == (self.pressure_difference_Pa is None):
             raise ValueError(
                 "`scene.load` must hold either `torque_N_m` or `pressure_difference_Pa`, but holds "
-                + ("neither" if self.torque_N_m is None else "both")
+                + ("neither; add one" if self.torque_N_m is None else "both; set one to null")
             )
         return self
 
