@@ -23,12 +23,9 @@ from rootsopt.dynamics.steady import (
     TOO_DEEP,
     UNRESOLVED,
     close_orbit,
-    force_rounding,
-    is_consistent,
-    is_idle,
-    judged,
     settle,
     settled_within,
+    verdict,
 )
 from rootsopt.model import Model
 from rootsopt.programs import Program
@@ -111,9 +108,8 @@ def respond(
     finite = jnp.all(jnp.isfinite(closed.response)) & jnp.all(jnp.isfinite(closed.sensitivity))
     rtols = transient.tolerance(state.dtype), orbit.tolerance(state.dtype)
     open_by = jnp.maximum(enough, RESIDUAL[model.precision])
-    found = judged(closed, settled.state, tolerance, rtols, open_by)
-    rounding = force_rounding(closed, model.law.exponent, model.pitch_radius)
-    consistent = is_consistent(closed, 10 * rtols[1] * pair.force_scale)
+    scales = model.law.exponent, model.pitch_radius, pair.force_scale
+    found = verdict(closed, settled.state, tolerance, rtols, open_by, scales)
     outcomes = (
         (~settled.solved, Status.SOLVER_FAILED),
         (pair.stalled(settled.state), Status.STALLED),
@@ -121,11 +117,11 @@ def respond(
         (~jnp.all(jnp.isfinite(settled.state)), Status.NON_FINITE),
         (~ran, Status.NOT_SETTLED),
         (~closed.flow.solved, Status.SOLVER_FAILED),
-        (is_idle(closed), Status.IDLE),
+        (found.idle, Status.IDLE),
         (~finite, Status.NON_FINITE),
-        (~found, Status.NOT_SETTLED),
+        (~found.steady, Status.NOT_SETTLED),
         (closed.flow.depth > TOO_DEEP * model.pitch_radius, Status.TOO_DEEP),
-        ((rounding > UNRESOLVED) | ~consistent, Status.UNRESOLVED),
+        ((found.rounding > UNRESOLVED) | ~found.consistent, Status.UNRESOLVED),
     )
     conditions, names = zip(*outcomes, strict=True)
     status = jnp.select(conditions, [STATUSES.index(name) for name in names], 0)

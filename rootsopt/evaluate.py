@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config
 from rootsopt.contact.size import size_map
-from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.flow import Flow, Integrator
 from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import (
@@ -26,15 +26,13 @@ from rootsopt.dynamics.steady import (
     UNRESOLVED,
     Orbit,
     Transient,
+    Verdict,
     close_orbit,
-    force_rounding,
-    is_consistent,
-    is_idle,
-    judged,
     lyapunov,
     reverse_sensitivity,
     settle,
     settled_within,
+    verdict,
 )
 from rootsopt.errors import InputError
 from rootsopt.model import MM, Model, design_keys, design_vector, integrators, measures
@@ -173,6 +171,11 @@ class Evaluator:
         # The one that takes longest first.
         _close.prepare(pair, tangents, state, whole, self.orbit, self.measures)
         most = self.config.solver.max_orbit_periods
+        sizes = pair.states, len(design), SAMPLES, self.orbit.max_steps, self.measures
+        orbit = jax.eval_shape(
+            lambda state: Orbit.empty(state, len(design), Flow.empty(*sizes, dtype)), state
+        )
+        _verdict.prepare(orbit, state, number, (number, number), number, self._scales(pair))
         _settle.prepare(pair, state, self.transient, number, whole, most)
         _build.prepare(self.model, design)
         if series:
@@ -260,7 +263,7 @@ class Evaluator:
             used += int(transient.periods)
             steps += int(transient.steps)
             state = transient.state
-            orbit, status = None, self._transient_status(pair, transient)
+            orbit, found, status = None, None, self._transient_status(pair, transient)
             if status is Status.NOT_SETTLED and float(transient.spread) < _NEARLY:
                 # Time is out, but the motion nearly repeats: noise of the coarse transient
                 # may be all that is left. Newton's method tells.
@@ -268,7 +271,7 @@ class Evaluator:
                 transient = transient._replace(period=transient.nearest)
             elif status is not None:
                 break
-            transient, orbit, status = self._close(pair, tangents, transient, tolerance)
+            transient, orbit, found, status = self._close(pair, tangents, transient, tolerance)
             steps += int(orbit.flow.steps)
             late = used >= self.max_periods or tolerance < _CLOSEST
             if status is not Status.NOT_SETTLED or late:
@@ -277,15 +280,15 @@ class Evaluator:
             # steady state yet, or too coarse an image of it. Go on, and look more closely.
             tolerance /= 10
             how = dataclasses.replace(how, rtol=jnp.maximum(how.rtol / 10, self.orbit.rtol))
-        return _Outcome(pair, shape, transient, orbit, status, used, steps)
+        return _Outcome(pair, shape, transient, orbit, found, status, used, steps)
 
     def _close(self, pair, tangents, transient: Transient, tolerance: float):
-        """Orbit the transient leads to, of the least period, and its status."""
+        """Orbit the transient leads to, of the least period, the verdict on it and its status."""
         settings = self.orbit, self.measures
         orbit = jax.device_get(_close(pair, tangents, transient.state, transient.period, *settings))
-        status = self._orbit_status(orbit, transient, tolerance)
+        found, status = self._judged(pair, orbit, transient, tolerance)
         if status is not Status.PERIODIC:
-            return transient, orbit, status
+            return transient, orbit, found, status
         # Noise of the transient can hide that a motion repeats sooner.
         for shorter in _divisors(int(transient.period)):
             again = np.asarray(orbit.flow.states)[shorter * SAMPLES // int(transient.period)]
@@ -293,9 +296,10 @@ class Evaluator:
                 period = np.asarray(shorter)
                 simpler = jax.device_get(_close(pair, tangents, orbit.state, period, *settings))
                 reduced = transient._replace(period=period, state=orbit.state)
-                if self._orbit_status(simpler, reduced, tolerance) is Status.PERIODIC:
-                    return reduced, simpler, Status.PERIODIC
-        return transient, orbit, status
+                other, its_status = self._judged(pair, simpler, reduced, tolerance)
+                if its_status is Status.PERIODIC:
+                    return reduced, simpler, other, its_status
+        return transient, orbit, found, status
 
     @staticmethod
     def _transient_status(pair: RotorPair, transient: Transient) -> Status | None:
@@ -307,19 +311,30 @@ class Evaluator:
             return lost_status(pair, transient.state)
         return None if int(transient.period) > 0 else Status.NOT_SETTLED
 
-    def _orbit_status(self, orbit: Orbit, transient: Transient, tolerance: float) -> Status:
-        if not bool(orbit.flow.solved):
-            return Status.SOLVER_FAILED
-        if bool(is_idle(orbit)):
-            return Status.IDLE
-        numbers = np.concatenate([orbit.response, np.ravel(orbit.sensitivity), orbit.state])
-        if not np.all(np.isfinite(numbers)):
-            return Status.NON_FINITE
+    def _judged(
+        self, pair: RotorPair, orbit: Orbit, transient: Transient, tolerance: float
+    ) -> tuple[Verdict, Status]:
+        """The verdict on an orbit, and its status as a motion; whether its forces are known is
+        asked in the report."""
         dtype = orbit.state.dtype
         rtols = tuple(np.asarray(how.tolerance(dtype)) for how in (self.transient, self.orbit))
         within, limit = (np.asarray(x, dtype) for x in (tolerance, RESIDUAL[self.model.precision]))
-        found = _judged(orbit, transient.state, within, rtols, limit)
-        return Status.PERIODIC if bool(found) else Status.NOT_SETTLED
+        scales = self._scales(pair)
+        found = jax.device_get(_verdict(orbit, transient.state, within, rtols, limit, scales))
+        numbers = np.concatenate([orbit.response, np.ravel(orbit.sensitivity), orbit.state])
+        if not orbit.flow.solved:
+            status = Status.SOLVER_FAILED
+        elif found.idle:
+            status = Status.IDLE
+        elif not np.all(np.isfinite(numbers)):
+            status = Status.NON_FINITE
+        else:
+            status = Status.PERIODIC if found.steady else Status.NOT_SETTLED
+        return found, status
+
+    def _scales(self, pair: RotorPair):
+        """The `scales` of a verdict."""
+        return self.model.law.exponent, self.model.pitch_radius, pair.force_scale
 
     def _report(self, design, outcome: Any, began: float, with_series: bool) -> Evaluation:
         """The evaluation that an attempt which `began` then has come to."""
@@ -354,12 +369,12 @@ class Evaluator:
                 "orbit_steps": int(orbit.flow.steps),
             }
             series = _orbit_series(pair, orbit, period) if with_series else None
-            rounding = force_rounding(orbit, self.model.law.exponent, self.model.pitch_radius)
-            statistics["force_rounding"] = float(rounding)
-            least = 10 * self.orbit.tolerance(orbit.state.dtype) * pair.force_scale
+            found = outcome.found
+            assert found is not None
+            statistics["force_rounding"] = float(found.rounding)
             if float(orbit.flow.depth) > TOO_DEEP * float(self.model.pitch_radius):
                 status = Status.TOO_DEEP
-            elif float(rounding) > UNRESOLVED or not is_consistent(orbit, least):
+            elif found.rounding > UNRESOLVED or not found.consistent:
                 status = Status.UNRESOLVED
         elif status is Status.NOT_SETTLED and not self.survey:
             window = lyapunov_program(pair, outcome.transient.state, CHAOS_WINDOW, self.transient)
@@ -404,6 +419,7 @@ class _Outcome:
     shape: Geometry
     transient: Transient
     orbit: Orbit | None
+    found: Verdict | None
     status: Status
     used: int
     steps: int
@@ -447,7 +463,7 @@ def _response(mean, square, peak) -> dict[str, float]:
 _build = Program(Model.pair_and_tangents)
 _settle = Program(settle)
 _close = Program(close_orbit)
-_judged = Program(judged)
+_verdict = Program(verdict)
 lyapunov_program = Program(lyapunov)
 
 

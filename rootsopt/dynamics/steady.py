@@ -93,6 +93,52 @@ class Orbit(NamedTuple):
     sensitivity: Float[Array, "r d"]
     newton_steps: Int[Array, ""]
 
+    @classmethod
+    def empty(cls, state: Float[Array, " n"], directions: int, flow: Flow) -> "Orbit":
+        """An orbit from `state` that has not been integrated yet, with derivatives along d
+        `directions` of the design; `flow` is `Flow.empty`."""
+        count, dtype = state.shape[0], state.dtype
+        infinite = jnp.asarray(jnp.inf, dtype)
+        return cls(
+            state=state,
+            flow=flow,
+            residual=infinite,
+            monodromy=jnp.zeros((count, count), dtype),
+            multiplier=infinite,
+            response=flow.response,
+            sensitivity=jnp.zeros((flow.response.shape[0], directions), dtype),
+            newton_steps=jnp.zeros((), int),
+        )
+
+
+class Verdict(NamedTuple):
+    """What there is to say of a closed orbit: `is_idle`, `judged` steady, `force_rounding`,
+    `is_consistent`."""
+
+    idle: Bool[Array, ""]
+    steady: Bool[Array, ""]
+    rounding: Float[Array, ""]
+    consistent: Bool[Array, ""]
+
+
+def verdict(
+    orbit: Orbit,
+    state: Float[Array, " n"],
+    within: Float[Array, ""] | float,
+    rtols: tuple[Float[Array, ""] | float, Float[Array, ""] | float],
+    residual: Float[Array, ""] | float,
+    scales: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]],
+) -> Verdict:
+    """The verdict on an orbit; arguments as of `judged`, and the `scales` exponent of the contact
+    law, pitch radius (m), force unit (N)."""
+    exponent, radius, force = scales
+    return Verdict(
+        idle=is_idle(orbit),
+        steady=judged(orbit, state, within, rtols, residual),
+        rounding=force_rounding(orbit, exponent, radius),
+        consistent=is_consistent(orbit, 10 * rtols[1] * force),
+    )
+
 
 def is_idle(orbit: Orbit) -> Bool[Array, ""]:
     """Whether the pair floats: no flank ever touches, and nothing brings it back when it is moved.
@@ -311,16 +357,7 @@ def close_orbit(
     infinite = jnp.asarray(jnp.inf, dtype)
     designs = jax.tree.leaves(eqx.filter(tangents, eqx.is_inexact_array))[0].shape[0]
     none = Flow.empty(count, designs, samples, how.max_steps, measures, dtype)
-    first = Orbit(
-        state=state,
-        flow=none,
-        residual=infinite,
-        monodromy=jnp.zeros((count, count), dtype),
-        multiplier=infinite,
-        response=none.response,
-        sensitivity=jnp.zeros((none.response.shape[0], designs), dtype),
-        newton_steps=jnp.zeros((), int),
-    )
+    first = Orbit.empty(state, designs, none)
     no = jnp.zeros((), bool)
     start = (first, state, no, no, no, none.grid, infinite, jnp.zeros((), int))
     orbit = lax.while_loop(go_on, step, start)[0]
