@@ -7,12 +7,12 @@
    precision.
 2. Motion: every scene is simulated from rest and must end in a finite result or in a named status.
 3. Truth: a sample of those that ended periodic is closed again from the same state by dopri8 at
-   1e-12 in double precision with contact by search, and by SciPy's DOP853 along that orbit. The
+   1e-12 in double precision, and by SciPy's DOP853 along that orbit. The
    relative deviation of mean and peak force must be below `ALLOWED` times the tolerance.
 4. Public path: a sample goes through `Evaluator` from config to record, some with up to 1000
    revolutions.
 
-Scenes are drawn by `experiments.extreme_scenes`. Writes extremes.csv (a row for each scene),
+Scenes are drawn by `extremes_parts/scenes.py`. Writes extremes.csv (a row for each scene),
 extremes.json (counts and worst deviations) and extremes.png; the exit status is 3 if a promise is
 broken.
 """
@@ -20,7 +20,6 @@ broken.
 import argparse
 import dataclasses
 import itertools
-import math
 import os
 import sys
 import time
@@ -37,51 +36,19 @@ from rootsopt.cli import use_cache, use_float64
 
 use_float64()
 
-import equinox as eqx  # noqa: E402
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-from scipy.integrate import solve_ivp  # noqa: E402
-
-from experiments.extreme_scenes import Kind, cloud, grid, row_of, stacked  # noqa: E402
-from experiments.extremes_plot import draw  # noqa: E402
+from experiments.extremes_parts import checks as ask  # noqa: E402
+from experiments.extremes_parts.checks import ALLOWED, FEW, HORIZON, SINGLE, Case  # noqa: E402
+from experiments.extremes_parts.figure import draw  # noqa: E402
+from experiments.extremes_parts.scenes import Kind, cloud, grid, row_of  # noqa: E402
 from rootsopt import files  # noqa: E402
-from rootsopt.batch import STATUSES, respond  # noqa: E402
 from rootsopt.config import Config  # noqa: E402
-from rootsopt.dynamics.flow import Integrator, flow, strobe  # noqa: E402
-from rootsopt.dynamics.steady import close_orbit, force_rounding, no_tangents  # noqa: E402
-from rootsopt.evaluate import Evaluator  # noqa: E402
-from rootsopt.model import Model, design_vector  # noqa: E402
-from rootsopt.programs import Program  # noqa: E402
-
-HORIZON = 24
-"""Mesh periods the transient may last in the mass of scenes."""
-STEPS = 1024
-"""Solver steps for a mesh period, there."""
-ALLOWED = 100.0
-"""Deviation of a force from the truth in units of the tolerance, relative to the greater of that
-force and the static one; in single precision five roundings of the gap are added."""
-CORNER = 1e-9
-"""Tolerance below which deviations are not judged: a peak on a corner of the force is known to some
-1e-8 only (docs/accuracy.md)."""
-SINGLE = 2.4e-6
-"""Tolerance that single precision holds."""
-SHARP = "dopri8", 1e-12, 20_000
-FEW = 50
-"""Swings in a mesh period that SciPy, an explicit method in Python, is asked for at most."""
-PATIENCE = 24
-"""Mesh periods of plain motion where Newton's method does not close a reference."""
-DEPTHS = np.concatenate([[-1e-3, 0.0], np.geomspace(1e-36, 1e-2, 39)])
-RATES = np.concatenate([-np.geomspace(1e-9, 1e3, 7), [0.0], np.geomspace(1e-9, 1e3, 4)])
-POSES = 4
-"""Random states of each scene at which the equation of motion is looked at."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Study:
     """How many scenes: `kinds` with the number of random ones, whether the grid is added, how
-    many of each kind go to the reference, to SciPy and through the `Evaluator`, and how many
-    with the long horizon (mesh periods)."""
+    many of each kind go to the reference (a third of that where it needs a program of its own), to
+    SciPy and through the `Evaluator`, and how many with the long horizon (mesh periods)."""
 
     kinds: tuple[tuple[Kind, int], ...]
     gridded: bool
@@ -95,20 +62,25 @@ class Study:
 FULL = Study(
     kinds=(
         (Kind(), 2500),
-        (Kind(precision="float32"), 2600),
+        (Kind(precision="float32"), 2500),
         (Kind("kvaerno5"), 200),
-        (Kind("dopri8"), 400),
-        (Kind(lobes=2), 300),
-        (Kind(lobes=6), 200),
-        (Kind(family="ee"), 300),
+        (Kind("dopri8"), 300),
+        (Kind("dopri5"), 150),
+        (Kind("kvaerno3"), 100),
         (Kind("kvaerno5", "float32"), 100),
-        (Kind(fidelity="map", precision="float32"), 200),
-        (Kind(lobes=4), 150),
-        (Kind(lobes=5), 150),
-        (Kind(geared=False), 150),
+        (Kind(fidelity="map"), 300),
+        (Kind(fidelity="map", precision="float32"), 150),
+        (Kind(lobes=2), 250),
+        (Kind(lobes=4), 120),
+        (Kind(lobes=5), 120),
+        (Kind(lobes=6), 120),
+        (Kind(family="ee"), 250),
+        (Kind(scene="plain"), 120),
+        (Kind(scene="pump"), 150),
+        (Kind("kvaerno5", scene="pump"), 40),
     ),
     gridded=True,
-    references=30,
+    references=24,
     scipy=4,
     evaluated=60,
     long=10,
@@ -121,267 +93,6 @@ QUICK = Study(
     evaluated=0,
     long=0,
 )
-
-
-@dataclasses.dataclass
-class Case:
-    """A scene and what became of it; `row` is its line of the table."""
-
-    kind: Kind
-    config: Config
-    row: dict[str, Any]
-    state: Any = None
-
-
-# Promise 1: the law and the equation
-
-
-@eqx.filter_jit
-def _law_values(laws, depths, rates):
-    def one(law):
-        def at(depth, rate):
-            slopes = jax.grad(lambda *x: x[0](*x[1:]), argnums=(0, 1, 2))(law, depth, rate)
-            return jnp.stack([law(depth, rate), *jax.tree.leaves(slopes)])
-
-        table = jax.vmap(lambda d: jax.vmap(lambda r: at(d, r))(rates))(depths)
-        return jnp.sum(~jnp.isfinite(table)), jnp.sum(table[..., 0] < 0)
-
-    return jax.lax.map(one, laws)
-
-
-@eqx.filter_jit
-def _equation_values(models: Model, designs, poses):
-    def one(at):
-        model, design, poses = at
-
-        def slope(design, pose):
-            pair = model.pair(design)
-            scale = pair.angle_scale
-            state = jnp.stack([pose[1], pose[2]]).astype(scale.dtype)
-            found, contact = pair.derivative(pose[0].astype(scale.dtype), state)
-            return jnp.append(found, contact.total)
-
-        def all_of(pose):
-            jacobians = jax.jacfwd(slope, argnums=(0, 1))(design, pose)
-            return jnp.concatenate([slope(design, pose), *(x.ravel() for x in jacobians)])
-
-        return jnp.sum(~jnp.isfinite(jax.vmap(all_of)(poses)))
-
-    return jax.lax.map(one, (models, designs, poses))
-
-
-def check_law(cases: list[Case]) -> dict[str, Any]:
-    """Values of the law that are not finite, or negative, among all scenes."""
-    laws = [jax.tree.map(np.asarray, Model.of(case.config).law) for case in cases]
-    laws = jax.tree.map(lambda *leaves: np.stack(leaves), *laws)
-    found: dict[str, Any] = {}
-    for dtype in (np.float32, np.float64):
-        single = jax.tree.map(lambda x: jnp.asarray(x, dtype), laws)  # noqa: B023
-        bad, negative = _law_values(single, jnp.asarray(DEPTHS, dtype), jnp.asarray(RATES, dtype))
-        found[np.dtype(dtype).name] = {
-            "values": len(cases) * DEPTHS.size * RATES.size,
-            "not_finite": int(np.sum(bad)),
-            "negative": int(np.sum(negative)),
-        }
-    return found
-
-
-def check_equation(cases: list[Case], seed: int) -> dict[str, Any]:
-    """Values of the equation of motion, and of its derivatives in state and design, that are not
-    finite: at random times, some static depths and plays to either side, at any speed."""
-    draw = np.random.default_rng(seed)
-    found: dict[str, Any] = {}
-    groups: dict[tuple, list[Case]] = {}
-    for case in cases:
-        kind = case.kind
-        shape = kind.family, kind.lobes, kind.geared, kind.fidelity
-        groups.setdefault(shape, []).append(case)
-    for (family, lobes, geared, fidelity), members in groups.items():
-        if fidelity == "map" or lobes in (4, 5):
-            continue
-        configs = [case.config for case in members]
-        designs = np.stack([np.asarray(design_vector(config)) for config in configs])
-        size = np.exp(draw.uniform(np.log(1e-9), np.log(30), (2, len(members), POSES)))
-        signed = size * draw.choice([-1, 1], size.shape)
-        poses = np.stack([draw.uniform(0, 1, size.shape[1:]), signed[0], 100 * signed[1]], axis=-1)
-        models = stacked(configs, "float64")
-        for precision in ("float32", "float64"):
-            bad = _equation_values(dataclasses.replace(models, precision=precision), designs, poses)
-            name = f"{family} {lobes}{'' if geared else ' no gear'}, {precision}"
-            found[name] = {"scenes": len(members), "not_finite": int(np.sum(bad))}
-    return found
-
-
-# Promise 2: the motion
-
-
-@Program
-def _simulate(model: Model, design, tolerances, method: str):
-    pair = model.pair(design)
-    transient, orbit = (Integrator(method, tolerances[k], STEPS) for k in range(2))
-    out = respond(model, design, jnp.zeros(2), transient, orbit, HORIZON)
-    assert pair.pace is not None
-    swings = pair.mesh_period / (2 * jnp.pi * pair.pace.swing)
-    # Share of the static penetration that is lost in rounding.
-    rounding = jnp.finfo(pair.angle_scale.dtype).eps * model.pitch_radius
-    return out, swings, rounding / pair.law.depth_at(pair.force_scale), pair.force_scale
-
-
-def _arguments(case: Case) -> tuple[Any, ...]:
-    model = jax.tree.map(np.asarray, Model.of(case.config))
-    solver = case.config.solver
-    tolerances = np.array([solver.transient_rtol, solver.rtol])
-    return model, np.asarray(design_vector(case.config)), tolerances, case.kind.method
-
-
-def simulate(case: Case) -> None:
-    """Simulate a scene from rest and complete its row."""
-    arguments = _arguments(case)
-    began = time.perf_counter()
-    found = _simulate(*arguments)
-    out, swings, rounding, force = jax.device_get(found)
-    status = STATUSES[int(out.status)]
-    numbers = np.concatenate([np.ravel(out.response), np.ravel(out.gradient)])
-    mean, peak, rms = map(float, out.response)
-    case.state = np.asarray(out.state, np.float64)
-    case.row |= {
-        "seconds": time.perf_counter() - began,
-        "steps": int(out.steps),
-        "swings": float(swings),
-        "gap_rounding": float(rounding),
-        "static_force_N": float(force),
-        "status": status.label,
-        "period": int(out.period),
-        "multiplier": float(out.multiplier),
-        "mean_force_N": mean,
-        "peak_force_N": peak,
-        "rms_force_N": rms,
-        # What is called a result is finite, and nothing else looks like one.
-        "named": bool(np.all(np.isfinite(numbers)) if status.usable else np.all(np.isnan(numbers))),
-    }
-
-
-# Promise 3: the truth
-
-
-@Program
-def _sharp(model: Model, design, state, period):
-    method, rtol, steps = SHARP
-    pair = model.pair(design)
-    how = Integrator(method, jnp.asarray(rtol), steps)
-    orbit = close_orbit(pair, no_tangents(pair), state, period, how)
-    return orbit._replace(flow=orbit.flow._replace(grid=jnp.zeros(0)))
-
-
-@Program
-def _patient(model: Model, design, state, period):
-    """The last round of plain motion, without Newton's method, and the state it begins with."""
-    method, rtol, steps = SHARP
-    pair = model.pair(design)
-    how = Integrator(method, jnp.asarray(100 * rtol), steps)
-    states = strobe(pair, state, PATIENCE, how).states
-    last = states[PATIENCE - 1 - period]
-    out = flow(pair, last, period.astype(float), how, 2520, no_tangents(pair))
-    return out._replace(grid=jnp.zeros(0)), last
-
-
-@eqx.filter_jit
-def _equation(model: Model, design):
-    return model.pair(design)
-
-
-@eqx.filter_jit
-def _rates(pair, tau, state):
-    slope, contact = pair.derivative(tau, state)
-    return jnp.append(slope, contact.total / pair.force_scale)
-
-
-def refine(case: Case) -> None:
-    """Deviation of a periodic result from the orbit that the sharp settings find beside it."""
-    model = dataclasses.replace(Model.of(case.config), precision="float64", fidelity="search")
-    design = np.asarray(design_vector(case.config))
-    period = np.asarray(case.row["period"])
-    orbit = jax.device_get(_sharp(model, design, case.state, period))
-    closed = bool(orbit.flow.solved) and float(orbit.residual) < 1e-9
-    state, numbers = orbit.state, orbit.response[:3]
-    if not closed:
-        out, state = jax.device_get(_patient(model, design, case.state, period))
-        closed = bool(out.solved) and float(np.max(np.abs(out.end - state))) < 1e-4
-        numbers = np.array([out.mean, out.mean_square, out.peak])
-    mean, square, peak = numbers
-    truth = np.array([mean, peak, np.sqrt(square)])
-    names = ("mean_force_N", "peak_force_N", "rms_force_N")
-    found = np.array([case.row[name] for name in names])
-    off = np.abs(found - truth) / np.maximum(truth, case.row["static_force_N"])
-    allowed = ALLOWED * max(case.config.solver.rtol, CORNER)
-    if case.kind.precision == "float32":
-        # Of the reference's gap in double; single rounds 2^29 times as coarsely.
-        rounding = 2**29 * float(force_rounding(orbit, model.law.exponent, model.pitch_radius))
-        allowed = ALLOWED * max(case.config.solver.rtol, SINGLE) + 5 * rounding
-    case.row |= {
-        "reference": "closed" if closed else "not closed",
-        "reference_mean_N": float(mean),
-        "reference_peak_N": float(peak),
-        "mean_off": float(off[0]),
-        "peak_off": float(off[1]),
-        "moved": float(np.max(np.abs(state - case.state))),
-        "reference_multiplier": float(orbit.multiplier),
-        "share_of_allowed": float(max(off[:2]) / allowed),
-    }
-    case.state = np.asarray(state)
-
-
-def by_scipy(case: Case) -> None:
-    """Along the orbit (that of the reference, if there is one): how far SciPy's end is from its
-    start, and its mean force."""
-    fidelity = "search" if "reference" in case.row else case.kind.fidelity
-    model = dataclasses.replace(Model.of(case.config), precision="float64", fidelity=fidelity)
-    pair = _equation(model, design_vector(case.config))
-    period = case.row["period"]
-    done = solve_ivp(
-        lambda tau, y: np.asarray(_rates(pair, tau, y[:2])),
-        (0.0, float(period)),
-        np.append(case.state, 0.0),
-        method="DOP853",
-        rtol=1e-11,
-        atol=1e-11,
-        max_step=1 / 32,
-    )
-    mean = done.y[2, -1] / period * float(pair.force_scale)
-    truth = case.row.get("reference_mean_N", case.row["mean_force_N"])
-    case.row |= {
-        "scipy_end": float(np.max(np.abs(done.y[:2, -1] - case.state))),
-        "scipy_mean_off": abs(mean - truth) / (truth if truth > 0 else 1.0),
-    }
-
-
-# Promise 4: the public path
-
-
-def evaluate(case: Case, evaluator: Evaluator) -> None:
-    """Simulate a scene as the commands do."""
-    began = time.perf_counter()
-    evaluation = evaluator(series=False)
-    record = evaluation.record()
-    numbers = [*record["response"].values()]
-    numbers += [x for row in record["gradient"].values() for x in row.values()]
-    case.row |= {
-        "evaluator_status": record["status"],
-        "evaluator_seconds": time.perf_counter() - began,
-        "evaluator_periods": int(record["statistics"]["transient_mesh_periods"]),
-        "evaluator_mean_N": record["response"].get("mean_force_N", math.nan),
-        "named": bool(case.row["named"] and np.all(np.isfinite(numbers))),
-    }
-
-
-def evaluator_of(config: Config, horizon: int) -> Evaluator:
-    """An evaluator of a config with a transient of at most `horizon` mesh periods."""
-    changes = {"max_mesh_periods": horizon, "max_steps_per_period": STEPS}
-    solver = config.solver.model_copy(update=changes)
-    return Evaluator(config.model_copy(update={"solver": solver}))
-
-
-# The study
 
 
 def run(
@@ -399,7 +110,7 @@ def run(
             for c in configs
         ]
     say(f"{len(cases)} scenes")
-    checks = {"law": check_law(cases), "equation": check_equation(cases, seed=1)}
+    checks = {"law": ask.law(cases), "equation": ask.equation(cases, seed=1)}
     say(f"law and equation: {checks}")
 
     def each(what: str, task: Callable[[Case], None], chosen: list[Case]) -> None:
@@ -414,26 +125,29 @@ def run(
     first = [next(case for case in cases if case.kind == kind) for kind, _ in study.kinds]
     for number, (kind, _) in enumerate(study.kinds):
         for case in first[number : number + 2]:
-            _simulate.prepare(*_arguments(case))
-        each(kind.label, simulate, [case for case in cases if case.kind == kind])
+            ask.prepare(case)
+        each(kind.label, ask.simulate, [case for case in cases if case.kind == kind])
         keep(cases)
     picked: list[Case] = []
     compared: list[Case] = []
     for kind, _ in study.kinds:
-        if kind.lobes in (4, 5, 6) or not kind.geared:
-            continue  # The reference needs programs of its own for each.
+        shape = kind.lobes, kind.family, kind.fidelity, kind.scene
+        if kind.lobes in (4, 5, 6) or kind.fidelity == "linear":
+            continue
         mine = [case for case in cases if case.kind == kind]
         good = [case for case in mine if case.row["status"] == "periodic"]
-        picked += good[: study.references]
-        compared += [case for case in good if case.row["swings"] < FEW][: study.scipy]
-    each("reference", refine, picked)
+        own = shape != (3, "cic", "search", "gear")
+        picked += good[: study.references // (3 if own else 1)]
+        if kind.scene != "pump":  # Whose independent equation is that of tests/planar.py.
+            compared += [case for case in good if case.row["swings"] < FEW][: study.scipy]
+    each("reference", ask.refine, picked)
     keep(cases)
-    each("scipy", by_scipy, compared)
+    each("scipy", ask.by_scipy, compared)
     for kind, _ in study.kinds[: 2 if study.evaluated else 0]:
         mine = [case for case in cases if case.kind == kind][: study.evaluated]
         for place, case in enumerate(mine):
             horizon = study.horizon if place < study.long else 8 * HORIZON
-            evaluate(case, evaluator_of(case.config, horizon))
+            ask.evaluate(case, ask.evaluator_of(case.config, horizon))
     return cases, checks
 
 

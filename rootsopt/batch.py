@@ -31,7 +31,7 @@ from rootsopt.model import Model
 from rootsopt.programs import Program
 from rootsopt.status import Status
 
-_SHOTS = 5
+_SHOTS = 8
 SAMPLES = 840
 """Uniform samples of an orbit, among which the peak is looked for; divisible by all
 periods up to eight."""

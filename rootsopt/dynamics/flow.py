@@ -109,8 +109,8 @@ class Flow(NamedTuple):
     `end`: final state; `mean`, `mean_square`, `peak` of the contact force (N, N², N);
     `peak_time` (mesh periods); `depth`: greatest penetration (m; negative: least gap)
     at the sampled times; `states` at uniform times, endpoint excluded; `grid`: ends
-    of the steps taken (mesh periods), inf beyond the last; `steps`: accepted and rejected
-    solver steps; `solved`; `others`: the values of `Measures` beside mean and mean square.
+    of the steps taken (mesh periods), inf beyond the last, and `corners` the states there; `steps`:
+    accepted and rejected solver steps; `solved`; `others`: the values of `Measures` beside mean and mean square.
     `slope`: derivatives of (end, mean, mean_square, peak, others) in the initial state (n columns)
     and along the directions that were asked for (d more), or no columns at all.
     """
@@ -123,6 +123,7 @@ class Flow(NamedTuple):
     depth: Float[Array, ""]
     states: Float[Array, "samples n"]
     grid: Float[Array, " steps"]
+    corners: Float[Array, "steps n"]
     steps: Int[Array, ""]
     solved: Bool[Array, ""]
     others: Float[Array, " others"]
@@ -143,6 +144,7 @@ class Flow(NamedTuple):
             depth=nothing,
             states=jnp.zeros((samples, count), dtype),
             grid=jnp.full(steps, jnp.inf, dtype),
+            corners=jnp.zeros((steps, count), dtype),
             steps=jnp.zeros((), int),
             solved=jnp.zeros((), bool),
             others=jnp.zeros(measures.count - 2, dtype),
@@ -408,6 +410,7 @@ def flow(
         depth=depth,
         states=states,
         grid=ends,
+        corners=steps.after,
         steps=solution.stats["num_steps"],
         solved=solution.result == diffrax.RESULTS.successful,
         others=averages[2:],

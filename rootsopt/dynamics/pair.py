@@ -321,9 +321,12 @@ class RotorPair(eqx.Module):
         depth = -gap - self.clearance
         return _Touch(depth, closing, lever1, lever2, roll, found, sliding)
 
-    def switches(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> Bool[Array, " s"]:
+    def switches(
+        self, tau: Float[Array, ""], state: Float[Array, " n"]
+    ) -> tuple[Bool[Array, " s"], Bool[Array, " s"]]:
         """Which of its smooth pieces the equation is on, at rotation `tau` (mesh periods) and
-        scaled `state`: side and pieces of the flanks, of the contact law, of every part."""
+        scaled `state`: side and pieces of the flanks, of the contact law, of every part. And which
+        of these are of account: not the pieces of a flank that does not touch."""
         motion = self.motion(tau, state)
 
         def of_flank(side):
@@ -335,18 +338,21 @@ class RotorPair(eqx.Module):
             if self.friction is not None:
                 assert touch.sliding is not None
                 flags.append(self.friction.switches(touch.sliding.speed))
-            # The pieces of a flank that does not touch are of no account.
-            return jnp.concatenate(flags) & (touch.depth > 0)
+            found = jnp.concatenate(flags)
+            return found, jnp.full_like(found, touch.depth > 0)
 
         drives = motion.relative < 0
         if self.both:
             sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)
-            flags = [jax.vmap(of_flank)(sides).ravel()]
+            flags, counts = (x.ravel() for x in jax.vmap(of_flank)(sides))
         else:
-            flags = [jnp.stack([drives]), of_flank(jnp.where(drives, 1.0, -1.0))]
+            flags, counts = of_flank(jnp.where(drives, 1.0, -1.0))
+            flags, counts = jnp.append(flags, drives), jnp.append(counts, True)
+        parts = [self.load.switches(motion.phi)]
         if self.gear is not None:
-            flags.append(self.gear.switches(motion.relative))
-        return jnp.concatenate([*flags, self.load.switches(motion.phi)])
+            parts.append(self.gear.switches(motion.relative))
+        flags = jnp.concatenate([flags, *parts])
+        return flags, jnp.pad(counts, (0, flags.size - counts.size), constant_values=True)
 
     def derivative(
         self, tau: Float[Array, ""], state: Float[Array, " n"]

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.pair import RotorPair
 
@@ -54,9 +54,7 @@ class Steps(NamedTuple):
     def motion(self, tau: Float[Array, ""]) -> Float[Array, " n"]:
         """State (scaled) at time `tau` (mesh periods): ε and dε/dτ by the cubic through both at
         the ends of the step, others in proportion."""
-        k = jnp.clip(jnp.searchsorted(self.ends, tau), 0, self.count - 1)
-        step = self.ends[k] - self.begins[k]
-        x = (tau - self.begins[k]) / step
+        k, step, x = self._place(tau)
         (start, rate), (end, last) = self.before[k, :2], self.after[k, :2]
         rise = end - start
         bend, twist = 3 * rise - step * (2 * rate + last), step * (rate + last) - 2 * rise
@@ -64,6 +62,18 @@ class Steps(NamedTuple):
         swing = jnp.stack([place, rate + x * (2 * bend + 3 * x * twist) / step])
         others = (1 - x) * self.before[k, 2:] + x * self.after[k, 2:]
         return jnp.concatenate([swing, others])
+
+    def reaches(self, tau: Float[Array, ""], width: Float[Array, ""]) -> Bool[Array, ""]:
+        """Whether that cubic is at `tau` as good as a polynomial through samples a `width` apart:
+        close enough to an end of the step."""
+        _, step, x = self._place(tau)
+        return x * (1 - x) * step**2 < width**2
+
+    def _place(self, tau):
+        """The step at `tau`, its length, and the share of it that has passed."""
+        k = jnp.clip(jnp.searchsorted(self.ends, tau), 0, self.count - 1)
+        step = self.ends[k] - self.begins[k]
+        return k, step, (tau - self.begins[k]) / step
 
 
 def locate_peak(

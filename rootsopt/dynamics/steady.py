@@ -50,6 +50,10 @@ _FREE = 1e-6
 """Distance of a Floquet multiplier from 1 that is none."""
 _LOOKS = 3
 """Times that kinks are looked for while an orbit is closed, at most."""
+_DRIFT = 1e-9, 1e-5
+"""Distance (scaled) that an orbit may have moved from where its kinks were looked for: a thousand
+times its tolerance, but within these. The kinks lie that far outside their steps, which costs
+accuracy in first order."""
 _SMALL = 1e-9, 1e-3
 """Newton step (scaled) from which on the solver's steps are kept: a thousand times its
 tolerance, but within these."""
@@ -307,6 +311,7 @@ def close_orbit(
     enough = jnp.minimum(tolerances * how.tolerance(dtype), most)
     enough = jnp.maximum(roundings * float(jnp.finfo(dtype).eps), enough)
     closed = jnp.maximum(closed, enough).astype(dtype)
+    far = jnp.clip(1000 * how.tolerance(dtype), *_DRIFT)
     length = period.astype(dtype)
     measures = Measures() if measures is None else measures
     frozen = lax.stop_gradient(pair)
@@ -324,7 +329,7 @@ def close_orbit(
         return (open_still | ~repeated) & (orbit.newton_steps < shots)
 
     def step(carry):
-        orbit, state, repeat, _, _, grid, best, looks = carry
+        orbit, state, repeat, _, _, grid, best, looks, looked = carry
         out = shoot(state, grid, repeat, orbit.flow.peak)
         monodromy = out.slope[:count, :count]
         miss = out.end - state
@@ -339,7 +344,9 @@ def close_orbit(
         improving = residual < 0.5 * best
         # Kinks are looked for again where the motion has moved them out of their steps.
         stalled = repeat & ~improving & (residual > closed) & (looks < _LOOKS)
-        look = following & (~repeat | stalled)
+        drift = jnp.max(jnp.abs(state - looked))
+        strayed = repeat & (residual <= closed) & (drift > far) & (looks < _LOOKS)
+        look = following & (~repeat | stalled | strayed)
         orbit = orbit._replace(
             state=state, flow=out, residual=residual, monodromy=monodromy, newton_steps=done
         )
@@ -351,7 +358,8 @@ def close_orbit(
         # Residuals compare on the same steps only.
         best = jnp.where(look | ~repeat, jnp.inf, jnp.minimum(best, residual))
         looks += look
-        return orbit, new, following, repeat, improving | look, grid, best, looks
+        looked = jnp.where(look, state, looked)
+        return orbit, new, following, repeat & ~strayed, improving | look, grid, best, looks, looked
 
     # The loop holds the only copy of the integration: one shot is compiled, not two.
     infinite = jnp.asarray(jnp.inf, dtype)
@@ -359,7 +367,7 @@ def close_orbit(
     none = Flow.empty(count, designs, samples, how.max_steps, measures, dtype)
     first = Orbit.empty(state, designs, none)
     no = jnp.zeros((), bool)
-    start = (first, state, no, no, no, none.grid, infinite, jnp.zeros((), int))
+    start = (first, state, no, no, no, none.grid, infinite, jnp.zeros((), int), state)
     orbit = lax.while_loop(go_on, step, start)[0]
     slope = orbit.flow.slope
     moved = solved(jnp.eye(count, dtype=dtype) - orbit.monodromy, slope[:count, count:])

@@ -12,19 +12,24 @@ from jaxtyping import Array, Float
 
 from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.peak import motion
+from rootsopt.dynamics.peak import Steps, motion
 
-_LOOKS = 252
-"""Intervals in which changes are looked for (every switch for itself)."""
-_CHANGES = 48
+_LOOKS, _LONGEST = 252, 8
+"""Places in a mesh period where changes are looked for, beside the ends of the steps, and mesh
+periods that there are places for."""
+_CHANGES = 192
 """Changes found in one stretch of motion, at most."""
-_HALVINGS = 24
+_LANES = 16
+"""Places looked at together."""
+_HALVINGS = 26
 _BRIEF, _PARTS = 0.05, 8
 """Changes less than `_BRIEF` mesh periods apart have `_PARTS` steps between them."""
 _ASIDE = 1e-9, 1e-6
 """Half a step (mesh periods) that holds a change: so many times the tolerance of the motion as
 `_LOOSE`, but within these. What it does to the gradients is in proportion to it."""
 _LOOSE = 1e3
+_SHARE = 1e-2
+"""The same as a share of the time to the next change, at most."""
 _APART = 1e-10
 """Ends of steps closer than this (mesh periods) are one."""
 
@@ -34,51 +39,70 @@ def with_switches(
 ) -> Float[Array, " steps"]:
     """The grid of `out`, integrated over `periods` mesh periods at a relative `tolerance`, with
     steps that end where the equation changes from one smooth piece to another."""
-    samples = out.states.shape[0]
-    width = periods / samples
-    stride = (samples - 1) / _LOOKS
-    blocks = -(-(_LOOKS + 1) // _CHANGES)
-    lanes = jnp.arange(_CHANGES)
+    width = periods / out.states.shape[0]
+    before = jnp.concatenate([out.states[:1], out.corners[:-1]])
+    begins = jnp.concatenate([jnp.zeros_like(out.grid[:1]), out.grid[:-1]])
+    taken = jnp.sum(out.grid < jnp.inf)
+    steps = Steps(begins, out.grid, before, out.corners, taken, taken)
+    even = jnp.arange(_LONGEST * _LOOKS, dtype=width.dtype) / _LOOKS
+    places = jnp.sort(jnp.concatenate([jnp.where(even < periods, even, jnp.inf), out.grid]))
+    known = jnp.sum(places < jnp.inf)
+    blocks = -(-known // _LANES)
+    lanes = jnp.arange(_LANES)
 
-    def flags(place):
-        return pair.switches(place * width, motion(out.states, place))
+    def flags(tau):
+        # A polynomial through samples to both sides of a change does not know of it; the steps
+        # are short there.
+        near = steps.reaches(tau, width)
+        state = jnp.where(near, steps.motion(tau), motion(out.states, tau / width))
+        return pair.switches(tau, state)
 
-    def changes(seen):
-        """Where switches change: interval, switch, and its value before."""
-        interval, which = jnp.nonzero(
-            seen[1 : _LOOKS + 1] != seen[:_LOOKS], size=_CHANGES, fill_value=-1
-        )
-        return interval, which, seen[interval, which]
+    def changes(seen, counts):
+        """Where switches change that count on either side: how many, and of each the switch, its
+        value before, and the ends of the interval."""
+        differ = (seen[1:] != seen[:-1]) & (counts[1:] | counts[:-1])
+        differ &= (jnp.arange(1, places.shape[0]) < known)[:, None]
+        interval, which = jnp.nonzero(differ, size=_CHANGES, fill_value=0)
+        number = jnp.minimum(jnp.sum(differ), _CHANGES)
+        return number, which, seen[interval, which], places[interval], places[interval + 1]
 
     # Looking and halving in one loop, so that the switches are compiled once.
-    def look(i, carry):
-        seen, low, high = carry
-        interval, which, before = changes(seen)
-        looking = i < blocks
-        first = i == blocks
-        low = jnp.where(first, interval * stride, low)
-        high = jnp.where(first, (interval + 1) * stride, high)
-        middle = (low + high) / 2
-        index = jnp.minimum(i * _CHANGES + lanes, _LOOKS)
-        found = jax.vmap(flags)(jnp.where(looking, index * stride, middle))
-        seen = jnp.where(looking, seen.at[index].set(found), seen)
-        same = found[lanes, which] == before
-        low, high = jnp.where(same, middle, low), jnp.where(same, high, middle)
-        return seen, low, high
+    def go_on(carry):
+        turn, (number, *_), *_ = carry
+        return (turn <= blocks) | (turn < blocks + _HALVINGS * -(-number // _LANES))
 
-    shape = jax.eval_shape(flags, width).shape
-    nothing = jnp.zeros(_CHANGES, width.dtype)
-    start = jnp.zeros((_LOOKS + 1, *shape), bool), nothing, nothing
-    seen, _, high = lax.fori_loop(0, blocks + _HALVINGS, look, start)
-    interval, _, _ = changes(seen)
-    found = jnp.sort(jnp.where(interval >= 0, high * width, jnp.inf))
+    def look(carry):
+        turn, listed, seen, counts = carry
+        looking = turn < blocks
+        listed = lax.cond(turn == blocks, lambda: changes(seen, counts), lambda: listed)
+        number, which, value, low, high = listed
+        place = jnp.where(looking, turn, (turn - blocks) // _HALVINGS) * _LANES + lanes
+        at = jnp.minimum(place, jnp.where(looking, known, _CHANGES) - 1)
+        middle = (low[at % _CHANGES] + high[at % _CHANGES]) / 2
+        found, counted = jax.vmap(flags)(jnp.where(looking, places[at], middle))
+        kept = jnp.where(looking, at, places.shape[0])
+        seen = seen.at[kept].set(found, mode="drop")
+        counts = counts.at[kept].set(counted, mode="drop")
+        same = found[lanes, which[at % _CHANGES]] == value[at % _CHANGES]
+        lower, upper = (jnp.where(looking | ~side, _CHANGES, at) for side in (same, ~same))
+        low = low.at[lower].set(middle, mode="drop")
+        high = high.at[upper].set(middle, mode="drop")
+        return turn + 1, (number, which, value, low, high), seen, counts
+
+    shape = jax.eval_shape(flags, width)[0].shape
+    unseen = jnp.zeros((places.shape[0], *shape), bool)
+    nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(changes, unseen, unseen))
+    listed = lax.while_loop(go_on, look, (jnp.zeros((), int), nothing, unseen, unseen))[1]
+    number, *_, high = listed
+    found = jnp.sort(jnp.where(jnp.arange(_CHANGES) < number, high, jnp.inf))
     # Between two changes close together the contact crosses a whole piece of the flank.
     brief = jnp.diff(found, append=jnp.inf)
     share = jnp.arange(1, _PARTS, dtype=found.dtype) / _PARTS
     inside = found[:, None] + jnp.where(brief < _BRIEF, brief, jnp.inf)[:, None] * share
     # A change lies inside a step too short to matter: no stage is evaluated beside it, where
     # rounding would decide on which side.
-    aside = jnp.clip(_LOOSE * tolerance, *_ASIDE)
+    apart = jnp.minimum(brief, jnp.diff(found, prepend=-jnp.inf))
+    aside = jnp.minimum(jnp.clip(_LOOSE * tolerance, *_ASIDE), _SHARE * apart)
     added = [found - aside, found + aside, inside.ravel()]
     merged = jnp.sort(jnp.concatenate([out.grid, *added]))
     # Nearly equal ends would make steps of no length.

@@ -33,11 +33,29 @@ SPANS: dict[str, tuple[float, float]] = {
     "solver.transient_rtol": (1e-12, 1e-2),
 }
 """Ranges drawn from, evenly in the logarithm; also what may be 0 is drawn here."""
+PUMP_SPANS: dict[str, tuple[float, float]] = {
+    "scene.load.pressure_difference_Pa": (1.0, 1e7),
+    "scene.motor.slope_N_m_s_per_rad": (1e-3, 10.0),
+    "scene.motor.inertia_kg_m2": (1e-6, 1.0),
+    "scene.supports.stiffness_N_per_mm": (1e2, 1e7),
+    "scene.supports.damping_N_s_per_mm": (1e-3, 1e3),
+    "contact.friction.kinetic": (1e-3, 2.0),
+    "contact.friction.stiction_speed_mm_s": (1.0, 1e4),
+    "contact.clearance_mm": (1e-4, 0.1),
+}
+"""The same for the parts of a scene with everything, in place of its constant load."""
+SIGNED = {"scene.center_distance_error_mm": 1.0, "scene.phase_error_mrad": 100.0}
+"""Greatest errors of assembly, to either side; drawn over four decades."""
 EXPONENT = 1.0, 3.0
 MAY_VANISH = (
     "contact.max_damping_N_s_per_mm",
     "scene.load.torque_N_m",
     "scene.timing_gear.backlash_mm",
+    "scene.load.pressure_difference_Pa",
+    "scene.motor.inertia_kg_m2",
+    "scene.supports.damping_N_s_per_mm",
+    "contact.friction.kinetic",
+    "contact.clearance_mm",
 )
 GRID: dict[str, tuple[float, ...]] = {
     "contact.stiffness_N_per_mm_e": (1e3, 1e6, 1e9),
@@ -53,30 +71,42 @@ GRID: dict[str, tuple[float, ...]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """What scenes of one compiled program have in common."""
+    """What scenes of one compiled program have in common; `scene` is plain (flanks alone), gear,
+    or pump (everything a scene can hold)."""
 
     method: str = "tsit5"
     precision: str = "float64"
     lobes: int = 3
     family: str = "cic"
-    geared: bool = True
+    scene: str = "gear"
     fidelity: str = "search"
 
     @property
     def label(self) -> str:
         """Name in tables."""
-        gear = "" if self.geared else ", no gear"
-        return f"{self.family} {self.lobes}, {self.fidelity}, {self.method}, {self.precision}{gear}"
+        scene = "" if self.scene == "gear" else f", {self.scene}"
+        return (
+            f"{self.family} {self.lobes}, {self.fidelity}, {self.method}, {self.precision}{scene}"
+        )
+
+    @property
+    def states(self) -> int:
+        """How many states the equation of motion has."""
+        return 11 if self.scene == "pump" else 2
 
 
 @functools.cache
-def _shipped(family: str) -> Config:
-    return load(f"configs/{family}.yaml")
+def _shipped(name: str) -> Config:
+    return load(f"configs/{name}.yaml")
+
+
+def _base(kind: Kind) -> Config:
+    return _shipped("pump" if kind.scene == "pump" else kind.family)
 
 
 def config_of(kind: Kind, values: dict[str, float]) -> Config:
-    """The shipped config of the kind's family with `values` by dotted key."""
-    data = _shipped(kind.family).model_dump()
+    """The shipped config of the kind with `values` by dotted key."""
+    data = _base(kind).model_dump()
     fixed = {
         "profile.lobes": kind.lobes,
         "solver.fidelity": kind.fidelity,
@@ -91,7 +121,7 @@ def config_of(kind: Kind, values: dict[str, float]) -> Config:
         for part in place:
             section = section[part]
         section[name] = value
-    if not kind.geared:
+    if kind.scene == "plain":
         data["scene"]["timing_gear"] = None
     return Config.model_validate(data)
 
@@ -118,21 +148,41 @@ def _design(draw: np.random.Generator, lobes: int, radius: float) -> dict[str, f
     }
 
 
+def _assembly(draw: np.random.Generator, values: dict[str, float]) -> dict[str, float]:
+    """Errors of assembly, and what of the friction follows from its other `values`."""
+    kinetic = values["contact.friction.kinetic"]
+    stiction = values["contact.friction.stiction_speed_mm_s"]
+    found = {
+        "contact.friction.static": min(2.0, kinetic * float(draw.uniform(1, 3))),
+        "contact.friction.friction_speed_mm_s": stiction * float(draw.uniform(1.01, 20)),
+    }
+    for key, greatest in SIGNED.items():
+        size = greatest * 10 ** draw.uniform(-4, 0)
+        found[key] = float(size * draw.choice([-1, 1]))
+    return found
+
+
 def cloud(kind: Kind, count: int, seed: int) -> Iterator[Config]:
     """`count` random scenes of a kind; a tenth of what may vanish does."""
     draw = np.random.default_rng([seed, *kind.label.encode()])
-    radius = _shipped(kind.family).profile.pitch_radius_mm
+    radius = _base(kind).profile.pitch_radius_mm
+    spans = SPANS
+    if kind.scene == "plain":
+        spans = {key: v for key, v in SPANS.items() if "timing_gear" not in key}
+    elif kind.scene == "pump":
+        spans = SPANS | PUMP_SPANS
+        spans = {key: v for key, v in spans.items() if key != "scene.load.torque_N_m"}
     for _ in range(count):
         values = {
             key: float(math.exp(draw.uniform(math.log(low), math.log(high))))
-            for key, (low, high) in SPANS.items()
+            for key, (low, high) in spans.items()
         }
-        for key in MAY_VANISH:
-            if draw.uniform() < 0.1:
+        for key in spans:
+            if key in MAY_VANISH and draw.uniform() < 0.1:
                 values[key] = 0.0
-        if not kind.geared:
-            values = {key: v for key, v in values.items() if "timing_gear" not in key}
-        else:
+        if kind.scene == "pump":
+            values |= _assembly(draw, values)
+        if kind.scene != "plain":
             values["scene.timing_gear.damping_ratio"] = float(draw.uniform(0, 1))
         values["contact.exponent"] = float(draw.uniform(*EXPONENT))
         if kind.family == "cic":
@@ -149,12 +199,18 @@ def grid(kind: Kind) -> Iterator[Config]:
 def row_of(config: Config) -> dict[str, float]:
     """The numbers of a scene by dotted key, for a table."""
     data: Any = config.model_dump()
-    keys = [*SPANS, "contact.exponent", *(f"profile.{key}" for key in DESIGN_KEYS)]
+    keys = [
+        *SPANS,
+        *PUMP_SPANS,
+        *SIGNED,
+        "contact.exponent",
+        *(f"profile.{key}" for key in DESIGN_KEYS),
+    ]
     row = {}
     for key in keys:
         value = data
         for part in key.split("."):
-            value = value[part] if value is not None else None
+            value = value.get(part) if value is not None else None
         row[key] = math.nan if value is None else float(value)
     return row
 
