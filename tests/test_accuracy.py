@@ -232,11 +232,14 @@ def test_single_precision(default):
         assert single.gradient["mean_force_N"][key] == pytest.approx(value, abs=0.03 * largest)
 
 
+DESIGNS = jnp.array([[36.43, 9.0, 4.0], [28.0, 3.0, 1.5], [30.0, 4.0, 2.0]])
+
+
 def test_batch_is_the_designs_one_by_one(default):
     """Responses and gradients of a batch are those of its members; a hopeless one (given no
     time to settle here) is marked, and spoils no other."""
     evaluator, _ = default
-    designs = jnp.array([[36.43, 9.0, 4.0], [28.0, 3.0, 1.5], [30.0, 4.0, 2.0]])
+    designs = DESIGNS
     batch = respond_many(
         evaluator.model, designs, jnp.zeros((3, 2)), evaluator.transient, evaluator.orbit
     )
@@ -251,6 +254,24 @@ def test_batch_is_the_designs_one_by_one(default):
     failed = respond_many(lost, designs, jnp.zeros((3, 2)), evaluator.transient, evaluator.orbit)
     assert not np.any(failed.usable)
     assert np.all(np.isnan(failed.response))
+
+
+def test_batch_at_a_coarse_tolerance(default):
+    """Kinks are looked for again where the orbit has moved away from the first look: else gradients
+    would be some 1e-2 off at this tolerance."""
+    evaluator, _ = default
+    coarse, fine = (
+        respond_many(
+            evaluator.model,
+            DESIGNS,
+            jnp.zeros((3, 2)),
+            *(dataclasses.replace(evaluator.orbit, rtol=jnp.asarray(x)) for x in rtols),
+        )
+        for rtols in ((1e-5, 1e-6), (1e-7, 1e-10))
+    )
+    np.testing.assert_allclose(coarse.response, fine.response, rtol=1e-6)
+    largest = np.max(np.abs(fine.gradient), axis=2, keepdims=True)
+    assert np.max(np.abs(coarse.gradient - fine.gradient) / largest) < 1e-3
 
 
 # The choice

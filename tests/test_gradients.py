@@ -1,5 +1,7 @@
 """Gradients of closed orbits against central differences of the orbits themselves."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -125,6 +127,40 @@ def test_ee(scene, lobes):
     """The same by speed, load and backlash for a profile that has no design parameter."""
     found = errors(load("configs/ee.yaml", [*SHARP, *SCENES[scene], f"profile.lobes={lobes}"]))
     assert max(found.values()) < 1e-6, found
+
+
+NARROW = (
+    "scene.speed_rpm=28859",
+    "scene.load.torque_N_m=1.7",
+    "scene.timing_gear.backlash_mm=0.93",
+    "scene.timing_gear.stiffness_N_m_per_rad=21095",
+    "scene.timing_gear.damping_ratio=0.5",
+    "contact.stiffness_N_per_mm_e=47086",
+    "contact.exponent=1.93",
+    "contact.max_damping_N_s_per_mm=5e-4",
+    "contact.full_damping_depth_mm=0.35",
+    "contact.smoothing_mm=5e-5",
+    "rotor.length_mm=3.1",
+)
+
+
+def test_many_kinks_in_a_thousandth_of_a_mesh():
+    """Light rotors cross the rounded edges of the backlash four times in a mesh, each within 1e-5
+    of it: derivatives of a coarse motion hold to what its tolerance lets expect."""
+    design = ("profile.pressure_angle_deg=10.9", "profile.tip_arc_angle_deg=14.44")
+    changes = [*SHARP, *NARROW, *design, "profile.involute_length_mm=1.146"]
+    orbit, evaluator, period = orbits_of(load("configs/cic.yaml", changes))
+    ones = jnp.ones(3)
+    sharp = orbit(ones)
+    config_design = design_vector(evaluator.config)
+    for rtol, within in ((1e-7, 3e-2), (1e-9, 1e-4)):
+        how = dataclasses.replace(evaluator.orbit, rtol=jnp.asarray(rtol))
+        start = np.asarray(sharp.state), np.asarray(period)
+        found = closed(evaluator.model, config_design, ones, *start, how)
+        assert float(found.multiplier) == pytest.approx(float(sharp.multiplier), rel=within)
+        size = np.max(np.abs(sharp.sensitivity[:3]), axis=1, keepdims=True)
+        off = np.abs(found.sensitivity[:3] - sharp.sensitivity[:3]) / size
+        assert np.max(off) < within, (rtol, off)
 
 
 def test_jump_in_both_modes():

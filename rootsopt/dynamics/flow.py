@@ -110,7 +110,8 @@ class Flow(NamedTuple):
     `peak_time` (mesh periods); `depth`: greatest penetration (m; negative: least gap)
     at the sampled times; `states` at uniform times, endpoint excluded; `grid`: ends
     of the steps taken (mesh periods), inf beyond the last, and `corners` the states there; `steps`:
-    accepted and rejected solver steps; `solved`; `others`: the values of `Measures` beside mean and mean square.
+    accepted and rejected solver steps; `solved`; `others`: the values of `Measures` beside mean
+    and mean square.
     `slope`: derivatives of (end, mean, mean_square, peak, others) in the initial state (n columns)
     and along the directions that were asked for (d more), or no columns at all.
     """
