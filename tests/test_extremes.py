@@ -156,7 +156,7 @@ def test_motion_inside_a_step_is_a_cubic():
 
     with np.errstate(invalid="ignore"):
         before, after = cubic(begins), cubic(ends)
-    steps = Steps(*map(jnp.asarray, (begins, ends, before, after, 3, 1)))
+    steps = Steps(*map(jnp.asarray, (begins, ends, before, after, 3)))
     for tau in (0.0, 0.03, 0.1, 0.25, 0.41, 0.45):
         np.testing.assert_allclose(steps.motion(jnp.asarray(tau)), cubic(tau), rtol=1e-12)
 
@@ -182,8 +182,7 @@ def test_impact_between_the_samples_is_found():
     near = middle + width * np.linspace(-4, 4, 41)
     edges = np.concatenate([np.linspace(0, 0.7, 11), near, np.linspace(0.72, 1, 11)])
     begins, ends = edges[:-1], edges[1:]
-    strongest = int(np.searchsorted(ends, middle))
-    steps = Steps(begins, ends, motion(begins), motion(ends), np.array(len(ends)), strongest)
+    steps = Steps(begins, ends, motion(begins), motion(ends), np.array(len(ends)))
     steps = jax.tree.map(jnp.asarray, steps)
     time, depth = peak_of(pair, jnp.asarray(samples), steps)
     assert float(time) == pytest.approx(middle, abs=2e-5)

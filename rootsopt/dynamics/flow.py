@@ -110,8 +110,8 @@ class Flow(NamedTuple):
     `peak_time` (mesh periods); `depth`: greatest penetration (m; negative: least gap)
     at the sampled times; `states` at uniform times, endpoint excluded; `grid`: ends
     of the steps taken (mesh periods), inf beyond the last, and `corners` the states there; `steps`:
-    accepted and rejected solver steps; `solved`; `others`: the values of `Measures` beside mean
-    and mean square.
+    accepted and rejected solver steps; `solved`; `strain`: greatest error estimate of a repeated
+    step, in tolerances; `others`: the values of `Measures` beside mean and mean square.
     `slope`: derivatives of (end, mean, mean_square, peak, others) in the initial state (n columns)
     and along the directions that were asked for (d more), or no columns at all.
     """
@@ -127,6 +127,7 @@ class Flow(NamedTuple):
     corners: Float[Array, "steps n"]
     steps: Int[Array, ""]
     solved: Bool[Array, ""]
+    strain: Float[Array, ""]
     others: Float[Array, " others"]
     slope: Float[Array, "rows columns"]
 
@@ -148,6 +149,7 @@ class Flow(NamedTuple):
             corners=jnp.zeros((steps, count), dtype),
             steps=jnp.zeros((), int),
             solved=jnp.zeros((), bool),
+            strain=nothing,
             others=jnp.zeros(measures.count - 2, dtype),
             slope=jnp.zeros((count + 1 + measures.count, count + directions), dtype),
         )
@@ -187,22 +189,26 @@ class StepGrid(diffrax.AbstractAdaptiveStepSizeController):
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         first, state = self.pid.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        return jnp.where(self.repeat, self.ends[0], first), (state, jnp.asarray(1))
+        strain = jnp.zeros((), self.ends.dtype)
+        return jnp.where(self.repeat, self.ends[0], first), (state, jnp.asarray(1), strain)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state):  # pyright: ignore[reportIncompatibleMethodOverride]
-        state, count = state
+        state, count, strain = state
         # The choice of steps is no part of what is differentiated.
         y0, y1_candidate, y_error = lax.stop_gradient((y0, y1_candidate, y_error))
         keep, start, stop, jump, state, result = self.pid.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, state
         )
         recorded = self.ends[jnp.minimum(count, self.ends.shape[0] - 1)]
+        # Nothing is rejected where steps are repeated; whether it would have been is remembered.
+        unit = self.pid.atol + self.pid.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1_candidate))
+        strain = jnp.maximum(strain, self.pid.norm(y_error / unit))
         return (
             keep | self.repeat,
             jnp.where(self.repeat, t1, start),
             jnp.where(self.repeat, recorded, stop),
             jump & ~self.repeat,
-            (state, count + 1),
+            (state, count + 1, strain),
             diffrax.RESULTS.where(self.repeat, diffrax.RESULTS.successful, result),
         )
 
@@ -308,7 +314,8 @@ def flow(
                 ),
                 diffrax.SubSaveAt(steps=True, fn=lambda share, y, args: (share, y)),
                 diffrax.SubSaveAt(t1=True),
-            ]
+            ],
+            controller_state=True,
         ),
         stepsize_controller=StepGrid(  # pyright: ignore[reportCallIssue]
             pid=how.controller(dtype, periods, lax.stop_gradient(pair)), ends=ends, repeat=repeated
@@ -319,6 +326,8 @@ def flow(
     )
     assert solution.ys is not None
     states, (ends, after), (end,) = solution.ys
+    assert solution.controller_state is not None
+    strain = solution.controller_state[-1]
     states, ends = lax.stop_gradient((states, ends * periods))
     begins = jnp.concatenate([jnp.zeros_like(ends[:1]), ends[:-1]])
     before = jnp.concatenate([start[None], after[:-1]])
@@ -349,11 +358,7 @@ def flow(
         end, before = lax.scan(advance, start, (begins, ends))
     # The step that holds the peak is taken once more, as far as the peak, and from there on short
     # steps to both sides.
-    pushes = (after[:, count] - before[:, count]) / (ends - begins)
-    means = jnp.where(jnp.arange(ends.shape[0]) <= last, pushes, -jnp.inf)
-    steps = lax.stop_gradient(
-        Steps(begins, ends, before[:, :count], after[:, :count], last + 1, jnp.argmax(means))
-    )
+    steps = lax.stop_gradient(Steps(begins, ends, before[:, :count], after[:, :count], last + 1))
     peak_time, depth = locate_peak(lax.stop_gradient(pair), states, periods, steps)
     holds = jnp.clip(jnp.sum(ends < peak_time), 0, last)
     peak_time = jnp.maximum(peak_time, begins[holds] + _SHORTEST)
@@ -414,6 +419,7 @@ def flow(
         corners=steps.after,
         steps=solution.stats["num_steps"],
         solved=solution.result == diffrax.RESULTS.successful,
+        strain=jnp.where(repeated, lax.stop_gradient(strain), 0.0),
         others=averages[2:],
         slope=slope,
     )

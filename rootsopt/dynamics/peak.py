@@ -21,9 +21,6 @@ BESIDE_UNIT = {8: 2e-8, 4: 1e-3}
 _FARTHEST = {8: 32.0, 4: 1 / 16}
 """Distance of the vertex from the located peak that is believed, in units of `_WIDE`: where the
 states between the samples bend, the peak is located no better than to some 1e-5."""
-_CLEARLY = 1e-4
-"""Share by which the force in a step exceeds that at the samples if they have missed it: states
-inside a step are those of a cubic."""
 _ROUNDINGS = 1e5
 """Bend of the force over `_WIDE` that is more than rounding, in roundings of the force."""
 _LEAST = 1e-9
@@ -42,14 +39,13 @@ def motion(states: Float[Array, "samples n"], place: Float[Array, ""]) -> Float[
 
 class Steps(NamedTuple):
     """Steps of a solver: where they begin and end (mesh periods; inf beyond the last), the states
-    there, how many there are, and which has the greatest mean force."""
+    there, and how many there are."""
 
     begins: Float[Array, " steps"]
     ends: Float[Array, " steps"]
     before: Float[Array, "steps n"]
     after: Float[Array, "steps n"]
     count: Int[Array, ""]
-    strongest: Int[Array, ""]
 
     def motion(self, tau: Float[Array, ""]) -> Float[Array, " n"]:
         """State (scaled) at time `tau` (mesh periods): ε and dε/dτ by the cubic through both at
@@ -76,6 +72,19 @@ class Steps(NamedTuple):
         return k, step, (tau - self.begins[k]) / step
 
 
+def blended(
+    states: Float[Array, "samples n"],
+    steps: Steps,
+    tau: Float[Array, ""],
+    width: Float[Array, ""],
+) -> Float[Array, " n"]:
+    """State at `tau` (mesh periods) from the `states` at times a `width` apart and the `steps`.
+
+    A polynomial through samples to both sides of a corner does not know of it; the steps are short
+    there, and their cubics count where they are as good."""
+    return jnp.where(steps.reaches(tau, width), steps.motion(tau), motion(states, tau / width))
+
+
 def locate_peak(
     pair: RotorPair, states: Float[Array, "samples n"], length: Float[Array, ""], steps: Steps
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -84,57 +93,65 @@ def locate_peak(
 
     An impact's peak can be narrower than the sampling, with a corner where the damping
     saturates: it is enclosed by looking ever more closely around the greatest sample. An impact
-    can also fall between two samples: the same is done in the step of greatest mean force, which
-    counts if the steps are about as close as the samples and it is clearly greater, or if the
+    can also fall between two samples: the same is done around the greatest force at the ends of
+    the steps, which counts if it is greater. Inside a step the state is known less well where that
+    is long; it is looked at there only if the steps are about as close as the samples, or the
     motion can swing between samples.
     """
     samples = states.shape[0]
     width = length / samples
     blocks = -(-samples // _BLOCK)
+    corners = -(-steps.count // _BLOCK)
     spread = jnp.linspace(-1, 1, _BLOCK, dtype=width.dtype)
-    begin, end = steps.begins[steps.strongest], steps.ends[steps.strongest]
+    if pair.pace is None:
+        swings = steps.count > samples
+    else:
+        swings = width * pair.mesh_period > pair.pace.swing
+    inside = swings | (2 * steps.count > samples)
 
     # One loop for all, so that the contact is compiled once.
     def look(i, carry):
-        greatest, best, depth = carry
+        greatest, best, corner, depth = carry
         by_steps = i >= blocks + _ROUNDS
         way = by_steps.astype(int)
-        round_ = i - blocks - way * _ROUNDS
-        block = jnp.minimum(i * _BLOCK + jnp.arange(_BLOCK), samples - 1).astype(width.dtype)
-        reach = (2.0 / (_BLOCK - 1)) ** round_.astype(width.dtype)
-        reach *= jnp.where(by_steps, (end - begin) / (2 * width), 1.0)
-        # Not beyond the step: the force may jump at its ends.
-        first, last = (
+        round_ = i - blocks - way * (_ROUNDS + corners)
+        at_ends = by_steps & (round_ < 0)
+        looking = at_ends | (i < blocks)
+        block = jnp.where(by_steps, round_ + corners, i) * _BLOCK + jnp.arange(_BLOCK)
+        ends = steps.ends[jnp.minimum(block, steps.count - 1)] / width
+        block = jnp.where(by_steps, ends, jnp.minimum(block, samples - 1).astype(width.dtype))
+        # Not beyond the steps to both sides of the end: the force may jump at theirs.
+        first, last = steps.begins[corner], steps.ends[jnp.minimum(corner + 1, steps.count - 1)]
+        reach = (2.0 / (_BLOCK - 1)) ** jnp.maximum(round_, 0).astype(width.dtype)
+        reach *= jnp.where(by_steps, (last - first) / width, 1.0)
+        low, high = (
             jnp.where(by_steps, at / width, limit)
-            for at, limit in ((begin, 0.0), (end, samples - 1.0))
+            for at, limit in ((first, 0.0), (last, samples - 1.0))
         )
-        close = jnp.clip(best[way] + reach * spread, first, last)
-        places = jnp.where(i < blocks, block, close)
+        places = jnp.where(looking, block, jnp.clip(best[way] + reach * spread, low, high))
 
         def contact(place):
-            state = jnp.where(by_steps, steps.motion(place * width), motion(states, place))
-            return pair.contact_at(place * width, state)
+            tau = place * width
+            state = jnp.where(by_steps, steps.motion(tau), blended(states, steps, tau, width))
+            known = ~by_steps | inside | steps.reaches(tau, width)
+            return pair.contact_at(tau, state), known
 
-        found = jax.vmap(contact)(places)
-        top = jnp.argmax(found.total)
-        more = found.total[top] > greatest[way]
-        greatest = greatest.at[way].set(jnp.where(more, found.total[top], greatest[way]))
+        found, known = jax.vmap(contact)(places)
+        force = jnp.where(known, found.total, -jnp.inf)
+        top = jnp.argmax(force)
+        more = force[top] > greatest[way]
+        greatest = greatest.at[way].set(jnp.where(more, force[top], greatest[way]))
         best = best.at[way].set(jnp.where(more, places[top], best[way]))
-        return greatest, best, jnp.maximum(depth, jnp.max(found.depth))
+        here = jnp.minimum((round_ + corners) * _BLOCK + top, steps.count - 1)
+        corner = jnp.where(at_ends & more, here, corner)
+        return greatest, best, corner, jnp.maximum(depth, jnp.max(found.depth))
 
     least = jnp.full_like(width, -jnp.inf)
-    first = jnp.stack([jnp.zeros_like(width), (begin + end) / 2 / width])
-    start = jnp.stack([least, least]), first, least
-    greatest, best, depth = lax.fori_loop(0, blocks + 2 * _ROUNDS, look, start)
-    # Only where the steps are about as close as the samples: a force that jumps is higher in a
-    # step across the jump than it ever is.
-    clearly = (2 * steps.count > samples) & (greatest[1] > (1 + _CLEARLY) * greatest[0])
-    if pair.pace is None:
-        between = steps.count > samples
-    else:
-        between = width * pair.mesh_period > pair.pace.swing
-    missed = clearly | between
-    return jnp.where(missed, best[1], best[0]) * width, depth
+    nothing = jnp.zeros_like(width)
+    start = jnp.stack([least, least]), jnp.stack([nothing, nothing]), jnp.zeros((), int), least
+    turns = blocks + 2 * _ROUNDS + corners
+    greatest, best, _, depth = lax.fori_loop(0, turns, look, start)
+    return jnp.where(greatest[1] > greatest[0], best[1], best[0]) * width, depth
 
 
 def one_sided(forces: Float[Array, "7"]) -> tuple[Float[Array, ""], Float[Array, "7"]]:

@@ -54,6 +54,9 @@ _DRIFT = 1e-9, 1e-5
 """Distance (scaled) that an orbit may have moved from where its kinks were looked for: a thousand
 times its tolerance, but within these. The kinks lie that far outside their steps, which costs
 accuracy in first order."""
+_STRAIN, _STRAINED = 10.0, 100.0
+"""Error of a repeated step, in tolerances, with which the steps are chosen anew; and with which an
+orbit on them is none."""
 _SMALL = 1e-9, 1e-3
 """Newton step (scaled) from which on the solver's steps are kept: a thousand times its
 tolerance, but within these."""
@@ -163,10 +166,10 @@ def judged(
     """Whether an orbit is the stable motion that a transient led to, both integrated at `rtols`
     (transient, orbit).
 
-    It is closed to a `residual`, its Floquet multipliers lie inside the unit circle, errors of the
-    size of its tolerance do not add up to anything in it (I - M is far enough from singular), and
-    it is beside the `state` that repeated `within` some distance (all scaled, and relative to
-    states beyond 1).
+    It is closed to a `residual` on steps that a solver would have taken, its Floquet multipliers
+    lie inside the unit circle, errors of the size of its tolerance do not add up to anything in it
+    (I - M is far enough from singular), and it is beside the `state` that repeated `within` some
+    distance (all scaled, and relative to states beyond 1).
     """
     size = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.state)))
     multiplier = orbit.multiplier
@@ -175,7 +178,7 @@ def judged(
     noise = _NOISE * jnp.maximum(*rtols) * size
     near = 10 * within / jnp.maximum(1 - multiplier, 1e-3) + noise
     moved = jnp.max(jnp.abs(orbit.state - state))
-    closed = orbit.residual <= residual * size
+    closed = (orbit.residual <= residual * size) & (orbit.flow.strain <= _STRAINED)
     return closed & (multiplier < 1) & (gain * rtols[1] < _UNKNOWN) & (moved <= near)
 
 
@@ -346,6 +349,9 @@ def close_orbit(
         stalled = repeat & ~improving & (residual > closed) & (looks < _LOOKS)
         drift = jnp.max(jnp.abs(state - looked))
         strayed = repeat & (residual <= closed) & (drift > far) & (looks < _LOOKS)
+        strained = repeat & (residual <= closed) & ~(out.strain <= _STRAIN) & (looks < _LOOKS)
+        # Steps of a solver that did not get through are none to be repeated.
+        following &= ~strained & (out.solved | repeat)
         look = following & (~repeat | stalled | strayed)
         orbit = orbit._replace(
             state=state, flow=out, residual=residual, monodromy=monodromy, newton_steps=done
@@ -359,7 +365,8 @@ def close_orbit(
         best = jnp.where(look | ~repeat, jnp.inf, jnp.minimum(best, residual))
         looks += look
         looked = jnp.where(look, state, looked)
-        return orbit, new, following, repeat & ~strayed, improving | look, grid, best, looks, looked
+        held = repeat & ~strayed & ~strained
+        return orbit, new, following, held, improving | look, grid, best, looks, looked
 
     # The loop holds the only copy of the integration: one shot is compiled, not two.
     infinite = jnp.asarray(jnp.inf, dtype)

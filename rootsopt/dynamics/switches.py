@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.peak import Steps, motion
+from rootsopt.dynamics.peak import Steps, blended
 
 _LOOKS, _LONGEST = 252, 8
 """Places in a mesh period where changes are looked for, beside the ends of the steps, and mesh
@@ -27,7 +27,7 @@ _BRIEF, _PARTS = 0.05, 8
 _ASIDE = 1e-9, 1e-6
 """Half a step (mesh periods) that holds a change: so many times the tolerance of the motion as
 `_LOOSE`, but within these. What it does to the gradients is in proportion to it."""
-_LOOSE = 1e3
+_LOOSE = 10.0
 _SHARE = 1e-2
 """The same as a share of the time to the next change, at most."""
 _APART = 1e-10
@@ -43,7 +43,7 @@ def with_switches(
     before = jnp.concatenate([out.states[:1], out.corners[:-1]])
     begins = jnp.concatenate([jnp.zeros_like(out.grid[:1]), out.grid[:-1]])
     taken = jnp.sum(out.grid < jnp.inf)
-    steps = Steps(begins, out.grid, before, out.corners, taken, taken)
+    steps = Steps(begins, out.grid, before, out.corners, taken)
     even = jnp.arange(_LONGEST * _LOOKS, dtype=width.dtype) / _LOOKS
     places = jnp.sort(jnp.concatenate([jnp.where(even < periods, even, jnp.inf), out.grid]))
     known = jnp.sum(places < jnp.inf)
@@ -51,11 +51,7 @@ def with_switches(
     lanes = jnp.arange(_LANES)
 
     def flags(tau):
-        # A polynomial through samples to both sides of a change does not know of it; the steps
-        # are short there.
-        near = steps.reaches(tau, width)
-        state = jnp.where(near, steps.motion(tau), motion(out.states, tau / width))
-        return pair.switches(tau, state)
+        return pair.switches(tau, blended(out.states, steps, tau, width))
 
     def changes(seen, counts):
         """Where switches change that count on either side: how many, and of each the switch, its
