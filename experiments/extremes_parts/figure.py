@@ -15,6 +15,7 @@ COLOURS = {
     "passed_through": "#F0E442",
     "too_deep": "#E69F00",
     "unresolved": "#CC79A7",
+    "stalled": "#009E73",
     "solver_failed": "#D55E00",
     "non_finite": "#000000",
 }
@@ -74,7 +75,7 @@ def draw(rows: list[dict[str, Any]], allowed: float, single: float, path: Path) 
     ax.set_xlabel("tolerance (single precision: the finest it holds)", fontsize=8)
     ax.set_ylabel("relative deviation of mean or peak force", fontsize=8)
     ax.set_title(f"deviation from the reference ({len(judged)} scenes)", fontsize=9)
-    ax.legend(fontsize=5.5)
+    ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.02, 0.5), frameon=False)
     ax.grid(alpha=0.3)
     for ax in axes[len(groups) + 1 :]:
         ax.axis("off")
