@@ -75,7 +75,12 @@ def draw(rows: list[dict[str, Any]], allowed: float, single: float, path: Path) 
     ax.set_xlabel("tolerance (single precision: the finest it holds)", fontsize=8)
     ax.set_ylabel("relative deviation of mean or peak force", fontsize=8)
     ax.set_title(f"deviation from the reference ({len(judged)} scenes)", fontsize=9)
-    ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.02, 0.5), frameon=False)
+    # Beside the panel, where there is one left empty.
+    handles, labels = ax.get_legend_handles_labels()
+    for free in axes[len(groups) + 1 : len(groups) + 2]:
+        free.legend(handles, labels, fontsize=8, loc="center left", frameon=False)
+    if len(axes) == len(groups) + 1:
+        ax.legend(fontsize=5.5)
     ax.grid(alpha=0.3)
     for ax in axes[len(groups) + 1 :]:
         ax.axis("off")
