@@ -231,6 +231,7 @@ def refine(case: Case) -> None:
     period = np.asarray(case.row["period"])
     orbit = jax.device_get(_sharp(model, design, case.state, period))
     closed = bool(orbit.flow.solved) and float(orbit.residual) < 1e-9
+    closed = closed and float(orbit.flow.strain) < 100
     state, numbers = orbit.state, orbit.response[:3]
     if not closed:
         out, state = jax.device_get(_patient(model, design, case.state, period))

@@ -10,6 +10,8 @@ come from a potential. The error is of second order in ε over the smooth stretc
 grows towards a tip arc centred on the pitch circle, which all meshes at one instant.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -26,6 +28,8 @@ class LinearContact(eqx.Module):
     both rotors' profile.
     """
 
+    smooth: ClassVar[bool] = False
+    """Its levers jump, which no switch tells."""
     profile: Profile
 
     @classmethod

@@ -15,6 +15,8 @@ With a = x + ε/2 for rotor 1 and a = π/N - x + ε/2 for rotor 2, a point z of 
 E the centre distance: exchanging the rotors exchanges a and a′, nothing else.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -46,6 +48,8 @@ class NodeContact(eqx.Module):
     little more is kept and of rotor 2 its mate: the rest of the mesh follows by exchange.
     """
 
+    smooth: ClassVar[bool] = False
+    """Its levers jump, which no switch tells."""
     nodes: Float[Array, "2 n 2"]
     tangent: Float[Array, "2 n 2"]
     normal: Float[Array, "2 n-1 2"]

@@ -111,7 +111,8 @@ class Flow(NamedTuple):
     at the sampled times; `states` at uniform times, endpoint excluded; `grid`: ends
     of the steps taken (mesh periods), inf beyond the last, and `corners` the states there; `steps`:
     accepted and rejected solver steps; `solved`; `strain`: greatest error estimate of a repeated
-    step, in tolerances; `others`: the values of `Measures` beside mean and mean square.
+    step, in tolerances (0 where the contact is not `RotorPair.smooth`); `others`: the values of
+    `Measures` beside mean and mean square.
     `slope`: derivatives of (end, mean, mean_square, peak, others) in the initial state (n columns)
     and along the directions that were asked for (d more), or no columns at all.
     """
@@ -419,7 +420,7 @@ def flow(
         corners=steps.after,
         steps=solution.stats["num_steps"],
         solved=solution.result == diffrax.RESULTS.successful,
-        strain=jnp.where(repeated, lax.stop_gradient(strain), 0.0),
+        strain=jnp.where(repeated & pair.smooth, lax.stop_gradient(strain), 0.0),
         others=averages[2:],
         slope=slope,
     )

@@ -169,6 +169,11 @@ class RotorPair(eqx.Module):
         return jnp.pi / (8 * self.lobes)
 
     @property
+    def smooth(self) -> bool:
+        """Whether the equation is smooth between its `switches`."""
+        return getattr(self.contact, "smooth", True)
+
+    @property
     def jumps(self) -> bool:
         """Whether the contact force may jump where no other part does."""
         return isinstance(self.contact, SearchContact) and self.contact.jumps

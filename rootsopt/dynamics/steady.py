@@ -351,7 +351,7 @@ def close_orbit(
         strayed = repeat & (residual <= closed) & (drift > far) & (looks < _LOOKS)
         strained = repeat & (residual <= closed) & ~(out.strain <= _STRAIN) & (looks < _LOOKS)
         # Steps of a solver that did not get through are none to be repeated.
-        following &= ~strained & (out.solved | repeat)
+        following &= ~strained & (out.solved | repeat | ~jnp.all(jnp.isfinite(state)))
         look = following & (~repeat | stalled | strayed)
         orbit = orbit._replace(
             state=state, flow=out, residual=residual, monodromy=monodromy, newton_steps=done

@@ -27,7 +27,7 @@ _BRIEF, _PARTS = 0.05, 8
 _ASIDE = 1e-9, 1e-6
 """Half a step (mesh periods) that holds a change: so many times the tolerance of the motion as
 `_LOOSE`, but within these. What it does to the gradients is in proportion to it."""
-_LOOSE = 10.0
+_LOOSE = 1e3
 _SHARE = 1e-2
 """The same as a share of the time to the next change, at most."""
 _APART = 1e-10
