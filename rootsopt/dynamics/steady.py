@@ -57,6 +57,8 @@ accuracy in first order."""
 _STRAIN, _STRAINED = 10.0, 100.0
 """Error of a repeated step, in tolerances, with which the steps are chosen anew; and with which an
 orbit on them is none."""
+_AFTER = 3
+"""Integrations that must be left, for that."""
 _SMALL = 1e-9, 1e-3
 """Newton step (scaled) from which on the solver's steps are kept: a thousand times its
 tolerance, but within these."""
@@ -348,8 +350,10 @@ def close_orbit(
         # Kinks are looked for again where the motion has moved them out of their steps.
         stalled = repeat & ~improving & (residual > closed) & (looks < _LOOKS)
         drift = jnp.max(jnp.abs(state - looked))
-        strayed = repeat & (residual <= closed) & (drift > far) & (looks < _LOOKS)
-        strained = repeat & (residual <= closed) & ~(out.strain <= _STRAIN) & (looks < _LOOKS)
+        again = repeat & (residual <= closed) & (looks < _LOOKS) & (done + _AFTER <= shots)
+        # A jump that no switch tells stays where the steps have it.
+        strayed = again & (drift > far) & pair.smooth
+        strained = again & ~(out.strain <= _STRAIN)
         # Steps of a solver that did not get through are none to be repeated.
         following &= ~strained & (out.solved | repeat | ~jnp.all(jnp.isfinite(state)))
         look = following & (~repeat | stalled | strayed)
