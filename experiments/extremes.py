@@ -1,14 +1,14 @@
 """Where solvers and precisions hold: scenes at and between the limits of every key.
 
-    python experiments/extremes.py [-o DIR] [--quick] [--jobs 3]
+    python experiments/extremes.py [-o DIR] [--quick] [--jobs 2]
 
 1. Law: force and derivatives of every scene's contact law from no penetration to far beyond any,
    and the equation of motion with its derivatives in state and design, must be finite in either
    precision.
 2. Motion: every scene is simulated from rest and must end in a finite result or in a named status.
 3. Truth: a sample of those that ended periodic is closed again from the same state by dopri8 at
-   1e-12 in double precision, and by SciPy's DOP853 along that orbit. The
-   relative deviation of mean and peak force must be below `ALLOWED` times the tolerance.
+   1e-12 in double precision, and by SciPy's DOP853 along that orbit. The relative deviation of
+   mean and peak force must be below `ALLOWED` times the tolerance.
 4. Public path: a sample goes through `Evaluator` from config to record, some with up to 1000
    revolutions.
 

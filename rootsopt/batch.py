@@ -19,19 +19,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.steady import (
-    RESIDUAL,
-    TOO_DEEP,
-    UNRESOLVED,
     close_orbit,
     settle,
     settled_within,
-    verdict,
 )
+from rootsopt.dynamics.verdict import RESIDUAL, TOO_DEEP, UNRESOLVED, verdict
 from rootsopt.model import Model
 from rootsopt.programs import Program
 from rootsopt.status import Status
 
 _SHOTS = 8
+"""Integrations that closing an orbit may take."""
 SAMPLES = 840
 """Uniform samples of an orbit, among which the peak is looked for; divisible by all
 periods up to eight."""

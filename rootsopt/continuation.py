@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from rootsopt.arclength import End, Path, Spot, Steps, StoppedError, corrected, follow_curve
 from rootsopt.config import Config
-from rootsopt.dynamics.steady import RESIDUAL
+from rootsopt.dynamics.verdict import RESIDUAL
 from rootsopt.errors import InputError
 from rootsopt.orbits import (
     LONGEST,

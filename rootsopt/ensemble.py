@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config, EnsembleConfig
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import TOO_DEEP
+from rootsopt.dynamics.verdict import TOO_DEEP
 from rootsopt.evaluate import (
     CHAOS_WINDOW,
     RESPONSES,

@@ -20,20 +20,16 @@ from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import (
     BLOCK,
-    RESIDUAL,
     SAMPLES,
-    TOO_DEEP,
-    UNRESOLVED,
     Orbit,
     Transient,
-    Verdict,
     close_orbit,
     lyapunov,
     reverse_sensitivity,
     settle,
     settled_within,
-    verdict,
 )
+from rootsopt.dynamics.verdict import RESIDUAL, TOO_DEEP, UNRESOLVED, Verdict, verdict
 from rootsopt.errors import InputError
 from rootsopt.model import MM, Model, design_keys, design_vector, integrators, measures
 from rootsopt.profiles import Geometry

@@ -20,8 +20,9 @@ from rootsopt.arclength import End, Look, Spot, Steps, StoppedError, corrected
 from rootsopt.config import DESIGN_KEYS, Config, parse
 from rootsopt.dynamics.flow import Flow, Integrator, flow
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import RESIDUAL, SAMPLES, TOO_DEEP
+from rootsopt.dynamics.steady import SAMPLES
 from rootsopt.dynamics.switches import with_switches
+from rootsopt.dynamics.verdict import RESIDUAL, TOO_DEEP
 from rootsopt.errors import InputError
 from rootsopt.model import MM, Model, check_geometry, design_keys, integrators
 from rootsopt.programs import Program

@@ -17,7 +17,8 @@ from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pace import Pace
 from rootsopt.dynamics.parts import TimingGear
 from rootsopt.dynamics.peak import Steps, locate_peak
-from rootsopt.dynamics.steady import Orbit, force_rounding, is_consistent, is_idle, judged
+from rootsopt.dynamics.steady import Orbit
+from rootsopt.dynamics.verdict import force_rounding, is_consistent, is_idle, judged
 from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluator
 from rootsopt.model import Model, check_geometry, design_vector
@@ -194,10 +195,12 @@ def test_impact_between_the_samples_is_found():
 # What counts as a result
 
 
-def orbit_of(multipliers=(0.5, 0.1), size=1.0, residual=0.0, peak=1.0, depth=1e-5, mean=1.0):
+def orbit_of(
+    multipliers=(0.5, 0.1), size=1.0, residual=0.0, peak=1.0, depth=1e-5, mean=1.0, strain=1.0
+):
     """A closed orbit with a diagonal monodromy matrix and little else."""
     none = Flow.empty(2, 0, 1, 1, Measures(), np.dtype(float))
-    numbers = {"mean": mean, "peak": peak, "depth": depth}
+    numbers = {"mean": mean, "peak": peak, "depth": depth, "strain": strain}
     flow = none._replace(**{k: jnp.asarray(v) for k, v in numbers.items()})
     return Orbit(
         state=jnp.array([size, 0.0]),
@@ -226,6 +229,13 @@ def test_an_orbit_that_multiplies_errors_is_none():
     assert not accepted(near, 1e-3)
     assert accepted(orbit_of(), 1e-3)
     assert not accepted(orbit_of((1.01, 0.1)))
+
+
+def test_an_orbit_on_steps_no_solver_would_take_is_none():
+    """However well it is closed on them; nor one whose error is not a number."""
+    assert accepted(orbit_of(strain=50.0))
+    assert not accepted(orbit_of(strain=200.0))
+    assert not accepted(orbit_of(strain=np.nan))
 
 
 def test_distances_are_relative_to_large_states():

@@ -15,7 +15,8 @@ from experiments.extremes_parts.scenes import Kind, stacked
 from rootsopt.batch import STATUSES, respond
 from rootsopt.config import Config
 from rootsopt.dynamics.flow import Integrator, flow, strobe
-from rootsopt.dynamics.steady import close_orbit, force_rounding, no_tangents
+from rootsopt.dynamics.steady import close_orbit, no_tangents
+from rootsopt.dynamics.verdict import force_rounding
 from rootsopt.evaluate import Evaluator
 from rootsopt.model import Model, design_vector
 from rootsopt.programs import Program
@@ -231,7 +232,7 @@ def refine(case: Case) -> None:
     period = np.asarray(case.row["period"])
     orbit = jax.device_get(_sharp(model, design, case.state, period))
     closed = bool(orbit.flow.solved) and float(orbit.residual) < 1e-9
-    closed = closed and float(orbit.flow.strain) < 100
+    closed = closed and float(orbit.flow.strain) < 100.0  # Steps a solver would have taken.
     state, numbers = orbit.state, orbit.response[:3]
     if not closed:
         out, state = jax.device_get(_patient(model, design, case.state, period))
