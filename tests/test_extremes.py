@@ -11,14 +11,14 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from rootsopt.config import load
-from rootsopt.contact.impact import ImpactLaw
+from rootsopt.contact.impact import ImpactLaw, force_rounding
 from rootsopt.dynamics.flow import Flow, Integrator, first_step
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pace import Pace
 from rootsopt.dynamics.parts import TimingGear
 from rootsopt.dynamics.peak import Steps, locate_peak
 from rootsopt.dynamics.steady import Orbit
-from rootsopt.dynamics.verdict import force_rounding, is_consistent, is_idle, judged
+from rootsopt.dynamics.verdict import is_consistent, is_idle, judged
 from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluator
 from rootsopt.model import Model, check_geometry, design_vector
@@ -149,6 +149,8 @@ def test_steps_follow_the_scene(speed, stiffness):
 
 def test_motion_inside_a_step_is_a_cubic():
     """Between the ends of the steps, ε and its rate are those of any cubic motion."""
+    config = config_of(solver__fidelity="linear")
+    pair = pair_of(Model.of(config), design_vector(config))
     ends = np.array([0.1, 0.4, 0.45, np.inf])
     begins = np.array([0.0, 0.1, 0.4, 0.45])
 
@@ -159,7 +161,7 @@ def test_motion_inside_a_step_is_a_cubic():
         before, after = cubic(begins), cubic(ends)
     steps = Steps(*map(jnp.asarray, (begins, ends, before, after, 3)))
     for tau in (0.0, 0.03, 0.1, 0.25, 0.41, 0.45):
-        np.testing.assert_allclose(steps.motion(jnp.asarray(tau)), cubic(tau), rtol=1e-12)
+        np.testing.assert_allclose(steps.motion(pair, jnp.asarray(tau)), cubic(tau), rtol=1e-12)
 
 
 @jax.jit
@@ -190,6 +192,26 @@ def test_impact_between_the_samples_is_found():
     deepest = pair.contact_at(jnp.asarray(middle), jnp.asarray(motion(middle)))
     assert float(deepest.drive) > 0
     assert float(depth) == pytest.approx(float(deepest.depth), rel=1e-3)
+
+
+def test_the_greatest_sample_need_not_lie_by_the_greatest_peak():
+    """The deeper of two dips has its bottom half way between two samples, the other on one."""
+    config = config_of(solver__fidelity="linear", contact__max_damping_N_s_per_mm=0)
+    pair = pair_of(Model.of(config), design_vector(config))
+    bottoms, depths, width = np.array([[20 / 60], [42.5 / 60]]), [[0.5], [0.501]], 0.02
+
+    def motion(tau):
+        bumps = depths * np.exp(-(((tau - bottoms) / width) ** 2))
+        rates = 2 * (tau - bottoms) / width**2 * bumps
+        return np.stack([0.05 - bumps.sum(axis=0), rates.sum(axis=0)], axis=-1)
+
+    samples = motion(np.arange(60) / 60)
+    assert np.argmin(samples[:, 0]) == 20
+    edges = np.linspace(0, 1, 8)
+    begins, ends = edges[:-1], edges[1:]
+    steps = Steps(begins, ends, motion(begins), motion(ends), np.array(len(ends)))
+    time, _ = peak_of(pair, jnp.asarray(samples), jax.tree.map(jnp.asarray, steps))
+    assert float(time) == pytest.approx(42.5 / 60, abs=1e-3)
 
 
 # What counts as a result
@@ -250,12 +272,11 @@ def test_rounding_of_the_gap():
     """The gap is known to a rounding of the pitch radius, and the force is a power of it."""
     radius, exponent = jnp.asarray(0.033), jnp.asarray(2.0)
     eps = np.finfo(float).eps
-    found = float(force_rounding(orbit_of(depth=1e-9), exponent, radius))
+    found = float(force_rounding(jnp.asarray(1e-9), exponent, radius))
     assert found == pytest.approx(2 * eps * 0.033 / 1e-9)
-    single = orbit_of(depth=np.float32(1e-7))
-    found = float(force_rounding(single, exponent, radius))
+    found = float(force_rounding(jnp.asarray(1e-7, np.float32), exponent, radius))
     assert found == pytest.approx(2 * np.finfo(np.float32).eps * 0.033 / 1e-7, rel=1e-6)
-    assert float(force_rounding(orbit_of(peak=0.0, depth=-0.03), exponent, radius)) == 0
+    assert float(force_rounding(jnp.asarray(-0.03), exponent, radius)) == 0
 
 
 def test_mean_rms_and_peak_must_not_contradict_each_other():

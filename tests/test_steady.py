@@ -346,8 +346,8 @@ def test_weights_of_a_peak():
     found although the instant is a little beside it; a jump: its higher side."""
     times = np.array(BESIDE)
 
-    def weights(force):
-        value, found = one_sided(jnp.asarray(force(times)))
+    def weights(force, noise=0.0):
+        value, found = one_sided(jnp.asarray(force(times)), noise)
         assert np.sum(found) == pytest.approx(1)
         return float(value), np.asarray(found)
 
@@ -362,6 +362,10 @@ def test_weights_of_a_peak():
     value, found = weights(lambda t: 3 - 1e-9 * (t - 300) ** 2)
     assert value == pytest.approx(3, rel=1e-12)
     assert found @ (5 + 2 * times) == pytest.approx(605, rel=1e-6)
+    # Noise is no bend either, where it is known.
+    noise = 3e-7 * np.array([0, 1, -1, -1, 1, 0, 0])
+    value, found = weights(lambda t: 3 - 1e-9 * (t - 0.3) ** 2 + noise, 1e-7)
+    assert found @ (5 + 2 * times) == pytest.approx(5.6, rel=1e-4)
     # A jump away from the peak is no bend.
     value, found = weights(lambda t: np.where(t > -30, 4.0, 1.0))
     assert value == 4

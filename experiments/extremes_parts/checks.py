@@ -14,9 +14,9 @@ from scipy.integrate import solve_ivp
 from experiments.extremes_parts.scenes import Kind, stacked
 from rootsopt.batch import STATUSES, respond
 from rootsopt.config import Config
+from rootsopt.contact.impact import force_rounding
 from rootsopt.dynamics.flow import Integrator, flow, strobe
 from rootsopt.dynamics.steady import close_orbit, no_tangents
-from rootsopt.dynamics.verdict import force_rounding
 from rootsopt.evaluate import Evaluator
 from rootsopt.model import Model, design_vector
 from rootsopt.programs import Program
@@ -246,7 +246,8 @@ def refine(case: Case) -> None:
     allowed = ALLOWED * max(case.config.solver.rtol, CORNER)
     if case.kind.precision == "float32":
         # Of the reference's gap in double; single rounds 2^29 times as coarsely.
-        rounding = 2**29 * float(force_rounding(orbit, model.law.exponent, model.pitch_radius))
+        depth, law = jnp.asarray(orbit.flow.depth), model.law
+        rounding = 2**29 * float(force_rounding(depth, law.exponent, model.pitch_radius))
         allowed = ALLOWED * max(case.config.solver.rtol, SINGLE) + 5 * rounding
     case.row |= {
         "reference": "closed" if closed else "not closed",

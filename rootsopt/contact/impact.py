@@ -31,6 +31,18 @@ def smooth_step(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return t**2 * (3 - 2 * t)
 
 
+def force_rounding(
+    depth: Float[Array, ""], exponent: Float[Array, ""], radius: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Relative error by rounding alone of the force at a `depth` (m); 0 without contact.
+
+    The gap is the difference of lengths of the size of the pitch `radius` (m), so it is known to
+    a rounding of that, and the force is a power of it with the law's `exponent`.
+    """
+    deep = jnp.where(depth > 0, depth, jnp.inf)
+    return exponent * float(jnp.finfo(depth.dtype).eps) * radius / deep
+
+
 class ImpactLaw(eqx.Module):
     """IMPACT contact force between two flanks (SI units).
 

@@ -366,6 +366,7 @@ def flow(
     duration = end[-1] if pair.drive.free else periods
     raw = end[count : count + measures.count] / duration
     averages, factors = measures.values(raw, force_unit, top)
+    noise = lax.stop_gradient(pair.rounding(depth))
     sides = BESIDE_UNIT[dtype.itemsize] * jnp.asarray(BESIDE, dtype)
 
     def state_and_force(begin, end, y, dynamic):
@@ -380,7 +381,7 @@ def flow(
 
         forces = jax.vmap(force_beside)(sides)
         frozen = lax.stop_gradient(forces)
-        peak, weights = one_sided(frozen)
+        peak, weights = one_sided(frozen, noise)
         peak += jnp.dot(weights, forces - frozen)
         slope = jnp.zeros((count + 1 + measures.count, 0), dtype)
     else:
@@ -401,7 +402,7 @@ def flow(
         along, there, beside = propagated(linear_step, unit, last, holds, len(BESIDE))
         slopes = jax.vmap(Linear.after, (0, None))(beside, there)[:, -1]
         forces = beside.value[:, -1]
-        peak, weights = one_sided(forces)
+        peak, weights = one_sided(forces, noise)
         changes = along[count : count + measures.count]
         if pair.drive.free:
             changes = changes - raw[:, None] * along[-1]

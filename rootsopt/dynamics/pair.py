@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from rootsopt.contact.closest import ClosestApproach, FlankPair
-from rootsopt.contact.impact import ImpactLaw
+from rootsopt.contact.impact import ImpactLaw, force_rounding
 from rootsopt.contact.point import ContactPoint, contact_point
 from rootsopt.dynamics.pace import Pace
 from rootsopt.dynamics.parts import (
@@ -177,6 +177,12 @@ class RotorPair(eqx.Module):
     def jumps(self) -> bool:
         """Whether the contact force may jump where no other part does."""
         return isinstance(self.contact, SearchContact) and self.contact.jumps
+
+    def rounding(self, depth: Float[Array, ""]) -> Float[Array, ""]:
+        """Relative error of the force at a `depth` (m) that a search found, by rounding alone."""
+        if not isinstance(self.contact, SearchContact):
+            return jnp.zeros_like(depth)
+        return force_rounding(depth, self.law.exponent, self.contact.pair.center_distance / 2)
 
     def speed(self, state: Float[Array, "*k n"]) -> Float[Array, "*#k"]:
         """Angular speed of rotor 1 (rad/s) in a scaled state."""

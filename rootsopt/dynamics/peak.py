@@ -9,10 +9,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.pair import RotorPair
 
-_BLOCK = 63
-"""Places looked at together."""
-_ROUNDS = 6
-"""Times the neighbourhood of the greatest force is looked at more closely."""
+_RIVALS, _CLOSER, _ROUNDS = 4, 16, 10
+"""Maxima of samples and of ends of steps whose neighbourhoods are looked at, places in each, and
+how many times ever more closely."""
+_INNER = 2 * _RIVALS * _CLOSER - 2
+"""Samples or ends looked at together: as many places, less one beside them to either side."""
 _WIDE = 64
 BESIDE = (0.0, -1.0, -2.0, 1.0, 2.0, -_WIDE, _WIDE)
 """Times just before and after a peak, in units of `BESIDE_UNIT`."""
@@ -23,18 +24,54 @@ _FARTHEST = {8: 32.0, 4: 1 / 16}
 states between the samples bend, the peak is located no better than to some 1e-5."""
 _ROUNDINGS = 1e5
 """Bend of the force over `_WIDE` that is more than rounding, in roundings of the force."""
+_NOISES = 10.0
+"""The same in times the noise of the force, and scatter of the forces beside a smooth peak."""
 _LEAST = 1e-9
 """Fall of the force beside a corner, relative to it; what is less may be rounding."""
 
 
-def motion(states: Float[Array, "samples n"], place: Float[Array, ""]) -> Float[Array, "n"]:
-    """State at a `place` counted in samples: the quartic through the five nearest."""
+def motion(
+    pair: RotorPair,
+    states: Float[Array, "samples n"],
+    place: Float[Array, ""],
+    width: Float[Array, ""],
+) -> Float[Array, " n"]:
+    """State at a `place` counted in samples, a `width` apart (mesh periods): ε by the quintic
+    through the three nearest and their rates, others by the quartic through the five nearest."""
     middle = jnp.clip(jnp.round(place).astype(int), 2, states.shape[0] - 3)
     near = lax.dynamic_slice_in_dim(states, middle - 2, 5)
-    x = place - middle - jnp.arange(-2, 3, dtype=place.dtype)
-    others = jnp.where(jnp.eye(5, dtype=bool), 1.0, x)
+    three = near[1:4]
+    rates = width * _slope(pair, three)
+
+    def quintic(x):
+        right, left = (x * (1 + x) / 2) ** 2, (x * (1 - x) / 2) ** 2
+        values = jnp.stack([left * (4 + 3 * x), (1 - x * x) ** 2, right * (4 - 3 * x)])
+        slopes = jnp.stack([left * (1 + x), x * (1 - x * x) ** 2, right * (x - 1)])
+        return jnp.dot(values, three[:, 0]) + jnp.dot(slopes, rates)
+
+    x = place - middle
+    swing, rise = jax.jvp(quintic, (x,), (jnp.ones_like(x),))
+    nodes = x - jnp.arange(-2, 3, dtype=place.dtype)
+    others = jnp.where(jnp.eye(5, dtype=bool), 1.0, nodes)
     factors = jnp.asarray([24.0, -6.0, 4.0, -6.0, 24.0], place.dtype)
-    return jnp.sum((jnp.prod(others, axis=1) / factors)[:, None] * near, axis=0)
+    rest = jnp.sum((jnp.prod(others, axis=1) / factors)[:, None] * near[:, 2:], axis=0)
+    return _state(pair, swing, rise / width, rest)
+
+
+def _slope(pair: RotorPair, states: Float[Array, "*k n"]) -> Float[Array, "*k"]:
+    """dε/dτ (scaled) at scaled states."""
+    return states[..., 1] * pair.lapse(states) if pair.drive.free else states[..., 1]
+
+
+def _state(
+    pair: RotorPair,
+    swing: Float[Array, ""],
+    slope: Float[Array, ""],
+    others: Float[Array, " m"],
+) -> Float[Array, " n"]:
+    """The scaled state with this ε and dε/dτ."""
+    state = jnp.concatenate([jnp.stack([swing, slope]), others])
+    return state.at[1].divide(pair.lapse(state)) if pair.drive.free else state
 
 
 class Steps(NamedTuple):
@@ -47,17 +84,17 @@ class Steps(NamedTuple):
     after: Float[Array, "steps n"]
     count: Int[Array, ""]
 
-    def motion(self, tau: Float[Array, ""]) -> Float[Array, " n"]:
+    def motion(self, pair: RotorPair, tau: Float[Array, ""]) -> Float[Array, " n"]:
         """State (scaled) at time `tau` (mesh periods): ε and dε/dτ by the cubic through both at
         the ends of the step, others in proportion."""
         k, step, x = self._place(tau)
-        (start, rate), (end, last) = self.before[k, :2], self.after[k, :2]
-        rise = end - start
-        bend, twist = 3 * rise - step * (2 * rate + last), step * (rate + last) - 2 * rise
-        place = start + x * (step * rate + x * (bend + x * twist))
-        swing = jnp.stack([place, rate + x * (2 * bend + 3 * x * twist) / step])
-        others = (1 - x) * self.before[k, 2:] + x * self.after[k, 2:]
-        return jnp.concatenate([swing, others])
+        before, after = self.before[k], self.after[k]
+        rate, last = step * _slope(pair, jnp.stack([before, after]))
+        rise = after[0] - before[0]
+        bend, twist = 3 * rise - 2 * rate - last, rate + last - 2 * rise
+        swing = before[0] + x * (rate + x * (bend + x * twist))
+        slope = (rate + x * (2 * bend + 3 * x * twist)) / step
+        return _state(pair, swing, slope, (1 - x) * before[2:] + x * after[2:])
 
     def reaches(self, tau: Float[Array, ""], width: Float[Array, ""]) -> Bool[Array, ""]:
         """Whether that cubic is at `tau` as good as a polynomial through samples a `width` apart:
@@ -73,6 +110,7 @@ class Steps(NamedTuple):
 
 
 def blended(
+    pair: RotorPair,
     states: Float[Array, "samples n"],
     steps: Steps,
     tau: Float[Array, ""],
@@ -82,7 +120,8 @@ def blended(
 
     A polynomial through samples to both sides of a corner does not know of it; the steps are short
     there, and their cubics count where they are as good."""
-    return jnp.where(steps.reaches(tau, width), steps.motion(tau), motion(states, tau / width))
+    sampled = motion(pair, states, tau / width, width)
+    return jnp.where(steps.reaches(tau, width), steps.motion(pair, tau), sampled)
 
 
 def locate_peak(
@@ -92,71 +131,72 @@ def locate_peak(
     from the `states` at uniform times over `length` mesh periods and the `steps` of the solver.
 
     An impact's peak can be narrower than the sampling, with a corner where the damping
-    saturates: it is enclosed by looking ever more closely around the greatest sample. An impact
-    can also fall between two samples: the same is done around the greatest force at the ends of
-    the steps, which counts if it is greater. Inside a step the state is known less well where that
-    is long; it is looked at there only if the steps are about as close as the samples, or the
-    motion can swing between samples.
+    saturates: the greatest of the samples' maxima are enclosed by looking ever more closely around
+    each, as the greatest sample need not lie by the greatest peak. An impact can also fall between
+    two samples: the same is done around the maxima at the ends of the steps. Inside a step the
+    state is known less well where that is long; it is looked at there only if the steps are about
+    as close as the samples, or the motion can swing between samples.
     """
-    samples = states.shape[0]
-    width = length / samples
-    blocks = -(-samples // _BLOCK)
-    corners = -(-steps.count // _BLOCK)
-    spread = jnp.linspace(-1, 1, _BLOCK, dtype=width.dtype)
-    if pair.pace is None:
-        swings = steps.count > samples
-    else:
-        swings = width * pair.mesh_period > pair.pace.swing
-    inside = swings | (2 * steps.count > samples)
+    last = jnp.stack([jnp.asarray(states.shape[0]), steps.count]) - 1  # of samples, of steps
+    width = length / states.shape[0]
+    scans, by_ends = -(-(last + 1) // _INNER)
+    inside = 2 * last[1] > last[0]
+    if pair.pace is not None:
+        inside |= width * pair.mesh_period > pair.pace.swing
+    spread = jnp.linspace(-1, 1, _CLOSER, dtype=width.dtype)
+    by_steps = jnp.repeat(jnp.arange(2), _RIVALS * _CLOSER)
 
-    # One loop for all, so that the contact is compiled once.
+    def contact(place, by_steps):
+        tau = place * width
+        at_step = steps.motion(pair, tau)
+        state = jnp.where(by_steps, at_step, blended(pair, states, steps, tau, width))
+        found = pair.contact_at(tau, state)
+        known = ~by_steps | inside | steps.reaches(tau, width)
+        return jnp.where(known, found.total, -jnp.inf), found.depth
+
+    # One loop for all, so that the contact is compiled once: the samples, the ends of the steps,
+    # and rounds about the rivals. Of each: its force, place (in samples), and the ends of the
+    # interval that it is in; of the samples, and of the ends.
     def look(i, carry):
-        greatest, best, corner, depth = carry
-        by_steps = i >= blocks + _ROUNDS
-        way = by_steps.astype(int)
-        round_ = i - blocks - way * (_ROUNDS + corners)
-        at_ends = by_steps & (round_ < 0)
-        looking = at_ends | (i < blocks)
-        block = jnp.where(by_steps, round_ + corners, i) * _BLOCK + jnp.arange(_BLOCK)
-        ends = steps.ends[jnp.minimum(block, steps.count - 1)] / width
-        block = jnp.where(by_steps, ends, jnp.minimum(block, samples - 1).astype(width.dtype))
-        # Not beyond the steps to both sides of the end: the force may jump at theirs.
-        first, last = steps.begins[corner], steps.ends[jnp.minimum(corner + 1, steps.count - 1)]
-        reach = (2.0 / (_BLOCK - 1)) ** jnp.maximum(round_, 0).astype(width.dtype)
-        reach *= jnp.where(by_steps, (last - first) / width, 1.0)
-        low, high = (
-            jnp.where(by_steps, at / width, limit)
-            for at, limit in ((first, 0.0), (last, samples - 1.0))
-        )
-        places = jnp.where(looking, block, jnp.clip(best[way] + reach * spread, low, high))
+        rivals, depth = carry
+        scanning = i < scans + by_ends
+        way = ((i >= scans) & scanning).astype(int)
+        k = (i - way * scans) * _INNER + jnp.arange(-1, _INNER + 1)
+        sides = jnp.clip(k + jnp.arange(-1, 2)[:, None], 0, last[way])
+        at_step = jnp.minimum(sides, last[1])
+        ends = jnp.stack([steps.begins[at_step[1]], *steps.ends[at_step[1:]]]) / width
+        low, place, high = jnp.where(way == 1, ends, sides.astype(width.dtype))
+        reach = (2.0 / (_CLOSER - 1)) ** jnp.maximum(i - scans - by_ends, 0).astype(width.dtype)
+        _, best, left, right = rivals[..., None]
+        closer = jnp.clip(best + reach * (right - left) * spread, left, right)
+        place = jnp.where(scanning, place, closer.ravel())
+        force, deep = jax.vmap(contact)(place, jnp.where(scanning, way, by_steps) == 1)
 
-        def contact(place):
-            tau = place * width
-            state = jnp.where(by_steps, steps.motion(tau), blended(states, steps, tau, width))
-            known = ~by_steps | inside | steps.reaches(tau, width)
-            return pair.contact_at(tau, state), known
+        beside = jnp.maximum(jnp.roll(force, 1), jnp.roll(force, -1))
+        maximum = (force >= beside) & (k <= last[way])
+        maximum = maximum.at[jnp.array([0, -1])].set(False)  # Those are of the next blocks.
+        found = jnp.stack([jnp.where(maximum, force, -jnp.inf), place, low, high])
+        listed = jnp.concatenate([rivals[:, way], found], axis=1)
+        scanned = rivals.at[:, way].set(listed[:, lax.top_k(listed[0], _RIVALS)[1]])
 
-        found, known = jax.vmap(contact)(places)
-        force = jnp.where(known, found.total, -jnp.inf)
-        top = jnp.argmax(force)
-        more = force[top] > greatest[way]
-        greatest = greatest.at[way].set(jnp.where(more, force[top], greatest[way]))
-        best = best.at[way].set(jnp.where(more, places[top], best[way]))
-        here = jnp.minimum((round_ + corners) * _BLOCK + top, steps.count - 1)
-        corner = jnp.where(at_ends & more, here, corner)
-        return greatest, best, corner, jnp.maximum(depth, jnp.max(found.depth))
+        forces = force.reshape(closer.shape)
+        top = jnp.argmax(forces, axis=-1, keepdims=True)
+        tops = [jnp.take_along_axis(x, top, -1)[..., 0] for x in (forces, closer)]
+        refined = rivals.at[:2].set(jnp.where(tops[0] > rivals[0], jnp.stack(tops), rivals[:2]))
+        rivals = jnp.where(scanning, scanned, refined)
+        return rivals, jnp.maximum(depth, jnp.max(deep))
 
-    least = jnp.full_like(width, -jnp.inf)
-    nothing = jnp.zeros_like(width)
-    start = jnp.stack([least, least]), jnp.stack([nothing, nothing]), jnp.zeros((), int), least
-    turns = blocks + 2 * _ROUNDS + corners
-    greatest, best, _, depth = lax.fori_loop(0, turns, look, start)
-    return jnp.where(greatest[1] > greatest[0], best[1], best[0]) * width, depth
+    nothing = jnp.zeros((4, 2, _RIVALS), width.dtype).at[0].set(-jnp.inf)
+    start = nothing, jnp.full_like(width, -jnp.inf)
+    (force, place, *_), depth = lax.fori_loop(0, scans + by_ends + _ROUNDS, look, start)
+    return place.ravel()[jnp.argmax(force)] * width, depth
 
 
-def one_sided(forces: Float[Array, "7"]) -> tuple[Float[Array, ""], Float[Array, "7"]]:
-    """The peak from the forces at the times `BESIDE` it, and with which weights their
-    derivatives make up that of the peak.
+def one_sided(
+    forces: Float[Array, "7"], noise: Float[Array, ""] | float = 0.0
+) -> tuple[Float[Array, ""], Float[Array, "7"]]:
+    """The peak from the forces at the times `BESIDE` it, known but for a relative `noise` and
+    rounding, and with which weights their derivatives make up that of the peak.
 
     Where the force is smooth at its peak, it is the derivative at the fixed instant (envelope
     theorem), at the vertex of the parabola through the forces: rounding hides where exactly the
@@ -178,10 +218,12 @@ def one_sided(forces: Float[Array, "7"]) -> tuple[Float[Array, ""], Float[Array,
     at_corner = jnp.stack([none, 1 - share, none, share, none, none, none])
     bend = 2 * here - left - right
     rounding = float(jnp.finfo(forces.dtype).eps) * here
+    noise = _NOISES * noise * here
     # A jump stands out from the slope that it makes over the wide distance.
     line = here + (right - left) / (2 * _WIDE) * jnp.asarray(BESIDE[:5], forces.dtype)
-    smooth = jnp.max(jnp.abs(forces[:5] - line)) < bend / (8 * _WIDE) + 100 * rounding
-    vertex = (right - left) / (2 * jnp.where(bend > _ROUNDINGS * rounding, bend, jnp.inf))
+    smooth = jnp.max(jnp.abs(forces[:5] - line)) < bend / (8 * _WIDE) + 100 * rounding + noise
+    bent = bend > jnp.maximum(_ROUNDINGS * rounding, noise)
+    vertex = (right - left) / (2 * jnp.where(bent, bend, jnp.inf))
     near = jnp.abs(vertex) < _FARTHEST[forces.dtype.itemsize]
     vertex = jnp.where(smooth & near, vertex, 0.0)
     at_vertex = jnp.stack([one, none, none, none, none, -vertex / 2, vertex / 2])

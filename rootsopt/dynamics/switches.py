@@ -51,7 +51,7 @@ def with_switches(
     lanes = jnp.arange(_LANES)
 
     def flags(tau):
-        return pair.switches(tau, blended(out.states, steps, tau, width))
+        return pair.switches(tau, blended(pair, out.states, steps, tau, width))
 
     def changes(seen, counts):
         """Where switches change that count on either side: how many, and of each the switch, its

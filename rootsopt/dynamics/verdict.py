@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from rootsopt.contact.impact import force_rounding
 from rootsopt.dynamics.steady import NOISE, Orbit, solved
 
 RESIDUAL = {"float64": 1e-9, "float32": 1e-3}
@@ -25,8 +26,8 @@ _STRAINED = 100.0
 
 
 class Verdict(NamedTuple):
-    """What there is to say of a closed orbit: `is_idle`, `judged` steady, `force_rounding`,
-    `is_consistent`."""
+    """What there is to say of a closed orbit: `is_idle`, `judged` steady, relative error
+    by `force_rounding` of the greatest force, `is_consistent`."""
 
     idle: Bool[Array, ""]
     steady: Bool[Array, ""]
@@ -45,10 +46,11 @@ def verdict(
     """The verdict on an orbit; arguments as of `judged`, and the `scales` exponent of the contact
     law, pitch radius (m), force unit (N)."""
     exponent, radius, force = scales
+    rounding = force_rounding(orbit.flow.depth, exponent, radius)
     return Verdict(
         idle=is_idle(orbit),
         steady=judged(orbit, state, within, rtols, residual),
-        rounding=force_rounding(orbit, exponent, radius),
+        rounding=jnp.where(orbit.flow.peak > 0, rounding, 0.0),
         consistent=is_consistent(orbit, 10 * rtols[1] * force),
     )
 
@@ -98,17 +100,3 @@ def is_consistent(orbit: Orbit, least: Float[Array, ""]) -> Bool[Array, ""]:
     mean, square, peak = orbit.response[:3]
     ordered = (square + least**2 >= 0.98 * mean**2) & (peak**2 + least**2 >= 0.98 * square)
     return ordered & (mean >= -least)
-
-
-def force_rounding(
-    orbit: Orbit, exponent: Float[Array, ""], radius: Float[Array, ""]
-) -> Float[Array, ""]:
-    """Relative error of the greatest force of an orbit by rounding alone; 0 without contact.
-
-    The gap is the difference of lengths of the size of the pitch `radius` (m), so it is known to
-    a rounding of that, and the force is a power of it with the law's `exponent`.
-    """
-    touches = (orbit.flow.peak > 0) & (orbit.flow.depth > 0)
-    depth = jnp.where(touches, orbit.flow.depth, 1.0)
-    error = exponent * float(jnp.finfo(depth.dtype).eps) * radius / depth
-    return jnp.where(touches, error, 0.0)
