@@ -132,12 +132,13 @@ def run(
     compared: list[Case] = []
     for kind, _ in study.kinds:
         shape = kind.lobes, kind.family, kind.fidelity, kind.scene
-        if kind.lobes in (4, 5, 6) or kind.fidelity == "linear":
+        if kind.lobes in (4, 5, 6):
             continue
         mine = [case for case in cases if case.kind == kind]
         good = [case for case in mine if case.row["status"] == "periodic"]
         own = shape != (3, "cic", "search", "gear")
-        picked += good[: study.references // (3 if own else 1)]
+        if kind.fidelity != "linear":  # Whose jumps no reference gets over.
+            picked += good[: study.references // (3 if own else 1)]
         if kind.scene != "pump":  # Whose independent equation is that of tests/planar.py.
             compared += [case for case in good if case.row["swings"] < FEW][: study.scipy]
     each("reference", ask.refine, picked)
