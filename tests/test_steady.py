@@ -313,6 +313,32 @@ def test_recorded_steps_give_the_same_motion(sharp, orbits):
         np.testing.assert_allclose(difference, once.slope[:2, 1], atol=1e-6)
 
 
+def test_repeated_steps_tell_of_their_error(sharp, orbits):
+    """Steps chosen for this motion repeat it within a tolerance or so; half as many do not, nor
+    those of another motion. Steps just chosen tell nothing, nor do those over a contact that jumps.
+    """
+    state, one = jnp.asarray(orbits["shorter involute"][1].state), jnp.asarray(1.0)
+    design, how = jnp.array(DESIGNS["shorter involute"]), integrator(1e-8)
+    linear = Evaluator(config_of("solver.fidelity=linear"))
+
+    def strains(model):
+        pair = pair_of(model, design)
+        still = no_tangents(pair)
+        once = eqx.filter_jit(lambda y: flow(pair, y, one, how, 64, still))(state)
+        again = eqx.filter_jit(lambda y, grid: flow(pair, y, one, how, 64, still, grid))
+        count = int(jnp.sum(once.grid < jnp.inf))
+        ends = once.grid[(count - 1) % 2 : count : 2]
+        half = jnp.pad(ends, (0, once.grid.size - ends.size), constant_values=jnp.inf)
+        moved = state.at[1].add(0.3)
+        repeated = again(state, once.grid), again(state, half), again(moved, once.grid)
+        return [float(each.strain) for each in (once, *repeated)]
+
+    none, own, halved, foreign = strains(sharp.model)
+    assert none == 0 < own < 2
+    assert min(halved, foreign) > 10
+    assert strains(linear.model) == [0, 0, 0, 0]
+
+
 def test_peak_on_a_corner_has_its_gradient():
     """Where the contact moves from the involute to the tip arc the force has a corner, and here
     its peak: the derivative is neither of the two beside it."""
