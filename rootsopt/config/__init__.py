@@ -1,0 +1,20 @@
+"""Configuration: YAML in, typed settings out.
+
+The only place that knows file formats. Keys carry their units; conversion to SI happens
+in `rootsopt.model`. Anything wrong with a file, a key or a value raises `InputError`
+with one message that names the key, the value and what is allowed.
+"""
+
+from rootsopt.config.reading import Config, describe_keys, load, parse
+from rootsopt.config.scene import DESIGN_KEYS
+from rootsopt.config.study import EnsembleConfig, SolverConfig
+
+__all__ = [
+    "DESIGN_KEYS",
+    "Config",
+    "EnsembleConfig",
+    "SolverConfig",
+    "describe_keys",
+    "load",
+    "parse",
+]

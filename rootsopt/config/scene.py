@@ -1,0 +1,159 @@
+"""Sections of a config that say what is simulated: profile, rotor, contact, scene."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from rootsopt.config.section import NonNegative, Positive, Section
+
+DESIGN_KEYS = ("pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg")
+"""The design parameters of a CIC rotor, as named in the config."""
+
+
+class ProfileConfig(Section):
+    """The rotor profile."""
+
+    family: Literal["cic", "ee"] = Field(description="profile family")
+    lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
+    pitch_radius_mm: Positive = Field(description="pitch radius; centre distance is twice that")
+    pressure_angle_deg: Annotated[float, Field(gt=0, lt=90)] | None = Field(
+        None, description="cic: pressure angle of the involute"
+    )
+    involute_length_mm: Positive | None = Field(None, description="cic: involute parameter u")
+    tip_arc_angle_deg: Annotated[float, Field(ge=0, lt=45)] | None = Field(
+        None, description="cic: half angle of the tip land"
+    )
+
+    @model_validator(mode="after")
+    def _family_keys(self):
+        for key in DESIGN_KEYS:
+            given = getattr(self, key) is not None
+            if self.family == "cic" and not given:
+                raise ValueError(f"`profile.{key}` is required for family cic")
+            if self.family == "ee" and given:
+                raise ValueError(f"`profile.{key}` does not belong to family ee; remove it")
+        return self
+
+
+class RotorConfig(Section):
+    """The rotor as a body."""
+
+    length_mm: Positive = Field(description="axial length")
+    density_kg_m3: Positive = Field(description="density")
+
+
+class FrictionConfig(Section):
+    """Coulomb friction between the flanks, with the transitions of multibody programs."""
+
+    static: Annotated[float, Field(ge=0, le=2)] = Field(0.2, description="static coefficient")
+    kinetic: Annotated[float, Field(ge=0, le=2)] = Field(0.1, description="kinetic coefficient")
+    stiction_speed_mm_s: Positive = Field(
+        100.0, description="sliding speed at which the static coefficient is reached"
+    )
+    friction_speed_mm_s: Positive = Field(
+        1000.0, description="sliding speed from which on the coefficient is the kinetic one"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self):
+        if self.friction_speed_mm_s <= self.stiction_speed_mm_s:
+            raise ValueError(
+                "`contact.friction.friction_speed_mm_s` must be greater than "
+                f"`contact.friction.stiction_speed_mm_s` = {self.stiction_speed_mm_s:g}, but is "
+                f"{self.friction_speed_mm_s:g}"
+            )
+        return self
+
+
+class ContactConfig(Section):
+    """The IMPACT contact law."""
+
+    stiffness_N_per_mm_e: Positive = Field(description="K of K·δ^e, δ in mm")
+    exponent: Annotated[float, Field(ge=1, le=5)] = Field(description="e")
+    max_damping_N_s_per_mm: NonNegative = Field(description="C, reached at full depth")
+    full_damping_depth_mm: Positive = Field(description="d")
+    clearance_mm: NonNegative = Field(0.0, description="added to every flank gap")
+    smoothing_mm: NonNegative = Field(
+        1e-4, description="rounding of the law's corners; 0 is the law as it stands"
+    )
+    friction: FrictionConfig | None = Field(None, description="absent: frictionless flanks")
+
+
+class LoadConfig(Section):
+    """What opposes the rotors: a constant torque on rotor 2, or gas on both."""
+
+    torque_N_m: NonNegative | None = Field(None, description="constant torque against rotor 2")
+    pressure_difference_Pa: NonNegative | None = Field(
+        None, description="instead of a constant torque: gas pressure across the pair"
+    )
+
+    @model_validator(mode="after")
+    def _one(self):
+        if (self.torque_N_m is None) == (self.pressure_difference_Pa is None):
+            raise ValueError(
+                "`scene.load` must hold either `torque_N_m` or `pressure_difference_Pa`, but holds "
+                + ("neither; add one" if self.torque_N_m is None else "both; set one to null")
+            )
+        return self
+
+
+class MotorConfig(Section):
+    """Motor on rotor 1, with a straight torque-speed line, for `drive: torque`."""
+
+    torque_N_m: NonNegative | None = Field(
+        None, description="torque at scene.speed_rpm; absent: what the load takes there"
+    )
+    slope_N_m_s_per_rad: Positive = Field(
+        description="torque lost for every rad/s above scene.speed_rpm"
+    )
+    inertia_kg_m2: NonNegative = Field(0.0, description="added to that of rotor 1")
+
+
+class SupportsConfig(Section):
+    """Bearings that give way, the same for both rotors."""
+
+    stiffness_N_per_mm: Positive = Field(description="of a rotor in its housing, any way")
+    damping_N_s_per_mm: NonNegative = Field(description="damping of the same motion")
+
+
+class TimingGearConfig(Section):
+    """Timing gear between the rotors."""
+
+    stiffness_N_m_per_rad: Positive = Field(description="torsional stiffness")
+    damping_ratio: NonNegative = Field(0.0, description="ζ on the two rotors' inertia")
+    backlash_mm: NonNegative = Field(description="total play at the pitch radius")
+
+
+class SceneConfig(Section):
+    """What drives and loads the pair."""
+
+    speed_rpm: Positive = Field(description="speed of rotor 1; of a motor, that of its torque_N_m")
+    drive: Literal["prescribed", "torque"] = Field(
+        "prescribed", description="how rotor 1 is driven: at its speed, or by scene.motor"
+    )
+    motor: MotorConfig | None = Field(None, description="belongs to drive torque")
+    load: LoadConfig
+    timing_gear: TimingGearConfig | None = Field(None, description="absent: flanks alone")
+    supports: SupportsConfig | None = Field(None, description="absent: rigid bearings")
+    center_distance_error_mm: Annotated[float, Field(ge=-1, le=1)] | None = Field(
+        None, description="centre distance beyond twice the pitch radius"
+    )
+    phase_error_mrad: Annotated[float, Field(ge=-100, le=100)] | None = Field(
+        None, description="relative rotation at the middle of the timing gear's backlash"
+    )
+
+    @model_validator(mode="after")
+    def _belong(self):
+        if (self.drive == "torque") != (self.motor is not None):
+            raise ValueError(
+                "`scene.motor` is missing; `scene.drive` = torque needs it, with "
+                "`slope_N_m_s_per_rad`"
+                if self.motor is None
+                else "`scene.motor` belongs to `scene.drive` = torque; remove it or set that"
+            )
+        if self.phase_error_mrad is not None and self.timing_gear is None:
+            raise ValueError(
+                "`scene.phase_error_mrad` is an error of mounting `scene.timing_gear`; add that "
+                "or remove it"
+            )
+        return self

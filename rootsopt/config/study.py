@@ -1,0 +1,303 @@
+"""Sections of a config that say how it is solved, and what is asked of it."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from rootsopt.config.section import NonNegative, Positive, Section, number, tuples
+
+
+class SolverConfig(Section):
+    """How the scene is solved."""
+
+    fidelity: Literal["search", "map", "linear", "nodes", "auto"] = Field(
+        "search",
+        description="contact: search at every call (reference), C² map of the gap, linear in "
+        "the relative rotation, the paper's nodes against segments, or auto: these settings "
+        "as accuracy needs",
+    )
+    accuracy: Annotated[float, Field(ge=1e-6, le=0.1)] = Field(
+        1e-3, description="relative error of mean and peak force that auto may leave"
+    )
+    nodes: Annotated[int, Field(ge=16, le=20_000)] = Field(
+        400, description="nodes per flank of fidelity nodes"
+    )
+    map_error: Annotated[float, Field(ge=1e-6, le=0.1)] = Field(
+        1e-4, description="error of the map's penetration, relative to the static one"
+    )
+    map_rolls: Annotated[int, Field(ge=16, le=4096)] | None = Field(
+        None, description="map points over the roll angle; absent: as map_error needs"
+    )
+    map_relatives: Annotated[int, Field(ge=12, le=1024)] | None = Field(
+        None, description="map points over the relative rotation; absent: as map_error needs"
+    )
+    method: Literal["tsit5", "dopri5", "dopri8", "kvaerno3", "kvaerno5"] = Field(
+        "tsit5", description="explicit: tsit5, dopri5, dopri8; implicit: kvaerno3, kvaerno5"
+    )
+    rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] = Field(
+        1e-8, description="tolerance on the orbit and its statistics"
+    )
+    transient_rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] = Field(
+        1e-7, description="tolerance while the transient passes"
+    )
+    max_steps_per_period: Annotated[int, Field(ge=64, le=10**6)] = Field(
+        4096, description="solver steps allowed per mesh period"
+    )
+    max_mesh_periods: Annotated[int, Field(ge=16, le=10**6)] = Field(
+        640, description="how long the transient may last"
+    )
+    max_orbit_periods: Annotated[int, Field(ge=1, le=8)] = Field(
+        8, description="longest periodic orbit looked for, in mesh periods"
+    )
+    gradient: Literal["forward", "reverse"] = Field(
+        "forward", description="differentiation mode; both give the same gradient"
+    )
+    precision: Literal["float64", "float32"] = Field(
+        "float64", description="of the integration; float32 holds tolerances down to 2e-6"
+    )
+
+
+class ObjectiveConfig(Section):
+    """Weighted sum of measures of the contact force, each relative to the baseline."""
+
+    mean_weight: NonNegative = Field(0.5, description="weight of the mean contact force")
+    peak_weight: NonNegative = Field(0.5, description="weight of the peak contact force")
+    rms_weight: NonNegative = Field(0.0, description="weight of the RMS contact force")
+    line_weights: dict[Positive, NonNegative] = Field(
+        default_factory=dict,
+        description="weights of spectral lines, {order: weight}, order in mesh frequencies",
+    )
+    motion: Literal["reached", "worst", "weighted", "ensemble"] = Field(
+        "reached",
+        description="motion that counts: the one reached from rest, the worst of those that "
+        "coexist, all weighted by their share of initial states, or an average over an "
+        "ensemble, which a chaotic scene needs",
+    )
+    peak_norm: Annotated[float, Field(ge=4, le=64)] | None = Field(
+        None, description="p of the p-norm that stands for the peak in the search; absent: the peak"
+    )
+    speeds_rpm: tuple[Positive, ...] = Field(
+        (), description="speeds the objective is taken over, as [2000, 3000]; none: the scene's"
+    )
+    speed_weights: tuple[Positive, ...] = Field(
+        (), description="weights of these speeds in the objective; none: equal ones"
+    )
+    over_speeds: Literal["weighted", "worst"] = Field(
+        "weighted", description="what these speeds come to: their weighted mean or the worst"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _orders(cls, data):
+        data = tuples(data)
+        # The name of a key that `--set` gives, and of one in JSON, is a word.
+        if isinstance(data, dict) and isinstance(data.get("line_weights"), dict):
+            lines = {number(k): v for k, v in data["line_weights"].items()}
+            return data | {"line_weights": lines}
+        return data
+
+    @model_validator(mode="after")
+    def _some_weight(self):
+        lines = sum(self.line_weights.values())
+        if self.mean_weight + self.peak_weight + self.rms_weight + lines <= 0:
+            raise ValueError(
+                "`objective.mean_weight`, `objective.peak_weight`, `objective.rms_weight` and "
+                "`objective.line_weights` must not all be 0"
+            )
+        if self.motion == "ensemble" and (lines > 0 or self.peak_norm is not None):
+            raise ValueError(
+                "`objective.line_weights` and `objective.peak_norm` belong to a periodic motion; "
+                "remove them or set `objective.motion` to reached, worst or weighted"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _speeds(self):
+        speeds, weights = self.speeds_rpm, self.speed_weights
+        if len(set(speeds)) != len(speeds) or len(speeds) > 32:
+            raise ValueError(
+                f"`objective.speeds_rpm` must be at most 32 different speeds, but is {list(speeds)}"
+            )
+        worst = self.over_speeds == "worst"
+        if not speeds and (weights or worst):
+            key = "speed_weights" if weights else "over_speeds"
+            raise ValueError(
+                f"`objective.{key}` belongs to `objective.speeds_rpm`, which has no speed; add "
+                "some or remove it"
+            )
+        if weights and len(weights) != len(speeds):
+            raise ValueError(
+                f"`objective.speed_weights` must be {len(speeds)} numbers, one for each of "
+                f"`objective.speeds_rpm`, but is {list(weights)}"
+            )
+        if weights and worst:
+            raise ValueError(
+                "`objective.speed_weights` belongs to `objective.over_speeds` weighted, but that "
+                "is worst; remove one of them"
+            )
+        if speeds and self.motion == "ensemble":
+            raise ValueError(
+                "`objective.speeds_rpm` must be empty for `objective.motion` ensemble, but is "
+                f"{list(speeds)}: the noise of an average is judged at one speed; optimise at one, "
+                "and look at the others with `rootsopt sweep`"
+            )
+        return self
+
+
+class ResponseConfig(Section):
+    """What is reported beside mean, peak and RMS of the contact force."""
+
+    lines: tuple[Positive, ...] = Field(
+        (), description="spectral lines of the force, orders in mesh frequencies, as [1, 2]"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lists(cls, data):
+        return tuples(data)
+
+    @model_validator(mode="after")
+    def _few(self):
+        if len(set(self.lines)) != len(self.lines) or len(self.lines) > 32:
+            raise ValueError(
+                f"`response.lines` must be at most 32 different orders, but is {list(self.lines)}"
+            )
+        return self
+
+
+class AttractorsConfig(Section):
+    """Initial states tried to find the motions that coexist."""
+
+    relatives: Annotated[int, Field(ge=1, le=1000)] = Field(
+        12, description="initial relative rotations tried"
+    )
+    rates: Annotated[int, Field(ge=1, le=1000)] = Field(
+        9, description="initial relative speeds tried"
+    )
+    relative_range_mrad: tuple[float, float] | None = Field(
+        None, description="(low, high) of the relative rotation; absent: the play and contact"
+    )
+    rate_range_rad_s: tuple[float, float] | None = Field(
+        None, description="(low, high) of the relative speed; absent: as impacts reach"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _pairs(cls, data):
+        return tuples(data)
+
+    @model_validator(mode="after")
+    def _ordered(self):
+        for key in ("relative_range_mrad", "rate_range_rad_s"):
+            pair = getattr(self, key)
+            if pair is not None and not pair[0] < pair[1]:
+                raise ValueError(
+                    f"`attractors.{key}` must be two increasing numbers, but is {list(pair)}"
+                )
+        return self
+
+
+class EnsembleConfig(Section):
+    """Motions averaged over where a single one means nothing."""
+
+    members: Annotated[int, Field(ge=4, le=100_000)] = Field(
+        16, description="motions from different initial states, per design"
+    )
+    settle_periods: Annotated[int, Field(ge=0, le=10**6)] = Field(
+        64, description="mesh periods before a motion counts"
+    )
+    periods: Annotated[int, Field(ge=1, le=10**6)] = Field(
+        64, description="mesh periods of a motion that count"
+    )
+    designs: Annotated[int, Field(ge=12, le=4096)] = Field(
+        32, description="designs around one, in pairs, from which its gradient is estimated"
+    )
+    spread: Annotated[float, Field(gt=0, le=0.5)] = Field(
+        0.1,
+        description="standard deviation of these designs, as a share of the bounds, which they "
+        "stay within",
+    )
+    seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of states and designs")
+
+
+class SweepConfig(Section):
+    """The speeds of `rootsopt sweep`."""
+
+    speed_rpm: dict[Literal["from", "to", "points"], Positive] | None = Field(
+        None,
+        description="{from: 300, to: 6000, points: 39}; absent: `objective.speeds_rpm`, and "
+        "without these 39 from a tenth of to twice the scene's speed",
+    )
+
+    @model_validator(mode="after")
+    def _range(self):
+        wanted = self.speed_rpm
+        if wanted is None:
+            return self
+        whole = wanted.get("points", 0)
+        ordered = wanted.get("from", 0) < wanted.get("to", 0)
+        if len(wanted) < 3 or not (ordered and whole == int(whole) and 2 <= whole <= 10_000):
+            raise ValueError(
+                "`sweep.speed_rpm` must be {from: .., to: .., points: ..} with from below to and "
+                f"2 to 10000 points, but is {wanted}"
+            )
+        return self
+
+
+class ConstraintsConfig(Section):
+    """What an optimised design must satisfy."""
+
+    area_efficiency_min: Literal["baseline"] | Annotated[float, Field(ge=0, lt=1)] = Field(
+        "baseline", description="floor of the area efficiency"
+    )
+    undercut_margin_min_mm: NonNegative = Field(0.0, description="floor of the undercut margin")
+    seal_width_min_mm: NonNegative = Field(
+        0.0, description="floor of the tip land's whole arc length"
+    )
+
+
+class BoundsConfig(Section):
+    """Box of the search, (low, high) for each design parameter."""
+
+    pressure_angle_deg: tuple[float, float] = Field((25.0, 45.0))
+    involute_length_mm: tuple[float, float] | None = Field(
+        None, description="default: 10 % to 100 % of the longest involute"
+    )
+    tip_arc_angle_deg: tuple[float, float] = Field((0.5, 8.0))
+
+    @model_validator(mode="before")
+    @classmethod
+    def _pairs(cls, data):
+        return tuples(data)
+
+    @model_validator(mode="after")
+    def _ordered(self):
+        limits = {
+            "pressure_angle_deg": (1.0, 80.0),
+            "involute_length_mm": (1e-6, 1e6),
+            "tip_arc_angle_deg": (0.0, 44.0),
+        }
+        for key, (least, most) in limits.items():
+            pair = getattr(self, key)
+            if pair is not None and not least <= pair[0] < pair[1] <= most:
+                raise ValueError(
+                    f"`optimizer.bounds.{key}` must be two increasing numbers in "
+                    f"[{least:g}, {most:g}], but is {list(pair)}"
+                )
+        return self
+
+
+class OptimizerConfig(Section):
+    """How the design is searched."""
+
+    method: Literal["adam", "rmsprop", "sgd"] = Field(
+        "adam", description="optax update rule: adam, rmsprop, sgd"
+    )
+    learning_rate: Positive = Field(0.05, description="step in the unit box of the bounds")
+    iterations: Annotated[int, Field(ge=1, le=10000)] = Field(40, description="per start")
+    starts: Annotated[int, Field(ge=1, le=64)] = Field(2, description="local searches")
+    screening: Annotated[int, Field(ge=0, le=4096)] = Field(
+        48, description="designs screened to place the starts; 0 starts at the baseline only"
+    )
+    seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of the screening sample")
+    bounds: BoundsConfig = Field(default_factory=lambda: BoundsConfig.model_validate({}))
