@@ -85,6 +85,9 @@ class Space(eqx.Module):
             _constraint("undercut margin", "undercut_margin", "mm", margin, MM, MM),
             _constraint("seal width", "seal_width", "mm", limits.seal_width_min_mm * MM, MM, MM),
         )
+        if model.bore_radius is not None:
+            room = model.bore_radius
+            constraints += (_constraint("root radius", "root_radius", "mm", room, MM, MM),)
         lower, upper = np.array(rows, dtype=float).T
         return cls(model, jnp.asarray(lower), jnp.asarray(upper), constraints)
 
