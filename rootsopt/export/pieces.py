@@ -10,13 +10,12 @@ with a lobe tip on +x.
 """
 
 import dataclasses
-from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex128, Float64
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline, PPoly, make_interp_spline
+from scipy.interpolate import BSpline, make_interp_spline
 
 from rootsopt.errors import InputError
 from rootsopt.profiles import Profile
@@ -52,7 +51,7 @@ class Arc:
     begin: float
     sweep: float
 
-    def at(self, share: Float64[np.ndarray, " n"] | float) -> Complex128[np.ndarray, " n"]:
+    def at(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
         """Points at shares 0 to 1 of the way."""
         angle = self.begin + np.asarray(share) * self.sweep
         return np.asarray(self.center + self.radius * np.exp(1j * angle))
@@ -88,7 +87,7 @@ class Spline:
     knots: Float64[np.ndarray, " m"]
     controls: Complex128[np.ndarray, " n"]
 
-    def at(self, share: Float64[np.ndarray, " n"] | float) -> Complex128[np.ndarray, " n"]:
+    def at(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
         """Points at shares 0 to 1 of the parameter, which is nearly arc length."""
         first, last = self.knots[0], self.knots[-1]
         return np.asarray(BSpline(self.knots, self.controls, 3)(first + share * (last - first)))
@@ -116,13 +115,13 @@ class Spline:
 
     def beziers(self) -> Complex128[np.ndarray, "k 4"]:
         """The same curve as cubic Bézier curves, one a row."""
-        curve = PPoly.from_spline(BSpline(self.knots, self.controls, 3))
-        width = np.diff(curve.x)
-        keep = width > 0
-        cubic, square, linear, start = curve.c[:, keep] * width[keep] ** np.arange(3, -1, -1)[:, None]
-        first = start + linear / 3
-        second = first + (linear + square) / 3
-        return np.stack([start, first, second, start + linear + square + cubic], axis=-1)
+        curve = BSpline(self.knots, self.controls, 3)
+        ends = np.unique(self.knots)
+        points, third = curve(ends), np.diff(ends) / 3
+        # The derivative is continuous at every knot.
+        slopes = curve.derivative()(ends)
+        first, second = points[:-1] + slopes[:-1] * third, points[1:] - slopes[1:] * third
+        return np.stack([points[:-1], first, second, points[1:]], axis=-1)
 
 
 Piece = Arc | Spline
@@ -208,7 +207,9 @@ class _Stretch:
         inside = np.pad(inside, (0, -len(share) % _BLOCK), mode="edge")
         nu = self.start + (self.stop - self.start) * inside.reshape(-1, _BLOCK)
         blocks = [_points(self.profile, jnp.asarray(block))[int(self.dedendum)] for block in nu]
-        points, normal, speed = (np.concatenate(part)[: len(share)] for part in zip(*blocks, strict=True))
+        points, normal, speed = (
+            np.concatenate(part)[: len(share)] for part in zip(*blocks, strict=True)
+        )
         return (
             points @ np.array([1, 1j]) * _MM,
             np.exp(1j * normal),
@@ -272,9 +273,7 @@ class _Stretch:
         length = np.concatenate([[0.0], np.cumsum(speed @ weights / 2 * width)])
         points, normals, _ = self.look(nodes)
         ends = 1j * normals[[0, -1]]
-        curve = make_interp_spline(
-            length, points, k=3, bc_type=([(1, ends[0])], [(1, ends[1])])
-        )
+        curve = make_interp_spline(length, points, k=3, bc_type=([(1, ends[0])], [(1, ends[1])]))
         between = (nodes[:-1, None] + width[:, None] * _BETWEEN).ravel()
         true = self.look(between)[0]
         foot = np.interp(between, nodes, length)

@@ -4,6 +4,9 @@ The only place that knows the CAD kernel (build123d on Open CASCADE), an optiona
 Lengths in millimetres, angles in radians.
 """
 
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
+# (The kernel is optional, and its bindings come without types.)
+
 import dataclasses
 import importlib.util
 import io
@@ -18,7 +21,8 @@ from rootsopt.errors import InputError
 from rootsopt.export.pieces import Arc, Piece
 
 if TYPE_CHECKING:
-    from build123d import Compound, Edge, Face, Shape, Solid
+    from build123d import Compound, Edge, Face, Solid
+    from build123d.topology import Shape
 
 CHORD = 0.005
 """Largest distance (mm) between a facet of an STL file and the solid."""
@@ -75,8 +79,8 @@ def pair(
     first, second = (rotor(pieces, length, bore, turn) for turn in (helix, -helix))
     # The mirror image of a symmetric rotor that is turned by π/N.
     second = second.rotate(Axis.Z, 180 - 180 / lobes).translate(Vector(center_distance, 0, 0))
-    first.label, second.label = "rotor 1", "rotor 2"
-    return Compound(label="rotor pair", children=[first, second])
+    first.label, second.label = "rotor_1", "rotor_2"
+    return Compound(label="rotor_pair", children=[first, second])
 
 
 def step_bytes(shape: "Shape") -> bytes:
@@ -109,10 +113,9 @@ def _edge(piece: Piece) -> "Edge":
     if not isinstance(piece, Arc):
         return Edge.make_bspline([_point(z) for z in piece.controls], piece.knots, 3)
     ways = AngularDirection.COUNTER_CLOCKWISE, AngularDirection.CLOCKWISE
-    ends = np.degrees([piece.begin, piece.begin + piece.sweep])
-    return Edge.make_circle(
-        piece.radius, Plane(_point(piece.center)), *map(float, ends), ways[piece.sweep < 0]
-    )
+    first, last = np.degrees([piece.begin, piece.begin + piece.sweep])
+    plane = Plane(_point(piece.center))
+    return Edge.make_circle(piece.radius, plane, first, last, ways[piece.sweep < 0])
 
 
 def _side(piece: Piece, length: float, helix: float) -> "Face":
@@ -157,7 +160,8 @@ def _quarters(piece: Piece) -> list[Piece]:
         return [piece]
     count = int(np.ceil(abs(piece.sweep) / (np.pi / 2) - 1e-9))
     sweep = piece.sweep / count
-    return [dataclasses.replace(piece, begin=piece.begin + k * sweep, sweep=sweep) for k in range(count)]
+    begins = (piece.begin + k * sweep for k in range(count))
+    return [dataclasses.replace(piece, begin=begin, sweep=sweep) for begin in begins]
 
 
 def _surface(degrees, knots, points, heights, weights) -> "Face":

@@ -291,6 +291,7 @@ class Problem:
             "area_efficiency": "area_efficiency",
             "undercut_margin": "undercut_margin_mm",
             "seal_width": "seal_width_mm",
+            "root_radius": "root_radius_mm",
         }
         for c in self.space.constraints:
             before = self.baseline.geometry[keys[c.quantity]]
