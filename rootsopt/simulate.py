@@ -31,6 +31,8 @@ def body(config: Config, options: argparse.Namespace) -> int:
         folder.write_csv("response_design.csv", files.response_columns(evaluation.series))
     folder.write_json("result.json", evaluation.record() | choice | {"versions": files.versions()})
     period = evaluation.steady_state.get("period") or config.profile.lobes
+    if evaluation.series is None:
+        formats = tuple(name for name in formats if name != "gif")  # no motion to be shown
     export.write(folder, config, formats, evaluation.design, evaluation.series, period)
     if not options.no_figures:
         from rootsopt import plot
