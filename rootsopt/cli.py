@@ -61,9 +61,13 @@ def run(
     purpose: str,
     body: Callable[[Config, argparse.Namespace], int],
     argv: Sequence[str] | None,
+    add_options: Callable[[argparse.ArgumentParser], None] = lambda _: None,
 ) -> int:
-    """Parse, load, choose float64, run `body`; turn `InputError` into exit 2."""
-    options = parser(command, purpose).parse_args(argv)
+    """Parse, load, choose float64, run `body`; turn `InputError` into exit 2. `add_options` adds
+    the command's own arguments."""
+    arguments = parser(command, purpose)
+    add_options(arguments)
+    options = arguments.parse_args(argv)
     if options.output is None:
         options.output = Path("results") / options.config.stem
     try:

@@ -67,6 +67,7 @@ class Model(eqx.Module):
     precision: str = eqx.field(static=True)
     map_size: tuple[int, int] = eqx.field(static=True)
     nodes: int = eqx.field(static=True)
+    straight: bool = eqx.field(static=True)
     pitch_radius: Float[Array, ""]
     length: Float[Array, ""]
     density: Float[Array, ""]
@@ -77,6 +78,7 @@ class Model(eqx.Module):
     gear: TimingGear | None
     gear_damping_ratio: Float[Array, ""]
     deepest: Float[Array, ""]
+    bore_radius: Float[Array, ""] | None = None
     pressure: Float[Array, ""] | None = None
     motor: MotorDrive | None = None
     friction: Friction | None = None
@@ -124,6 +126,7 @@ class Model(eqx.Module):
             precision=solver.precision,
             map_size=(solver.map_rolls or _ROLLS, solver.map_relatives or _RELATIVES),
             nodes=solver.nodes,
+            straight=config.rotor.helix_deg == 0,
             pitch_radius=jnp.asarray(radius),
             length=jnp.asarray(config.rotor.length_mm * MM),
             density=jnp.asarray(config.rotor.density_kg_m3),
@@ -134,6 +137,7 @@ class Model(eqx.Module):
             gear=gear,
             gear_damping_ratio=jnp.asarray(damping_ratio),
             deepest=jnp.asarray(deepest),
+            bore_radius=_optional(config.rotor.bore_mm, MM / 2),
             pressure=_optional(scene.load.pressure_difference_Pa),
             center_distance_error=_optional(scene.center_distance_error_mm, MM),
             **_parts(config),
@@ -154,7 +158,17 @@ class Model(eqx.Module):
 
     def inertia(self, shape: Geometry) -> Float[Array, ""]:
         """Polar moment of inertia of one rotor about its axis (kg·m²)."""
-        return self.density * self.length * shape.polar_area_moment
+        moment = shape.polar_area_moment
+        if self.bore_radius is not None:
+            moment = moment - jnp.pi / 2 * self.bore_radius**4
+        return self.density * self.length * moment
+
+    def mass(self, shape: Geometry) -> Float[Array, ""]:
+        """Mass of one rotor (kg)."""
+        area = shape.area
+        if self.bore_radius is not None:
+            area = area - jnp.pi * self.bore_radius**2
+        return self.density * self.length * area
 
     @property
     def both(self) -> bool:
@@ -225,7 +239,16 @@ class Model(eqx.Module):
         return eqx.combine(dynamic, static.value), tangents, shape
 
     def pair_and_shape(self, design: Float[Array, " d"]) -> tuple[RotorPair, Geometry]:
-        """The rotor pair and the geometry of one rotor."""
+        """The rotor pair and the geometry of one rotor.
+
+        Raises `InputError` for twisted rotors: along their length every phase of the mesh is met
+        at once, which the pair of this package knows nothing of."""
+        if not self.straight:
+            raise InputError(
+                "`rotor.helix_deg` must be 0 for a simulation, which is of straight rotors; set "
+                "it to 0 to simulate straight rotors of the same section, or draw the twisted "
+                "ones with `rootsopt profile`"
+            )
         profile = self.profile(design)
         shape = geometry(profile)
         inertia = self.inertia(shape)
@@ -241,7 +264,7 @@ class Model(eqx.Module):
             angle = angle + gear.half_backlash
         supports = self.supports
         if supports is not None:
-            mass = self.density * self.length * shape.area
+            mass = self.mass(shape)
             unit = angle * self.pitch_radius
             supports = eqx.tree_at(lambda s: (s.mass, s.unit), supports, (mass, unit))
         load = self._load(profile, shape)
@@ -376,6 +399,27 @@ def measures(config: Config) -> Measures:
 
 
 def check_geometry(config: Config) -> None:
+    """Raise `InputError` unless the config's profile can be made and meshes, and leaves room for
+    the bore."""
+    _check_profile(config)
+    bore = config.rotor.bore_mm
+    if bore is None:
+        return
+    root = float(_shape(Model.of(config), design_vector(config)).root_radius) / MM
+    if bore >= 2 * root:
+        raise InputError(
+            f"`rotor.bore_mm` must be less than {2 * root:.6g} (the root circle), but is "
+            f"{bore:g}; make it smaller"
+        )
+
+
+@Program
+def _shape(model: Model, design):
+    """Geometry of a design in config units."""
+    return geometry(model.profile(design))
+
+
+def _check_profile(config: Config) -> None:
     """Raise `InputError` unless the config's profile can be made and meshes."""
     profile_config = config.profile
     if profile_config.family != "cic":

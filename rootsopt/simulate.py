@@ -4,7 +4,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from rootsopt import cli
+from rootsopt import cli, export
 from rootsopt.config import Config
 
 PURPOSE = "Simulate one design in one scene: steady state, contact force, its gradient."
@@ -19,6 +19,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
     from rootsopt.model import check_geometry, outline_mm
     from rootsopt.speeds import alone
 
+    formats = export.chosen(options.export)
     check_geometry(config)
     folder = files.ResultFolder(options.output)
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
@@ -29,6 +30,10 @@ def body(config: Config, options: argparse.Namespace) -> int:
     if evaluation.series is not None:
         folder.write_csv("response_design.csv", files.response_columns(evaluation.series))
     folder.write_json("result.json", evaluation.record() | choice | {"versions": files.versions()})
+    period = evaluation.steady_state.get("period") or config.profile.lobes
+    if evaluation.series is None:
+        formats = tuple(name for name in formats if name != "gif")  # no motion to be shown
+    export.write(folder, config, formats, evaluation.design, evaluation.series, period)
     if not options.no_figures:
         from rootsopt import plot
 
@@ -41,7 +46,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return cli.run("simulate", PURPOSE, body, argv)
+    return cli.run("simulate", PURPOSE, body, argv, lambda p: export.add_option(p, "none"))
 
 
 if __name__ == "__main__":

@@ -40,6 +40,10 @@ class RotorConfig(Section):
 
     length_mm: Positive = Field(description="axial length")
     density_kg_m3: Positive = Field(description="density")
+    bore_mm: Positive | None = Field(None, description="diameter of the bore; absent: none")
+    helix_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
+        0.0, description="twist over the length, for CAD; only straight rotors are simulated"
+    )
 
 
 class FrictionConfig(Section):

@@ -85,6 +85,9 @@ class Space(eqx.Module):
             _constraint("undercut margin", "undercut_margin", "mm", margin, MM, MM),
             _constraint("seal width", "seal_width", "mm", limits.seal_width_min_mm * MM, MM, MM),
         )
+        if model.bore_radius is not None:
+            room = model.bore_radius
+            constraints += (_constraint("root radius", "root_radius", "mm", room, MM, MM),)
         lower, upper = np.array(rows, dtype=float).T
         return cls(model, jnp.asarray(lower), jnp.asarray(upper), constraints)
 
@@ -288,6 +291,7 @@ class Problem:
             "area_efficiency": "area_efficiency",
             "undercut_margin": "undercut_margin_mm",
             "seal_width": "seal_width_mm",
+            "root_radius": "root_radius_mm",
         }
         for c in self.space.constraints:
             before = self.baseline.geometry[keys[c.quantity]]

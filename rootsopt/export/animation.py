@@ -1,0 +1,227 @@
+"""GIF of the meshing pair with the point of contact and the force on rotor 2."""
+
+import dataclasses
+import io
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from rootsopt.contact.nodes import place_pair
+from rootsopt.evaluate import Series
+from rootsopt.export.drawing import Drawing
+from rootsopt.export.pieces import polyline
+from rootsopt.plot import BLUE, GREY, ORANGE, SKY, VERMILION, figure
+from rootsopt.profiles import Profile
+from rootsopt.programs import Program
+
+_MM = 1e3
+_FRAMES = 40  # per mesh period
+_MOST_PERIODS = 4
+_MILLISECONDS = 60  # per frame
+_DPI = 80
+_COLORS = 64
+_CHORD = 0.01  # of the polygons drawn, in outer radii
+_ARROW = 0.75  # length of the longest arrow, in pitch radii
+_FLANKS = ("drive flank", BLUE), ("coast flank", VERMILION)
+
+
+@dataclasses.dataclass(frozen=True)
+class Contacts:
+    """Where flanks touch at several rotations φ of rotor 1, one row for each: `point` (n, 2) in
+    mm in the fixed frame, unit `normal` (n, 2) from rotor 1 to rotor 2, and whether there is a
+    contact at all (`present`)."""
+
+    point: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    present: NDArray[np.bool_]
+
+
+@Program
+def _rolling(profile, roll):
+    """Pressure angle (rad) and distance (m) from the pitch point at a roll angle of a flank."""
+    half = profile.half_pitch
+    beyond = roll > half
+    point = profile.addendum(profile.normal_at(jnp.where(beyond, 2 * half - roll, roll)))
+    return point.psi, jnp.where(beyond, -point.s, point.s)
+
+
+def rolling_contacts(
+    profile: Profile, rotation: Float[np.ndarray, " n"], coast: bool = False
+) -> Contacts:
+    """Contacts of the drive (or coast) flanks in perfect rolling, at rotations φ (rad).
+
+    A drive flank touches at roll angle β = -φ, in 0 ≤ β ≤ π/N of every lobe pitch; outside, the
+    point is that of the nearer end. The contact is (r + s sin ψ, s cos ψ), its normal
+    (sin ψ, cos ψ); a coast flank is the mirror image, β = φ.
+    """
+    half = np.pi / (2 * profile.lobes)
+    roll = (rotation if coast else -rotation) - half
+    roll = half + roll - 4 * half * np.round(roll / (4 * half))
+    psi, s = map(np.asarray, _rolling(profile, jnp.asarray(np.clip(roll, 0, 2 * half))))
+    normal = np.stack([np.sin(psi), np.cos(psi) * (-1 if coast else 1)], axis=-1)
+    point = _MM * (s[:, None] * normal + [float(profile.pitch_radius), 0.0])
+    return Contacts(point, normal, (roll >= 0) & (roll <= 2 * half))
+
+
+def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
+    """The pair in perfect rolling over one lobe pitch: the contact and the direction of its
+    force, whose size is not known without a simulation."""
+    rotation = 2 * np.pi / profile.lobes * np.arange(_FRAMES) / _FRAMES
+    flanks = [rolling_contacts(profile, rotation, coast) for coast in (False, True)]
+    # Where one flank hands over to the next both ends touch; one arrow is enough.
+    flanks[1] = dataclasses.replace(flanks[1], present=flanks[1].present & ~flanks[0].present)
+    made, axes = figure(9, 5.4)
+    scene = _Scene(axes[0, 0], drawing)
+    axes[0, 0].set_title("Perfect rolling: contact and direction of its force on rotor 2")
+
+    def draw(i: int) -> None:
+        scene.turn(rotation[i], rotation[i])
+        for arrow, flank in zip(scene.arrows, flanks, strict=True):
+            arrow.show(flank.point[i], flank.normal[i], float(flank.present[i]))
+
+    return _gif(made, draw, len(rotation))
+
+
+def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: int) -> bytes:
+    """A simulated motion over so many mesh periods: contacts, with arrows as long as the largest
+    force of the time a frame stands for, and the force over the rotation."""
+    pitch = 2 * np.pi / profile.lobes
+    whole = max(1, round(float(np.ptp(series.rotation)) / pitch))
+    periods = max(1, min(periods, whole, _MOST_PERIODS))
+    samples = len(series.time) * periods // whole
+    count = periods * _FRAMES
+    edges = np.linspace(0, samples, count + 1).astype(int)
+    middle = (edges[1:] + edges[:-1]) // 2
+    rotation, relative = series.rotation[middle], series.relative[middle]
+    forces = [
+        np.array([np.max(force[a:b]) for a, b in itertools.pairwise(edges)])
+        for force in (series.drive_force, series.coast_force)
+    ]
+    longest = max(1e-30, *map(np.max, forces))
+    flanks = [rolling_contacts(profile, rotation, coast) for coast in (False, True)]
+    made, axes = figure(9, 7.4, 2, 1, gridspec_kw={"height_ratios": [2.6, 1]})
+    scene = _Scene(axes[0, 0], drawing)
+    axes[0, 0].set_title("Contact force on rotor 2, its length as the force below")
+    cursor = _force_panel(axes[1, 0], series, samples)
+    degrees = np.degrees(rotation - series.rotation[0])
+
+    def draw(i: int) -> None:
+        scene.turn(rotation[i], rotation[i] + relative[i])
+        for arrow, flank, force in zip(scene.arrows, flanks, forces, strict=True):
+            arrow.show(flank.point[i], flank.normal[i], float(force[i] / longest))
+        cursor.set_xdata([degrees[i], degrees[i]])
+
+    return _gif(made, draw, count)
+
+
+def _force_panel(ax: Axes, series: Series, samples: int):
+    """Flank forces over the rotation; returns the line that marks the frame."""
+    shown = slice(0, samples)
+    degrees = np.degrees(series.rotation[shown] - series.rotation[0])
+    forces = series.drive_force[shown], series.coast_force[shown]
+    for (name, color), force in zip(_FLANKS, forces, strict=True):
+        ax.fill_between(degrees, force, color=color, alpha=0.15, linewidth=0)
+        ax.plot(degrees, force, color=color, linewidth=1.2, label=name)
+    top = max(map(np.max, forces))
+    ax.set(
+        xlim=(0, degrees[-1]),
+        ylim=(0, 1.1 * top if top > 0 else 1),
+        xlabel="rotation of rotor 1 (°)",
+        ylabel="contact force (N)",
+    )
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
+    return ax.axvline(0, color="black", linewidth=1.0)
+
+
+class _Arrow:
+    """A contact and its force on one kind of flank."""
+
+    def __init__(self, ax: Axes, color: str, longest: float):
+        self.longest = longest
+        (self.point,) = ax.plot([], [], "o", color=color, markersize=6, zorder=5)
+        self.arrow = ax.annotate(
+            "",
+            (0, 0),
+            (0, 0),
+            arrowprops={"arrowstyle": "-|>,head_width=.35,head_length=.7", "color": color,
+                        "linewidth": 2.2, "shrinkA": 0, "shrinkB": 0},
+            zorder=6,
+        )  # fmt: skip
+
+    def show(self, point, normal, share: float) -> None:
+        """Put the arrow at `point` along `normal`, at a share of the longest; 0 hides it."""
+        self.point.set_data([point[0]], [point[1]])
+        for artist in (self.point, self.arrow):
+            artist.set_visible(share > 0)
+        self.arrow.set_position(tuple(point))
+        self.arrow.xy = tuple(point + self.longest * share * np.asarray(normal))
+
+
+class _Scene:
+    """The axes with both rotors, to be turned frame by frame."""
+
+    def __init__(self, ax: Axes, drawing: Drawing):
+        points = polyline(drawing.pieces, _CHORD * drawing.outer_radius)
+        self.outline = np.stack([np.real(points), np.imag(points)], axis=-1)
+        self.lobes, self.center = drawing.lobes, 2 * drawing.pitch_radius
+        named = (SKY, "rotor 1 ↺", 0.0), (ORANGE, "rotor 2 ↻", self.center)
+        self.rotors = [self._rotor(ax, drawing, *one) for one in named]
+        for name, color in _FLANKS:
+            ax.plot([], [], "o", color=color, label=name)
+        self.label = ax.text(0.01, 0.98, "", transform=ax.transAxes, va="top")
+        reach = 1.06 * drawing.outer_radius
+        ax.set(xlim=(-reach, self.center + reach), ylim=(-reach, reach))
+        ax.set(xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
+        ax.legend(loc="lower left", fontsize="small", framealpha=0.9)
+        self.arrows = [_Arrow(ax, color, _ARROW * drawing.pitch_radius) for _, color in _FLANKS]
+
+    def _rotor(self, ax, drawing, color, name, x):
+        """Draw a rotor with its axis at `x`; returns the part that turns."""
+        line = {"edgecolor": "black", "linewidth": 0.8}
+        (patch,) = ax.fill(*self.outline.T, facecolor=color, alpha=0.75, **line)
+        circle = np.exp(1j * np.linspace(0, 2 * np.pi, 181))
+        pitch = drawing.pitch_radius * circle
+        ax.plot(x + np.real(pitch), np.imag(pitch), "--", color=GREY, linewidth=0.9)
+        hole = 0.0 if drawing.bore is None else drawing.bore / 2
+        if hole > 0:
+            bore = hole * circle
+            ax.fill(x + np.real(bore), np.imag(bore), facecolor="white", **line)
+        ax.plot(x, 0, "o", color="black", markersize=4)
+        ax.annotate(name, (x, -hole), (0, -16), textcoords="offset points", ha="center")
+        return patch
+
+    def turn(self, first: float, second: float) -> None:
+        """Turn both rotors (rad)."""
+        placed = place_pair(self.outline, self.lobes, self.center, first, second)
+        for rotor, points in zip(self.rotors, placed, strict=True):
+            rotor.set_xy(points)
+        pitch = 360 / self.lobes
+        self.label.set_text(f"φ = {np.degrees(first) % pitch:5.1f}° of {pitch:g}°")
+
+
+def _gif(made: Figure, draw, count: int) -> bytes:
+    """Frames 0 to `count` - 1, as `draw` leaves them, as one endless GIF with one palette."""
+    made.set_dpi(_DPI)
+    canvas = FigureCanvasAgg(made)
+    pictures: list[Image.Image] = []
+    for i in range(count):
+        draw(i)
+        canvas.draw()
+        if i == 0:
+            made.set_layout_engine("none")  # laid out once, so that nothing wobbles
+        pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
+    # Some frames side by side have all the colours there are.
+    some = np.hstack([np.asarray(picture) for picture in pictures[:: max(1, count // 8)]])
+    palette = Image.fromarray(some).quantize(_COLORS, Image.Quantize.MAXCOVERAGE)
+    frames = [one.quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures]
+    file = io.BytesIO()
+    options = {"save_all": True, "append_images": frames[1:], "loop": 0, "optimize": True}
+    frames[0].save(file, format="GIF", duration=_MILLISECONDS, **options)
+    return file.getvalue()

@@ -1,0 +1,119 @@
+"""`--export` of the commands: which files, and writing them."""
+
+import argparse
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from rootsopt.errors import InputError
+
+if TYPE_CHECKING:
+    from rootsopt.config import Config
+    from rootsopt.evaluate import Series
+    from rootsopt.files import ResultFolder
+
+FORMATS = {
+    "dxf": "rotor.dxf, true arcs and splines on layers",
+    "svg": "rotor.svg, true size",
+    "step": "rotor.step and pair.step, solids (needs the [cad] extra)",
+    "stl": "rotor.stl and pair.stl, triangles (needs the [cad] extra)",
+    "gif": "figures/meshing.gif, the pair in motion with contact and force",
+}
+"""Formats with the files they make; lengths are in mm."""
+_SOLID = ("step", "stl")
+
+
+def add_option(parser: argparse.ArgumentParser, default: str) -> None:
+    """Add `--export` to a command that writes `default` if not told otherwise."""
+    formats = "; ".join(f"{name}: {files}" for name, files in FORMATS.items())
+    parser.add_argument(
+        "--export",
+        default=default,
+        metavar="LIST",
+        help=f"files to draw the rotors in (mm), as in --export dxf,step; all; none. {formats} "
+        f"(default: {default})",
+    )
+
+
+def chosen(text: str) -> tuple[str, ...]:
+    """The formats `--export` names. Raises `InputError` for one that is not known, or that needs
+    a CAD kernel where there is none."""
+    names = tuple(name.strip() for name in text.lower().split(",") if name.strip())
+    if names == ("none",):
+        return ()
+    if names == ("all",):
+        names = tuple(FORMATS)
+    for name in names:
+        if name not in FORMATS:
+            raise InputError(
+                f"`--export` must be formats out of {', '.join(FORMATS)}, or all, or none, but "
+                f"has {name!r}; leave it out"
+            )
+    if set(names) & set(_SOLID):
+        from rootsopt.export.solid import require_kernel
+
+        require_kernel()
+    return tuple(name for name in FORMATS if name in names)
+
+
+def write(
+    folder: "ResultFolder",
+    config: "Config",
+    formats: Sequence[str],
+    design: dict[str, float],
+    series: "Series | None" = None,
+    periods: int = 1,
+) -> list[str]:
+    """Write a `design` (config units) in the `formats`, and return the files' names. With the
+    `series` of a simulation, the GIF shows `periods` mesh periods of it."""
+    if not formats:
+        return []
+    import jax.numpy as jnp
+    import numpy as np
+
+    from rootsopt.export.drawing import Drawing
+    from rootsopt.model import Model
+
+    values = jnp.asarray(np.array(list(design.values()), dtype=float))
+    profile = Model.of(config).profile(values)
+    drawing = Drawing.of(config, profile, design)
+    files: dict[str, bytes] = {}
+    if "dxf" in formats:
+        from rootsopt.export.dxf import dxf_bytes
+
+        files["rotor.dxf"] = dxf_bytes(drawing)
+    if "svg" in formats:
+        from rootsopt.export.svg import svg_text
+
+        files["rotor.svg"] = svg_text(drawing).encode()
+    if set(formats) & set(_SOLID):
+        files |= _solids(drawing, formats)
+    if "gif" in formats:
+        from rootsopt.export.animation import rolling_gif, simulation_gif
+
+        if series is None:
+            files["figures/meshing.gif"] = rolling_gif(drawing, profile)
+        else:
+            files["figures/meshing.gif"] = simulation_gif(drawing, profile, series, periods)
+    for name, data in files.items():
+        folder.write_bytes(name, data)
+    return list(files)
+
+
+def _solids(drawing, formats) -> dict[str, bytes]:
+    """The STEP and STL files, each solid made once."""
+    import math
+
+    from rootsopt.export import solid
+
+    body = drawing.length, drawing.bore, math.radians(drawing.helix_deg)
+    shapes = {
+        "rotor": solid.rotor(drawing.pieces, *body),
+        "pair": solid.pair(drawing.pieces, drawing.lobes, 2 * drawing.pitch_radius, *body),
+    }
+    make = {"step": solid.step_bytes, "stl": solid.stl_bytes}
+    return {
+        f"{name}.{suffix}": make[suffix](shape)
+        for suffix in _SOLID
+        if suffix in formats
+        for name, shape in shapes.items()
+    }

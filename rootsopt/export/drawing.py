@@ -1,0 +1,63 @@
+"""What a drawing of one rotor shows, whatever the format (mm, angles in rad)."""
+
+import dataclasses
+
+from rootsopt.config import Config
+from rootsopt.export.pieces import Piece, outline_pieces
+from rootsopt.profiles import Geometry, Profile, geometry
+from rootsopt.programs import Program
+
+_MM = 1e3
+_shape = Program(geometry)
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawing:
+    """One rotor: its closed outline in `pieces`, the radii of its pitch and outer circle, number
+    of `lobes`, axial `length`, twist in degrees over that length, diameter of the `bore` if it has
+    one, and `notes`, lines of text with the design's numbers."""
+
+    pieces: list[Piece]
+    pitch_radius: float
+    outer_radius: float
+    lobes: int
+    length: float
+    helix_deg: float
+    bore: float | None
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, config: Config, profile: Profile, design: dict[str, float]) -> "Drawing":
+        """The drawing of `profile`, a `design` (config units) of a config."""
+        shape: Geometry = _shape(profile)
+        outer, root = float(shape.outer_radius) * _MM, float(shape.root_radius) * _MM
+        rotor, radius = config.rotor, config.profile.pitch_radius_mm
+        body = f"length {rotor.length_mm:g} mm"
+        if rotor.bore_mm is not None:
+            body += f", bore {rotor.bore_mm:g} mm"
+        if rotor.helix_deg != 0:
+            body += f", twist {rotor.helix_deg:g} deg over the length (rotor 2: the other way)"
+        notes = [
+            f"Roots rotor, family {config.profile.family}, {config.profile.lobes} lobes",
+            ", ".join(f"{key} = {value:.8g}" for key, value in design.items()),
+            f"centre distance {2 * radius:g} mm, pitch radius {radius:g} mm",
+            f"outer radius {outer:.6f} mm, root radius {root:.6f} mm, "
+            f"area {float(shape.area) * _MM**2:.6f} mm2",
+            body,
+            f"dimensions in mm, flank clearance {config.contact.clearance_mm:g} mm not taken off",
+        ]
+        return cls(
+            pieces=outline_pieces(profile),
+            pitch_radius=radius,
+            outer_radius=outer,
+            lobes=config.profile.lobes,
+            length=rotor.length_mm,
+            helix_deg=rotor.helix_deg,
+            bore=rotor.bore_mm,
+            notes=tuple(note for note in notes if note),
+        )
+
+    @property
+    def reach(self) -> float:
+        """How far centre lines go from the axis (mm)."""
+        return 1.08 * self.outer_radius

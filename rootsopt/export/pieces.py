@@ -1,0 +1,322 @@
+"""The outline of a rotor as true arcs and cubic splines: the one source of every drawing.
+
+Each smooth stretch of the flank is either a circular arc, recognised by its own points and
+normals, or is fitted by a cubic B-spline through exact points with exact end tangents, refined
+until it deviates nowhere by more than `TOLERANCE`. Joints are shared to the last bit or, at the
+end of an arc, to rounding; a corner or cusp is a joint and is not smoothed over.
+
+Lengths are in millimetres, angles in radians, points complex numbers x + iy in the rotor frame
+with a lobe tip on +x.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex128, Float64
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline, make_interp_spline
+
+from rootsopt.errors import InputError
+from rootsopt.profiles import Profile
+from rootsopt.programs import Program
+
+TOLERANCE = 1e-7
+"""Largest deviation of a spline from the true flank, in pitch radii. As the perimeter times it
+bounds the error in area, that is below 1e-6 for every rotor."""
+ROUND = 1e-9
+"""Deviation from a circle, in pitch radii, up to which a stretch is an arc."""
+_MM = 1e3
+_SAMPLES = 65
+"""Points at which a stretch is compared with a circle."""
+_BETWEEN = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
+"""Where between two nodes a spline is compared with the true flank."""
+_MOST_NODES = 4096
+_UNEVEN = 100
+"""Ratio of a spline's longest to its shortest span past which it becomes two: towards a cusp the
+spans shrink, and programs that integrate over a whole edge by a fixed rule are then off by more
+than 1e-6."""
+_BLOCK = 512
+"""Points evaluated at once, always as many, so that one compiled program serves all."""
+_GAUSS = np.polynomial.legendre.leggauss(8)
+
+
+@dataclasses.dataclass(frozen=True)
+class Arc:
+    """Part of a circle: `center`, `radius` > 0, from angle `begin` through `sweep` (> 0 is
+    counter-clockwise)."""
+
+    center: complex
+    radius: float
+    begin: float
+    sweep: float
+
+    def at(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
+        """Points at shares 0 to 1 of the way."""
+        angle = self.begin + np.asarray(share) * self.sweep
+        return np.asarray(self.center + self.radius * np.exp(1j * angle))
+
+    @property
+    def start(self) -> complex:
+        return complex(self.at(0.0))
+
+    @property
+    def stop(self) -> complex:
+        return complex(self.at(1.0))
+
+    @property
+    def length(self) -> float:
+        return self.radius * abs(self.sweep)
+
+    def turned(self, angle: float) -> "Arc":
+        """The arc turned about the rotor's axis."""
+        center = complex(self.center * np.exp(1j * angle))
+        return dataclasses.replace(self, center=center, begin=self.begin + angle)
+
+    def mirrored(self) -> "Arc":
+        """The mirror image in the x axis, run through the other way."""
+        begin = -(self.begin + self.sweep)
+        return dataclasses.replace(self, center=complex(np.conj(self.center)), begin=begin)
+
+
+@dataclasses.dataclass(frozen=True)
+class Spline:
+    """A cubic B-spline that starts at its first control point and stops at its last:
+    `knots` (n + 4,), the ends fourfold, `controls` (n,)."""
+
+    knots: Float64[np.ndarray, " m"]
+    controls: Complex128[np.ndarray, " n"]
+
+    def at(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
+        """Points at shares 0 to 1 of the parameter, which is nearly arc length."""
+        first, last = self.knots[0], self.knots[-1]
+        return np.asarray(BSpline(self.knots, self.controls, 3)(first + share * (last - first)))
+
+    @property
+    def start(self) -> complex:
+        return complex(self.controls[0])
+
+    @property
+    def stop(self) -> complex:
+        return complex(self.controls[-1])
+
+    @property
+    def length(self) -> float:
+        return float(self.knots[-1] - self.knots[0])
+
+    def turned(self, angle: float) -> "Spline":
+        """The spline turned about the rotor's axis."""
+        return dataclasses.replace(self, controls=self.controls * np.exp(1j * angle))
+
+    def mirrored(self) -> "Spline":
+        """The mirror image in the x axis, run through the other way."""
+        knots = self.knots[0] + (self.knots[-1] - self.knots[::-1])
+        return Spline(knots, np.conj(self.controls[::-1]))
+
+    def beziers(self) -> Complex128[np.ndarray, "k 4"]:
+        """The same curve as cubic Bézier curves, one a row."""
+        curve = BSpline(self.knots, self.controls, 3)
+        ends = np.unique(self.knots)
+        points, third = curve(ends), np.diff(ends) / 3
+        # The derivative is continuous at every knot.
+        slopes = curve.derivative()(ends)
+        first, second = points[:-1] + slopes[:-1] * third, points[1:] - slopes[1:] * third
+        return np.stack([points[:-1], first, second, points[1:]], axis=-1)
+
+
+Piece = Arc | Spline
+
+
+def outline_pieces(profile: Profile) -> list[Piece]:
+    """The closed counter-clockwise outline (mm) from the root before the lobe on +x; every piece
+    starts where the one before it stops.
+
+    Raises `InputError` where a stretch of the flank takes too many nodes to come within
+    `TOLERANCE` of the true one.
+    """
+    flank = _flank(profile)
+    lobe = [piece.mirrored() for piece in reversed(flank)] + flank
+    pitch = 2 * np.pi / profile.lobes
+    around = [piece.turned(pitch * k) for k in range(profile.lobes) for piece in lobe]
+    return _closed(_merged(around, ROUND * float(profile.pitch_radius) * _MM))
+
+
+def area(pieces: list[Piece]) -> float:
+    """Area (mm²) inside a closed outline, exact for arcs and splines."""
+    return sum(map(_swept, pieces))
+
+
+def polyline(pieces: list[Piece], chord: float) -> Complex128[np.ndarray, " n"]:
+    """Closed polygon with about `chord` mm between its points, the first repeated at the end."""
+    parts = []
+    for piece in pieces:
+        count = max(2, int(np.ceil(piece.length / chord)))
+        parts.append(piece.at(np.arange(count) / count))
+    return np.concatenate([*parts, parts[0][:1]])
+
+
+def _swept(piece: Piece) -> float:
+    """∫ (x dy - y dx) / 2 along a piece."""
+    if isinstance(piece, Arc):
+        across = np.imag(np.conj(piece.center) * (piece.stop - piece.start))
+        return float(across + piece.radius**2 * piece.sweep) / 2
+    # The integrand is a polynomial of degree 5 between knots.
+    curve = BSpline(piece.knots, piece.controls, 3)
+    nodes, weights = _GAUSS
+    ends = np.unique(piece.knots)
+    half = np.diff(ends)[:, None] / 2
+    at = ends[:-1, None] + half * (1 + nodes)
+    return float(np.sum(np.imag(np.conj(curve(at)) * curve.derivative()(at)) * half * weights)) / 2
+
+
+def _flank(profile: Profile) -> list[Piece]:
+    """Pieces of one flank, from the tip's centre to the root's."""
+    size = float(profile.pitch_radius) * _MM
+    segments = [(float(s.start), float(s.stop)) for s in profile.segments()]
+    stretches = [_Stretch(profile, start, stop, False) for start, stop in segments]
+    stretches += [_Stretch(profile, stop, start, True) for start, stop in reversed(segments)]
+    whole = [stretch for stretch in stretches if stretch.start != stretch.stop]
+    pieces = [piece for stretch in whole for piece in stretch.pieces(size)]
+    # A tip land of no width, say, is left out.
+    return [piece for piece in pieces if piece.length > 1e-12 * size]
+
+
+@Program
+def _points(profile, nu):
+    """Points (m) and directions of the outward normal (rad), and arc length per normal angle
+    (m/rad), of addendum and dedendum."""
+    _, addendum, dedendum = profile.speeds(nu)
+    turned = nu + jnp.pi / profile.lobes - 2 * profile.roll_angle(nu)
+    above = profile.position(profile.addendum(nu)), nu, addendum
+    return above, (profile.position(profile.dedendum(nu)), turned, dedendum)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Stretch:
+    """One segment of the addendum, or of the dedendum, from normal angle `start` to `stop`."""
+
+    profile: Profile
+    start: float
+    stop: float
+    dedendum: bool
+
+    def look(self, share: NDArray[np.float64]):
+        """Points (mm), unit normals, and arc length per share (mm) at shares 0 to 1 of the normal
+        angle. Each end is looked at from just inside, so that it belongs to its segment."""
+        inside = np.clip(share, 1e-12, 1 - 1e-12)
+        inside = np.pad(inside, (0, -len(share) % _BLOCK), mode="edge")
+        nu = self.start + (self.stop - self.start) * inside.reshape(-1, _BLOCK)
+        blocks = [_points(self.profile, jnp.asarray(block))[int(self.dedendum)] for block in nu]
+        points, normal, speed = (
+            np.concatenate(part)[: len(share)] for part in zip(*blocks, strict=True)
+        )
+        return (
+            points @ np.array([1, 1j]) * _MM,
+            np.exp(1j * normal),
+            np.abs(speed * (self.stop - self.start)) * _MM,
+        )
+
+    def pieces(self, size: float) -> list[Piece]:
+        """The arc, the spline or the two splines, `size` being the pitch radius (mm)."""
+        if arc := self._arc(ROUND * size):
+            return [arc]
+        spline = self._spline(TOLERANCE * size)
+        spans = np.diff(np.unique(spline.knots))
+        if np.max(spans) <= _UNEVEN * np.min(spans):
+            return [spline]
+        middle = (self.start + self.stop) / 2
+        parts = (
+            dataclasses.replace(self, stop=middle),
+            dataclasses.replace(self, start=middle),
+        )
+        return [part._spline(TOLERANCE * size) for part in parts]
+
+    def _arc(self, tolerance: float) -> Arc | None:
+        """The circle P = C + ρ n that is nearest to a sample of points and normals, if all of
+        them are on it."""
+        points, normals, _ = self.look(np.linspace(0, 1, _SAMPLES))
+        spread = normals - normals.mean()
+        turning = np.sum(np.abs(spread) ** 2)
+        if turning < 1e-20:
+            return None
+        radius = np.sum(np.real((points - points.mean()) * np.conj(spread))) / turning
+        center = points.mean() - radius * normals.mean()
+        if np.max(np.abs(points - center - radius * normals)) > tolerance:
+            return None
+        ends = (points[[0, -1]] - center) / radius
+        sweep = float(np.sum(np.angle(normals[1:] / normals[:-1])))
+        side = 0.0 if radius > 0 else np.pi
+        return Arc(complex(center), float(abs(radius)), float(np.angle(ends[0])) + side, sweep)
+
+    def _spline(self, tolerance: float) -> Spline:
+        """Cubic spline over arc length, with nodes halved between until it is close enough."""
+        nodes = np.linspace(0, 1, 5)
+        while len(nodes) <= _MOST_NODES:
+            spline, error = self._fitted(nodes)
+            coarse = error > tolerance
+            if not np.any(coarse):
+                return spline
+            middle = (nodes[1:] + nodes[:-1])[coarse] / 2
+            nodes = np.sort(np.concatenate([nodes, middle]))
+        raise InputError(
+            f"the flank between normal angles {self.start:.6g} and {self.stop:.6g} rad needs more "
+            f"than {_MOST_NODES} nodes to be drawn within {tolerance:.2g} mm; change the design a "
+            "little"
+        )
+
+    def _fitted(self, nodes: NDArray[np.float64]) -> tuple[Spline, NDArray[np.float64]]:
+        """The spline through `nodes`, and its largest deviation (mm) between each two of them."""
+        width = np.diff(nodes)
+        gauss, weights = _GAUSS
+        at = nodes[:-1, None] + width[:, None] * (1 + gauss) / 2
+        speed = self.look(at.ravel())[2].reshape(at.shape)
+        length = np.concatenate([[0.0], np.cumsum(speed @ weights / 2 * width)])
+        points, normals, _ = self.look(nodes)
+        ends = 1j * normals[[0, -1]]
+        curve = make_interp_spline(length, points, k=3, bc_type=([(1, ends[0])], [(1, ends[1])]))
+        between = (nodes[:-1, None] + width[:, None] * _BETWEEN).ravel()
+        true = self.look(between)[0]
+        foot = np.interp(between, nodes, length)
+        # The parameter of the foot point, by Newton's method; what is left is the deviation.
+        slope = curve.derivative()
+        for _ in range(4):
+            tangent = slope(foot)
+            foot = foot + np.real((true - curve(foot)) * np.conj(tangent)) / np.abs(tangent) ** 2
+            foot = np.clip(foot, 0, length[-1])
+        error = np.abs(true - curve(foot)).reshape(at.shape[0], -1).max(axis=1)
+        return Spline(np.asarray(curve.t), np.asarray(curve.c, dtype=complex)), error
+
+
+def _merged(pieces: list[Piece], tolerance: float) -> list[Piece]:
+    """Neighbouring arcs of one circle in one piece; the first piece may start earlier then."""
+    merged: list[Piece] = []
+    for piece in pieces:
+        if merged and (joined := _joined(merged[-1], piece, tolerance)):
+            merged[-1] = joined
+        else:
+            merged.append(piece)
+    if len(merged) > 2 and (joined := _joined(merged[-1], merged[0], tolerance)):
+        merged = [joined, *merged[1:-1]]
+    return merged
+
+
+def _joined(one: Piece, other: Piece, tolerance: float) -> Arc | None:
+    if not (isinstance(one, Arc) and isinstance(other, Arc)):
+        return None
+    same = abs(one.center - other.center) + abs(one.radius - other.radius) <= tolerance
+    if not same or one.sweep * other.sweep < 0:
+        return None
+    return dataclasses.replace(one, sweep=one.sweep + other.sweep)
+
+
+def _closed(pieces: list[Piece]) -> list[Piece]:
+    """The pieces with every spline's ends put on those of its neighbours, which differ from them
+    by rounding."""
+    closed = list(pieces)
+    for i, piece in enumerate(closed):
+        if isinstance(piece, Spline):
+            after = closed[(i + 1) % len(closed)]
+            controls = piece.controls.copy()
+            controls[0], controls[-1] = closed[i - 1].stop, after.start
+            closed[i] = dataclasses.replace(piece, controls=controls)
+    return closed

@@ -1,0 +1,192 @@
+"""Solids of one rotor and of the pair: STEP with true arcs and B-splines, STL for printing.
+
+The only place that knows the CAD kernel (build123d on Open CASCADE), an optional dependency.
+Lengths in millimetres, angles in radians.
+"""
+
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
+# (The kernel is optional, and its bindings come without types.)
+
+import dataclasses
+import importlib.util
+import io
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+
+from rootsopt.errors import InputError
+from rootsopt.export.pieces import Arc, Piece
+
+if TYPE_CHECKING:
+    from build123d import Compound, Edge, Face, Solid
+    from build123d.topology import Shape
+
+CHORD = 0.005
+"""Largest distance (mm) between a facet of an STL file and the solid."""
+TURN = 0.05
+"""Largest angle (rad) between neighbouring facets of a curved face of an STL file."""
+_STEP = np.pi / 48
+"""Twist (rad) between the knots of a helical face: a cubic spline of the turning that fine is
+off by 5e-8 of the radius."""
+_SPANS = 8
+"""Least knot spans along a face. One would do for a straight rotor, but what most programs give
+as volume is the kernel's Gauss quadrature, and that is finer the more knots it meets: with a
+single span it is off by 2e-4 next to a cusp, where the solid itself is right to 1e-8."""
+
+
+def require_kernel() -> None:
+    """Raise `InputError` where the CAD kernel is not installed."""
+    if importlib.util.find_spec("build123d") is None:
+        raise InputError(
+            "`--export` step and stl need the CAD kernel build123d, which is not installed; "
+            "run: pip install 'rootsopt[cad]'"
+        )
+
+
+def rotor(pieces: list[Piece], length: float, bore: float | None, helix: float) -> "Solid":
+    """One rotor between z = 0 and `length`: the closed outline `pieces` at z = 0, turned by
+    `helix` on the way up, with a `bore` (its diameter; None for none)."""
+    from build123d import Axis, Edge, Face, Shell, Solid, Vector, Wire
+
+    if helix != 0:
+        pieces = [part for piece in pieces for part in _quarters(piece)]
+    up = Vector(0, 0, length)
+    hole = [] if bore is None else [Edge.make_circle(bore / 2)]
+    bottom = Face(Wire([_edge(piece) for piece in pieces]), [Wire([edge]) for edge in hole])
+    top = bottom.rotate(Axis.Z, np.degrees(helix)).translate(up)
+    sides = [_side(piece, length, helix) for piece in pieces]
+    sides += [Face.extrude(edge, up) for edge in hole]
+    solid = Solid(Shell([bottom, top, *sides]))
+    solid.label = "rotor"
+    return solid
+
+
+def pair(
+    pieces: list[Piece],
+    lobes: int,
+    center_distance: float,
+    length: float,
+    bore: float | None,
+    helix: float,
+) -> "Compound":
+    """Both rotors at φ = 0: rotor 1 at the origin with a lobe on +x, rotor 2 at
+    (`center_distance`, 0) with a space there, twisted the other way."""
+    from build123d import Axis, Compound, Vector
+
+    first, second = (rotor(pieces, length, bore, turn) for turn in (helix, -helix))
+    # The mirror image of a symmetric rotor that is turned by π/N.
+    second = second.rotate(Axis.Z, 180 - 180 / lobes).translate(Vector(center_distance, 0, 0))
+    first.label, second.label = "rotor_1", "rotor_2"
+    return Compound(label="rotor_pair", children=[first, second])
+
+
+def step_bytes(shape: "Shape") -> bytes:
+    """A STEP file (mm) of a solid or an assembly."""
+    from build123d import export_step
+
+    file = io.BytesIO()
+    export_step(shape, file)
+    return file.getvalue()
+
+
+def stl_bytes(shape: "Shape") -> bytes:
+    """A binary STL file (mm) within `CHORD` and `TURN` of a solid or an assembly."""
+    from build123d import export_stl
+
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "shape.stl"
+        if not export_stl(shape, file, tolerance=CHORD, angular_tolerance=TURN):
+            raise InputError("the solid cannot be cut into triangles; export step instead")
+        return file.read_bytes()
+
+
+def _point(z: complex) -> tuple[float, float, float]:
+    return float(z.real), float(z.imag), 0.0
+
+
+def _edge(piece: Piece) -> "Edge":
+    from build123d import AngularDirection, Edge, Plane
+
+    if not isinstance(piece, Arc):
+        return Edge.make_bspline([_point(z) for z in piece.controls], piece.knots, 3)
+    ways = AngularDirection.COUNTER_CLOCKWISE, AngularDirection.CLOCKWISE
+    first, last = np.degrees([piece.begin, piece.begin + piece.sweep])
+    plane = Plane(_point(piece.center))
+    return Edge.make_circle(piece.radius, plane, first, last, ways[piece.sweep < 0])
+
+
+def _side(piece: Piece, length: float, helix: float) -> "Face":
+    """The side of the rotor over one piece: a cylinder over an arc of a straight rotor, else a
+    B-spline surface, which is exact where the kernel's own twisted sweeps are off by 1e-4 near a
+    cusp."""
+    from build123d import Face, Vector
+
+    if isinstance(piece, Arc) and helix == 0:
+        return Face.extrude(_edge(piece), Vector(0, 0, length))
+    degree, knots, controls, weights = _rational(piece)
+    # Along z the points turn as exp(iθ), of which a cubic spline ρ gives control points c ρ.
+    turns = max(_SPANS, int(np.ceil(abs(helix) / _STEP)))
+    share = np.linspace(0, 1, turns + 1)
+    rate = 1j * helix
+    ends = ([(1, rate)], [(1, rate * np.exp(rate))])
+    rising = make_interp_spline(share, np.exp(rate * share), k=3, bc_type=ends)
+    heights = np.array([rising.t[i + 1 : i + 4].mean() for i in range(len(rising.c))])
+    return _surface(
+        (degree, 3),
+        (knots, rising.t),
+        controls[:, None] * rising.c,
+        np.broadcast_to(heights * length, (len(controls), len(heights))),
+        np.broadcast_to(weights[:, None], (len(controls), len(heights))),
+    )
+
+
+def _rational(piece: Piece):
+    """Degree, knots, control points and weights of a piece as a rational B-spline; an arc must be
+    shorter than half a circle."""
+    if not isinstance(piece, Arc):
+        return 3, piece.knots, piece.controls, np.ones(len(piece.controls))
+    half = piece.sweep / 2
+    weights = np.array([1, np.cos(half), 1])
+    circle = piece.radius / weights * np.exp(1j * (piece.begin + half * np.arange(3)))
+    return 2, np.repeat([0, piece.length], 3), piece.center + circle, weights
+
+
+def _quarters(piece: Piece) -> list[Piece]:
+    """A piece in parts of which no arc is longer than a quarter of a circle."""
+    if not isinstance(piece, Arc):
+        return [piece]
+    count = int(np.ceil(abs(piece.sweep) / (np.pi / 2) - 1e-9))
+    sweep = piece.sweep / count
+    begins = (piece.begin + k * sweep for k in range(count))
+    return [dataclasses.replace(piece, begin=begin, sweep=sweep) for begin in begins]
+
+
+def _surface(degrees, knots, points, heights, weights) -> "Face":
+    """A face on a rational B-spline surface: `points` complex (n, m), at `heights`."""
+    from build123d import Face
+    from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeFace
+    from OCP.collections import Array1_double, Array1_int, Array2_double, Array2_gp_Pnt
+    from OCP.Geom import Geom_BSplineSurface
+    from OCP.gp import gp_Pnt
+
+    rows, columns = points.shape
+    poles = Array2_gp_Pnt(1, rows, 1, columns)
+    shares = Array2_double(1, rows, 1, columns)
+    for i in range(rows):
+        for j in range(columns):
+            x, y, _ = _point(points[i, j])
+            poles.SetValue(i + 1, j + 1, gp_Pnt(x, y, float(heights[i, j])))
+            shares.SetValue(i + 1, j + 1, float(weights[i, j]))
+    vectors = []
+    for values, counts in (np.unique(k, return_counts=True) for k in knots):
+        places, multiplicities = Array1_double(1, len(values)), Array1_int(1, len(values))
+        for i, (value, count) in enumerate(zip(values, counts, strict=True), start=1):
+            places.SetValue(i, float(value))
+            multiplicities.SetValue(i, int(count))
+        vectors.append((places, multiplicities))
+    (u, u_counts), (v, v_counts) = vectors
+    surface = Geom_BSplineSurface(poles, shares, u, v, u_counts, v_counts, *degrees)
+    return Face(BRepBuilderAPI_MakeFace(surface, 1e-7).Face())
