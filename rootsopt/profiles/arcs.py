@@ -92,7 +92,9 @@ class Arcs(Profile):
 
     def contact_distance(self, nu):
         lever = self.lever(nu)
-        return self.support(nu) - jnp.sqrt((self.pitch_radius - lever) * (self.pitch_radius + lever))
+        return self.support(nu) - jnp.sqrt(
+            (self.pitch_radius - lever) * (self.pitch_radius + lever)
+        )
 
     def normal_at(self, roll_angle):
         # The normals of an arc pass through its centre and the pitch point.

@@ -63,9 +63,7 @@ class Curve(Profile):
         node, value, slope, bend = jnp.concatenate([jnp.stack(row) for row in rows], axis=1)
         ends = jnp.append(node[:: intervals + 1], node[-1])
         names, lands = (tuple(x) for x in zip(*((p.name, p.land) for p in pieces), strict=True))
-        return cls(
-            lobes, names, lands, jnp.asarray(pitch_radius), node, value, slope, bend, ends
-        )
+        return cls(lobes, names, lands, jnp.asarray(pitch_radius), node, value, slope, bend, ends)
 
     def segments(self) -> tuple[Segment, ...]:
         stretches = zip(self.names, self.ends[:-1], self.ends[1:], self.lands, strict=True)
@@ -114,7 +112,9 @@ class Curve(Profile):
 
     def contact_distance(self, nu):
         lever = self.lever(nu)
-        return self.support(nu) - jnp.sqrt((self.pitch_radius - lever) * (self.pitch_radius + lever))
+        return self.support(nu) - jnp.sqrt(
+            (self.pitch_radius - lever) * (self.pitch_radius + lever)
+        )
 
     def normal_at(self, roll_angle):
         begins = self.node - jnp.arcsin(-self.slope / self.pitch_radius)
