@@ -1,7 +1,7 @@
 """From config to model: units, profile, rotor pair.
 
 A design is a vector of the config's design parameters in the config's own units
-(`DESIGN_KEYS` for CIC, empty for EE), so gradients come out per config unit.
+(`FAMILY_KEYS`; none for EE), so gradients come out per config unit.
 """
 
 import functools
@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
-from rootsopt.config import DESIGN_KEYS, Config
+from rootsopt import families
+from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.contact.impact import ImpactLaw
 from rootsopt.contact.linear import LinearContact
 from rootsopt.contact.map import MapContact
@@ -36,20 +37,10 @@ from rootsopt.dynamics.parts import (
     TimingGear,
 )
 from rootsopt.errors import InputError
-from rootsopt.profiles import CIC, EE, Geometry, Profile, geometry, outline
+from rootsopt.families import MM
+from rootsopt.profiles import Geometry, Profile, geometry, outline
 from rootsopt.programs import Program
 
-MM = 1e-3
-DEG = math.pi / 180
-_OVERLENGTH = 0.02
-"""How far u may exceed u_max, relative. Past u_max the roll angle turns back and two
-points of a flank mesh at once. Node search finds no interference (< 1 nm) up to 5 % over;
-the paper's printed Table 1 is 1.2 % over."""
-
-
-_CLEAR = 1e-6
-"""Least involute beyond that at which the tip arc is centred on the pitch circle a second time, in
-pitch radii."""
 _ROLLS, _RELATIVES = 384, 16
 """Map of a model nobody has sized."""
 
@@ -145,10 +136,7 @@ class Model(eqx.Module):
 
     def profile(self, design: Float[Array, " d"]) -> Profile:
         """The profile of a design given in config units."""
-        if self.family == "ee":
-            return EE(self.lobes, self.pitch_radius)
-        angle, length, tip = design
-        return CIC(self.lobes, self.pitch_radius, angle * DEG, length * MM, tip * DEG)
+        return families.profile_of(self.family, self.lobes, self.pitch_radius, design)
 
     @property
     def static_depth(self) -> float:
@@ -360,14 +348,12 @@ def _expected_rotation(config: Config) -> float:
 
 def design_vector(config: Config) -> Float[Array, " d"]:
     """The config's design parameters in config units: (3,) for CIC, (0,) for EE."""
-    if config.profile.family == "ee":
-        return jnp.zeros(0)
-    return jnp.asarray([getattr(config.profile, key) for key in DESIGN_KEYS])
+    return families.design_of(config.profile)
 
 
 def design_keys(config: Config) -> tuple[str, ...]:
     """Names of the entries of `design_vector`."""
-    return () if config.profile.family == "ee" else DESIGN_KEYS
+    return FAMILY_KEYS[config.profile.family]
 
 
 def outline_mm(config: Config, design: ArrayLike | None = None) -> NDArray[np.float64]:
@@ -421,46 +407,4 @@ def _shape(model: Model, design):
 
 def _check_profile(config: Config) -> None:
     """Raise `InputError` unless the config's profile can be made and meshes."""
-    profile_config = config.profile
-    if profile_config.family != "cic":
-        return
-    alpha = profile_config.pressure_angle_deg
-    length = profile_config.involute_length_mm
-    tip = profile_config.tip_arc_angle_deg
-    assert alpha is not None
-    assert length is not None
-    assert tip is not None
-    half = 90.0 / profile_config.lobes
-    if tip >= half:
-        raise InputError(
-            f"`profile.tip_arc_angle_deg` must be less than {half:g} (a quarter of the lobe "
-            f"pitch) for {profile_config.lobes} lobes, but is {tip:g}"
-        )
-    longest = profile_config.pitch_radius_mm * math.sin(alpha * DEG) * (half - tip) * DEG
-    limit = longest * (1 + _OVERLENGTH)
-    if length > limit:
-        raise InputError(
-            f"`profile.involute_length_mm` must be at most {longest:.4g} at "
-            f"`profile.pressure_angle_deg` = {alpha:g} and `profile.tip_arc_angle_deg` = "
-            f"{tip:g} (up to {limit:.4g} is tolerated), but is {length:g}: the roll angle would "
-            "turn back; shorten it or raise the pressure angle"
-        )
-    radius, sine = profile_config.pitch_radius_mm, math.sin(alpha * DEG)
-    # The tip arc's centre must lie inside the pitch circle, which all its normals cross.
-    shortest = radius * sine * (half - tip - 2 * alpha) * DEG
-    if length < shortest + _CLEAR * radius:
-        raise InputError(
-            f"`profile.involute_length_mm` must be at least {shortest + _CLEAR * radius:.4g} at "
-            f"`profile.pressure_angle_deg` = {alpha:g} and `profile.tip_arc_angle_deg` = {tip:g}, "
-            f"but is {length:g}: the tip arc would touch nothing on the other rotor; lengthen it, "
-            "or raise the pressure angle or the tip arc"
-        )
-    # On the dedendum the involute's end is the first to be undercut.
-    uncut = radius * sine * math.tan(alpha * DEG)
-    if length > uncut * (1 + 1e-9):
-        raise InputError(
-            f"`profile.involute_length_mm` must be at most {uncut:.4g} at "
-            f"`profile.pressure_angle_deg` = {alpha:g}, but is {length:g}: the dedendum is "
-            f"undercut (margin {(uncut - length) / math.tan(alpha * DEG):.3g} mm); shorten it "
-            "or raise the pressure angle"
-        )
+    families.check(config.profile)

@@ -8,30 +8,68 @@ from rootsopt.config.section import NonNegative, Positive, Section
 
 DESIGN_KEYS = ("pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg")
 """The design parameters of a CIC rotor, as named in the config."""
+FAMILY_KEYS: dict[str, tuple[str, ...]] = {
+    "cic": DESIGN_KEYS,
+    "ee": (),
+    "arc": ("arc_center_mm",),
+    "arc_involute": ("pressure_angle_deg", "involute_length_mm"),
+    "four_arcs": ("arc_center_mm", "tip_arc_radius_mm", "tip_arc_turn_deg"),
+    "five_arcs": (
+        "outer_radius_mm",
+        "tip_arc_angle_deg",
+        "tip_arc_radius_mm",
+        "tip_arc_turn_deg",
+    ),
+    "ellipse": ("ellipse_center_mm", "ellipse_height_mm"),
+}
+"""Profile families with their design parameters, as named in the config."""
 
 
 class ProfileConfig(Section):
     """The rotor profile."""
 
-    family: Literal["cic", "ee"] = Field(description="profile family")
+    family: Literal["cic", "ee", "arc", "arc_involute", "four_arcs", "five_arcs", "ellipse"] = (
+        Field(description="profile family")
+    )
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
     pitch_radius_mm: Positive = Field(description="pitch radius; centre distance is twice that")
     pressure_angle_deg: Annotated[float, Field(gt=0, lt=90)] | None = Field(
-        None, description="cic: pressure angle of the involute"
+        None, description="cic, arc_involute: pressure angle of the involute"
     )
-    involute_length_mm: Positive | None = Field(None, description="cic: involute parameter u")
+    involute_length_mm: Positive | None = Field(
+        None, description="cic, arc_involute: involute parameter u"
+    )
     tip_arc_angle_deg: Annotated[float, Field(ge=0, lt=45)] | None = Field(
-        None, description="cic: half angle of the tip land"
+        None, description="cic, five_arcs: half angle of the tip land"
+    )
+    arc_center_mm: Positive | None = Field(
+        None, description="arc, four_arcs: distance of the tip arc's centre from the axis"
+    )
+    tip_arc_radius_mm: Positive | None = Field(
+        None, description="four_arcs, five_arcs: radius of the tip arc"
+    )
+    tip_arc_turn_deg: Annotated[float, Field(gt=0, lt=180)] | None = Field(
+        None, description="four_arcs, five_arcs: normal angle at which the tip arc ends"
+    )
+    outer_radius_mm: Positive | None = Field(None, description="five_arcs: radius of the tip land")
+    ellipse_center_mm: NonNegative | None = Field(
+        None, description="ellipse: distance of the ellipse's centre from the axis"
+    )
+    ellipse_height_mm: Positive | None = Field(
+        None, description="ellipse: semi-axis along the lobe"
     )
 
     @model_validator(mode="after")
     def _family_keys(self):
-        for key in DESIGN_KEYS:
+        own = FAMILY_KEYS[self.family]
+        for key in dict.fromkeys(key for keys in FAMILY_KEYS.values() for key in keys):
             given = getattr(self, key) is not None
-            if self.family == "cic" and not given:
-                raise ValueError(f"`profile.{key}` is required for family cic")
-            if self.family == "ee" and given:
-                raise ValueError(f"`profile.{key}` does not belong to family ee; remove it")
+            if key in own and not given:
+                raise ValueError(f"`profile.{key}` is required for family {self.family}")
+            if key not in own and given:
+                raise ValueError(
+                    f"`profile.{key}` does not belong to family {self.family}; remove it"
+                )
         return self
 
 

@@ -1,0 +1,114 @@
+"""Addenda of circular arcs, each tangent to the next."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rootsopt.profiles.base import Profile, Segment
+
+
+class Arcs(Profile):
+    """An addendum of n circular arcs, and the envelope it leaves on the partner.
+
+    The point of the arc with centre C and radius ρ whose normal has the direction ν is C + ρ n(ν),
+    so its support function is C·n + ρ and the lever of its normal C × n. The normal meets the
+    pitch circle where sin(ν - β) = lever / r, and s = support - r cos(ν - β). An arc of radius 0 is
+    a corner: it turns about one point, which traces an extended epicycloid on the partner.
+
+    `center` (n, 2) and `radius` (n,) in m, in the rotor frame with the lobe's axis on +x; `joints`
+    (n + 1,): normal angles (rad) from the tip, 0, to the pitch crossing; `names` of the arcs, of
+    which the first is a `land` if it is centred on the rotor's axis.
+    """
+
+    lobes: int = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+    land: bool = eqx.field(static=True)
+    pitch_radius: Float[Array, ""]
+    center: Float[Array, "n 2"]
+    radius: Float[Array, " n"]
+    joints: Float[Array, " n+1"]
+
+    @classmethod
+    def chain(
+        cls,
+        lobes: int,
+        pitch_radius: Float[Array, ""],
+        center: Float[Array, ""],
+        radii: Sequence[Float[Array, ""]],
+        joints: Sequence[Float[Array, ""]],
+        names: Sequence[str] = (),
+    ) -> "Arcs":
+        """Arcs from the tip to the pitch crossing: the first has its `center` (m) on the lobe's
+        axis (0: a land), all but the last have `radii` (m) and end at the `joints` (rad); the
+        radius of the last makes it pass through the pitch crossing."""
+        r = jnp.asarray(pitch_radius)
+        half = jnp.pi / (2 * lobes)
+        crossing = r * jnp.stack([jnp.cos(half), jnp.sin(half)])
+        place = jnp.stack([jnp.asarray(center), jnp.zeros_like(r)])
+        centers, found = [place], list(map(jnp.asarray, radii))
+        for k, joint in enumerate(joints):
+            normal = jnp.stack([jnp.cos(joint), jnp.sin(joint)])
+            if k + 1 == len(radii):
+                # |X - C| = ρ for the last, with C on the normal of the joint.
+                to = crossing - centers[-1] - found[-1] * normal
+                found.append(-jnp.dot(to, to) / (2 * jnp.dot(to, normal)))
+            centers.append(centers[-1] + (found[k] - found[k + 1]) * normal)
+        if not radii:
+            found.append(jnp.linalg.norm(crossing - place))
+        x, y = crossing - centers[-1]
+        stop = jnp.arctan2(y, x)
+        ends = jnp.stack([jnp.zeros_like(r), *map(jnp.asarray, joints), stop])
+        names = tuple(names) or tuple(f"arc {k + 1}" for k in range(len(found)))
+        land = isinstance(center, float | int) and center == 0
+        return cls(lobes, names, land, r, jnp.stack(centers), jnp.stack(found), ends)
+
+    def segments(self) -> tuple[Segment, ...]:
+        ends = zip(self.names, self.joints[:-1], self.joints[1:], strict=True)
+        return tuple(
+            Segment(name, start, stop, self.land and place == 0)
+            for place, (name, start, stop) in enumerate(ends)
+        )
+
+    def _arc(self, nu):
+        """Index of the arc with the normal `nu`; the first and the last go on beyond their ends."""
+        return jnp.sum(nu[..., None] > self.joints[1:-1], axis=-1)
+
+    def lever(self, nu):
+        return self.lever_from(nu, jnp.cos(nu), jnp.sin(nu))
+
+    def lever_from(self, nu, cos, sin):
+        x, y = jnp.moveaxis(self.center[self._arc(nu)], -1, 0)
+        return x * sin - y * cos
+
+    def support(self, nu):
+        arc = self._arc(nu)
+        x, y = jnp.moveaxis(self.center[arc], -1, 0)
+        return x * jnp.cos(nu) + y * jnp.sin(nu) + self.radius[arc]
+
+    def roll_angle(self, nu):
+        return nu - jnp.arcsin(self.lever(nu) / self.pitch_radius)
+
+    def contact_distance(self, nu):
+        lever = self.lever(nu)
+        return self.support(nu) - jnp.sqrt(
+            (self.pitch_radius - lever) * (self.pitch_radius + lever)
+        )
+
+    def normal_at(self, roll_angle):
+        # The normals of an arc pass through its centre and the pitch point.
+        begins = self.roll_angle(self.joints[1:-1])
+        arc = jnp.sum(roll_angle[..., None] > begins, axis=-1)
+        r = self.pitch_radius
+        pitch = r * jnp.stack([jnp.cos(roll_angle), jnp.sin(roll_angle)], axis=-1)
+        reach = pitch - self.center[arc]
+        # From a corner outside of the pitch circle the normal points away from the pitch point.
+        outside = jnp.sum(self.center[arc] ** 2, axis=-1) > r**2
+        reach = jnp.where(outside[..., None], -reach, reach)
+        x, y = jnp.moveaxis(reach, -1, 0)
+        return jnp.arctan2(y, x)
+
+    @property
+    def cusp(self) -> bool:
+        return False

@@ -1,0 +1,27 @@
+"""Ellipse: an elliptic arc and its conjugate envelope."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rootsopt.profiles.curve import Curve, Piece
+
+
+def ellipse(
+    lobes: int,
+    pitch_radius: Float[Array, ""],
+    center: Float[Array, ""],
+    height: Float[Array, ""],
+) -> Curve:
+    """The lobe is an arc of an ellipse through both pitch crossings: its `center` b (m) and the
+    semi-axis `height` A (m) lie along the lobe's axis; the other one, B, follows from the
+    crossings, (r cos π/2N - b)² / A² + (r sin π/2N)² / B² = 1. With A = B it is the single arc."""
+    r, half = jnp.asarray(pitch_radius), jnp.pi / (2 * lobes)
+    x, y = (r * jnp.cos(half) - center) / height, r * jnp.sin(half)
+    stop = jnp.arccos(x)
+    width = y / jnp.sin(stop)
+
+    def position(t):
+        angle = stop * t
+        return jnp.stack([center + height * jnp.cos(angle), width * jnp.sin(angle)])
+
+    return Curve.of(lobes, r, [Piece("ellipse", position)])

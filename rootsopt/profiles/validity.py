@@ -1,0 +1,58 @@
+"""How far a profile is from being none."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rootsopt.profiles.base import Profile
+from rootsopt.programs import Program
+
+_POINTS = 400
+"""Places on a segment that are looked at."""
+
+
+class Margins(NamedTuple):
+    """Least values along a flank, positive where the profile is sound.
+
+    `turning` (rad): of a segment's range of normals, that is, the order of the joints; `convexity`
+    (m): radius of curvature of the addendum; `reach` (m): what the normals' levers lack to the
+    pitch radius, beyond which they miss the pitch circle; `rolling`: dβ/dν, negative where two
+    points of a flank mesh at once; `undercut` (m/rad): `Profile.dedendum_speed`; `star` (m):
+    distance of a tangent of addendum or dedendum from the axis, seen from which the outline would
+    fold back at 0; `root` (m): root radius.
+    """
+
+    turning: Float[Array, ""]
+    convexity: Float[Array, ""]
+    reach: Float[Array, ""]
+    rolling: Float[Array, ""]
+    undercut: Float[Array, ""]
+    star: Float[Array, ""]
+    root: Float[Array, ""]
+
+
+@Program
+def margins(profile: Profile) -> Margins:
+    """Margins of a profile, looked at in many places of each segment (joints from both sides)."""
+    segments = profile.segments()
+    start = jnp.stack([s.start for s in segments])[:, None]
+    length = jnp.stack([s.stop for s in segments])[:, None] - start
+    nu = start + length * jnp.linspace(1e-9, 1 - 1e-9, _POINTS)
+    point, addendum, dedendum = profile.speeds(nu)
+    r = profile.pitch_radius
+    sliding = r * jnp.sin(point.psi)
+    present = length > 0
+
+    def least(values):
+        return jnp.min(jnp.where(present, values, jnp.inf))
+
+    return Margins(
+        turning=jnp.min(length),
+        convexity=least(addendum),
+        reach=least(r - jnp.abs(profile.lever(nu))),
+        rolling=least(profile.roll_rate(nu)),
+        undercut=least(dedendum),
+        star=least(jnp.minimum(sliding + point.s, sliding - point.s)),
+        root=r - profile.contact_distance(jnp.zeros_like(r)),
+    )
