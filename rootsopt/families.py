@@ -8,8 +8,19 @@ from jaxtyping import Array, Float
 
 from rootsopt.config import FAMILY_KEYS, ProfileConfig
 from rootsopt.errors import InputError
-from rootsopt.profiles import CIC, EE, Profile, ellipse
-from rootsopt.profiles.arc_families import arc, five_arcs, four_arcs
+from rootsopt.profiles import (
+    CIC,
+    EE,
+    Profile,
+    arc,
+    arcs_epicycloid,
+    circle_epicycloid,
+    ellipse,
+    extended_cycloid,
+    five_arcs,
+    four_arcs,
+    hypo_epicycloid,
+)
 from rootsopt.profiles.validity import margins
 
 MM = 1e-3
@@ -28,16 +39,22 @@ _MAKERS: dict[str, Callable[..., Profile]] = {
     "cic": CIC,
     "ee": EE,
     "arc": arc,
+    "arcs_epicycloid": arcs_epicycloid,
     "arc_involute": lambda lobes, r, angle, length: CIC(lobes, r, angle, length, 0.0),
     "four_arcs": four_arcs,
     "five_arcs": five_arcs,
+    "circle_epicycloid": circle_epicycloid,
+    "hypo_epicycloid": hypo_epicycloid,
+    "extended_cycloid": extended_cycloid,
     "ellipse": ellipse,
 }
 
 
 def unit_of(key: str) -> float:
     """SI value of one unit of a config key."""
-    return DEG if key.endswith("_deg") else MM
+    if key.endswith("_deg"):
+        return DEG
+    return MM if key.endswith("_mm") else 1.0
 
 
 def profile_of(
@@ -59,16 +76,19 @@ def check(config: ProfileConfig) -> None:
     if config.family in ("cic", "arc_involute"):
         _check_involute(config)
         return
+    if config.family == "arcs_epicycloid":
+        _check_edge(config)
     profile = profile_of(
         config.family, config.lobes, jnp.asarray(config.pitch_radius_mm * MM), design_of(config)
     )
     found = margins(profile)
-    size = {"turning": 1.0, "rolling": 1.0}
     for name, value in found._asdict().items():
-        least = _ROUNDING * size.get(name, config.pitch_radius_mm * MM)
-        if not float(value) >= -least:
+        if (config.family, name) in _INHERENT:
+            continue
+        scale = 1.0 if name in _PURE else config.pitch_radius_mm * MM
+        if not float(value) >= -_ROUNDING * scale:
             given = ", ".join(
-                f"`profile.{key}` = {getattr(config, key):g}" for key in FAMILY_KEYS[config.family]
+                f"`profile.{key}` = {getattr(config, key)}" for key in FAMILY_KEYS[config.family]
             )
             raise InputError(
                 f"the profile of family {config.family} must be sound, but with {given} "
@@ -76,21 +96,44 @@ def check(config: ProfileConfig) -> None:
             )
 
 
+_PURE = ("turning", "rolling", "order")
+"""Margins that are no lengths."""
+_INHERENT = {("arcs_epicycloid", "rolling")}
+"""What belongs to a family: an edge outside of the pitch circle meshes twice."""
+_SHARPEST = 0.002
+"""Least radius of an edge in pitch radii: less is a corner, along which the outline's and the
+contact's nodes fall together."""
 _FAULTS = {
     "turning": "an arc would end before it begins",
     "convexity": "the addendum is not convex",
     "reach": "some normals of the addendum miss the pitch circle: it would touch nothing there",
+    "fall": "the tip is no tip: the outline rises again behind it",
     "rolling": "two points of a flank would mesh at once",
+    "order": "a flank would touch before the tip of its lobe has come to the line of centres",
     "undercut": "the dedendum is undercut",
     "star": "the outline folds back, seen from the axis",
     "root": "the root lies beyond the axis",
 }
 _REMEDIES = {
     "arc": "move the centre: it must lie inside the pitch circle, and too far out undercuts",
+    "arcs_epicycloid": "widen the land, move the arc's centre inwards, or round the edge more",
     "four_arcs": "move the tip arc's centre inwards, or change where it ends or its radius",
     "five_arcs": "lower the outer radius, or change the tip arc's radius or where it ends",
+    "circle_epicycloid": "let the tip arc end further from the tip, or change the rolling radius",
+    "hypo_epicycloid": "make the tip arc angle less than 90° / lobes",
+    "extended_cycloid": "bring the trochoid ratio closer to 1",
     "ellipse": "move the centre, or change the height",
 }
+
+
+def _check_edge(config: ProfileConfig) -> None:
+    edge, least = config.edge_radius_mm, _SHARPEST * config.pitch_radius_mm
+    assert edge is not None
+    if edge < least:
+        raise InputError(
+            f"`profile.edge_radius_mm` must be at least {least:g} ({_SHARPEST:g} pitch radii), but "
+            f"is {edge:g}: a sharp edge has no contact law; round it"
+        )
 
 
 def _check_involute(profile_config: ProfileConfig) -> None:

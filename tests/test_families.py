@@ -27,6 +27,10 @@ DESIGNS = {
         "tip_arc_radius_mm": 13.0,
         "tip_arc_turn_deg": 60.0,
     },
+    "arcs_epicycloid": {"arc_center_mm": 27.0, "tip_arc_angle_deg": 8.0, "edge_radius_mm": 1.0},
+    "circle_epicycloid": {"rolling_radius_mm": 7.0, "tip_arc_turn_deg": 30.0},
+    "hypo_epicycloid": {"tip_arc_angle_deg": 4.0},
+    "extended_cycloid": {"trochoid_ratio": 1.3},
     "ellipse": {"ellipse_center_mm": 27.0, "ellipse_height_mm": 18.0},
 }
 every_family = pytest.mark.parametrize("family", DESIGNS)
@@ -81,7 +85,7 @@ def test_ranges_of_the_arc_and_involute_patent():
     distance = 1.0
     r = distance / 2
     longest = r * np.sin(np.pi / 4) * np.pi / 4
-    least = profile_of("arc_involute", 2, r / 1.0, np.array([45.0, longest * 1e3]))
+    least = profile_of("arc_involute", 2, jnp.asarray(r), jnp.asarray([45.0, longest * 1e3]))
     assert isinstance(least, CIC)
     assert float(least.base_radius) == pytest.approx(distance / (2 * np.sqrt(2)), rel=1e-12)
     assert float(least.arc_radius) == pytest.approx(np.sqrt(2) / 16 * np.pi * distance, rel=1e-12)

@@ -12,6 +12,7 @@ FAMILY_KEYS: dict[str, tuple[str, ...]] = {
     "cic": DESIGN_KEYS,
     "ee": (),
     "arc": ("arc_center_mm",),
+    "arcs_epicycloid": ("arc_center_mm", "tip_arc_angle_deg", "edge_radius_mm"),
     "arc_involute": ("pressure_angle_deg", "involute_length_mm"),
     "four_arcs": ("arc_center_mm", "tip_arc_radius_mm", "tip_arc_turn_deg"),
     "five_arcs": (
@@ -20,6 +21,9 @@ FAMILY_KEYS: dict[str, tuple[str, ...]] = {
         "tip_arc_radius_mm",
         "tip_arc_turn_deg",
     ),
+    "circle_epicycloid": ("rolling_radius_mm", "tip_arc_turn_deg"),
+    "hypo_epicycloid": ("tip_arc_angle_deg",),
+    "extended_cycloid": ("trochoid_ratio",),
     "ellipse": ("ellipse_center_mm", "ellipse_height_mm"),
 }
 """Profile families with their design parameters, as named in the config."""
@@ -28,9 +32,19 @@ FAMILY_KEYS: dict[str, tuple[str, ...]] = {
 class ProfileConfig(Section):
     """The rotor profile."""
 
-    family: Literal["cic", "ee", "arc", "arc_involute", "four_arcs", "five_arcs", "ellipse"] = (
-        Field(description="profile family")
-    )
+    family: Literal[
+        "cic",
+        "ee",
+        "arc",
+        "arcs_epicycloid",
+        "arc_involute",
+        "four_arcs",
+        "five_arcs",
+        "circle_epicycloid",
+        "hypo_epicycloid",
+        "extended_cycloid",
+        "ellipse",
+    ] = Field(description="profile family")
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
     pitch_radius_mm: Positive = Field(description="pitch radius; centre distance is twice that")
     pressure_angle_deg: Annotated[float, Field(gt=0, lt=90)] | None = Field(
@@ -40,18 +54,32 @@ class ProfileConfig(Section):
         None, description="cic, arc_involute: involute parameter u"
     )
     tip_arc_angle_deg: Annotated[float, Field(ge=0, lt=45)] | None = Field(
-        None, description="cic, five_arcs: half angle of the tip land"
+        None,
+        description="cic, five_arcs, arcs_epicycloid, hypo_epicycloid: half angle of the tip land",
     )
     arc_center_mm: Positive | None = Field(
-        None, description="arc, four_arcs: distance of the tip arc's centre from the axis"
+        None,
+        description="arc, arcs_epicycloid, four_arcs: distance of the arc's centre from the axis",
     )
     tip_arc_radius_mm: Positive | None = Field(
         None, description="four_arcs, five_arcs: radius of the tip arc"
     )
     tip_arc_turn_deg: Annotated[float, Field(gt=0, lt=180)] | None = Field(
-        None, description="four_arcs, five_arcs: normal angle at which the tip arc ends"
+        None,
+        description="four_arcs, five_arcs, circle_epicycloid: normal angle where the tip arc ends",
     )
     outer_radius_mm: Positive | None = Field(None, description="five_arcs: radius of the tip land")
+    edge_radius_mm: Positive | None = Field(
+        None, description="arcs_epicycloid: radius of the edge between tip land and arc"
+    )
+    rolling_radius_mm: Positive | None = Field(
+        None, description="circle_epicycloid: radius of the rolling circle"
+    )
+    trochoid_ratio: Annotated[float, Field(gt=0, le=10)] | None = Field(
+        None,
+        description="extended_cycloid: distance of the drawing point from the rolling circle's "
+        "centre at the tip, in its radii",
+    )
     ellipse_center_mm: NonNegative | None = Field(
         None, description="ellipse: distance of the ellipse's centre from the axis"
     )

@@ -1,13 +1,15 @@
 """Rotor profiles: the roll-angle core and one file per family."""
 
-from rootsopt.profiles.arc_families import arc, five_arcs, four_arcs
+from rootsopt.profiles.arc_families import arc, arcs_epicycloid, five_arcs, four_arcs
 from rootsopt.profiles.arcs import Arcs
 from rootsopt.profiles.base import Profile, RollPoint, Segment
 from rootsopt.profiles.cic import CIC
-from rootsopt.profiles.curve import Curve, Piece
+from rootsopt.profiles.curve import Curve, Piece, RollPiece
 from rootsopt.profiles.ee import EE
 from rootsopt.profiles.ellipse import ellipse
+from rootsopt.profiles.epicycloid import TippedEpicycloid, circle_epicycloid, hypo_epicycloid
 from rootsopt.profiles.geometry import Geometry, flank, flank_nodes, geometry, outline
+from rootsopt.profiles.trochoid import extended_cycloid
 
 __all__ = [
     "CIC",
@@ -17,14 +19,20 @@ __all__ = [
     "Geometry",
     "Piece",
     "Profile",
+    "RollPiece",
     "RollPoint",
     "Segment",
+    "TippedEpicycloid",
     "arc",
+    "arcs_epicycloid",
+    "circle_epicycloid",
     "ellipse",
+    "extended_cycloid",
     "five_arcs",
     "flank",
     "flank_nodes",
     "four_arcs",
     "geometry",
+    "hypo_epicycloid",
     "outline",
 ]

@@ -1,27 +1,28 @@
-"""Families of tangent circular arcs: one, four and five, with their conjugate envelopes.
+"""Families of tangent circular arcs: one, four, five and an edge, with their conjugate envelopes.
 
-The sources' own formulas for four and five arcs were not at hand: what is made of them here is a
-derivation from their names and figures' descriptions, stated with each.
+The sources' own formulas for all but the single arc were not at hand: what is made of them here
+is a derivation from their names and descriptions, stated with each.
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
+from jaxtyping import Float
 
 from rootsopt.profiles.arcs import Arcs
 
 
-def arc(lobes: int, pitch_radius: Float[Array, ""], center: Float[Array, ""]) -> Arcs:
+def arc(lobes: int, pitch_radius: Float[ArrayLike, ""], center: Float[ArrayLike, ""]) -> Arcs:
     """The lobe is one circular arc through both pitch crossings, with its `center` b (m) on the
     lobe's axis: its radius is √(r² + b² - 2 r b cos π/2N). (The single arc of the literature.)"""
-    return Arcs.chain(lobes, pitch_radius, jnp.asarray(center), (), (), ("arc",))
+    return Arcs.chain(lobes, pitch_radius, center, (), (), ("arc",))
 
 
 def four_arcs(
     lobes: int,
-    pitch_radius: Float[Array, ""],
-    center: Float[Array, ""],
-    tip_radius: Float[Array, ""],
-    turn: Float[Array, ""],
+    pitch_radius: Float[ArrayLike, ""],
+    center: Float[ArrayLike, ""],
+    tip_radius: Float[ArrayLike, ""],
+    turn: Float[ArrayLike, ""],
 ) -> Arcs:
     """Four curves a flank: two tangent arcs on the addendum, and their conjugates.
 
@@ -30,16 +31,16 @@ def four_arcs(
     crossing, which gives its radius. With ρ that of `arc` the two are one.
     """
     names = ("tip arc", "flank arc")
-    return Arcs.chain(lobes, pitch_radius, jnp.asarray(center), (tip_radius,), (turn,), names)
+    return Arcs.chain(lobes, pitch_radius, center, (tip_radius,), (turn,), names)
 
 
 def five_arcs(
     lobes: int,
-    pitch_radius: Float[Array, ""],
-    outer_radius: Float[Array, ""],
-    land: Float[Array, ""],
-    tip_radius: Float[Array, ""],
-    turn: Float[Array, ""],
+    pitch_radius: Float[ArrayLike, ""],
+    outer_radius: Float[ArrayLike, ""],
+    land: Float[ArrayLike, ""],
+    tip_radius: Float[ArrayLike, ""],
+    turn: Float[ArrayLike, ""],
 ) -> Arcs:
     """Five arcs a lobe: a tip land, and on either side a tip arc and a flank arc, all tangent.
 
@@ -49,4 +50,47 @@ def five_arcs(
     """
     names = ("tip land", "tip arc", "flank arc")
     radii, joints = (outer_radius, tip_radius), (land, turn)
-    return Arcs.chain(lobes, pitch_radius, 0.0, radii, joints, names)
+    return Arcs.chain(lobes, pitch_radius, None, radii, joints, names)
+
+
+def arcs_epicycloid(
+    lobes: int,
+    pitch_radius: Float[ArrayLike, ""],
+    center: Float[ArrayLike, ""],
+    land: Float[ArrayLike, ""],
+    edge_radius: Float[ArrayLike, ""],
+) -> Arcs:
+    """Circular arcs joined with a conjugate epicycloid: a single arc cut off by a tip land.
+
+    The lobe is the arc of `arc` around its `center` b (m), of radius ρ, and a land of half angle
+    `land` θ1 (rad). The edge between them is an arc of radius `edge_radius` e (m) tangent to both,
+    its centre on the ray θ1 at the distance d = b cos θ1 + √((ρ - e)² - b² sin² θ1) from the axis,
+    and the outer radius d + e. On the partner the edge traces the curve at the distance e from
+    the extended epicycloid that its centre describes (the epicycloid itself for e = 0); it joins
+    the mates of land and arc.
+
+    From an edge with its centre outside of the pitch circle (d > r) the contact moves backwards:
+    sin(ν - β) = (d / r) sin(ν - θ1) gives dβ/dν = 1 - d cos(ν - θ1) / (r sin ψ) < 0. The dedendum
+    stays sound, as its arc length, (r sin ψ - 2 s) dβ/dν + s, grows. But edge and arc are then in
+    mesh at once, which carries what is shut in between them over to the other side. An edge with
+    d ≤ r has no such carryover: its radius must be a share of the tip's height over the pitch
+    circle. (Derivation.)
+    """
+    r = jnp.asarray(pitch_radius)
+    b, theta, e = jnp.asarray(center), jnp.asarray(land), jnp.asarray(edge_radius)
+    half = jnp.pi / (2 * lobes)
+    zero = jnp.zeros_like(r)
+    away, across = r * jnp.cos(half) - b, r * jnp.sin(half)
+    radius = jnp.sqrt(away**2 + across**2)
+    reach = b * jnp.cos(theta) + jnp.sqrt((radius - e) ** 2 - (b * jnp.sin(theta)) ** 2)
+    edge = reach * jnp.stack([jnp.cos(theta), jnp.sin(theta)])
+    turn = jnp.arctan2(edge[1], edge[0] - b)
+    return Arcs(
+        lobes=lobes,
+        names=("tip land", "edge", "arc"),
+        land=True,
+        pitch_radius=r,
+        center=jnp.stack([jnp.zeros(2), edge, jnp.stack([b, zero])]),
+        radius=jnp.stack([reach + e, e, radius]),
+        joints=jnp.stack([zero, theta, turn, jnp.arctan2(across, away)]),
+    )

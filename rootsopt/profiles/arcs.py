@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from rootsopt.profiles.base import Profile, Segment
@@ -14,8 +15,7 @@ class Arcs(Profile):
 
     The point of the arc with centre C and radius ρ whose normal has the direction ν is C + ρ n(ν),
     so its support function is C·n + ρ and the lever of its normal C × n. The normal meets the
-    pitch circle where sin(ν - β) = lever / r, and s = support - r cos(ν - β). An arc of radius 0 is
-    a corner: it turns about one point, which traces an extended epicycloid on the partner.
+    pitch circle where sin(ν - β) = lever / r, and s = support - r cos(ν - β).
 
     `center` (n, 2) and `radius` (n,) in m, in the rotor frame with the lobe's axis on +x; `joints`
     (n + 1,): normal angles (rad) from the tip, 0, to the pitch crossing; `names` of the arcs, of
@@ -34,19 +34,19 @@ class Arcs(Profile):
     def chain(
         cls,
         lobes: int,
-        pitch_radius: Float[Array, ""],
-        center: Float[Array, ""],
-        radii: Sequence[Float[Array, ""]],
-        joints: Sequence[Float[Array, ""]],
-        names: Sequence[str] = (),
+        pitch_radius: Float[ArrayLike, ""],
+        center: Float[ArrayLike, ""] | None,
+        radii: Sequence[Float[ArrayLike, ""]],
+        joints: Sequence[Float[ArrayLike, ""]],
+        names: Sequence[str],
     ) -> "Arcs":
         """Arcs from the tip to the pitch crossing: the first has its `center` (m) on the lobe's
-        axis (0: a land), all but the last have `radii` (m) and end at the `joints` (rad); the
-        radius of the last makes it pass through the pitch crossing."""
+        axis (None: it is a land), all but the last have `radii` (m) and end at the `joints` (rad);
+        the radius of the last makes it pass through the pitch crossing."""
         r = jnp.asarray(pitch_radius)
         half = jnp.pi / (2 * lobes)
         crossing = r * jnp.stack([jnp.cos(half), jnp.sin(half)])
-        place = jnp.stack([jnp.asarray(center), jnp.zeros_like(r)])
+        place = jnp.stack([jnp.asarray(0.0 if center is None else center), jnp.zeros_like(r)])
         centers, found = [place], list(map(jnp.asarray, radii))
         for k, joint in enumerate(joints):
             normal = jnp.stack([jnp.cos(joint), jnp.sin(joint)])
@@ -59,10 +59,15 @@ class Arcs(Profile):
             found.append(jnp.linalg.norm(crossing - place))
         x, y = crossing - centers[-1]
         stop = jnp.arctan2(y, x)
-        ends = jnp.stack([jnp.zeros_like(r), *map(jnp.asarray, joints), stop])
-        names = tuple(names) or tuple(f"arc {k + 1}" for k in range(len(found)))
-        land = isinstance(center, float | int) and center == 0
-        return cls(lobes, names, land, r, jnp.stack(centers), jnp.stack(found), ends)
+        return cls(
+            lobes=lobes,
+            names=tuple(names),
+            land=center is None,
+            pitch_radius=r,
+            center=jnp.stack(centers),
+            radius=jnp.stack(found),
+            joints=jnp.stack([jnp.zeros_like(r), *map(jnp.asarray, joints), stop]),
+        )
 
     def segments(self) -> tuple[Segment, ...]:
         ends = zip(self.names, self.joints[:-1], self.joints[1:], strict=True)
@@ -97,9 +102,12 @@ class Arcs(Profile):
         )
 
     def normal_at(self, roll_angle):
-        # The normals of an arc pass through its centre and the pitch point.
+        # The normals of an arc pass through its centre and the pitch point. Where the roll angle
+        # turns back, the last arc that begins before is the nearest to the pitch point.
         begins = self.roll_angle(self.joints[1:-1])
-        arc = jnp.sum(roll_angle[..., None] > begins, axis=-1)
+        places = jnp.arange(1, begins.shape[0] + 1)
+        begun = roll_angle[..., None] > begins
+        arc = jnp.max(jnp.where(begun, places, 0), axis=-1, initial=0)
         r = self.pitch_radius
         pitch = r * jnp.stack([jnp.cos(roll_angle), jnp.sin(roll_angle)], axis=-1)
         reach = pitch - self.center[arc]

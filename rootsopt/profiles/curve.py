@@ -1,19 +1,24 @@
 """Addenda given as a curve: the meshing condition by its normals, the conjugate by the core."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from rootsopt.profiles.base import Profile, Segment
 
 INTERVALS = 48
-"""Intervals of a piece: the quintic between their ends misses a smooth curve by some 1e-13 r."""
+"""Intervals of a piece: the quintic between their ends misses a smooth curve by some 1e-11 r."""
 _STEPS = 4
 """Newton steps for the normal angle at a roll angle, from a table good to some 1e-4."""
+_GAUSS = np.polynomial.legendre.leggauss(4)
+"""Quadrature over an interval at most, to rounding."""
 
 
 class Piece(NamedTuple):
@@ -25,99 +30,140 @@ class Piece(NamedTuple):
     land: bool = False
 
 
+class RollPiece(NamedTuple):
+    """A stretch of an addendum by roll and pressure angle: `roll(t)` gives (β, ψ) in rad for t from
+    0 to 1, as `Piece` does. It may end in a cusp (ψ = 0), where a curve has no tangent."""
+
+    name: str
+    roll: Callable[[Float[Array, ""]], Float[Array, "2"]]
+    land: bool = False
+
+
 class Curve(Profile):
     """An addendum of given curves, each tangent to the next.
 
-    Stored is what its support function h is at nodes of the normal angle ν, with h′ (less the
-    lever) and h″ (the radius of curvature is h + h″): quintics join them with two derivatives.
-    From h follow lever -h′, sin(ν - β) = lever / r, s = h - r cos(ν - β), so that the law of
-    gearing holds for the quintics themselves, whatever they miss of the curve.
+    Stored is the pressure angle ψ with two derivatives by the normal angle ν at nodes, which
+    quintics join. From it follow β = ν - π/2 + ψ, the lever r cos ψ, and the support function by
+    quadrature from the pitch crossing, so that the law of gearing holds for the quintics
+    themselves, whatever they miss of the curve.
 
-    `node` (n,) in rad, `value`, `slope`, `bend` (n,) in m; `ends` (k + 1,): joints (rad) between the
-    pieces, from 0 to the pitch crossing. Nodes of pieces follow each other; a joint has one node of
-    either piece, as h″ may jump there.
+    `node` (n,) in rad; `psi`, `slope`, `bend` (n,): ψ, dψ/dν, d²ψ/dν²; `value` (n,): the support
+    function (m); `ends` (m,): joints (rad) between the pieces, from 0 to the pitch crossing.
+    Nodes of pieces follow each other; a joint has one node of either piece, as dψ/dν may jump
+    there. Beyond the pitch crossing ψ goes on as a parabola, over the tip by symmetry.
     """
 
     lobes: int = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
     lands: tuple[bool, ...] = eqx.field(static=True)
+    sharp: bool = eqx.field(static=True)
     pitch_radius: Float[Array, ""]
     node: Float[Array, " n"]
-    value: Float[Array, " n"]
+    psi: Float[Array, " n"]
     slope: Float[Array, " n"]
     bend: Float[Array, " n"]
-    ends: Float[Array, " k+1"]
+    value: Float[Array, " n"]
+    ends: Float[Array, " m"]
 
     @classmethod
     def of(
         cls,
         lobes: int,
-        pitch_radius: Float[Array, ""],
-        pieces: Sequence[Piece],
+        pitch_radius: Float[ArrayLike, ""],
+        pieces: Sequence[Piece | RollPiece],
         intervals: int = INTERVALS,
+        sharp: bool = False,
     ) -> "Curve":
         """The addendum made of `pieces`, which reach from the lobe's axis to the pitch crossing
-        and have one normal where they meet."""
-        t = jnp.arange(intervals + 1) / intervals
-        rows = [jax.vmap(lambda x, p=piece.position: _support(p, x))(t) for piece in pieces]
-        node, value, slope, bend = jnp.concatenate([jnp.stack(row) for row in rows], axis=1)
-        ends = jnp.append(node[:: intervals + 1], node[-1])
-        names, lands = (tuple(x) for x in zip(*((p.name, p.land) for p in pieces), strict=True))
-        return cls(lobes, names, lands, jnp.asarray(pitch_radius), node, value, slope, bend, ends)
+        and have one normal where they meet. `sharp`: the last ends in a cusp."""
+        r = jnp.asarray(pitch_radius)
+        t = jnp.arange(intervals + 1, dtype=r.dtype) / intervals
+        turning = [functools.partial(_turning, _rolling(piece, r)) for piece in pieces]
+        rows = [jax.vmap(turn)(t) for turn in turning]
+        node, psi, slope, bend = jnp.concatenate([jnp.stack(row) for row in rows], axis=1)
+        curve = cls(
+            lobes=lobes,
+            names=tuple(piece.name for piece in pieces),
+            lands=tuple(piece.land for piece in pieces),
+            sharp=sharp,
+            pitch_radius=r,
+            node=node,
+            psi=psi,
+            slope=slope,
+            bend=bend,
+            value=jnp.zeros_like(node),
+            ends=jnp.append(node[:: intervals + 1], node[-1]),
+        )
+        # With zeros for the support function at the nodes: what it falls by over each interval.
+        start = jnp.arange(node.shape[0] - 1)
+        fall = -curve._support(start, jnp.diff(node))
+        value = r * jnp.sin(psi[-1]) + jnp.cumsum(fall[::-1])[::-1]
+        return eqx.tree_at(lambda c: c.value, curve, jnp.append(value, r * jnp.sin(psi[-1])))
 
     def segments(self) -> tuple[Segment, ...]:
         stretches = zip(self.names, self.ends[:-1], self.ends[1:], self.lands, strict=True)
         return tuple(Segment(*stretch) for stretch in stretches)
 
-    def _quintic(self, nu):
-        """Coefficients of the quintic at `nu` in x = (ν - ν0) / width; x and width."""
-        # The last node before it, and never the last of a piece.
-        k = jnp.searchsorted(self.node, nu, side="right") - 1
-        count = self.node.shape[0] // len(self.names)
-        k = jnp.clip(k, 0, self.node.shape[0] - 2)
-        k = jnp.where(k % count == count - 1, k - 1, k)
-        width = self.node[k + 1] - self.node[k]
-        x = (nu - self.node[k]) / width
-        a, b = self.value[k], self.value[k + 1]
-        da, db = self.slope[k] * width, self.slope[k + 1] * width
-        dda, ddb = self.bend[k] * width**2, self.bend[k + 1] * width**2
+    def _place(self, nu):
+        """The last node before `nu`, which is none at the end of a piece but the last, and the
+        distance from it."""
+        last = self.node.shape[0] - 1
+        count = (last + 1) // len(self.names)
+        k = jnp.clip(jnp.searchsorted(self.node, nu, side="right") - 1, 0, last)
+        k = jnp.where((k % count == count - 1) & (k < last), k - 1, k)
+        return k, nu - self.node[k]
+
+    def _psi(self, k, away):
+        """ψ at a distance `away` from node k."""
+        following = jnp.minimum(k + 1, self.node.shape[0] - 1)
+        width = self.node[following] - self.node[k]
+        # After the last node a parabola is left of the quintic, as between nodes in one place.
+        inside = width > 0
+        width = jnp.where(inside, width, 1.0)
+        x = away / width
+        a, da, dda = self.psi[k], self.slope[k] * width, self.bend[k] * width**2
+        b, db, ddb = self.psi[following], self.slope[following] * width, self.bend[following]
         rise, fall = b - a - da - dda / 2, db - da - dda
-        turn = ddb - dda
-        coefficients = (
-            a,
-            da,
-            dda / 2,
-            10 * rise - 4 * fall + turn / 2,
-            -15 * rise + 7 * fall - turn,
-            6 * rise - 3 * fall + turn / 2,
+        turn = ddb * width**2 - dda
+        cubic = (
+            10 * rise
+            - 4 * fall
+            + turn / 2
+            + x * (-15 * rise + 7 * fall - turn + x * (6 * rise - 3 * fall + turn / 2))
         )
-        return coefficients, x, width
+        return a + x * (da + x * (dda / 2 + x * jnp.where(inside, cubic, 0.0)))
+
+    def _support(self, k, away):
+        """Support function (m) at a distance `away` from node k: its slope is -r cos ψ."""
+        shares, weights = (jnp.asarray(part, away.dtype) for part in _GAUSS)
+        inside = away[..., None] * (1 + shares) / 2
+        mean = jnp.sum(jnp.cos(self._psi(k[..., None], inside)) * weights, axis=-1) / 2
+        return self.value[k] - self.pitch_radius * mean * away
+
+    def _mirrored(self, nu):
+        """ν on this side of the lobe's axis, and which side it was. (A land goes on itself.)"""
+        over = jnp.zeros(nu.shape, bool) if self.lands[0] else nu < 0
+        return jnp.where(over, -nu, nu), over
+
+    def _pressure_angle(self, nu):
+        here, over = self._mirrored(nu)
+        psi = self._psi(*self._place(here))
+        return jnp.where(over, jnp.pi - psi, psi)
 
     def support(self, nu):
-        coefficients, x, _ = self._quintic(nu)
-        total = coefficients[-1]
-        for c in coefficients[-2::-1]:
-            total = c + x * total
-        return total
+        return self._support(*self._place(self._mirrored(nu)[0]))
 
     def lever(self, nu):
-        coefficients, x, width = self._quintic(nu)
-        total = 5 * coefficients[-1]
-        for order in (4, 3, 2, 1):
-            total = order * coefficients[order] + x * total
-        return -total / width
+        return self.pitch_radius * jnp.cos(self._pressure_angle(nu))
 
     def roll_angle(self, nu):
-        return nu - jnp.arcsin(self.lever(nu) / self.pitch_radius)
+        return nu - jnp.pi / 2 + self._pressure_angle(nu)
 
     def contact_distance(self, nu):
-        lever = self.lever(nu)
-        return self.support(nu) - jnp.sqrt(
-            (self.pitch_radius - lever) * (self.pitch_radius + lever)
-        )
+        return self.support(nu) - self.pitch_radius * jnp.sin(self._pressure_angle(nu))
 
     def normal_at(self, roll_angle):
-        begins = self.node - jnp.arcsin(-self.slope / self.pitch_radius)
+        begins = self.node - jnp.pi / 2 + self.psi
         guess = jnp.interp(roll_angle, begins, self.node)
         one = jnp.ones_like(guess)
         for _ in range(_STEPS):
@@ -127,22 +173,37 @@ class Curve(Profile):
 
     @property
     def cusp(self) -> bool:
-        return False
+        return self.sharp
 
 
-def _support(position, t):
-    """ν, h, h′ and h″ of a convex curve at t."""
+def _rolling(piece, pitch_radius):
+    """t → (β, ψ) of a piece."""
+    if isinstance(piece, RollPiece):
+        return piece.roll
+
+    def roll(t):
+        place, speed = jax.jvp(piece.position, (t,), (jnp.ones_like(t),))
+        tangent = speed / jnp.sqrt(jnp.sum(speed**2))
+        # The outward normal is a quarter turn behind the direction of travel from the tip.
+        lever = -jnp.dot(place, tangent)
+        psi = jnp.arctan2(jnp.sqrt((pitch_radius - lever) * (pitch_radius + lever)), lever)
+        nu = jnp.arctan2(-tangent[0], tangent[1])
+        return jnp.stack([nu - jnp.pi / 2 + psi, psi])
+
+    return roll
+
+
+def _turning(roll, t):
+    """ν, ψ, dψ/dν and d²ψ/dν² at t."""
     one = jnp.ones_like(t)
 
-    def velocity(t):
-        return jax.jvp(position, (t,), (one,))
+    def angles(t):
+        beta, psi = roll(t)
+        return jnp.stack([beta + jnp.pi / 2 - psi, psi])
 
-    (place, speed), (_, bend) = jax.jvp(velocity, (t,), (one,))
-    length = jnp.sqrt(jnp.sum(speed**2))
-    tangent = speed / length
-    # The outward normal is a quarter turn behind the direction of travel from the tip.
-    normal = jnp.stack([tangent[1], -tangent[0]])
-    nu = jnp.arctan2(normal[1], normal[0])
-    support = jnp.dot(place, normal)
-    radius = length**3 / (speed[0] * bend[1] - speed[1] * bend[0])
-    return nu, support, jnp.dot(place, tangent), radius - support
+    def speed(t):
+        return jax.jvp(angles, (t,), (one,))
+
+    ((nu, psi), (nu_t, psi_t)), (_, (nu_tt, psi_tt)) = jax.jvp(speed, (t,), (one,))
+    slope = psi_t / nu_t
+    return nu, psi, slope, (psi_tt - slope * nu_tt) / nu_t**2

@@ -1,16 +1,17 @@
 """Ellipse: an elliptic arc and its conjugate envelope."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
+from jaxtyping import Float
 
 from rootsopt.profiles.curve import Curve, Piece
 
 
 def ellipse(
     lobes: int,
-    pitch_radius: Float[Array, ""],
-    center: Float[Array, ""],
-    height: Float[Array, ""],
+    pitch_radius: Float[ArrayLike, ""],
+    center: Float[ArrayLike, ""],
+    height: Float[ArrayLike, ""],
 ) -> Curve:
     """The lobe is an arc of an ellipse through both pitch crossings: its `center` b (m) and the
     semi-axis `height` A (m) lie along the lobe's axis; the other one, B, follows from the

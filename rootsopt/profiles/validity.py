@@ -17,16 +17,22 @@ class Margins(NamedTuple):
 
     `turning` (rad): of a segment's range of normals, that is, the order of the joints; `convexity`
     (m): radius of curvature of the addendum; `reach` (m): what the normals' levers lack to the
-    pitch radius, beyond which they miss the pitch circle; `rolling`: dβ/dν, negative where two
-    points of a flank mesh at once; `undercut` (m/rad): `Profile.dedendum_speed`; `star` (m):
-    distance of a tangent of addendum or dedendum from the axis, seen from which the outline would
-    fold back at 0; `root` (m): root radius.
+    pitch radius, beyond which they miss the pitch circle; `fall` (m): the levers, negative where
+    the outline rises again behind the tip; `rolling`: dβ/dν, negative where two points of a flank
+    mesh at once and carry over what is between them (the centre of curvature then lies outside of
+    the pitch circle); `order` (rad): β, negative where a flank meshes before its tip, together
+    with the lobe's other flank; `undercut` (m/rad): `Profile.dedendum_speed`; `star` (m): distance
+    of a tangent of addendum or dedendum from the axis, seen from which the outline folds back
+    below 0 (above it, no flank crosses the other one of its lobe or space, as they meet on its
+    axis); `root` (m): root radius.
     """
 
     turning: Float[Array, ""]
     convexity: Float[Array, ""]
     reach: Float[Array, ""]
+    fall: Float[Array, ""]
     rolling: Float[Array, ""]
+    order: Float[Array, ""]
     undercut: Float[Array, ""]
     star: Float[Array, ""]
     root: Float[Array, ""]
@@ -42,6 +48,7 @@ def margins(profile: Profile) -> Margins:
     point, addendum, dedendum = profile.speeds(nu)
     r = profile.pitch_radius
     sliding = r * jnp.sin(point.psi)
+    lever = profile.lever(nu)
     present = length > 0
 
     def least(values):
@@ -50,8 +57,10 @@ def margins(profile: Profile) -> Margins:
     return Margins(
         turning=jnp.min(length),
         convexity=least(addendum),
-        reach=least(r - jnp.abs(profile.lever(nu))),
+        reach=least(r - jnp.abs(lever)),
+        fall=least(lever),
         rolling=least(profile.roll_rate(nu)),
+        order=least(point.beta),
         undercut=least(dedendum),
         star=least(jnp.minimum(sliding + point.s, sliding - point.s)),
         root=r - profile.contact_distance(jnp.zeros_like(r)),

@@ -1,0 +1,130 @@
+"""Epicycloids with a circular tip: circle + epicycloid, hypocycloid + epicycloid."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from rootsopt.profiles.base import Profile, Segment
+
+
+class TippedEpicycloid(Profile):
+    """An epicycloid from the pitch crossing to a joint, and a circular arc over the tip.
+
+    On the epicycloid of rolling radius r_e, with κ = r / 2 r_e, the pressure angle is
+    ψ = κ (π/2N - β) and s = 2 r_e sin ψ, so that ds/dβ = -r cos ψ; its mate is the hypocycloid of
+    the same circle. EE has r_e = r / 2N, where ψ reaches π/2 on the lobe's axis. The tip arc is
+    tangent to it at the joint and has its centre C on the lobe's axis: at the distance
+    c = r cos ψ / sin ν from the rotor's, for a joint with the normal ν and the pressure angle ψ.
+    No epicycloid with r_e < r undercuts: its mate's arc length per ν is
+    4 r_e (r - r_e) sin ψ / (r + 2 r_e). (Derivation; no source of the formulas was at hand.)
+
+    `rolling_radius` r_e (m); `joint`: normal angle (rad) at which the arc ends;
+    `arc_center_radius` c and `arc_radius` (m); `land`: whether the arc is one about the rotor's
+    axis (c = 0).
+    """
+
+    lobes: int = eqx.field(static=True)
+    land: bool = eqx.field(static=True)
+    pitch_radius: Float[Array, ""]
+    rolling_radius: Float[Array, ""]
+    joint: Float[Array, ""]
+    arc_center_radius: Float[Array, ""]
+    arc_radius: Float[Array, ""]
+
+    def __init__(self, lobes, pitch_radius, rolling_radius, joint, land=False):
+        """`lobes` N; `pitch_radius` r (m), `rolling_radius` r_e (m) and `joint` (rad), scalars."""
+        self.lobes, self.land = lobes, land
+        r = self.pitch_radius = jnp.asarray(pitch_radius)
+        self.rolling_radius = jnp.asarray(rolling_radius)
+        joint = self.joint = jnp.asarray(joint)
+        lever, support = self._lever(joint), self._support(joint)
+        if land:
+            self.arc_center_radius, self.arc_radius = jnp.zeros_like(r), support
+        else:
+            self.arc_center_radius = lever / jnp.sin(joint)
+            self.arc_radius = support - lever / jnp.tan(joint)
+
+    def segments(self) -> tuple[Segment, ...]:
+        zero, stop = jnp.zeros_like(self.joint), jnp.zeros_like(self.joint) + self._stop
+        return (
+            Segment("tip land" if self.land else "tip arc", zero, self.joint, self.land),
+            Segment("epicycloid", self.joint, stop, False),
+        )
+
+    @property
+    def _stop(self):
+        return self.half_pitch + jnp.pi / 2
+
+    def _psi(self, nu):
+        """ψ on the epicycloid."""
+        r, rolling = self.pitch_radius, self.rolling_radius
+        return (self._stop - nu) * r / (r + 2 * rolling)
+
+    def _lever(self, nu):
+        return self.pitch_radius * jnp.cos(self._psi(nu))
+
+    def _support(self, nu):
+        return (self.pitch_radius + 2 * self.rolling_radius) * jnp.sin(self._psi(nu))
+
+    def _on_arc(self, nu):
+        """Whether the arc has the normal `nu`, and that normal, or another one where not."""
+        on_arc = nu < self.joint
+        return on_arc, jnp.where(on_arc, nu, 0.0)
+
+    def _tilt(self, nu):
+        """ν - β of the arc's normals."""
+        return jnp.arcsin(self.arc_center_radius * jnp.sin(nu) / self.pitch_radius)
+
+    def roll_angle(self, nu):
+        on_arc, here = self._on_arc(nu)
+        epicycloid = nu - jnp.pi / 2 + self._psi(nu)
+        return jnp.where(on_arc, here - self._tilt(here), epicycloid)
+
+    def contact_distance(self, nu):
+        on_arc, here = self._on_arc(nu)
+        c, r = self.arc_center_radius, self.pitch_radius
+        arc = self.arc_radius + c * jnp.cos(here) - r * jnp.cos(self._tilt(here))
+        return jnp.where(on_arc, arc, 2 * self.rolling_radius * jnp.sin(self._psi(nu)))
+
+    def lever(self, nu):
+        arc = self.arc_center_radius * jnp.sin(nu)
+        return jnp.where(nu < self.joint, arc, self._lever(nu))
+
+    def support(self, nu):
+        arc = self.arc_radius + self.arc_center_radius * jnp.cos(nu)
+        return jnp.where(nu < self.joint, arc, self._support(nu))
+
+    def normal_at(self, roll_angle):
+        r, rolling, c = self.pitch_radius, self.rolling_radius, self.arc_center_radius
+        begin = self.joint - jnp.pi / 2 + self._psi(self.joint)
+        psi = (self.half_pitch - roll_angle) * r / (2 * rolling)
+        on_arc = roll_angle < begin
+        turn = jnp.where(on_arc, roll_angle, jnp.pi / 2)
+        arc = jnp.arctan2(r * jnp.sin(turn), r * jnp.cos(turn) - c)
+        return jnp.where(on_arc, arc, roll_angle + jnp.pi / 2 - psi)
+
+
+def circle_epicycloid(
+    lobes: int,
+    pitch_radius: Float[ArrayLike, ""],
+    rolling_radius: Float[ArrayLike, ""],
+    turn: Float[ArrayLike, ""],
+) -> TippedEpicycloid:
+    """A tip arc centred on the lobe's axis, which ends at the normal angle `turn` (rad), and an
+    epicycloid of `rolling_radius` (m). With the joint on the lobe's axis, that is
+    turn = π/2 - π r / 4N r_e, the arc is centred on the pitch circle and meshes all at once."""
+    return TippedEpicycloid(lobes, pitch_radius, rolling_radius, turn)
+
+
+def hypo_epicycloid(
+    lobes: int, pitch_radius: Float[ArrayLike, ""], land: Float[ArrayLike, ""]
+) -> TippedEpicycloid:
+    """Whole half arches of hypocycloid and epicycloid, with a land of half angle `land` θ1 (rad)
+    at tip and root.
+
+    Both arches, for identical rotors at 1:1, are rolled by one circle, and ψ must reach π/2 where
+    the land begins: r_e = r (π/2N - θ1) / π. Without a land this is EE. (Derivation.)
+    """
+    rolling = jnp.asarray(pitch_radius) * (1 / (2 * lobes) - jnp.asarray(land) / jnp.pi)
+    return TippedEpicycloid(lobes, pitch_radius, rolling, land, land=True)

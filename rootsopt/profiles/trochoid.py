@@ -1,0 +1,55 @@
+"""Extended cycloid with a variable trochoid ratio."""
+
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Float
+
+from rootsopt.profiles.curve import Curve, RollPiece
+
+
+def extended_cycloid(
+    lobes: int, pitch_radius: Float[ArrayLike, ""], ratio: Float[ArrayLike, ""]
+) -> Curve:
+    """An epicycloid drawn by a point whose distance from the rolling circle's centre varies.
+
+    With r_e = r / 2N the curve is P(θ) = e^{iθ} [r + r_e + λ(θ) r_e e^{2iNθ}], from the tip (θ = 0)
+    to the pitch crossing (θ = π/2N). The trochoid ratio λ falls or rises from `ratio` λ0 at the tip
+    to 1 at the crossing by the quintic that has no slope and no bend at either end,
+    λ = 1 + (λ0 - 1) u³ (10 - 15 u + 6 u²) with u = 1 - 2Nθ/π: the idea of Hsieh and Hwang (J. Mech.
+    Des. 129 (2007) 1278), whose own formulas were not at hand. λ0 = 1 is EE; the outer radius is
+    r + (1 + λ0) r_e.
+
+    The crossing is a cusp: dP/dθ vanishes with δ = π/2N - θ. What the normal needs is therefore
+    taken with the power of δ that it has divided out. In the frame turned by θ, with w = e^{-2iNδ},
+    the normal is (X δ + iY) / M, M its length, where
+
+        X δ + iY = (r + r_e) (1 - λ w) / δ + i r_e w λ′ / δ,
+
+    and it makes the angle η = arctan(X δ / Y) with the tangent of the pitch circle at θ. For a
+    constant λ it passes through the pitch point at θ, and ψ = η; else it misses it by
+    e = r_e² λ′ (cos 2Nδ - λ) / (δ M), and cos ψ = cos η + e / r. Of this
+    sin²(ψ/2) = sin²(η/2) - e / 2r is left, of second order in δ, and β = θ - η + ψ. (Derivation.)
+    """
+    r, ratio = jnp.asarray(pitch_radius), jnp.asarray(ratio)
+    half, n = jnp.pi / (2 * lobes), lobes
+    rolling = r / (2 * lobes)
+
+    def roll(t):
+        u = 1 - t
+        delta = half * u
+        # (λ - 1) / δ² and λ′ / δ.
+        beyond = (ratio - 1) * u * (10 - 15 * u + 6 * u**2) / half**2
+        steepness = -(ratio - 1) * 30 * u * t**2 / half**2
+        here = 1 + beyond * delta**2
+        # sin(Nδ) / δ and sin(2Nδ) / δ, and (1 - λ cos 2Nδ) / δ².
+        single, double = n * jnp.sinc(u / 2), 2 * n * jnp.sinc(u)
+        open_ = 2 * single**2 - beyond * jnp.cos(2 * n * delta)
+        x = (r + rolling) * open_ + rolling * steepness * double
+        y = (r + rolling) * here * double + rolling * steepness * jnp.cos(2 * n * delta)
+        length = jnp.sqrt(y**2 + (x * delta) ** 2)
+        miss = -(rolling**2) * steepness * (2 * single**2 + beyond) / length
+        square = x**2 / (2 * length * (length + y)) - miss / (2 * r)
+        psi = 2 * jnp.arcsin(delta * jnp.sqrt(square))
+        return jnp.stack([half * t - jnp.arctan2(x * delta, y) + psi, psi])
+
+    return Curve.of(lobes, r, [RollPiece("extended cycloid", roll)], sharp=True)
