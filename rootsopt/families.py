@@ -22,6 +22,7 @@ from rootsopt.profiles import (
     hypo_epicycloid,
 )
 from rootsopt.profiles.validity import margins
+from rootsopt.programs import Program
 
 MM = 1e-3
 DEG = math.pi / 180
@@ -78,10 +79,8 @@ def check(config: ProfileConfig) -> None:
         return
     if config.family == "arcs_epicycloid":
         _check_edge(config)
-    profile = profile_of(
-        config.family, config.lobes, jnp.asarray(config.pitch_radius_mm * MM), design_of(config)
-    )
-    found = margins(profile)
+    radius = jnp.asarray(config.pitch_radius_mm * MM)
+    found = _margins(config.family, config.lobes, radius, design_of(config))
     for name, value in found._asdict().items():
         if (config.family, name) in _INHERENT:
             continue
@@ -96,6 +95,12 @@ def check(config: ProfileConfig) -> None:
             )
 
 
+@Program
+def _margins(family, lobes, pitch_radius, design):
+    """Margins of the profile of a design in config units."""
+    return margins(profile_of(family, lobes, pitch_radius, design))
+
+
 _PURE = ("turning", "rolling", "order")
 """Margins that are no lengths."""
 _INHERENT = {("arcs_epicycloid", "rolling")}
@@ -104,7 +109,7 @@ _SHARPEST = 0.002
 """Least radius of an edge in pitch radii: less is a corner, along which the outline's and the
 contact's nodes fall together."""
 _FAULTS = {
-    "turning": "an arc would end before it begins",
+    "turning": "a part of it would end before it begins, or miss the pitch crossing",
     "convexity": "the addendum is not convex",
     "reach": "some normals of the addendum miss the pitch circle: it would touch nothing there",
     "fall": "the tip is no tip: the outline rises again behind it",

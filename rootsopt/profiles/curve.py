@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -42,15 +43,16 @@ class RollPiece(NamedTuple):
 class Curve(Profile):
     """An addendum of given curves, each tangent to the next.
 
-    Stored is the pressure angle ψ with two derivatives by the normal angle ν at nodes, which
-    quintics join. From it follow β = ν - π/2 + ψ, the lever r cos ψ, and the support function by
-    quadrature from the pitch crossing, so that the law of gearing holds for the quintics
-    themselves, whatever they miss of the curve.
+    Stored is the pressure angle ψ by the normal angle ν: quintics between nodes, which join its
+    values and two derivatives there. From it follow β = ν - π/2 + ψ, the lever r cos ψ, and the
+    support function by quadrature from the pitch crossing, so that the law of gearing holds for
+    the quintics themselves, whatever they miss of the curve.
 
-    `node` (n,) in rad; `psi`, `slope`, `bend` (n,): ψ, dψ/dν, d²ψ/dν²; `value` (n,): the support
-    function (m); `ends` (m,): joints (rad) between the pieces, from 0 to the pitch crossing.
-    Nodes of pieces follow each other; a joint has one node of either piece, as dψ/dν may jump
-    there. Beyond the pitch crossing ψ goes on as a parabola, over the tip by symmetry.
+    `node` (n,) in rad; `series` (n, 6): coefficients of ψ (rad) by powers of the distance from the
+    last node; `value` (n,): the support function (m); `ends` (m,): joints (rad) between the pieces,
+    from 0 to the pitch crossing. Nodes of pieces follow each other; a joint has one node of either
+    piece, as dψ/dν may jump there. Beyond the pitch crossing ψ goes on as a parabola, over the tip
+    by symmetry.
     """
 
     lobes: int = eqx.field(static=True)
@@ -59,9 +61,7 @@ class Curve(Profile):
     sharp: bool = eqx.field(static=True)
     pitch_radius: Float[Array, ""]
     node: Float[Array, " n"]
-    psi: Float[Array, " n"]
-    slope: Float[Array, " n"]
-    bend: Float[Array, " n"]
+    series: Float[Array, "n 6"]
     value: Float[Array, " n"]
     ends: Float[Array, " m"]
 
@@ -79,7 +79,7 @@ class Curve(Profile):
         r = jnp.asarray(pitch_radius)
         t = jnp.arange(intervals + 1, dtype=r.dtype) / intervals
         turning = [functools.partial(_turning, _rolling(piece, r)) for piece in pieces]
-        rows = [jax.vmap(turn)(t) for turn in turning]
+        rows = [lax.map(turn, t) for turn in turning]
         node, psi, slope, bend = jnp.concatenate([jnp.stack(row) for row in rows], axis=1)
         curve = cls(
             lobes=lobes,
@@ -88,9 +88,7 @@ class Curve(Profile):
             sharp=sharp,
             pitch_radius=r,
             node=node,
-            psi=psi,
-            slope=slope,
-            bend=bend,
+            series=_quintics(node, psi, slope, bend),
             value=jnp.zeros_like(node),
             ends=jnp.append(node[:: intervals + 1], node[-1]),
         )
@@ -115,23 +113,11 @@ class Curve(Profile):
 
     def _psi(self, k, away):
         """ψ at a distance `away` from node k."""
-        following = jnp.minimum(k + 1, self.node.shape[0] - 1)
-        width = self.node[following] - self.node[k]
-        # After the last node a parabola is left of the quintic, as between nodes in one place.
-        inside = width > 0
-        width = jnp.where(inside, width, 1.0)
-        x = away / width
-        a, da, dda = self.psi[k], self.slope[k] * width, self.bend[k] * width**2
-        b, db, ddb = self.psi[following], self.slope[following] * width, self.bend[following]
-        rise, fall = b - a - da - dda / 2, db - da - dda
-        turn = ddb * width**2 - dda
-        cubic = (
-            10 * rise
-            - 4 * fall
-            + turn / 2
-            + x * (-15 * rise + 7 * fall - turn + x * (6 * rise - 3 * fall + turn / 2))
-        )
-        return a + x * (da + x * (dda / 2 + x * jnp.where(inside, cubic, 0.0)))
+        series = self.series[k]
+        psi = series[..., 5]
+        for power in (4, 3, 2, 1, 0):
+            psi = series[..., power] + away * psi
+        return psi
 
     def _support(self, k, away):
         """Support function (m) at a distance `away` from node k: its slope is -r cos ψ."""
@@ -163,7 +149,7 @@ class Curve(Profile):
         return self.support(nu) - self.pitch_radius * jnp.sin(self._pressure_angle(nu))
 
     def normal_at(self, roll_angle):
-        begins = self.node - jnp.pi / 2 + self.psi
+        begins = self.node - jnp.pi / 2 + self.series[:, 0]
         guess = jnp.interp(roll_angle, begins, self.node)
         one = jnp.ones_like(guess)
         for _ in range(_STEPS):
@@ -174,6 +160,29 @@ class Curve(Profile):
     @property
     def cusp(self) -> bool:
         return self.sharp
+
+
+def _quintics(node, psi, slope, bend):
+    """Coefficients (n, 6) by powers of the distance from each node; a parabola at the last of a
+    piece."""
+    here = node, psi, slope, bend
+    following = (jnp.append(row[1:], row[-1:]) for row in here)
+
+    def between(ends):
+        (node, psi, slope, bend), (far, b, db, ddb) = ends
+        inside = far > node
+        width = jnp.where(inside, far - node, 1.0)
+        rise = (b - psi) / width**3 - slope / width**2 - bend / (2 * width)
+        fall = (db - slope) / width**2 - bend / width
+        turn = (ddb - bend) / width
+        rest = (
+            10 * rise - 4 * fall + turn / 2,
+            (-15 * rise + 7 * fall - turn) / width,
+            (6 * rise - 3 * fall + turn / 2) / width**2,
+        )
+        return jnp.stack([psi, slope, bend / 2, *(jnp.where(inside, c, 0.0) for c in rest)])
+
+    return lax.map(between, (here, tuple(following)))
 
 
 def _rolling(piece, pitch_radius):

@@ -12,6 +12,8 @@ from rootsopt.programs import Program
 # Gauss-Legendre per smooth segment: the integrands are analytic inside a segment, and
 # 24 points bring area and inertia of every family here to rounding error.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
+# Further places where undercut is looked for: that of an arc is worst inside.
+_BETWEEN = 128
 
 
 class Geometry(eqx.Module):
@@ -42,8 +44,10 @@ def geometry(profile: Profile) -> Geometry:
     start = jnp.stack([s.start for s in segments])[:, None]
     length = jnp.stack([s.stop for s in segments])[:, None] - start
     # Each end is looked at from just inside, so that it belongs to its segment.
-    shares = np.concatenate([[1e-12], (1 + _NODES) / 2, [1 - 1e-12]])
-    weights = jnp.asarray(np.concatenate([[0.0], _WEIGHTS / 2, [0.0]])) * length
+    between = np.arange(1, _BETWEEN) / _BETWEEN
+    shares = np.concatenate([[1e-12], (1 + _NODES) / 2, [1 - 1e-12], between])
+    weights = np.concatenate([[0.0], _WEIGHTS / 2, np.zeros(_BETWEEN)])
+    weights = jnp.asarray(weights) * length
     nu = start + length * jnp.asarray(shares)
     (_, psi, s), addendum, dedendum = profile.speeds(nu)
     sliding = r * jnp.sin(psi)
