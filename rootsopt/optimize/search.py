@@ -109,7 +109,7 @@ class Search:
         if config.profile.family != "cic":
             raise InputError(
                 f"`profile.family` must be cic to be optimised, but is {config.profile.family}: "
-                "it has no design parameter; use `simulate` for it"
+                "bounds and constraints are those of that family; use `simulate` for others"
             )
         self.config = config
         self.settings = config.optimizer
