@@ -103,7 +103,7 @@ def respond(
     shots = jnp.where(settled.period > 0, _SHOTS, 0)
     closed = close_orbit(pair, tangents, settled.state, period, orbit, None, SAMPLES, shots, enough)
     ran = settled.period > 0
-    finite = jnp.all(jnp.isfinite(closed.response)) & jnp.all(jnp.isfinite(closed.sensitivity))
+    forces, slopes = (jnp.all(jnp.isfinite(x)) for x in (closed.response, closed.sensitivity))
     rtols = transient.tolerance(state.dtype), orbit.tolerance(state.dtype)
     open_by = jnp.maximum(enough, RESIDUAL[model.precision])
     scales = model.law.exponent, model.pitch_radius, pair.force_scale
@@ -116,8 +116,9 @@ def respond(
         (~ran, Status.NOT_SETTLED),
         (~closed.flow.solved, Status.SOLVER_FAILED),
         (found.idle, Status.IDLE),
-        (~finite, Status.NON_FINITE),
+        (~forces, Status.NON_FINITE),
         (~found.steady, Status.NOT_SETTLED),
+        (~slopes, Status.NON_FINITE),
         (closed.flow.depth > TOO_DEEP * model.pitch_radius, Status.TOO_DEEP),
         ((found.rounding > UNRESOLVED) | ~found.consistent, Status.UNRESOLVED),
     )

@@ -317,15 +317,18 @@ class Evaluator:
         within, limit = (np.asarray(x, dtype) for x in (tolerance, RESIDUAL[self.model.precision]))
         scales = self._scales(pair)
         found = jax.device_get(_verdict(orbit, transient.state, within, rtols, limit, scales))
-        numbers = np.concatenate([orbit.response, np.ravel(orbit.sensitivity), orbit.state])
+        numbers = np.concatenate([orbit.response, orbit.state])
         if not orbit.flow.solved:
             status = Status.SOLVER_FAILED
         elif found.idle:
             status = Status.IDLE
         elif not np.all(np.isfinite(numbers)):
             status = Status.NON_FINITE
+        elif not found.steady:  # Of what multiplies errors no derivative is known either.
+            status = Status.NOT_SETTLED
         else:
-            status = Status.PERIODIC if found.steady else Status.NOT_SETTLED
+            slopes = np.all(np.isfinite(orbit.sensitivity))
+            status = Status.PERIODIC if slopes else Status.NON_FINITE
         return found, status
 
     def _scales(self, pair: RotorPair):

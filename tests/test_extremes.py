@@ -332,6 +332,16 @@ def test_boundary_scenes_end_as_they_must(name):
         assert 1e5 < evaluation.statistics["swings_per_mesh_period"] < 1e7
 
 
+def test_a_pair_with_a_motor_that_floats_is_idle():
+    """Newton's equations are singular then; the state is that of the transient all the same."""
+    scene = {"scene__drive": "torque", "scene__motor": "{slope_N_m_s_per_rad: 0.1}"}
+    scene |= {"scene__timing_gear": "null", "scene__load__torque_N_m": 0}
+    contact = {"solver__fidelity": "linear", "contact__clearance_mm": 0.01}
+    evaluation = Evaluator(config_of(**scene, **contact))(series=False)
+    assert evaluation.status is Status.IDLE
+    assert np.all(np.isfinite(evaluation.state))
+
+
 def test_a_force_lost_in_rounding_is_no_result(monkeypatch):
     """Beyond the limit of `force_rounding` the numbers come with a status and no gradient."""
     monkeypatch.setattr("rootsopt.evaluate.UNRESOLVED", 1e-14)

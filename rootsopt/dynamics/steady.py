@@ -240,6 +240,9 @@ def close_orbit(
         miss = out.end - state
         residual = jnp.max(jnp.abs(miss))
         correction = solved(jnp.eye(count, dtype=dtype) - monodromy, miss[:, None])[:, 0]
+        # A pair that floats stays where the transient led to: any place is as good.
+        floats = jnp.all(jnp.isfinite(miss)) & ~jnp.all(jnp.isfinite(correction))
+        correction = jnp.where(floats, 0.0, correction)
         size = jnp.max(jnp.abs(correction))
         # Keep the first steps inside the neighbourhood the transient pointed to.
         new = state + correction * jnp.minimum(1.0, 0.5 / jnp.maximum(size, 1e-30))
