@@ -8,6 +8,7 @@ from rootsopt.profiles.curve import Curve, Piece
 from rootsopt.profiles.ee import EE
 from rootsopt.profiles.ellipse import ellipse
 from rootsopt.profiles.geometry import Geometry, flank, flank_nodes, geometry, outline
+from rootsopt.profiles.outline import Outline, Table
 
 __all__ = [
     "CIC",
@@ -15,10 +16,12 @@ __all__ = [
     "Arcs",
     "Curve",
     "Geometry",
+    "Outline",
     "Piece",
     "Profile",
     "RollPoint",
     "Segment",
+    "Table",
     "arc",
     "ellipse",
     "five_arcs",
