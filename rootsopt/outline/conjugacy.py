@@ -19,11 +19,12 @@ _POSES = 361
 
 @dataclasses.dataclass(frozen=True)
 class Conjugacy:
-    """Gap between the flanks of a pair rolling at ε = 0 and the nominal centre distance.
+    """Gap of a pair rolling at ε = 0 and the nominal centre distance.
 
-    `roll` (rad): angle that rotor 1 has turned through since its tip passed the line of centres,
-    over half the mesh of one flank (the other half is its mirror image); `gap` (m): negative where
-    they overlap, NaN where no points of the flanks face each other.
+    `roll` (rad): angle of rotor 1 from where its tip passes the line of centres, over a quarter of
+    a lobe pitch (the rest is alike, rotors or flanks having changed places); `gap` (m) of the drive
+    or the coast flanks, whichever is less: negative where they overlap, NaN where no points of the
+    flanks face each other.
     """
 
     roll: Float64[np.ndarray, " n"]
@@ -53,7 +54,6 @@ class Conjugacy:
 def conjugacy(profile: Profile) -> Conjugacy:
     """The gap of `profile` through a mesh. Raises `InputError` where the flanks never face each
     other."""
-    # At 0 the tip's very end meets that of the root.
     roll = float(profile.half_pitch) * (np.arange(_POSES) + 0.5) / _POSES
     gap, found = map(np.asarray, _gaps(profile, jnp.asarray(roll)))
     if not np.any(found):
@@ -67,8 +67,10 @@ def conjugacy(profile: Profile) -> Conjugacy:
 @Program
 def _gaps(profile, roll):
     pair = FlankPair.of(profile, 2 * profile.pitch_radius, both=True)
-    contact = lax.map(lambda x: pair(x, jnp.zeros_like(x)), roll)
-    return contact.gap, contact.found
+    sides = jnp.stack([roll, -roll])
+    contact = lax.map(lambda x: pair(x, jnp.zeros_like(x)), sides.ravel())
+    gap = jnp.where(contact.found, contact.gap, jnp.inf).reshape(sides.shape)
+    return jnp.min(gap, axis=0), jnp.any(contact.found.reshape(sides.shape), axis=0)
 
 
 def gaps_um(found: Conjugacy) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -22,6 +22,8 @@ _JUMP, _ABOVE = 0.02, 20.0
 point to point around there."""
 _BESIDE, _AROUND = 3, 12
 """Points on either side that a joint shows at, and among which its surroundings are."""
+_WINDING = 7.0
+"""Sum of the angles (rad) between the steps along a flank past which its points are scattered."""
 _SHORTEST = 4
 """Intervals of a piece, at least."""
 _CUSP, _SPARED = 2e-2, 2
@@ -120,6 +122,13 @@ def through(
             f"`profile.outline_file` must have at least 8 points on a flank, but has {len(points)}"
         )
     steps = np.abs(np.diff(points))
+    turned = np.sum(np.abs(np.angle(np.diff(points)[1:] / np.diff(points)[:-1])))
+    if smoothing == 0 and turned > _WINDING:
+        raise InputError(
+            "`profile.outline_smoothing_mm` must be the scatter (RMS) of the points, but is 0: "
+            f"from point to point a flank turns by {turned:.3g} rad in all, a smooth one by 4; "
+            "set it"
+        )
     if smoothing > 0:
         t = np.concatenate([[0.0], np.cumsum(steps)])
         sum_of_squares = len(points) * smoothing**2

@@ -79,7 +79,7 @@ def _closed(loop: Loop, name: str) -> Loop:
     if gap > _WIDEST * np.max(steps):
         raise InputError(
             f"{name}: the outline must be closed, but its last point is {gap:.4g} mm from its "
-            f"first, and the longest step between others {np.max(steps):.4g} mm; add what is missing"
+            f"first (longest step between others: {np.max(steps):.4g} mm); add what is missing"
         )
     same = np.append(steps, gap) <= 1e-9 * np.max(np.abs(points))
     # Of two points in one place the first is left out, and the joint is the other's.
