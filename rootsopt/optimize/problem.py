@@ -24,7 +24,8 @@ from rootsopt.config import Config
 from rootsopt.dynamics.measures import line_name
 from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluation, objective_weights
-from rootsopt.model import DEG, MM, Model
+from rootsopt.families import DEG
+from rootsopt.model import MM, Model
 from rootsopt.profiles import Geometry, geometry
 from rootsopt.programs import Program
 from rootsopt.speeds import counted, parts_of

@@ -35,7 +35,7 @@ that are spared, as is what lies before the curve has that speed."""
 class Curve:
     """A curve z(t) in `pieces` that follow each other, each from the `ends` to the next."""
 
-    ends: Float64[np.ndarray, " k+1"]
+    ends: Float64[np.ndarray, " k"]
     pieces: tuple[BSpline, ...]
 
     def derivatives(self, t: NDArray[np.float64], place: int) -> NDArray[np.complex128]:
@@ -46,7 +46,7 @@ class Curve:
         """z, z′, z″, z‴ (4, n) at any t."""
         place = np.clip(np.searchsorted(self.ends, t, side="right") - 1, 0, len(self.pieces) - 1)
         found = np.empty((4, len(t)), complex)
-        for k in np.unique(place):
+        for k in map(int, np.unique(place)):
             found[:, place == k] = self.derivatives(t[place == k], k)
         return found
 
