@@ -66,7 +66,7 @@ def imported(config: Config, path: Path) -> Config:
 def off_um(points: np.ndarray, design: Profile) -> np.ndarray:
     """Normal distance (µm) of points (mm) from a design."""
     fine = np.asarray(outline(design, 2000)) / MM
-    return 1e3 * signed_distance(np.stack([points.real, points.imag], axis=1), fine)
+    return 1e3 * signed_distance(np.stack([np.real(points), np.imag(points)], axis=1), fine)
 
 
 def draw(
@@ -106,7 +106,7 @@ def main() -> int:
     config = load(options.config)
     design = Model.of(config).profile(design_vector(config))
     points = measured(design)
-    columns = {"x_mm": points.real, "y_mm": points.imag}
+    columns = {"x_mm": np.real(points), "y_mm": np.imag(points)}
     path = folder.write_csv("measured.csv", columns).absolute()
     other = imported(config, path)
     check_geometry(other)

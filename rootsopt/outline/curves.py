@@ -92,7 +92,7 @@ def stretch(
     fast = np.linspace(low, high, count)[speed > _CUSP * np.mean(speed)]
     spared = [max(knots[_SPARED], fast[0]), min(knots[-1 - _SPARED], fast[-1])]
     ends = np.where(cusp, spared, ends)
-    t = np.linspace(*ends, count - int(np.sum(cusp)))
+    t = np.linspace(ends[0], ends[1], count - int(np.sum(cusp)))
     t = np.concatenate([[low][: int(cusp[0])], t, [high][: int(cusp[1])]])
     z, first, second, _ = curve.derivatives(t, place)
     speed = np.abs(first)
@@ -133,9 +133,8 @@ def through(
         t = np.concatenate([[0.0], np.cumsum(steps)])
         sum_of_squares = len(points) * smoothing**2
         try:
-            spline, _ = make_splprep(
-                [points.real, points.imag], u=t, k=5, s=sum_of_squares, nest=len(points) + 6
-            )
+            sides = [np.real(points), np.imag(points)]
+            spline, _ = make_splprep(sides, u=t, k=5, s=sum_of_squares)  # type: ignore[arg-type]
         except ValueError as error:
             raise InputError(f"the outline cannot be smoothed: {error}") from None
         controls = np.asarray(spline.c)

@@ -160,7 +160,8 @@ def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
                 "crossing; add points"
             )
         i = i[len(i) // 2]
-        return float(brentq(function, scan[i], scan[i + 1], xtol=1e-13, rtol=1e-14))
+        found = brentq(function, scan[i], scan[i + 1], xtol=1e-13)
+        return float(found)  # type: ignore[arg-type]
 
     def point(t):
         return curve(np.array([t]))[0][0]

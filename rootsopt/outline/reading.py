@@ -143,8 +143,7 @@ def _from_dxf(data: bytes, name: str) -> Loop:
     except (DXFError, OSError, ValueError) as error:
         raise InputError(f"{name}: is not a DXF file that can be read: {error}") from None
     given = document.header.get("$INSUNITS", 0)
-    scale = units.conversion_factor(units.InsertUnits(given), units.InsertUnits.Millimeters)
-    scale = scale if given else 1.0
+    scale = units.conversion_factor(given, units.MM) if given else 1.0
     kinds = (*_LINES, *_CURVES, *_CHAINS)
     entities = [e for e in document.modelspace() if e.dxftype() in kinds]
     entities = [e for e in entities if e.dxf.layer.upper() == _LAYER] or entities
@@ -239,4 +238,4 @@ def _joined(chains: list[Loop], name: str) -> Loop:
 
 def signed_area(points: Complex128[np.ndarray, " n"]) -> float:
     """Area inside a closed polygon (mm²), positive if it runs counter-clockwise."""
-    return float(np.sum((np.conj(points) * np.roll(points, -1)).imag)) / 2
+    return float(np.sum(np.imag(np.conj(points) * np.roll(points, -1)))) / 2
