@@ -24,7 +24,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
         config, choice = auto.resolve(config)
         found = basins.find(Evaluator(config), series=True)
-    folder.write_text("config.yaml", config.to_yaml())
+    files.write_config(folder, config)
     data = {
         "attractors": found.records(),
         "lost": found.lost,

@@ -8,9 +8,11 @@ from jaxtyping import Array, Float
 
 from rootsopt.config import FAMILY_KEYS, ProfileConfig
 from rootsopt.errors import InputError
+from rootsopt.outline.conjugacy import conjugacy
 from rootsopt.profiles import (
     CIC,
     EE,
+    Outline,
     Profile,
     arc,
     arcs_epicycloid,
@@ -72,8 +74,20 @@ def design_of(config: ProfileConfig) -> Float[Array, " d"]:
     return jnp.asarray([getattr(config, key) for key in FAMILY_KEYS[config.family]], float)
 
 
+def outline(config: ProfileConfig) -> Outline | None:
+    """The profile of a config that has it in a file."""
+    if config.family != "outline":
+        return None
+    from rootsopt.outline.source import outline_of  # Half a second, for outlines alone.
+
+    return outline_of(config)[0]
+
+
 def check(config: ProfileConfig) -> None:
     """Raise `InputError` unless the profile can be made and meshes."""
+    if (given := outline(config)) is not None:
+        conjugacy(given)
+        return
     if config.family in ("cic", "arc_involute"):
         _check_involute(config)
         return

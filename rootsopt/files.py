@@ -26,6 +26,7 @@ from rootsopt.errors import InputError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from rootsopt.config import Config
     from rootsopt.evaluate import Series
 
 DPI = 150
@@ -185,6 +186,23 @@ def _cell(value: Any) -> str:
     if isinstance(value, float | np.floating):
         return f"{value + 0.0:.10g}"
     return str(value)
+
+
+def write_config(folder: ResultFolder, config: "Config") -> None:
+    """Write config.yaml, and beside it a copy of the file that an outline is in, which it names:
+    the folder stays whole wherever it is moved."""
+    profile = config.profile
+    if profile.outline_file is not None:
+        source = Path(profile.outline_file)
+        copy = f"outline{source.suffix.lower()}"
+        try:
+            data = source.read_bytes()
+        except OSError as error:
+            raise InputError(f"{str(source)!r}: cannot be read: {_reason(error)}") from None
+        folder.write_bytes(copy, data)
+        profile = profile.model_copy(update={"outline_file": copy})
+        config = config.model_copy(update={"profile": profile})
+    folder.write_text("config.yaml", config.to_yaml())
 
 
 def profile_columns(outline_mm: ArrayLike) -> dict[str, NDArray[np.float64]]:

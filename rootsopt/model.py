@@ -38,7 +38,7 @@ from rootsopt.dynamics.parts import (
 )
 from rootsopt.errors import InputError
 from rootsopt.families import MM
-from rootsopt.profiles import Geometry, Profile, geometry, outline
+from rootsopt.profiles import Geometry, Outline, Profile, geometry, outline
 from rootsopt.programs import Program
 
 _ROLLS, _RELATIVES = 384, 16
@@ -75,6 +75,7 @@ class Model(eqx.Module):
     friction: Friction | None = None
     supports: Supports | None = None
     center_distance_error: Float[Array, ""] | None = None
+    outline: Outline | None = None
 
     @classmethod
     def of(cls, config: Config, deepest: float | None = None) -> "Model":
@@ -131,11 +132,14 @@ class Model(eqx.Module):
             bore_radius=_optional(config.rotor.bore_mm, MM / 2),
             pressure=_optional(scene.load.pressure_difference_Pa),
             center_distance_error=_optional(scene.center_distance_error_mm, MM),
+            outline=families.outline(config.profile),
             **_parts(config),
         )
 
     def profile(self, design: Float[Array, " d"]) -> Profile:
         """The profile of a design given in config units."""
+        if self.outline is not None:
+            return self.outline
         return families.profile_of(self.family, self.lobes, self.pitch_radius, design)
 
     @property
@@ -160,8 +164,10 @@ class Model(eqx.Module):
 
     @property
     def both(self) -> bool:
-        """Whether the axes may be elsewhere than at the nominal centre distance."""
-        return self.supports is not None or self.center_distance_error is not None
+        """Whether drive and coast flanks may touch at once: the axes may be elsewhere than at the
+        nominal centre distance, or the flanks are not conjugate."""
+        odd = self.supports, self.center_distance_error, self.outline
+        return any(part is not None for part in odd)
 
     def contact(self, profile: Profile) -> GapFunction:
         """Gap and levers of `profile` at this model's fidelity."""

@@ -5,6 +5,7 @@ figure without pyplot, so that nothing here is global, needs a display or a main
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from rootsopt.contact.nodes import place_pair
 from rootsopt.evaluate import Evaluation, Series
 from rootsopt.files import ResultFolder
 from rootsopt.model import design_keys, outline_mm
+from rootsopt.outline.conjugacy import conjugacy, gaps_um
+from rootsopt.outline.source import outline_of
 
 # Okabe and Ito's palette, told apart with any colour vision and in grey.
 BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"
@@ -111,6 +114,22 @@ def plot_meshing(
         ax.set_aspect("equal")
         ax.set_title(f"rotor 1 at {angle:g}°")
     return axes
+
+
+def plot_conjugacy(ax: Axes, gaps: Mapping[str, tuple[NDArray, NDArray]]) -> Axes:
+    """Gap (µm) that pairs leave in perfect rolling, over rotor 1's angle (deg) from where its tip
+    passes the line of centres."""
+    for (name, (angle, gap)), color, dashes in zip(gaps.items(), _CYCLE, _DASHES * 2, strict=False):
+        ax.plot(angle, gap, color=color, linestyle=dashes, linewidth=1.6, label=name)
+    ax.axhline(0, color="black", linewidth=0.8)
+    low, high = ax.get_ylim()
+    if low < 0:
+        ax.axhspan(low, 0, color=VERMILION, alpha=0.08, linewidth=0, label="overlap")
+    ax.set(ylim=(low, high), xlabel="angle of rotor 1 from tip on the line of centres (°)")
+    ax.set(ylabel="gap at ε = 0 (µm)", title="Gap in rolling")
+    ax.grid(color="0.92", linewidth=0.6)
+    ax.set_axisbelow(True)
+    return ax
 
 
 def plot_force(
@@ -320,10 +339,17 @@ def _outside(ax, history):
 def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, Any]) -> list[str]:
     """Write profiles.png and meshing.png of one record; return their names."""
     points = _outline(config, record.get("design", {}))
-    return [
+    names = [
         _write(folder, "profiles", _profiles({config.profile.family.upper(): points}, config)),
         _write(folder, "meshing", _meshing(points, config)),
     ]
+    if config.profile.family == "outline":
+        made, axes = figure(8, 4.2)
+        gaps = gaps_um(conjugacy(outline_of(config.profile)[0]))
+        plot_conjugacy(axes[0, 0], {Path(config.profile.outline_file or "").name: gaps})
+        axes[0, 0].legend(frameon=False)
+        names.append(_write(folder, "conjugacy", made))
+    return names
 
 
 def simulation_figures(folder: ResultFolder, evaluation: Evaluation, config: Config) -> list[str]:

@@ -19,6 +19,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
     from rootsopt import files, report
     from rootsopt.evaluate import geometry_record
     from rootsopt.model import Model, check_geometry, design_keys, design_vector, outline_mm
+    from rootsopt.outline import report as outline_report
     from rootsopt.profiles import geometry
     from rootsopt.status import Status
 
@@ -37,7 +38,8 @@ def body(config: Config, options: argparse.Namespace) -> int:
         "message": Status.GEOMETRY_ONLY.value,
         "statistics": {},
     }
-    folder.write_text("config.yaml", config.to_yaml())
+    record |= outline_report.record(config)
+    files.write_config(folder, config)
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     folder.write_json("result.json", record | {"versions": files.versions()})
     export.write(folder, config, formats, record["design"])
@@ -47,6 +49,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
         plot.profile_figures(folder, config, record)
     out = Console()
     out.print(report.geometry_table(record))
+    outline_report.say(config, out)
     out.print(f"results in {options.output}", soft_wrap=True)
     return cli.OK
 

@@ -20,6 +20,7 @@ _UNITS = {
     "_kg_m2": "kg m^2",
     "_N_m": "N m",
     "_mm2": "mm^2",
+    "_um": "um",
     "_mm": "mm",
     "_deg": "deg",
     "_N": "N",
@@ -150,6 +151,8 @@ def geometry_table(record: Mapping[str, Any]) -> RenderableType:
     table = _table("Rotor profile", "value")
     _group(table, "design", _singles(record.get("design", {})))
     _group(table, "geometry", _singles(record.get("geometry", {})))
+    if "outline" in record:
+        _group(table, "outline", _singles(record["outline"]))
     if record.get("status"):
         _group(table, "status", [("status", str(record["status"]))])
     return Group(table, Text(record.get("message") or ""))

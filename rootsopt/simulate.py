@@ -17,6 +17,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
     from rootsopt import auto, files, report
     from rootsopt.evaluators import evaluator_for
     from rootsopt.model import check_geometry, outline_mm
+    from rootsopt.outline import report as outline_report
     from rootsopt.speeds import alone
 
     formats = export.chosen(options.export)
@@ -25,11 +26,12 @@ def body(config: Config, options: argparse.Namespace) -> int:
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
         config, choice = auto.resolve(config)
         evaluation = evaluator_for(alone(config))()
-    folder.write_text("config.yaml", config.to_yaml())
+    files.write_config(folder, config)
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     if evaluation.series is not None:
         folder.write_csv("response_design.csv", files.response_columns(evaluation.series))
-    folder.write_json("result.json", evaluation.record() | choice | {"versions": files.versions()})
+    data = evaluation.record() | choice | outline_report.record(config)
+    folder.write_json("result.json", data | {"versions": files.versions()})
     period = evaluation.steady_state.get("period") or config.profile.lobes
     if evaluation.series is None:
         formats = tuple(name for name in formats if name != "gif")  # no motion to be shown
@@ -40,6 +42,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
         plot.simulation_figures(folder, evaluation, config)
     out = Console()
     out.print(report.evaluation_table(evaluation))
+    outline_report.say(config, out)
     out.print(f"results in {options.output}", soft_wrap=True)
     return cli.OK if evaluation.usable else cli.NO_RESULT
 

@@ -27,7 +27,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
         parts = speeds.sweep(evaluator, speeds.swept_speeds(config), progress=progress)
     rows = [part.row() for part in parts]
     status, message = speeds.overall(parts)
-    folder.write_text("config.yaml", config.to_yaml())
+    files.write_config(folder, config)
     folder.write_csv("sweep.csv", files.row_columns(rows))
     data = {
         "design": {key: getattr(config.profile, key) for key in design_keys(config)},

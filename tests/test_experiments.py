@@ -220,3 +220,13 @@ def test_polished():
         found = polished(cast(Any, pairs), start, held=held)
         assert found.misfit < 1e-4
         assert found.values[held] == pytest.approx(start[held], rel=1e-12)
+
+
+@pytest.mark.long
+def test_measured(tmp_path, programs):
+    run("measured", tmp_path, programs)
+    found = json.loads((tmp_path / "measured.json").read_text())
+    assert found["form_found_um"] == pytest.approx(found["form_given_um"], abs=1.5)
+    assert found["outline"]["interference_um"] == pytest.approx(20, abs=1.5)
+    assert found["outline"]["reversed"]
+    assert is_picture(tmp_path / "measured.png")

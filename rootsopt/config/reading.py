@@ -45,11 +45,12 @@ class Config(Section):
 
     @property
     def needs_search(self) -> tuple[str, ...]:
-        """Keys of parts that need the place of contact, which only a search has."""
+        """Keys that need what only a search has: the place of contact, any pair of flanks."""
         parts = {
             "contact.friction": self.contact.friction,
             "scene.supports": self.scene.supports,
             "scene.center_distance_error_mm": self.scene.center_distance_error_mm,
+            "profile.outline_file": self.profile.outline_file,
         }
         return tuple(key for key, part in parts.items() if part is not None)
 
@@ -59,7 +60,7 @@ class Config(Section):
         if self.needs_search and fidelity not in ("search", "auto"):
             raise ValueError(
                 f"`solver.fidelity` must be search (or auto) with `{self.needs_search[0]}`, which "
-                f"needs the place of contact, but is {fidelity}"
+                f"needs what only a search has, but is {fidelity}"
             )
         return self
 
@@ -105,11 +106,17 @@ def load(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Confi
 
     Raises `InputError` for anything wrong with file, keys or values.
     """
-    return parse(_read(Path(path)), overrides, source=str(path))
+    return parse(_read(Path(path)), overrides, source=str(path), folder=Path(path).parent)
 
 
-def parse(text: str, overrides: list[str] | tuple[str, ...] = (), source: str = "config") -> Config:
-    """Like `load`, from YAML text."""
+def parse(
+    text: str,
+    overrides: list[str] | tuple[str, ...] = (),
+    source: str = "config",
+    folder: str | Path = ".",
+) -> Config:
+    """Like `load`, from YAML text. Files that it names are relative to `folder`, those that
+    `overrides` name to the current folder; the config has absolute paths."""
     data = _yaml(text, source)
     if data is None:
         data = {}
@@ -118,12 +125,21 @@ def parse(text: str, overrides: list[str] | tuple[str, ...] = (), source: str = 
             f"{source}: must hold sections such as `profile:` and `scene:`, but is a "
             f"{type(data).__name__}"
         )
+    _place_files(data, Path(folder))
     for override in overrides:
         _override(data, override)
+    _place_files(data, Path())
     try:
         return Config.model_validate(data)
     except ValidationError as error:
         raise InputError(f"{source}: {_explain(error)}") from None
+
+
+def _place_files(data: dict, folder: Path) -> None:
+    """Make paths of files absolute that are relative to `folder`."""
+    profile = data.get("profile")
+    if isinstance(profile, dict) and isinstance(profile.get("outline_file"), str):
+        profile["outline_file"] = str((folder / profile["outline_file"]).absolute())
 
 
 def _read(path: Path) -> str:

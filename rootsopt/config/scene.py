@@ -25,6 +25,7 @@ FAMILY_KEYS: dict[str, tuple[str, ...]] = {
     "hypo_epicycloid": ("tip_arc_angle_deg",),
     "extended_cycloid": ("trochoid_ratio",),
     "ellipse": ("ellipse_center_mm", "ellipse_height_mm"),
+    "outline": (),
 }
 """Profile families with their design parameters, as named in the config."""
 
@@ -44,7 +45,8 @@ class ProfileConfig(Section):
         "hypo_epicycloid",
         "extended_cycloid",
         "ellipse",
-    ] = Field(description="profile family")
+        "outline",
+    ] = Field(description="profile family; outline: from a file")
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
     pitch_radius_mm: Positive = Field(description="pitch radius; centre distance is twice that")
     pressure_angle_deg: Annotated[float, Field(gt=0, lt=90)] | None = Field(
@@ -86,6 +88,27 @@ class ProfileConfig(Section):
     ellipse_height_mm: Positive | None = Field(
         None, description="ellipse: semi-axis along the lobe"
     )
+
+    outline_file: str | None = Field(
+        None, description="outline: CSV or DXF file, relative to the config's folder"
+    )
+    outline_smoothing_mm: NonNegative | None = Field(
+        None, description="outline: scatter (RMS) of measured points; absent: 0, through them"
+    )
+
+    @model_validator(mode="after")
+    def _from_file(self):
+        if self.family == "outline":
+            if self.outline_file is None:
+                raise ValueError("`profile.outline_file` is required for family outline")
+            return self
+        for key in ("outline_file", "outline_smoothing_mm"):
+            if getattr(self, key) is not None:
+                raise ValueError(
+                    f"`profile.{key}` does not belong to family {self.family}; remove it, or set "
+                    "`profile.family` to outline"
+                )
+        return self
 
     @model_validator(mode="after")
     def _family_keys(self):

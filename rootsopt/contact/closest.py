@@ -39,8 +39,6 @@ from jaxtyping import Array, Bool, Float
 
 from rootsopt.profiles.base import Profile
 
-# Nodes per smooth segment; they only have to separate the roots of T.
-_NODES_PER_SEGMENT = 32
 # Newton steps from the point of perfect rolling, at most (two or three are usual). The last
 # one must be so short that the next would be lost in rounding, even across a kink of T.
 _NEWTON_STEPS = 5
@@ -56,6 +54,8 @@ _USUAL = -5e-3
 # Distance (rad) before a cusp within which a contact belongs to it: between the two minima, which
 # are several |ε| apart.
 _NEAR_CUSP = 1e-3
+# Gap (pitch radii) below which flanks that are not conjugate cannot touch.
+_DEEPEST = 0.1
 # Rounding of T relative to the pitch radius, by bytes of a number.
 _SLACK = {8: 1e-13, 4: 1e-6}
 
@@ -82,8 +82,8 @@ class FlankNodes(NamedTuple):
     """Where T is sampled: normal angles ν2 with what does not depend on the pose.
 
     `facing` is the direction of the common normal at x = 0, `direction` its cosine and
-    sine; `turned` the cosine and sine of `Profile.turn_ratio` times it; `lever` that of
-    rotor 2's point.
+    sine; `turned` the cosine and sine of `Profile.turn_ratio` times it; `lever` and, where
+    more than two minima of the gap are to be told apart, `support` those of rotor 2's point.
     """
 
     normal: Float[Array, " n"]
@@ -91,6 +91,7 @@ class FlankNodes(NamedTuple):
     direction: Float[Array, "2 n"]
     turned: Float[Array, "2 n"]
     lever: Float[Array, " n"]
+    support: Float[Array, " n"] | None
 
 
 class FlankPair(eqx.Module):
@@ -123,7 +124,8 @@ class FlankPair(eqx.Module):
         """
         frozen = lax.stop_gradient(profile)
         segments = [s for s in frozen.segments() if both or not s.land]
-        fraction = jnp.arange(_NODES_PER_SEGMENT) / _NODES_PER_SEGMENT
+        count = frozen.search_nodes
+        fraction = jnp.arange(count) / count
         pieces = [s.start + (s.stop - s.start) * fraction for s in segments[:-1]]
         if not (both or frozen.segments()[0].land):
             # A rounded tip: at the hand-over the contact slides over its top. (A land
@@ -134,24 +136,24 @@ class FlankPair(eqx.Module):
         # radius of curvature. Rotor 2 may touch beyond its pitch point by about ε, so a
         # piece of its addendum is searched too, reflected about the pitch normal.
         start, stop = segments[-1].start, segments[-1].stop
-        crowd = 0.5 ** jnp.arange(1, 8) / _NODES_PER_SEGMENT
+        crowd = 0.5 ** jnp.arange(1, 8) / count
         near = jnp.concatenate([fraction, 1 - crowd, jnp.ones(1), 1 + crowd[::-1]])
-        beyond = 1 + jnp.arange(1, 1 + _NODES_PER_SEGMENT // 2) / _NODES_PER_SEGMENT
+        beyond = 1 + jnp.arange(1, 1 + count // 2) / count
         pieces.append(start + (stop - start) * jnp.concatenate([near, beyond]))
         normal = jnp.concatenate(pieces)
-        beta, psi, _ = _mate_point(frozen, normal, distance=False)
-        facing = jnp.pi / 2 - psi - beta
+        mate = frozen.mate(normal)
         nodes = FlankNodes(
             normal=normal,
-            facing=facing,
-            direction=_circle(facing),
-            turned=_circle(frozen.turn_ratio * facing),
-            lever=frozen.pitch_radius * jnp.cos(psi),
+            facing=mate.facing,
+            direction=_circle(mate.facing),
+            turned=_circle(frozen.turn_ratio * mate.facing),
+            lever=mate.lever,
+            support=None if frozen.conjugate else mate.support,
         )
         distance = 2 * profile.pitch_radius if center_distance is None else center_distance
         dynamic, static = eqx.partition(frozen, eqx.is_inexact_array)
         dynamic, nodes = _materialized((dynamic, nodes), nodes.normal[-1] > -jnp.inf)
-        rolling = center_distance is None
+        rolling = center_distance is None and profile.conjugate
         return cls(profile, eqx.combine(dynamic, static), nodes, distance, rolling)
 
     def __call__(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> ClosestApproach:
@@ -236,33 +238,27 @@ class FlankPair(eqx.Module):
     def reach(self, normal1, normal2, roll, relative):
         """Support functions (m) of both points on the common normal, and the part of the normal
         along the line of centres, at a folded `roll`."""
-        profile = self.profile
-        beta, psi, s2 = _mate_point(profile, normal2)
-        direction = jnp.pi / 2 - psi - beta + roll - relative / 2
-        support2 = profile.pitch_radius * jnp.sin(psi) + s2
-        return profile.support(normal1), support2, jnp.cos(direction)
+        mate = self.profile.mate(normal2)
+        direction = mate.facing + roll - relative / 2
+        return self.profile.support(normal1), mate.support, jnp.cos(direction)
 
     def _mesh(self, normal2, roll, relative):
         """T, G, ν1, q1, q2 at `normal2`, from the definition."""
         profile = self.profile
-        r = profile.pitch_radius
-        beta, psi, s2 = _mate_point(profile, normal2)
-        facing = jnp.pi / 2 - psi - beta
-        normal1 = facing + 2 * roll
-        direction = facing + roll - relative / 2
-        lever1, lever2 = profile.lever(normal1), r * jnp.cos(psi)
-        support = profile.support(normal1) + r * jnp.sin(psi) + s2
+        mate = profile.mate(normal2)
+        normal1 = mate.facing + 2 * roll
+        direction = mate.facing + roll - relative / 2
+        lever1 = profile.lever(normal1)
+        support = profile.support(normal1) + mate.support
         gap = self.center_distance * jnp.cos(direction) - support
-        offset = self.center_distance * jnp.sin(direction) - lever1 - lever2
-        return offset, gap, normal1, lever1, lever2
+        offset = self.center_distance * jnp.sin(direction) - lever1 - mate.lever
+        return offset, gap, normal1, lever1, mate.lever
 
     def _offset(self, normal2, roll, relative):
         """T alone, with as little work as possible."""
-        beta, psi, _ = _mate_point(self.profile, normal2, distance=False)
-        facing = jnp.pi / 2 - psi - beta
-        reach = self.center_distance * jnp.sin(facing + roll - relative / 2)
-        arms = self.profile.lever(facing + 2 * roll) + self.profile.pitch_radius * jnp.cos(psi)
-        return reach - arms
+        mate = self.profile.mate(normal2, support=False)
+        reach = self.center_distance * jnp.sin(mate.facing + roll - relative / 2)
+        return reach - self.profile.lever(mate.facing + 2 * roll) - mate.lever
 
     def _search(self, roll, relative, attempt=0):
         """Closest approach at a folded `roll`, and the attempts it took.
@@ -270,7 +266,9 @@ class FlankPair(eqx.Module):
         Attempt 0 is Newton's method from the point of perfect rolling. Where it cannot be relied
         on, attempts 1 and 2 follow: two minima occur away from the nominal centre distance and
         next to a cusp, and are the last and the first interval of the nodes where T falls
-        through zero; the deeper counts. (One loop for all, so that it is compiled once.)
+        through zero; the deeper counts. Flanks that are not conjugate may have more of them, of
+        which the two that the nodes show to be deepest are looked at. (One loop for all, so that
+        it is compiled once.)
         """
         nothing = jnp.zeros_like(roll)
         none = ClosestApproach(
@@ -309,27 +307,40 @@ class FlankPair(eqx.Module):
         return attempts % _DONE, best
 
     def _bracket(self, attempt, roll, relative):
-        """Interval between nodes where T falls through zero, the last (`attempt` 1) or the first:
-        (low, high), first guess, whether there is one, whether there is but one."""
+        """Interval between nodes where T falls through zero, the last (`attempt` 1) or the first,
+        of flanks that are not conjugate the deepest or the second: (low, high), first guess,
+        whether there is one, whether there is but one."""
         profile, nodes = self.profile, self.nodes
         turned = _rotate(nodes.turned, 2 * profile.turn_ratio * roll)
-        lever1 = profile.lever_from(nodes.facing + 2 * roll, turned[0], turned[1])
-        sin = _rotate(nodes.direction, roll - relative / 2)[1]
+        normal1 = nodes.facing + 2 * roll
+        lever1 = profile.lever_from(normal1, turned[0], turned[1])
+        cos, sin = _rotate(nodes.direction, roll - relative / 2)
         offset = self.center_distance * sin - lever1 - nodes.lever
         # The tolerance is for a root on a node: a compiled program may round T[i] one way as the
         # end of one interval and another way as the start of the next.
         slack = _SLACK[offset.dtype.itemsize] * profile.pitch_radius
         falling = (offset[:-1] >= -slack) & (offset[1:] < slack)
-        # Whole numbers, whose greatest is found at vector speed; an arg-minimum is not.
-        place = jnp.arange(falling.shape[0])
-        last = jnp.max(jnp.where(falling, place, -1))
-        first = jnp.min(jnp.where(falling, place, place.shape[0]))
-        present = last >= 0
-        index = jnp.where(present, jnp.where(attempt == 1, last, first), 0)
+        if nodes.support is None:
+            # Whole numbers, whose greatest is found at vector speed; an arg-minimum is not.
+            place = jnp.arange(falling.shape[0])
+            last = jnp.max(jnp.where(falling, place, -1))
+            first = jnp.min(jnp.where(falling, place, place.shape[0]))
+            present, single = last >= 0, first >= last
+            index = jnp.where(present, jnp.where(attempt == 1, last, first), 0)
+        else:
+            # The gap of parallel tangents changes by -T for every angle that they turn.
+            gap = self.center_distance * cos - profile.support(normal1) - nodes.support
+            share = _share(offset[:-1], offset[1:])
+            least = gap[:-1] - jnp.diff(nodes.facing) * share * offset[:-1] / 2
+            # A pair this deep has come through the lobe from its other flank.
+            falling &= least > -_DEEPEST * profile.pitch_radius
+            least = jnp.where(falling, least, jnp.inf)
+            present, single = jnp.any(falling), jnp.sum(falling) < 2
+            first = jnp.argmin(least)
+            index = jnp.where(attempt == 1, first, jnp.argmin(least.at[first].set(jnp.inf)))
         low, high = nodes.normal[index], nodes.normal[index + 1]
-        fall = offset[index] - offset[index + 1]
-        share = jnp.clip(offset[index] / jnp.where(fall > 0, fall, 1.0), 0.0, 1.0)
-        return (low, high), low + (high - low) * share, present, first >= last
+        share = _share(offset[index], offset[index + 1])
+        return (low, high), low + (high - low) * share, present, single
 
     def _root(self, bracket, guess, guarded, roll, relative):
         """Root of T by Newton's method from `guess`, and whether it converged.
@@ -404,21 +415,13 @@ def _circle(angle):
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
+def _share(before, after):
+    """Share of an interval at which a function, linear in it, falls through zero."""
+    fall = before - after
+    return jnp.clip(before / jnp.where(fall > 0, fall, 1.0), 0.0, 1.0)
+
+
 def _rotate(directions, angle):
     """Cosines and sines (2, n) of angles turned by one common `angle`."""
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     return cos * directions[0] - sin * directions[1], cos * directions[1] + sin * directions[0]
-
-
-def _mate_point(profile, normal, distance=True):
-    """(β, ψ, s) of rotor 2's point for ν2, where ν2 beyond the pitch normal stands for
-    rotor 2's addendum, reflected; β and s are those of the meshing addendum point, so
-    the dedendum itself has π/N - β and -s. Returns -s as the third entry."""
-    pitch = profile.pitch_normal
-    beyond = normal > pitch
-    nu = jnp.where(beyond, 2 * pitch - normal, normal)
-    beta = profile.roll_angle(nu)
-    psi = beta + jnp.pi / 2 - nu
-    s = profile.contact_distance(nu) if distance else nu
-    mate_beta = jnp.where(beyond, jnp.pi / profile.lobes - beta, beta)
-    return mate_beta, psi, jnp.where(beyond, s, -s)

@@ -186,9 +186,10 @@ def _points(profile, nu):
     """Points (m) and directions of the outward normal (rad), and arc length per normal angle
     (m/rad), of addendum and dedendum."""
     _, addendum, dedendum = profile.speeds(nu)
-    turned = nu + jnp.pi / profile.lobes - 2 * profile.roll_angle(nu)
+    below = profile.dedendum(nu)
+    turned = below.beta + jnp.pi / 2 - below.psi
     above = profile.position(profile.addendum(nu)), nu, addendum
-    return above, (profile.position(profile.dedendum(nu)), turned, dedendum)
+    return above, (profile.position(below), turned, dedendum)
 
 
 @dataclasses.dataclass(frozen=True)

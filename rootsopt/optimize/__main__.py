@@ -80,7 +80,7 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
     from rootsopt.model import outline_mm
 
     records = {"baseline": result.baseline, "optimized": result.optimized}
-    folder.write_text("config.yaml", config.to_yaml())
+    files.write_config(folder, config)
     data: dict = {name: e.record() if e is not None else None for name, e in records.items()}
     for name, evaluation in records.items():
         if evaluation is None:

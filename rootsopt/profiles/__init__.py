@@ -9,6 +9,7 @@ from rootsopt.profiles.ee import EE
 from rootsopt.profiles.ellipse import ellipse
 from rootsopt.profiles.epicycloid import TippedEpicycloid, circle_epicycloid, hypo_epicycloid
 from rootsopt.profiles.geometry import Geometry, flank, flank_nodes, geometry, outline
+from rootsopt.profiles.outline import Outline, Table
 from rootsopt.profiles.trochoid import extended_cycloid
 
 __all__ = [
@@ -17,11 +18,13 @@ __all__ = [
     "Arcs",
     "Curve",
     "Geometry",
+    "Outline",
     "Piece",
     "Profile",
     "RollPiece",
     "RollPoint",
     "Segment",
+    "Table",
     "TippedEpicycloid",
     "arc",
     "arcs_epicycloid",

@@ -53,6 +53,15 @@ class Segment(NamedTuple):
     land: bool
 
 
+class Mate(NamedTuple):
+    """A point of the partner's flank: `facing`, the direction (rad) of its outward normal from
+    the axis of the valley; `lever` and `support` (m) of that normal."""
+
+    facing: Float[Array, "*n"]
+    lever: Float[Array, "*n"]
+    support: Float[Array, "*n"]
+
+
 class Profile(eqx.Module):
     """One flank of a conjugate Roots rotor; see the module's docstring.
 
@@ -92,6 +101,35 @@ class Profile(eqx.Module):
         """Support function P·n = r sin ψ + s (m) of the addendum; its slope is -lever."""
         arm = self.pitch_radius * jnp.cos(nu - self.roll_angle(nu))
         return arm + self.contact_distance(nu)
+
+    def mate(self, nu: Float[Array, "*n"], support: bool = True) -> Mate:
+        """The partner's point that meshes with the addendum point `nu`; beyond the pitch normal
+        that of the partner's addendum, reflected there. Without `support` that is not computed
+        (and 0)."""
+        pitch = self.pitch_normal
+        beyond = nu > pitch
+        nu = jnp.where(beyond, 2 * pitch - nu, nu)
+        beta = self.roll_angle(nu)
+        psi = beta + jnp.pi / 2 - nu
+        mate_beta = jnp.where(beyond, jnp.pi / self.lobes - beta, beta)
+        facing = jnp.pi / 2 - psi - mate_beta
+        lever = self.pitch_radius * jnp.cos(psi)
+        if not support:
+            return Mate(facing, lever, jnp.zeros_like(lever))
+        s = self.contact_distance(nu)
+        arm = self.pitch_radius * jnp.sin(psi)
+        return Mate(facing, lever, arm + jnp.where(beyond, s, -s))
+
+    @property
+    def conjugate(self) -> bool:
+        """Whether the flanks touch all through the mesh in perfect rolling, by construction."""
+        return True
+
+    @property
+    def search_nodes(self) -> int:
+        """Nodes per segment that the closest approach is bracketed with; they only have to
+        separate its candidates."""
+        return 32
 
     @property
     def turn_ratio(self) -> float:

@@ -7,6 +7,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rootsopt.profiles.base import Profile
+from rootsopt.profiles.outline import Outline
 from rootsopt.programs import Program
 
 # Gauss-Legendre per smooth segment: the integrands are analytic inside a segment, and
@@ -39,6 +40,8 @@ def geometry(profile: Profile) -> Geometry:
     With the support function h = P·n and arc length element dl, dA = h dl / 2 and
     ∫r² dA = ∫ |P|² h dl / 4 over the outline.
     """
+    if isinstance(profile, Outline):
+        return _given(profile)
     r = profile.pitch_radius
     segments = profile.segments()
     start = jnp.stack([s.start for s in segments])[:, None]
@@ -76,6 +79,20 @@ def geometry(profile: Profile) -> Geometry:
         polar_area_moment=moment,
         undercut_margin=margin,
         seal_width=outer_radius * seal_angle,
+    )
+
+
+def _given(profile: Outline) -> Geometry:
+    """What was measured when the outline was read. Not being the envelope of a partner, it has no
+    undercut margin (NaN)."""
+    return Geometry(
+        outer_radius=profile.outer_radius,
+        root_radius=profile.root_radius,
+        area=profile.area,
+        area_efficiency=1 - profile.area / (jnp.pi * profile.outer_radius**2),
+        polar_area_moment=profile.polar_area_moment,
+        undercut_margin=jnp.full_like(profile.area, jnp.nan),
+        seal_width=profile.seal_width,
     )
 
 

@@ -1,0 +1,139 @@
+"""A flank given as it is: its addendum and its dedendum, which need not be conjugate."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rootsopt.profiles.base import Mate, Profile, RollPoint, Segment
+
+
+class Table(eqx.Module):
+    """k functions of x by cubics between nodes, through values with given slopes.
+
+    `node` (n,), not falling; `value`, `slope` (n, k). A node that stands twice is a place where
+    slopes jump. Beyond the ends the first and the last cubic go on.
+    """
+
+    node: Float[Array, " n"]
+    value: Float[Array, "n k"]
+    slope: Float[Array, "n k"]
+
+    def __call__(self, x: Float[Array, "*m"]) -> tuple[Float[Array, "*m"], ...]:
+        """The k functions at x."""
+        index = jnp.searchsorted(self.node, x, side="right") - 1
+        index = jnp.clip(index, 0, self.node.shape[0] - 2)
+        start, stop = self.node[index], self.node[index + 1]
+        width = stop - start
+        t = (x - start) / width
+        before, after = self.value[index], self.value[index + 1]
+        rise = after - before
+        width, t = width[..., None], t[..., None]
+        first, last = self.slope[index] * width, self.slope[index + 1] * width
+        bend = 3 * rise - 2 * first - last
+        found = before + t * (first + t * (bend + t * (first + last - 2 * rise)))
+        return tuple(jnp.moveaxis(found, -1, 0))
+
+
+class Outline(Profile):
+    """A foreign or measured flank.
+
+    `crown`: support function h and lever q (m) of the addendum over its normal angle ν, from the
+    tip to the pitch circle; it is convex, so that ν tells its points. `valley`: direction of the
+    normal from the valley's axis (rad), h and q of the dedendum over a parameter that runs from 0
+    at the root to the pitch normal at the pitch circle; a dedendum may be convex and concave.
+    With the direction F, dh = -q dF and dq = h dF less the element of arc along the tangent.
+
+    Beyond its ends the addendum is continued by its circles of curvature, over the tip by its
+    mirror image. The law of gearing is nowhere assumed: `mate` is the dedendum as it is. Roll
+    angle and contact distance are those at which either curve's own normals meet the pitch circle.
+
+    `area`, `polar_area_moment`, `outer_radius`, `root_radius`, `seal_width`: see `Geometry`.
+    """
+
+    lobes: int = eqx.field(static=True)
+    pitch_radius: Float[Array, ""]
+    crown: Table
+    valley: Table
+    area: Float[Array, ""]
+    polar_area_moment: Float[Array, ""]
+    outer_radius: Float[Array, ""]
+    root_radius: Float[Array, ""]
+    seal_width: Float[Array, ""]
+
+    def segments(self) -> tuple[Segment, ...]:
+        stop = self.crown.node[-1]
+        return (Segment("flank", jnp.zeros_like(stop), stop, False),)
+
+    def _crown(self, nu):
+        """Support function and lever at any ν."""
+        inside = jnp.clip(jnp.abs(nu), self.crown.node[0], self.crown.node[-1])
+        beyond = jnp.abs(nu) - inside
+        support, lever = self.crown(inside)
+        # Distance of the centre of curvature from the axis, along the normal and across.
+        along = jnp.where(beyond > 0, self.crown.slope[-1, 1], self.crown.slope[0, 1])
+        cos, sin = jnp.cos(beyond), jnp.sin(beyond)
+        support = support + along * (cos - 1) - lever * sin
+        return support, jnp.where(nu < 0, -1.0, 1.0) * (along * sin + lever * cos)
+
+    def support(self, nu):
+        return self._crown(nu)[0]
+
+    def lever(self, nu):
+        return self._crown(nu)[1]
+
+    def _valley(self, nu):
+        return Mate(*self.valley(jnp.clip(nu, self.valley.node[0], self.valley.node[-1])))
+
+    def mate(self, nu, support=True):
+        del support
+        pitch = self.pitch_normal
+        beyond = nu > pitch
+        reflected = jnp.where(beyond, 2 * pitch - nu, pitch)
+        height, lever = self._crown(reflected)
+        across = Mate(reflected - jnp.pi / self.lobes, lever, height)
+        return jax.tree.map(lambda a, b: jnp.where(beyond, a, b), across, self._valley(nu))
+
+    @property
+    def conjugate(self) -> bool:
+        return False
+
+    @property
+    def search_nodes(self) -> int:
+        return 192
+
+    @property
+    def cusp(self) -> bool:
+        return False
+
+    def _rolled(self, direction, mate):
+        """A point in roll-angle form. A normal that misses the pitch circle is taken where it
+        comes nearest to it."""
+        psi = jnp.arccos(jnp.clip(mate.lever / self.pitch_radius, -1.0, 1.0))
+        s = mate.support - self.pitch_radius * jnp.sin(psi)
+        return RollPoint(direction + psi - jnp.pi / 2, psi, s)
+
+    def addendum(self, nu):
+        support, lever = self._crown(nu)
+        return self._rolled(nu, Mate(nu, lever, support))
+
+    def dedendum(self, nu):
+        mate = self._valley(nu)
+        return self._rolled(mate.facing + jnp.pi / self.lobes, mate)
+
+    def roll_angle(self, nu):
+        return self.addendum(nu).beta
+
+    def contact_distance(self, nu):
+        return self.addendum(nu).s
+
+    def normal_at(self, roll_angle):
+        nodes = self.crown.node
+        return jnp.interp(roll_angle, self.roll_angle(nodes), nodes)
+
+    def speeds(self, nu):
+        one = jnp.ones_like(nu)
+        (height, _), (_, turned) = jax.jvp(self._crown, (nu,), (one,))
+        mate, moved = jax.jvp(self._valley, (nu,), (one,))
+        point = self.addendum(nu)
+        return point, height - turned, -(mate.support * moved.facing - moved.lever)
