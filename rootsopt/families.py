@@ -4,12 +4,15 @@ import math
 from collections.abc import Callable
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
-from rootsopt.config import FAMILY_KEYS, ProfileConfig
+from rootsopt.config import FAMILY_KEYS, LIST_KEYS, ProfileConfig
 from rootsopt.errors import InputError
-from rootsopt.profiles import CIC, EE, Profile, ellipse
+from rootsopt.profiles import CIC, EE, FreeForm, Profile, ellipse, project
 from rootsopt.profiles.arc_families import arc, five_arcs, four_arcs
+from rootsopt.profiles.departure import departure
 from rootsopt.profiles.validity import margins
 
 MM = 1e-3
@@ -32,11 +35,17 @@ _MAKERS: dict[str, Callable[..., Profile]] = {
     "four_arcs": four_arcs,
     "five_arcs": five_arcs,
     "ellipse": ellipse,
+    "free_form": FreeForm,
 }
+BY_LIMITS = ("cic", "arc_involute")
+"""Families whose soundness is known from limits of their parameters; that of the others is by
+margins."""
 
 
 def unit_of(key: str) -> float:
     """SI value of one unit of a config key."""
+    if key in LIST_KEYS:
+        return 1.0
     return DEG if key.endswith("_deg") else MM
 
 
@@ -44,19 +53,59 @@ def profile_of(
     family: str, lobes: int, pitch_radius: Float[Array, ""], design: Float[Array, " d"]
 ) -> Profile:
     """The profile of a `family` with a `design` in config units, `pitch_radius` in m."""
-    keys = FAMILY_KEYS[family]
-    values = [design[k] * unit_of(key) for k, key in enumerate(keys)]
+    values: list[Float[Array, "*n"]] = []
+    for k, key in enumerate(FAMILY_KEYS[family]):
+        value = design[k:] if key in LIST_KEYS else design[k]
+        values.append(value * unit_of(key))
     return _MAKERS[family](lobes, pitch_radius, *values)
+
+
+def keys_of(config: ProfileConfig) -> tuple[str, ...]:
+    """Names of the design parameters of a config: its keys, those of a list numbered from 1."""
+    names: list[str] = []
+    for key in FAMILY_KEYS[config.family]:
+        value = getattr(config, key)
+        numbers = range(1, 1 + len(value)) if key in LIST_KEYS else ()
+        names += [f"{key}_{number}" for number in numbers] or [key]
+    return tuple(names)
 
 
 def design_of(config: ProfileConfig) -> Float[Array, " d"]:
     """The design parameters of a config, in its units."""
-    return jnp.asarray([getattr(config, key) for key in FAMILY_KEYS[config.family]], float)
+    values = [getattr(config, key) for key in FAMILY_KEYS[config.family]]
+    return jnp.asarray(np.hstack([*values, ()]), float)
+
+
+def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:
+    """A config's profile with another `design` (d,) in its units, as many as it has."""
+    given = [float(value) for value in np.asarray(design)]
+    values: dict[str, float | tuple[float, ...]] = {}
+    for k, key in enumerate(FAMILY_KEYS[config.family]):
+        values[key] = tuple(given[k:]) if key in LIST_KEYS else given[k]
+    return config.model_copy(update=values)
+
+
+def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, float]:
+    """A config's profile as a free form of `count` coefficients, and how far (m) that departs from
+    it at most."""
+    radius = jnp.asarray(config.pitch_radius_mm * MM)
+    profile = profile_of(config.family, config.lobes, radius, design_of(config))
+    found = project(profile, count)
+    # Decimals enough for a hundredth of a micrometre.
+    result = ProfileConfig(
+        family="free_form",
+        lobes=config.lobes,
+        pitch_radius_mm=config.pitch_radius_mm,
+        tip_arc_angle_deg=round(float(found.tip_arc_angle) / DEG, 9),
+        coefficients=tuple(round(float(c), 6) for c in found.coefficients),
+    )
+    written = profile_of("free_form", config.lobes, radius, design_of(result))
+    return result, departure(profile, written)
 
 
 def check(config: ProfileConfig) -> None:
     """Raise `InputError` unless the profile can be made and meshes."""
-    if config.family in ("cic", "arc_involute"):
+    if config.family in BY_LIMITS:
         _check_involute(config)
         return
     profile = profile_of(
@@ -68,12 +117,17 @@ def check(config: ProfileConfig) -> None:
         least = _ROUNDING * size.get(name, config.pitch_radius_mm * MM)
         if not float(value) >= -least:
             given = ", ".join(
-                f"`profile.{key}` = {getattr(config, key):g}" for key in FAMILY_KEYS[config.family]
+                f"`profile.{key}` = {_written(getattr(config, key))}"
+                for key in FAMILY_KEYS[config.family]
             )
             raise InputError(
                 f"the profile of family {config.family} must be sound, but with {given} "
                 f"{_FAULTS[name]}; {_REMEDIES[config.family]}"
             )
+
+
+def _written(value: float | tuple[float, ...]) -> str:
+    return f"{[*value]}" if isinstance(value, tuple) else f"{value:g}"
 
 
 _FAULTS = {
@@ -90,6 +144,7 @@ _REMEDIES = {
     "four_arcs": "move the tip arc's centre inwards, or change where it ends or its radius",
     "five_arcs": "lower the outer radius, or change the tip arc's radius or where it ends",
     "ellipse": "move the centre, or change the height",
+    "free_form": "change the coefficients, or begin with `rootsopt profile --project`",
 }
 
 

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.section import NonNegative, Positive, Section
+from rootsopt.config.section import NonNegative, Positive, Section, tuples
 
 DESIGN_KEYS = ("pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg")
 """The design parameters of a CIC rotor, as named in the config."""
@@ -21,16 +21,22 @@ FAMILY_KEYS: dict[str, tuple[str, ...]] = {
         "tip_arc_turn_deg",
     ),
     "ellipse": ("ellipse_center_mm", "ellipse_height_mm"),
+    "free_form": ("tip_arc_angle_deg", "coefficients"),
 }
 """Profile families with their design parameters, as named in the config."""
+LIST_KEYS = ("coefficients",)
+"""Keys that hold a list of design parameters, each last of its family."""
+
+
+_Share = Annotated[float, Field(ge=-1, le=1)]
 
 
 class ProfileConfig(Section):
     """The rotor profile."""
 
-    family: Literal["cic", "ee", "arc", "arc_involute", "four_arcs", "five_arcs", "ellipse"] = (
-        Field(description="profile family")
-    )
+    family: Literal[
+        "cic", "ee", "arc", "arc_involute", "four_arcs", "five_arcs", "ellipse", "free_form"
+    ] = Field(description="profile family")
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
     pitch_radius_mm: Positive = Field(description="pitch radius; centre distance is twice that")
     pressure_angle_deg: Annotated[float, Field(gt=0, lt=90)] | None = Field(
@@ -40,7 +46,7 @@ class ProfileConfig(Section):
         None, description="cic, arc_involute: involute parameter u"
     )
     tip_arc_angle_deg: Annotated[float, Field(ge=0, lt=45)] | None = Field(
-        None, description="cic, five_arcs: half angle of the tip land"
+        None, description="cic, five_arcs, free_form: half angle of the tip land"
     )
     arc_center_mm: Positive | None = Field(
         None, description="arc, four_arcs: distance of the tip arc's centre from the axis"
@@ -58,6 +64,16 @@ class ProfileConfig(Section):
     ellipse_height_mm: Positive | None = Field(
         None, description="ellipse: semi-axis along the lobe"
     )
+    coefficients: Annotated[tuple[_Share, ...], Field(min_length=3, max_length=64)] | None = Field(
+        None,
+        description="free_form: fall of the pressure angle per turn of the normal, from tip to "
+        "pitch circle, 3 to 64 numbers up to 1 (arc about a pitch point); 0: involute, down to -1",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lists(cls, data):
+        return tuples(data)
 
     @model_validator(mode="after")
     def _family_keys(self):

@@ -7,6 +7,7 @@ from rootsopt.profiles.cic import CIC
 from rootsopt.profiles.curve import Curve, Piece
 from rootsopt.profiles.ee import EE
 from rootsopt.profiles.ellipse import ellipse
+from rootsopt.profiles.freeform import FreeForm, project
 from rootsopt.profiles.geometry import Geometry, flank, flank_nodes, geometry, outline
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "EE",
     "Arcs",
     "Curve",
+    "FreeForm",
     "Geometry",
     "Piece",
     "Profile",
@@ -27,4 +29,5 @@ __all__ = [
     "four_arcs",
     "geometry",
     "outline",
+    "project",
 ]
