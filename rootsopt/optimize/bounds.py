@@ -16,6 +16,8 @@ _SHARES = {
 """Lengths, in pitch radii."""
 _FIXED = {"tip_arc_turn_deg": (5.0, 90.0), "coefficients": (-1.0, 1.0)}
 """Those that do not go with the size."""
+_ANY_LENGTH, _ANY_ANGLE, _ANY_NUMBER = (0.01, 1.5), (0.0, 90.0), (0.0, 2.0)
+"""For a key that is not listed; lengths in pitch radii."""
 _AROUND = (0.5, 1.5)
 """Of the config's own value, for any other parameter."""
 
@@ -45,9 +47,22 @@ def _pair(config: Config, key: str) -> tuple[float, float]:
         return given
     if key == "involute_length_mm":
         return 0.0, math.inf
+    if key in _FIXED or key in _SHARES:
+        return around(key, profile.pitch_radius_mm, profile.lobes)
+    value = abs(getattr(profile, key))
+    return _AROUND[0] * value, _AROUND[1] * value
+
+
+def around(key: str, pitch_radius_mm: float, lobes: int) -> tuple[float, float]:
+    """(low, high) between which a parameter of a rotor of this size usually lies."""
     if key in _FIXED:
         return _FIXED[key]
-    scale, shares = profile.pitch_radius_mm, _SHARES.get(key)
-    if shares is None:
-        scale, shares = abs(getattr(profile, key)), _AROUND
-    return scale * shares[0], scale * shares[1]
+    if key == "pressure_angle_deg":
+        return 15.0, 60.0
+    if key == "tip_arc_angle_deg":
+        return 0.0, 45.0 / lobes
+    known = _SHARES.get(key)
+    if known is not None or key.endswith("_mm"):
+        low, high = known or _ANY_LENGTH
+        return low * pitch_radius_mm, high * pitch_radius_mm
+    return _ANY_ANGLE if key.endswith("_deg") else _ANY_NUMBER
