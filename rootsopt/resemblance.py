@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import linprog
 
 from rootsopt.config import FAMILY_KEYS, LIST_KEYS
 from rootsopt.families import MM, profile_of
@@ -25,6 +25,11 @@ _NODES = 96
 _SAMPLE = 128
 """Members of a family that are tried; the best of them begin a search."""
 _STARTS = 3
+_PROGRAMS, _LONGEST, _SHORTEST = 80, 0.2, 1e-9
+"""Linear programs of a search, at most, and the longest and shortest of their steps, as a share of
+where the parameters usually lie."""
+_UNSOUND_WEIGHT = 10.0
+"""Of a negative margin against distance."""
 _UNSOUND = 1e-6
 """Negative margin, relative to its scale, with which a member of a family is none."""
 
@@ -69,8 +74,8 @@ def _nearest(profile: Profile, family: str, keys: tuple[str, ...]) -> Likeness |
     else:
         low, high = np.array([around(key, float(radius) / MM, lobes) for key in keys]).T
         sample = low + (high - low) * sobol(_SAMPLE, 0, len(keys))
-        away = np.array([look(one).away for one in sample])
-        starts = [_fitted(look, sample[k], high - low) for k in np.argsort(away)[:_STARTS]]
+        faults = np.array([look(one).fault for one in sample])
+        starts = [_fitted(look, sample[k], high - low) for k in np.argsort(faults)[:_STARTS]]
     sound = [one for one in starts if look(one).sound]
     if not sound:
         return None
@@ -98,6 +103,14 @@ class _Seen(NamedTuple):
         return self.finite and bool(np.min(self.margin) >= -_UNSOUND)
 
     @property
+    def fault(self) -> float:
+        """What a search is to make small: the greatest distance, and negative margins."""
+        if not self.finite:
+            return math.inf
+        lacking = max(0.0, -float(np.min(self.margin)))
+        return float(np.max(np.abs(self.distance))) + _UNSOUND_WEIGHT * lacking
+
+    @property
     def away(self) -> float:
         """Greatest distance; of what is not sound, beyond every other."""
         return float(np.max(np.abs(self.distance))) if self.sound else math.inf
@@ -121,42 +134,35 @@ class _Look:
 
 
 def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
-    """The design near `start` with the least greatest distance: from that of the least squares, by
-    sequential quadratic programs in the design and a bound on all distances."""
-    if not look(start).finite:
-        return start
+    """The design near `start` with the least greatest distance, by a sequence of linear programs:
+    each finds the step, at most `size` of the `width`, that the derivatives promise most of."""
+    design, size = start, _LONGEST
+    for _ in range(_PROGRAMS):
+        seen = look(design)
+        if not seen.finite or size < _SHORTEST:
+            break
+        new = design + width * _promising(seen, width, size)
+        if look(new).fault < seen.fault:
+            design, size = new, min(2 * size, _LONGEST)
+        else:
+            size /= 4
+    return design
 
-    def at(x):
-        # Where a member cannot be made, it is far away.
-        seen = look(start + width * x)
-        return seen if seen.finite else look(start)._replace(distance=np.full(2 * _NODES, 10.0))
 
-    squares = least_squares(
-        lambda x: at(x).distance, np.zeros(len(start)), lambda x: at(x).distance_slope * width
+def _promising(seen: _Seen, width, size: float) -> NDArray[np.float64]:
+    """The step, in `width`, with the least fault to first order: minimise the bound t on all
+    distances plus the weighted bound u on negative margins."""
+    count, distances, soundness = len(width), len(seen.distance), len(seen.margin)
+    by_step = np.concatenate([seen.distance_slope, -seen.distance_slope, -seen.margin_slope])
+    one, none = np.ones((2 * distances, 1)), np.zeros((2 * distances, 1))
+    bounds = np.block([[-one, none], [np.zeros((soundness, 1)), -np.ones((soundness, 1))]])
+    found = linprog(
+        np.concatenate([np.zeros(count), [1.0, _UNSOUND_WEIGHT]]),
+        A_ub=np.hstack([by_step * width, bounds]),
+        b_ub=np.concatenate([-seen.distance, seen.distance, seen.margin]),
+        bounds=[(-size, size)] * count + [(0, None)] * 2,
     )
-    begin = np.append(squares.x, np.max(np.abs(at(squares.x).distance)))
-
-    def spare(z):
-        seen = at(z[:-1])
-        return np.concatenate([z[-1] - seen.distance, z[-1] + seen.distance, seen.margin])
-
-    def spare_slope(z):
-        seen = at(z[:-1])
-        by_design = [-seen.distance_slope, seen.distance_slope, seen.margin_slope]
-        ones = np.ones(2 * len(seen.distance))
-        by_bound = np.append(ones, np.zeros(len(seen.margin)))
-        return np.column_stack([np.concatenate(by_design) * width, by_bound])
-
-    bound = minimize(
-        lambda z: z[-1],
-        begin,
-        jac=lambda z: np.eye(len(z))[-1],
-        method="SLSQP",
-        constraints={"type": "ineq", "fun": spare, "jac": spare_slope},
-        options={"ftol": 1e-12, "maxiter": 60},
-    )
-    ends = [start + width * x for x in (squares.x, bound.x[:-1], np.zeros(len(start)))]
-    return min(ends, key=lambda one: look(one).away)
+    return np.zeros(count) if found.x is None else found.x[:count]
 
 
 @Program
