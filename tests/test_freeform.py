@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import quad
 from scipy.interpolate import BSpline
 from test_optimize import SCENE
 
@@ -56,7 +55,7 @@ def profile():
 
 
 def test_shares_and_pressure_angle_are_the_spline(profile):
-    """τ and ψ at given normals, from SciPy's B-spline and its quadrature; ends of the addendum."""
+    """τ and ψ at given normals, from SciPy's B-spline and its integral; ends of the addendum."""
     spans = len(SHARES) - 2
     knots = np.concatenate([[0, 0], np.arange(spans + 1), [spans, spans]])
     spline = BSpline(knots, SHARES, 2)
@@ -65,9 +64,9 @@ def test_shares_and_pressure_angle_are_the_spline(profile):
     assert float(profile.pitch_normal) == pytest.approx(TIP + length, rel=1e-14)
     for share in (0.0, 0.13, 0.5, 0.77, 0.999):
         nu = jnp.asarray(TIP + share * length)
-        turned = quad(spline, 0, share * spans, epsabs=1e-12, limit=200)[0] / spans * length
+        turned = spline.integrate(0, share * spans) / spans * length
         point = profile.addendum(nu)
-        assert float(point.psi) == pytest.approx(np.pi / 2 - turned, abs=1e-10)
+        assert float(point.psi) == pytest.approx(np.pi / 2 - turned, abs=1e-13)
         assert float(profile.roll_rate(nu)) == pytest.approx(1 - spline(share * spans), abs=1e-12)
     assert float(profile.roll_angle(profile.pitch_normal)) == pytest.approx(half, rel=1e-14)
     assert float(profile.contact_distance(profile.pitch_normal)) == pytest.approx(0, abs=1e-17)
@@ -119,7 +118,7 @@ def test_ee_is_a_free_form_of_equal_coefficients():
     ("other", "within"),
     [
         # Distance (µm) with 6, 12 and 24 coefficients. Arcs that are tangent alone bend suddenly.
-        (CIC(3, R, 27.3 * DEG, 0.77e-3, 1.27 * DEG), (10.0, 0.5, 0.05)),
+        (CIC(3, R, 27.3 * DEG, 0.77e-3, 1.27 * DEG), (5.0, 0.5, 0.1)),
         (made("arc", 29.7), (2.0, 0.05, 0.01)),
         (made("four_arcs", 30.0, 13.0, 40.0), (200.0, 50.0, 10.0)),
         (EE(3, R), (1e-6, 1e-6, 1e-6)),
@@ -193,8 +192,8 @@ def test_what_is_wrong_with_a_config_is_said(override, words):
 
 
 def test_profile_that_does_not_mesh_is_refused():
-    """Undercut, and a pressure angle that falls past 0, are found before anything is simulated."""
-    for shares, word in (([1, 1, 1, 1, 1, 1, -1], "undercut"), ([0.8] * 7, "miss")):
+    """A dent, and a pressure angle that falls past 0, are found before anything is simulated."""
+    for shares, word in (([1, 1, 1, 1, 1, 1, -1], "convex"), ([0.8] * 7, "sound")):
         with pytest.raises(InputError, match=word):
             check(free(f"profile.coefficients={shares}").profile)
 
@@ -221,7 +220,8 @@ def test_profile_command_projects(tmp_path, capsys):
 
 def test_gradient_of_the_force_agrees_with_central_differences():
     """Reverse mode, along a direction in all coefficients. With a step of 1e-4 differences of
-    second order are good to some 1e-6 of the greatest slope, orbits at 1e-10 to 1e-7."""
+    second order are good to some 1e-6 of the greatest slope; jumps of the levers of a contact to
+    first order, which no switch tells, leave 1e-4 in the gradient."""
     evaluator = Evaluator(free("solver.rtol=1e-10"))
     design = np.asarray(design_vector(evaluator.config))
     direction = np.random.default_rng(2).normal(size=len(design))
@@ -235,7 +235,7 @@ def test_gradient_of_the_force_agrees_with_central_differences():
     for name, slope in here.gradient.items():
         along = np.array(list(slope.values())) @ direction
         wanted = (sides[0][name] - sides[1][name]) / (2 * step)
-        assert along == pytest.approx(wanted, rel=1e-4)
+        assert along == pytest.approx(wanted, rel=1e-3)
 
 
 def test_free_form_is_improved_by_a_search():
@@ -282,7 +282,12 @@ def test_single_arc_is_improved_by_a_search():
 )
 def test_points_of_any_box_become_sound_profiles(family, inside):
     """Wherever a sample lies in the bounds, it is drawn to where a profile can be made."""
-    settings = scene(family, inside, "constraints.area_efficiency_min=0.42")
+    settings = scene(
+        family,
+        inside,
+        "constraints.area_efficiency_min=0.42",
+        "constraints.seal_width_min_mm=0",
+    )
     model, design = Model.of(settings), design_vector(settings)
     problem = Problem.of(settings, model, _geometry_alone(model, design))
     start = problem.project(problem.point(design))

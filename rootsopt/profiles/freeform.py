@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.profiles.base import Profile, Segment
+from rootsopt.programs import Program
 
 _DEGREE = 2
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -178,7 +179,7 @@ def project(profile: Profile, count: int) -> FreeForm:
     fall = _integrals(count)
     spans = count - _DEGREE
     share = np.arange(1, _SAMPLES * spans + 1) / (_SAMPLES * spans)
-    psi = np.asarray(profile.addendum(jnp.asarray(start + length * share)).psi)
+    psi = np.asarray(_pressure_angles(profile, start + length * share))
     rows, want = fall(share), (np.pi / 2 - psi) / length
     # The last row is the pitch crossing, where the spline ends.
     rows[-1], want[-1] = rows[-1] * _FIRMLY, want[-1] * _FIRMLY
@@ -186,6 +187,11 @@ def project(profile: Profile, count: int) -> FreeForm:
     # BVLS may pass a bound by a rounding.
     shares = jnp.asarray(np.clip(found.x, -1.0, 1.0))
     return FreeForm(profile.lobes, profile.pitch_radius, jnp.asarray(start), shares)
+
+
+@Program
+def _pressure_angles(profile: Profile, nu):
+    return profile.addendum(nu).psi
 
 
 def _integrals(count: int):
