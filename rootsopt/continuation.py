@@ -22,6 +22,7 @@ from rootsopt.orbits import (
     BranchPoint,
     Orbits,
     parameters,
+    place_of,
     value_of,
     with_value,
 )
@@ -114,7 +115,7 @@ def follow(
     value = value_of(config, parameter)
     if not limits.low <= value <= limits.high:
         raise InputError(
-            f"`{PLACES[parameter]}` must lie in the range to follow, {limits.low:g} to "
+            f"`{place_of(parameter)}` must lie in the range to follow, {limits.low:g} to "
             f"{limits.high:g}, but is {value:g}"
         )
     if not 1 <= period <= LONGEST or not set(ways) <= {-1, 1} or not ways:
@@ -131,7 +132,7 @@ def follow(
         start = corrected(orbits, place, fixed, fixed)
     except StoppedError as stop:
         raise InputError(
-            f"no orbit of {period} mesh periods is near the state at `{PLACES[parameter]}` = "
+            f"no orbit of {period} mesh periods is near the state at `{place_of(parameter)}` = "
             f"{value:g}: {stop.end.value} Start from the state of a periodic Evaluation"
         ) from None
     branches = []

@@ -4,14 +4,17 @@ import math
 from collections.abc import Callable
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
-from rootsopt.config import FAMILY_KEYS, ProfileConfig
+from rootsopt.config import FAMILY_KEYS, LIST_KEYS, ProfileConfig
 from rootsopt.errors import InputError
 from rootsopt.outline.conjugacy import conjugacy
 from rootsopt.profiles import (
     CIC,
     EE,
+    FreeForm,
     Outline,
     Profile,
     arc,
@@ -22,7 +25,9 @@ from rootsopt.profiles import (
     five_arcs,
     four_arcs,
     hypo_epicycloid,
+    project,
 )
+from rootsopt.profiles.departure import departure
 from rootsopt.profiles.validity import margins
 from rootsopt.programs import Program
 
@@ -50,7 +55,11 @@ _MAKERS: dict[str, Callable[..., Profile]] = {
     "hypo_epicycloid": hypo_epicycloid,
     "extended_cycloid": extended_cycloid,
     "ellipse": ellipse,
+    "free_form": FreeForm,
 }
+BY_LIMITS = ("cic", "arc_involute")
+"""Families whose soundness is known from limits of their parameters; that of the others is by
+margins."""
 
 
 def unit_of(key: str) -> float:
@@ -64,14 +73,54 @@ def profile_of(
     family: str, lobes: int, pitch_radius: Float[Array, ""], design: Float[Array, " d"]
 ) -> Profile:
     """The profile of a `family` with a `design` in config units, `pitch_radius` in m."""
-    keys = FAMILY_KEYS[family]
-    values = [design[k] * unit_of(key) for k, key in enumerate(keys)]
+    values: list[Float[Array, "*n"]] = []
+    for k, key in enumerate(FAMILY_KEYS[family]):
+        value = design[k:] if key in LIST_KEYS else design[k]
+        values.append(value * unit_of(key))
     return _MAKERS[family](lobes, pitch_radius, *values)
+
+
+def keys_of(config: ProfileConfig) -> tuple[str, ...]:
+    """Names of the design parameters of a config: its keys, those of a list numbered from 1."""
+    names: list[str] = []
+    for key in FAMILY_KEYS[config.family]:
+        value = getattr(config, key)
+        numbers = range(1, 1 + len(value)) if key in LIST_KEYS else ()
+        names += [f"{key}_{number}" for number in numbers] or [key]
+    return tuple(names)
 
 
 def design_of(config: ProfileConfig) -> Float[Array, " d"]:
     """The design parameters of a config, in its units."""
-    return jnp.asarray([getattr(config, key) for key in FAMILY_KEYS[config.family]], float)
+    values = [getattr(config, key) for key in FAMILY_KEYS[config.family]]
+    return jnp.asarray(np.hstack([*values, ()]), float)
+
+
+def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:
+    """A config's profile with another `design` (d,) in its units, as many as it has."""
+    given = [float(value) for value in np.asarray(design)]
+    values: dict[str, float | tuple[float, ...]] = {}
+    for k, key in enumerate(FAMILY_KEYS[config.family]):
+        values[key] = tuple(given[k:]) if key in LIST_KEYS else given[k]
+    return config.model_copy(update=values)
+
+
+def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, float]:
+    """A config's profile as a free form of `count` coefficients, and how far (m) that departs from
+    it at most."""
+    radius = jnp.asarray(config.pitch_radius_mm * MM)
+    profile = profile_of(config.family, config.lobes, radius, design_of(config))
+    found = project(profile, count)
+    # Decimals enough for a hundredth of a micrometre.
+    result = ProfileConfig(
+        family="free_form",
+        lobes=config.lobes,
+        pitch_radius_mm=config.pitch_radius_mm,
+        tip_arc_angle_deg=round(float(found.tip_arc_angle) / DEG, 9),
+        coefficients=tuple(round(float(c), 6) for c in found.coefficients),
+    )
+    written = profile_of("free_form", config.lobes, radius, design_of(result))
+    return result, departure(profile, written)
 
 
 def outline(config: ProfileConfig) -> Outline | None:
@@ -88,7 +137,7 @@ def check(config: ProfileConfig) -> None:
     if (given := outline(config)) is not None:
         conjugacy(given)
         return
-    if config.family in ("cic", "arc_involute"):
+    if config.family in BY_LIMITS:
         _check_involute(config)
         return
     if config.family == "arcs_epicycloid":
@@ -101,7 +150,8 @@ def check(config: ProfileConfig) -> None:
         scale = 1.0 if name in _PURE else config.pitch_radius_mm * MM
         if not float(value) >= -_ROUNDING * scale:
             given = ", ".join(
-                f"`profile.{key}` = {getattr(config, key)}" for key in FAMILY_KEYS[config.family]
+                f"`profile.{key}` = {_written(getattr(config, key))}"
+                for key in FAMILY_KEYS[config.family]
             )
             raise InputError(
                 f"the profile of family {config.family} must be sound, but with {given} "
@@ -122,6 +172,12 @@ _INHERENT = {("arcs_epicycloid", "rolling")}
 _SHARPEST = 0.002
 """Least radius of an edge in pitch radii: less is a corner, along which the outline's and the
 contact's nodes fall together."""
+
+
+def _written(value: float | tuple[float, ...]) -> str:
+    return f"{[*value]}" if isinstance(value, tuple) else f"{value:g}"
+
+
 _FAULTS = {
     "turning": "a part of it would end before it begins, or miss the pitch crossing",
     "convexity": "the addendum is not convex",
@@ -142,6 +198,7 @@ _REMEDIES = {
     "hypo_epicycloid": "make the tip arc angle less than 90° / lobes",
     "extended_cycloid": "bring the trochoid ratio closer to 1",
     "ellipse": "move the centre, or change the height",
+    "free_form": "change the coefficients, or begin with `rootsopt profile --project`",
 }
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
 from rootsopt import families
-from rootsopt.config import FAMILY_KEYS, Config
+from rootsopt.config import Config
 from rootsopt.contact.impact import ImpactLaw
 from rootsopt.contact.linear import LinearContact
 from rootsopt.contact.map import MapContact
@@ -359,7 +359,7 @@ def design_vector(config: Config) -> Float[Array, " d"]:
 
 def design_keys(config: Config) -> tuple[str, ...]:
     """Names of the entries of `design_vector`."""
-    return FAMILY_KEYS[config.profile.family]
+    return families.keys_of(config.profile)
 
 
 def outline_mm(config: Config, design: ArrayLike | None = None) -> NDArray[np.float64]:

@@ -16,15 +16,16 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
+from rootsopt import families
 from rootsopt.arclength import End, Look, Spot, Steps, StoppedError, corrected
-from rootsopt.config import DESIGN_KEYS, Config, parse
+from rootsopt.config import Config, parse
 from rootsopt.dynamics.flow import Flow, Integrator, flow
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import SAMPLES
 from rootsopt.dynamics.switches import with_switches
 from rootsopt.dynamics.verdict import RESIDUAL, TOO_DEEP
 from rootsopt.errors import InputError
-from rootsopt.model import MM, Model, check_geometry, design_keys, integrators
+from rootsopt.model import MM, Model, check_geometry, design_keys, design_vector, integrators
 from rootsopt.programs import Program
 
 PLACES = {
@@ -33,8 +34,9 @@ PLACES = {
     "pressure_difference_Pa": "scene.load.pressure_difference_Pa",
     "backlash_mm": "scene.timing_gear.backlash_mm",
     "damping_ratio": "scene.timing_gear.damping_ratio",
-} | {key: f"profile.{key}" for key in DESIGN_KEYS}
-"""Parameters that can be followed, in the config's units, and where they stand there."""
+}
+"""Parameters that can be followed, in the config's units, and where they stand there, beside the
+design parameters, which are in `profile`."""
 _GEAR = ("backlash_mm", "damping_ratio")
 SPAN = 20.0
 """Change of the scaled state that counts as much as the whole range of the parameter."""
@@ -94,17 +96,35 @@ def parameters(config: Config) -> tuple[str, ...]:
 def value_of(config: Config, parameter: str) -> float:
     """Value of a parameter, in the config's unit. Raises `InputError` for an unknown one."""
     _check(config, parameter)
+    keys = design_keys(config)
+    if parameter in keys:
+        return float(design_vector(config)[keys.index(parameter)])
     found: Any = config
     for key in PLACES[parameter].split("."):
         found = getattr(found, key)
     return float(found)
 
 
+def place_of(parameter: str) -> str:
+    """Where a parameter stands in a config."""
+    return PLACES.get(parameter, f"profile.{parameter}")
+
+
 def with_value(config: Config, parameter: str, value: float) -> Config:
     """`config` with another value of a parameter. Raises `InputError` for an unknown
     parameter, and for a value that is out of bounds."""
     _check(config, parameter)
+    if parameter in design_keys(config):
+        return parse(_with_design(config, parameter, value).to_yaml())
     return parse(config.to_yaml(), [f"{PLACES[parameter]}={float(value)!r}"])
+
+
+def _with_design(config: Config, parameter: str, value: float) -> Config:
+    """`config` with another value of a design parameter, of which nothing is checked."""
+    design = np.asarray(design_vector(config)).copy()
+    design[design_keys(config).index(parameter)] = value
+    profile = families.with_design(config.profile, design)
+    return config.model_copy(update={"profile": profile})
 
 
 def _check(config: Config, parameter: str) -> None:
@@ -241,10 +261,9 @@ class Orbits:
 
     def _check_design(self, value: float) -> None:
         """Raise `StoppedError` where no profile can be made."""
-        if self.parameter in DESIGN_KEYS:
+        if self.parameter in design_keys(self.config):
             try:
-                profile = self.config.profile.model_copy(update={self.parameter: value})
-                check_geometry(self.config.model_copy(update={"profile": profile}))
+                check_geometry(_with_design(self.config, self.parameter, value))
             except InputError:
                 raise StoppedError(End.NO_GEOMETRY) from None
 
@@ -295,7 +314,7 @@ def _build(
         gear=gear,
         gear_damping_ratio=at.get("damping_ratio", model.gear_damping_ratio),
     )
-    design = [at[key] for key in DESIGN_KEYS if key in at]
+    design = [value for name, value in at.items() if name not in PLACES]
     pair = tuned.pair(jnp.stack(design) if design else jnp.zeros(0))
     return pair, pair.angle_scale
 

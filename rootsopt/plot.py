@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.markers import CARETDOWN
 from numpy.typing import ArrayLike, NDArray
 
-from rootsopt.config import DESIGN_KEYS, Config
+from rootsopt.config import DESIGN_KEYS, FAMILY_KEYS, LIST_KEYS, Config
 from rootsopt.contact.nodes import place_pair
 from rootsopt.evaluate import Evaluation, Series
 from rootsopt.files import ResultFolder
@@ -28,12 +29,6 @@ BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"
 ORANGE, SKY, PURPLE, GREY = "#E69F00", "#56B4E9", "#CC79A7", "#808080"
 _CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 _MARKERS = "os^Dvp"
-_LABELS = (
-    "objective / baseline",
-    "pressure angle (°)",
-    "involute length (mm)",
-    "tip arc angle (°)",
-)
 _DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), "-.")
 _MOST_TURNS = 4  # revolutions of a force panel
 _LINES = 400  # spectral lines drawn one by one
@@ -245,18 +240,25 @@ def plot_spectrum(
 
 
 def plot_history(
-    axes: Sequence[Axes] | NDArray, history: Sequence[Mapping[str, Any]]
+    axes: Sequence[Axes] | NDArray,
+    history: Sequence[Mapping[str, Any]],
+    keys: Sequence[str] = DESIGN_KEYS,
 ) -> Sequence[Axes] | NDArray:
     """Objective with best so far, then the design parameters, over the evaluations.
 
-    `axes` holds four panels. A row without `start`, or with a negative one, belongs to the
-    screening. Unusable designs (objective not finite) stand as crosses at the top.
+    `axes` holds a panel more than there are `keys`, those of the family in the config; a list of
+    parameters shares a panel, which shows the local searches only. A row without `start`, or with
+    a negative one, belongs to the screening. Unusable designs (objective not finite) stand as
+    crosses at the top.
     """
-    keys = ("objective", *DESIGN_KEYS)
-    for ax, key, label in zip(axes, keys, _LABELS, strict=True):
+    keys = ("objective", *keys)
+    for ax, key in zip(axes, keys, strict=True):
         for rows, style in _starts(history):
-            _trace(ax, rows, key, style)
-        ax.set_ylabel(label)
+            if key in LIST_KEYS:
+                _traces(ax, rows, key)
+            else:
+                _trace(ax, rows, key, style)
+        ax.set_ylabel("objective / baseline" if key == "objective" else _label(key))
         ax.grid(color="0.92", linewidth=0.6)
     axes[0].axhline(1, color="black", linewidth=0.8, linestyle=":", label="baseline")
     _best(axes, keys, history)
@@ -264,6 +266,28 @@ def plot_history(
     axes[0].legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
     axes[-1].set_xlabel("evaluation")
     return axes
+
+
+def _label(key: str) -> str:
+    """Name of a design parameter with its unit."""
+    units = {"_deg": " (°)", "_mm": " (mm)"}
+    unit = next((end for end in units if key.endswith(end)), "")
+    return key.removesuffix(unit).replace("_", " ") + units.get(unit, "")
+
+
+def _traces(ax, rows, key):
+    """The entries of a list of parameters over the evaluations of a local search."""
+    rows = [row for row in rows if _start(row) >= 0]
+    if not rows:
+        return
+    names = [name for name in rows[0] if name.startswith(key)]
+    x = _values(rows, "evaluation")
+    for k, name in enumerate(names):
+        shade = colormaps["cividis"](k / max(len(names) - 1, 1))
+        label = {0: "first, at the tip", len(names) - 1: "last, at the pitch circle"}.get(k)
+        ax.plot(x, _values(rows, name), color=shade, linewidth=1.2, label=label)
+    if not ax.get_legend():
+        ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
 
 
 def _starts(history) -> Iterator[tuple[list[Mapping[str, Any]], dict[str, Any]]]:
@@ -312,6 +336,8 @@ def _best(axes, keys, history):
     winner = [row for row in history if row["objective"] == last][:1]
     star = {"color": "black", "markerfacecolor": "#F0E442", "markersize": 14, "zorder": 5}
     for ax, key in zip(axes, keys, strict=True):
+        if key in LIST_KEYS:
+            continue
         x, y = [row["evaluation"] for row in winner], _values(winner, key)
         ax.plot(x, y, "*", label=f"best, {_number(last)}", **star)
 
@@ -374,7 +400,8 @@ def optimization_figures(
     ]
     names += _force_figures(folder, designs, config)
     if history:
-        names.append(_write(folder, "history", _history(history)))
+        keys = FAMILY_KEYS[config.profile.family]
+        names.append(_write(folder, "history", _history(history, keys)))
     return names
 
 
@@ -426,8 +453,12 @@ def _force_figures(folder, designs, config) -> list[str]:
     return [*names, _write(folder, "spectrum", made)]
 
 
-def _history(history):
-    made, axes = figure(10, 9, 4, 1, sharex=True, gridspec_kw={"height_ratios": [2.2, 1, 1, 1]})
-    plot_history(list(axes[:, 0]), history)
+def _history(history, keys):
+    heights = [2.2, *(1.8 if key in LIST_KEYS else 1 for key in keys)]
+    tall = 9 * sum(heights) / 5.2
+    made, axes = figure(
+        10, tall, len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights}
+    )
+    plot_history(list(axes[:, 0]), history, keys)
     made.suptitle("Optimisation history")
     return made

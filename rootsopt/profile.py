@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from rootsopt import cli, export
 from rootsopt.config import Config
+from rootsopt.errors import InputError
 
 PURPOSE = "Geometry of one design: radii, area, inertia, margins; drawings, solids, animation."
 EXPORT = "dxf,svg"
@@ -25,6 +26,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
 
     formats = export.chosen(options.export)
     check_geometry(config)
+    coefficients = _coefficients(options.project)
     folder = files.ResultFolder(options.output)
     model, design = Model.of(config), design_vector(config)
     shape = geometry(model.profile(design))
@@ -50,13 +52,49 @@ def body(config: Config, options: argparse.Namespace) -> int:
     out = Console()
     out.print(report.geometry_table(record))
     outline_report.say(config, out)
+    if coefficients is not None:
+        out.print(_projected(folder, config, coefficients), soft_wrap=True)
     out.print(f"results in {options.output}", soft_wrap=True)
     return cli.OK
 
 
+def _coefficients(given: str | None) -> int | None:
+    """The number of coefficients that `--project` asks for. Raises `InputError`."""
+    if given is None:
+        return None
+    if not (given.isdecimal() and 3 <= int(given) <= 64):
+        raise InputError(
+            f"`--project` must be a number of coefficients from 3 to 64, but is {given}; "
+            "12 come within some micrometres of most profiles"
+        )
+    return int(given)
+
+
+def _projected(folder, config: Config, count: int) -> str:
+    """Write the config with its profile as a free form; what there is to say of that."""
+    from rootsopt.families import free_form_of
+
+    profile, away = free_form_of(config.profile, count)
+    folder.write_text("free_form.yaml", config.model_copy(update={"profile": profile}).to_yaml())
+    return (
+        f"as a free form of {count} coefficients, at most {away * 1e6:.3g} µm away from this "
+        f"outline: {folder.path / 'free_form.yaml'}"
+    )
+
+
+def _options(parser: argparse.ArgumentParser) -> None:
+    export.add_option(parser, EXPORT)
+    parser.add_argument(
+        "--project",
+        metavar="N",
+        help="write free_form.yaml, the same config with the profile as a free form of N "
+        "coefficients, to begin an optimisation with",
+    )
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return cli.run("profile", PURPOSE, body, argv, lambda p: export.add_option(p, EXPORT))
+    return cli.run("profile", PURPOSE, body, argv, _options)
 
 
 if __name__ == "__main__":

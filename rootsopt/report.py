@@ -158,6 +158,16 @@ def geometry_table(record: Mapping[str, Any]) -> RenderableType:
     return Group(table, Text(record.get("message") or ""))
 
 
+def likeness_table(rows: list[dict[str, Any]]) -> RenderableType:
+    """The nearest member of each family, nearest first; rows as in the result file's
+    `resembles`."""
+    table = _table("The optimised profile resembles", "away at most, um", "nearest member")
+    for row in rows:
+        design = ", ".join(f"{key} {_number(value)}" for key, value in row["design"].items())
+        table.add_row(row["family"], _number(row["departure_um"]), design)
+    return table
+
+
 def _table(title: str, *columns: str) -> Table:
     table = Table(title=title, box=box.ASCII, title_justify="left", title_style="bold")
     table.add_column("", overflow="fold")
@@ -239,7 +249,7 @@ def _errors(*steady_states: Mapping[str, Any]) -> list[tuple]:
 def _per_unit(row: Mapping[str, float], unit: str) -> dict[str, float]:
     """The row with labels such as "by pressure angle, N/deg"."""
     labels = ((key, *_split(key)) for key in row)
-    return {f"by {name}, {unit}/{per or 1}": row[key] for key, name, per in labels}
+    return {f"by {name}, {f'{unit}/{per}' if per else unit}": row[key] for key, name, per in labels}
 
 
 def _split(key: str) -> tuple[str, str]:

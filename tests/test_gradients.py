@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.config import load
+from rootsopt.config import DESIGN_KEYS, load
 from rootsopt.contact.closest import FlankPair
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.steady import close_orbit, reverse_sensitivity, settle, settled_within
 from rootsopt.evaluate import Evaluator
-from rootsopt.model import DESIGN_KEYS, design_vector
+from rootsopt.model import design_vector
 from rootsopt.profiles.ee import EE
 
 SHARP = ("solver.method=dopri8", "solver.rtol=1e-12")

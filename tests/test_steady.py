@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.config import load
+from rootsopt.config import DESIGN_KEYS, load
 from rootsopt.dynamics.flow import Integrator, flow, strobe
 from rootsopt.dynamics.peak import BESIDE, one_sided
 from rootsopt.dynamics.steady import no_tangents, spectral_radius
 from rootsopt.evaluate import RESPONSES, Evaluator, evaluate
-from rootsopt.model import DESIGN_KEYS
 from rootsopt.status import Status
 
 # The scene of the shipped configs as it was when the figures below were measured.

@@ -6,12 +6,13 @@ with one message that names the key, the value and what is allowed.
 """
 
 from rootsopt.config.reading import Config, describe_keys, load, parse
-from rootsopt.config.scene import DESIGN_KEYS, FAMILY_KEYS, ProfileConfig
+from rootsopt.config.scene import DESIGN_KEYS, FAMILY_KEYS, LIST_KEYS, ProfileConfig
 from rootsopt.config.study import EnsembleConfig, SolverConfig
 
 __all__ = [
     "DESIGN_KEYS",
     "FAMILY_KEYS",
+    "LIST_KEYS",
     "Config",
     "EnsembleConfig",
     "ProfileConfig",

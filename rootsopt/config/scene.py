@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.section import NonNegative, Positive, Section
+from rootsopt.config.section import NonNegative, Positive, Section, tuples
 
 DESIGN_KEYS = ("pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg")
 """The design parameters of a CIC rotor, as named in the config."""
@@ -26,8 +26,14 @@ FAMILY_KEYS: dict[str, tuple[str, ...]] = {
     "extended_cycloid": ("trochoid_ratio",),
     "ellipse": ("ellipse_center_mm", "ellipse_height_mm"),
     "outline": (),
+    "free_form": ("tip_arc_angle_deg", "coefficients"),
 }
 """Profile families with their design parameters, as named in the config."""
+LIST_KEYS = ("coefficients",)
+"""Keys that hold a list of design parameters, each last of its family."""
+
+
+_Share = Annotated[float, Field(ge=-1, le=1)]
 
 
 class ProfileConfig(Section):
@@ -45,6 +51,7 @@ class ProfileConfig(Section):
         "hypo_epicycloid",
         "extended_cycloid",
         "ellipse",
+        "free_form",
         "outline",
     ] = Field(description="profile family; outline: from a file")
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
@@ -57,7 +64,8 @@ class ProfileConfig(Section):
     )
     tip_arc_angle_deg: Annotated[float, Field(ge=0, lt=45)] | None = Field(
         None,
-        description="cic, five_arcs, arcs_epicycloid, hypo_epicycloid: half angle of the tip land",
+        description="cic, five_arcs, arcs_epicycloid, hypo_epicycloid, free_form: half angle of "
+        "the tip land",
     )
     arc_center_mm: Positive | None = Field(
         None,
@@ -88,6 +96,16 @@ class ProfileConfig(Section):
     ellipse_height_mm: Positive | None = Field(
         None, description="ellipse: semi-axis along the lobe"
     )
+    coefficients: Annotated[tuple[_Share, ...], Field(min_length=3, max_length=64)] | None = Field(
+        None,
+        description="free_form: fall of the pressure angle per turn of the normal, from tip to "
+        "pitch circle, 3 to 64 numbers up to 1 (arc about a pitch point); 0: involute, down to -1",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lists(cls, data):
+        return tuples(data)
 
     outline_file: str | None = Field(
         None, description="outline: CSV or DXF file, relative to the config's folder"

@@ -2,8 +2,9 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, create_model, model_validator
 
+from rootsopt.config.scene import FAMILY_KEYS
 from rootsopt.config.section import NonNegative, Positive, Section, number, tuples
 
 
@@ -256,14 +257,8 @@ class ConstraintsConfig(Section):
     )
 
 
-class BoundsConfig(Section):
-    """Box of the search, (low, high) for each design parameter."""
-
-    pressure_angle_deg: tuple[float, float] = Field((25.0, 45.0))
-    involute_length_mm: tuple[float, float] | None = Field(
-        None, description="default: 10 % to 100 % of the longest involute"
-    )
-    tip_arc_angle_deg: tuple[float, float] = Field((0.5, 8.0))
+class _Bounds(Section):
+    """Box of the search, (low, high) for each design parameter of the family."""
 
     @model_validator(mode="before")
     @classmethod
@@ -272,19 +267,48 @@ class BoundsConfig(Section):
 
     @model_validator(mode="after")
     def _ordered(self):
-        limits = {
-            "pressure_angle_deg": (1.0, 80.0),
-            "involute_length_mm": (1e-6, 1e6),
-            "tip_arc_angle_deg": (0.0, 44.0),
-        }
-        for key, (least, most) in limits.items():
-            pair = getattr(self, key)
+        for key, pair in self:
+            least, most = _limits(key)
             if pair is not None and not least <= pair[0] < pair[1] <= most:
                 raise ValueError(
                     f"`optimizer.bounds.{key}` must be two increasing numbers in "
                     f"[{least:g}, {most:g}], but is {list(pair)}"
                 )
         return self
+
+
+def _limits(key: str) -> tuple[float, float]:
+    """Least and greatest value that a bound of a design parameter may have."""
+    known = {
+        "pressure_angle_deg": (1.0, 80.0),
+        "tip_arc_angle_deg": (0.0, 44.0),
+        "coefficients": (-1.0, 1.0),
+    }
+    return known.get(key, (0.0, 180.0) if key.endswith("_deg") else (1e-6, 1e6))
+
+
+_Pair = tuple[float, float]
+_DEFAULTS: dict[str, _Pair] = {
+    "pressure_angle_deg": (25.0, 45.0),
+    "tip_arc_angle_deg": (0.5, 8.0),
+}
+"""Bounds that are the same for every rotor; the others are made for its size."""
+_NOTES = {
+    "involute_length_mm": "default: 10 % to 100 % of the longest involute",
+    "coefficients": "of each of them; default: -1 to 1",
+}
+BoundsConfig = create_model(
+    "BoundsConfig",
+    __base__=_Bounds,
+    __doc__=_Bounds.__doc__,
+    **{
+        key: (
+            _Pair if key in _DEFAULTS else _Pair | None,
+            Field(_DEFAULTS.get(key), description=_NOTES.get(key, "")),
+        )
+        for key in dict.fromkeys(key for keys in FAMILY_KEYS.values() for key in keys)
+    },
+)  # type: ignore[call-overload]
 
 
 class OptimizerConfig(Section):
@@ -300,4 +324,6 @@ class OptimizerConfig(Section):
         48, description="designs screened to place the starts; 0 starts at the baseline only"
     )
     seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of the screening sample")
-    bounds: BoundsConfig = Field(default_factory=lambda: BoundsConfig.model_validate({}))
+    bounds: BoundsConfig = Field(  # type: ignore[valid-type]
+        default_factory=lambda: BoundsConfig.model_validate({})
+    )

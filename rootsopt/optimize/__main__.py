@@ -34,7 +34,8 @@ def body(config: Config, options: argparse.Namespace) -> int:
         config, choice = auto.resolve(config)
         result = Search(config, progress).run()
     ran = time.perf_counter() - began
-    _write(folder, config, options, result, choice, clock.seconds, ran)
+    alike = _alike(config, result)
+    _write(folder, config, options, result, choice | alike, clock.seconds, ran)
     out = Console()
     baseline = result.baseline.record().get("speeds")
     if result.optimized is None:
@@ -48,6 +49,8 @@ def body(config: Config, options: argparse.Namespace) -> int:
         if baseline:
             optimized = result.optimized.record()["speeds"]
             out.print(report.speeds_table(baseline, optimized, result.objective_by_speed))
+        if alike:
+            out.print(report.likeness_table(alike["resembles"]))
     total = time.perf_counter() - began
     out.print(
         f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
@@ -55,6 +58,20 @@ def body(config: Config, options: argparse.Namespace) -> int:
         soft_wrap=True,
     )
     return cli.OK if result.optimized is not None else cli.NO_RESULT
+
+
+def _alike(config: Config, result) -> dict:
+    """What a free form that was found resembles, for report and result file."""
+    if config.profile.family != "free_form" or result.optimized is None:
+        return {}
+    import jax.numpy as jnp
+
+    from rootsopt.model import Model
+    from rootsopt.resemblance import likenesses
+
+    design = list(result.optimized.design.values())
+    found = likenesses(Model.of(config).profile(jnp.asarray(design)))
+    return {"resembles": [one.record() for one in found]}
 
 
 def _no_result(result) -> str:
@@ -77,10 +94,15 @@ def _no_result(result) -> str:
 
 def _write(folder, config, options, result, choice, compiled, ran) -> None:
     from rootsopt import files
+    from rootsopt.families import with_design
     from rootsopt.model import outline_mm
 
     records = {"baseline": result.baseline, "optimized": result.optimized}
     files.write_config(folder, config)
+    if result.optimized is not None:
+        profile = with_design(config.profile, list(result.optimized.design.values()))
+        best = config.model_copy(update={"profile": profile})
+        folder.write_text("optimized.yaml", best.to_yaml())
     data: dict = {name: e.record() if e is not None else None for name, e in records.items()}
     for name, evaluation in records.items():
         if evaluation is None:

@@ -1,8 +1,10 @@
 """The design problem: unit box, constraints, objective.
 
-The search runs in a unit box. Pressure angle and tip arc angle map linearly onto their
-bounds; the involute length is a share of the longest involute the other two allow, so
-that u ≤ u_max holds by construction. Constraints depend on geometry alone and are cheap.
+The search runs in a unit box, onto whose sides the design parameters map linearly from their
+bounds, but for the length of an involute: that is a share of the longest one which pressure
+angle and tip land allow, so that u ≤ u_max holds by construction. Constraints depend on geometry
+alone and are cheap; where no limits of the parameters say whether a profile is sound, the margins
+of `rootsopt.profiles.validity` are constraints like the others.
 """
 
 import dataclasses
@@ -11,6 +13,7 @@ import importlib
 import itertools
 import threading
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,9 +27,11 @@ from rootsopt.config import Config
 from rootsopt.dynamics.measures import line_name
 from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluation, objective_weights
-from rootsopt.families import DEG, MM
+from rootsopt.families import BY_LIMITS, DEG, MM, keys_of
 from rootsopt.model import Model
+from rootsopt.optimize.bounds import bounds_of
 from rootsopt.profiles import Geometry, geometry
+from rootsopt.profiles.validity import Margins, margins
 from rootsopt.programs import Program
 from rootsopt.speeds import counted, parts_of
 
@@ -34,14 +39,27 @@ _SHORTEST = 0.1
 """Least involute, as a share of the longest, where the config sets no bound."""
 _NO_LINE = 1e-9
 """Amplitude of a spectral line, relative to the mean force, that counts as none."""
+_DRAWN = 5
+"""How often a point that cannot be made feasible is drawn half way towards one that is."""
+_SOUND = (
+    # name, margin, unit, limit, scale, factor
+    ("order of the joints", "turning", "deg", 0.0, 0.1, DEG),
+    ("convex addendum", "convexity", "mm", 0.0, MM, MM),
+    ("reach of the normals", "reach", "mm", 0.0, MM, MM),
+    ("roll angle per normal", "rolling", "", 0.0, 0.1, 1.0),
+    ("star shape", "star", "mm", 0.0, MM, MM),
+    ("root above the axis", "root", "mm", 0.0, MM, MM),
+)
+"""What makes a profile sound, beside its undercut margin."""
 _ACTIVE = 1e-6
 """Scaled distance from its limit at which a constraint counts as active."""
 
 
 class Constraint(eqx.Module):
-    """value(geometry) ≥ limit, scaled by `scale` to order one.
+    """value ≥ limit, scaled by `scale` to order one.
 
-    `quantity`: a field of `Geometry`; `factor` turns SI into the reported `unit`.
+    `quantity`: a field of `Geometry`, or one of `Margins` where `margin`; `factor` turns SI into
+    the reported `unit`.
     """
 
     name: str = eqx.field(static=True)
@@ -50,88 +68,116 @@ class Constraint(eqx.Module):
     limit: Float[Array, ""]
     scale: float = eqx.field(static=True)
     factor: float = eqx.field(static=True)
+    margin: bool = eqx.field(static=True, default=False)
 
-    def slack(self, shape: Geometry) -> Float[Array, ""]:
+    def slack(self, shape: Geometry, found: Margins | None) -> Float[Array, ""]:
         """Scaled distance to the limit, ≥ 0 where satisfied."""
-        return (getattr(shape, self.quantity) - self.limit) / self.scale
+        return (getattr(found if self.margin else shape, self.quantity) - self.limit) / self.scale
+
+
+class _Involute(NamedTuple):
+    """Which entries of a design are the pressure angle, the involute's length, and the tip land's
+    half angle, if there is one."""
+
+    angle: int
+    length: int
+    tip: int | None
 
 
 class Space(eqx.Module):
-    """The unit box and the constraints in it."""
+    """The unit box of d design parameters and the constraints in it."""
 
     model: Model
-    lower: Float[Array, "3"]
-    upper: Float[Array, "3"]
+    lower: Float[Array, " d"]
+    upper: Float[Array, " d"]
     constraints: tuple[Constraint, ...]
+    involute: _Involute | None = eqx.field(static=True)
 
     @classmethod
     def of(cls, config: Config, model: Model, area_efficiency: float) -> "Space":
         """Bounds and floors of a config whose baseline has this `area_efficiency`; raises
         `InputError` where they leave no design."""
-        bounds, limits = config.optimizer.bounds, config.constraints
-        lengths = bounds.involute_length_mm or (0.0, np.inf)
-        rows = [bounds.pressure_angle_deg, lengths, bounds.tip_arc_angle_deg]
-        half = 90.0 / config.profile.lobes
-        if rows[2][1] >= half:
-            raise InputError(
-                f"`optimizer.bounds.tip_arc_angle_deg` must stay below {half:g} (a quarter of "
-                f"the lobe pitch), but is {list(rows[2])}"
-            )
+        limits, family = config.constraints, config.profile.family
+        rows = bounds_of(config)
         floor = limits.area_efficiency_min
         if floor == "baseline":
             floor = area_efficiency
         margin = limits.undercut_margin_min_mm * MM
+        sound = family not in BY_LIMITS
+        # Looked at in more places where that decides whether the profile is sound.
+        undercut = "undercut" if sound else "undercut_margin"
         constraints = (
             _constraint("area efficiency", "area_efficiency", "", floor, 0.01, 1.0),
-            _constraint("undercut margin", "undercut_margin", "mm", margin, MM, MM),
+            _constraint("undercut margin", undercut, "mm", margin, MM, MM, sound),
             _constraint("seal width", "seal_width", "mm", limits.seal_width_min_mm * MM, MM, MM),
         )
         if model.bore_radius is not None:
             room = model.bore_radius
             constraints += (_constraint("root radius", "root_radius", "mm", room, MM, MM),)
+        if sound:
+            constraints += tuple(_constraint(*row, margin=True) for row in _SOUND)
         lower, upper = np.array(rows, dtype=float).T
-        return cls(model, jnp.asarray(lower), jnp.asarray(upper), constraints)
+        keys = keys_of(config.profile)
+        involute = None
+        if "involute_length_mm" in keys:
+            tip = "tip_arc_angle_deg"
+            places = [keys.index(key) for key in ("pressure_angle_deg", "involute_length_mm")]
+            involute = _Involute(*places, keys.index(tip) if tip in keys else None)
+        return cls(model, jnp.asarray(lower), jnp.asarray(upper), constraints, involute)
 
-    def design(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Design in config units (α deg, u mm, θ1 deg) at `point` of the unit box."""
-        low, high = self.lower, self.upper
-        alpha = low[0] + (high[0] - low[0]) * point[0]
-        tip = low[2] + (high[2] - low[2]) * point[2]
-        least, most = self._lengths(alpha, tip)
-        return jnp.stack([alpha, least + (most - least) * point[1], tip])
+    def design(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
+        """Design in config units at `point` of the unit box."""
+        limits = zip(self.lower, self.upper, point, strict=True)
+        values = [low + (high - low) * share for low, high, share in limits]
+        if self.involute is not None:
+            place = self.involute.length
+            least, most = self._lengths(*self._angles(values))
+            values[place] = least + (most - least) * point[place]
+        return jnp.stack(values)
 
-    def point(self, design: Float[Array, "3"]) -> Float[Array, "3"]:
+    def point(self, design: Float[Array, " d"]) -> Float[Array, " d"]:
         """The nearest point of the unit box to a design."""
-        alpha, length, tip = jnp.clip(design, self.lower, self.upper)
-        least, most = self._lengths(alpha, tip)
-        low, high = self.lower, self.upper
-        raw = jnp.stack(
-            [
-                (alpha - low[0]) / (high[0] - low[0]),
-                (length - least) / (most - least),
-                (tip - low[2]) / (high[2] - low[2]),
-            ]
-        )
-        return jnp.clip(raw, 0.0, 1.0)
+        values = jnp.clip(design, self.lower, self.upper)
+        limits = zip(self.lower, self.upper, values, strict=True)
+        shares = [(value - low) / (high - low) for low, high, value in limits]
+        if self.involute is not None:
+            place = self.involute.length
+            least, most = self._lengths(*self._angles(values))
+            shares[place] = (values[place] - least) / (most - least)
+        return jnp.clip(jnp.stack(shares), 0.0, 1.0)
+
+    def _angles(self, values):
+        """Pressure angle and the tip land's half angle (deg) of a design with an involute."""
+        assert self.involute is not None
+        angle, _, tip = self.involute
+        return values[angle], 0.0 if tip is None else values[tip]
 
     def _lengths(self, alpha, tip):
         """Shortest and longest involute (mm) at α, θ1 (deg)."""
+        assert self.involute is not None
+        low, high = self.lower[self.involute.length], self.upper[self.involute.length]
         half = jnp.pi / (2 * self.model.lobes)
         radius = self.model.pitch_radius / MM
         longest = radius * jnp.sin(alpha * DEG) * (half - tip * DEG)
-        most = jnp.minimum(longest, self.upper[1])
-        return jnp.minimum(jnp.maximum(self.lower[1], _SHORTEST * longest), 0.999 * most), most
+        most = jnp.minimum(longest, high)
+        return jnp.minimum(jnp.maximum(low, _SHORTEST * longest), 0.999 * most), most
 
-    def slacks(self, point: Float[Array, "3"]) -> Float[Array, " m"]:
+    def slacks(self, point: Float[Array, " d"]) -> Float[Array, " m"]:
         """Scaled slack of every constraint."""
-        shape = geometry(self.model.profile(self.design(point)))
-        return jnp.stack([c.slack(shape) for c in self.constraints])
+        return self.slacks_of(self.design(point))
+
+    def slacks_of(self, design: Float[Array, " d"]) -> Float[Array, " m"]:
+        """Scaled slack of every constraint at a design in config units."""
+        profile = self.model.profile(design)
+        shape = geometry(profile)
+        found = margins(profile) if any(c.margin for c in self.constraints) else None
+        return jnp.stack([c.slack(shape, found) for c in self.constraints])
 
     def prepare(self) -> None:
         """Compile in the background what a search in this space takes."""
         # Half a second to import, and only needed here.
         threading.Thread(target=importlib.import_module, args=("scipy.stats.qmc",)).start()
-        _look.prepare(self, jax.ShapeDtypeStruct((3,), self.lower.dtype))
+        _look.prepare(self, jax.ShapeDtypeStruct(self.lower.shape, self.lower.dtype))
 
 
 @Program
@@ -157,6 +203,9 @@ def _longest(space: Space, point):
     """Longest involute (mm) at a point of the unit box, bounds aside."""
     profile = space.model.profile(space.design(point))
     return profile.longest_involute / MM  # type: ignore[attr-defined]
+
+
+_slacks_of = Program(Space.slacks_of)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,7 +267,7 @@ class Problem:
     def slope(self, evaluation: Evaluation, point) -> NDArray[np.float64]:
         """Gradient of the objective in the unit box."""
         _, jacobian, _, _ = self.look(point)
-        by_design = np.zeros(3)
+        by_design = np.zeros(len(self.space.lower))
         for share, one, baseline in self._counted(evaluation):
             for key, weight in self._weights(baseline).items():
                 by_design += share * weight * np.array(list(one.gradient[key].values()))
@@ -239,7 +288,7 @@ class Problem:
         """The nearest point of the unit box to a design in config units."""
         return np.asarray(_nearest(self.space, np.asarray(design, dtype=np.float64)))
 
-    def design(self, point) -> Float[Array, "3"]:
+    def design(self, point) -> Float[Array, " d"]:
         """Design in config units at a point of the unit box."""
         return jnp.asarray(self.look(point)[0])
 
@@ -267,6 +316,19 @@ class Problem:
             point = np.clip(point + np.clip(move, -0.3, 0.3), 0.0, 1.0)
         return np.asarray(point, dtype=np.float64)
 
+    def toward(self, point, inside) -> NDArray[np.float64]:
+        """As `project`; where that finds nothing feasible and no limits say what is sound, so that
+        perhaps a profile cannot even be made, the point is drawn towards `inside`, a feasible one,
+        until it does."""
+        found = self.project(point)
+        if self.space.involute is not None:
+            return found
+        for share in (*0.5 ** np.arange(1, _DRAWN + 1), 0.0):
+            if self.feasible(found):
+                break
+            found = self.project(inside + share * (np.asarray(point) - inside))
+        return found
+
     def descent(self, point, slope: NDArray[np.float64]) -> NDArray[np.float64]:
         """The slope less what active constraints and box faces forbid.
 
@@ -277,8 +339,9 @@ class Problem:
         _, _, slack, jacobian = self.look(point)
         point = np.asarray(point)
         walls = [row for row, s in zip(jacobian, slack, strict=True) if s < 1e-4]
-        walls += [np.eye(3)[i] for i in range(3) if point[i] <= _ACTIVE]
-        walls += [-np.eye(3)[i] for i in range(3) if point[i] >= 1 - _ACTIVE]
+        sides = np.eye(len(point))
+        walls += [side for side, x in zip(sides, point, strict=True) if x <= _ACTIVE]
+        walls += [-side for side, x in zip(sides, point, strict=True) if x >= 1 - _ACTIVE]
         if not walls:
             return np.asarray(slope, dtype=np.float64)
         normals = np.stack(walls)
@@ -294,14 +357,24 @@ class Problem:
             "seal_width": "seal_width_mm",
             "root_radius": "root_radius_mm",
         }
-        for c in self.space.constraints:
-            before = self.baseline.geometry[keys[c.quantity]]
-            after = optimized.geometry[keys[c.quantity]]
+        for k, c in enumerate(self.space.constraints):
             limit = float(c.limit) / c.factor
+            if c.margin:
+                slacks = (self._slacks(one)[k] for one in (self.baseline, optimized))
+                before, after = (limit + slack * c.scale / c.factor for slack in slacks)
+            else:
+                before = self.baseline.geometry[keys[c.quantity]]
+                after = optimized.geometry[keys[c.quantity]]
             slack = (after - limit) * c.factor / c.scale
             rows.append(_row(c.name, before, after, limit, c.unit, slack))
-        rows.append(self._length_row(optimized))
+        if self.space.involute is not None:
+            rows.append(self._length_row(optimized))
         return rows
+
+    def _slacks(self, evaluation: Evaluation) -> NDArray[np.float64]:
+        """Scaled slack of every constraint for a design that was evaluated."""
+        design = np.asarray(list(evaluation.design.values()), dtype=np.float64)
+        return np.asarray(_slacks_of(self.space, design))
 
     def _length_row(self, optimized: Evaluation) -> dict:
         point = self.point(list(optimized.design.values()))
@@ -318,8 +391,8 @@ class Problem:
         return row | {"sense": "<="}
 
 
-def _constraint(name, quantity, unit, limit, scale, factor) -> Constraint:
-    return Constraint(name, quantity, unit, jnp.asarray(float(limit)), scale, factor)
+def _constraint(name, quantity, unit, limit, scale, factor, margin=False) -> Constraint:
+    return Constraint(name, quantity, unit, jnp.asarray(float(limit)), scale, factor, margin)
 
 
 def _row(name, before, after, limit, unit, slack) -> dict:
@@ -335,11 +408,11 @@ def _row(name, before, after, limit, unit, slack) -> dict:
     }
 
 
-def sobol(count: int, seed: int) -> NDArray[np.float64]:
-    """`count` points (n, 3) of a scrambled Sobol sequence in the unit box."""
+def sobol(count: int, seed: int, dimension: int = 3) -> NDArray[np.float64]:
+    """`count` points (n, `dimension`) of a scrambled Sobol sequence in the unit box."""
     from scipy.stats import qmc
 
-    sampler = qmc.Sobol(3, rng=np.random.default_rng(seed))
+    sampler = qmc.Sobol(dimension, rng=np.random.default_rng(seed))
     power = max(0, int(np.ceil(np.log2(max(count, 1)))))
     return sampler.random_base2(power)[:count]
 

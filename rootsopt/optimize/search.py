@@ -20,7 +20,7 @@ import numpy as np
 import optax
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluation, Evaluator
 from rootsopt.evaluators import evaluator_for, without_gradient
@@ -106,10 +106,11 @@ class Search:
     """One optimisation run of a config."""
 
     def __init__(self, config: Config, progress: Progress | None = None):
-        if config.profile.family != "cic":
+        if not FAMILY_KEYS[config.profile.family]:
+            valid = ", ".join(family for family, keys in FAMILY_KEYS.items() if keys)
             raise InputError(
-                f"`profile.family` must be cic to be optimised, but is {config.profile.family}: "
-                "bounds and constraints are those of that family; use `simulate` for others"
+                f"`profile.family` must be one of {valid} to be optimised, but is "
+                f"{config.profile.family}: it has no design parameter; use `simulate` for it"
             )
         self.config = config
         self.settings = config.optimizer
@@ -169,8 +170,10 @@ class Search:
 
     def _feasible(self, baseline_point) -> list[NDArray[np.float64]]:
         """The baseline's neighbourhood and a Sobol sample, as far as they can be made feasible."""
-        sample = [baseline_point, *sobol(self.settings.screening, self.settings.seed)]
-        points = [self.problem.project(point) for point in sample]
+        start = self.problem.project(baseline_point)
+        count, seed = self.settings.screening, self.settings.seed
+        sample = sobol(count, seed, len(baseline_point))
+        points = [start, *(self.problem.toward(point, start) for point in sample)]
         points = [point for point in points if self.problem.feasible(point)]
         if not points:
             raise InputError(
@@ -209,7 +212,7 @@ class Search:
                 # No steady state there: go half way back to the last good design.
                 if last is None:
                     break
-                point = self.problem.project((point + last.point) / 2)
+                point = self.problem.toward((point + last.point) / 2, last.point)
                 continue
             last = trial
             since = 0 if trial.objective < best * (1 - _GAIN) else since + 1
@@ -220,7 +223,7 @@ class Search:
             if np.linalg.norm(slope) < _STATIONARY:
                 break
             update, state = _update(*rule, slope, state)
-            point = self.problem.project(point + np.asarray(update))
+            point = self.problem.toward(point + np.asarray(update), point)
         return trials
 
     def _evaluate(self, evaluator: Evaluator, point, start, iteration, orbit=None) -> Trial:

@@ -8,6 +8,7 @@ from rootsopt.profiles.curve import Curve, Piece, RollPiece
 from rootsopt.profiles.ee import EE
 from rootsopt.profiles.ellipse import ellipse
 from rootsopt.profiles.epicycloid import TippedEpicycloid, circle_epicycloid, hypo_epicycloid
+from rootsopt.profiles.freeform import FreeForm, project
 from rootsopt.profiles.geometry import Geometry, flank, flank_nodes, geometry, outline
 from rootsopt.profiles.outline import Outline, Table
 from rootsopt.profiles.trochoid import extended_cycloid
@@ -17,6 +18,7 @@ __all__ = [
     "EE",
     "Arcs",
     "Curve",
+    "FreeForm",
     "Geometry",
     "Outline",
     "Piece",
@@ -38,4 +40,5 @@ __all__ = [
     "geometry",
     "hypo_epicycloid",
     "outline",
+    "project",
 ]

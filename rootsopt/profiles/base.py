@@ -77,6 +77,10 @@ class Profile(eqx.Module):
     def segments(self) -> tuple[Segment, ...]:
         """The smooth stretches of the addendum, from the tip to the pitch point."""
 
+    def stretches(self) -> tuple[Segment, ...]:
+        """The segments, cut where they are smooth to a few derivatives only, for quadrature."""
+        return self.segments()
+
     @abc.abstractmethod
     def roll_angle(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """β(ν) in rad, non-decreasing for a profile free of interference."""

@@ -43,7 +43,7 @@ def geometry(profile: Profile) -> Geometry:
     if isinstance(profile, Outline):
         return _given(profile)
     r = profile.pitch_radius
-    segments = profile.segments()
+    segments = profile.stretches()
     start = jnp.stack([s.start for s in segments])[:, None]
     length = jnp.stack([s.stop for s in segments])[:, None] - start
     # Each end is looked at from just inside, so that it belongs to its segment.

@@ -1,0 +1,44 @@
+"""How far one profile departs from another."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from rootsopt.profiles.base import Profile
+from rootsopt.programs import Program
+
+_NODES = 400
+"""Nodes of a flank, so that its chords stay within some 1e-7 r of it."""
+
+
+def departure(profile: Profile, other: Profile, nodes: int = _NODES) -> float:
+    """Greatest distance (m) of the flank of one profile from that of the other, from tip to root
+    and both ways; `nodes` on either side of the pitch circle."""
+    first, second = (flank_points(one, nodes) for one in (profile, other))
+    return float(max(distances(first, second).max(), distances(second, first).max()))
+
+
+def flank_points(profile: Profile, nodes: int = _NODES) -> NDArray[np.float64]:
+    """Points (n, 2) in m from tip to root, dense where the normal turns."""
+    stop = float(profile.pitch_normal)
+    ends = [float(s.stop) for s in profile.segments()]
+    return np.asarray(_points(profile, np.union1d(np.linspace(0, stop, nodes), ends)))
+
+
+@Program
+def _points(profile: Profile, nu):
+    addendum, dedendum = (profile.position(f(nu)) for f in (profile.addendum, profile.dedendum))
+    return jnp.concatenate([addendum, dedendum[::-1]])
+
+
+def distances(
+    points: Float[np.ndarray, "n 2"], line: Float[np.ndarray, "m 2"]
+) -> NDArray[np.float64]:
+    """Distance of each of the `points` from a polygonal `line`, in their unit."""
+    start, step = line[:-1], np.diff(line, axis=0)
+    squares = np.maximum(np.sum(step**2, axis=1), np.finfo(float).tiny)
+    away = points[:, None] - start
+    share = np.clip(np.einsum("nmk,mk->nm", away, step) / squares, 0.0, 1.0)
+    away -= share[..., None] * step
+    return np.sqrt(np.min(np.einsum("nmk,nmk->nm", away, away), axis=1))

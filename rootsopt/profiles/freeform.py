@@ -1,0 +1,237 @@
+"""Free form: the fall of the pressure angle as a B-spline, from which all else follows."""
+
+import functools
+import itertools
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from rootsopt.profiles.base import Profile, Segment
+from rootsopt.programs import Program
+
+_DEGREE = 2
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+_STEPS = 8
+"""Guarded Newton steps for the normal angle at a roll angle; each at least halves the bracket."""
+_POLISH = 2
+"""Plain Newton steps after these, with as many derivatives."""
+_SAMPLES = 40
+"""Places in a knot span at which a free form is fitted."""
+_FIRMLY = 1e3
+"""Weight of the pitch crossing in the fit."""
+_FLAT = 1e-9
+"""Least dβ/dν in these steps: on an arc centred on the pitch circle it is 0."""
+
+
+class FreeForm(Profile):
+    """A tip land and a free addendum, with as many coefficients as one likes.
+
+    The turn of the normal dν is shared between the roll angle, dβ = (1 - τ) dν, and the pressure
+    angle, dψ = -τ dν. The share τ(ν) is a quadratic B-spline with even knots from the end of the
+    land to the pitch crossing, and ψ(ν), which begins at π/2, a cubic one. Coefficients of at most
+    1 (an arc centred on the pitch circle) keep the roll angle from turning back; with none below 0
+    (an involute) ψ falls steadily, and it rises where τ < 0, as towards the pitch circle in a
+    single arc. They are N / (1 + N) throughout in an EE rotor without a land. The length of the
+    spline follows from the roll angle of the pitch crossing,
+
+        (ν_p - θ1) (1 - mean of τ) = π/2N - θ1,
+
+    and the support function from h′ = -lever = -r cos ψ, h(ν_p) = r sin ψ(ν_p), by Gauss-Legendre
+    quadrature inside each knot span, to rounding: the law of gearing holds for any coefficients.
+
+    The parameter is ν, as for every family, and not β, in which an arc centred on the pitch circle
+    would be a jump of ψ.
+
+    `tip_arc_angle` θ1 (rad), half the angle of the land; `coefficients` (n,), n ≥ 3, from the land
+    to the pitch crossing; `width` (rad) of a knot span; `turn` (n - 2, 4): coefficients of ψ (rad)
+    in powers of the share of a span; `beyond` (n - 2,): the support function (m) at the end of
+    each.
+    """
+
+    lobes: int = eqx.field(static=True)
+    pitch_radius: Float[Array, ""]
+    tip_arc_angle: Float[Array, ""]
+    coefficients: Float[Array, " n"]
+    width: Float[Array, ""]
+    turn: Float[Array, "k 4"]
+    beyond: Float[Array, " k"]
+
+    def __init__(self, lobes, pitch_radius, tip_arc_angle, coefficients):
+        """`lobes` N; `pitch_radius` r (m), `tip_arc_angle` θ1 (rad), scalars; `coefficients`
+        (n,)."""
+        self.lobes = lobes
+        r = self.pitch_radius = jnp.asarray(pitch_radius)
+        self.tip_arc_angle = jnp.asarray(tip_arc_angle)
+        self.coefficients = jnp.asarray(coefficients)
+        share = jnp.asarray(_powers(self.coefficients.shape[0])) @ self.coefficients
+        # The integral over each span, and over all before it.
+        gone = share / jnp.arange(1, 2 + _DEGREE)
+        whole = jnp.sum(gone, axis=1)
+        before = jnp.cumsum(whole) - whole
+        spans = whole.shape[0]
+        room = self.half_pitch - self.tip_arc_angle
+        self.width = room / (spans - jnp.sum(whole))
+        start = jnp.pi / 2 - self.width * before
+        self.turn = jnp.concatenate([start[:, None], -self.width * gone], axis=1)
+        self.beyond = jnp.zeros(spans)
+        each = self._within(jnp.arange(spans), jnp.zeros(spans))
+        last = r * jnp.sin(jnp.sum(self.turn[-1]))
+        self.beyond = last + jnp.cumsum(each[::-1])[::-1] - each
+
+    @property
+    def _spans(self) -> int:
+        return self.turn.shape[0]
+
+    def segments(self) -> tuple[Segment, ...]:
+        zero, start = jnp.zeros_like(self.tip_arc_angle), self.tip_arc_angle
+        return (
+            Segment("tip land", zero, start, True),
+            Segment("free form", start, start + self._spans * self.width, False),
+        )
+
+    def stretches(self) -> tuple[Segment, ...]:
+        land, free = self.segments()
+        ends = [free.start + k * self.width for k in range(self._spans)] + [free.stop]
+        spans = itertools.pairwise(ends)
+        return (land, *(Segment(free.name, start, stop, False) for start, stop in spans))
+
+    def _place(self, nu):
+        """Knot span at `nu`, and the share of it; the first and the last go on."""
+        x = (nu - self.tip_arc_angle) / self.width
+        span = jnp.clip(jnp.floor(lax.stop_gradient(x)), 0, self._spans - 1).astype(int)
+        return span, x - span
+
+    def _psi(self, span, share):
+        """ψ at a share of a span."""
+        c = jnp.moveaxis(self.turn[span], -1, 0)
+        return c[0] + share * (c[1] + share * (c[2] + share * c[3]))
+
+    def _within(self, span, share):
+        """∫ r cos ψ dν (m) from a share of a span to its end."""
+        nodes, weights = (jnp.asarray(x, self.width.dtype) for x in (_NODES, _WEIGHTS))
+        rest = (1 - share)[..., None]
+        at = share[..., None] + rest * (1 + nodes) / 2
+        lever = self.pitch_radius * jnp.cos(self._psi(span[..., None], at))
+        return self.width / 2 * jnp.sum(lever * rest * weights, axis=-1)
+
+    def _pressure(self, nu):
+        free = self._psi(*self._place(nu))
+        return jnp.where(nu < self.tip_arc_angle, jnp.pi / 2, free)
+
+    def roll_angle(self, nu):
+        return nu + (self._pressure(nu) - jnp.pi / 2)
+
+    def lever(self, nu):
+        free = self.pitch_radius * jnp.cos(self._psi(*self._place(nu)))
+        return jnp.where(nu < self.tip_arc_angle, 0.0, free)
+
+    def support(self, nu):
+        span, share = self._place(jnp.maximum(nu, self.tip_arc_angle))
+        return self.beyond[span] + self._within(span, share)
+
+    def contact_distance(self, nu):
+        return self.support(nu) - self.pitch_radius * jnp.sin(self._pressure(nu))
+
+    def normal_at(self, roll_angle):
+        width, tip = self.width, self.tip_arc_angle
+        starts = tip + width * jnp.arange(self._spans) + self.turn[:, 0] - jnp.pi / 2
+        span = jnp.searchsorted(starts, roll_angle, side="right") - 1
+        span = lax.stop_gradient(jnp.clip(span, 0, self._spans - 1))
+        c = jnp.moveaxis(self.turn[span], -1, 0)
+        want = roll_angle - starts[span]
+
+        def short(c, width, want, share):
+            """β beyond the one wanted, and its slope, at a share of the span."""
+            rise = share * (width + c[1] + share * (c[2] + share * c[3]))
+            slope = width + c[1] + share * (2 * c[2] + 3 * share * c[3])
+            return rise - want, jnp.maximum(slope, _FLAT * width)
+
+        fixed = lax.stop_gradient((c, width, want))
+        low, high = jnp.zeros_like(want), jnp.ones_like(want)
+        share = (low + high) / 2
+        for _ in range(_STEPS):
+            error, slope = short(*fixed, share)
+            low, high = jnp.where(error < 0, share, low), jnp.where(error < 0, high, share)
+            step = share - error / slope
+            share = jnp.where((step >= low) & (step <= high), step, (low + high) / 2)
+        share = lax.stop_gradient(share)
+        for _ in range(_POLISH):
+            error, slope = short(c, width, want, share)
+            share = share - error / slope
+        return jnp.where(roll_angle < tip, roll_angle, tip + width * (span + share))
+
+
+def project(profile: Profile, count: int) -> FreeForm:
+    """The free form of `count` coefficients nearest to a `profile`, its tip land kept.
+
+    Least squares of the pressure angle over the normal angle, which are linear in the coefficients;
+    these stay between -1 and 1, and the length of the spline is that of the addendum.
+    """
+    from scipy.optimize import lsq_linear  # A fifth of a second, and only needed here.
+
+    first, last = profile.segments()[0], profile.segments()[-1]
+    start = float(first.stop) if first.land else 0.0
+    length = float(last.stop) - start
+    fall = _integrals(count)
+    spans = count - _DEGREE
+    share = np.arange(1, _SAMPLES * spans + 1) / (_SAMPLES * spans)
+    psi = np.asarray(_pressure_angles(profile, start + length * share))
+    rows, want = fall(share), (np.pi / 2 - psi) / length
+    # The last row is the pitch crossing, where the spline ends.
+    rows[-1], want[-1] = rows[-1] * _FIRMLY, want[-1] * _FIRMLY
+    found = lsq_linear(rows, want, (-1.0, 1.0), method="bvls")
+    # BVLS may pass a bound by a rounding.
+    shares = jnp.asarray(np.clip(found.x, -1.0, 1.0))
+    return FreeForm(profile.lobes, profile.pitch_radius, jnp.asarray(start), shares)
+
+
+@Program
+def _pressure_angles(profile: Profile, nu):
+    return profile.addendum(nu).psi
+
+
+def _integrals(count: int):
+    """∫ of every B-spline from 0 to shares (n,) of the whole length: a function to (n, count)."""
+    powers = _powers(count) / np.arange(1, 2 + _DEGREE)[:, None]
+    spans = len(powers)
+    before = np.cumsum(powers.sum(axis=1), axis=0) - powers.sum(axis=1)
+
+    def integrals(share):
+        x = share * spans
+        span = np.clip(np.floor(x).astype(int), 0, spans - 1)
+        inside = (x - span)[:, None] ** np.arange(1, 2 + _DEGREE)
+        return (before[span] + np.einsum("np,npc->nc", inside, powers[span])) / spans
+
+    return integrals
+
+
+@functools.cache
+def _powers(count: int) -> NDArray[np.float64]:
+    """(spans, 3, count): coefficients of each B-spline in powers of the share of a knot span.
+
+    By Cox and de Boor's recursion on polynomials; knots are the ends of spans, those of the whole
+    repeated."""
+    spans = count - _DEGREE
+    knots = np.clip(np.arange(-_DEGREE, spans + _DEGREE + 1.0), 0, spans)
+    basis = np.zeros((spans, _DEGREE + 1, count + _DEGREE))
+    # Of the splines of degree 0 one is 1 in each span.
+    basis[np.arange(spans), 0, np.arange(spans) + _DEGREE] = 1
+    for degree in range(1, _DEGREE + 1):
+        lower, basis = basis, np.zeros_like(basis)
+        for k in range(count + _DEGREE - degree):
+            start, stop = knots[k], knots[k + 1]
+            rise, fall = knots[k + degree] - start, knots[k + degree + 1] - stop
+            for part, sign, width, zero in (
+                (lower[..., k], 1.0, rise, start),
+                (lower[..., k + 1], -1.0, fall, knots[k + degree + 1]),
+            ):
+                if width > 0:
+                    # Times ±(span + share - zero) / width.
+                    away = (np.arange(spans) - zero)[:, None]
+                    basis[..., k] += sign / width * (away * part)
+                    basis[:, 1:, k] += sign / width * part[:, :-1]
+    return basis[..., :count]
