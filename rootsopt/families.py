@@ -112,12 +112,14 @@ def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, floa
     profile = profile_of(config.family, config.lobes, radius, design_of(config))
     found = project(profile, count)
     # Decimals enough for a hundredth of a micrometre.
-    result = ProfileConfig(
-        family="free_form",
-        lobes=config.lobes,
-        pitch_radius_mm=config.pitch_radius_mm,
-        tip_arc_angle_deg=round(float(found.tip_arc_angle) / DEG, 9),
-        coefficients=tuple(round(float(c), 6) for c in found.coefficients),
+    result = ProfileConfig.model_validate(
+        {
+            "family": "free_form",
+            "lobes": config.lobes,
+            "pitch_radius_mm": config.pitch_radius_mm,
+            "tip_arc_angle_deg": round(float(found.tip_arc_angle) / DEG, 9),
+            "coefficients": tuple(round(float(c), 6) for c in found.coefficients),
+        }
     )
     written = profile_of("free_form", config.lobes, radius, design_of(result))
     return result, departure(profile, written)
@@ -145,7 +147,7 @@ def check(config: ProfileConfig) -> None:
     radius = jnp.asarray(config.pitch_radius_mm * MM)
     found = _margins(config.family, config.lobes, radius, design_of(config))
     for name, value in found._asdict().items():
-        if (config.family, name) in _INHERENT:
+        if (config.family, name) in INHERENT:
             continue
         scale = 1.0 if name in _PURE else config.pitch_radius_mm * MM
         if not float(value) >= -_ROUNDING * scale:
@@ -167,7 +169,7 @@ def _margins(family, lobes, pitch_radius, design):
 
 _PURE = ("turning", "rolling", "order")
 """Margins that are no lengths."""
-_INHERENT = {("arcs_epicycloid", "rolling")}
+INHERENT = {("arcs_epicycloid", "rolling")}
 """What belongs to a family: an edge outside of the pitch circle meshes twice."""
 _SHARPEST = 0.002
 """Least radius of an edge in pitch radii: less is a corner, along which the outline's and the

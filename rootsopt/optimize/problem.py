@@ -27,7 +27,7 @@ from rootsopt.config import Config
 from rootsopt.dynamics.measures import line_name
 from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluation, objective_weights
-from rootsopt.families import BY_LIMITS, DEG, MM, keys_of
+from rootsopt.families import BY_LIMITS, DEG, INHERENT, MM, keys_of
 from rootsopt.model import Model
 from rootsopt.optimize.bounds import bounds_of
 from rootsopt.profiles import Geometry, geometry
@@ -46,7 +46,9 @@ _SOUND = (
     ("order of the joints", "turning", "deg", 0.0, 0.1, DEG),
     ("convex addendum", "convexity", "mm", 0.0, MM, MM),
     ("reach of the normals", "reach", "mm", 0.0, MM, MM),
+    ("levers from the tip on", "fall", "mm", 0.0, MM, MM),
     ("roll angle per normal", "rolling", "", 0.0, 0.1, 1.0),
+    ("roll angle from the tip on", "order", "deg", 0.0, 0.1, DEG),
     ("star shape", "star", "mm", 0.0, MM, MM),
     ("root above the axis", "root", "mm", 0.0, MM, MM),
 )
@@ -115,14 +117,15 @@ class Space(eqx.Module):
             room = model.bore_radius
             constraints += (_constraint("root radius", "root_radius", "mm", room, MM, MM),)
         if sound:
-            constraints += tuple(_constraint(*row, margin=True) for row in _SOUND)
+            rows_of = [row for row in _SOUND if (family, row[1]) not in INHERENT]
+            constraints += tuple(_constraint(*row, margin=True) for row in rows_of)
         lower, upper = np.array(rows, dtype=float).T
         keys = keys_of(config.profile)
         involute = None
         if "involute_length_mm" in keys:
             tip = "tip_arc_angle_deg"
-            places = [keys.index(key) for key in ("pressure_angle_deg", "involute_length_mm")]
-            involute = _Involute(*places, keys.index(tip) if tip in keys else None)
+            angle, length = map(keys.index, ("pressure_angle_deg", "involute_length_mm"))
+            involute = _Involute(angle, length, keys.index(tip) if tip in keys else None)
         return cls(model, jnp.asarray(lower), jnp.asarray(upper), constraints, involute)
 
     def design(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
