@@ -26,14 +26,17 @@ def body(config: Config, options: argparse.Namespace) -> int:
 
     check_geometry(config)
     folder = files.ResultFolder(options.output)
+    # Half a second that passes while the first programs are compiled.
+    drawing = threading.Thread(target=importlib.import_module, args=("rootsopt.plot",))
     if not options.no_figures:
-        # Half a second that passes while the first programs are compiled.
-        threading.Thread(target=importlib.import_module, args=("rootsopt.plot",)).start()
+        drawing.start()
     clock = CompileClock()
     with clock, _progress(Console(stderr=True)) as progress:
         config, choice = auto.resolve(config)
         result = Search(config, progress).run()
     ran = time.perf_counter() - began
+    if not options.no_figures:
+        drawing.join()  # Two threads in one import may each see the other's half of it.
     _write(folder, config, options, result, choice, clock.seconds, ran)
     out = Console()
     baseline = result.baseline.record().get("speeds")
