@@ -48,20 +48,21 @@ def verdict(
     exponent, radius, force = scales
     rounding = force_rounding(orbit.flow.depth, exponent, radius)
     return Verdict(
-        idle=is_idle(orbit),
+        idle=is_idle(orbit, float(jnp.finfo(orbit.state.dtype).eps) * force),
         steady=judged(orbit, state, within, rtols, residual),
         rounding=jnp.where(orbit.flow.peak > 0, rounding, 0.0),
         consistent=is_consistent(orbit, 10 * rtols[1] * force),
     )
 
 
-def is_idle(orbit: Orbit) -> Bool[Array, ""]:
-    """Whether the pair floats: no flank ever touches, and nothing brings it back when it is moved.
+def is_idle(orbit: Orbit, least: Float[Array, ""] | float = 0.0) -> Bool[Array, ""]:
+    """Whether the pair floats: no flank ever touches, but for forces up to the `least` (N) of
+    rounding, and nothing brings it back when it is moved.
 
     Then it can rest anywhere, and neither Newton's method nor a derivative has an answer.
     """
     free = jnp.isnan(orbit.multiplier) | (orbit.multiplier > 1 - _FREE)
-    return (orbit.flow.mean == 0) & (orbit.flow.peak <= 0) & free
+    return (orbit.flow.mean <= least) & (orbit.flow.peak <= least) & free
 
 
 def judged(

@@ -2,9 +2,7 @@
 
 import argparse
 import contextlib
-import importlib
 import sys
-import threading
 import time
 from collections.abc import Iterator, Sequence
 
@@ -26,9 +24,6 @@ def body(config: Config, options: argparse.Namespace) -> int:
 
     check_geometry(config)
     folder = files.ResultFolder(options.output)
-    if not options.no_figures:
-        # Half a second that passes while the first programs are compiled.
-        threading.Thread(target=importlib.import_module, args=("rootsopt.plot",)).start()
     clock = CompileClock()
     with clock, _progress(Console(stderr=True)) as progress:
         config, choice = auto.resolve(config)
