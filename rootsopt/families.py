@@ -28,7 +28,7 @@ from rootsopt.profiles import (
     project,
 )
 from rootsopt.profiles.departure import departure
-from rootsopt.profiles.validity import margins
+from rootsopt.profiles.validity import PURE, margins
 from rootsopt.programs import Program
 
 MM = 1e-3
@@ -57,6 +57,8 @@ _MAKERS: dict[str, Callable[..., Profile]] = {
     "ellipse": ellipse,
     "free_form": FreeForm,
 }
+CLASSICAL = tuple(family for family in _MAKERS if not {*FAMILY_KEYS[family]} & {*LIST_KEYS})
+"""Families made from a few parameters."""
 BY_LIMITS = ("cic", "arc_involute")
 """Families whose soundness is known from limits of their parameters; that of the others is by
 margins."""
@@ -107,7 +109,13 @@ def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:
 
 def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, float]:
     """A config's profile as a free form of `count` coefficients, and how far (m) that departs from
-    it at most."""
+    it at most. Raises `InputError` for an outline from a file."""
+    if config.family == "outline":
+        raise InputError(
+            "`profile.family` must be that of a design to be projected onto a free form, but is "
+            "outline: its dedendum need not be the mate of its addendum, as that of a free form "
+            "is; name the family the rotor was made to"
+        )
     radius = jnp.asarray(config.pitch_radius_mm * MM)
     profile = profile_of(config.family, config.lobes, radius, design_of(config))
     found = project(profile, count)
@@ -149,7 +157,7 @@ def check(config: ProfileConfig) -> None:
     for name, value in found._asdict().items():
         if (config.family, name) in INHERENT:
             continue
-        scale = 1.0 if name in _PURE else config.pitch_radius_mm * MM
+        scale = 1.0 if name in PURE else config.pitch_radius_mm * MM
         if not float(value) >= -_ROUNDING * scale:
             given = ", ".join(
                 f"`profile.{key}` = {_written(getattr(config, key))}"
@@ -167,8 +175,6 @@ def _margins(family, lobes, pitch_radius, design):
     return margins(profile_of(family, lobes, pitch_radius, design))
 
 
-_PURE = ("turning", "rolling", "order")
-"""Margins that are no lengths."""
 INHERENT = {("arcs_epicycloid", "rolling")}
 """What belongs to a family: an edge outside of the pitch circle meshes twice."""
 _SHARPEST = 0.002

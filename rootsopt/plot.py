@@ -21,8 +21,6 @@ from rootsopt.contact.nodes import place_pair
 from rootsopt.evaluate import Evaluation, Series
 from rootsopt.files import ResultFolder
 from rootsopt.model import design_keys, outline_mm
-from rootsopt.outline.conjugacy import conjugacy, gaps_um
-from rootsopt.outline.source import outline_of
 
 # Okabe and Ito's palette, told apart with any colour vision and in grey.
 BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"
@@ -370,6 +368,9 @@ def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, A
         _write(folder, "meshing", _meshing(points, config)),
     ]
     if config.profile.family == "outline":
+        from rootsopt.outline.conjugacy import conjugacy, gaps_um
+        from rootsopt.outline.source import outline_of
+
         made, axes = figure(8, 4.2)
         gaps = gaps_um(conjugacy(outline_of(config.profile)[0]))
         plot_conjugacy(axes[0, 0], {Path(config.profile.outline_file or "").name: gaps})

@@ -11,13 +11,13 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from rootsopt.config import FAMILY_KEYS, LIST_KEYS
-from rootsopt.families import MM, profile_of
+from rootsopt.config import FAMILY_KEYS
+from rootsopt.families import CLASSICAL, INHERENT, MM, profile_of
 from rootsopt.optimize.bounds import around
 from rootsopt.optimize.problem import sobol
 from rootsopt.profiles import Profile
 from rootsopt.profiles.departure import departure
-from rootsopt.profiles.validity import margins
+from rootsopt.profiles.validity import PURE, margins
 from rootsopt.programs import Program
 
 _NODES = 96
@@ -52,17 +52,16 @@ class Likeness(NamedTuple):
 
 
 def likenesses(profile: Profile) -> list[Likeness]:
-    """The nearest member of every family with parameters of its own to `profile`, nearest first.
+    """The nearest member of every classical family to `profile`, nearest first.
 
     Nearest is where the greatest distance of the outlines is least, looked for from the best of a
     Sobol sample: a nearer member may be left unfound. Families without a sound one are left out.
     """
     found = []
-    for family, keys in FAMILY_KEYS.items():
-        if not any(key in LIST_KEYS for key in keys):
-            likeness = _nearest(profile, family, keys)
-            if likeness is not None:
-                found.append(likeness)
+    for family in CLASSICAL:
+        likeness = _nearest(profile, family, FAMILY_KEYS[family])
+        if likeness is not None:
+            found.append(likeness)
     return sorted(found, key=lambda one: one.departure)
 
 
@@ -187,7 +186,11 @@ def _compared(family: str, lobes: int, radius: Float[Array, ""], target, design)
         sides = [profile.position(side(nu)) for side in (profile.addendum, profile.dedendum)]
         away = jnp.sum((jnp.stack(sides) - places) * normals, axis=-1).ravel() / radius
         found = margins(profile)._asdict()
-        scaled = [v / (1.0 if k in ("turning", "rolling") else radius) for k, v in found.items()]
+        scaled = [
+            value / (1.0 if name in PURE else radius)
+            for name, value in found.items()
+            if (family, name) not in INHERENT
+        ]
         values = away, jnp.stack(scaled)
         return values, values
 

@@ -32,10 +32,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
         folder.write_csv("response_design.csv", files.response_columns(evaluation.series))
     data = evaluation.record() | choice | outline_report.record(config)
     folder.write_json("result.json", data | {"versions": files.versions()})
-    period = evaluation.steady_state.get("period") or config.profile.lobes
-    if evaluation.series is None:
-        formats = tuple(name for name in formats if name != "gif")  # no motion to be shown
-    export.write(folder, config, formats, evaluation.design, evaluation.series, period)
+    export.write_simulated(folder, config, formats, evaluation)
     if not options.no_figures:
         from rootsopt import plot
 

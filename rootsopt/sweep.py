@@ -17,7 +17,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
 
     from rootsopt import auto, files, report, speeds
     from rootsopt.evaluators import evaluator_for, without_gradient
-    from rootsopt.model import check_geometry, design_keys
+    from rootsopt.model import check_geometry, design_keys, design_vector
 
     check_geometry(config)
     folder = files.ResultFolder(options.output)
@@ -30,7 +30,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
     files.write_config(folder, config)
     folder.write_csv("sweep.csv", files.row_columns(rows))
     data = {
-        "design": {key: getattr(config.profile, key) for key in design_keys(config)},
+        "design": dict(zip(design_keys(config), map(float, design_vector(config)), strict=True)),
         "geometry": parts[0].evaluation.geometry,
         "speeds": rows,
         "status": status.label,

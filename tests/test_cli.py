@@ -11,6 +11,11 @@ import numpy as np
 import pytest
 import yaml
 
+from rootsopt import profiles
+from rootsopt.config import load
+from rootsopt.model import Model, design_vector
+from rootsopt.outline.reading import read, signed_area
+
 ROOT = Path(__file__).parents[1]
 CIC = str(ROOT / "configs" / "cic.yaml")
 EE = str(ROOT / "configs" / "ee.yaml")
@@ -40,9 +45,15 @@ def columns(path):
     return rows[0], np.array(rows[1:], dtype=float)
 
 
+def profile_in(folder):
+    """The profile of the optimised config in a result folder."""
+    config = load(folder / "optimized.yaml")
+    return Model.of(config).profile(design_vector(config))
+
+
 def test_optimize_writes_the_contract(tmp_path):
     """Every file of the contract, the table, compile and run time, exit 0, quiet stderr."""
-    done = command("optimize", CIC, "-o", tmp_path, *SMALL)
+    done = command("optimize", CIC, "-o", tmp_path, *SMALL, "--export", "dxf")
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     for word in ("baseline", "optimised", "pressure angle", "mean force", "periodic", "compile"):
@@ -78,6 +89,11 @@ def test_optimize_writes_the_contract(tmp_path):
     names = ("profiles", "meshing", "force", "spectrum", "history")
     assert figures == {f"{name}.png" for name in names}
     assert (tmp_path / "history.csv").read_text().count("\n") >= 4
+    # The optimised design, as a config and as a drawing, both read back.
+    best, drawn = result["optimized"]["geometry"], profiles.geometry(profile_in(tmp_path))
+    assert float(drawn.area) * 1e6 == pytest.approx(best["area_mm2"], rel=1e-9)
+    loop = read(tmp_path / "rotor.dxf").points
+    assert abs(signed_area(loop)) == pytest.approx(best["area_mm2"], rel=1e-3)
 
 
 def test_simulate_ee_and_profile(tmp_path):

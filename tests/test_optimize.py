@@ -1,7 +1,9 @@
 """Optimiser: space, constraints, projection, descent directions, and a whole small run."""
 
+import dataclasses
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -85,6 +87,39 @@ def test_projection_makes_feasible_and_keeps_feasible_points(problem):
         np.testing.assert_array_equal(problem.project(projected), projected)
     inside = next(p for p in sobol(256, 4) if problem.feasible(p))
     np.testing.assert_array_equal(problem.project(inside), inside)
+
+
+def test_rotor_stays_in_its_housing(problem):
+    """Floor and ceiling of the outer radius bind on their own sides, and are reported as such."""
+    limits = "constraints.outer_radius_min_mm=44.2", "constraints.outer_radius_max_mm=44.5"
+    settings = config(*limits, "constraints.area_efficiency_min=0.4")
+    model, start = Model.of(settings), baseline(settings)
+    start = dataclasses.replace(start, geometry=start.geometry | _radii(44.3))
+    housed = Problem.of(settings, model, start)
+    free = [float(_outer(model, problem.design(p))) * 1e3 for p in sobol(32, 3)]
+    assert min(free) < 44.2
+    assert max(free) > 44.5
+    for point in sobol(32, 3):
+        found = housed.project(point)
+        assert housed.feasible(found)
+        assert 44.2 - 2e-6 < float(_outer(model, housed.design(found))) * 1e3 < 44.5 + 2e-6
+    wide = dataclasses.replace(start, geometry=start.geometry | _radii(44.8))
+    narrow = dataclasses.replace(start, geometry=start.geometry | _radii(44.0))
+    for one, floor, ceiling in ((wide, True, False), (narrow, False, True)):
+        rows = [r for r in housed.constraint_rows(one) if r["name"] == "outer radius"]
+        satisfied = {row["sense"]: row["satisfied"] for row in rows}
+        assert satisfied == {">=": floor, "<=": ceiling}
+    with pytest.raises(InputError, match=r"outer_radius_max_mm` must be greater"):
+        config("constraints.outer_radius_min_mm=44.5", "constraints.outer_radius_max_mm=44.2")
+
+
+@jax.jit
+def _outer(model, design):
+    return geometry(model.profile(design)).outer_radius
+
+
+def _radii(outer):
+    return {"outer_radius_mm": outer, "undercut_margin_mm": 5.0, "seal_width_mm": 5.0}
 
 
 def test_descent_respects_active_constraints(problem):

@@ -509,7 +509,7 @@ def test_chaos_has_a_positive_exponent_and_no_gradient(settled):
     scale, rate = float(pair.angle_scale), float(pair.angle_scale) / float(pair.mesh_period)
     start = jnp.array([evaluation.series.relative[0] / scale, evaluation.series.rate[0] / rate])
     starts = start + 1e-9 * jnp.array([[0.0, 0.0], [1.0, 0.0]])
-    ends = np.asarray(run_strobe(pair, starts, 60, integrator(1e-12)))
+    ends = np.asarray(run_strobe(pair, starts, 120, integrator(1e-12)))
     apart = np.linalg.norm(ends[0] - ends[1], axis=1)
     assert np.max(apart) > 1e-2
 

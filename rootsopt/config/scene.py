@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.section import NonNegative, Positive, Section, tuples
+from rootsopt.config.section import NonNegative, Positive, Section
 
 DESIGN_KEYS = ("pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg")
 """The design parameters of a CIC rotor, as named in the config."""
@@ -104,8 +104,10 @@ class ProfileConfig(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _lists(cls, data):
-        return tuples(data)
+    def _list(cls, data):
+        if isinstance(data, dict) and isinstance(given := data.get("coefficients"), list):
+            return data | {"coefficients": tuple(given)}
+        return data
 
     outline_file: str | None = Field(
         None, description="outline: CSV or DXF file, relative to the config's folder"

@@ -1,6 +1,6 @@
 """Sections of a config that say how it is solved, and what is asked of it."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, create_model, model_validator
 
@@ -255,6 +255,20 @@ class ConstraintsConfig(Section):
     seal_width_min_mm: NonNegative = Field(
         0.0, description="floor of the tip land's whole arc length"
     )
+    outer_radius_min_mm: Positive | None = Field(None, description="floor of the outer radius")
+    outer_radius_max_mm: Positive | None = Field(
+        None, description="ceiling of the outer radius: that of the housing's bore"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self):
+        low, high = self.outer_radius_min_mm, self.outer_radius_max_mm
+        if low is not None and high is not None and not low < high:
+            raise ValueError(
+                "`constraints.outer_radius_max_mm` must be greater than "
+                f"`constraints.outer_radius_min_mm` = {low:g}, but is {high:g}"
+            )
+        return self
 
 
 class _Bounds(Section):
@@ -297,18 +311,14 @@ _NOTES = {
     "involute_length_mm": "default: 10 % to 100 % of the longest involute",
     "coefficients": "of each of them; default: -1 to 1",
 }
-BoundsConfig = create_model(
-    "BoundsConfig",
-    __base__=_Bounds,
-    __doc__=_Bounds.__doc__,
-    **{
-        key: (
-            _Pair if key in _DEFAULTS else _Pair | None,
-            Field(_DEFAULTS.get(key), description=_NOTES.get(key, "")),
-        )
-        for key in dict.fromkeys(key for keys in FAMILY_KEYS.values() for key in keys)
-    },
-)  # type: ignore[call-overload]
+_BOUNDS: dict[str, Any] = {
+    key: (
+        _Pair if key in _DEFAULTS else _Pair | None,
+        Field(_DEFAULTS.get(key), description=_NOTES.get(key, "")),
+    )
+    for key in dict.fromkeys(key for keys in FAMILY_KEYS.values() for key in keys)
+}
+BoundsConfig = create_model("BoundsConfig", __base__=_Bounds, __doc__=_Bounds.__doc__, **_BOUNDS)
 
 
 class OptimizerConfig(Section):

@@ -1,5 +1,5 @@
 """Drawings, solids and animations of a design, all from one outline of arcs and splines."""
 
-from rootsopt.export.command import FORMATS, add_option, chosen, write
+from rootsopt.export.command import FORMATS, add_option, chosen, write, write_simulated
 
-__all__ = ["FORMATS", "add_option", "chosen", "write"]
+__all__ = ["FORMATS", "add_option", "chosen", "write", "write_simulated"]

@@ -8,7 +8,7 @@ from rootsopt.errors import InputError
 
 if TYPE_CHECKING:
     from rootsopt.config import Config
-    from rootsopt.evaluate import Series
+    from rootsopt.evaluate import Evaluation, Series
     from rootsopt.files import ResultFolder
 
 FORMATS = {
@@ -97,6 +97,17 @@ def write(
     for name, data in files.items():
         folder.write_bytes(name, data)
     return list(files)
+
+
+def write_simulated(
+    folder: "ResultFolder", config: "Config", formats: Sequence[str], evaluation: "Evaluation"
+) -> list[str]:
+    """As `write`, for a design that was simulated; the GIF shows its motion, if it has one."""
+    series = evaluation.series
+    if series is None:
+        formats = tuple(name for name in formats if name != "gif")
+    periods = evaluation.steady_state.get("period") or config.profile.lobes
+    return write(folder, config, formats, evaluation.design, series, periods)
 
 
 def _solids(drawing, formats) -> dict[str, bytes]:

@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 
-from rootsopt import cli
+from rootsopt import cli, export
 from rootsopt.config import Config
 
 PURPOSE = "Optimise the design parameters for low contact force and compare with the baseline."
@@ -22,6 +22,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
     from rootsopt.optimize.search import Search
     from rootsopt.timing import CompileClock
 
+    formats = export.chosen(options.export)
     check_geometry(config)
     folder = files.ResultFolder(options.output)
     clock = CompileClock()
@@ -31,6 +32,8 @@ def body(config: Config, options: argparse.Namespace) -> int:
     ran = time.perf_counter() - began
     alike = _alike(config, result)
     _write(folder, config, options, result, choice | alike, clock.seconds, ran)
+    if result.optimized is not None:
+        export.write_simulated(folder, config, formats, result.optimized)
     out = Console()
     baseline = result.baseline.record().get("speeds")
     if result.optimized is None:
@@ -165,7 +168,7 @@ def _progress(console) -> Iterator:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return cli.run("optimize", PURPOSE, body, argv)
+    return cli.run("optimize", PURPOSE, body, argv, lambda p: export.add_option(p, "none"))
 
 
 if __name__ == "__main__":

@@ -58,7 +58,7 @@ _ACTIVE = 1e-6
 
 
 class Constraint(eqx.Module):
-    """value ≥ limit, scaled by `scale` to order one.
+    """value ≥ limit, or ≤ where it is a `ceiling`, scaled by `scale` to order one.
 
     `quantity`: a field of `Geometry`, or one of `Margins` where `margin`; `factor` turns SI into
     the reported `unit`.
@@ -71,10 +71,17 @@ class Constraint(eqx.Module):
     scale: float = eqx.field(static=True)
     factor: float = eqx.field(static=True)
     margin: bool = eqx.field(static=True, default=False)
+    ceiling: bool = eqx.field(static=True, default=False)
 
-    def slack(self, shape: Geometry, found: Margins | None) -> Float[Array, ""]:
+    @property
+    def sign(self) -> float:
+        """+1 for a floor, -1 for a ceiling."""
+        return -1.0 if self.ceiling else 1.0
+
+    def slack(self, shape: Geometry, found: Margins | None = None) -> Float[Array, ""]:
         """Scaled distance to the limit, ≥ 0 where satisfied."""
-        return (getattr(found if self.margin else shape, self.quantity) - self.limit) / self.scale
+        value = getattr(found if self.margin else shape, self.quantity)
+        return self.sign * (value - self.limit) / self.scale
 
 
 class _Involute(NamedTuple):
@@ -116,6 +123,11 @@ class Space(eqx.Module):
         if model.bore_radius is not None:
             room = model.bore_radius
             constraints += (_constraint("root radius", "root_radius", "mm", room, MM, MM),)
+        radii = ((True, limits.outer_radius_max_mm), (False, limits.outer_radius_min_mm))
+        for ceiling, radius in radii:
+            if radius is not None:
+                row = "outer radius", "outer_radius", "mm", radius * MM, MM, MM
+                constraints += (_constraint(*row, ceiling=ceiling),)
         if sound:
             rows_of = [row for row in _SOUND if (family, row[1]) not in INHERENT]
             constraints += tuple(_constraint(*row, margin=True) for row in rows_of)
@@ -359,17 +371,19 @@ class Problem:
             "undercut_margin": "undercut_margin_mm",
             "seal_width": "seal_width_mm",
             "root_radius": "root_radius_mm",
+            "outer_radius": "outer_radius_mm",
         }
         for k, c in enumerate(self.space.constraints):
             limit = float(c.limit) / c.factor
             if c.margin:
                 slacks = (self._slacks(one)[k] for one in (self.baseline, optimized))
-                before, after = (limit + slack * c.scale / c.factor for slack in slacks)
+                before, after = (limit + c.sign * slack * c.scale / c.factor for slack in slacks)
             else:
                 before = self.baseline.geometry[keys[c.quantity]]
                 after = optimized.geometry[keys[c.quantity]]
-            slack = (after - limit) * c.factor / c.scale
-            rows.append(_row(c.name, before, after, limit, c.unit, slack))
+            slack = c.sign * (after - limit) * c.factor / c.scale
+            sense = "<=" if c.ceiling else ">="
+            rows.append(_row(c.name, before, after, limit, c.unit, slack, sense))
         if self.space.involute is not None:
             rows.append(self._length_row(optimized))
         return rows
@@ -383,29 +397,25 @@ class Problem:
         point = self.point(list(optimized.design.values()))
         limit = float(_longest(self.space, point))
         after = optimized.design["involute_length_mm"]
-        row = _row(
-            "involute length",
-            self.baseline.design["involute_length_mm"],
-            after,
-            limit,
-            "mm",
-            limit - after,
-        )
-        return row | {"sense": "<="}
+        before = self.baseline.design["involute_length_mm"]
+        return _row("involute length", before, after, limit, "mm", limit - after, "<=")
 
 
-def _constraint(name, quantity, unit, limit, scale, factor, margin=False) -> Constraint:
-    return Constraint(name, quantity, unit, jnp.asarray(float(limit)), scale, factor, margin)
+def _constraint(
+    name, quantity, unit, limit, scale, factor, margin=False, ceiling=False
+) -> Constraint:
+    limit = jnp.asarray(float(limit))
+    return Constraint(name, quantity, unit, limit, scale, factor, margin, ceiling)
 
 
-def _row(name, before, after, limit, unit, slack) -> dict:
+def _row(name, before, after, limit, unit, slack, sense) -> dict:
     return {
         "name": name,
         "baseline": before,
         "optimized": after,
         "limit": limit,
         "unit": unit,
-        "sense": ">=",
+        "sense": sense,
         "satisfied": bool(slack >= -1e-6),
         "active": bool(abs(slack) < 1e-4),
     }

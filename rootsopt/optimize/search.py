@@ -178,7 +178,8 @@ class Search:
         if not points:
             raise InputError(
                 "`constraints` and `optimizer.bounds` leave no feasible design; lower "
-                "`constraints.area_efficiency_min` or widen `optimizer.bounds`"
+                "`constraints.area_efficiency_min`, or widen `optimizer.bounds` or the range of "
+                "`constraints.outer_radius_*_mm`"
             )
         return points
 

@@ -136,6 +136,7 @@ def _from_dxf(data: bytes, name: str) -> Loop:
     # A quarter of a second to import; it announces itself in the log.
     logging.getLogger("ezdxf").setLevel(logging.WARNING)
     from ezdxf import recover, units
+    from ezdxf.enums import InsertUnits
     from ezdxf.lldxf.const import DXFError
 
     try:
@@ -143,7 +144,7 @@ def _from_dxf(data: bytes, name: str) -> Loop:
     except (DXFError, OSError, ValueError) as error:
         raise InputError(f"{name}: is not a DXF file that can be read: {error}") from None
     given = document.header.get("$INSUNITS", 0)
-    scale = units.conversion_factor(given, units.MM) if given else 1.0
+    scale = units.conversion_factor(given, InsertUnits.Millimeters) if given else 1.0
     kinds = (*_LINES, *_CURVES, *_CHAINS)
     entities = [e for e in document.modelspace() if e.dxftype() in kinds]
     entities = [e for e in entities if e.dxf.layer.upper() == _LAYER] or entities

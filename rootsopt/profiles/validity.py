@@ -8,6 +8,8 @@ from jaxtyping import Array, Float
 from rootsopt.profiles.base import Profile
 from rootsopt.programs import Program
 
+PURE = ("turning", "rolling", "order")
+"""Margins that are no lengths."""
 _POINTS = 400
 """Places on a segment that are looked at."""
 
