@@ -21,6 +21,7 @@ import json
 import multiprocessing
 import sys
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ use_float64()
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from numpy.typing import ArrayLike  # noqa: E402
 
 from experiments.families_parts.reach import (  # noqa: E402
     Reach,
@@ -53,6 +55,8 @@ from rootsopt.profiles.departure import departure  # noqa: E402
 FORCES = ("mean_force_N", "peak_force_N")
 EQUAL = 5e-5
 """Difference of area efficiency that counts as none."""
+TRIED = 6
+"""Designs of different area efficiency of which the best begins a search."""
 COEFFICIENTS = 12
 """Of the free form."""
 SCENES: dict[str, dict[str, Any]] = {
@@ -62,7 +66,7 @@ SCENES: dict[str, dict[str, Any]] = {
 }
 """What is changed of the scene in which the designs were found."""
 SEARCH = {"screening": 12, "starts": 2, "iterations": 30, "learning_rate": 0.08}
-SEARCH_FREE = {"screening": 0, "starts": 1, "iterations": 60, "learning_rate": 0.02}
+SEARCH_FREE = {"screening": 0, "starts": 1, "iterations": 100, "learning_rate": 0.005}
 QUICK = ("cic", "arc")
 
 
@@ -112,28 +116,36 @@ def optimised(config: Config, reference: dict[str, float]) -> tuple[Config, int]
     if not start.usable:
         return config, 1
     result = Search(weighed(config, start.response, reference)).run()
+    count = 1 + len(result.history)
     if result.optimized is None:
-        return config, len(result.history)
-    design = list(result.optimized.design.values())
-    profile = with_design(config.profile, design)
-    return config.model_copy(update={"profile": profile}), len(result.history)
+        return config, count
+    return with_values(config, list(result.optimized.design.values())), count
+
+
+def with_values(config: Config, design: ArrayLike) -> Config:
+    """A config with another design."""
+    return config.model_copy(update={"profile": with_design(config.profile, design)})
 
 
 def placed(
-    base: Config, found: Reach, bore: float, floor: float, quick: bool
-) -> tuple[Config, bool]:
-    """The config with the floor of area efficiency and a design to begin with, and whether the
-    family reaches the floor asked for."""
+    base: Config, found: Reach, reference: Evaluation, quick: bool
+) -> tuple[Config, bool, int]:
+    """The config with the floor of area efficiency and the best of some designs to begin with,
+    whether the family reaches the floor asked for, and how many were simulated."""
+    bore, floor = (reference.geometry[key] for key in ("outer_radius_mm", "area_efficiency"))
     reached = found.efficiencies[-1] >= floor - EQUAL
     least = (floor if reached else found.efficiencies[-1]) - EQUAL
-    config = in_housing(base, bore, float(least))
-    if found.points.shape[1]:
-        there = found.points[found.efficiencies >= least]
-        point = there[len(there) // 2]
-        profile = with_design(config.profile, problem_of(config).design(point))
-        config = config.model_copy(update={"profile": profile})
     few = {"screening": 2, "starts": 1, "iterations": 3} if quick else SEARCH
-    return changed(config, optimizer=few), bool(reached)
+    config = changed(in_housing(base, bore, float(least)), optimizer=few)
+    if not found.points.shape[1]:
+        return config, bool(reached), 0
+    there = found.points[found.efficiencies >= least]
+    places = np.unique(np.linspace(0, len(there) - 1, 1 if quick else TRIED).astype(int))
+    problem = problem_of(config)
+    tried = [with_values(config, problem.design(there[k])) for k in places]
+    marks = [objective(Evaluator(one)(series=False), reference.response) for one in tried]
+    best = int(np.argmin(np.nan_to_num(marks, nan=np.inf)))
+    return tried[best], bool(reached), len(tried)
 
 
 def row_of(study: str, config: Config, reference: dict[str, float]) -> dict[str, Any]:
@@ -174,15 +186,14 @@ def one_family(path: str, family: str, quick: bool) -> dict[str, Any] | None:
     """The best design of a family in the housing of a reference; None where it does not fit."""
     began = time.perf_counter()
     reference, base = reference_of(path, quick)
-    bore, floor = (base.geometry[key] for key in ("outer_radius_mm", "area_efficiency"))
-    config = in_housing(of_family(reference, family), bore, 0.0)
+    config = in_housing(of_family(reference, family), base.geometry["outer_radius_mm"], 0.0)
     found = reach(config, 24) if quick else reach(config)
     if found is None:
         return None
-    config, reached = placed(config, found, bore, floor, quick)
-    count = 1
+    config, reached, count = placed(config, found, base, quick)
     if found.points.shape[1]:
-        config, count = optimised(config, base.response)
+        config, more = optimised(config, base.response)
+        count += more
     return {
         **row_of(Path(path).stem, config, base.response),
         "reached": reached,
@@ -202,10 +213,9 @@ def free_form(path: str, best: dict[str, Any], quick: bool) -> dict[str, Any]:
     _, base = reference_of(path, quick)
     config = parse(best["config"])
     start = Model.of(config).profile(design_vector(config))
-    profile, _ = free_form_of(config.profile, 5 if quick else COEFFICIENTS)
-    settings = dict(SEARCH_FREE, bounds={"tip_arc_angle_deg": (0.0, 45 / config.profile.lobes)})
-    if quick:
-        settings["iterations"] = 2
+    profile, _ = free_form_of(config.profile, COEFFICIENTS)
+    settings: dict[str, Any] = {"bounds": {"tip_arc_angle_deg": (0.0, 45 / config.profile.lobes)}}
+    settings |= SEARCH_FREE | ({"iterations": 2} if quick else {})
     config = changed(
         config,
         profile=profile.model_dump(),
@@ -230,7 +240,9 @@ def _own_process() -> None:
     use_cache()
 
 
-def study(paths: list[str], families: list[str], jobs: int, quick: bool) -> list[dict[str, Any]]:
+def study(
+    paths: Sequence[str], families: Sequence[str], jobs: int, quick: bool
+) -> list[dict[str, Any]]:
     """The rows of all families in all housings, the free form of each last."""
     tasks = list(itertools.product(paths, families))
     context = multiprocessing.get_context("spawn")

@@ -199,7 +199,8 @@ _FAULTS = {
 }
 _REMEDIES = {
     "arc": "move the centre: it must lie inside the pitch circle, and too far out undercuts",
-    "arcs_epicycloid": "widen the land, move the arc's centre inwards, or round the edge more",
+    "arcs_epicycloid": "widen the land, move the arc's centre inwards, or round the edge more (an "
+    "edge is sharper than its arc)",
     "four_arcs": "move the tip arc's centre inwards, or change where it ends or its radius",
     "five_arcs": "lower the outer radius, or change the tip arc's radius or where it ends",
     "circle_epicycloid": "let the tip arc end further from the tip, or change the rolling radius",

@@ -12,7 +12,9 @@ from rootsopt.config import FAMILY_KEYS, parse
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.nodes import pair_gap
 from rootsopt.errors import InputError
-from rootsopt.families import check, design_of, profile_of
+from rootsopt.families import INHERENT, check, design_of, profile_of
+from rootsopt.optimize.bounds import around
+from rootsopt.optimize.problem import sobol
 from rootsopt.profiles import CIC, EE, arc, geometry
 from rootsopt.profiles.validity import margins
 
@@ -273,6 +275,34 @@ def test_curve_is_the_one_its_normals_say(family):
     # Where one normal only has the roll angle.
     apart = nu > (made(family).joints[2] if family == "arcs_epicycloid" else 0.0)
     np.testing.assert_allclose(found["inverse"][apart], nu[apart], atol=1e-9)
+
+
+@every_family
+def test_what_margins_call_sound_is_one_curve(family):
+    """Wherever in its bounds a member is sound, support function and lever go on without a jump,
+    and the law of gearing holds: h′ = -lever."""
+    low, high = np.array([around(key, 1e3 * R, 3) for key in DESIGNS[family]]).T
+    sample = low + (high - low) * sobol(128, 1, len(low))
+
+    def looked(design):
+        profile = profile_of(family, 3, jnp.asarray(R), design)
+        nu = profile.pitch_normal * jnp.linspace(0.0, 1.0, COUNT)
+        found = margins(profile)._asdict()
+        least = [value for key, value in found.items() if (family, key) not in INHERENT]
+        curved = jnp.max(profile.addendum_speed(nu))
+        return jnp.min(jnp.stack(least)), curved, nu[1], profile.support(nu), profile.lever(nu)
+
+    designs = jnp.asarray(np.concatenate([[list(DESIGNS[family].values())], sample]))
+    found = jax.jit(lambda designs: jax.lax.map(looked, designs))(designs)
+    least, curved, step, support, lever = map(np.asarray, found)
+    # All but straight flanks: there the lever may change at any rate.
+    sound = (least >= -1e-9) & (curved < 3 * R)
+    assert np.sum(sound) >= 2
+    step, support, lever = step[sound, None], support[sound], lever[sound]
+    # By the distance of a centre of curvature from the axis.
+    assert np.max(np.abs(np.diff(lever)) / step) < 4 * R
+    fall = (lever[:, 1:] + lever[:, :-1]) / 2 * step
+    assert np.max(np.abs(np.diff(support) + fall)) < 2e-6 * R
 
 
 @every_family

@@ -1,5 +1,6 @@
 """Tables and figures of `experiments/families.py`."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,7 @@ def tables(data: dict[str, Any]) -> str:
     return "\n".join(parts)
 
 
-def _table(heads: list[str], lines: list[list[str]]) -> str:
+def _table(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     rows = [heads, ["---"] * len(heads), *lines]
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 

@@ -10,11 +10,11 @@ _SHARES = {
     "arc_center_mm": (0.5, 0.999),
     "tip_arc_radius_mm": (0.05, 0.8),
     "outer_radius_mm": (1.1, 1.7),
-    "ellipse_center_mm": (0.3, 0.99),
-    "ellipse_height_mm": (0.2, 1.0),
+    "ellipse_center_mm": (0.0, 0.99),
+    "ellipse_height_mm": (0.2, 1.5),
 }
 """Lengths, in pitch radii."""
-_FIXED = {"tip_arc_turn_deg": (5.0, 90.0), "coefficients": (-1.0, 1.0)}
+_FIXED = {"tip_arc_turn_deg": (1.0, 90.0), "coefficients": (-1.0, 1.0)}
 """Those that do not go with the size."""
 _ANY_LENGTH, _ANY_ANGLE, _ANY_NUMBER = (0.01, 1.5), (0.0, 90.0), (0.0, 2.0)
 """For a key that is not listed; lengths in pitch radii."""

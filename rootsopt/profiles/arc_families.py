@@ -64,10 +64,10 @@ def arcs_epicycloid(
 
     The lobe is the arc of `arc` around its `center` b (m), of radius ρ, and a land of half angle
     `land` θ1 (rad). The edge between them is an arc of radius `edge_radius` e (m) tangent to both,
-    its centre on the ray θ1 at the distance d = b cos θ1 + √((ρ - e)² - b² sin² θ1) from the axis,
-    and the outer radius d + e. On the partner the edge traces the curve at the distance e from
-    the extended epicycloid that its centre describes (the epicycloid itself for e = 0); it joins
-    the mates of land and arc.
+    its centre on the ray θ1 at the distance d = b cos θ1 ± √((ρ - e)² - b² sin² θ1) from the axis,
+    and the outer radius d + e; an edge flatter than the arc (-, e > ρ) would have to turn back. On
+    the partner the edge traces the curve at the distance e from the extended epicycloid that its
+    centre describes (the epicycloid itself for e = 0); it joins the mates of land and arc.
 
     From an edge with its centre outside of the pitch circle (d > r) the contact moves backwards:
     sin(ν - β) = (d / r) sin(ν - θ1) gives dβ/dν = 1 - d cos(ν - θ1) / (r sin ψ) < 0. The dedendum
@@ -82,9 +82,10 @@ def arcs_epicycloid(
     zero = jnp.zeros_like(r)
     away, across = r * jnp.cos(half) - b, r * jnp.sin(half)
     radius = jnp.sqrt(away**2 + across**2)
-    reach = b * jnp.cos(theta) + jnp.sqrt((radius - e) ** 2 - (b * jnp.sin(theta)) ** 2)
+    side = jnp.sign(radius - e)
+    reach = b * jnp.cos(theta) + side * jnp.sqrt((radius - e) ** 2 - (b * jnp.sin(theta)) ** 2)
     edge = reach * jnp.stack([jnp.cos(theta), jnp.sin(theta)])
-    turn = jnp.arctan2(edge[1], edge[0] - b)
+    turn = jnp.arctan2(side * edge[1], side * (edge[0] - b))
     return Arcs(
         lobes=lobes,
         names=("tip land", "edge", "arc"),
