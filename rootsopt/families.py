@@ -169,6 +169,21 @@ def check(config: ProfileConfig) -> None:
             )
 
 
+def margins_of(config: ProfileConfig) -> dict[str, float]:
+    """The margins of a config's profile by name and unit, for the result file; none for an outline
+    from a file."""
+    if config.family == "outline":
+        return {}
+    radius = jnp.asarray(config.pitch_radius_mm * MM)
+    found = _margins(config.family, config.lobes, radius, design_of(config))._asdict()
+    units = {"turning": ("_deg", DEG), "order": ("_deg", DEG), "rolling": ("", 1.0)}
+    record = {}
+    for name, value in found.items():
+        suffix, unit = units.get(name, ("_mm", MM))
+        record[name + suffix] = float(value) / unit
+    return record
+
+
 @Program
 def _margins(family, lobes, pitch_radius, design):
     """Margins of the profile of a design in config units."""

@@ -19,6 +19,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
 
     from rootsopt import files, report
     from rootsopt.evaluate import geometry_record
+    from rootsopt.families import margins_of
     from rootsopt.model import Model, check_geometry, design_keys, design_vector, outline_mm
     from rootsopt.outline import report as outline_report
     from rootsopt.profiles import geometry
@@ -40,6 +41,8 @@ def body(config: Config, options: argparse.Namespace) -> int:
         "message": Status.GEOMETRY_ONLY.value,
         "statistics": {},
     }
+    if margins := margins_of(config.profile):
+        record["margins"] = margins
     record |= outline_report.record(config)
     files.write_config(folder, config)
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))

@@ -151,6 +151,8 @@ def geometry_table(record: Mapping[str, Any]) -> RenderableType:
     table = _table("Rotor profile", "value")
     _group(table, "design", _singles(record.get("design", {})))
     _group(table, "geometry", _singles(record.get("geometry", {})))
+    if "margins" in record:
+        _group(table, "margins of the flank", _singles(record["margins"]))
     if "outline" in record:
         _group(table, "outline", _singles(record["outline"]))
     if record.get("status"):

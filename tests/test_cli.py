@@ -109,6 +109,9 @@ def test_simulate_ee_and_profile(tmp_path):
     record = json.loads((tmp_path / "p" / "result.json").read_text())
     assert record["geometry"]["area_efficiency"] == pytest.approx(0.5, abs=1e-12)
     assert record["response"] == {}
+    assert record["margins"]["root_mm"] == pytest.approx(record["geometry"]["root_radius_mm"])
+    # Of the turn of an epicycloid's normal 1 / (1 + N) is the roll angle's.
+    assert record["margins"]["rolling"] == pytest.approx(1 / 3, abs=1e-9)
 
 
 def test_no_usable_result_exits_3(tmp_path):

@@ -24,6 +24,7 @@ from rootsopt.export.animation import rolling_contacts, simulation_gif
 from rootsopt.export.drawing import Drawing
 from rootsopt.export.dxf import dxf_bytes
 from rootsopt.export.pieces import Arc, Spline, outline_pieces, polyline
+from rootsopt.families import profile_of
 from rootsopt.model import Model, check_geometry, design_keys, design_vector
 from rootsopt.optimize.problem import Space
 from rootsopt.profiles import CIC, EE, geometry, outline
@@ -172,6 +173,27 @@ def test_dxf_read_back(shape):
     tip = np.max(np.abs(run))
     assert tip == pytest.approx(float(geometry(shape).outer_radius) * 1e3, abs=1e-5)
     assert abs(np.angle(run[np.argmin(np.abs(run - tip))])) < 1e-3
+
+
+OTHERS = {
+    "arcs_epicycloid": [27.0, 8.0, 1.0],
+    "extended_cycloid": [1.3],
+    "free_form": [2.0, 0.7, 0.9, 0.95, 0.8, 0.4, 0.1, -0.3],
+}
+
+
+@pytest.mark.parametrize("family", OTHERS)
+def test_any_family_is_drawn(family, tmp_path):
+    """Arcs with an edge, a curve with a cusp, a free form: DXF and STEP read back, area 1e-6."""
+    shape = profile_of(family, 3, jnp.asarray(R), jnp.asarray(OTHERS[family]))
+    document = ezdxf.read(io.StringIO(dxf_bytes(drawing(shape)).decode()))
+    run, gap = chained(list(read(document)))
+    assert gap < 1e-9
+    assert green(run) == pytest.approx(area_mm2(shape), rel=1e-6)
+    pytest.importorskip("build123d")
+    body = written(solid.rotor(outline_pieces(shape), LENGTH, None, 0.0), tmp_path)
+    assert body.is_valid
+    assert body.volume / LENGTH == pytest.approx(area_mm2(shape), rel=1e-6)
 
 
 @pytest.mark.parametrize("name", ["cic 2, no land", "cic 3", "ee 4"])
