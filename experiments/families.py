@@ -65,7 +65,7 @@ SCENES: dict[str, dict[str, Any]] = {
     "20 N m": {"load": {"torque_N_m": 20.0}},
 }
 """What is changed of the scene in which the designs were found."""
-SEARCH = {"screening": 12, "starts": 2, "iterations": 30, "learning_rate": 0.08}
+SEARCH = {"screening": 24, "starts": 4, "iterations": 40, "learning_rate": 0.06}
 SEARCH_FREE = {"screening": 0, "starts": 1, "iterations": 100, "learning_rate": 0.005}
 QUICK = ("cic", "arc")
 

@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-from rootsopt.plot import BLUE, GREY, ORANGE, VERMILION, figure, plot_flank
+from rootsopt.plot import BLUE, GREY, VERMILION, figure, plot_flank
 
 Row = dict[str, Any]
 _COLUMNS = 4
@@ -125,62 +126,67 @@ def ranking_figure(data: dict[str, Any]) -> Figure:
     """Mean and peak force of each family relative to the reference's, a panel for each housing."""
     studies = by_study(data)
     longest = max(len(rows) for rows in studies.values())
-    made, axes = figure(6.2 * len(studies), 1.6 + 0.36 * longest, 1, len(studies))
+    made, axes = figure(6.2 * len(studies), 2.0 + 0.34 * longest, 1, len(studies))
     for ax, (name, rows) in zip(axes[0], studies.items(), strict=True):
         reference = data["references"][name]
         forces = reference["response"]
         kept = [row for row in rows if not _missing(row)]
-        places = np.arange(len(kept))
-        short = [row["family"].replace("_", " ") for row in kept]
-        labels = [
-            text if row["reached"] else f"{text}\n(area {row['area_efficiency']:.4f})"
-            for text, row in zip(short, kept, strict=True)
-        ]
-        styles = (("mean", BLUE, "o"), ("peak", VERMILION, "^"))
-        for key, color, marker in styles:
-            force = [
-                row[f"{key}_force_N"] / reference["response"][f"{key}_force_N"] for row in kept
-            ]
-            ax.plot(force, places, marker, color=color, ms=7, label=f"{key} force")
-        values = [row["objective"] for row in kept]
-        ax.barh(places, values, color=[ORANGE if r["reached"] else GREY for r in kept], alpha=0.45)
-        ax.barh([0], [0], color=ORANGE, alpha=0.45, label="objective")
-        if any(not row["reached"] for row in kept):
-            ax.barh([0], [0], color=GREY, alpha=0.45, label="objective, with less area efficiency")
-        ax.axvline(1, color="black", lw=0.9, ls=":", label=f"{name}.yaml")
-        ax.set_yticks(places, labels)
+        for place, row in enumerate(kept):
+            shares = [row[key] / forces[key] for key in ("mean_force_N", "peak_force_N")]
+            face = "black" if row["reached"] else "white"
+            ax.plot(shares, [place, place], color="0.8", lw=2, zorder=1)
+            ax.plot(shares[0], place, "o", color=BLUE, ms=7)
+            ax.plot(shares[1], place, "^", color=VERMILION, ms=7)
+            ax.plot(row["objective"], place, "D", color="black", ms=6, markerfacecolor=face)
+        ax.axvline(1, color="black", lw=0.9, ls=":")
+        ax.set_yticks(range(len(kept)), list(map(_panel_name, kept)))
         ax.invert_yaxis()
-        keys = ("mean_force_N", "peak_force_N")
-        low = min(row[key] / forces[key] for row in kept for key in keys)
-        ax.set_xlim(left=max(0.0, np.floor(10 * low - 1) / 10))
         ax.set(xlabel="force / reference's", title=_title(name, reference))
         ax.title.set_size(10)
         ax.grid(axis="x", color="0.9", linewidth=0.6)
         ax.set_axisbelow(True)
-        ax.legend(fontsize=8, frameon=True)
+    lines = (
+        ("o", BLUE, BLUE, "mean force"),
+        ("^", VERMILION, VERMILION, "peak force"),
+        ("D", "black", "black", "objective: mean of both"),
+        ("D", "black", "white", "the same, with less area efficiency than asked"),
+    )
+    handles = [
+        Line2D([], [], marker=marker, color=color, markerfacecolor=face, ls="", label=label)
+        for marker, color, face, label in lines
+    ]
+    handles.append(Line2D([], [], color="black", ls=":", lw=0.9, label="reference"))
+    made.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     return made
 
 
+def _panel_name(row: Row) -> str:
+    name = row["family"].replace("_", " ")
+    return name if row["reached"] else f"{name} (area {row['area_efficiency']:.4f})"
+
+
 def profiles_figure(data: dict[str, Any]) -> Figure:
-    """The flanks that were found: each over that of the best."""
+    """The flanks that were found, each over that of the best in its housing."""
     studies = by_study(data)
     heights = [-(-len(rows) // _COLUMNS) for rows in studies.values()]
-    made, axes = figure(3.1 * _COLUMNS, 3.0 * sum(heights), sum(heights), _COLUMNS)
+    made, axes = figure(3.0 * _COLUMNS, 2.15 * sum(heights) + 0.4, sum(heights), _COLUMNS)
     begin = 0
     for (name, rows), height in zip(studies.items(), heights, strict=True):
         panels = axes[begin : begin + height].ravel()
         begin += height
         best = np.array(rows[0]["outline_mm"])
-        shape = data["references"][name]
+        bore = 2 * data["references"][name]["geometry"]["outer_radius_mm"]
         for ax in panels[len(rows) :]:
             ax.axis("off")
-        for ax, row in zip(panels, rows, strict=False):
-            outline = np.array(row["outline_mm"])
-            text = row["family"].replace("_", " ")
-            ahead = {f"best: {rows[0]['family'].replace('_', ' ')}": best}
-            lobes, radius = row["lobes"], row["pitch_radius_mm"]
-            plot_flank(ax, {text: outline} | (ahead if row is not rows[0] else {}), lobes, radius)
-            bore = 2 * shape["geometry"]["outer_radius_mm"]
-            ax.set_title(f"{text}, bore {bore:.1f} mm", fontsize=9)
-            ax.title.set_size(9)
+        for place, (ax, row) in enumerate(zip(panels, rows, strict=False)):
+            lines = {"family": np.array(row["outline_mm"]), "best": best}
+            plot_flank(ax, lines, row["lobes"], row["pitch_radius_mm"])
+            text = f"{row['family'].replace('_', ' ')}, bore {bore:.1f} mm"
+            ax.set_title(text, fontsize=9)
+            ax.set(xlabel="x (mm)" if place + _COLUMNS >= len(rows) else "")
+            ax.set(ylabel="" if place % _COLUMNS else "y (mm)")
+    lines = (BLUE, "-", "this family"), (VERMILION, (0, (5, 1.5)), "best of this housing")
+    handles = [Line2D([], [], color=color, ls=ls, label=label) for color, ls, label in lines]
+    handles.append(Line2D([], [], color=GREY, ls="--", lw=0.9, label="pitch circle"))
+    made.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return made

@@ -296,6 +296,7 @@ def _limits(key: str) -> tuple[float, float]:
     known = {
         "pressure_angle_deg": (1.0, 80.0),
         "tip_arc_angle_deg": (0.0, 44.0),
+        "ellipse_center_mm": (0.0, 1e6),
         "coefficients": (-1.0, 1.0),
     }
     return known.get(key, (0.0, 180.0) if key.endswith("_deg") else (1e-6, 1e6))
@@ -307,14 +308,26 @@ _DEFAULTS: dict[str, _Pair] = {
     "tip_arc_angle_deg": (0.5, 8.0),
 }
 """Bounds that are the same for every rotor; the others are made for its size."""
+_AROUND = "default: half to one and a half of the config's own"
 _NOTES = {
+    "pressure_angle_deg": "default: 25 to 45",
     "involute_length_mm": "default: 10 % to 100 % of the longest involute",
+    "tip_arc_angle_deg": "default: 0.5 to 8",
+    "arc_center_mm": "default: 0.5 to 0.999 pitch radii",
+    "edge_radius_mm": _AROUND,
+    "tip_arc_radius_mm": "default: 0.05 to 0.8 pitch radii",
+    "tip_arc_turn_deg": "default: 1 to 90",
+    "outer_radius_mm": "default: 1.1 to 1.7 pitch radii",
+    "rolling_radius_mm": _AROUND,
+    "trochoid_ratio": _AROUND,
+    "ellipse_center_mm": "default: 0 to 0.99 pitch radii",
+    "ellipse_height_mm": "default: 0.2 to 1.5 pitch radii",
     "coefficients": "of each of them; default: -1 to 1",
 }
 _BOUNDS: dict[str, Any] = {
     key: (
         _Pair if key in _DEFAULTS else _Pair | None,
-        Field(_DEFAULTS.get(key), description=_NOTES.get(key, "")),
+        Field(_DEFAULTS.get(key), description=_NOTES[key]),
     )
     for key in dict.fromkeys(key for keys in FAMILY_KEYS.values() for key in keys)
 }
