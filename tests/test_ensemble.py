@@ -472,6 +472,7 @@ def test_simulate_an_ensemble(tmp_path):
     assert (tmp_path / "figures" / "force.png").exists()
 
 
+@pytest.mark.long
 def test_experiment(tmp_path):
     """The study runs, and writes its tables and its figure."""
     command = [sys.executable, "experiments/chaos.py", "--quick", "-o", str(tmp_path)]

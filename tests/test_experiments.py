@@ -57,6 +57,7 @@ def is_picture(path: Path):
     return path.read_bytes()[:4] == PNG
 
 
+@pytest.mark.long
 def test_work_precision(tmp_path, programs):
     """Errors fall with the tolerance; a longer smoothing has a greater bias."""
     run("work_precision", tmp_path, programs)
@@ -76,6 +77,7 @@ def test_work_precision(tmp_path, programs):
     assert summary["references"]["cic"]["error"]["mean"] < 1e-7
 
 
+@pytest.mark.long
 def test_speed(tmp_path):
     """The slowest speed is as good as standstill; resonances lie where the harmonics meet them."""
     run("speed", tmp_path, os.environ | {"JAX_PLATFORMS": "cpu"})

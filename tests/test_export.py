@@ -190,6 +190,8 @@ def test_any_family_is_drawn(family, tmp_path):
     run, gap = chained(list(read(document)))
     assert gap < 1e-9
     assert green(run) == pytest.approx(area_mm2(shape), rel=1e-6)
+    if family == "arcs_epicycloid":
+        return  # A solid of arcs is among those below.
     pytest.importorskip("build123d")
     body = written(solid.rotor(outline_pieces(shape), LENGTH, None, 0.0), tmp_path)
     assert body.is_valid

@@ -76,22 +76,27 @@ def test_law_of_gearing_and_inverse(profile):
     """ds/dβ = -r cos ψ and h′ = -lever by differentiation; ν(β) is the inverse of β(ν), with its
     derivatives by the coefficients."""
     nu = jnp.linspace(TIP, float(profile.pitch_normal), 33)[1:-1]
-    one = jnp.ones_like(nu)
-    slope = jax.jvp(profile.contact_distance, (nu,), (one,))[1]
-    psi = profile.addendum(nu).psi
-    np.testing.assert_allclose(slope, -R * jnp.cos(psi) * profile.roll_rate(nu), atol=1e-15)
-    np.testing.assert_allclose(
-        jax.jvp(profile.support, (nu,), (one,))[1], -profile.lever(nu), atol=1e-15
-    )
-    beta = profile.roll_angle(nu)
-    np.testing.assert_allclose(profile.normal_at(beta), nu, atol=1e-13)
+
+    @jax.jit
+    def looked(profile, nu):
+        one = jnp.ones_like(nu)
+        rise, fall = (
+            jax.jvp(f, (nu,), (one,))[1] for f in (profile.contact_distance, profile.support)
+        )
+        law = -R * jnp.cos(profile.addendum(nu).psi) * profile.roll_rate(nu)
+        return rise - law, fall + profile.lever(nu), profile.normal_at(profile.roll_angle(nu))
 
     def there_and_back(shares):
         made = FreeForm(3, R, TIP, shares)
         return made.normal_at(made.roll_angle(nu))
 
+    gearing, support, back = looked(profile, nu)
+    np.testing.assert_allclose(gearing, 0, atol=1e-15)
+    np.testing.assert_allclose(support, 0, atol=1e-15)
+    np.testing.assert_allclose(back, nu, atol=1e-13)
     # Whatever the coefficients: nothing changes.
-    np.testing.assert_allclose(jax.jacfwd(there_and_back)(jnp.asarray(SHARES)), 0, atol=1e-12)
+    slopes = jax.jit(jax.jacfwd(there_and_back))(jnp.asarray(SHARES))
+    np.testing.assert_allclose(slopes, 0, atol=1e-12)
 
 
 def test_pair_touches_and_does_not_overlap(profile, graded_outline):
@@ -218,11 +223,11 @@ def test_profile_command_projects(tmp_path, capsys):
 # Optimised
 
 
+@pytest.mark.long
 def test_gradient_of_the_force_agrees_with_central_differences():
     """Reverse mode, along a direction in all coefficients. With a step of 1e-4 differences of
-    second order are good to some 1e-6 of the greatest slope; jumps of the levers of a contact to
-    first order, which no switch tells, leave 1e-4 in the gradient."""
-    evaluator = Evaluator(free("solver.rtol=1e-10"))
+    second order are good to some 1e-6 of the greatest slope."""
+    evaluator = Evaluator(free("solver.rtol=1e-10", "solver.fidelity=search"))
     design = np.asarray(design_vector(evaluator.config))
     direction = np.random.default_rng(2).normal(size=len(design))
     here = evaluator(jnp.asarray(design), series=False)
@@ -235,7 +240,7 @@ def test_gradient_of_the_force_agrees_with_central_differences():
     for name, slope in here.gradient.items():
         along = np.array(list(slope.values())) @ direction
         wanted = (sides[0][name] - sides[1][name]) / (2 * step)
-        assert along == pytest.approx(wanted, rel=1e-3)
+        assert along == pytest.approx(wanted, rel=1e-4)
 
 
 def test_free_form_is_improved_by_a_search():
@@ -255,6 +260,7 @@ def test_free_form_is_improved_by_a_search():
     check(with_design(settings.profile, list(result.optimized.design.values())))
 
 
+@pytest.mark.long
 def test_single_arc_is_improved_by_a_search():
     """A family of one parameter with margins for constraints: less displacement, less force."""
     settings = scene(

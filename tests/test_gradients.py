@@ -29,7 +29,7 @@ SCENES = {
 CIC = [(36.43, 9.0, 4.0), (36.43, 8.0, 4.0), (30.0, 5.0, 2.0)]
 # Lobes of EE. The deeper of two contacts beside the cusp at the pitch point changes, and the force
 # jumps: without that in the derivative it is 4e-6 off with three lobes, 4e-5 with four.
-EE_LOBES = [2, 3, 4]
+EE_LOBES = [*(pytest.param(n, marks=pytest.mark.long) for n in (2, 3)), 4]
 MEASURES = Measures(np.array([1.0, 2.0]), jnp.asarray(16.0))
 STEP = 2e-5
 """Relative step: differences of order 4 agree from 1e-3 down to 1e-5; orbits have a noise of

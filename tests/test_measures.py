@@ -115,7 +115,9 @@ def test_objective_takes_the_lines_and_the_norm_as_weighted():
 def test_a_line_the_baseline_has_not_got_is_refused():
     config = load("configs/cic.yaml", ["objective.line_weights={0.5: 1, 1: 1}"])
     # Of the same kind as in the test before: nothing is compiled for it.
-    evaluator = Evaluator(load("configs/cic.yaml", ["response.lines=[0.5, 1, 2]"]))
+    evaluator = Evaluator(
+        load("configs/cic.yaml", ["response.lines=[0.5, 1]", "objective.peak_norm=8"])
+    )
     with pytest.raises(InputError, match=r"line_weights.*0\.5.*repeats every 1 mesh periods"):
         Problem.of(config, evaluator.model, evaluator(series=False))
 

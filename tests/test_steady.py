@@ -248,6 +248,7 @@ def test_forward_and_reverse_gradients_agree(settled):
     assert settled["periodic"].gradient
 
 
+@pytest.mark.long
 def test_both_modes_differentiate_the_same_motion(sharp, orbits):
     """On one sequence of steps w·(J v) is (w·J) v to rounding, search contact included.
 

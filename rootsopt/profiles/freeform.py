@@ -17,7 +17,7 @@ _DEGREE = 2
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _STEPS = 8
 """Guarded Newton steps for the normal angle at a roll angle; each at least halves the bracket."""
-_POLISH = 2
+_POLISH = 3
 """Plain Newton steps after these, with as many derivatives."""
 _SAMPLES = 40
 """Places in a knot span at which a free form is fitted."""
