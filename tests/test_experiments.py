@@ -16,6 +16,7 @@ import pytest
 
 from experiments.baselines import Scene
 from experiments.baselines.scipy_nodes import ScipyNodes
+from experiments.families import FORCES
 from experiments.paper_scene import PAPER, Response, config_of, pair_of, polished
 from rootsopt.config import load
 from rootsopt.model import Model, design_vector
@@ -232,3 +233,38 @@ def test_measured(tmp_path, programs):
     assert found["outline"]["interference_um"] == pytest.approx(20, abs=1.5)
     assert found["outline"]["reversed"]
     assert is_picture(tmp_path / "measured.png")
+
+
+@pytest.mark.long
+def test_freeform(tmp_path, programs):
+    """Better than where it began, by the figures of both designs."""
+    run("freeform", tmp_path, programs)
+    designs = json.loads((tmp_path / "freeform.json").read_text())["designs"]
+    assert designs["free form"]["objective"] < designs["best CIC"]["objective"] < 1
+    assert designs["paper"]["objective"] == 1
+    found = load(tmp_path / "freeform.yaml")
+    assert len(found.profile.coefficients) == 12
+    assert is_picture(tmp_path / "freeform.png")
+
+
+@pytest.mark.long
+def test_families(tmp_path, programs):
+    """One housing for all: bore and area efficiency as the reference's, forces and ranks told."""
+    out = run("families", tmp_path, programs)
+    rows = {row["family"]: row for row in rows_of(tmp_path / "families.csv")}
+    assert set(rows) == {"cic", "arc", "free_form"}
+    reference = json.loads((tmp_path / "families.json").read_text())["references"]["cic"]
+    for row in rows.values():
+        shape = reference["geometry"]
+        assert row["status"] == "periodic"
+        assert 0 <= shape["outer_radius_mm"] - float(row["outer_radius_mm"]) <= 1.1e-3
+        if row["reached"] == "true":
+            assert float(row["area_efficiency"]) >= shape["area_efficiency"] - 6e-5
+        forces = (float(row[key]) / reference["response"][key] for key in FORCES)
+        assert float(row["objective"]) == pytest.approx(np.mean(list(forces)), rel=1e-12)
+    # The single arc of this bore is known, and has too small an area efficiency.
+    assert rows["arc"]["reached"] == "false"
+    assert float(rows["arc"]["area_efficiency"]) == pytest.approx(0.43365, abs=2e-5)
+    assert "| 1 | `" in out
+    assert is_picture(tmp_path / "families.png")
+    assert is_picture(tmp_path / "families_profiles.png")
