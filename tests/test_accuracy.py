@@ -67,8 +67,10 @@ def test_root_is_found_to_twelve_digits(name, error_mm):
 gap_of = eqx.filter_jit(lambda pair, roll, relative: pair(roll, relative).gap)
 
 
-@pytest.mark.parametrize("name", ["paper", "short", "epicycloid"])
-@pytest.mark.parametrize("error_mm", [0.0, 0.3])
+@pytest.mark.parametrize(
+    "name", ["paper", pytest.param("short", marks=pytest.mark.long), "epicycloid"]
+)
+@pytest.mark.parametrize("error_mm", [0.0, pytest.param(0.3, marks=pytest.mark.long)])
 def test_gap_is_that_of_nodes_far_out(graded_outline, name, error_mm):
     """Against node search, which knows no flanks: ±20 mrad, wrong centre distance."""
     profile, distance = PROFILES[name], 2 * R + error_mm * 1e-3

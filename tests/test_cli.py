@@ -115,9 +115,9 @@ def test_simulate_ee_and_profile(tmp_path):
 
 
 def test_no_usable_result_exits_3(tmp_path):
-    """Lobes passing through each other: status, exit 3, no numbers."""
+    """Lobes passing through each other, with hardly a gear: status, exit 3, no numbers."""
     text = yaml.safe_load(Path(CIC).read_text())
-    del text["scene"]["timing_gear"]
+    text["scene"]["timing_gear"]["stiffness_N_m_per_rad"] = 1.0
     text["scene"]["load"]["torque_N_m"] = 40.0
     config = tmp_path / "loose.yaml"
     config.write_text(yaml.safe_dump(text))

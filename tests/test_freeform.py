@@ -315,6 +315,7 @@ def _geometry_alone(model, design):
     return dataclasses.replace(made, geometry={"area_efficiency": float(shape.area_efficiency)})
 
 
+@pytest.mark.long
 def test_likeness_finds_the_family_it_came_from(monkeypatch):
     """A projected member of a family resembles that family, in its parameters too."""
     from rootsopt import resemblance

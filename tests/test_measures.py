@@ -153,6 +153,7 @@ class Lagging(RotorPair):
         return super().contact_at(tau, state[:2])
 
 
+@pytest.mark.long
 def test_an_orbit_of_three_states():
     """Closed to 1e-9, with the derivative that differences of orbits give."""
     model = Evaluator(load("configs/cic.yaml", [])).model
