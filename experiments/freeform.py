@@ -19,6 +19,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
+from experiments.families import objective  # noqa: E402
 from rootsopt import files  # noqa: E402
 from rootsopt.config import Config, load  # noqa: E402
 from rootsopt.evaluate import Evaluation, Evaluator  # noqa: E402
@@ -37,12 +38,6 @@ MM, UM = 1e-3, 1e-6
 def profile_of(config: Config, evaluation: Evaluation) -> Profile:
     """The profile of a design that was simulated."""
     return Model.of(config).profile(jnp.asarray(list(evaluation.design.values())))
-
-
-def objective(evaluation: Evaluation, reference: Evaluation) -> float:
-    """Mean of mean and peak force, each relative to the reference's."""
-    keys = "mean_force_N", "peak_force_N"
-    return float(np.mean([evaluation.response[k] / reference.response[k] for k in keys]))
 
 
 def draw(start: Profile, found: Profile) -> Figure:
@@ -120,7 +115,7 @@ def main() -> int:
     designs = {"paper": paper, "best CIC": result.baseline, "free form": result.optimized}
     data = {
         "designs": {
-            name: {"objective": objective(one, paper), **one.response, **one.geometry}
+            name: {"objective": objective(one, paper.response), **one.response, **one.geometry}
             for name, one in designs.items()
         },
         "evaluations": len(result.history),

@@ -15,6 +15,7 @@ from rootsopt.config import load, parse
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.nodes import pair_gap
 from rootsopt.errors import InputError
+from rootsopt.families import free_form_of
 from rootsopt.model import Model, check_geometry, design_vector
 from rootsopt.optimize.search import Search
 from rootsopt.outline.conjugacy import conjugacy
@@ -283,6 +284,8 @@ def test_config_keys(tmp_path):
             load(tmp_path / "scene.yaml", [change])
     with pytest.raises(InputError, match=r"must be a file that can be read"):
         check_geometry(load(tmp_path / "scene.yaml", ["profile.outline_file=none.csv"]))
+    with pytest.raises(InputError, match=r"must be that of a design to be projected"):
+        free_form_of(config.profile, 12)
     with pytest.raises(InputError, match=r"to be optimised, but is outline"):
         Search(config)
 

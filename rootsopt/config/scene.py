@@ -102,19 +102,19 @@ class ProfileConfig(Section):
         "pitch circle, 3 to 64 numbers up to 1 (arc about a pitch point); 0: involute, down to -1",
     )
 
-    @model_validator(mode="before")
-    @classmethod
-    def _list(cls, data):
-        if isinstance(data, dict) and isinstance(given := data.get("coefficients"), list):
-            return data | {"coefficients": tuple(given)}
-        return data
-
     outline_file: str | None = Field(
         None, description="outline: CSV or DXF file, relative to the config's folder"
     )
     outline_smoothing_mm: NonNegative | None = Field(
         None, description="outline: scatter (RMS) of measured points; absent: 0, through them"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _list(cls, data):
+        if isinstance(data, dict) and isinstance(given := data.get("coefficients"), list):
+            return data | {"coefficients": tuple(given)}
+        return data
 
     @model_validator(mode="after")
     def _from_file(self):
