@@ -301,7 +301,9 @@ def references():
 REACH = {"cic": (2e-4, 1e-3, 1e-3), "ee": (1e-5, 1e-4, 2e-4)}
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize(
+    "scene", ["cic search", "cic map", pytest.param("ee map", marks=pytest.mark.long)]
+)
 def test_motion_and_force_are_those_of_an_independent_integration(scene, references):
     """From ε = 0 the stroboscopic states, then mean, RMS and peak force, match SciPy's."""
     pair, _ = pair_of(*SCENES[scene])

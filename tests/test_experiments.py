@@ -146,6 +146,7 @@ def test_benchmark(tmp_path, programs):
     assert is_picture(tmp_path / "benchmark.png")
 
 
+@pytest.mark.long
 def test_parts(tmp_path, programs):
     """Every part costs something, and the smallest scene least."""
     run("parts", tmp_path, programs)

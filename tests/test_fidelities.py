@@ -192,7 +192,9 @@ def special_poses(profile, rng):
     return jnp.stack(design), jnp.asarray(rolls), jnp.asarray(np.concatenate(depths))
 
 
-@every_fidelity
+@pytest.mark.parametrize(
+    "build", [LinearContact.of, pytest.param(nodes_100, marks=pytest.mark.long)]
+)
 def test_derivatives_are_finite_and_equal_in_both_modes(build):
     """In pose and design, inside contact and outside it, with c < r, c = r and c > r."""
     rng = np.random.default_rng(3)

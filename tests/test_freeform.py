@@ -243,6 +243,7 @@ def test_gradient_of_the_force_agrees_with_central_differences():
         assert along == pytest.approx(wanted, rel=1e-4)
 
 
+@pytest.mark.long
 def test_free_form_is_improved_by_a_search():
     """Some steps of descent: better than the baseline within the constraints, and still sound."""
     settings = free(
@@ -260,7 +261,6 @@ def test_free_form_is_improved_by_a_search():
     check(with_design(settings.profile, list(result.optimized.design.values())))
 
 
-@pytest.mark.long
 def test_single_arc_is_improved_by_a_search():
     """A family of one parameter with margins for constraints: less displacement, less force."""
     settings = scene(

@@ -67,6 +67,7 @@ def test_p_norm_tends_to_the_peak_as_stated():
     assert bias[-1] < 0.3 * bias[0]
 
 
+@pytest.mark.long
 def test_what_is_not_asked_for_is_not_computed():
     """No lines, no norm: no quadrature for them in the program."""
     plain, more = (
