@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from rootsopt.config import FAMILY_KEYS, Config
-from rootsopt.families import CLASSICAL
 from rootsopt.model import MM, Model, design_keys, design_vector
 from rootsopt.optimize.bounds import around
 from rootsopt.optimize.problem import Problem, Space, sobol
@@ -139,6 +138,3 @@ def _extreme(problem: Problem, start, sign: float) -> NDArray[np.float64]:
     )
     finite = np.all(np.isfinite(found.x))
     return problem.project(found.x) if finite else np.asarray(start)
-
-
-__all__ = ["BAND_MM", "CLASSICAL", "Reach", "changed", "in_housing", "of_family", "reach"]
