@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: optimize test test-all lint clean
+.PHONY: optimize test test-all fuzz mutants lint clean
 
 optimize: $(VENV)/.run
 	$(BIN)/python -m rootsopt.optimize configs/cic.yaml -o results/cic
@@ -13,6 +13,14 @@ test: $(VENV)/.dev
 
 test-all: $(VENV)/.dev
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+# Random configs, outline files and kills against the commands (about an hour).
+fuzz: $(VENV)/.dev
+	$(BIN)/python -m tests.fuzz
+
+# Mistakes put in on purpose, each to be noticed by a test (hours).
+mutants: $(VENV)/.dev
+	$(BIN)/python -m tests.mutants
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

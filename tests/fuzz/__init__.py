@@ -1,0 +1,1 @@
+"""Fuzzing of the commands: configs, outline files, kills; run by `make fuzz`."""
