@@ -1,8 +1,9 @@
 """Many designs at once: one compiled program over a batch.
 
 The same steps as `evaluate.Evaluator` (settle, close the orbit, differentiate), without
-its second attempts, and with orbits closed to a tenth of the tolerance: a design that
-needs more is reported as not settled, and can be given to an `Evaluator`.
+its second attempts and without the check of the derivatives on halved steps, and with orbits closed
+to a tenth of the tolerance: a design that needs more is reported as not settled or inaccurate, and
+can be given to an `Evaluator`.
 """
 
 import os
@@ -43,6 +44,7 @@ STATUSES = (
     Status.TOO_DEEP,
     Status.IDLE,
     Status.UNRESOLVED,
+    Status.INACCURATE,
 )
 
 
@@ -101,7 +103,8 @@ def respond(
     enough = 0.1 * orbit.rtol
     # Nothing is there to be closed where the transient has not settled.
     shots = jnp.where(settled.period > 0, _SHOTS, 0)
-    closed = close_orbit(pair, tangents, settled.state, period, orbit, None, SAMPLES, shots, enough)
+    settings = orbit, None, SAMPLES, shots, enough, False
+    closed = close_orbit(pair, tangents, settled.state, period, *settings)
     ran = settled.period > 0
     forces, slopes = (jnp.all(jnp.isfinite(x)) for x in (closed.response, closed.sensitivity))
     rtols = transient.tolerance(state.dtype), orbit.tolerance(state.dtype)
@@ -121,6 +124,7 @@ def respond(
         (~slopes, Status.NON_FINITE),
         (closed.flow.depth > TOO_DEEP * model.pitch_radius, Status.TOO_DEEP),
         ((found.rounding > UNRESOLVED) | ~found.consistent, Status.UNRESOLVED),
+        (~found.certain, Status.INACCURATE),
     )
     conditions, names = zip(*outcomes, strict=True)
     status = jnp.select(conditions, [STATUSES.index(name) for name in names], 0)

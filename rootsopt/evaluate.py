@@ -366,6 +366,8 @@ class Evaluator:
             statistics |= {
                 "newton_steps": int(orbit.newton_steps),
                 "orbit_steps": int(orbit.flow.steps),
+                "orbit_defect": float(orbit.defect),
+                "gradient_disagreement": float(orbit.disagreement),
             }
             series = _orbit_series(pair, orbit, period) if with_series else None
             found = outcome.found
@@ -375,6 +377,8 @@ class Evaluator:
                 status = Status.TOO_DEEP
             elif found.rounding > UNRESOLVED or not found.consistent:
                 status = Status.UNRESOLVED
+            elif not found.certain:
+                status = Status.INACCURATE
         elif status is Status.NOT_SETTLED and not self.survey:
             window = lyapunov_program(pair, outcome.transient.state, CHAOS_WINDOW, self.transient)
             status, steady, response, series = unsettled(pair, window, with_series)

@@ -276,7 +276,9 @@ class Model(eqx.Module):
             friction=self.friction,
             supports=supports,
             both=self.both,
-            pace=Pace.of(self.law, gear, supports, inertia, force, self.pitch_radius),
+            pace=Pace.of(
+                self.law, gear, supports, inertia, force, self.pitch_radius, self.clearance
+            ),
         )
         if self.precision == "float32":
             # Built in double precision; single only where it is integrated.

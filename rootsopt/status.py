@@ -36,6 +36,11 @@ class Status(enum.Enum):
         "(mean, RMS and peak contradict each other). Set solver.precision to float64, or tighten "
         "solver.rtol."
     )
+    INACCURATE = (
+        "The orbit is closed, but with the solver's steps halved it or its derivatives are others: "
+        "they are not known well enough to be reported. Tighten solver.rtol, or raise "
+        "contact.smoothing_mm."
+    )
     IDLE = (
         "No flank touches: the pair rests anywhere within its play, without contact force and "
         "without a gradient. Raise scene.load.torque_N_m."

@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.jump import MARKS, marks, saltation
+from rootsopt.dynamics.landing import LandingControl
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, Steps, locate_peak, one_sided
@@ -74,7 +75,7 @@ class Integrator(eqx.Module):
         dtype: Any,
         periods: Float[Array, ""] | float = 1.0,
         pair: RotorPair | None = None,
-    ) -> diffrax.PIDController:
+    ) -> "diffrax.PIDController | LandingControl":
         """Step size control of states of type `dtype` over an interval of `periods`, for `pair`
         if that is known."""
         rtol = self.tolerance(dtype)
@@ -83,7 +84,10 @@ class Integrator(eqx.Module):
             fall = pair.pace.fall / pair.mesh_period
             flying = jnp.maximum(_LONGEST[1] * fall, _LONGEST[2] / self.max_steps)
             longest = jnp.minimum(longest, flying).astype(dtype)
-        return diffrax.PIDController(rtol=rtol, atol=rtol, dtmax=longest / periods)
+        base = diffrax.PIDController(rtol=rtol, atol=rtol, dtmax=longest / periods)
+        if pair is None or pair.pace is None:
+            return base
+        return LandingControl.of(base, pair, periods)
 
 
 def first_step(pair: RotorPair, dtype: Any) -> Float[Array, ""]:
@@ -169,7 +173,7 @@ class StepGrid(diffrax.AbstractAdaptiveStepSizeController):
     the last), used where `repeat` is true.
     """
 
-    pid: diffrax.PIDController
+    pid: diffrax.PIDController | LandingControl
     ends: Float[Array, " steps"]
     repeat: Bool[Array, ""]
 

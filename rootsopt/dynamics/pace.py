@@ -15,10 +15,13 @@ class Pace(eqx.Module):
     `swing`: in which the phase of rotor 2's swing on flank and timing gear, or that of a rotor on
     its supports, advances by one radian; `fall`: from one end of the gear's play to the other under
     the load, infinite where the play is less than the static penetration and the pair never flies.
+    `free`: |ε| (rad) below which the clearance keeps the flanks apart at the nominal centre
+    distance.
     """
 
     swing: Float[Array, ""]
     fall: Float[Array, ""]
+    free: Float[Array, ""]
 
     @classmethod
     def of(
@@ -29,6 +32,7 @@ class Pace(eqx.Module):
         inertia: Float[Array, ""],
         force: Float[Array, ""],
         radius: Float[Array, ""],
+        clearance: Float[Array, ""],
     ) -> "Pace":
         """Pace of a pair whose flanks carry the static `force` (N) at the pitch `radius` (m).
 
@@ -48,5 +52,7 @@ class Pace(eqx.Module):
         swing = jnp.sqrt(inertia / stiffness)
         if supports is not None:
             swing = jnp.minimum(swing, jnp.sqrt(supports.mass / supports.stiffness))
-        found = cls(swing, jnp.where(flies, fall, jnp.inf))
+        # No lever is longer than the pitch radius.
+        free = jnp.maximum(clearance, 0.0) / radius
+        found = cls(swing, jnp.where(flies, fall, jnp.inf), free)
         return lax.stop_gradient(found)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.flow import Flow, Integrator, flow, strobe
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.switches import with_switches
+from rootsopt.dynamics.switches import halved, with_switches
 
 BLOCK = 4
 """Mesh periods integrated between two looks at the transient."""
@@ -29,7 +29,7 @@ _MEMORY = 20
 SAMPLES = 2520
 """Uniform samples of an orbit; divisible by every period up to ten, so that a sample
 falls on the end of each mesh period."""
-_NEWTON_STEPS = 12
+_NEWTON_STEPS = 24
 _CLOSED = 4000, 1e-3, 1e-10
 """Residual (scaled) at which Newton stops: in roundings (1e-12 in double precision), or in
 tolerances of the motion up to a limit."""
@@ -38,17 +38,24 @@ _PATIENCE = 32, 1e-5
 at most: their noise hides that the motion repeats."""
 NOISE = 100.0
 """Noise that adaptive steps give the stroboscopic states, in tolerances and relative to them."""
-_LOOKS = 3
+_KEPT = 4
+"""Integrations after which the steps are kept in any case."""
+_LOOKS = 6
 """Times that kinks are looked for while an orbit is closed, at most."""
-_DRIFT = 1e-9, 1e-5
-"""Distance (scaled) that an orbit may have moved from where its kinks were looked for: a thousand
-times its tolerance, but within these. The kinks lie that far outside their steps, which costs
+_DRIFT = 30.0, 1e-9, 1e-6
+"""Distance (scaled) that an orbit may have moved from where its kinks were looked for, in
+tolerances, but within these limits. The kinks lie that far outside their steps, which costs
 accuracy in first order."""
 _STRAIN = 10.0
 """Error of a repeated step, in tolerances, with which the steps are chosen anew."""
 _AFTER = 3
 """Integrations that must be left for looking at kinks again, or choosing steps anew: an orbit that
 is closed is not given away."""
+_AGREE = 10.0, 1e-3, 3e-2
+"""Disagreement of the derivatives on a grid and on one with its steps halved that is accepted: in
+square roots of the tolerance, but within these limits."""
+_SINGLE = 10.0
+"""The same limit in single precision, in units of that in double."""
 _SMALL = 1e-9, 1e-3
 """Newton step (scaled) from which on the solver's steps are kept: a thousand times its
 tolerance, but within these."""
@@ -80,7 +87,9 @@ class Orbit(NamedTuple):
     `state` at φ1 = 0; `flow` over the orbit; `residual` |Φ(z) - z| in scaled units;
     `monodromy` dΦ/dz and `multiplier`, the greatest modulus of its eigenvalues; `response`:
     (mean, mean square, peak, other measures); `sensitivity` (r, d): their derivatives along the
-    orbit family with respect to the design; `newton_steps`.
+    orbit family with respect to the design; `newton_steps`. `drift`: distance (scaled) from where
+    the kinks were looked for. `defect`: residual on a grid with every step halved, and
+    `disagreement` of the derivatives on both, relative to the greatest; 0 where there was no check.
     """
 
     state: Float[Array, " n"]
@@ -91,6 +100,9 @@ class Orbit(NamedTuple):
     response: Float[Array, " r"]
     sensitivity: Float[Array, "r d"]
     newton_steps: Int[Array, ""]
+    drift: Float[Array, ""]
+    defect: Float[Array, ""]
+    disagreement: Float[Array, ""]
 
     @classmethod
     def empty(cls, state: Float[Array, " n"], directions: int, flow: Flow) -> "Orbit":
@@ -107,7 +119,34 @@ class Orbit(NamedTuple):
             response=flow.response,
             sensitivity=jnp.zeros((flow.response.shape[0], directions), dtype),
             newton_steps=jnp.zeros((), int),
+            drift=jnp.zeros((), dtype),
+            defect=jnp.zeros((), dtype),
+            disagreement=jnp.zeros((), dtype),
         )
+
+
+class _Closing(NamedTuple):
+    """An orbit that is being closed.
+
+    `state` and `grid` of the next integration, whose steps are kept if `repeat`; `held`: whether
+    those of the last one were; `improving`: whether it came closer; `base`: the steps without those
+    made for kinks; `best` residual on this grid; kinks were looked for `looks` times, last along
+    the orbit from `looked`; `refined`: times the steps were halved because derivatives disagreed;
+    `checked`: whether the derivatives were compared.
+    """
+
+    orbit: Orbit
+    state: Float[Array, " n"]
+    repeat: Bool[Array, ""]
+    held: Bool[Array, ""]
+    improving: Bool[Array, ""]
+    base: Float[Array, " steps"]
+    grid: Float[Array, " steps"]
+    best: Float[Array, ""]
+    looks: Int[Array, ""]
+    looked: Float[Array, " n"]
+    refined: Int[Array, ""]
+    checked: Bool[Array, ""]
 
 
 def settled_within(rtol: Float[Array, ""]) -> Float[Array, ""]:
@@ -201,6 +240,7 @@ def close_orbit(
     samples: int = SAMPLES,
     shots: Int[Array, ""] | int = _NEWTON_STEPS,
     closed: Float[Array, ""] | float = 0.0,
+    check: bool = True,
 ) -> Orbit:
     """Newton shooting on Φ(z) = z, then the implicit function theorem for gradients.
 
@@ -209,17 +249,21 @@ def close_orbit(
     `closed` (at least some thousand roundings and a thousandth of the tolerance). Once its steps
     are small those of the solver are kept, with ends added where the equation is not smooth: so
     the map it solves is smooth and closes to rounding, and its derivative is as accurate as the
-    motion.
+    motion. With `check`, orbit and derivatives are compared with those on a grid with every step
+    halved; where they disagree the orbit is closed once more, on that one.
     """
     count, dtype = state.shape[0], state.dtype
+    tolerance = how.tolerance(dtype)
     roundings, tolerances, most = _CLOSED
-    enough = jnp.minimum(tolerances * how.tolerance(dtype), most)
+    enough = jnp.minimum(tolerances * tolerance, most)
     enough = jnp.maximum(roundings * float(jnp.finfo(dtype).eps), enough)
     closed = jnp.maximum(closed, enough).astype(dtype)
-    far = jnp.clip(1000 * how.tolerance(dtype), *_DRIFT)
+    far = jnp.clip(_DRIFT[0] * tolerance, *_DRIFT[1:])
     length = period.astype(dtype)
     measures = Measures() if measures is None else measures
     frozen = lax.stop_gradient(pair)
+    # A contact that may jump anywhere has derivatives of the steps, not of the motion.
+    check = check and pair.smooth
 
     def shoot(state, grid, repeat, peak):
         top = jnp.where(peak > 0, peak, frozen.force_scale)
@@ -227,17 +271,23 @@ def close_orbit(
             pair, state, length, how, samples, tangents, grid, repeat, measures=measures, top=top
         )
 
-    def go_on(carry):
-        orbit, _, _, repeated, improving, *_ = carry
-        open_still = (orbit.residual > closed) & ((orbit.newton_steps < 3) | improving)
+    def is_open(now):
+        done = now.orbit.newton_steps
+        left = (now.orbit.residual > closed) & ((done < 3) | now.improving)
         # Chosen anew, the steps depend on the state, and that leaves a floor.
-        return (open_still | ~repeated) & (orbit.newton_steps < shots)
+        return (left | ~now.held) & (done < shots + now.refined * shots // 2)
 
-    def step(carry):
-        orbit, state, repeat, _, _, grid, best, looks, looked = carry
-        out = shoot(state, grid, repeat, orbit.flow.peak)
+    def go_on(now):
+        sound = now.held & now.orbit.flow.solved & jnp.isfinite(now.orbit.residual)
+        return is_open(now) | (sound & ~now.checked & check)
+
+    def step(now):
+        checking = ~is_open(now)
+        start = jnp.where(checking, now.orbit.state, now.state)
+        grid = lax.cond(checking, lambda: halved(now.orbit.flow.grid), lambda: now.grid)
+        out = shoot(start, grid, now.repeat | checking, now.orbit.flow.peak)
         monodromy = out.slope[:count, :count]
-        miss = out.end - state
+        miss = out.end - start
         residual = jnp.max(jnp.abs(miss))
         correction = solved(jnp.eye(count, dtype=dtype) - monodromy, miss[:, None])[:, 0]
         # A pair that floats stays where the transient led to: any place is as good.
@@ -245,44 +295,79 @@ def close_orbit(
         correction = jnp.where(floats, 0.0, correction)
         size = jnp.max(jnp.abs(correction))
         # Keep the first steps inside the neighbourhood the transient pointed to.
-        new = state + correction * jnp.minimum(1.0, 0.5 / jnp.maximum(size, 1e-30))
-        done = orbit.newton_steps + 1
-        known = size < jnp.clip(1000 * how.tolerance(dtype), *_SMALL)
-        following = repeat | known | (done >= shots // 3)
-        improving = residual < 0.5 * best
+        new = start + correction * jnp.minimum(1.0, 0.5 / jnp.maximum(size, 1e-30))
+        done = now.orbit.newton_steps + 1
+        known = size < jnp.clip(1000 * tolerance, *_SMALL)
+        following = now.repeat | known | (done >= jnp.minimum(shots // 3, _KEPT))
+        improving = residual < 0.5 * now.best
         # Kinks are looked for again where the motion has moved them out of their steps.
-        stalled = repeat & ~improving & (residual > closed) & (looks < _LOOKS)
-        drift = jnp.max(jnp.abs(state - looked))
-        again = repeat & (residual <= closed) & (looks < _LOOKS) & (done + _AFTER <= shots)
+        few = now.looks < _LOOKS
+        stalled = now.repeat & ~improving & (residual > closed) & few
+        drift = jnp.max(jnp.abs(start - now.looked))
+        again = now.repeat & (residual <= closed) & few & (done + _AFTER <= shots)
         # A jump that no switch tells stays where the steps have it.
         strayed = again & (drift > far) & pair.smooth
         strained = again & ~(out.strain <= _STRAIN)
         # Steps of a solver that did not get through are none to be repeated.
-        following &= ~strained & (out.solved | repeat | ~jnp.all(jnp.isfinite(state)))
-        look = following & (~repeat | stalled | strayed)
-        orbit = orbit._replace(
-            state=state, flow=out, residual=residual, monodromy=monodromy, newton_steps=done
+        following &= ~strained & (out.solved | now.repeat | ~jnp.all(jnp.isfinite(start)))
+        look = following & (~now.repeat | stalled | strayed)
+
+        found = now.orbit._replace(
+            state=start,
+            flow=out,
+            residual=residual,
+            monodromy=monodromy,
+            newton_steps=done,
+            drift=drift,
         )
+        apart = disagreement(now.orbit.flow.slope, out.slope, count)
+        compared = now.orbit._replace(defect=residual, disagreement=apart)
+        orbit = _choose(checking, compared, found)
+        finer = checking & (apart > agreement(tolerance)) & (now.refined < 1)
+        base = jnp.where(now.repeat, now.base, out.grid)
+        base = lax.cond(finer, lambda: halved(base), lambda: base)
         grid = lax.cond(
-            look,
-            lambda: with_switches(frozen, out, length, how.tolerance(dtype)),
-            lambda: out.grid,
+            jnp.where(checking, finer, look),
+            lambda: with_switches(frozen, out, length, tolerance, base),
+            lambda: jnp.where(now.repeat, now.grid, out.grid),
         )
+        renewed = jnp.where(checking, finer, look)
         # Residuals compare on the same steps only.
-        best = jnp.where(look | ~repeat, jnp.inf, jnp.minimum(best, residual))
-        looks += look
-        looked = jnp.where(look, state, looked)
-        held = repeat & ~strayed & ~strained
-        return orbit, new, following, held, improving | look, grid, best, looks, looked
+        best = jnp.where(renewed | ~now.repeat, jnp.inf, jnp.minimum(now.best, residual))
+        return _Closing(
+            orbit=orbit,
+            state=new,
+            repeat=following | checking,
+            held=jnp.where(checking, ~finer, now.repeat & ~strayed & ~strained),
+            improving=improving | renewed,
+            base=base,
+            grid=grid,
+            best=best,
+            looks=now.looks + renewed,
+            looked=jnp.where(renewed, start, now.looked),
+            refined=now.refined + finer,
+            checked=checking & ~finer,
+        )
 
     # The loop holds the only copy of the integration: one shot is compiled, not two.
-    infinite = jnp.asarray(jnp.inf, dtype)
     designs = jax.tree.leaves(eqx.filter(tangents, eqx.is_inexact_array))[0].shape[0]
     none = Flow.empty(count, designs, samples, how.max_steps, measures, dtype)
-    first = Orbit.empty(state, designs, none)
-    no = jnp.zeros((), bool)
-    start = (first, state, no, no, no, none.grid, infinite, jnp.zeros((), int), state)
-    orbit = lax.while_loop(go_on, step, start)[0]
+    no, zero = jnp.zeros((), bool), jnp.zeros((), int)
+    start = _Closing(
+        orbit=Orbit.empty(state, designs, none),
+        state=state,
+        repeat=no,
+        held=no,
+        improving=no,
+        base=none.grid,
+        grid=none.grid,
+        best=jnp.asarray(jnp.inf, dtype),
+        looks=zero,
+        looked=state,
+        refined=zero,
+        checked=no,
+    )
+    orbit = lax.while_loop(go_on, step, start).orbit
     slope = orbit.flow.slope
     moved = solved(jnp.eye(count, dtype=dtype) - orbit.monodromy, slope[:count, count:])
     sensitivity = slope[count:, count:] + slope[count:, :count] @ moved
@@ -291,6 +376,42 @@ def close_orbit(
         response=orbit.flow.response,
         sensitivity=sensitivity,
     )
+
+
+def _choose(condition, new, old):
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
+
+
+def agreement(tolerance: Float[Array, ""]) -> Float[Array, ""]:
+    """Largest `disagreement` with which derivatives of an orbit at a relative `tolerance` are
+    reported."""
+    scale, least, most = _AGREE
+    limit = jnp.clip(scale * jnp.sqrt(tolerance), least, most)
+    return limit * (1.0 if limit.dtype == jnp.float64 else _SINGLE)
+
+
+def disagreement(
+    first: Float[Array, "rows columns"], second: Float[Array, "rows columns"], count: int
+) -> Float[Array, ""]:
+    """Largest difference of two estimates of an orbit's derivatives, each kind relative to its
+    greatest: (I - M)⁻¹, and those of the state and of mean and mean square force with respect to
+    the design. `first` and `second`: `Flow.slope` of `count` states on two grids.
+    """
+
+    def derivatives(slope):
+        unit = jnp.eye(count, dtype=slope.dtype)
+        right = jnp.concatenate([unit, slope[:count, count:]], axis=1)
+        moved = solved(unit - slope[:count, :count], right)
+        forces = slope[count : count + 2]
+        along = forces[:, count:] + forces[:, :count] @ moved[:, count:]
+        return [moved[:, :count], moved[:, count:], *along]
+
+    def apart(one, other):
+        size = jnp.max(jnp.abs(one), initial=0.0)
+        return jnp.max(jnp.abs(one - other), initial=0.0) / jnp.where(size > 0, size, 1.0)
+
+    pairs = zip(derivatives(first), derivatives(second), strict=True)
+    return jnp.max(jnp.stack([apart(one, other) for one, other in pairs]))
 
 
 def reverse_sensitivity(

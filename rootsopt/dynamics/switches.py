@@ -28,17 +28,26 @@ _ASIDE = 1e-9, 1e-6
 """Half a step (mesh periods) that holds a change: so many times the tolerance of the motion as
 `_LOOSE`, but within these. What it does to the gradients is in proportion to it."""
 _LOOSE = 1e3
-_SHARE = 1e-2
-"""The same as a share of the time to the next change, at most."""
+_SHARE = 1e-4
+"""The same as a share of the time to the next change, at most: beside a change of curvature in a
+rounding layer the error of the gradients is in proportion to the square of this share."""
+_GRADES = 8.0, 64.0
+"""Further ends beside a change, in units of that half step: a change that lies a little outside its
+step is still in a short one."""
 _APART = 1e-10
 """Ends of steps closer than this (mesh periods) are one."""
 
 
 def with_switches(
-    pair: RotorPair, out: Flow, periods: Float[Array, ""], tolerance: Float[Array, ""]
+    pair: RotorPair,
+    out: Flow,
+    periods: Float[Array, ""],
+    tolerance: Float[Array, ""],
+    base: Float[Array, " steps"] | None = None,
 ) -> Float[Array, " steps"]:
-    """The grid of `out`, integrated over `periods` mesh periods at a relative `tolerance`, with
-    steps that end where the equation changes from one smooth piece to another."""
+    """The grid `base` (default: that of `out`) with steps that end where the equation changes from
+    one smooth piece to another along `out`, integrated over `periods` mesh periods at a relative
+    `tolerance`."""
     width = periods / out.states.shape[0]
     before = jnp.concatenate([out.states[:1], out.corners[:-1]])
     begins = jnp.concatenate([jnp.zeros_like(out.grid[:1]), out.grid[:-1]])
@@ -99,9 +108,21 @@ def with_switches(
     # rounding would decide on which side.
     apart = jnp.minimum(brief, jnp.diff(found, prepend=-jnp.inf))
     aside = jnp.minimum(jnp.clip(_LOOSE * tolerance, *_ASIDE), _SHARE * apart)
-    added = [found - aside, found + aside, inside.ravel()]
-    merged = jnp.sort(jnp.concatenate([out.grid, *added]))
+    beside = [sign * grade * aside for grade in (1.0, *_GRADES) for sign in (-1, 1)]
+    added = [*(found + apart for apart in beside), inside.ravel()]
+    merged = jnp.sort(jnp.concatenate([out.grid if base is None else base, *added]))
     # Nearly equal ends would make steps of no length.
     close = jnp.diff(merged, prepend=-jnp.inf) < _APART
     close |= ~((merged > 0) & (merged <= periods))
     return jnp.sort(jnp.where(close, jnp.inf, merged))[: out.grid.shape[0]]
+
+
+def halved(grid: Float[Array, " steps"]) -> Float[Array, " steps"]:
+    """The grid with its steps divided in two; where there is no room for all, the longest."""
+    begins = jnp.concatenate([jnp.zeros_like(grid[:1]), grid[:-1]])
+    taken = grid < jnp.inf
+    lengths = jnp.where(taken, grid - jnp.where(taken, begins, 0.0), 0.0)
+    rank = jnp.argsort(jnp.argsort(-lengths))
+    chosen = (rank < grid.shape[0] - jnp.sum(taken)) & (lengths > 2 * _APART)
+    middles = jnp.where(chosen, begins + lengths / 2, jnp.inf)
+    return jnp.sort(jnp.concatenate([grid, middles]))[: grid.shape[0]]

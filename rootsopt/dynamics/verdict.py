@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rootsopt.contact.impact import force_rounding
-from rootsopt.dynamics.steady import NOISE, Orbit, solved
+from rootsopt.dynamics.steady import NOISE, Orbit, agreement, solved
 
 RESIDUAL = {"float64": 1e-9, "float32": 1e-3}
 """Largest residual (scaled) of an orbit that counts as closed, by precision."""
@@ -21,18 +21,25 @@ _UNKNOWN = 0.1
 """Error of an orbit (scaled) beyond which nothing is known of it."""
 _FREE = 1e-6
 """Distance of a Floquet multiplier from 1 that is none."""
+_DEFECT = 1e3
+"""Residual of an orbit on halved steps, in tolerances and relative to the greatest entry of its
+monodromy matrix, with which it is no result."""
+_DRIFT = 1e3, 1e-5
+"""Distance (scaled) from where kinks were looked for, in tolerances but at least the second, beyond
+which the derivatives of an orbit are not known: some kinks lie inside long steps."""
 _STRAINED = 100.0
 """Error of a repeated step, in tolerances, with which an orbit on these steps is none."""
 
 
 class Verdict(NamedTuple):
     """What there is to say of a closed orbit: `is_idle`, `judged` steady, relative error
-    by `force_rounding` of the greatest force, `is_consistent`."""
+    by `force_rounding` of the greatest force, `is_consistent`, `is_certain`."""
 
     idle: Bool[Array, ""]
     steady: Bool[Array, ""]
     rounding: Float[Array, ""]
     consistent: Bool[Array, ""]
+    certain: Bool[Array, ""]
 
 
 def verdict(
@@ -52,6 +59,7 @@ def verdict(
         steady=judged(orbit, state, within, rtols, residual),
         rounding=jnp.where(orbit.flow.peak > 0, rounding, 0.0),
         consistent=is_consistent(orbit, 10 * rtols[1] * force),
+        certain=is_certain(orbit, jnp.asarray(rtols[1])),
     )
 
 
@@ -101,3 +109,16 @@ def is_consistent(orbit: Orbit, least: Float[Array, ""]) -> Bool[Array, ""]:
     mean, square, peak = orbit.response[:3]
     ordered = (square + least**2 >= 0.98 * mean**2) & (peak**2 + least**2 >= 0.98 * square)
     return ordered & (mean >= -least)
+
+
+def is_certain(orbit: Orbit, rtol: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether the derivatives of an orbit integrated at `rtol` hold what they promise: on halved
+    steps the orbit closes as the tolerance says and the derivatives agree, and its kinks lie where
+    they were looked for."""
+    size = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.state)))
+    gain = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.monodromy)))
+    closes = orbit.defect <= _DEFECT * rtol * size * gain
+    agree = orbit.disagreement <= agreement(rtol.astype(orbit.state.dtype))
+    tolerances, least = _DRIFT
+    near = orbit.drift <= jnp.maximum(tolerances * rtol, least) * size
+    return closes & agree & near
