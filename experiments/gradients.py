@@ -287,7 +287,7 @@ def figure(folder: Path, rows: list[dict[str, Any]]) -> None:
 
 def main() -> int:
     """Run or draw."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Errors of gradients")
     parser.add_argument("-o", "--output", type=Path, default=Path("results/gradients"))
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)

@@ -87,7 +87,7 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         step = self.unit * (t1 - t0)
         before, after = y0[:2], y1_candidate[:2]
         away, late = self._passed(before, after, step)
-        again = keep & (late > _LATE * _BEYOND) & (step > 2 * late)
+        again = keep & (late > _LATE * _BEYOND)
         # To the edge by the secant, and a little beyond.
         shorter = jnp.maximum(step - late, 0.0) + _BEYOND
         most = jnp.where(away, _AFTER * _BEYOND, self._ahead(before, after, step))
