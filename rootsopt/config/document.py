@@ -19,7 +19,7 @@ from rootsopt.errors import InputError
 
 MOST_BYTES = 128 * 1024
 """Largest text; a config has some 2000 bytes."""
-_MOST_NODES = 10_000
+_MOST_NODES = 5000
 """Most keys, values, lists and sections, with everything that aliases stand for."""
 _DEEPEST = 32
 """Most sections and lists inside each other."""

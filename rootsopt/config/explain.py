@@ -23,7 +23,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     place, rest = _split(model, first["loc"])
     if first["type"] in _UNKNOWN and not rest:
         return _unknown(model, place)
-    field = _field(model, place)
+    field = field_of(model, place)
     first = _branch(first, problems, place)
     key = ".".join(map(named, place + [part for part in rest if isinstance(part, int)]))
     kind, value, context = first["type"], first.get("input"), first.get("ctx", {})
@@ -147,7 +147,8 @@ def _model_of(annotation: Any) -> type[BaseModel] | None:
     return None
 
 
-def _field(model: type[BaseModel], place: list) -> FieldInfo | None:
+def field_of(model: type[BaseModel], place: list) -> FieldInfo | None:
+    """The field of a `model` at a place, given as a list of keys."""
     section = _section(model, place[:-1])
     return section.model_fields.get(place[-1]) if section is not None and place else None
 
@@ -229,7 +230,7 @@ def describe(model: type[BaseModel]) -> str:
     """One line per key with meaning, unit, choices or range, and default, for `--help`."""
     lines = []
     for key in all_keys(model):
-        field = _field(model, key.split("."))
+        field = field_of(model, key.split("."))
         if field is None or _model_of(field.annotation) is not None:
             continue
         notes = [unit_of(key.split(".")[-1]), " | ".join(choices(field.annotation)), _range(field)]

@@ -8,7 +8,14 @@ from pydantic import Field, ValidationError, model_validator
 
 from rootsopt.config.document import MOST_BYTES, read_document
 from rootsopt.config.explain import describe, explain
-from rootsopt.config.scene import ContactConfig, ProfileConfig, RotorConfig, SceneConfig
+from rootsopt.config.scene import (
+    FAMILY_KEYS,
+    ContactConfig,
+    ProfileConfig,
+    RotorConfig,
+    SceneConfig,
+    length_limits,
+)
 from rootsopt.config.section import Section
 from rootsopt.config.study import (
     AttractorsConfig,
@@ -20,6 +27,7 @@ from rootsopt.config.study import (
     SolverConfig,
     SweepConfig,
 )
+from rootsopt.config.units import hint
 from rootsopt.config.words import named, placed, sentence, shown
 from rootsopt.errors import InputError
 
@@ -65,6 +73,22 @@ class Config(Section):
             raise ValueError(
                 f"`solver.fidelity` must be search (or auto) with `{self.needs_search[0]}`, which "
                 f"needs what only a search has, but is {fidelity}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _sized_bounds(self):
+        profile = self.profile
+        for key in FAMILY_KEYS[profile.family]:
+            limits = length_limits(key, profile.pitch_radius_mm)
+            pair = getattr(self.optimizer.bounds, key)
+            if limits is None or pair is None or limits[0] <= pair[0] < pair[1] <= limits[1]:
+                continue
+            low, high = limits
+            raise ValueError(
+                f"`optimizer.bounds.{key}` must lie in [{low:.4g}, {high:.4g}] at "
+                f"`profile.pitch_radius_mm` = {profile.pitch_radius_mm:g}, but is {[*pair]}"
+                + hint(key, pair[1], low, high)
             )
         return self
 

@@ -122,20 +122,17 @@ class ProfileConfig(Section):
 
     @model_validator(mode="after")
     def _sized(self):
-        least, most = (share * self.pitch_radius_mm for share in _SHARES)
         for key in _SIZED:
-            value = getattr(self, key)
-            low = 0.0 if key == "ellipse_center_mm" else least
-            if value is not None and not low <= value <= most:
-                word = (
-                    f"at least {low:.4g} ({_SHARES[0]:g}"
-                    if value < low
-                    else f"at most {most:.4g} ({_SHARES[1]:g}"
-                )
-                raise ValueError(
-                    f"`profile.{key}` must be {word} pitch radii), but is {value:g}"
-                    + hint(key, value, low, most)
-                )
+            value, limits = getattr(self, key), length_limits(key, self.pitch_radius_mm)
+            if value is None or limits is None or limits[0] <= value <= limits[1]:
+                continue
+            low, high = limits
+            word = f"at least {low:.4g}" if value < low else f"at most {high:.4g}"
+            share = _SHARES[0] if value < low else _SHARES[1]
+            raise ValueError(
+                f"`profile.{key}` must be {word} ({share:g} pitch radii), but is {value:g}"
+                + hint(key, value, low, high)
+            )
         return self
 
     @model_validator(mode="after")
@@ -169,6 +166,14 @@ class ProfileConfig(Section):
                     f"`profile.{key}` does not belong to family {self.family}; remove it"
                 )
         return self
+
+
+def length_limits(key: str, pitch_radius_mm: float) -> tuple[float, float] | None:
+    """Least and greatest value of a length of a profile that goes with the pitch radius."""
+    if key not in _SIZED:
+        return None
+    least = 0.0 if key == "ellipse_center_mm" else _SHARES[0] * pitch_radius_mm
+    return least, _SHARES[1] * pitch_radius_mm
 
 
 _SIZED = (
