@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from rootsopt.config import FAMILY_KEYS, LIST_KEYS, ProfileConfig
+from rootsopt.config import FAMILY_KEYS, LIST_KEYS, ProfileConfig, hint
 from rootsopt.errors import InputError
 from rootsopt.outline.conjugacy import conjugacy
 from rootsopt.profiles import (
@@ -40,6 +40,8 @@ the paper's printed Table 1 is 1.2 % over."""
 _CLEAR = 1e-6
 """Least involute beyond that at which the tip arc is centred on the pitch circle a second time, in
 pitch radii."""
+_LEAST_INVOLUTE = 0.002
+"""Least involute in units of the longest: less makes no difference, and is a length in metres."""
 _ROUNDING = 1e-9
 """Margin relative to its scale that counts as 0."""
 
@@ -250,6 +252,12 @@ def _check_involute(profile_config: ProfileConfig) -> None:
         )
     longest = profile_config.pitch_radius_mm * math.sin(alpha * DEG) * (half - tip) * DEG
     limit = longest * (1 + _OVERLENGTH)
+    if length < _LEAST_INVOLUTE * longest:
+        raise InputError(
+            f"`profile.involute_length_mm` must be at least {_LEAST_INVOLUTE * longest:.4g} "
+            f"({_LEAST_INVOLUTE:g} of the longest, {longest:.4g}), but is {length:g}"
+            + hint("involute_length_mm", length, _LEAST_INVOLUTE * longest, limit)
+        )
     if length > limit:
         raise InputError(
             f"`profile.involute_length_mm` must be at most {longest:.4g} at "

@@ -8,6 +8,7 @@ with one message that names the key, the value and what is allowed.
 from rootsopt.config.reading import Config, describe_keys, load, parse
 from rootsopt.config.scene import DESIGN_KEYS, FAMILY_KEYS, LIST_KEYS, ProfileConfig
 from rootsopt.config.study import EnsembleConfig, SolverConfig
+from rootsopt.config.units import hint
 
 __all__ = [
     "DESIGN_KEYS",
@@ -18,6 +19,7 @@ __all__ = [
     "ProfileConfig",
     "SolverConfig",
     "describe_keys",
+    "hint",
     "load",
     "parse",
 ]

@@ -1,14 +1,21 @@
 """The whole config, read from YAML."""
 
-import difflib
-import re
+import stat
 from pathlib import Path
-from typing import Any
 
 import yaml
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
-from rootsopt.config.scene import ContactConfig, ProfileConfig, RotorConfig, SceneConfig
+from rootsopt.config.document import MOST_BYTES, read_document
+from rootsopt.config.explain import describe, explain
+from rootsopt.config.scene import (
+    FAMILY_KEYS,
+    ContactConfig,
+    ProfileConfig,
+    RotorConfig,
+    SceneConfig,
+    length_limits,
+)
 from rootsopt.config.section import Section
 from rootsopt.config.study import (
     AttractorsConfig,
@@ -20,7 +27,12 @@ from rootsopt.config.study import (
     SolverConfig,
     SweepConfig,
 )
+from rootsopt.config.units import hint
+from rootsopt.config.words import named, placed, sentence, shown
 from rootsopt.errors import InputError
+
+_MOST_PARTS = 8
+"""Most keys of an override; no key of a config lies deeper than 3."""
 
 
 class Config(Section):
@@ -64,41 +76,26 @@ class Config(Section):
             )
         return self
 
+    @model_validator(mode="after")
+    def _sized_bounds(self):
+        profile = self.profile
+        for key in FAMILY_KEYS[profile.family]:
+            limits = length_limits(key, profile.pitch_radius_mm)
+            pair = getattr(self.optimizer.bounds, key)
+            if limits is None or pair is None or limits[0] <= pair[0] < pair[1] <= limits[1]:
+                continue
+            low, high = limits
+            raise ValueError(
+                f"`optimizer.bounds.{key}` must lie in [{low:.4g}, {high:.4g}] at "
+                f"`profile.pitch_radius_mm` = {profile.pitch_radius_mm:g}, but is {[*pair]}"
+                + hint(key, pair[1], low, high)
+            )
+        return self
+
     def to_yaml(self) -> str:
         """The resolved config, every default written out."""
         data = self.model_dump(mode="json", exclude_none=True)
         return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML with `1e5` as a number and without silently overwritten keys."""
-
-    def construct_mapping(self, node, deep=False):
-        seen = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            try:
-                repeated = key in seen
-            except TypeError:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"a key must be a plain name, but is {key!r}", key_node.start_mark
-                ) from None
-            if repeated:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} stands twice", key_node.start_mark
-                )
-            seen.add(key)
-        return super().construct_mapping(node, deep)
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(
-        r"^[-+]?(?:[0-9][0-9_]*\.?[0-9_]*(?:[eE][-+]?[0-9]+)|[0-9][0-9_]*\.[0-9_]*"
-        r"|\.[0-9_]+(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
-    ),
-    list("-+0123456789."),
-)
 
 
 def load(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Config:
@@ -117,12 +114,13 @@ def parse(
 ) -> Config:
     """Like `load`, from YAML text. Files that it names are relative to `folder`, those that
     `overrides` name to the current folder; the config has absolute paths."""
-    data = _yaml(text, source)
+    name = placed(source)
+    data = read_document(text, name)
     if data is None:
         data = {}
     if not isinstance(data, dict):
         raise InputError(
-            f"{source}: must hold sections such as `profile:` and `scene:`, but is a "
+            f"{name}: must hold sections such as `profile:` and `scene:`, but is a "
             f"{type(data).__name__}"
         )
     _place_files(data, Path(folder))
@@ -132,7 +130,7 @@ def parse(
     try:
         return Config.model_validate(data)
     except ValidationError as error:
-        raise InputError(f"{source}: {_explain(error)}") from None
+        raise InputError(sentence(f"{name}: {explain(error, Config)}")) from None
 
 
 def _place_files(data: dict, folder: Path) -> None:
@@ -143,146 +141,57 @@ def _place_files(data: dict, folder: Path) -> None:
 
 
 def _read(path: Path) -> str:
+    name = placed(path)
     try:
-        return path.read_bytes().decode("utf-8")
+        # Reading a pipe may wait for ever, and a device may never end.
+        if stat.S_ISREG(path.stat().st_mode) or path.is_dir():
+            with path.open("rb") as file:
+                data = file.read(MOST_BYTES + 1)
+        else:
+            data = None
     except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file; give the path of a config") from None
+        raise InputError(f"{name}: there is no such file; give the path of a config") from None
     except IsADirectoryError:
-        raise InputError(f"{path}: is a folder; give the path of a config file") from None
+        raise InputError(f"{name}: is a folder; give the path of a config file") from None
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise InputError(f"{name}: cannot be read: {reason}") from None
+    except ValueError:  # A path with a null character.
+        raise InputError(f"{name}: is not a path; give that of a config file") from None
+    if data is None:
+        raise InputError(
+            f"{name}: is not a regular file (a pipe, socket or device); give the path of a config "
+            "file"
+        )
+    try:
+        # What is too long may be cut within a character, and is refused for its length.
+        return data.decode("utf-8", "strict" if len(data) <= MOST_BYTES else "replace")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8"
+            f"{name}: is not UTF-8 text (byte {error.start}); save it as UTF-8"
         ) from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-
-
-def _yaml(text: str, source: str) -> Any:
-    try:
-        return yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f" (line {mark.line + 1})" if mark is not None else ""
-        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise InputError(f"{source}: is not valid YAML{place}: {problem}") from None
 
 
 def _override(data: dict, override: str) -> None:
     key, equals, value = override.partition("=")
     parts = key.strip().split(".")
+    name = f"--set {shown(override)}"
     if not equals or not all(parts):
-        raise InputError(
-            f"--set {override!r}: must be dotted.key=value, as in scene.speed_rpm=1500"
-        )
+        raise InputError(f"{name}: must be dotted.key=value, as in scene.speed_rpm=1500")
+    if len(parts) > _MOST_PARTS:
+        raise InputError(f"{name}: has more than {_MOST_PARTS} keys, dotted; no key lies as deep")
     target = data
     for i, part in enumerate(parts[:-1]):
         inner = target.get(part)
         if inner is None:
             inner = target[part] = {}
         if not isinstance(inner, dict):
-            raise InputError(f"--set {override!r}: `{'.'.join(parts[: i + 1])}` holds no keys")
+            place = ".".join(map(named, parts[: i + 1]))
+            raise InputError(f"{name}: `{place}` holds no keys")
         target = inner
-    target[parts[-1]] = _yaml(value, f"--set {override!r}")
-
-
-def _explain(error: ValidationError) -> str:
-    """One sentence for the first, most telling problem."""
-    problems = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-    first = problems[0]
-    place = [str(p) for p in first["loc"] if not _is_branch(p)]
-    key = ".".join(place)
-    kind, value, context = first["type"], first.get("input"), first.get("ctx", {})
-    if kind == "extra_forbidden":
-        return _unknown(place)
-    if kind == "missing":
-        field = _field(place)
-        note = f" ({field.description})" if field is not None and field.description else ""
-        return f"`{key}` is missing{note}; add it"
-    if kind == "value_error":
-        return str(context["error"])
-    return f"`{key}` must be {_allowed(kind, context, first['msg'])}, but is {value!r}"
-
-
-def _is_branch(part) -> bool:
-    """Whether a part of a pydantic location names a union branch rather than a key."""
-    text = str(part)
-    return "[" in text or text in ("float", "int", "tuple")
-
-
-def _allowed(kind: str, context: dict, message: str) -> str:
-    words = {
-        "float_type": "a number",
-        "float_parsing": "a number",
-        "int_type": "a whole number",
-        "int_from_float": "a whole number",
-        "finite_number": "a finite number",
-        "model_type": "a section with keys of its own",
-        "string_type": "a word",
-        "dict_type": "keys with values, as {a: 1, b: 2}",
-        "tuple_type": "a list of numbers, as [1, 2]",
-    }
-    if kind in words:
-        return words[kind]
-    signs = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
-    for name, word in signs.items():
-        if name in context:
-            return f"{word} {context[name]:g}"
-    if kind == "literal_error":
-        return f"one of {context['expected']}"
-    return message[0].lower() + message[1:]
-
-
-def _section(place: list[str]) -> type[BaseModel] | None:
-    model: type[BaseModel] | None = Config
-    for part in place:
-        field = model.model_fields.get(part) if model is not None else None
-        if field is None:
-            return None
-        model = _model_of(field.annotation)
-    return model
-
-
-def _model_of(annotation: Any) -> type[BaseModel] | None:
-    candidates = [annotation, *getattr(annotation, "__args__", ())]
-    for candidate in candidates:
-        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
-            return candidate
-    return None
-
-
-def _field(place: list[str]):
-    model = _section(place[:-1])
-    return model.model_fields.get(place[-1]) if model is not None else None
-
-
-def _unknown(place: list[str]) -> str:
-    key = ".".join(place)
-    model = _section(place[:-1])
-    names = list(model.model_fields) if model is not None else []
-    near = difflib.get_close_matches(place[-1], names, n=1, cutoff=0.5)
-    elsewhere = [k for k in _all_keys(Config) if k.split(".")[-1] == place[-1]]
-    if elsewhere:
-        return f"`{key}` is not a known key; did you mean `{elsewhere[0]}`?"
-    if near:
-        return f"`{key}` is not a known key; did you mean `{'.'.join([*place[:-1], near[0]])}`?"
-    return f"`{key}` is not a known key; valid here: {', '.join(names)}"
-
-
-def _all_keys(model: type[BaseModel], prefix: str = ""):
-    for name, field in model.model_fields.items():
-        inner = _model_of(field.annotation)
-        yield f"{prefix}{name}"
-        if inner is not None:
-            yield from _all_keys(inner, f"{prefix}{name}.")
+    target[parts[-1]] = read_document(value, name)
 
 
 def describe_keys() -> str:
-    """One line per key with unit and meaning, for `--help`."""
-    lines = []
-    for key in _all_keys(Config):
-        place = key.split(".")
-        field = _field(place)
-        if field is None or _model_of(field.annotation) is not None:
-            continue
-        lines.append(f"  {key:<42} {field.description or ''}".rstrip())
-    return "\n".join(lines)
+    """One line per key with meaning, unit, choices or range, and default, for `--help`."""
+    return describe(Config)

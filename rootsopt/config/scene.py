@@ -4,7 +4,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.section import NonNegative, Positive, Section
+from rootsopt.config.section import Radius, Section, Speed, Torque, between
+from rootsopt.config.units import hint
+from rootsopt.config.words import shown
 
 DESIGN_KEYS = ("pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg")
 """The design parameters of a CIC rotor, as named in the config."""
@@ -33,7 +35,11 @@ LIST_KEYS = ("coefficients",)
 """Keys that hold a list of design parameters, each last of its family."""
 
 
-_Share = Annotated[float, Field(ge=-1, le=1)]
+_LONGEST = 5e4
+_Length = Annotated[float, between(1e-3, _LONGEST)]
+_SHARES = 0.002, 10.0
+"""Least and greatest length of a profile, in pitch radii."""
+_Share = Annotated[float, between(-1, 1)]
 
 
 class ProfileConfig(Section):
@@ -55,11 +61,11 @@ class ProfileConfig(Section):
         "outline",
     ] = Field(description="profile family; outline: from a file")
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
-    pitch_radius_mm: Positive = Field(description="pitch radius; centre distance is twice that")
-    pressure_angle_deg: Annotated[float, Field(gt=0, lt=90)] | None = Field(
+    pitch_radius_mm: Radius = Field(description="pitch radius; centre distance is twice that")
+    pressure_angle_deg: Annotated[float, Field(ge=1, lt=90)] | None = Field(
         None, description="cic, arc_involute: pressure angle of the involute"
     )
-    involute_length_mm: Positive | None = Field(
+    involute_length_mm: Annotated[float, between(1e-9, 1e4)] | None = Field(
         None, description="cic, arc_involute: involute parameter u"
     )
     tip_arc_angle_deg: Annotated[float, Field(ge=0, lt=45)] | None = Field(
@@ -67,35 +73,33 @@ class ProfileConfig(Section):
         description="cic, five_arcs, arcs_epicycloid, hypo_epicycloid, free_form: half angle of "
         "the tip land",
     )
-    arc_center_mm: Positive | None = Field(
+    arc_center_mm: _Length | None = Field(
         None,
         description="arc, arcs_epicycloid, four_arcs: distance of the arc's centre from the axis",
     )
-    tip_arc_radius_mm: Positive | None = Field(
+    tip_arc_radius_mm: _Length | None = Field(
         None, description="four_arcs, five_arcs: radius of the tip arc"
     )
-    tip_arc_turn_deg: Annotated[float, Field(gt=0, lt=180)] | None = Field(
+    tip_arc_turn_deg: Annotated[float, Field(ge=1, lt=180)] | None = Field(
         None,
         description="four_arcs, five_arcs, circle_epicycloid: normal angle where the tip arc ends",
     )
-    outer_radius_mm: Positive | None = Field(None, description="five_arcs: radius of the tip land")
-    edge_radius_mm: Positive | None = Field(
+    outer_radius_mm: _Length | None = Field(None, description="five_arcs: radius of the tip land")
+    edge_radius_mm: _Length | None = Field(
         None, description="arcs_epicycloid: radius of the edge between tip land and arc"
     )
-    rolling_radius_mm: Positive | None = Field(
+    rolling_radius_mm: _Length | None = Field(
         None, description="circle_epicycloid: radius of the rolling circle"
     )
-    trochoid_ratio: Annotated[float, Field(gt=0, le=10)] | None = Field(
+    trochoid_ratio: Annotated[float, between(1e-3, 10)] | None = Field(
         None,
         description="extended_cycloid: distance of the drawing point from the rolling circle's "
         "centre at the tip, in its radii",
     )
-    ellipse_center_mm: NonNegative | None = Field(
+    ellipse_center_mm: Annotated[float, between(0, _LONGEST)] | None = Field(
         None, description="ellipse: distance of the ellipse's centre from the axis"
     )
-    ellipse_height_mm: Positive | None = Field(
-        None, description="ellipse: semi-axis along the lobe"
-    )
+    ellipse_height_mm: _Length | None = Field(None, description="ellipse: semi-axis along the lobe")
     coefficients: Annotated[tuple[_Share, ...], Field(min_length=3, max_length=64)] | None = Field(
         None,
         description="free_form: fall of the pressure angle per turn of the normal, from tip to "
@@ -105,7 +109,7 @@ class ProfileConfig(Section):
     outline_file: str | None = Field(
         None, description="outline: CSV or DXF file, relative to the config's folder"
     )
-    outline_smoothing_mm: NonNegative | None = Field(
+    outline_smoothing_mm: Annotated[float, between(0, 10)] | None = Field(
         None, description="outline: scatter (RMS) of measured points; absent: 0, through them"
     )
 
@@ -117,7 +121,27 @@ class ProfileConfig(Section):
         return data
 
     @model_validator(mode="after")
+    def _sized(self):
+        for key in _SIZED:
+            value, limits = getattr(self, key), length_limits(key, self.pitch_radius_mm)
+            if value is None or limits is None or limits[0] <= value <= limits[1]:
+                continue
+            low, high = limits
+            word = f"at least {low:.4g}" if value < low else f"at most {high:.4g}"
+            share = _SHARES[0] if value < low else _SHARES[1]
+            raise ValueError(
+                f"`profile.{key}` must be {word} ({share:g} pitch radii), but is {value:g}"
+                + hint(key, value, low, high)
+            )
+        return self
+
+    @model_validator(mode="after")
     def _from_file(self):
+        if self.outline_file is not None and not self.outline_file.isprintable():
+            raise ValueError(
+                "`profile.outline_file` must be the path of a file, but is "
+                f"{shown(self.outline_file)}, which has characters that cannot be printed"
+            )
         if self.family == "outline":
             if self.outline_file is None:
                 raise ValueError("`profile.outline_file` is required for family outline")
@@ -144,12 +168,34 @@ class ProfileConfig(Section):
         return self
 
 
+def length_limits(key: str, pitch_radius_mm: float) -> tuple[float, float] | None:
+    """Least and greatest value of a length of a profile that goes with the pitch radius."""
+    if key not in _SIZED:
+        return None
+    least = 0.0 if key == "ellipse_center_mm" else _SHARES[0] * pitch_radius_mm
+    return least, _SHARES[1] * pitch_radius_mm
+
+
+_SIZED = (
+    "arc_center_mm",
+    "tip_arc_radius_mm",
+    "outer_radius_mm",
+    "edge_radius_mm",
+    "rolling_radius_mm",
+    "ellipse_center_mm",
+    "ellipse_height_mm",
+)
+"""Lengths of a profile that go with the pitch radius."""
+
+
 class RotorConfig(Section):
     """The rotor as a body."""
 
-    length_mm: Positive = Field(description="axial length")
-    density_kg_m3: Positive = Field(description="density")
-    bore_mm: Positive | None = Field(None, description="diameter of the bore; absent: none")
+    length_mm: Annotated[float, between(1, 2e4)] = Field(description="axial length")
+    density_kg_m3: Annotated[float, between(50, 3e4)] = Field(description="density")
+    bore_mm: Annotated[float, between(0.1, 1e4)] | None = Field(
+        None, description="diameter of the bore; absent: none"
+    )
     helix_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
         0.0, description="twist over the length, for CAD; only straight rotors are simulated"
     )
@@ -160,10 +206,10 @@ class FrictionConfig(Section):
 
     static: Annotated[float, Field(ge=0, le=2)] = Field(0.2, description="static coefficient")
     kinetic: Annotated[float, Field(ge=0, le=2)] = Field(0.1, description="kinetic coefficient")
-    stiction_speed_mm_s: Positive = Field(
+    stiction_speed_mm_s: Annotated[float, between(1e-3, 1e6)] = Field(
         100.0, description="sliding speed at which the static coefficient is reached"
     )
-    friction_speed_mm_s: Positive = Field(
+    friction_speed_mm_s: Annotated[float, between(1e-3, 1e7)] = Field(
         1000.0, description="sliding speed from which on the coefficient is the kinetic one"
     )
 
@@ -181,12 +227,18 @@ class FrictionConfig(Section):
 class ContactConfig(Section):
     """The IMPACT contact law."""
 
-    stiffness_N_per_mm_e: Positive = Field(description="K of K·δ^e, δ in mm")
+    stiffness_N_per_mm_e: Annotated[float, between(1, 1e11)] = Field(
+        description="K of K·δ^e, δ in mm"
+    )
     exponent: Annotated[float, Field(ge=1, le=5)] = Field(description="e")
-    max_damping_N_s_per_mm: NonNegative = Field(description="C, reached at full depth")
-    full_damping_depth_mm: Positive = Field(description="d")
-    clearance_mm: NonNegative = Field(0.0, description="added to every flank gap")
-    smoothing_mm: NonNegative = Field(
+    max_damping_N_s_per_mm: Annotated[float, between(0, 1e4)] = Field(
+        description="C, reached at full depth"
+    )
+    full_damping_depth_mm: Annotated[float, between(1e-7, 10)] = Field(description="d")
+    clearance_mm: Annotated[float, between(0, 10)] = Field(
+        0.0, description="added to every flank gap"
+    )
+    smoothing_mm: Annotated[float, between(0, 1)] = Field(
         1e-4, description="rounding of the law's corners; 0 is the law as it stands"
     )
     friction: FrictionConfig | None = Field(None, description="absent: frictionless flanks")
@@ -195,8 +247,8 @@ class ContactConfig(Section):
 class LoadConfig(Section):
     """What opposes the rotors: a constant torque on rotor 2, or gas on both."""
 
-    torque_N_m: NonNegative | None = Field(None, description="constant torque against rotor 2")
-    pressure_difference_Pa: NonNegative | None = Field(
+    torque_N_m: Torque | None = Field(None, description="constant torque against rotor 2")
+    pressure_difference_Pa: Annotated[float, between(0, 1e8)] | None = Field(
         None, description="instead of a constant torque: gas pressure across the pair"
     )
 
@@ -213,34 +265,46 @@ class LoadConfig(Section):
 class MotorConfig(Section):
     """Motor on rotor 1, with a straight torque-speed line, for `drive: torque`."""
 
-    torque_N_m: NonNegative | None = Field(
+    torque_N_m: Torque | None = Field(
         None, description="torque at scene.speed_rpm; absent: what the load takes there"
     )
-    slope_N_m_s_per_rad: Positive = Field(
+    slope_N_m_s_per_rad: Annotated[float, between(1e-6, 1e6)] = Field(
         description="torque lost for every rad/s above scene.speed_rpm"
     )
-    inertia_kg_m2: NonNegative = Field(0.0, description="added to that of rotor 1")
+    inertia_kg_m2: Annotated[float, between(0, 1e5)] = Field(
+        0.0, description="added to that of rotor 1"
+    )
 
 
 class SupportsConfig(Section):
     """Bearings that give way, the same for both rotors."""
 
-    stiffness_N_per_mm: Positive = Field(description="of a rotor in its housing, any way")
-    damping_N_s_per_mm: NonNegative = Field(description="damping of the same motion")
+    stiffness_N_per_mm: Annotated[float, between(1, 1e9)] = Field(
+        description="of a rotor in its housing, any way"
+    )
+    damping_N_s_per_mm: Annotated[float, between(0, 1e6)] = Field(
+        description="damping of the same motion"
+    )
 
 
 class TimingGearConfig(Section):
     """Timing gear between the rotors."""
 
-    stiffness_N_m_per_rad: Positive = Field(description="torsional stiffness")
-    damping_ratio: NonNegative = Field(0.0, description="ζ on the two rotors' inertia")
-    backlash_mm: NonNegative = Field(description="total play at the pitch radius")
+    stiffness_N_m_per_rad: Annotated[float, between(1e-2, 1e10)] = Field(
+        description="torsional stiffness"
+    )
+    damping_ratio: Annotated[float, between(0, 100)] = Field(
+        0.0, description="ζ on the two rotors' inertia"
+    )
+    backlash_mm: Annotated[float, between(0, 50)] = Field(
+        description="total play at the pitch radius"
+    )
 
 
 class SceneConfig(Section):
     """What drives and loads the pair."""
 
-    speed_rpm: Positive = Field(description="speed of rotor 1; of a motor, that of its torque_N_m")
+    speed_rpm: Speed = Field(description="speed of rotor 1; of a motor, that of its torque_N_m")
     drive: Literal["prescribed", "torque"] = Field(
         "prescribed", description="how rotor 1 is driven: at its speed, or by scene.motor"
     )

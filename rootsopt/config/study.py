@@ -4,8 +4,16 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, create_model, model_validator
 
-from rootsopt.config.scene import FAMILY_KEYS
-from rootsopt.config.section import NonNegative, Positive, Section, number, tuples
+from rootsopt.config.explain import limits_of
+from rootsopt.config.scene import FAMILY_KEYS, ProfileConfig
+from rootsopt.config.section import Order, Section, Speed, Weight, between, number, tuples
+from rootsopt.config.units import hint
+from rootsopt.config.words import shown
+
+_Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
+_LEAST_WEIGHT = 1e-6
+"""Sum of weights below which they are none."""
+_MOST_LINES = 32
 
 
 class SolverConfig(Section):
@@ -61,10 +69,10 @@ class SolverConfig(Section):
 class ObjectiveConfig(Section):
     """Weighted sum of measures of the contact force, each relative to the baseline."""
 
-    mean_weight: NonNegative = Field(0.5, description="weight of the mean contact force")
-    peak_weight: NonNegative = Field(0.5, description="weight of the peak contact force")
-    rms_weight: NonNegative = Field(0.0, description="weight of the RMS contact force")
-    line_weights: dict[Positive, NonNegative] = Field(
+    mean_weight: Weight = Field(0.5, description="weight of the mean contact force")
+    peak_weight: Weight = Field(0.5, description="weight of the peak contact force")
+    rms_weight: Weight = Field(0.0, description="weight of the RMS contact force")
+    line_weights: dict[Order, Weight] = Field(
         default_factory=dict,
         description="weights of spectral lines, {order: weight}, order in mesh frequencies",
     )
@@ -77,10 +85,10 @@ class ObjectiveConfig(Section):
     peak_norm: Annotated[float, Field(ge=4, le=64)] | None = Field(
         None, description="p of the p-norm that stands for the peak in the search; absent: the peak"
     )
-    speeds_rpm: tuple[Positive, ...] = Field(
+    speeds_rpm: tuple[Speed, ...] = Field(
         (), description="speeds the objective is taken over, as [2000, 3000]; none: the scene's"
     )
-    speed_weights: tuple[Positive, ...] = Field(
+    speed_weights: tuple[Annotated[float, between(1e-6, 1e6)], ...] = Field(
         (), description="weights of these speeds in the objective; none: equal ones"
     )
     over_speeds: Literal["weighted", "worst"] = Field(
@@ -92,18 +100,23 @@ class ObjectiveConfig(Section):
     def _orders(cls, data):
         data = tuples(data)
         # The name of a key that `--set` gives, and of one in JSON, is a word.
-        if isinstance(data, dict) and isinstance(data.get("line_weights"), dict):
-            lines = {number(k): v for k, v in data["line_weights"].items()}
-            return data | {"line_weights": lines}
+        if isinstance(data, dict) and isinstance(given := data.get("line_weights"), dict):
+            lines = {number(k): v for k, v in given.items()}
+            return data | {"line_weights": lines if len(lines) == len(given) else given}
         return data
 
     @model_validator(mode="after")
     def _some_weight(self):
+        if len(self.line_weights) > _MOST_LINES:
+            raise ValueError(
+                f"`objective.line_weights` must be at most {_MOST_LINES} orders, but is "
+                f"{shown(self.line_weights)}"
+            )
         lines = sum(self.line_weights.values())
-        if self.mean_weight + self.peak_weight + self.rms_weight + lines <= 0:
+        if self.mean_weight + self.peak_weight + self.rms_weight + lines < _LEAST_WEIGHT:
             raise ValueError(
                 "`objective.mean_weight`, `objective.peak_weight`, `objective.rms_weight` and "
-                "`objective.line_weights` must not all be 0"
+                f"`objective.line_weights` must not all be 0 (together at least {_LEAST_WEIGHT:g})"
             )
         if self.motion == "ensemble" and (lines > 0 or self.peak_norm is not None):
             raise ValueError(
@@ -117,7 +130,8 @@ class ObjectiveConfig(Section):
         speeds, weights = self.speeds_rpm, self.speed_weights
         if len(set(speeds)) != len(speeds) or len(speeds) > 32:
             raise ValueError(
-                f"`objective.speeds_rpm` must be at most 32 different speeds, but is {list(speeds)}"
+                "`objective.speeds_rpm` must be at most 32 different speeds, but is "
+                f"{shown([*speeds])}"
             )
         worst = self.over_speeds == "worst"
         if not speeds and (weights or worst):
@@ -129,7 +143,7 @@ class ObjectiveConfig(Section):
         if weights and len(weights) != len(speeds):
             raise ValueError(
                 f"`objective.speed_weights` must be {len(speeds)} numbers, one for each of "
-                f"`objective.speeds_rpm`, but is {list(weights)}"
+                f"`objective.speeds_rpm`, but is {shown([*weights])}"
             )
         if weights and worst:
             raise ValueError(
@@ -139,8 +153,8 @@ class ObjectiveConfig(Section):
         if speeds and self.motion == "ensemble":
             raise ValueError(
                 "`objective.speeds_rpm` must be empty for `objective.motion` ensemble, but is "
-                f"{list(speeds)}: the noise of an average is judged at one speed; optimise at one, "
-                "and look at the others with `rootsopt sweep`"
+                f"{shown([*speeds])}: the noise of an average is judged at one speed; optimise at "
+                "one, and look at the others with `rootsopt sweep`"
             )
         return self
 
@@ -148,7 +162,7 @@ class ObjectiveConfig(Section):
 class ResponseConfig(Section):
     """What is reported beside mean, peak and RMS of the contact force."""
 
-    lines: tuple[Positive, ...] = Field(
+    lines: tuple[Order, ...] = Field(
         (), description="spectral lines of the force, orders in mesh frequencies, as [1, 2]"
     )
 
@@ -161,9 +175,14 @@ class ResponseConfig(Section):
     def _few(self):
         if len(set(self.lines)) != len(self.lines) or len(self.lines) > 32:
             raise ValueError(
-                f"`response.lines` must be at most 32 different orders, but is {list(self.lines)}"
+                "`response.lines` must be at most 32 different orders, but is "
+                f"{shown([*self.lines])}"
             )
         return self
+
+
+_Milliradians = tuple[Annotated[float, between(-1e3, 1e3)], Annotated[float, between(-1e3, 1e3)]]
+_Rates = tuple[Annotated[float, between(-1e6, 1e6)], Annotated[float, between(-1e6, 1e6)]]
 
 
 class AttractorsConfig(Section):
@@ -175,10 +194,10 @@ class AttractorsConfig(Section):
     rates: Annotated[int, Field(ge=1, le=1000)] = Field(
         9, description="initial relative speeds tried"
     )
-    relative_range_mrad: tuple[float, float] | None = Field(
+    relative_range_mrad: _Milliradians | None = Field(
         None, description="(low, high) of the relative rotation; absent: the play and contact"
     )
-    rate_range_rad_s: tuple[float, float] | None = Field(
+    rate_range_rad_s: _Rates | None = Field(
         None, description="(low, high) of the relative speed; absent: as impacts reach"
     )
 
@@ -193,7 +212,7 @@ class AttractorsConfig(Section):
             pair = getattr(self, key)
             if pair is not None and not pair[0] < pair[1]:
                 raise ValueError(
-                    f"`attractors.{key}` must be two increasing numbers, but is {list(pair)}"
+                    f"`attractors.{key}` must be two increasing numbers, but is {shown([*pair])}"
                 )
         return self
 
@@ -218,13 +237,15 @@ class EnsembleConfig(Section):
         description="standard deviation of these designs, as a share of the bounds, which they "
         "stay within",
     )
-    seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of states and designs")
+    seed: _Seed = Field(0, description="seed of states and designs")
 
 
 class SweepConfig(Section):
     """The speeds of `rootsopt sweep`."""
 
-    speed_rpm: dict[Literal["from", "to", "points"], Positive] | None = Field(
+    speed_rpm: (
+        dict[Literal["from", "to", "points"], Annotated[float, between(1e-2, 1e6)]] | None
+    ) = Field(
         None,
         description="{from: 300, to: 6000, points: 39}; absent: `objective.speeds_rpm`, and "
         "without these 39 from a tenth of to twice the scene's speed",
@@ -240,9 +261,13 @@ class SweepConfig(Section):
         if len(wanted) < 3 or not (ordered and whole == int(whole) and 2 <= whole <= 10_000):
             raise ValueError(
                 "`sweep.speed_rpm` must be {from: .., to: .., points: ..} with from below to and "
-                f"2 to 10000 points, but is {wanted}"
+                f"2 to 10000 points, but is {shown(wanted)}"
             )
         return self
+
+
+_Floor = Annotated[float, between(0, 5000)]
+_Outer = Annotated[float, between(1, 1e4)]
 
 
 class ConstraintsConfig(Section):
@@ -251,12 +276,10 @@ class ConstraintsConfig(Section):
     area_efficiency_min: Literal["baseline"] | Annotated[float, Field(ge=0, lt=1)] = Field(
         "baseline", description="floor of the area efficiency"
     )
-    undercut_margin_min_mm: NonNegative = Field(0.0, description="floor of the undercut margin")
-    seal_width_min_mm: NonNegative = Field(
-        0.0, description="floor of the tip land's whole arc length"
-    )
-    outer_radius_min_mm: Positive | None = Field(None, description="floor of the outer radius")
-    outer_radius_max_mm: Positive | None = Field(
+    undercut_margin_min_mm: _Floor = Field(0.0, description="floor of the undercut margin")
+    seal_width_min_mm: _Floor = Field(0.0, description="floor of the tip land's whole arc length")
+    outer_radius_min_mm: _Outer | None = Field(None, description="floor of the outer radius")
+    outer_radius_max_mm: _Outer | None = Field(
         None, description="ceiling of the outer radius: that of the housing's bore"
     )
 
@@ -286,22 +309,22 @@ class _Bounds(Section):
             if pair is not None and not least <= pair[0] < pair[1] <= most:
                 raise ValueError(
                     f"`optimizer.bounds.{key}` must be two increasing numbers in "
-                    f"[{least:g}, {most:g}], but is {list(pair)}"
+                    f"[{least:g}, {most:g}], but is {shown([*pair])}"
+                    + hint(key, pair[0], least, most)
                 )
         return self
 
 
 def _limits(key: str) -> tuple[float, float]:
     """Least and greatest value that a bound of a design parameter may have."""
-    known = {
-        "pressure_angle_deg": (1.0, 80.0),
-        "tip_arc_angle_deg": (0.0, 44.0),
-        "ellipse_center_mm": (0.0, 1e6),
-        "coefficients": (-1.0, 1.0),
-    }
-    return known.get(key, (0.0, 180.0) if key.endswith("_deg") else (1e-6, 1e6))
+    if (known := _KNOWN.get(key)) is not None:
+        return known
+    field = ProfileConfig.model_fields[key]
+    return limits_of(field.annotation, field.metadata).ends
 
 
+_KNOWN = {"pressure_angle_deg": (1.0, 80.0), "tip_arc_angle_deg": (0.0, 44.0)}
+"""Limits of bounds where they are narrower than those of the key itself."""
 _Pair = tuple[float, float]
 _DEFAULTS: dict[str, _Pair] = {
     "pressure_angle_deg": (25.0, 45.0),
@@ -327,7 +350,10 @@ _NOTES = {
 _BOUNDS: dict[str, Any] = {
     key: (
         _Pair if key in _DEFAULTS else _Pair | None,
-        Field(_DEFAULTS.get(key), description=_NOTES[key]),
+        Field(
+            _DEFAULTS.get(key),
+            description="{}; from {:g} to {:g}".format(_NOTES[key], *_limits(key)),
+        ),
     )
     for key in dict.fromkeys(key for keys in FAMILY_KEYS.values() for key in keys)
 }
@@ -340,13 +366,15 @@ class OptimizerConfig(Section):
     method: Literal["adam", "rmsprop", "sgd"] = Field(
         "adam", description="optax update rule: adam, rmsprop, sgd"
     )
-    learning_rate: Positive = Field(0.05, description="step in the unit box of the bounds")
+    learning_rate: Annotated[float, between(1e-6, 10)] = Field(
+        0.05, description="step in the unit box of the bounds"
+    )
     iterations: Annotated[int, Field(ge=1, le=10000)] = Field(40, description="per start")
     starts: Annotated[int, Field(ge=1, le=64)] = Field(2, description="local searches")
     screening: Annotated[int, Field(ge=0, le=4096)] = Field(
         48, description="designs screened to place the starts; 0 starts at the baseline only"
     )
-    seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of the screening sample")
+    seed: _Seed = Field(0, description="seed of the screening sample")
     bounds: BoundsConfig = Field(  # type: ignore[valid-type]
         default_factory=lambda: BoundsConfig.model_validate({})
     )

@@ -1,0 +1,248 @@
+"""One YAML document as plain data, read within limits.
+
+YAML 1.1 as PyYAML reads it, but for what surprises in a config: `1e5` is a number, `1:30`,
+`2020-01-01`, `yes` and `off` are words, `010` is ten, a key may stand once, and no tag makes
+anything but plain data. Anchors, aliases and merge keys work, as long as what they expand to is
+small.
+"""
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import yaml
+from yaml.constructor import ConstructorError
+from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from rootsopt.config.words import clipped, named, sentence, shown
+from rootsopt.errors import InputError
+
+MOST_BYTES = 128 * 1024
+"""Largest text; a config has some 2000 bytes."""
+_MOST_NODES = 5000
+"""Most keys, values, lists and sections, with everything that aliases stand for."""
+_DEEPEST = 32
+"""Most sections and lists inside each other."""
+_LONGEST_VALUE = 4096
+"""Longest scalar (characters)."""
+_MOST_DIGITS = 400
+"""Longest number (characters); a double has at most 309 digits before its point."""
+
+_TAG = "tag:yaml.org,2002:"
+_MERGE = _TAG + "merge"
+
+
+def read_document(text: str, source: str) -> Any:
+    """Dictionaries, lists and plain values of a YAML text; `source` names it in messages.
+
+    No two places of the result share a dictionary or a list. Raises `InputError` for whatever is
+    wrong with the text."""
+    if len(text.encode("utf-8", "surrogatepass")) > MOST_BYTES:
+        raise InputError(
+            f"{source}: must have at most {MOST_BYTES} bytes, but has more; is that a config?"
+        )
+    try:
+        loader = _Loader(text)
+        return _unshared(loader.get_single_data())
+    # The one place where the reader runs: whatever it fails with is the text's fault.
+    except Exception as error:
+        raise InputError(sentence(f"{source}: is not valid YAML{_told(error)}")) from None
+
+
+def _told(error: Exception) -> str:
+    """Line and problem of what the reader failed with."""
+    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+    place = f" (line {mark.line + 1})" if mark is not None else ""
+    problem = getattr(error, "problem", None)
+    if problem is None:
+        lines = str(error).splitlines()
+        problem = lines[0] if isinstance(error, yaml.YAMLError) and lines else "cannot be read"
+    context = getattr(error, "context", None)
+    if context is not None and problem.startswith("but "):
+        problem = f"{context}, {problem}"
+    if "'\\t'" in problem:
+        problem += "; indent by spaces"
+    return f"{place}: {clipped(problem, 300)}"
+
+
+def _unshared(data: Any) -> Any:
+    """A copy without anything shared, so that an override changes what it names and no more."""
+    if isinstance(data, dict):
+        return {key: _unshared(value) for key, value in data.items()}
+    if isinstance(data, list):
+        return [_unshared(value) for value in data]
+    return data
+
+
+class _Loader(yaml.SafeLoader):
+    """SafeLoader with limits and words of its own, checked while the nodes are made."""
+
+    yaml_implicit_resolvers = {}  # noqa: RUF012
+    yaml_constructors = {}  # noqa: RUF012
+
+    def __init__(self, text: str):
+        super().__init__(text)
+        # (nodes, height) so far of each node that is not complete, and of complete anchors.
+        self._open: list[tuple[int, int]] = []
+        self._anchored: dict[str, tuple[int, int]] = {}
+
+    def compose_node(self, parent, index):
+        event: Any = self.peek_event()
+        mark, anchor = event.start_mark, event.anchor
+        if isinstance(event, yaml.AliasEvent):
+            if anchor in self.anchors and anchor not in self._anchored:
+                raise _wrong(f"the alias *{named(anchor)} stands inside what it names", mark)
+            node = super().compose_node(parent, index)
+            self._count(*self._anchored[anchor], mark)
+            return node
+        if len(self._open) >= _DEEPEST:
+            raise _wrong(f"there are more than {_DEEPEST} levels inside each other", mark)
+        self._open.append((1, 1))
+        node = super().compose_node(parent, index)
+        extent = self._open.pop()
+        if anchor is not None:
+            self._anchored[anchor] = extent
+        self._count(*extent, mark)
+        return node
+
+    def _count(self, nodes: int, height: int, mark) -> None:
+        """Add a node and all in it to what it stands in."""
+        if len(self._open) + height > _DEEPEST:
+            raise _wrong(f"there are more than {_DEEPEST} levels inside each other", mark)
+        if not self._open:
+            return
+        before, highest = self._open[-1]
+        self._open[-1] = before + nodes, max(highest, 1 + height)
+        if before + nodes > _MOST_NODES:
+            raise _wrong(
+                f"there are more than {_MOST_NODES} values, with those that aliases stand for",
+                mark,
+            )
+
+    def compose_scalar_node(self, anchor):
+        node = super().compose_scalar_node(anchor)
+        if len(node.value) > _LONGEST_VALUE:
+            raise _wrong(
+                f"a value has {len(node.value)} characters; at most {_LONGEST_VALUE} are read",
+                node.start_mark,
+            )
+        if any("\ud800" <= character <= "\udfff" for character in node.value):
+            raise _wrong(
+                f"{shown(node.value)} holds half of a character (a lone surrogate)",
+                node.start_mark,
+            )
+        return node
+
+    def compose_mapping_node(self, anchor):
+        node = super().compose_mapping_node(anchor)
+        seen = set()
+        for key_node, value_node in node.value:
+            if key_node.tag == _MERGE:
+                key: Any = "<<"
+                _check_merge(value_node)
+            else:
+                key = self._key(key_node)
+            if key in seen:
+                more = "; give it a list, as <<: [*a, *b]" if key_node.tag == _MERGE else ""
+                raise _wrong(f"the key {shown(key)} stands twice{more}", key_node.start_mark)
+            seen.add(key)
+        return node
+
+    def _key(self, node: Node) -> str | float:
+        key = self.construct_object(node) if isinstance(node, ScalarNode) else None
+        if isinstance(key, str) or (isinstance(key, int | float) and not isinstance(key, bool)):
+            return key
+        kinds = {MappingNode: "a section", SequenceNode: "a list"}
+        what = kinds.get(type(node)) or shown(node.value) if node.value != "" else "empty"
+        raise _wrong(f"a key must be a plain name, but is {what}", node.start_mark)
+
+
+def _check_merge(node: Node) -> None:
+    """Raise unless a merge key takes a section or a list of sections."""
+    parts = node.value if isinstance(node, SequenceNode) else [node]
+    for part in parts:
+        if not isinstance(part, MappingNode):
+            raise _wrong(
+                "the merge key << must be given sections that stand elsewhere, as <<: *name or "
+                f"<<: [*a, *b], but is given {shown(part.value) if part.value else 'nothing'}",
+                node.start_mark,
+            )
+
+
+def _wrong(problem: str, mark) -> ConstructorError:
+    return ConstructorError(None, None, problem, mark)
+
+
+_NUMBER = re.compile(
+    r"[-+]?(?:[0-9][0-9_]*\.?[0-9_]*(?:[eE][-+]?[0-9]+)?|\.[0-9][0-9_]*(?:[eE][-+]?[0-9]+)?"
+    r"|\.(?:inf|Inf|INF))|\.(?:nan|NaN|NAN)"
+)
+_WHOLE = re.compile(r"[-+]?(?:0b[01_]+|0o[0-7_]+|0x[0-9a-fA-F_]+|[0-9][0-9_]*)")
+_CONSTANTS = {
+    "bool": {"true": True, "True": True, "TRUE": True}
+    | {"false": False, "False": False, "FALSE": False},
+    "null": dict.fromkeys(("", "~", "null", "Null", "NULL")),
+}
+
+
+def _whole(text: str) -> int:
+    if _WHOLE.fullmatch(text) is None:
+        raise ValueError
+    sign = -1 if text.startswith("-") else 1
+    digits = text.lstrip("+-").replace("_", "")
+    bases = {"0b": 2, "0o": 8, "0x": 16}
+    base = bases.get(digits[:2], 10)
+    return sign * int(digits if base == 10 else digits[2:], base)
+
+
+def _real(text: str) -> float:
+    if _NUMBER.fullmatch(text) is None:
+        return float(_whole(text))
+    named_ones = text.lower().lstrip("+-").lstrip(".")
+    if named_ones in ("inf", "nan"):
+        return float("-" * text.startswith("-") + named_ones)
+    return float(text.replace("_", ""))
+
+
+def _scalar(kind: str, read: Callable[[str], Any]) -> None:
+    """Have scalars of a kind read by a function that raises `ValueError` or `KeyError`."""
+
+    def construct(loader, node):
+        text = loader.construct_scalar(node)
+        try:
+            if len(text) > _MOST_DIGITS:
+                raise ValueError
+            return read(text)
+        except (ValueError, KeyError, OverflowError):
+            raise _wrong(f"{shown(text)} is not a {_KINDS[kind]}", node.start_mark) from None
+
+    _Loader.add_constructor(_TAG + kind, construct)
+
+
+def _unknown(_, node):
+    tag = named(str(node.tag).replace(_TAG, "!!"))
+    raise _wrong(f"the tag {tag} is not known; write the value without it", node.start_mark)
+
+
+_KINDS = {
+    "bool": "choice of true and false",
+    "null": "way to write nothing",
+    "int": "whole number that can be read",
+    "float": "number that can be read",
+}
+_scalar("bool", _CONSTANTS["bool"].__getitem__)
+_scalar("null", _CONSTANTS["null"].__getitem__)
+_scalar("int", _whole)
+_scalar("float", _real)
+_Loader.add_constructor(_TAG + "str", yaml.SafeLoader.construct_yaml_str)
+_Loader.add_constructor(_TAG + "seq", yaml.SafeLoader.construct_yaml_seq)
+_Loader.add_constructor(_TAG + "map", yaml.SafeLoader.construct_yaml_map)
+_Loader.yaml_constructors[None] = _unknown
+for _kind, _pattern, _first in (
+    ("bool", "|".join(_CONSTANTS["bool"]), "tTfF"),
+    ("null", "|".join(_CONSTANTS["null"]), ["", "~", "n", "N"]),
+    ("int", _WHOLE.pattern, "-+0123456789"),
+    ("float", _NUMBER.pattern, "-+.0123456789"),
+    ("merge", "<<", "<"),
+):
+    _Loader.add_implicit_resolver(_TAG + _kind, re.compile(rf"^(?:{_pattern})\Z"), list(_first))

@@ -1,0 +1,246 @@
+"""What is wrong with a config, and what its keys are, in words."""
+
+import difflib
+import types
+from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin
+
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+
+from rootsopt.config.section import choices
+from rootsopt.config.units import hint, unit_of
+from rootsopt.config.words import named, shown
+
+_MOST_NAMES = 12
+"""Most keys listed as valid ones."""
+
+
+def explain(error: ValidationError, model: type[BaseModel]) -> str:
+    """One sentence for the first, most telling problem of a config of type `model`."""
+    problems = error.errors(include_url=False)
+    first = next((p for p in problems if p["type"] in _UNKNOWN), problems[0])
+    place, rest = _split(model, first["loc"])
+    if first["type"] in _UNKNOWN and not rest:
+        return _unknown(model, place)
+    field = field_of(model, place)
+    first = _branch(first, problems, place)
+    key = ".".join(map(named, place + [part for part in rest if isinstance(part, int)]))
+    kind, value, context = first["type"], first.get("input"), first.get("ctx", {})
+    if kind == "missing" and not rest:
+        note = f" ({field.description})" if field is not None and field.description else ""
+        return f"`{key}` is missing{note}; add it"
+    if kind == "value_error":
+        return str(context["error"])
+    if kind in ("missing", "too_short", "too_long"):  # Of a list.
+        key = ".".join(map(named, place))
+        count, given = _count(field, context), rest and first.get("input")
+        return f"`{key}` must be {count}, but is {shown(given or value)}"
+    wanted = _allowed(kind, value, context, first["msg"], field)
+    return f"`{key}` must be {wanted}, but is {shown(value)}{_advice(place, kind, value, field)}"
+
+
+_UNKNOWN = ("extra_forbidden", "invalid_key")
+
+
+def _split(model: type[BaseModel], location: tuple) -> tuple[list[Any], list[Any]]:
+    """The keys of a location, and what else pydantic names behind the last of them."""
+    place: list[Any] = []
+    inner: type[BaseModel] | None = model
+    for number, part in enumerate(location):
+        if inner is None:
+            return place, list(location[number:])
+        place.append(part)
+        found = inner.model_fields.get(part) if isinstance(part, str) else None
+        inner = None if found is None else _model_of(found.annotation)
+    return place, []
+
+
+def _branch(first, problems, place):
+    """Of a value that may be a word or a number, what is wrong with it as a number if it is one."""
+    if first["type"] != "literal_error" or not _is_number(first.get("input")):
+        return first
+    size = len(place)
+    same = [p for p in problems if list(p["loc"][:size]) == place and len(p["loc"]) > size]
+    return next((p for p in same if p["type"] != "literal_error"), first)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_real(field: FieldInfo | None) -> bool:
+    """Whether a key's numbers need not be whole."""
+    return field is not None and "float" in str(field.annotation)
+
+
+def _count(field: FieldInfo | None, context: dict) -> str:
+    if "min_length" in context:
+        return f"at least {context['min_length']} numbers"
+    if field is not None and "..." in str(field.annotation).replace("Ellipsis", "..."):
+        return f"at most {context['max_length']} numbers"
+    return "two numbers, as [1, 2]"
+
+
+def _allowed(kind: str, value: Any, context: dict, message: str, field: FieldInfo | None) -> str:
+    if kind in ("float_type", "int_type") and _is_number(value) and abs(value) > 2**53:
+        return "a number of ordinary size"
+    words = {
+        "float_type": "a number",
+        "float_parsing": "a number",
+        "int_type": "a whole number",
+        "int_from_float": "a whole number",
+        "finite_number": "a finite number",
+        "model_type": "a section with keys of its own",
+        "string_type": "a word",
+        "dict_type": "keys with values, as {a: 1, b: 2}",
+        "tuple_type": "a list of numbers, as [1, 2]",
+    }
+    if kind in words:
+        return words[kind]
+    if kind == "greater_than_equal" and value <= 0 < context["ge"] and _is_real(field):
+        return f"greater than 0 (at least {context['ge']:g})"
+    signs = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
+    for name, word in signs.items():
+        if name in context:
+            return f"{word} {context[name]:g}"
+    if kind == "literal_error":
+        ranges = _range(field) if field is not None else ""
+        other = f" or a number ({ranges})" if ranges else ""
+        return f"one of {context['expected']}{other}"
+    return f"valid ({message[0].lower() + message[1:]})"
+
+
+def _advice(place: list, kind: str, value: Any, field: FieldInfo | None) -> str:
+    """What was probably meant, or nothing."""
+    if field is None:
+        return ""
+    if kind in ("greater_than_equal", "less_than_equal", "less_than") and _is_number(value):
+        low, high = limits_of(field.annotation, field.metadata).ends
+        return hint(place[-1], value, low, high)
+    if kind == "literal_error" and isinstance(value, str):
+        near = difflib.get_close_matches(value[:80].casefold(), choices(field.annotation), n=1)
+        return f"; did you mean {near[0]}?" if near else ""
+    if kind == "float_type" and isinstance(value, str) and len(value) < 20:
+        try:
+            return f"; write {float(value.replace(',', '.')):g}" if "," in value else ""
+        except ValueError:
+            return ""
+    return ""
+
+
+def _section(model: type[BaseModel], place: list) -> type[BaseModel] | None:
+    inner: type[BaseModel] | None = model
+    for part in place:
+        field = inner.model_fields.get(part) if inner is not None else None
+        if field is None:
+            return None
+        inner = _model_of(field.annotation)
+    return inner
+
+
+def _model_of(annotation: Any) -> type[BaseModel] | None:
+    candidates = [annotation, *getattr(annotation, "__args__", ())]
+    for candidate in candidates:
+        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
+            return candidate
+    return None
+
+
+def field_of(model: type[BaseModel], place: list) -> FieldInfo | None:
+    """The field of a `model` at a place, given as a list of keys."""
+    section = _section(model, place[:-1])
+    return section.model_fields.get(place[-1]) if section is not None and place else None
+
+
+def _unknown(model: type[BaseModel], place: list) -> str:
+    key = ".".join(map(named, place))
+    section = _section(model, place[:-1])
+    names = list(section.model_fields) if section is not None else []
+    last = str(place[-1])[:80]
+    near = difflib.get_close_matches(last, names, n=1, cutoff=0.5)
+    elsewhere = [k for k in all_keys(model) if k.split(".")[-1] == last]
+    if elsewhere:
+        return f"`{key}` is not a known key; did you mean `{elsewhere[0]}`?"
+    if near:
+        right = ".".join([*place[:-1], near[0]])
+        return f"`{key}` is not a known key; did you mean `{right}`?"
+    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return f"`{key}` is not a known key; valid here: {', '.join(names[:_MOST_NAMES])}{more}"
+
+
+def all_keys(model: type[BaseModel], prefix: str = ""):
+    """Dotted names of all sections and keys of a `model`."""
+    for name, field in model.model_fields.items():
+        inner = _model_of(field.annotation)
+        yield f"{prefix}{name}"
+        if inner is not None:
+            yield from all_keys(inner, f"{prefix}{name}.")
+
+
+class Limits(NamedTuple):
+    """Range of a number; None where there is no such end."""
+
+    ge: float | None = None
+    gt: float | None = None
+    le: float | None = None
+    lt: float | None = None
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Least and greatest value, an excluded end among them."""
+        low = self.ge if self.ge is not None else self.gt
+        high = self.le if self.le is not None else self.lt
+        return (float("-inf") if low is None else low, float("inf") if high is None else high)
+
+
+def limits_of(annotation: Any, metadata: Any = ()) -> Limits:
+    """The range of a number, of each number of a list, or of a dictionary's values."""
+    found: dict[str, Any] = {}
+    for mark in metadata:
+        for inner in mark.metadata if isinstance(mark, FieldInfo) else (mark,):
+            for kind, name in ((Ge, "ge"), (Gt, "gt"), (Le, "le"), (Lt, "lt")):
+                if isinstance(inner, kind):
+                    found[name] = getattr(inner, name)
+    if found:
+        return Limits(**found)
+    if get_origin(annotation) is Annotated:
+        inner, *marks = get_args(annotation)
+        return limits_of(inner, marks)
+    parts = get_args(annotation)
+    if get_origin(annotation) is dict:
+        parts = parts[1:]
+    elif get_origin(annotation) not in (Union, types.UnionType, tuple):
+        return Limits()
+    return next((limits for part in parts if (limits := limits_of(part)) != Limits()), Limits())
+
+
+def _range(field: FieldInfo) -> str:
+    """The range of a key's numbers in words, or nothing."""
+    limits = limits_of(field.annotation, field.metadata)
+    words = []
+    if limits.ge is not None or limits.gt is not None:
+        words.append(f"from {limits.ge:g}" if limits.ge is not None else f"above {limits.gt:g}")
+    if limits.le is not None or limits.lt is not None:
+        words.append(f"to {limits.le:g}" if limits.le is not None else f"below {limits.lt:g}")
+    return " ".join(words)
+
+
+def describe(model: type[BaseModel]) -> str:
+    """One line per key with meaning, unit, choices or range, and default, for `--help`."""
+    lines = []
+    for key in all_keys(model):
+        field = field_of(model, key.split("."))
+        if field is None or _model_of(field.annotation) is not None:
+            continue
+        notes = [unit_of(key.split(".")[-1]), " | ".join(choices(field.annotation)), _range(field)]
+        if field.is_required():
+            notes.append("required")
+        elif field.default_factory is None and field.default not in (None, ()):
+            default = field.default
+            notes.append(f"default {list(default) if isinstance(default, tuple) else default}")
+        note = ", ".join(note for note in notes if note)
+        lines.append(
+            f"  {key:<42} {field.description or ''}{f' [{note}]' if note else ''}".rstrip()
+        )
+    return "\n".join(lines)

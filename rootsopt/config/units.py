@@ -1,0 +1,42 @@
+"""Units as the names of keys have them, and values that seem to be in another one."""
+
+import math
+
+# Longest endings first: the first that fits is the unit. With each, the units that are often
+# written in its place, and what a number in one of them must be multiplied by.
+_UNITS: dict[str, tuple[str, dict[str, float]]] = {
+    "_N_s_per_mm": ("N·s/mm", {"N·s/m": 1e-3}),
+    "_N_per_mm_e": ("N/mm^e", {}),
+    "_N_per_mm": ("N/mm", {"N/m": 1e-3}),
+    "_N_m_s_per_rad": ("N·m·s/rad", {"N·mm·s/rad": 1e-3}),
+    "_N_m_per_rad": ("N·m/rad", {"N·mm/rad": 1e-3}),
+    "_kg_m3": ("kg/m³", {"g/cm³": 1e3, "kg/mm³": 1e9, "t/mm³": 1e12}),
+    "_kg_m2": ("kg·m²", {"kg·mm²": 1e-6}),
+    "_mm_s": ("mm/s", {"m/s": 1e3}),
+    "_rad_s": ("rad/s", {}),
+    "_mrad": ("mrad", {"rad": 1e3}),
+    "_N_m": ("N·m", {"N·mm": 1e-3}),
+    "_rpm": ("rpm", {}),
+    "_mm": ("mm", {"metres": 1e3, "micrometres": 1e-3}),
+    "_deg": ("°", {"radians": 180 / math.pi}),
+    "_Pa": ("Pa", {}),
+}
+
+
+def unit_of(key: str) -> str:
+    """The unit in the name of a key; "" for none."""
+    return next((unit for end, (unit, _) in _UNITS.items() if key.endswith(end)), "")
+
+
+def hint(key: object, value: float, low: float, high: float) -> str:
+    """A question whether `value`, which does not lie within `low` and `high`, is in a unit in which
+    it does; "" if there is none."""
+    name = str(key)
+    for end, (_, others) in _UNITS.items():
+        if name.endswith(end):
+            meant = {other: value * factor for other, factor in others.items()}
+            fits = [other for other, number in meant.items() if low <= number <= high]
+            return f"; is that {fits[0]}? write {meant[fits[0]]:.4g}" if fits else ""
+    if high <= 1 < value <= 100 and low <= value / 100:
+        return f"; is that a percentage? write {value / 100:g}"
+    return ""

@@ -1,0 +1,58 @@
+"""Words for messages: values, names and whole messages, each of bounded length and one line."""
+
+import reprlib
+from typing import Any
+
+LONGEST = 500
+"""Longest message about a config (characters)."""
+_VALUE, _NAME, _PATH = 80, 60, 160
+"""Longest value, key and path in a message."""
+
+
+class _Bounded(reprlib.Repr):
+    """`repr` that never looks at more of a value than it shows."""
+
+    def __init__(self):
+        super().__init__()
+        self.maxstring = self.maxother = _VALUE
+        self.maxlevel, self.maxdict, self.maxlist, self.maxtuple = 3, 4, 8, 8
+
+    def repr_int(self, x, level):
+        digits = int(abs(x).bit_length() * 0.30103)
+        if digits < 30:
+            return repr(x)
+        return f"a whole number of {digits} digits"
+
+
+_repr = _Bounded().repr
+
+
+def shown(value: Any) -> str:
+    """A value as a message shows it: as Python writes it, shortened."""
+    return clipped(_repr(value), 2 * _VALUE)
+
+
+def named(part: Any) -> str:
+    """A key as a message shows it."""
+    text = clipped(part if isinstance(part, str) else shown(part), _NAME)
+    return text if text.isprintable() else ascii(text)[1:-1]
+
+
+def placed(path: Any) -> str:
+    """A path as a message shows it: its end, if it is long."""
+    text = str(path)
+    text = text if len(text) <= _PATH else "..." + text[3 - _PATH :]
+    return text if text.isprintable() else ascii(text)[1:-1]
+
+
+def clipped(text: str, longest: int = LONGEST) -> str:
+    """A text of at most `longest` characters, with its middle left out if it has more."""
+    if len(text) <= longest:
+        return text
+    tail = longest // 3
+    return f"{text[: longest - tail - 5]} ... {text[-tail:]}"
+
+
+def sentence(text: str) -> str:
+    """A message of one line and bounded length."""
+    return clipped(" ".join(text[: 100 * LONGEST].split()))
