@@ -112,7 +112,8 @@ def use_float64() -> None:
 def use_cache() -> None:
     """Keep compiled programs between processes, in the user's cache folder.
 
-    An unusable folder is no error: the programs are then compiled anew.
+    A folder that cannot be used is no error: the programs are then compiled anew. One line on
+    stderr says so where others could change what is kept there.
     """
     import platformdirs
 
@@ -121,7 +122,8 @@ def use_cache() -> None:
     choice = os.environ.get("ROOTSOPT_CACHE", "")
     if choice.lower() not in ("off", "0", "no"):
         folder = choice or platformdirs.user_cache_dir("rootsopt", appauthor=False)
-        programs.keep_in(Path(folder))
+        if refused := programs.keep_in(Path(folder)):
+            environment.say(f"compiled programs are not kept between runs: {refused}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
