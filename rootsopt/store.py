@@ -269,7 +269,7 @@ def _key() -> bytes:
         said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise UnsafeFolderError(
             f"the key that compiled programs are signed with cannot be kept in "
-            f"{os.fspath(path)!r}: {said}"
+            f"{os.fspath(path)!r}: {said}; mend that, or name another folder with XDG_STATE_HOME"
         ) from None
 
 

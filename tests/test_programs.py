@@ -250,8 +250,8 @@ def test_the_oldest_programs_give_way(folder, monkeypatch):
 
 
 def place():
-    """Name and purpose of a program in the store."""
-    _, kind = programs._split((Factor(jnp.asarray(2.0), 2), np.ones(3), "a"))
+    """Name and purpose of a program in the store; its arguments have no precision of their own."""
+    _, kind = programs._split((Factor(jnp.asarray(2, "int8"), 2), np.ones(3, "int8"), "a"))
     return Program(scaled)._place(kind)[1:]
 
 
@@ -279,16 +279,17 @@ def renamed_file(monkeypatch, tmp_path):
     return before
 
 
-def moved_lines(monkeypatch, tmp_path):
+def merged_files(monkeypatch, tmp_path):
+    """Two files that read as one."""
     (tmp_path / "room").mkdir()
     first, second = tmp_path / "room" / "a.py", tmp_path / "room" / "b.py"
-    first.write_text("x\ny\n")
-    second.write_text("z\n")
+    first.write_text("x\n")
+    second.write_text("y\n")
     monkeypatch.setattr(programs, "_PACKAGE", tmp_path / "room")
     programs._package_digest.cache_clear()
     before = place()
-    first.write_text("x\n")
-    second.write_text("y\nz\n")
+    first.write_text("x\nb.py\ny\n")
+    second.unlink()
     programs._package_digest.cache_clear()
     return before
 
@@ -352,7 +353,7 @@ UNDO = []
 CHANGES = {
     "a source": changed_file,
     "a source's name": renamed_file,
-    "where one source ends": moved_lines,
+    "where one source ends": merged_files,
     "flags of XLA": flags,
     "checks of equinox": checks,
     "precision": setting("jax_enable_x64", False),
