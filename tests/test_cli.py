@@ -184,7 +184,8 @@ def test_compiled_programs_are_kept_between_processes(tmp_path):
     answers = []
     for run, cache in (("first", os.environ["ROOTSOPT_CACHE"]), ("second", tmp_path / "cache")):
         if run == "second":
-            shutil.copytree(os.environ["ROOTSOPT_CACHE"], cache)
+            unfinished = shutil.ignore_patterns(".*")
+            shutil.copytree(os.environ["ROOTSOPT_CACHE"], cache, ignore=unfinished)
             kept = {path.name: path.stat().st_ino for path in cache.iterdir()}
         arguments = EE, "--no-figures", "-o", tmp_path / run
         done = command("simulate", *arguments, ROOTSOPT_CACHE=str(cache))
