@@ -12,7 +12,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rootsopt import environment
 from rootsopt.config import Config, describe_keys, load
+from rootsopt.environment import use_compiled_loops as use_compiled_loops
 from rootsopt.errors import InputError
 
 if TYPE_CHECKING:
@@ -65,6 +67,7 @@ def run(
 ) -> int:
     """Parse, load, choose float64, run `body`; turn `InputError` into exit 2. `add_options` adds
     the command's own arguments."""
+    environment.own_process()
     arguments = parser(command, purpose)
     add_options(arguments)
     options = arguments.parse_args(argv)
@@ -75,7 +78,8 @@ def run(
         use_float64()
         if not options.no_cache:
             use_cache()
-        return body(config, options)
+        with environment.explained():
+            return body(config, options)
     except InputError as error:
         message = " ".join(str(error).split())
         print(f"rootsopt {command}: {message}", file=sys.stderr)
@@ -99,33 +103,17 @@ def waiting(console: "Console", what: str) -> Iterator[None]:
         yield
 
 
-# XLA compiles a loop on a CPU to one function if its buffers are small; else it calls one for
-# every operation of every turn, which here costs several times the arithmetic itself.
-_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
-
-
-def use_compiled_loops() -> None:
-    """Have every loop compiled to a single function on CPUs; call it before JAX has
-    computed anything. What XLA_FLAGS says already stands."""
-    flags = os.environ.get("XLA_FLAGS", "")
-    if "xla_backend_extra_options" not in flags:
-        flags = f"{flags} --xla_backend_extra_options={_LOOPS}=1000000000"
-        os.environ["XLA_FLAGS"] = flags.strip()
-
-
 def use_float64() -> None:
-    """Double precision for the whole process; chosen here and nowhere in the library."""
-    import jax
-
-    use_compiled_loops()
-    jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_platforms", os.environ.get("JAX_PLATFORMS", "cpu"))
+    """Double precision for the whole process, on the CPU or what JAX_PLATFORMS names; chosen here
+    and nowhere in the library. Raises `InputError` where the environment does not let JAX start."""
+    environment.start_jax()
 
 
 def use_cache() -> None:
     """Keep compiled programs between processes, in the user's cache folder.
 
-    An unusable folder is no error: the programs are then compiled anew.
+    A folder that cannot be used is no error: the programs are then compiled anew. One line on
+    stderr says so where others could change what is kept there.
     """
     import platformdirs
 
@@ -134,7 +122,8 @@ def use_cache() -> None:
     choice = os.environ.get("ROOTSOPT_CACHE", "")
     if choice.lower() not in ("off", "0", "no"):
         folder = choice or platformdirs.user_cache_dir("rootsopt", appauthor=False)
-        programs.keep_in(Path(folder))
+        if refused := programs.keep_in(Path(folder)):
+            environment.say(f"compiled programs are not kept between runs: {refused}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

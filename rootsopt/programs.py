@@ -11,6 +11,7 @@ import hashlib
 import os
 import pickle
 import platform
+import sys
 import threading
 import zlib
 from collections.abc import Callable, Iterator
@@ -25,20 +26,51 @@ import numpy as np
 from jax.core import Tracer
 from jax.experimental import serialize_executable
 
-_PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix")
-_MOST_BYTES = 200 * 2**20
-_SUFFIX = ".program"
-_folder: Path | None = None
+from rootsopt.store import Store, UnsafeFolderError
+
+_PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "optax", "numpy")
+_SETTINGS = (
+    "jax_enable_x64",
+    "jax_numpy_dtype_promotion",
+    "jax_numpy_rank_promotion",
+    "jax_default_matmul_precision",
+    "jax_random_seed_offset",
+    "jax_default_prng_impl",
+    "jax_enable_custom_prng",
+    "jax_threefry_partitionable",
+    "jax_softmax_custom_jvp",
+    "jax_use_direct_linearize",
+    "jax_disable_most_optimizations",
+    "jax_optimization_level",
+    "jax_exec_time_optimization_effort",
+    "eager_constant_folding",
+)
+"""Settings of JAX that change what is traced or compiled."""
+_VARIABLES = ("XLA_FLAGS", "EQX_ON_ERROR")
+_PACKAGE = Path(__file__).parent
+_store: Store | None = None
 # Tracing is Python's work: in turn, the first asked for comes first to the compiler, which works
 # side by side.
 _tracing = threading.RLock()
 
 
-def keep_in(folder: Path | None) -> None:
-    """Keep programs in `folder` from now on; None keeps none. Whoever can write to the folder
-    can run code here: it must be the user's own."""
-    global _folder
-    _folder = folder
+def keep_in(folder: Path | None) -> str | None:
+    """Keep programs in `folder` from now on; None keeps none.
+
+    Nothing is kept where that cannot be done. Where it must not be done, as others could put
+    programs of theirs in place of these, the reason is returned.
+    """
+    global _store
+    _store = None
+    if folder is None:
+        return None
+    try:
+        _store = Store(folder)
+    except UnsafeFolderError as error:
+        return str(error)
+    except OSError:
+        return None
+    return None
 
 
 class _Kind(NamedTuple):
@@ -92,8 +124,8 @@ class Program:
     def outline(self, *args: Any) -> Any:
         """The result with `jax.ShapeDtypeStruct` for arrays, known before it is compiled."""
         _, kind = _split(args)
-        path = self._path(kind)
-        kept = path is not None and path.exists()
+        place = self._place(kind)
+        kept = place is not None and place.kept
         if kept:
             self.prepare(*args)
         future = self._made.get(kind)
@@ -109,14 +141,14 @@ class Program:
 
     def _make(self, future: Future[_Made], kind: _Kind) -> None:
         try:
-            path = self._path(kind)
-            future.set_result(_loaded(path) or self._compiled(kind, path))
+            place = self._place(kind)
+            future.set_result(_loaded(place) or self._compiled(kind, place))
         except BaseException as error:
             with self._lock:
                 del self._made[kind]
             future.set_exception(error)
 
-    def _compiled(self, kind: _Kind, path: Path | None) -> _Made:
+    def _compiled(self, kind: _Kind, place: "_Place | None") -> _Made:
         outlines = []
 
         def flat(*arrays):
@@ -129,24 +161,39 @@ class Program:
         with _tracing:
             lowered = jax.jit(flat).lower(*structs)
         made = _Made(lowered.compile(), outlines[-1])
-        if path is not None:
+        if place is not None:
             # Not being able to keep a program is no reason not to use it.
             with contextlib.suppress(Exception):
-                _save(path, made, len(structs))
+                _save(place, made, len(structs))
         return made
 
-    def _path(self, kind: _Kind) -> Path | None:
+    def _place(self, kind: _Kind) -> "_Place | None":
         """Where a program of this kind is kept, if it is."""
-        if _folder is None or jax.default_backend() != "cpu":
+        if _store is None or jax.default_backend() != "cpu":
             return None
         if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
             return None  # What comes out of JAX's own cache cannot be kept a second time.
+        sources = _sources({self.function.__module__, *_modules(kind)})
+        if sources is None:
+            return None
         name = f"{self.function.__module__}.{self.function.__qualname__}"
-        words = [name, *map(repr, kind), *_surroundings()]
+        words = [name, *map(repr, kind), *sources, *_machine(), *_versions(), *_settings()]
         if any(" at 0x" in word for word in words):
             return None  # Known by its address, which is another one next time.
-        digest = hashlib.sha256("\n".join(words).encode()).hexdigest()
-        return _folder / f"{self.function.__name__}-{digest[:32]}{_SUFFIX}"
+        purpose = hashlib.sha256("\0".join(words).encode()).hexdigest()
+        return _Place(_store, f"{self.function.__name__}-{purpose[:32]}", purpose)
+
+
+class _Place(NamedTuple):
+    """An entry of a store: its name, and all that the program depends on, as a digest."""
+
+    store: Store
+    name: str
+    purpose: str
+
+    @property
+    def kept(self) -> bool:
+        return self.name in self.store
 
 
 def _is_array(leaf: Any) -> bool:
@@ -175,35 +222,24 @@ def _joined(kind: _Kind, arrays: Iterator) -> tuple:
     return jax.tree.unflatten(kind.tree, leaves)
 
 
-def _save(path: Path, made: _Made, number: int) -> None:
+def _save(place: _Place, made: _Made, number: int) -> None:
     # A program that calls out (LAPACK, Python) relies on addresses set up when it is lowered.
     if "custom-call" in made.call.as_text():  # pyright: ignore[reportFunctionMemberAccess]
         return
     payload, _, _ = serialize_executable.serialize(made.call)  # pyright: ignore[reportArgumentType]
     data = zlib.compress(pickle.dumps((payload, number, made.outline)), 1)
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        unfinished.write_bytes(data)
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
-    # Only our own files: the folder may be one that holds others.
-    ours = path.parent.glob(f"*{_SUFFIX}")
-    kept = sorted(ours, key=lambda other: other.stat().st_mtime, reverse=True)
-    sizes = np.cumsum([other.stat().st_size for other in kept])
-    for old, total in zip(kept, sizes, strict=True):
-        if total > _MOST_BYTES:
-            old.unlink(missing_ok=True)
+    place.store.write(place.name, place.purpose, data)
 
 
-def _loaded(path: Path | None) -> _Made | None:
+def _loaded(place: _Place | None) -> _Made | None:
     """A kept program, or None if there is none that works."""
-    if path is None:
+    if place is None:
         return None
     try:
-        payload, number, outline = pickle.loads(zlib.decompress(path.read_bytes()))
-        os.utime(path)
+        data = place.store.read(place.name, place.purpose)
+        if data is None:
+            return None
+        payload, number, outline = pickle.loads(zlib.decompress(data))
         results = sum(map(_is_array, jax.tree.leaves(outline)))
         takes = jax.tree.structure(((0,) * number, {}))
         call = serialize_executable.deserialize_and_load(
@@ -214,17 +250,64 @@ def _loaded(path: Path | None) -> _Made | None:
     return _Made(call, outline)
 
 
+def _modules(kind: _Kind) -> set[str]:
+    """Modules that define the types in the arguments."""
+    found = {of.__module__ for of, _ in kind.others}
+    trees = [kind.tree]
+    while trees:
+        tree = trees.pop()
+        if (data := tree.node_data()) is not None:
+            found.add(data[0].__module__)
+        trees.extend(tree.children())
+    return found
+
+
+def _sources(modules: set[str]) -> list[str] | None:
+    """Digests of this package's sources, and of the files of modules that are neither in it nor
+    in a package whose version is known; None where there is such a module without a file."""
+    digests = [_package_digest()]
+    for name in sorted(modules):
+        top = name.partition(".")[0]
+        if top in (_PACKAGE.name, *_PACKAGES) or top in sys.stdlib_module_names:
+            continue
+        file = getattr(sys.modules.get(name), "__file__", None)
+        try:
+            digests.append(hashlib.sha256(Path(file or "").read_bytes()).hexdigest())
+        except OSError:
+            return None
+    return digests if digests[0] else None
+
+
 @functools.cache
-def _surroundings() -> tuple[str, ...]:
-    """All that a compiled program depends on beside its function and kinds of arguments."""
-    source = hashlib.sha256()
-    for file in sorted(Path(__file__).parent.rglob("*.py")):
-        source.update(file.read_bytes())
+def _package_digest() -> str:
+    """Digest of every source file of this package; empty where there are none to be read."""
+    digest, files = hashlib.sha256(), sorted(_PACKAGE.rglob("*.py"))
+    for file in files:
+        data = file.read_bytes()
+        digest.update(f"{file.relative_to(_PACKAGE).as_posix()} {len(data)}\n".encode())
+        digest.update(data)
+    return digest.hexdigest() if files else ""
+
+
+@functools.cache
+def _machine() -> list[str]:
+    """What the processor can do."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text("utf-8", errors="replace").splitlines()
         processor = next(line for line in lines if line.startswith(("flags", "Features")))
     except (OSError, StopIteration):
         processor = platform.processor()
-    versions = [f"{name} {metadata.version(name)}" for name in _PACKAGES]
-    settings = [os.environ.get("XLA_FLAGS", ""), str(jax.config.read("jax_enable_x64"))]
-    return source.hexdigest(), platform.machine(), processor, *versions, *settings
+    return [platform.system(), platform.machine(), processor]
+
+
+@functools.cache
+def _versions() -> list[str]:
+    """What traces and compiles."""
+    packages = [f"{name} {metadata.version(name)}" for name in _PACKAGES]
+    return [platform.python_implementation(), platform.python_version(), *packages]
+
+
+def _settings() -> list[str]:
+    """Settings that change what is traced or compiled, as they are now."""
+    variables = [f"{name}={os.environ.get(name, '')}" for name in _VARIABLES]
+    return variables + [f"{name}={getattr(jax.config, name, None)}" for name in _SETTINGS]

@@ -24,7 +24,9 @@ os.environ["XLA_FLAGS"] = " ".join(
 gc.set_threshold(100_000, 50, 100)
 # One folder of compiled programs for all processes of a session, new for every session.
 os.environ.setdefault("ROOTSOPT_TEST_CACHE", tempfile.mkdtemp(prefix="rootsopt-"))
-os.environ["ROOTSOPT_CACHE"] = os.environ["ROOTSOPT_TEST_CACHE"]
+os.environ["ROOTSOPT_CACHE"] = os.path.join(os.environ["ROOTSOPT_TEST_CACHE"], "programs")
+# The key that they are signed with belongs there too, and not to the user's own.
+os.environ["XDG_STATE_HOME"] = os.path.join(os.environ["ROOTSOPT_TEST_CACHE"], "state")
 
 from rootsopt.cli import use_cache, use_float64  # noqa: E402
 

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from rootsopt import profiles
+from rootsopt import profile, profiles, programs
 from rootsopt.config import load
 from rootsopt.model import Model, design_vector
 from rootsopt.outline.reading import read, signed_area
@@ -178,30 +179,31 @@ def test_console_command_and_help():
 
 
 def test_compiled_programs_are_kept_between_processes(tmp_path):
-    """A second run finds every large program in the cache and gives the same numbers; with
-    --no-cache, or an unusable folder, nothing is kept and the run is as good."""
-    cache = tmp_path / "cache"
-    arguments = [CIC, "--no-figures", "--set", "solver.fidelity=linear"]
-    answers, files = [], []
-    for run in ("first", "second"):
-        done = command("simulate", *arguments, "-o", tmp_path / run, ROOTSOPT_CACHE=str(cache))
+    """A second run finds every program in the cache and gives the same numbers. The first one
+    shares the session's cache; the second has a copy of it, which nobody else writes to."""
+    answers = []
+    for run, cache in (("first", os.environ["ROOTSOPT_CACHE"]), ("second", tmp_path / "cache")):
+        if run == "second":
+            unfinished = shutil.ignore_patterns(".*")
+            shutil.copytree(os.environ["ROOTSOPT_CACHE"], cache, ignore=unfinished)
+            kept = {path.name: path.stat().st_ino for path in cache.iterdir()}
+        arguments = EE, "--no-figures", "-o", tmp_path / run
+        done = command("simulate", *arguments, ROOTSOPT_CACHE=str(cache))
         assert done.returncode == 0, done.stderr
         assert done.stderr == ""
         answers.append(json.loads((tmp_path / run / "result.json").read_text())["response"])
-        kept = {path.name.split("-")[0]: path.stat().st_ino for path in cache.iterdir()}
-        assert {"pair_and_tangents", "settle", "close_orbit"} <= set(kept)
-        files.append(kept)
+    assert {"settle", "close_orbit"} <= {name.split("-")[0] for name in kept}
+    assert kept == {path.name: path.stat().st_ino for path in cache.iterdir()}
     assert answers[0] == answers[1]
-    assert files[0] == files[1]
 
-    def unkept(folder, *more):
-        done = command("profile", CIC, "-o", tmp_path / "p", *more, ROOTSOPT_CACHE=str(folder))
-        assert done.returncode == 0, done.stderr
-        assert done.stderr == ""
 
-    unkept(tmp_path / "other", "--no-cache")
-    assert not (tmp_path / "other").exists()
-    (tmp_path / "file").write_text("not a folder")
-    unkept(tmp_path / "file")
-    unkept(tmp_path / "other")
-    assert list((tmp_path / "other").iterdir())
+def test_no_programs_are_kept_if_told_so(tmp_path, monkeypatch, capsys):
+    """With --no-cache; without it they are."""
+    monkeypatch.setattr(programs, "_store", None)
+    monkeypatch.setenv("ROOTSOPT_CACHE", str(tmp_path / "cache"))
+    arguments = EE, "-o", str(tmp_path / "p"), "--no-figures", "--export", "none"
+    for more in (["--no-cache"], []):
+        assert not (tmp_path / "cache").exists()
+        assert profile.main([*arguments, *more]) == 0
+        assert capsys.readouterr().err == ""
+    assert (tmp_path / "cache").is_dir()

@@ -1,0 +1,326 @@
+"""Files of compiled programs: the user's own, signed, and within a limit of size.
+
+What is read here is executed, so that nobody else may have a hand in it. The folder, every file in
+it and every folder above must be out of the reach of others; and each entry is signed, under its
+name and what it was made for, with a key in the user's own state folder. An entry that is damaged,
+exchanged or signed by nobody is no entry.
+"""
+
+import contextlib
+import hashlib
+import hmac
+import os
+import secrets
+import stat
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+MOST_BYTES = 200 * 2**20
+"""Bytes of all entries together above which the ones not used for longest are removed."""
+SUFFIX = ".program"
+"""Ending of the names of entries; other files in the folder are left alone."""
+
+_KEY_NAME = "programs.key"
+_KEY_BYTES = 32
+_HEADER = b"rootsopt program 1\n"
+_MAC_BYTES = hashlib.sha256().digest_size
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+_OTHERS_AT_ALL = stat.S_IRWXG | stat.S_IRWXO
+_NEW_SECONDS = 2.0
+"""Age (s) of an unfinished file up to which its process may not have locked it yet."""
+# What a symbolic link or a named pipe in a file's place cannot lead astray or hold up.
+_SAFELY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+_HAS_OWNERS = hasattr(os, "geteuid")
+_IN_FOLDER = {os.open, os.unlink, os.stat, os.rename} <= os.supports_dir_fd
+
+
+class UnsafeFolderError(Exception):
+    """A folder that others have a hand in; the message says which and what to change."""
+
+
+class Folder:
+    """A folder of the user's own, made where it does not exist, and held open.
+
+    Files are reached through the open folder and not by its path, which therefore may lead
+    elsewhere later. Raises `UnsafeFolderError` if others could write to it or exchange it,
+    `OSError` if it cannot be made or opened.
+    """
+
+    def __init__(self, path: Path):
+        try:
+            self.path = path.expanduser().resolve()
+        except RuntimeError as error:  # no home, or links in a circle
+            raise OSError(str(error)) from None
+        _make(self.path)
+        self._open: int | None = None
+        if _IN_FOLDER:
+            self._open = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        try:
+            _check(self.path, os.stat(self.path) if self._open is None else os.fstat(self._open))
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Let go of the folder."""
+        if self._open is not None:
+            os.close(self._open)
+            self._open = None
+
+    def __del__(self) -> None:
+        with contextlib.suppress(Exception):
+            self.close()
+
+    def _at(self, name: str) -> str:
+        return name if self._open is not None else os.fspath(self.path / name)
+
+    def open(self, name: str, flags: int) -> int:
+        """A descriptor of a file in the folder; a new file is the user's alone."""
+        return os.open(self._at(name), flags | _SAFELY, 0o600, dir_fd=self._open)
+
+    def stat(self, name: str) -> os.stat_result:
+        """Of the file itself, not of what it may be a link to."""
+        return os.stat(self._at(name), dir_fd=self._open, follow_symlinks=False)
+
+    def exists(self, name: str) -> bool:
+        """Whether there is such a file."""
+        try:
+            return stat.S_ISREG(self.stat(name).st_mode)
+        except OSError:
+            return False
+
+    def unlink(self, name: str) -> None:
+        """Remove a file, if it can be removed."""
+        with contextlib.suppress(OSError):
+            os.unlink(self._at(name), dir_fd=self._open)
+
+    def link(self, name: str, other: str) -> None:
+        """Give a file another name. Raises `FileExistsError` where that is taken."""
+        os.link(self._at(name), self._at(other), src_dir_fd=self._open, dst_dir_fd=self._open)
+
+    def replace(self, name: str, other: str) -> None:
+        """Give a file the name of another, in one step."""
+        os.replace(self._at(name), self._at(other), src_dir_fd=self._open, dst_dir_fd=self._open)
+
+    def names(self) -> list[str]:
+        """Of everything in the folder."""
+        return os.listdir(self.path if self._open is None else self._open)
+
+    def read(self, name: str, most: int, forbidden: int = _OTHERS_WRITE) -> bytes | None:
+        """The content of a plain file of the user's own; None if it is anything else, larger
+        than `most` bytes, or gives others one of the `forbidden` permissions."""
+        try:
+            file = self.open(name, os.O_RDONLY)
+        except OSError:
+            return None
+        try:
+            found = os.fstat(file)
+            if not stat.S_ISREG(found.st_mode) or found.st_size > most:
+                return None
+            if _HAS_OWNERS and (found.st_uid != os.geteuid() or found.st_mode & forbidden):
+                return None
+            with open(file, "rb", closefd=False) as stream:
+                data = stream.read(most + 1)
+            with contextlib.suppress(OSError):
+                os.utime(file if os.utime in os.supports_fd else self._at(name))
+            return data if len(data) <= most else None
+        except OSError:
+            return None
+        finally:
+            os.close(file)
+
+    @contextlib.contextmanager
+    def unfinished(self, name: str, data: bytes) -> Iterator[str]:
+        """A new file with `data` under a name of its own, removed afterwards if it still has it.
+
+        It is locked until then, so that `sweep` can tell it from one whose process has died.
+        """
+        own = f".{name}.{secrets.token_hex(8)}"
+        file = self.open(own, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+        try:
+            if fcntl is not None:
+                with contextlib.suppress(OSError):
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with open(file, "wb", closefd=fcntl is None) as stream:
+                stream.write(data)
+            yield own
+        finally:
+            self.unlink(own)
+            if fcntl is not None:
+                os.close(file)
+
+    def sweep(self, middle: str) -> None:
+        """Remove unfinished files of dead processes whose names contain `middle`."""
+        for name in self.names():
+            if not (name.startswith(".") and middle in name):
+                continue
+            with contextlib.suppress(OSError):
+                if abs(time.time() - self.stat(name).st_mtime) < _NEW_SECONDS:
+                    continue
+                file = self.open(name, os.O_RDWR)
+                try:
+                    if fcntl is not None:
+                        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                        self.unlink(name)
+                finally:
+                    os.close(file)
+                self.unlink(name)  # On Windows this fails as long as a process has it open.
+
+
+class Store:
+    """Signed entries in a folder.
+
+    Raises `UnsafeFolderError` if others could change the entries or know the key, `OSError` if
+    the folder cannot be used.
+    """
+
+    def __init__(self, path: Path):
+        self._folder = Folder(path)
+        self._key = _key()
+        self._folder.sweep(f"{SUFFIX}.")
+
+    def __contains__(self, name: str) -> bool:
+        return self._folder.exists(name + SUFFIX)
+
+    def read(self, name: str, purpose: str) -> bytes | None:
+        """What was written under this name for this purpose, or None."""
+        found = self._folder.read(name + SUFFIX, MOST_BYTES)
+        if found is None:
+            return None
+        start = len(_HEADER) + _MAC_BYTES
+        data = found[start:]
+        if not hmac.compare_digest(found[:start], _HEADER + self._mac(name, purpose, data)):
+            return None
+        return data
+
+    def write(self, name: str, purpose: str, data: bytes) -> None:
+        """Write an entry, whole or not at all. Raises `OSError` if that fails."""
+        signed = _HEADER + self._mac(name, purpose, data) + data
+        target = name + SUFFIX
+        with self._folder.unfinished(target, signed) as made:
+            self._folder.replace(made, target)
+        self._prune()
+
+    def _mac(self, name: str, purpose: str, data: bytes) -> bytes:
+        mac = hmac.new(self._key, digestmod=hashlib.sha256)
+        for part in (_HEADER, name.encode(), purpose.encode(), data):
+            mac.update(len(part).to_bytes(8, "big"))
+            mac.update(part)
+        return mac.digest()
+
+    def _prune(self) -> None:
+        """Remove what was not used for longest, until the rest is small enough."""
+        kept = []
+        for name in self._folder.names():
+            # Only our own files: the folder may be one that holds others.
+            if name.endswith(SUFFIX) and not name.startswith("."):
+                with contextlib.suppress(OSError):  # removed by another process
+                    found = self._folder.stat(name)
+                    if stat.S_ISREG(found.st_mode):
+                        kept.append((found.st_mtime_ns, found.st_size, name))
+        total = 0
+        for _, size, name in sorted(kept, reverse=True):
+            total += size
+            if total > MOST_BYTES:
+                self._folder.unlink(name)
+        self._folder.sweep(f"{SUFFIX}.")
+
+
+def key_folder() -> Path:
+    """Where the key lies: the user's state folder, wherever the programs are."""
+    import platformdirs
+
+    return Path(platformdirs.user_state_dir("rootsopt", appauthor=False))
+
+
+def _key() -> bytes:
+    """The user's key, made where there is none that is fit. Raises `UnsafeFolderError`."""
+    path = key_folder()
+    try:
+        if not path.is_absolute():
+            raise OSError("it is not an absolute path")
+        folder = Folder(path)
+        folder.sweep(f"{_KEY_NAME}.")
+        for _ in range(_ATTEMPTS):
+            there = _there(folder)  # Looked for first: what appears meanwhile is fit.
+            key = folder.read(_KEY_NAME, _KEY_BYTES, _OTHERS_AT_ALL)
+            if key is not None and len(key) == _KEY_BYTES:
+                return key
+            # A key that others may have read, or that is damaged, gives way to a new one; what
+            # was signed with it is compiled anew.
+            with folder.unfinished(_KEY_NAME, secrets.token_bytes(_KEY_BYTES)) as made:
+                if there:
+                    folder.replace(made, _KEY_NAME)
+                    continue
+                try:
+                    folder.link(made, _KEY_NAME)
+                except FileExistsError:
+                    pass  # Another process was faster; its key is ours.
+                except (OSError, NotImplementedError):  # a file system without links
+                    folder.replace(made, _KEY_NAME)
+        raise OSError("it cannot be read back")
+    except (OSError, UnsafeFolderError) as error:
+        said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise UnsafeFolderError(
+            f"the key that compiled programs are signed with cannot be kept in "
+            f"{os.fspath(path)!r}: {said}; mend that, or name another folder with XDG_STATE_HOME"
+        ) from None
+
+
+_ATTEMPTS = 3
+
+
+def _there(folder: Folder) -> bool:
+    try:
+        folder.stat(_KEY_NAME)
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def _make(path: Path) -> None:
+    """Make a folder and those above it, for the user alone."""
+    missing = []
+    while not os.path.lexists(path):
+        missing.append(path)
+        path = path.parent
+    for folder in reversed(missing):
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(folder, 0o700)
+
+
+def _check(path: Path, found: os.stat_result) -> None:
+    """Raise `UnsafeFolderError` if others own a folder, may change it, or may put another in its
+    place."""
+    if not _HAS_OWNERS:
+        return  # Folders below the user's home are the user's there, by default.
+    me = os.geteuid()
+    if found.st_uid != me:
+        raise UnsafeFolderError(
+            f"{os.fspath(path)!r} belongs to another user (number {found.st_uid}); choose a "
+            "folder of your own"
+        )
+    if found.st_mode & _OTHERS_WRITE:
+        raise UnsafeFolderError(
+            f"others may write to {os.fspath(path)!r}; take that from them with chmod go-w, or "
+            "choose another folder"
+        )
+    for parent in path.parents:
+        above = os.stat(parent)
+        if above.st_uid not in (0, me):
+            raise UnsafeFolderError(
+                f"{os.fspath(parent)!r} above it belongs to another user (number {above.st_uid}), "
+                "who can exchange the folder; choose one in a folder of your own"
+            )
+        # In a folder with the sticky bit, as /tmp, only owners rename what is theirs.
+        if above.st_mode & _OTHERS_WRITE and not above.st_mode & stat.S_ISVTX:
+            raise UnsafeFolderError(
+                f"others may write to {os.fspath(parent)!r}, and so exchange the folder in it; "
+                "take that from them with chmod go-w, or choose another folder"
+            )
