@@ -1,14 +1,13 @@
 """Outlines from DXF drawings, text or binary: entities out of the file, points on them."""
 
 import io
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from rootsopt.errors import InputError
-from rootsopt.outline.entities import chain, segments
-from rootsopt.outline.guard import guarded, short, silenced
+from rootsopt.outline.entities import Entity, chain
+from rootsopt.outline.guard import each, guarded, short, silenced
 from rootsopt.outline.joining import joined
 from rootsopt.outline.loop import Loop
 
@@ -79,7 +78,9 @@ def from_dxf(data: bytes, name: str) -> Loop:
             f"{name}: $INSUNITS must be the code of a length unit (4: mm, 1: inch, 0: none), but "
             f"is {short(unit)}; set the drawing's units"
         )
-    parts = [part for e in _chosen(document, name) if (part := segments(e, scale, name))]
+    with silenced():
+        entities = [Entity.of(entity, name) for entity in _chosen(document, name)]
+    parts = [part for entity in entities if (part := entity.segments(scale))]
     if not parts:
         raise InputError(
             f"{name}: must hold an outline of {', '.join(_KINDS)}, but those in it have no extent; "
@@ -109,7 +110,8 @@ def _check_tags(data: bytes, binary: bool, name: str) -> None:
     """
     tags = binary_tags_loader(data) if binary else recover.bytes_loader(io.BytesIO(data))
     count, kind, ended = 0, "", False
-    for number, code, value in _numbered(tags, name):
+    for number, tag in enumerate(each(iter(tags), name, _NOT, _AGAIN), 1):
+        code, value = tag.code, tag.value
         if code == 0:
             kind = (value if isinstance(value, str) else value.decode("latin-1")).strip().upper()
             ended = kind == "EOF"
@@ -142,17 +144,6 @@ def _check_tags(data: bytes, binary: bool, name: str) -> None:
 
 def _raw(value: Any) -> bytes:
     return value if isinstance(value, bytes) else str(value).encode()
-
-
-def _numbered(tags: Iterator[Any], name: str) -> Iterator[tuple[int, int, Any]]:
-    number = 0
-    while True:
-        with guarded(name, _NOT, _AGAIN):
-            tag = next(tags, None)
-        if tag is None:
-            return
-        number += 1
-        yield number, tag.code, tag.value
 
 
 def _chosen(document: Drawing, name: str) -> list[Any]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from rootsopt.errors import InputError
-from rootsopt.outline.guard import guarded, short, silenced
+from rootsopt.outline.guard import guarded, short
 from rootsopt.outline.loop import Loop
 
 _FEWEST = 24
@@ -136,26 +136,39 @@ def chain(parts: list[Segment], spacing: float) -> Loop:
     return Loop(np.concatenate(points), np.concatenate(joints))
 
 
-def segments(entity: Any, scale: float, name: str) -> list[Segment]:
-    """The segments of an entity, `scale` mm for a drawing unit; none if it has no extent.
+@dataclasses.dataclass(frozen=True)
+class Entity:
+    """What a drawing says of an entity: `data` for its maker; `normal` of its plane."""
 
-    Raises `InputError` for an entity that makes no sense.
-    """
-    kind = entity.dxftype()
-    read, make = _KINDS[kind]
-    with guarded(name, f"{kind} cannot be read", "mend or remove it in the drawing"):
-        handle = short(entity.dxf.handle or "unknown", 20)
-        normal = [float(x) for x in entity.dxf.get("extrusion", (0, 0, 1))]
-        data = read(entity)
-    fault = _Fault(f"{name}: {kind} (handle {handle})")
-    if kind not in _SPATIAL and math.hypot(*normal[:2]) > _TILT * abs(normal[2]):
-        raise fault("lie in the plane of x and y", "is in another")
-    with silenced():
-        made = make(*data, _Plane(scale, normal[2] < 0), fault)
-        whole = all(np.all(np.isfinite(s.points(s.least))) for s in made)
-    if not whole:
-        raise fault("have a finite size", "has none")
-    return made
+    kind: str
+    what: str
+    normal: tuple[float, ...]
+    data: tuple[Any, ...]
+
+    @classmethod
+    def of(cls, entity: Any, name: str) -> "Entity":
+        """From the library's object. Raises `InputError`."""
+        kind = entity.dxftype()
+        with guarded(name, f"{kind} cannot be read", "mend or remove it in the drawing"):
+            handle = short(entity.dxf.handle or "unknown", 20)
+            normal = tuple(float(x) for x in entity.dxf.get("extrusion", (0, 0, 1)))
+            data = _KINDS[kind][0](entity)
+        return cls(kind, f"{name}: {kind} (handle {handle})", normal, data)
+
+    def segments(self, scale: float) -> list[Segment]:
+        """Its segments, `scale` mm for a drawing unit; none if it has no extent.
+
+        Raises `InputError` for an entity that makes no sense.
+        """
+        fault, across = _Fault(self.what), abs(self.normal[2])
+        if self.kind not in _SPATIAL and math.hypot(*self.normal[:2]) > _TILT * across:
+            raise fault("lie in the plane of x and y", "is in another")
+        made = _KINDS[self.kind][1](*self.data, _Plane(scale, self.normal[2] < 0), fault)
+        with np.errstate(all="ignore"):
+            whole = all(np.all(np.isfinite(s.points(s.least))) for s in made)
+        if not whole:
+            raise fault("have a finite size", "has none")
+        return made
 
 
 @dataclasses.dataclass(frozen=True)

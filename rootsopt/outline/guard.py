@@ -8,6 +8,7 @@ import contextlib
 import logging
 import warnings
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,9 @@ def silenced() -> Iterator[None]:
     """Keep log records, warnings and floating-point complaints of a library off the console."""
     logger = logging.getLogger(_LOGGER)
     level = logger.level
+    if level > logging.CRITICAL:  # Inside another; entering is slow for thousands of entities.
+        yield
+        return
     logger.setLevel(logging.CRITICAL + 1)
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -52,7 +56,23 @@ def guarded(name: str, fault: str, remedy: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        reason = short(" ".join(str(error).split()), _REASON)
-        if not reason or isinstance(error, KeyError):
-            reason = f"{type(error).__name__} {reason}".strip()
-        raise InputError(f"{name}: {fault}: {reason}; {remedy}") from error
+        raise _error(error, name, fault, remedy) from error
+
+
+def each(items: Iterator[Any], name: str, fault: str, remedy: str) -> Iterator[Any]:
+    """The items of a library's iterator, behind the same guard; what is done with them is not."""
+    while True:
+        try:
+            item = next(items)
+        except StopIteration:
+            return
+        except Exception as error:
+            raise _error(error, name, fault, remedy) from error
+        yield item
+
+
+def _error(error: Exception, name: str, fault: str, remedy: str) -> InputError:
+    reason = short(" ".join(str(error).split()), _REASON)
+    if not reason or isinstance(error, KeyError):
+        reason = f"{type(error).__name__} {reason}".strip()
+    return InputError(f"{name}: {fault}: {reason}; {remedy}")
