@@ -127,7 +127,6 @@ def through(
         raise InputError(
             f"`profile.outline_file` must have at least 8 points on a flank, but has {len(points)}"
         )
-    steps = np.abs(np.diff(points))
     turned = np.sum(np.abs(np.angle(np.diff(points)[1:] / np.diff(points)[:-1])))
     if smoothing == 0 and turned > _WINDING:
         raise InputError(
