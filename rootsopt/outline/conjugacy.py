@@ -56,6 +56,7 @@ def conjugacy(profile: Profile) -> Conjugacy:
     other."""
     roll = float(profile.half_pitch) * (np.arange(_POSES) + 0.5) / _POSES
     gap, found = map(np.asarray, _gaps(profile, jnp.asarray(roll)))
+    found = found & np.isfinite(gap)
     if not np.any(found):
         raise InputError(
             "`profile.pitch_radius_mm` must be half the centre distance at which the rotors mesh, "

@@ -11,9 +11,10 @@ import itertools
 import numpy as np
 from jaxtyping import Bool, Complex128, Float64
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline, make_interp_spline, make_splprep
+from scipy.interpolate import BSpline, make_interp_spline, make_splprep, splprep
 
 from rootsopt.errors import InputError
+from rootsopt.outline.guard import guarded
 
 _TURNING = 0.3
 """Length that a turn of 1 rad counts as much as, in pitch radii."""
@@ -26,6 +27,10 @@ _WINDING = 7.0
 """Sum of the angles (rad) between the steps along a flank past which its points are scattered."""
 _SHORTEST = 4
 """Intervals of a piece, at least."""
+_MOST_KNOTS, _NO_ROOM = 500, 1
+"""Number of knots above which a smoothing spline follows the noise, and FITPACK's word for it."""
+_KEY = "`profile.outline_file`"
+_UNEVEN = "remove points that are much closer together than others"
 _CUSP, _SPARED = 2e-2, 2
 """Speed at the end of a piece, relative to its mean, below which it is a cusp, and knots next to it
 that are spared, as is what lies before the curve has that speed."""
@@ -89,9 +94,10 @@ def stretch(
     cusp = speed[[0, -1]] < _CUSP * np.mean(speed)
     knots = np.unique(curve.pieces[place].t)
     cusp &= len(knots) > 2 * _SPARED
-    fast = np.linspace(low, high, count)[speed > _CUSP * np.mean(speed)]
-    spared = [max(knots[_SPARED], fast[0]), min(knots[-1 - _SPARED], fast[-1])]
-    ends = np.where(cusp, spared, ends)
+    if np.any(cusp):
+        fast = np.linspace(low, high, count)[speed > _CUSP * np.mean(speed)]
+        spared = [max(knots[_SPARED], fast[0]), min(knots[-1 - _SPARED], fast[-1])]
+        ends = np.where(cusp, spared, ends)
     t = np.linspace(ends[0], ends[1], count - int(np.sum(cusp)))
     t = np.concatenate([[low][: int(cusp[0])], t, [high][: int(cusp[1])]])
     z, first, second, _ = curve.derivatives(t, place)
@@ -121,7 +127,6 @@ def through(
         raise InputError(
             f"`profile.outline_file` must have at least 8 points on a flank, but has {len(points)}"
         )
-    steps = np.abs(np.diff(points))
     turned = np.sum(np.abs(np.angle(np.diff(points)[1:] / np.diff(points)[:-1])))
     if smoothing == 0 and turned > _WINDING:
         raise InputError(
@@ -130,16 +135,7 @@ def through(
             "set it"
         )
     if smoothing > 0:
-        t = np.concatenate([[0.0], np.cumsum(steps)])
-        sum_of_squares = len(points) * smoothing**2
-        try:
-            sides = [np.real(points), np.imag(points)]
-            spline, _ = make_splprep(sides, u=t, k=5, s=sum_of_squares)  # type: ignore[arg-type]
-        except ValueError as error:
-            raise InputError(f"the outline cannot be smoothed: {error}") from None
-        controls = np.asarray(spline.c)
-        controls = controls[0] + 1j * controls[1] if controls.shape[0] == 2 else controls @ [1, 1j]
-        return Curve(t[[0, -1]], (BSpline(spline.t, controls, spline.k),))
+        return _smoothed(points, smoothing)
     last = len(points) - 1
     ends = [0]
     for joint in np.flatnonzero(joints | _jumps(points)):
@@ -151,9 +147,32 @@ def through(
         part = points[start : stop + 1]
         t = places[-1] + _parameter(part, _TURNING * pitch_radius)
         degree = min(5, (stop - start) // 2 * 2 - 1)
-        pieces.append(make_interp_spline(t, part, k=degree))
+        with guarded(_KEY, "no curve goes through its points", _UNEVEN):
+            pieces.append(make_interp_spline(t, part, k=degree))
         places.append(t[-1])
     return Curve(np.array(places), tuple(pieces))
+
+
+def _smoothed(points: NDArray[np.complex128], smoothing: float) -> Curve:
+    """The smoothest spline at an RMS distance `smoothing` from the points."""
+    t = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points)))])
+    sides = [np.real(points), np.imag(points)]
+    squares = len(points) * smoothing**2
+    with guarded(_KEY, "its points cannot be smoothed", "check `profile.outline_smoothing_mm`"):
+        # FITPACK's own takes a hundredth of the time to find out that there are too many knots.
+        *_, flag, _ = splprep(
+            sides, u=t, k=5, s=squares, nest=_MOST_KNOTS, full_output=True, quiet=True
+        )
+    if flag == _NO_ROOM:
+        raise InputError(
+            "`profile.outline_smoothing_mm` must be the scatter (RMS) of the points, but with "
+            f"{smoothing:g} a flank needs more than {_MOST_KNOTS} knots to follow them; raise it"
+        )
+    with guarded(_KEY, "its points cannot be smoothed", "check `profile.outline_smoothing_mm`"):
+        spline, _ = make_splprep(sides, u=t, k=5, s=squares)  # type: ignore[arg-type]
+    controls = np.asarray(spline.c)
+    controls = controls[0] + 1j * controls[1] if controls.shape[0] == 2 else controls @ [1, 1j]
+    return Curve(t[[0, -1]], (BSpline(spline.t, controls, spline.k),))
 
 
 def _parameter(points: NDArray[np.complex128], weight: float) -> NDArray[np.float64]:

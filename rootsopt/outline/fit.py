@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +11,14 @@ from scipy.optimize import brentq
 from rootsopt.errors import InputError
 from rootsopt.outline.checks import Checks
 from rootsopt.outline.curves import Curve, Frame, stretch, through
-from rootsopt.outline.reading import Loop, signed_area
+from rootsopt.outline.loop import Loop, signed_area
 from rootsopt.profiles.outline import Outline, Table
 
 _MM = 1e-3
 NODES = 1536
 """Nodes of either table, so that one compiled program serves all outlines."""
+_PIECES = NODES // 4
+"""Smooth pieces of an addendum or dedendum, at most."""
 _BEYOND = 0.3
 """Share of a flank by which its points go on beyond tip and root."""
 _SHARES = 400
@@ -31,6 +34,8 @@ _CORNER = 1e-2
 """Angle (rad) at a joint from which on it is a corner."""
 _AT = 1e-6
 """Distance (pitch radii) from the pitch circle within which a joint is on it."""
+_FAR = 1e3
+"""Ratio of an outline's greatest radius to the pitch radius above which units are wrong."""
 _GAUSS = np.polynomial.legendre.leggauss(12)
 
 
@@ -62,6 +67,19 @@ def imported(
     Raises `InputError` where there is no rotor of so many lobes in the file, or none that can be
     simulated.
     """
+    # What overflows or divides by zero all the same is found in the outcome.
+    with np.errstate(all="ignore"):
+        outline, checks = _imported(loop, lobes, pitch_radius_mm, smoothing_mm)
+    found = [*jax.tree.leaves(outline), *checks.record().values()]
+    if not all(np.all(np.isfinite(x)) for x in found):
+        raise InputError(
+            "`profile.outline_file` must hold a smooth outline, but the curve through its points "
+            "is not finite; remove points that are much closer together than others"
+        )
+    return outline, checks
+
+
+def _imported(loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: float):
     points, joints = loop.points, loop.joints
     backwards = signed_area(points) < 0
     if backwards:
@@ -100,12 +118,21 @@ def imported(
 
 
 def _check_lobes(points, lobes, radius):
-    around = np.angle(np.roll(points, -1) / points)
-    if np.min(np.abs(points)) == 0 or round(np.sum(around) / (2 * np.pi)) != 1:
+    away = InputError(
+        "`profile.outline_file` must hold an outline around the rotor's axis, the origin, but "
+        "it does not go round it once; move it there"
+    )
+    least, most = np.min(np.abs(points)), np.max(np.abs(points))
+    if not radius / _FAR < most < radius * _FAR:
         raise InputError(
-            "`profile.outline_file` must hold an outline around the rotor's axis, the origin, but "
-            "it does not go round it once; move it there"
+            f"`profile.pitch_radius_mm` = {radius:g} must fit the outline, but the outline's "
+            f"greatest radius is {most:.5g} mm; mend the key or the file's units"
         )
+    if not least > most / _FAR**2:
+        raise away
+    around = np.angle(np.roll(points, -1) / points)
+    if round(np.sum(around) / (2 * np.pi)) != 1:
+        raise away
     # Noise may turn back and go on: what counts is how far behind the farthest it comes.
     angle = np.cumsum(around)
     back = np.max(np.maximum.accumulate(angle) - angle)
@@ -144,22 +171,26 @@ def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
     start = np.argmin(angle)
     local, joints, angle = (np.roll(x, -start) for x in (local, joints, angle + half / 2))
     kept = np.flatnonzero((angle > -_BEYOND * half) & (angle < (1 + _BEYOND) * half))
-    part = slice(kept[0], kept[-1] + 1)
+    part = slice(kept[0], kept[-1] + 1) if len(kept) else slice(0)
     local, joints, angle = local[part], joints[part], angle[part]
     curve = through(local, joints, radius, smoothing)
     low, high = curve.ends[[0, -1]]
     scan = np.linspace(low, high, 4 * len(local))
     z = curve(scan)[0]
 
+    lacking = InputError(
+        "`profile.outline_file` must have points all along every flank, but the one at "
+        f"{np.degrees(2 * np.pi * lobe / lobes):.4g} deg lacks its tip, root or pitch "
+        "crossing; add points"
+    )
+
     def root(values, function):
         i = np.flatnonzero((values[:-1] < 0) != (values[1:] < 0))
         if len(i) == 0:
-            raise InputError(
-                "`profile.outline_file` must have points all along every flank, but the one at "
-                f"{np.degrees(2 * np.pi * lobe / lobes):.4g} deg lacks its tip, root or pitch "
-                "crossing; add points"
-            )
+            raise lacking
         i = i[len(i) // 2]
+        if not function(scan[i]) * function(scan[i + 1]) <= 0:
+            raise lacking
         found = brentq(function, scan[i], scan[i + 1], xtol=1e-13)
         return float(found)  # type: ignore[arg-type]
 
@@ -177,6 +208,8 @@ def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
     # At a cusp on the pitch circle (EE) the radius hardly tells where it is.
     near = curve.ends[np.abs(np.abs(curve(curve.ends)[0]) - radius) < _AT * radius]
     pitch = next((float(t) for t in near if tip < t < end), pitch)
+    if not tip < pitch < end:
+        raise lacking
     off = 0.0
     if smoothing > 0:
         t = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(local)))])
@@ -202,6 +235,12 @@ def _distances(flank: _Flank, own: _Flank) -> NDArray[np.float64]:
 def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray[np.float64], Frame]]:
     """`NODES` places from `start` to `stop`, each joint twice, in their pieces."""
     parts = flank.curve.between(start, stop)
+    if len(parts) > _PIECES:
+        raise InputError(
+            f"`profile.outline_file` must have flanks of at most {_PIECES} smooth pieces, but one "
+            f"has {len(parts)}; if the points are measured, set `profile.outline_smoothing_mm` to "
+            "their scatter, else draw the flank with longer arcs or one spline"
+        )
     lengths = np.array([high - low for _, low, high in parts])
     counts = 2 + np.floor((NODES - 2 * len(parts)) * lengths / lengths.sum()).astype(int)
     counts[np.argmax(counts)] += NODES - counts.sum()
@@ -223,7 +262,7 @@ def _outline(flank: _Flank, lobes: int, radius: float) -> tuple[Outline, float, 
     height, lever = np.real(z * np.conj(normal)), -np.imag(z * np.conj(normal))
     nu = direction[:NODES]
     curvature_radius = speed[:NODES] / np.where(turning > 0, turning, 1.0)[:NODES]
-    folds = ~(turning[:NODES] > 0) | np.append(np.diff(nu) < 0, False)
+    folds = ~(turning[:NODES] > 0) | np.append(np.diff(nu) < 0, not nu[-1] > max(0.0, nu[0]))
     if np.any(folds):
         place = z[np.argmax(folds)]
         raise InputError(

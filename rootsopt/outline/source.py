@@ -21,15 +21,16 @@ def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
     does not hold one."""
     path = Path(config.outline_file or "")
     try:
-        stamp = path.stat().st_mtime_ns
-    except OSError:
-        stamp = 0  # Reading it says what is wrong.
+        found = path.stat()
+        stamp = found.st_mtime_ns, found.st_size, found.st_ino
+    except (OSError, ValueError):
+        stamp = ()  # Reading it says what is wrong.
     smoothing = config.outline_smoothing_mm or 0.0
     return _kept(path, stamp, config.lobes, config.pitch_radius_mm, smoothing)
 
 
 @functools.lru_cache(maxsize=16)
-def _kept(path: Path, stamp: int, lobes: int, radius: float, smoothing: float):
+def _kept(path: Path, stamp: tuple[int, ...], lobes: int, radius: float, smoothing: float):
     del stamp
     return imported(read(path), lobes, radius, smoothing)
 

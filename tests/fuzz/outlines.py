@@ -1,0 +1,494 @@
+"""Malformed outline files against the reader, the fit and the roll check.
+
+Good files of this program are damaged: bytes, DXF tags, entities, headers, cells, encodings, and
+the outline itself. A file passes if it gives a profile or one `InputError` of one line, with nothing
+on stderr, in 20 s of processor time and 8 GB of address space. A few go through the command itself.
+"""
+
+import contextlib
+import functools
+import io
+import multiprocessing
+import os
+import random
+import re
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from rootsopt.errors import InputError
+from tests.fuzz.report import Report
+
+SECONDS, MEMORY, LONGEST = 20, 8 << 30, 450
+"""Processor time (s) and memory (bytes) for a file; characters of a message."""
+_EVERY = 100
+"""One file of so many goes through the command in a process of its own."""
+_R = 33.0
+CONFIG = """
+profile: {{family: outline, lobes: 3, pitch_radius_mm: 33.0, outline_file: "{}",
+  outline_smoothing_mm: {}}}
+rotor: {{length_mm: 100.0, density_kg_m3: 7800.0}}
+contact: {{stiffness_N_per_mm_e: 2.0e5, exponent: 2.2, max_damping_N_s_per_mm: 0.25,
+  full_damping_depth_mm: 0.01}}
+scene: {{speed_rpm: 3000.0, load: {{torque_N_m: 4.775}},
+  timing_gear: {{stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.5, backlash_mm: 0.1}}}}
+"""
+NUMBERS = """nan NaN -nan inf -inf 1e308 -1e308 1e-308 1e400 0 -0 -1 1 2 3 99 255 1e9 1e12 -1e9
+2147483648 -9223372036854775809 123456789012345678901234567890 1,5 1.5.2 1_0 0x10 1e"""
+WORDS = [
+    "",
+    " ",
+    "\0",
+    "9" * 400,
+    "x" * 5000,
+    "é",
+    "\ud800",
+    "1 2",
+    "- 5",
+    "%s",
+    "\t",
+    "abc",
+    "#",
+    "{",
+]
+BAD = [*NUMBERS.split(), *WORDS]
+ENTITIES = {
+    "ARC": "8 0 10 {} 20 {} 30 0 40 {} 50 {} 51 {}",
+    "LINE": "8 OUTLINE 10 {} 20 {} 30 0 11 {} 21 {} 31 0",
+    "ELLIPSE": "8 OUTLINE 10 {} 20 {} 30 0 11 {} 21 {} 31 0 40 {} 41 {} 42 {}",
+    "LWPOLYLINE": "8 OUTLINE 90 {} 70 1 10 {} 20 {} 42 {} 10 {} 20 {} 42 {} 10 {} 20 {}",
+    "POLYLINE": "8 OUTLINE 66 1 70 {} 10 0 20 0 30 {}",
+    "SPLINE": "8 OUTLINE 70 {} 71 {} 72 8 73 4 74 {} 40 {} 40 0 40 0 40 {} 40 1 40 1 40 1 40 {} "
+    "41 {} 41 1 41 {} 41 1 10 {} 20 0 30 0 10 1 20 {} 30 0 10 2 20 2 30 0 10 3 20 0 30 0",
+    "INSERT": "2 {} 8 0 10 {} 20 {} 30 0 41 {} 42 {} 43 1 50 {} 70 {} 71 {} 44 {} 45 {}",
+    "CIRCLE": "8 OUTLINE 10 {} 20 {} 30 0 40 {}",
+}
+
+
+@functools.cache
+def points(family: str, count: int = 30) -> np.ndarray:
+    """Outline (mm, x + iy) of a good rotor, the first point not repeated."""
+    from rootsopt.profiles import CIC, EE, outline
+
+    rotor = CIC(3, 0.033, 0.6358, 8.5e-3, 0.0698) if family == "cic" else EE(3, 0.033)
+    return np.asarray(outline(rotor, count))[:-1] @ [1, 1j] * 1e3
+
+
+def table(z: np.ndarray, split: str = ",", comma: bool = False, header: str = "x_mm,y_mm") -> bytes:
+    """A CSV file of points."""
+    rows = [split.join(f"{v:.10g}" for v in (p.real, p.imag)) for p in [*z, *z[:1]]]
+    rows = [row.replace(".", ",") for row in rows] if comma else rows
+    return "\n".join([header.replace(",", split), *rows, ""]).encode()
+
+
+def drawing(draw, version: str = "R2010", units: int = 4, fmt: str = "asc") -> bytes:
+    """A DXF file of what `draw` adds to a document."""
+    import ezdxf
+
+    document = ezdxf.new(version, units=units if version != "R12" else 0)
+    draw(document)
+    if fmt == "bin":
+        data = io.BytesIO()
+        document.write(data, fmt="bin")
+        return data.getvalue()
+    text = io.StringIO()
+    document.write(text)
+    return document.encode(text.getvalue())
+
+
+def lines(z: np.ndarray, random: random.Random):
+    """Draws loose lines in any order and direction."""
+
+    def draw(document):
+        ends = list(zip(z, np.roll(z, -1), strict=True))
+        random.shuffle(ends)
+        for pair in ends:
+            start, stop = random.sample(pair, 2)
+            document.modelspace().add_line((start.real, start.imag), (stop.real, stop.imag))
+
+    return draw
+
+
+def polyline(z: np.ndarray, old: bool = False, block: bool = False):
+    """Draws one closed polyline with small bulges, in a block if asked for."""
+
+    def draw(document):
+        space = document.blocks.new("ROTOR") if block else document.modelspace()
+        rows = [(p.real, p.imag, 1e-4 * (k % 7)) for k, p in enumerate(z)]
+        add = space.add_polyline2d if old else space.add_lwpolyline
+        add(rows, format="xyb", close=True)
+        if block:
+            document.modelspace().add_blockref("ROTOR", (0, 0))
+
+    return draw
+
+
+@functools.cache
+def good() -> dict[str, bytes]:
+    """Sound files by name."""
+    from rootsopt.config import load
+    from rootsopt.export.drawing import Drawing
+    from rootsopt.export.dxf import dxf_bytes
+    from rootsopt.model import Model, design_vector
+
+    config = load(Path(__file__).parents[2] / "configs" / "cic.yaml")
+    profile = Model.of(config).profile(design_vector(config))
+    own, chance = dxf_bytes(Drawing.of(config, profile, {})), random.Random(0)
+    cic, ee = points("cic"), points("ee")
+    return {
+        "cic.csv": table(cic),
+        "ee.csv": table(ee, ";", comma=True),
+        "tabs.txt": table(points("cic", 60), "\t"),
+        "own.dxf": own,
+        "lines.dxf": drawing(lines(cic[::2], chance)),
+        "bulges.dxf": drawing(polyline(cic)),
+        "r12.dxf": drawing(polyline(ee, old=True), "R12"),
+        "block.dxf": drawing(polyline(cic, block=True), "R2000"),
+        "binary.dxf": drawing(polyline(cic), fmt="bin"),
+        "inches.dxf": drawing(lines(ee[::3] / 25.4, chance), units=1),
+    }
+
+
+def damaged_bytes(data: bytes, chance: random.Random) -> bytes:
+    """Bytes changed, lost, repeated or put in."""
+    for _ in range(chance.choice([1, 1, 2, 5, 40])):
+        at = chance.randrange(len(data) + 1)
+        size = chance.choice([1, 1, 2, 8, 100, len(data) // 3])
+        piece = chance.choice(
+            [chance.randbytes(size), b"", data[at : at + size] * 2, b"\0" * size, b"9" * size]
+        )
+        data = data[:at] + piece + data[at + size :]
+        if chance.random() < 0.15:
+            data = data[: chance.randrange(len(data) + 1)]
+    return data
+
+
+def _tags(data: bytes) -> list[list[str]]:
+    rows = data.decode("utf-8").splitlines()
+    return [list(pair) for pair in zip(rows[::2], rows[1::2], strict=False)]
+
+
+def _text(tags: list[list[str]]) -> bytes:
+    return "\n".join(row for tag in tags for row in tag).encode("utf-8", "replace") + b"\n"
+
+
+def _section(tags: list[list[str]], name: str) -> tuple[int, int]:
+    start = next(k for k, tag in enumerate(tags) if tag[1] == name and tag[0].strip() == "2")
+    return start + 1, next(k for k in range(start, len(tags)) if tags[k][1] == "ENDSEC")
+
+
+def damaged_tags(data: bytes, chance: random.Random) -> bytes:
+    """Values, codes or whole tags of a text DXF, mostly of its entities."""
+    tags = _tags(data)
+    low, high = _section(tags, "ENTITIES") if chance.random() < 0.8 else (0, len(tags))
+    low, high = (low, high) if high > low else (0, len(tags))
+    for _ in range(chance.choice([1, 1, 1, 3, 20])):
+        k = min(chance.randrange(low, high), len(tags) - 1)
+        match chance.randrange(6):
+            case 0:
+                del tags[k]
+            case 1:
+                tags.insert(k, list(chance.choice(tags)))
+            case 2:
+                tags[k][0] = chance.choice(["0", "10", "20", "40", "-5", "1071", "99999", "x", ""])
+            case _:
+                tags[k][1] = chance.choice(BAD)
+    return _text(tags)
+
+
+def damaged_header(data: bytes, chance: random.Random) -> bytes:
+    """Units, version or another variable of the header; or no header."""
+    tags = _tags(data)
+    low, high = _section(tags, "HEADER")
+    places = [k for k in range(low, high) if tags[k][0].strip() == "9"]
+    special = [k for k in places if tags[k][1] in ("$INSUNITS", "$ACADVER", "$DWGCODEPAGE")]
+    for _ in range(chance.choice([1, 2])):
+        k = chance.choice(special if special and chance.random() < 0.7 else places) + 1
+        k = min(k, len(tags) - 1)
+        tags[k][1] = chance.choice([*BAD, *map(str, range(26)), "AC1009", "AC1032", "AC9999"])
+        if chance.random() < 0.2:
+            tags[k][0] = chance.choice(["40", "1", "10", "70", "310"])
+    return _text(tags[: low - 2] + tags[high + 1 :] if chance.random() < 0.1 else tags)
+
+
+def damaged_entities(data: bytes, chance: random.Random) -> bytes:
+    """Entities lost, repeated, moved, flattened, or senseless ones put in."""
+    tags = _tags(data)
+    low, high = _section(tags, "ENTITIES")
+    groups: list[list[list[str]]] = []
+    for tag in tags[low:high]:
+        if tag[0].strip() == "0" or not groups:
+            groups.append([])
+        groups[-1].append(tag)
+    for _ in range(chance.choice([1, 1, 2, 4])):
+        groups = groups or [[["0", "LINE"]]]
+        k = chance.randrange(len(groups))
+        match chance.randrange(7):
+            case 0:
+                del groups[k]
+            case 1:
+                groups.insert(chance.randrange(len(groups)), groups[k])
+            case 2:
+                chance.shuffle(groups)
+            case 3:
+                value = chance.choice(["0", "0.0", "1e-300", "1e8", chance.choice(BAD)])
+                groups[k] = [
+                    [c, value if re.fullmatch(r" *[1-5]\d", c) else v] for c, v in groups[k]
+                ]
+            case 4:
+                groups += groups * chance.choice([1, 3])
+            case _:
+                groups.insert(k, _senseless(chance))
+    return _text(tags[:low] + [tag for group in groups for tag in group] + tags[high:])
+
+
+def _senseless(chance: random.Random) -> list[list[str]]:
+    kind = chance.choice(list(ENTITIES))
+    words = ENTITIES[kind].split(" ")
+    usual = ["0", "1", "2", "30", "45", "*Model_Space", "ROTOR"]
+    values = [chance.choice(BAD if chance.random() < 0.2 else usual) for _ in words]
+    words = [value if word == "{}" else word for word, value in zip(words, values, strict=True)]
+    return [
+        ["0", kind],
+        *([code, value] for code, value in zip(words[::2], words[1::2], strict=True)),
+    ]
+
+
+def damaged_cells(data: bytes, chance: random.Random) -> bytes:
+    """Cells, rows, separators, headers, marks or the encoding of a table."""
+    rows = data.decode().splitlines()
+    for _ in range(chance.choice([1, 1, 2, 10])):
+        k = chance.randrange(len(rows))
+        split = next((c for c in ";\t," if c in rows[k]), " ")
+        cells = rows[k].split(split)
+        match chance.randrange(9):
+            case 0 | 1:
+                cells[chance.randrange(len(cells))] = chance.choice(BAD)
+                rows[k] = split.join(cells)
+            case 2:
+                rows[k] = split.join(cells * chance.choice([2, 1000]))
+            case 3:
+                rows[k] = cells[0]
+            case 4:
+                rows[k] = rows[k].replace(split, chance.choice([" ", ";", "|", "\t\t", '","', ""]))
+            case 5:
+                names = [
+                    "x;y",
+                    "y,x",
+                    "nr,x [mm],y [mm]",
+                    '"x_mm","y_mm"',
+                    "x_mm",
+                    "# x",
+                    "a\tb",
+                    "",
+                ]
+                rows[0] = chance.choice(names)
+            case 6:
+                rows[k] = '"' + rows[k]
+            case 7:
+                rows.insert(k, rows[k])
+            case 8:
+                rows[k] += chance.choice(["9" * 300_000, "\0", "\x1c", "\u2028", "  ", ",,,", "#"])
+    text = "\n".join(rows)
+    if chance.random() < 0.2:
+        return text.encode(chance.choice(["utf-16", "utf-16-le", "utf-8-sig", "utf-32"]), "replace")
+    return text.encode("utf-8", "replace")
+
+
+def wrong_outline(chance: random.Random) -> np.ndarray:
+    """Points that can be read and are no rotor, or a strange one."""
+    z = points(chance.choice(["cic", "ee"]), chance.choice([4, 15, 30, 60])).copy()
+    noise = np.random.default_rng(chance.randrange(1 << 30))
+    n, k = len(z), chance.randrange(len(z))
+    size = 10.0 ** chance.choice([-300, -12, -6, -3, -2, -1, 1, 2, 3, 6, 12, 150, 300])
+    changes = [
+        lambda: z * size,
+        lambda: z * 0 + 33,
+        lambda: z.real + 0j,
+        lambda: z[[0, n // 2]],
+        lambda: z[: chance.randrange(12)],
+        lambda: np.where(np.arange(n) == k, z * chance.choice([0, -1, 1e-9, 1.2, 3, 1e4]), z),
+        lambda: np.roll(z, k)[:: chance.choice([-1, 2, 7, 31])],
+        lambda: np.concatenate([z, z]),
+        lambda: np.repeat(z, chance.choice([2, 5])),
+        lambda: np.sort_complex(z),
+        lambda: noise.permutation(z),
+        lambda: (
+            z + 10.0 ** chance.uniform(-9, 1) * (noise.normal(size=n) + 1j * noise.normal(size=n))
+        ),
+        lambda: z + chance.choice([1, 5, 40]) * np.exp(1j * chance.uniform(0, 7)),
+        lambda: np.abs(z) * np.exp(chance.choice([-1, 0.5, 2, 3]) * 1j * np.angle(z)),
+        lambda: z.real * chance.choice([0, 1e-9, 0.9, 2]) + 1j * z.imag,
+        lambda: _R * np.exp(2j * np.pi * np.arange(n) / n),
+        lambda: np.round(z, chance.choice([0, 1, 2])),
+        lambda: z * (1 + 0.3 * np.sin(np.angle(z) * chance.choice([1, 2, 3, 6, 50]))),
+        lambda: np.where(np.abs(z) > chance.uniform(20, 45), chance.uniform(0.8, 1.2) * z, z),
+        lambda: z * np.exp(1j * chance.choice([1e-4, 1e-2]) * (np.abs(z) - _R) ** 2),
+        lambda: z + 1e-9 * (np.arange(n) % 2),
+        lambda: np.insert(z, k, z[k] + 10.0 ** chance.choice([-12, -9, -7, -5, -3])),
+    ]
+    with np.errstate(all="ignore"):
+        return chance.choice(changes)()
+
+
+def malformed(chance: random.Random) -> tuple[str, str, bytes]:
+    """Class, ending and content of a file."""
+    if chance.random() < 0.3:
+        z = wrong_outline(chance)
+        if chance.random() < 0.3 and 0 < len(z) < 400:
+            draw = chance.choice([lines(z, chance), polyline(z), polyline(z, old=True)])
+            return "outline dxf", ".dxf", drawing(draw, fmt=chance.choice(["asc", "asc", "bin"]))
+        return "outline csv", ".csv", table(z)
+    name = chance.choice(list(good()))
+    data, ending = good()[name], Path(name).suffix
+    text = ending == ".dxf" and name != "binary.dxf"
+    kinds = {"bytes": damaged_bytes}
+    if text:
+        kinds |= {"tags": damaged_tags, "header": damaged_header, "entities": damaged_entities}
+    elif ending != ".dxf":
+        kinds |= {"cells": damaged_cells}
+    kind = chance.choice(list(kinds))
+    return (
+        f"{kind} {'binary' if name == 'binary.dxf' else ending[1:]}",
+        ending,
+        kinds[kind](data, chance),
+    )
+
+
+def fault_of(error: BaseException) -> str | None:
+    """What is wrong with an exception that a file has raised."""
+    text = str(error)
+    if not isinstance(error, InputError):
+        return f"{type(error).__name__}: {text[:200]}"
+    if len(text) > LONGEST or not text.isprintable():
+        return f"message of {len(text)} characters, printable {text.isprintable()}: {text[:200]}"
+    return None
+
+
+def tried(path: Path, smoothing: float) -> str | None:
+    """Read, fit and roll the outline in a file, as `rootsopt profile` does; what went wrong."""
+    from rootsopt.outline.conjugacy import conjugacy
+    from rootsopt.outline.fit import imported
+    from rootsopt.outline.reading import read
+
+    try:
+        conjugacy(imported(read(path), 3, _R, smoothing)[0])
+    except Exception as error:
+        return fault_of(error)
+    return None
+
+
+def _work(jobs) -> None:
+    """A worker: tries the files whose paths come, with stderr into a file, and answers."""
+    from rootsopt.cli import use_float64
+
+    use_float64()
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, resource.RLIM_INFINITY))
+    signal.signal(signal.SIGPROF, _late)
+    with tempfile.TemporaryFile() as noise, contextlib.suppress(EOFError):
+        os.dup2(noise.fileno(), 2)
+        while True:
+            path, smoothing = jobs.recv()
+            signal.setitimer(signal.ITIMER_PROF, SECONDS)
+            failure = tried(path, smoothing)
+            signal.setitimer(signal.ITIMER_PROF, 0)
+            os.lseek(noise.fileno(), 0, os.SEEK_SET)
+            said = os.read(noise.fileno(), 1 << 16)
+            os.ftruncate(noise.fileno(), 0)
+            os.lseek(noise.fileno(), 0, os.SEEK_SET)
+            jobs.send(failure or (f"on stderr: {said[:200]!r}" if said else None))
+
+
+class _Late(BaseException):
+    """A file took too long; no handler of the package may take it for an error of a library."""
+
+
+def _late(*_):
+    raise _Late
+
+
+class Worker:
+    """A process that tries files one after another; a new one where it has died."""
+
+    def __init__(self):
+        self.process = None
+
+    def __call__(self, path: Path, smoothing: float) -> str | None:
+        """What went wrong with a file."""
+        if self.process is None:
+            context = multiprocessing.get_context("spawn")
+            self.jobs, other = context.Pipe()
+            self.process = context.Process(target=_work, args=(other,), daemon=True)
+            self.process.start()
+            other.close()
+        try:
+            self.jobs.send((path, smoothing))
+            if self.jobs.poll(20 * SECONDS):
+                return self.jobs.recv()
+            return f"no answer after {20 * SECONDS} s"
+        except (EOFError, OSError):
+            return f"took more than {SECONDS} s or ended the process"
+        finally:
+            if not self.process.is_alive():
+                self.process = None
+
+    def close(self) -> None:
+        """End the process."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.join()
+
+
+def commanded(path: Path, smoothing: float) -> str | None:
+    """The file through `rootsopt profile`: exit code 0, or 2 with one line on stderr."""
+    scene = path.with_suffix(".yaml")
+    scene.write_text(CONFIG.format(path, smoothing))
+    arguments = [
+        str(scene),
+        "-o",
+        str(path.with_suffix(".results")),
+        "--no-figures",
+        "--export=none",
+    ]
+    done = subprocess.run(
+        [sys.executable, "-m", "rootsopt.profile", *arguments],
+        capture_output=True,
+        timeout=600,
+    )
+    said = done.stderr.decode(errors="replace")
+    if (done.returncode, said) == (0, ""):
+        return None
+    if done.returncode == 2 and said.count("\n") == 1 and len(said) < LONGEST + 50:
+        return None
+    return f"exit code {done.returncode}, stderr {said[-300:]!r}"
+
+
+def run(report: Report, seed: int) -> None:
+    """Try damaged files until `report` is over; failed ones are kept in a folder it names."""
+    from rootsopt.cli import use_float64
+
+    use_float64()
+    kept = Path(tempfile.gettempdir()) / "rootsopt-outlines"
+    worker, number = Worker(), 0
+    with tempfile.TemporaryDirectory() as folder:
+        while not report.over:
+            number += 1
+            chance = random.Random(f"{seed}-{number}")
+            kind, ending, data = malformed(chance)
+            smoothing = chance.choice([0.0, 0.0, 0.0, 1e-3, 1e-6, 10.0])
+            path = Path(folder) / f"case{number}{ending}"
+            path.write_bytes(data)
+            command = number % _EVERY == 1
+            failure = (commanded if command else worker)(path, smoothing)
+            if failure is not None:
+                kept.mkdir(exist_ok=True)
+                (kept / path.name).write_bytes(data)
+                failure = f"{kept / path.name}, smoothing {smoothing:g}: {failure}"
+            report.add("by command" if command else kind, failure)
+            path.unlink()
+    worker.close()
