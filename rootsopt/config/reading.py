@@ -20,6 +20,7 @@ from rootsopt.config.study import (
     SolverConfig,
     SweepConfig,
 )
+from rootsopt.disk import regular_file
 from rootsopt.errors import InputError
 
 
@@ -106,7 +107,8 @@ def load(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Confi
 
     Raises `InputError` for anything wrong with file, keys or values.
     """
-    return parse(_read(Path(path)), overrides, source=str(path), folder=Path(path).parent)
+    file = regular_file(path, "a config")
+    return parse(_read(file), overrides, source=str(path), folder=Path(path).parent)
 
 
 def parse(

@@ -2,17 +2,21 @@
 
 import argparse
 import contextlib
-import sys
 import time
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
-from rootsopt import cli, export
-from rootsopt.config import Config
+from rootsopt import door
+
+if TYPE_CHECKING:
+    from rootsopt.cli import Outcome
+    from rootsopt.config import Config
+    from rootsopt.runs import RunFolder
 
 PURPOSE = "Optimise the design parameters for low contact force and compare with the baseline."
 
 
-def body(config: Config, options: argparse.Namespace) -> int:
+def body(config: "Config", options: argparse.Namespace, folder: "RunFolder") -> "Outcome":
     """Check, search, write, print."""
     began = time.perf_counter()
     from rich.console import Console
@@ -168,8 +172,14 @@ def _progress(console) -> Iterator:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
+    return door.through("optimize", lambda: _run(argv), own=argv is None)
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    from rootsopt import cli, export
+
     return cli.run("optimize", PURPOSE, body, argv, lambda p: export.add_option(p, "none"))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    door.leave(main())
