@@ -98,6 +98,18 @@ def exchange(first: Path, second: Path) -> bool:
     return True
 
 
+def can_exchange(folder: Path) -> bool:
+    """Whether folders on the file system of `folder` can change places."""
+    pair = [folder / name for name in (".first", ".second")]
+    for one in pair:
+        os.mkdir(one)
+    try:
+        return exchange(*pair)
+    finally:
+        for one in pair:
+            discard(one)
+
+
 def _exchanged(call, first: bytes, second: bytes) -> int:
     """The error number of an exchange, 0 for none."""
     done = call(_AT_FDCWD, first, _AT_FDCWD, second, _RENAME_EXCHANGE)

@@ -18,6 +18,7 @@ folder in place.
 """
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
@@ -139,15 +140,14 @@ class RunFolder(ResultFolder):
                 continue
             left = self.target.parent / name
             if found[1] == self._base.name:
-                complete = (left / RESULT).is_file()
-                if complete and not os.path.lexists(self.target):
+                if _complete(left) and not os.path.lexists(self.target):
                     disk.move(left, self.target)
                 else:
                     disk.discard_tree(left)
                 continue
             with contextlib.suppress(InputError, OSError):  # of a run that goes on
                 other = Lock(self.target.parent / (found[1] + _SUFFIX))
-                if other.held and not (left / RESULT).is_file():
+                if other.held and not _complete(left):
                     disk.discard_tree(left)
                 other.release()
 
@@ -243,16 +243,17 @@ class RunFolder(ResultFolder):
 
     def _push_aside(self, aside: Path) -> None:
         """Take the place of the run in the target, which moves to `aside`."""
+        if not disk.can_exchange(self.stage):
+            self._swap_by(aside)
+            return
         # Complete under that name, so that nothing is lost if the process ends in between.
         disk.move(self.stage, aside)
         try:
-            done = disk.exchange(aside, self.target)
+            if not disk.exchange(aside, self.target):
+                raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
         except BaseException:
             disk.move(aside, self.stage)
             raise
-        if not done:
-            disk.move(aside, self.stage)
-            self._swap_by(aside)
 
     def _swap_by(self, older: Path) -> None:
         """In two steps: the target to `older`, this run to the target."""
@@ -335,6 +336,12 @@ def _listed(result: Path) -> set[str]:
         return {name for name in names if isinstance(name, str)}
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return set()
+
+
+def _complete(stage: Path) -> bool:
+    """Whether a run that was killed had written all its files."""
+    listed = _listed(stage / RESULT)
+    return bool(listed) and _files_in(stage) == listed
 
 
 def _mount_points() -> set[str]:
