@@ -1,12 +1,13 @@
 """`python -m rootsopt.attractors CONFIG`: the motions that coexist, and where they begin."""
 
-import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rootsopt import door
 
 if TYPE_CHECKING:
+    import argparse
+
     from rootsopt.cli import Outcome
     from rootsopt.config import Config
     from rootsopt.runs import RunFolder
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 PURPOSE = "Find the motions that coexist in a scene and the initial states that lead to each."
 
 
-def body(config: "Config", options: argparse.Namespace, folder: "RunFolder") -> "Outcome":
+def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Check, search, write, print."""
     import numpy as np
     from rich.console import Console

@@ -13,7 +13,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any, TextIO
+from typing import Any
 
 OK, BAD_INPUT, NO_RESULT = 0, 2, 3
 _NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
@@ -128,7 +128,7 @@ def leaving(abandon: Callable[[], str]) -> Iterator[None]:
 class _Stream:
     """A standard stream whose failures do not end the run, but are kept in `error`."""
 
-    def __init__(self, stream: TextIO, number: int | None):
+    def __init__(self, stream: Any, number: int | None):
         self.stream, self.number = stream, number
         self.error: OSError | None = None
         self.closed_early = False
@@ -188,7 +188,7 @@ def _streams(own: bool) -> Iterator[_Stream]:
                 os.fstat(number)
             except OSError:
                 _nowhere(number)
-    before = sys.stdout, sys.stderr
+    before: tuple[Any, Any] = sys.stdout, sys.stderr
     guards = []
     for number, stream in enumerate(before, start=1):
         if stream is None:
@@ -196,7 +196,7 @@ def _streams(own: bool) -> Iterator[_Stream]:
         elif own:
             with contextlib.suppress(AttributeError, ValueError, OSError):
                 # A terminal that lacks a letter shows a question mark.
-                stream.reconfigure(errors="replace")  # type: ignore[union-attr]
+                stream.reconfigure(errors="replace")
         guards.append(_Stream(stream, number if own else None))
     sys.stdout, sys.stderr = guards
     try:

@@ -1,12 +1,13 @@
 """`python -m rootsopt.profile CONFIG`: geometry only."""
 
-import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rootsopt import door
 
 if TYPE_CHECKING:
+    import argparse
+
     from rich.console import Console
 
     from rootsopt.cli import Outcome
@@ -17,7 +18,7 @@ EXPORT = "dxf,svg"
 """What is written if nothing is said: a drawing takes less than a second, a solid ten."""
 
 
-def body(config: "Config", options: argparse.Namespace, folder: "RunFolder") -> "Outcome":
+def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Check, measure, write, print."""
     from rootsopt import cli, export, files, report
     from rootsopt.evaluate import geometry_record
@@ -90,7 +91,7 @@ def _projected(folder: "RunFolder", config: "Config", count: int) -> str:
     )
 
 
-def _options(parser: argparse.ArgumentParser) -> None:
+def _options(parser: "argparse.ArgumentParser") -> None:
     from rootsopt import export
 
     export.add_option(parser, EXPORT)

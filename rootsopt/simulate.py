@@ -1,12 +1,13 @@
 """`python -m rootsopt.simulate CONFIG`: one design, one scene."""
 
-import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rootsopt import door
 
 if TYPE_CHECKING:
+    import argparse
+
     from rootsopt.cli import Outcome
     from rootsopt.config import Config
     from rootsopt.runs import RunFolder
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 PURPOSE = "Simulate one design in one scene: steady state, contact force, its gradient."
 
 
-def body(config: "Config", options: argparse.Namespace, folder: "RunFolder") -> "Outcome":
+def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Check, simulate, write, print."""
     from rich.console import Console
 

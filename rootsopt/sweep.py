@@ -1,6 +1,5 @@
 """`python -m rootsopt.sweep CONFIG`: one design at many speeds."""
 
-import argparse
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
@@ -8,6 +7,8 @@ from typing import TYPE_CHECKING
 from rootsopt import door
 
 if TYPE_CHECKING:
+    import argparse
+
     from rootsopt.cli import Outcome
     from rootsopt.config import Config
     from rootsopt.runs import RunFolder
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 PURPOSE = "Simulate one design at many speeds, each from rest: contact force and kind of motion."
 
 
-def body(config: "Config", options: argparse.Namespace, folder: "RunFolder") -> "Outcome":
+def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Check, simulate, write, print."""
     from rich.console import Console
 

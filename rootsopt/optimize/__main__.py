@@ -1,6 +1,5 @@
 """`python -m rootsopt.optimize CONFIG`: an optimised design against the baseline."""
 
-import argparse
 import contextlib
 import threading
 import time
@@ -10,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 from rootsopt import door
 
 if TYPE_CHECKING:
+    import argparse
+
     from rootsopt.cli import Outcome
     from rootsopt.config import Config
     from rootsopt.runs import RunFolder
@@ -21,7 +22,7 @@ _PATIENCE = 5.0
 """Time (s) after an interrupt for simulating the best design so far again from rest."""
 
 
-def body(config: "Config", options: argparse.Namespace, folder: "RunFolder") -> "Outcome":
+def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Check, search, write, print."""
     began = time.perf_counter()
     from rich.console import Console
