@@ -1,26 +1,30 @@
 """`python -m rootsopt.attractors CONFIG`: the motions that coexist, and where they begin."""
 
-import argparse
-import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from rootsopt import cli
-from rootsopt.config import Config
+from rootsopt import door
+
+if TYPE_CHECKING:
+    import argparse
+
+    from rootsopt.cli import Outcome
+    from rootsopt.config import Config
+    from rootsopt.runs import RunFolder
 
 PURPOSE = "Find the motions that coexist in a scene and the initial states that lead to each."
 
 
-def body(config: Config, options: argparse.Namespace) -> int:
+def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Check, search, write, print."""
     import numpy as np
     from rich.console import Console
 
-    from rootsopt import auto, basins, files, report
+    from rootsopt import auto, basins, cli, files, report
     from rootsopt.evaluate import Evaluator
     from rootsopt.model import check_geometry
 
     check_geometry(config)
-    folder = files.ResultFolder(options.output)
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
         config, choice = auto.resolve(config)
         found = basins.find(Evaluator(config), series=True)
@@ -51,18 +55,26 @@ def body(config: Config, options: argparse.Namespace) -> int:
         from rootsopt.plot_basins import basin_figures
 
         basin_figures(folder, found, config)
-    out = Console()
-    out.print(report.attractor_table(rows, found.lost))
-    if not found.status.usable:
-        out.print(f"{found.status.label}: {found.status.value}", soft_wrap=True)
-    out.print(f"results in {options.output}", soft_wrap=True)
-    return cli.OK if any(a.evaluation.usable for a in found.attractors) else cli.NO_RESULT
+
+    def show(out: Console) -> None:
+        out.print(report.attractor_table(rows, found.lost))
+        if not found.status.usable:
+            out.print(f"{found.status.label}: {found.status.value}", soft_wrap=True)
+
+    usable = any(one.evaluation.usable for one in found.attractors)
+    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
+    return door.through("attractors", lambda: _run(argv), own=argv is None)
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    from rootsopt import cli
+
     return cli.run("attractors", PURPOSE, body, argv)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    door.leave(main())

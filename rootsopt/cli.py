@@ -1,4 +1,4 @@
-"""What the commands share: arguments, float64, exit codes, console.
+"""What the commands share: arguments, result folder, float64, exit codes.
 
 Exit 0: success. 2: bad input, one message on stderr. 3: the run ended without a usable
 result; the status says why.
@@ -10,17 +10,19 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
-from rootsopt import environment
+from rootsopt import disk, door, environment
 from rootsopt.config import Config, describe_keys, load
+from rootsopt.door import BAD_INPUT, NO_RESULT
+from rootsopt.door import OK as OK
 from rootsopt.environment import use_compiled_loops as use_compiled_loops
 from rootsopt.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-OK, BAD_INPUT, NO_RESULT = 0, 2, 3
+    from rootsopt.runs import RunFolder
 
 # Equinox's checks of traced values call back to Python, and a program that does so cannot
 # be kept between processes. Every integration here returns a status instead. Read once,
@@ -28,9 +30,26 @@ OK, BAD_INPUT, NO_RESULT = 0, 2, 3
 os.environ.setdefault("EQX_ON_ERROR", "off")
 
 
+class Outcome(NamedTuple):
+    """What a command came to: its exit `code`, and `show`, which prints it."""
+
+    code: int
+    show: "Callable[[Console], None]"
+
+
+Body = Callable[[Config, argparse.Namespace, "RunFolder"], Outcome]
+"""What a command does: check, compute, write into the folder it is given."""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """One line, as for other bad input."""
+        self.exit(BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
 def parser(command: str, purpose: str) -> argparse.ArgumentParser:
     """The arguments every command takes."""
-    result = argparse.ArgumentParser(
+    result = _Parser(
         prog=f"rootsopt {command}",
         description=purpose,
         epilog=f"config keys (for --set and the file), units in the name:\n{describe_keys()}",
@@ -38,7 +57,16 @@ def parser(command: str, purpose: str) -> argparse.ArgumentParser:
     )
     result.add_argument("config", type=Path, help="YAML file, for example configs/cic.yaml")
     result.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="result folder (default: results/CONFIG)"
+        "-o",
+        "--output",
+        metavar="DIR",
+        help=f"result folder (default: results/CONFIG-{command}); appears whole when the run has "
+        "ended, and an earlier run in it is moved to DIR.1, DIR.2 ...",
+    )
+    result.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="replace an earlier run in the result folder instead of moving it",
     )
     result.add_argument(
         "--set",
@@ -61,36 +89,56 @@ def parser(command: str, purpose: str) -> argparse.ArgumentParser:
 def run(
     command: str,
     purpose: str,
-    body: Callable[[Config, argparse.Namespace], int],
+    body: Body,
     argv: Sequence[str] | None,
     add_options: Callable[[argparse.ArgumentParser], None] = lambda _: None,
 ) -> int:
-    """Parse, load, choose float64, run `body`; turn `InputError` into exit 2. `add_options` adds
-    the command's own arguments."""
+    """Parse, load, choose float64, run `body` in a folder of its own, put that in place, print;
+    turn `InputError` into exit 2. `add_options` adds the command's own arguments."""
     environment.own_process()
     arguments = parser(command, purpose)
     add_options(arguments)
     options = arguments.parse_args(argv)
     if options.output is None:
-        options.output = Path("results") / options.config.stem
+        options.output = os.path.join("results", f"{options.config.stem}-{command}")
     try:
         config = load(options.config, options.overrides)
         use_float64()
         if not options.no_cache:
             use_cache()
         with environment.explained():
-            return body(config, options)
+            return _in_folder(command, body, config, options)
     except InputError as error:
         message = " ".join(str(error).split())
         print(f"rootsopt {command}: {message}", file=sys.stderr)
         return BAD_INPUT
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename is not None else ""
+        print(f"rootsopt {command}: {where}{disk.reason(error)}", file=sys.stderr)
+        return BAD_INPUT
     except KeyboardInterrupt:
         print(f"rootsopt {command}: stopped by the user", file=sys.stderr)
         return NO_RESULT
-    except BrokenPipeError:
-        # The reader of our output has gone (as in `| head`); that is no error of ours.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OK
+
+
+def _in_folder(command: str, body: Body, config: Config, options: argparse.Namespace) -> int:
+    from rootsopt.runs import RunFolder
+
+    with (
+        RunFolder(options.output, command, options.overwrite) as folder,
+        door.leaving(folder.abandon),
+    ):
+        outcome = body(config, options, folder)
+        notes = folder.put_in_place()
+        # The console takes half of the time to import, and stdout may fail: files come first.
+        from rich.console import Console
+
+        out = Console()
+        outcome.show(out)
+        for note in notes:
+            out.print(note, soft_wrap=True, markup=False, highlight=False)
+        out.print(f"results in {folder.path}", soft_wrap=True, markup=False, highlight=False)
+    return outcome.code
 
 
 @contextlib.contextmanager
@@ -127,34 +175,7 @@ def use_cache() -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The console command `rootsopt`: optimize, simulate, sweep, attractors, profile."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    commands = {
-        "optimize": "optimise a design and compare it with the baseline",
-        "simulate": "simulate one design in one scene",
-        "sweep": "one design at many speeds",
-        "attractors": "the motions that coexist in one scene",
-        "profile": "geometry of one design",
-    }
-    usage = "usage: rootsopt COMMAND CONFIG [options]\n\n" + "\n".join(
-        f"  {name:<10} {what}" for name, what in commands.items()
-    )
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(usage)
-        return OK if arguments else BAD_INPUT
-    name, *rest = arguments
-    if name == "--version":
-        from rootsopt import __version__
+    """The console command `rootsopt`; returns the exit code."""
+    from rootsopt.__main__ import main as console
 
-        print(f"rootsopt {__version__}")
-        return OK
-    if name not in commands:
-        import difflib
-
-        near = difflib.get_close_matches(name, commands, n=1)
-        hint = f"; did you mean `{near[0]}`?" if near else f"; valid: {', '.join(commands)}"
-        print(f"rootsopt: `{name}` is not a command{hint}", file=sys.stderr)
-        return BAD_INPUT
-    import importlib
-
-    return importlib.import_module(f"rootsopt.{name}").main(rest)
+    return console(argv)

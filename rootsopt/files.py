@@ -1,7 +1,8 @@
 """Result files: written whole or not at all, into a folder checked before the work begins.
 
 Every file goes to a temporary name in its own folder and then takes the final name in one
-step, so a reader (or a killed run) sees the old file or the new one, never half of it.
+step, so a reader (or a killed run) sees the old file or the new one, never half of it. Commands
+write whole folders that way (`rootsopt.runs`).
 """
 
 import csv
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import rootsopt
+from rootsopt import disk
 from rootsopt.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,40 +49,52 @@ class ResultFolder:
         self.path = Path(path)
         made: list[Path] = []
         try:
-            _make(self.path, made)
+            disk.make_folders(self.path, made)
             probe = self.path / _temporary("probe")
-            _create(probe, b"probe")
-            probe.unlink()
+            disk.create(probe, b"probe")
+            disk.discard(probe)
         except (OSError, ValueError) as error:
             for folder in reversed(made):
-                folder.rmdir()
+                disk.discard(folder)
             raise InputError(
-                f"{str(path)!r}: cannot be used as output folder: {_reason(error)}; choose "
+                f"{str(path)!r}: cannot be used as output folder: {disk.reason(error)}; choose "
                 "another folder or make this one writable"
             ) from None
+
+    @property
+    def place(self) -> Path:
+        """Where files are."""
+        return self.path
 
     def write_bytes(self, name: str, data: bytes) -> Path:
         """Write `data` as `name`, which may lie in a subfolder (`figures/force.png`)."""
         target = self.path / name
         temporary = target.with_name(_temporary(target.name))
         try:
-            target.parent.mkdir(parents=True, exist_ok=True)
+            disk.make_folders(target.parent, [])
+            disk.create(temporary, data)
             try:
-                _create(temporary, data)
-                os.replace(temporary, target)
+                disk.replace(temporary, target)
             except BaseException:
-                temporary.unlink(missing_ok=True)
+                disk.discard(temporary)
                 raise
         except OSError as error:
             raise InputError(
-                f"{str(target)!r}: cannot be written: {_reason(error)}; free the place or "
+                f"{str(target)!r}: cannot be written: {disk.reason(error)}; free the place or "
                 "choose another output folder"
             ) from None
         return target
 
     def write_text(self, name: str, text: str) -> Path:
         """Write `text` as UTF-8."""
-        return self.write_bytes(name, text.encode("utf-8"))
+        try:
+            data = text.encode("utf-8")
+        except UnicodeEncodeError as error:
+            wrong = text[max(0, error.start - 20) : error.end + 20]
+            raise InputError(
+                f"{name}: {wrong!a} cannot be written as UTF-8; rename the file it names"
+            ) from None
+        return self.write_bytes(name, data)
 
     def write_json(self, name: str, data: Any) -> Path:
         """Write `data` as strict JSON: numbers that are not finite become null."""
@@ -102,45 +116,8 @@ class ResultFolder:
         return self.write_bytes(name, image.getvalue())
 
 
-def _make(folder: Path, made: list[Path]) -> None:
-    """Make a folder and its parents, noting the new ones in `made` as they appear."""
-    missing = []
-    while not folder.is_dir():
-        missing.append(folder)
-        if folder.parent == folder:
-            break
-        folder = folder.parent
-    for new in reversed(missing):
-        try:
-            new.mkdir()
-        except FileExistsError:
-            if not new.is_dir():  # not merely another process that was faster
-                raise
-        else:
-            made.append(new)
-
-
 def _temporary(name: str) -> str:
     return f".{name[:100]}.{os.getpid()}-{secrets.token_hex(4)}.tmp"
-
-
-def _create(path: Path, data: bytes) -> None:
-    """Write a new file with the user's usual permissions, through to the disk."""
-    try:
-        with open(path, "xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-    except FileExistsError:
-        raise
-    except BaseException:
-        path.unlink(missing_ok=True)
-        raise
-
-
-def _reason(error: Exception) -> str:
-    reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    return reason[:1].lower() + reason[1:]
 
 
 def _plain(data: Any) -> Any:
@@ -193,12 +170,12 @@ def write_config(folder: ResultFolder, config: "Config") -> None:
     the folder stays whole wherever it is moved."""
     profile = config.profile
     if profile.outline_file is not None:
-        source = Path(profile.outline_file)
+        source = disk.regular_file(profile.outline_file, "an outline")
         copy = f"outline{source.suffix.lower()}"
         try:
             data = source.read_bytes()
         except OSError as error:
-            raise InputError(f"{str(source)!r}: cannot be read: {_reason(error)}") from None
+            raise InputError(f"{str(source)!r}: cannot be read: {disk.reason(error)}") from None
         folder.write_bytes(copy, data)
         profile = profile.model_copy(update={"outline_file": copy})
         config = config.model_copy(update={"profile": profile})

@@ -1,23 +1,26 @@
 """`python -m rootsopt.profile CONFIG`: geometry only."""
 
-import argparse
-import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from rootsopt import cli, export
-from rootsopt.config import Config
-from rootsopt.errors import InputError
+from rootsopt import door
 
+if TYPE_CHECKING:
+    import argparse
+
+    from rich.console import Console
+
+    from rootsopt.cli import Outcome
+    from rootsopt.config import Config
+    from rootsopt.runs import RunFolder
 PURPOSE = "Geometry of one design: radii, area, inertia, margins; drawings, solids, animation."
 EXPORT = "dxf,svg"
 """What is written if nothing is said: a drawing takes less than a second, a solid ten."""
 
 
-def body(config: Config, options: argparse.Namespace) -> int:
+def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Check, measure, write, print."""
-    from rich.console import Console
-
-    from rootsopt import files, report
+    from rootsopt import cli, export, files, report
     from rootsopt.evaluate import geometry_record
     from rootsopt.families import margins_of
     from rootsopt.model import Model, check_geometry, design_keys, design_vector, outline_mm
@@ -28,7 +31,6 @@ def body(config: Config, options: argparse.Namespace) -> int:
     formats = export.chosen(options.export)
     check_geometry(config)
     coefficients = _coefficients(options.project)
-    folder = files.ResultFolder(options.output)
     model, design = Model.of(config), design_vector(config)
     shape = geometry(model.profile(design))
     record = {
@@ -52,17 +54,21 @@ def body(config: Config, options: argparse.Namespace) -> int:
         from rootsopt import plot
 
         plot.profile_figures(folder, config, record)
-    out = Console()
-    out.print(report.geometry_table(record))
-    outline_report.say(config, out)
-    if coefficients is not None:
-        out.print(_projected(folder, config, coefficients), soft_wrap=True)
-    out.print(f"results in {options.output}", soft_wrap=True)
-    return cli.OK
+    projected = None if coefficients is None else _projected(folder, config, coefficients)
+
+    def show(out: "Console") -> None:
+        out.print(report.geometry_table(record))
+        outline_report.say(config, out)
+        if projected is not None:
+            out.print(projected, soft_wrap=True)
+
+    return cli.Outcome(cli.OK, show)
 
 
 def _coefficients(given: str | None) -> int | None:
     """The number of coefficients that `--project` asks for. Raises `InputError`."""
+    from rootsopt.errors import InputError
+
     if given is None:
         return None
     if not (given.isdecimal() and 3 <= int(given) <= 64):
@@ -73,7 +79,7 @@ def _coefficients(given: str | None) -> int | None:
     return int(given)
 
 
-def _projected(folder, config: Config, count: int) -> str:
+def _projected(folder: "RunFolder", config: "Config", count: int) -> str:
     """Write the config with its profile as a free form; what there is to say of that."""
     from rootsopt.families import free_form_of
 
@@ -85,7 +91,9 @@ def _projected(folder, config: Config, count: int) -> str:
     )
 
 
-def _options(parser: argparse.ArgumentParser) -> None:
+def _options(parser: "argparse.ArgumentParser") -> None:
+    from rootsopt import export
+
     export.add_option(parser, EXPORT)
     parser.add_argument(
         "--project",
@@ -97,8 +105,14 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
+    return door.through("profile", lambda: _run(argv), own=argv is None)
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    from rootsopt import cli
+
     return cli.run("profile", PURPOSE, body, argv, _options)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    door.leave(main())

@@ -1,20 +1,25 @@
 """`python -m rootsopt.simulate CONFIG`: one design, one scene."""
 
-import argparse
-import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from rootsopt import cli, export
-from rootsopt.config import Config
+from rootsopt import door
+
+if TYPE_CHECKING:
+    import argparse
+
+    from rootsopt.cli import Outcome
+    from rootsopt.config import Config
+    from rootsopt.runs import RunFolder
 
 PURPOSE = "Simulate one design in one scene: steady state, contact force, its gradient."
 
 
-def body(config: Config, options: argparse.Namespace) -> int:
+def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Check, simulate, write, print."""
     from rich.console import Console
 
-    from rootsopt import auto, files, report
+    from rootsopt import auto, cli, export, files, report
     from rootsopt.evaluators import evaluator_for
     from rootsopt.model import check_geometry, outline_mm
     from rootsopt.outline import report as outline_report
@@ -22,7 +27,6 @@ def body(config: Config, options: argparse.Namespace) -> int:
 
     formats = export.chosen(options.export)
     check_geometry(config)
-    folder = files.ResultFolder(options.output)
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
         config, choice = auto.resolve(config)
         evaluation = evaluator_for(alone(config))()
@@ -37,17 +41,24 @@ def body(config: Config, options: argparse.Namespace) -> int:
         from rootsopt import plot
 
         plot.simulation_figures(folder, evaluation, config)
-    out = Console()
-    out.print(report.evaluation_table(evaluation))
-    outline_report.say(config, out)
-    out.print(f"results in {options.output}", soft_wrap=True)
-    return cli.OK if evaluation.usable else cli.NO_RESULT
+
+    def show(out: Console) -> None:
+        out.print(report.evaluation_table(evaluation))
+        outline_report.say(config, out)
+
+    return cli.Outcome(cli.OK if evaluation.usable else cli.NO_RESULT, show)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
+    return door.through("simulate", lambda: _run(argv), own=argv is None)
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    from rootsopt import cli, export
+
     return cli.run("simulate", PURPOSE, body, argv, lambda p: export.add_option(p, "none"))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    door.leave(main())

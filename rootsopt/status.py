@@ -45,6 +45,14 @@ class Status(enum.Enum):
         "No flank touches: the pair rests anywhere within its play, without contact force and "
         "without a gradient. Raise scene.load.torque_N_m."
     )
+    NOT_IMPROVED = (
+        "No feasible design better than the baseline was found. Lower "
+        "constraints.area_efficiency_min, widen optimizer.bounds, or raise optimizer.screening."
+    )
+    INTERRUPTED = (
+        "The search was stopped before its end; what it had found by then is reported. Run it "
+        "again for the optimum."
+    )
     SOLVER_FAILED = (
         "The solver ran out of steps. Raise solver.max_steps_per_period (an explicit method takes "
         "ten and more for each of statistics.swings_per_mesh_period), loosen solver.rtol, or use "

@@ -1,26 +1,30 @@
 """`python -m rootsopt.sweep CONFIG`: one design at many speeds."""
 
-import argparse
 import contextlib
-import sys
 from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
-from rootsopt import cli
-from rootsopt.config import Config
+from rootsopt import door
+
+if TYPE_CHECKING:
+    import argparse
+
+    from rootsopt.cli import Outcome
+    from rootsopt.config import Config
+    from rootsopt.runs import RunFolder
 
 PURPOSE = "Simulate one design at many speeds, each from rest: contact force and kind of motion."
 
 
-def body(config: Config, options: argparse.Namespace) -> int:
+def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Check, simulate, write, print."""
     from rich.console import Console
 
-    from rootsopt import auto, files, report, speeds
+    from rootsopt import auto, cli, files, report, speeds
     from rootsopt.evaluators import evaluator_for, without_gradient
     from rootsopt.model import check_geometry, design_keys, design_vector
 
     check_geometry(config)
-    folder = files.ResultFolder(options.output)
     with _progress(Console(stderr=True)) as progress:
         config, choice = auto.resolve(config)
         evaluator = without_gradient(evaluator_for(speeds.alone(config)))
@@ -43,12 +47,14 @@ def body(config: Config, options: argparse.Namespace) -> int:
 
         name = config.profile.family.upper()
         speed_figure(folder, {name: parts}, f"Contact force of the {name} pair over speed")
-    out = Console()
-    out.print(report.sweep_table(rows))
-    if not status.usable:
-        out.print(f"{status.label}: {message}", soft_wrap=True)
-    out.print(f"results in {options.output}", soft_wrap=True)
-    return cli.OK if any(part.evaluation.usable for part in parts) else cli.NO_RESULT
+
+    def show(out: Console) -> None:
+        out.print(report.sweep_table(rows))
+        if not status.usable:
+            out.print(f"{status.label}: {message}", soft_wrap=True)
+
+    usable = any(part.evaluation.usable for part in parts)
+    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)
 
 
 @contextlib.contextmanager
@@ -66,8 +72,14 @@ def _progress(console) -> Iterator[Callable[[int, int], None]]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
+    return door.through("sweep", lambda: _run(argv), own=argv is None)
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    from rootsopt import cli
+
     return cli.run("sweep", PURPOSE, body, argv)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    door.leave(main())

@@ -164,7 +164,7 @@ def test_a_failing_write_keeps_the_old_file(tmp_path, monkeypatch, step):
     def fail(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(files.os, step, fail)
+    monkeypatch.setattr(files.disk.os, step, fail)
     with pytest.raises(InputError, match="no space left on device") as caught:
         folder.write_text("result.json", "new")
     assert "\n" not in str(caught.value)
@@ -194,7 +194,7 @@ def test_an_unwritable_folder_is_refused_and_new_parents_removed(tmp_path, monke
     def refuse(*_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(files, "_create", refuse)
+    monkeypatch.setattr(files.disk, "create", refuse)
     with pytest.raises(InputError, match="permission denied"):
         files.ResultFolder(tmp_path / "a" / "b")
     assert os.listdir(tmp_path) == []

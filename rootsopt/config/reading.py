@@ -1,6 +1,5 @@
 """The whole config, read from YAML."""
 
-import stat
 from pathlib import Path
 
 import yaml
@@ -29,6 +28,7 @@ from rootsopt.config.study import (
 )
 from rootsopt.config.units import hint
 from rootsopt.config.words import named, placed, sentence, shown
+from rootsopt.disk import regular_file
 from rootsopt.errors import InputError
 
 _MOST_PARTS = 8
@@ -143,26 +143,15 @@ def _place_files(data: dict, folder: Path) -> None:
 def _read(path: Path) -> str:
     name = placed(path)
     try:
-        # Reading a pipe may wait for ever, and a device may never end.
-        if stat.S_ISREG(path.stat().st_mode) or path.is_dir():
-            with path.open("rb") as file:
-                data = file.read(MOST_BYTES + 1)
-        else:
-            data = None
+        with regular_file(path, "a config").open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
     except FileNotFoundError:
         raise InputError(f"{name}: there is no such file; give the path of a config") from None
-    except IsADirectoryError:
-        raise InputError(f"{name}: is a folder; give the path of a config file") from None
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError(f"{name}: cannot be read: {reason}") from None
     except ValueError:  # A path with a null character.
         raise InputError(f"{name}: is not a path; give that of a config file") from None
-    if data is None:
-        raise InputError(
-            f"{name}: is not a regular file (a pipe, socket or device); give the path of a config "
-            "file"
-        )
     try:
         # What is too long may be cut within a character, and is refused for its length.
         return data.decode("utf-8", "strict" if len(data) <= MOST_BYTES else "replace")

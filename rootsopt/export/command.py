@@ -86,7 +86,7 @@ def write(
 
         files["rotor.svg"] = svg_text(drawing).encode()
     if set(formats) & set(_SOLID):
-        files |= _solids(drawing, formats)
+        files |= _solids(drawing, formats, folder.place)
     if "gif" in formats:
         from rootsopt.export.animation import rolling_gif, simulation_gif
 
@@ -110,7 +110,7 @@ def write_simulated(
     return write(folder, config, formats, evaluation.design, series, periods)
 
 
-def _solids(drawing, formats) -> dict[str, bytes]:
+def _solids(drawing, formats, place) -> dict[str, bytes]:
     """The STEP and STL files, each solid made once."""
     import math
 
@@ -121,7 +121,10 @@ def _solids(drawing, formats) -> dict[str, bytes]:
         "rotor": solid.rotor(drawing.pieces, *body),
         "pair": solid.pair(drawing.pieces, drawing.lobes, 2 * drawing.pitch_radius, *body),
     }
-    make = {"step": solid.step_bytes, "stl": solid.stl_bytes}
+    make = {
+        "step": solid.step_bytes,
+        "stl": lambda shape: solid.stl_bytes(shape, place),
+    }
     return {
         f"{name}.{suffix}": make[suffix](shape)
         for suffix in _SOLID

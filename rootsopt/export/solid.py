@@ -92,11 +92,12 @@ def step_bytes(shape: "Shape") -> bytes:
     return file.getvalue()
 
 
-def stl_bytes(shape: "Shape") -> bytes:
-    """A binary STL file (mm) within `CHORD` and `TURN` of a solid or an assembly."""
+def stl_bytes(shape: "Shape", place: Path | None = None) -> bytes:
+    """A binary STL file (mm) within `CHORD` and `TURN` of a solid or an assembly. The kernel
+    writes it to a file, which is in the folder `place` meanwhile."""
     from build123d import export_stl
 
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=place) as folder:
         file = Path(folder) / "shape.stl"
         if not export_stl(shape, file, tolerance=CHORD, angular_tolerance=TURN):
             raise InputError("the solid cannot be cut into triangles; export step instead")

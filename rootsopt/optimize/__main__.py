@@ -1,64 +1,116 @@
 """`python -m rootsopt.optimize CONFIG`: an optimised design against the baseline."""
 
-import argparse
 import contextlib
-import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
-from rootsopt import cli, export
-from rootsopt.config import Config
+from rootsopt import door
+
+if TYPE_CHECKING:
+    import argparse
+
+    from rootsopt.cli import Outcome
+    from rootsopt.config import Config
+    from rootsopt.runs import RunFolder
 
 PURPOSE = "Optimise the design parameters for low contact force and compare with the baseline."
 
 
-def body(config: Config, options: argparse.Namespace) -> int:
+_PATIENCE = 5.0
+"""Time (s) after an interrupt for simulating the best design so far again from rest."""
+
+
+def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Check, search, write, print."""
     began = time.perf_counter()
     from rich.console import Console
 
-    from rootsopt import auto, files, report
+    from rootsopt import cli, export, report
     from rootsopt.model import check_geometry
-    from rootsopt.optimize.search import Search
     from rootsopt.timing import CompileClock
 
     formats = export.chosen(options.export)
     check_geometry(config)
-    folder = files.ResultFolder(options.output)
     clock = CompileClock()
-    with clock, _progress(Console(stderr=True)) as progress:
-        config, choice = auto.resolve(config)
-        result = Search(config, progress).run()
+    promise = "keeping the best design so far and writing the files"
+    with (
+        clock,
+        door.patience(promise) as stop,
+        _progress(Console(stderr=True)) as progress,
+    ):
+        config, choice, result = _searched(config, progress, stop)
+    if result is None:
+        return _nothing_known(config, folder)
     ran = time.perf_counter() - began
-    alike = _alike(config, result)
+    alike = {} if result.interrupted else _alike(config, result)
     _write(folder, config, options, result, choice | alike, clock.seconds, ran)
     if result.optimized is not None:
         export.write_simulated(folder, config, formats, result.optimized)
-    out = Console()
-    baseline = result.baseline.record().get("speeds")
-    if result.optimized is None:
-        out.print(report.evaluation_table(result.baseline))
-        if baseline:
-            out.print(report.speeds_table(baseline))
-        out.print(_no_result(result))
-    else:
-        numbers = result.constraints, result.improvement
-        out.print(report.comparison_table(result.baseline, result.optimized, *numbers))
-        if baseline:
-            optimized = result.optimized.record()["speeds"]
-            out.print(report.speeds_table(baseline, optimized, result.objective_by_speed))
-        if alike:
-            out.print(report.likeness_table(alike["resembles"]))
     total = time.perf_counter() - began
-    out.print(
-        f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
-        f"reports {total - ran:.1f} s; results in {options.output}",
-        soft_wrap=True,
-    )
-    return cli.OK if result.optimized is not None else cli.NO_RESULT
+
+    def show(out: Console) -> None:
+        baseline = result.baseline.record().get("speeds")
+        if result.optimized is None:
+            out.print(report.evaluation_table(result.baseline))
+            if baseline:
+                out.print(report.speeds_table(baseline))
+        else:
+            numbers = result.constraints, result.improvement
+            out.print(report.comparison_table(result.baseline, result.optimized, *numbers))
+            if baseline:
+                optimized = result.optimized.record()["speeds"]
+                out.print(report.speeds_table(baseline, optimized, result.objective_by_speed))
+            if alike:
+                out.print(report.likeness_table(alike["resembles"]))
+        if result.interrupted or result.optimized is None:
+            out.print(_message(result))
+        out.print(
+            f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
+            f"reports {total - ran:.1f} s",
+            soft_wrap=True,
+        )
+
+    found = result.optimized is not None and not result.interrupted
+    return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
 
 
-def _alike(config: Config, result) -> dict:
+def _searched(config: "Config", progress, stop: threading.Event):
+    """Config without `auto`, what was chosen there, and the search's outcome: None if it was
+    stopped before the baseline was simulated."""
+    from rootsopt import auto
+    from rootsopt.optimize.search import Search, until_stopped
+
+    state: dict[str, Any] = {"config": config, "choice": {}}
+
+    def work():
+        state["config"], state["choice"] = auto.resolve(config)
+        state["search"] = Search(state["config"], progress, stop)
+        return state["search"].run()
+
+    result = until_stopped(work, stop, _PATIENCE)
+    if result is None and "search" in state:
+        result = state["search"].so_far()
+    return state["config"], state["choice"], result
+
+
+def _nothing_known(config: "Config", folder: "RunFolder") -> "Outcome":
+    """Write what there is of a run that was stopped before the baseline was simulated."""
+    from rootsopt import cli, files
+    from rootsopt.status import Status
+
+    status = Status.INTERRUPTED
+    message = "The run was stopped before the baseline had been simulated: there is no result."
+    files.write_config(folder, config)
+    data = {"baseline": None, "optimized": None, "status": status.label, "message": message}
+    folder.write_json("result.json", data | {"versions": files.versions()})
+    folder.overwrite = False  # An earlier result is worth more than this.
+    text = f"{status.label}: {message}"
+    return cli.Outcome(cli.NO_RESULT, lambda out: out.print(text, soft_wrap=True))
+
+
+def _alike(config: "Config", result) -> dict:
     """What a free form that was found resembles, for report and result file."""
     if config.profile.family != "free_form" or result.optimized is None:
         return {}
@@ -72,11 +124,20 @@ def _alike(config: Config, result) -> dict:
     return {"resembles": [one.record() for one in found]}
 
 
-def _no_result(result) -> str:
+def _message(result) -> str:
+    """What to say of a search that was interrupted or has found nothing."""
+    return f"{result.status.label}: {_advice(result)}"
+
+
+def _advice(result) -> str:
     from rootsopt.optimize import noise
 
+    if result.interrupted:
+        return _interrupted(result)
     if not result.baseline.usable:
-        return f"baseline {result.baseline.status.label}: {result.baseline.message}"
+        return f"baseline: {result.baseline.message}"
+    if result.optimized is not None:
+        return result.optimized.message
     if message := noise.message(result.verification):
         return message
     if result.verification.get("rejected"):
@@ -84,9 +145,22 @@ def _no_result(result) -> str:
             "No better design held up when simulated again from rest at the tight tolerance. "
             "Raise optimizer.iterations or optimizer.screening, or tighten solver.rtol."
         )
+    return result.status.value
+
+
+def _interrupted(result) -> str:
+    """How far an interrupted search got."""
+    count = len(result.history)
+    begin = f"The search was stopped after {count} design{'s' if count != 1 else ''}"
+    if not result.baseline.usable:
+        return f"{begin}, and the baseline is of no use: {result.baseline.message}"
+    if result.optimized is None:
+        return f"{begin}; none of them is known to be feasible and better than the baseline."
+    if result.verification["holds_up"]:
+        return f"{begin}. The best of them, simulated again from rest, is reported."
     return (
-        "No feasible design better than the baseline was found. Lower "
-        "constraints.area_efficiency_min, widen optimizer.bounds, or raise optimizer.screening."
+        f"{begin}. The best of them is reported as the search found it: it was not simulated again "
+        "from rest at the config's tolerance."
     )
 
 
@@ -118,6 +192,7 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
     if config.objective.speeds_rpm and result.optimized is not None:
         data["objective_by_speed"] = result.objective_by_speed
     data["verification"] = result.verification
+    data["status"], data["message"] = result.status.label, _advice(result)
     data["statistics"] = {
         "evaluations": len(rows),
         "compile_seconds": compiled,
@@ -168,8 +243,14 @@ def _progress(console) -> Iterator:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
+    return door.through("optimize", lambda: _run(argv), own=argv is None)
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    from rootsopt import cli, export
+
     return cli.run("optimize", PURPOSE, body, argv, lambda p: export.add_option(p, "none"))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    door.leave(main())

@@ -134,6 +134,15 @@ def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[
     return chosen
 
 
+def most_promising(problem: Problem, trials: Sequence) -> Any:
+    """The trial at the best of the `candidates`, or None."""
+    found = candidates(problem, trials)
+    if not found:
+        return None
+    _, point = found[0]
+    return next(t for t in trials if t.candidate and np.array_equal(t.point, point))
+
+
 def message(record: dict[str, Any]) -> str:
     """What to tell of a verification over an ensemble that no design passed; nothing for
     another one."""

@@ -4,7 +4,8 @@ Screening places the starts on a Sobol sample of feasible designs. From each sta
 optax update rule walks in the unit box: the gradient is stripped of what active
 constraints forbid, the step is projected back onto the feasible set. The last orbit is
 the first guess for the next. Best-so-far is kept; the winner is simulated again from rest
-at a tighter tolerance before it is reported.
+at a tighter tolerance before it is reported. A search may be stopped at any time (`stop`), and then
+goes on to that last step with what it has.
 """
 
 import copy
@@ -12,9 +13,10 @@ import dataclasses
 import operator
 import os
 import threading
+import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from typing import Any, TypeVar
 
 import numpy as np
 import optax
@@ -27,7 +29,9 @@ from rootsopt.evaluators import evaluator_for, without_gradient
 from rootsopt.model import design_vector
 from rootsopt.optimize.problem import Problem, Space, sobol
 from rootsopt.programs import Program
+from rootsopt.status import Status
 
+T = TypeVar("T")
 RULES: dict[str, Callable[..., optax.GradientTransformation]] = {
     "adam": optax.adam,
     "rmsprop": optax.rmsprop,
@@ -38,6 +42,8 @@ _GAIN = 1e-4
 _STATIONARY = 1e-3
 _HOLDS_UP = 0.01
 """Relative change of the objective in the verification that still counts as holding up."""
+_POLL = 0.05
+"""Time (s) after which a wait looks whether the search is to stop."""
 
 Progress = Callable[[int, int, float], None]
 """Called with (evaluations done, evaluations expected, best objective)."""
@@ -67,7 +73,8 @@ class Optimization:
 
     `problem` is None where the baseline has no usable steady state, `optimized` also when no
     design better than the baseline held up. `verification` says what the search promised and
-    what the tight simulation from rest gave.
+    what the tight simulation from rest gave; its `holds_up` is None for the best design of a
+    search that was `interrupted` before it could be simulated again.
     """
 
     problem: Problem | None
@@ -75,6 +82,16 @@ class Optimization:
     optimized: Evaluation | None
     history: list[dict[str, Any]]
     verification: dict[str, Any]
+    interrupted: bool = False
+
+    @property
+    def status(self) -> Status:
+        """What can be said of the search as a whole."""
+        if self.interrupted:
+            return Status.INTERRUPTED
+        if not self.baseline.usable:
+            return self.baseline.status
+        return Status.NOT_IMPROVED if self.optimized is None else self.optimized.status
 
     @property
     def improvement(self) -> dict[str, float]:
@@ -103,9 +120,14 @@ class Optimization:
 
 
 class Search:
-    """One optimisation run of a config."""
+    """One optimisation run of a config, until it has ended or the event `stop` is set."""
 
-    def __init__(self, config: Config, progress: Progress | None = None):
+    def __init__(
+        self,
+        config: Config,
+        progress: Progress | None = None,
+        stop: threading.Event | None = None,
+    ):
         if not FAMILY_KEYS[config.profile.family]:
             valid = ", ".join(family for family, keys in FAMILY_KEYS.items() if keys)
             raise InputError(
@@ -124,21 +146,27 @@ class Search:
         # Where every objective has its noise, not to have found a better one says little.
         self.noisy = config.objective.motion == "ensemble"
         self.patience = np.inf if self.noisy else _PATIENCE
-        self._lock, self._done, self._best = threading.Lock(), 0, float("nan")
+        self.stop = threading.Event() if stop is None else stop
+        self._lock, self._best = threading.Lock(), float("nan")
+        self._trials: list[Trial] = []
+        self._refuted: list[NDArray[np.float64]] = []
+        self._baseline: Evaluation | None = None
 
     def run(self) -> Optimization:
-        """Baseline, screening, descents, verification."""
+        """Baseline, screening, descents, verification. After `stop`, what was found before it,
+        verified too unless that takes ensembles."""
         self.exact.prepare(design_vector(self.config))
         Space.of(self.config, self.exact.model, 0.0).prepare()
         baseline = self.exact()
         if not baseline.usable:
-            return Optimization(None, baseline, None, [], {})
+            return Optimization(None, baseline, None, [], {}, self.stop.is_set())
         self.fast.model = self.exact.model
         # What the forces of motions that coexist are relative to.
         self.fast.relate(baseline)
         self.exact.relate(baseline)
         self.fast.fitted = self.fast.prepared = True
         self.problem = Problem.of(self.config, self.exact.model, baseline)
+        self._baseline = baseline
         start = self.problem.point(list(baseline.design.values()))
         points = self._feasible(start)
         trials: list[Trial] = []
@@ -146,6 +174,10 @@ class Search:
             trials = self._side_by_side(self._screen, [(point,) for point in points])
         starts = self._starts(trials) or points[:1]
         trials += self._side_by_side(self._descend, list(enumerate(starts)))
+        if self.stop.is_set():
+            if self.noisy and (found := self.so_far()) is not None:
+                return found
+            trials = self._in_order()
         rows = _history(trials)
         if self.noisy:
             from rootsopt.ensemble import EnsembleEvaluator
@@ -154,19 +186,62 @@ class Search:
             assert isinstance(self.exact, EnsembleEvaluator)
             noise.add_errors(rows, trials, self.problem)
             found = noise.verify(self.problem, self.exact, trials)
-            return Optimization(found.problem, found.baseline, found.optimized, rows, found.record)
+            settled = found.problem, found.baseline, found.optimized, rows, found.record
+            return Optimization(*settled, self.stop.is_set())
         optimized, verification = self._verify(trials)
-        return Optimization(self.problem, baseline, optimized, rows, verification)
+        settled = self.problem, baseline, optimized, rows, verification
+        return Optimization(*settled, self.stop.is_set())
+
+    def so_far(self) -> Optimization | None:
+        """What the search has found up to now, without verification; None before the baseline was
+        simulated. Callable from another thread while it runs."""
+        if self._baseline is None:
+            return None
+        trials = self._in_order()
+        rows = _history(trials)
+        better = [
+            trial
+            for trial in trials
+            if trial.candidate and trial.objective < 1 and not _near(trial.point, self._refuted)
+        ]
+        best = min(better, key=_objective, default=None)
+        if self.noisy:
+            from rootsopt.optimize import noise
+
+            noise.add_errors(rows, trials, self.problem)
+            best = noise.most_promising(self.problem, trials)
+        verification: dict[str, Any] = {"holds_up": None, "rejected": []}
+        if best is None:
+            return Optimization(self.problem, self._baseline, None, rows, verification, True)
+        verification |= {
+            "searched_objective": best.objective,
+            "verified_objective": None,
+            "status": best.evaluation.status.label,
+        }
+        return Optimization(self.problem, self._baseline, best.evaluation, rows, verification, True)
+
+    def _in_order(self) -> list[Trial]:
+        """All trials up to now; screening first, then start by start."""
+        with self._lock:
+            return sorted(self._trials, key=lambda trial: (trial.start, trial.iteration))
 
     def _side_by_side(self, work: Callable[..., list[Trial]], tasks: Sequence) -> list[Trial]:
         """The trials of `work(evaluator, *task)` for every task, in their order. Each has its own
-        evaluator, so that the result does not depend on which is done first."""
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            done = [pool.submit(work, copy.copy(self.fast), *task) for task in tasks]
-            try:
-                return [trial for future in done for trial in future.result()]
-            finally:
-                pool.shutdown(cancel_futures=True)
+        evaluator, so that the result does not depend on which is done first.
+
+        After `stop` none, and nobody waits for the evaluations that go on."""
+        pool = ThreadPoolExecutor(os.cpu_count())
+        tasks = tasks if not self.stop.is_set() else []
+        done = [pool.submit(work, copy.copy(self.fast), *task) for task in tasks]
+        try:
+            pending = set(done)
+            while pending and not self.stop.is_set():
+                finished, pending = wait(pending, _POLL, FIRST_EXCEPTION)
+                for future in finished:
+                    future.result()
+            return [] if pending else [trial for future in done for trial in future.result()]
+        finally:
+            pool.shutdown(wait=not self.stop.is_set(), cancel_futures=True)
 
     def _feasible(self, baseline_point) -> list[NDArray[np.float64]]:
         """The baseline's neighbourhood and a Sobol sample, as far as they can be made feasible."""
@@ -184,6 +259,8 @@ class Search:
         return points
 
     def _screen(self, evaluator: Evaluator, point) -> list[Trial]:
+        if self.stop.is_set():
+            return []
         return [self._evaluate(without_gradient(evaluator), point, start=-1, iteration=0)]
 
     def _starts(self, trials: list[Trial]) -> list[NDArray[np.float64]]:
@@ -206,6 +283,8 @@ class Search:
         trials: list[Trial] = []
         last: Trial | None = None
         for iteration in range(settings.iterations + 1):
+            if self.stop.is_set():
+                break
             orbit = last.evaluation.state if last is not None and last is trials[-1] else None
             trial = self._evaluate(evaluator, point, number, iteration, orbit)
             trials.append(trial)
@@ -233,10 +312,10 @@ class Search:
         feasible = self.problem.feasible(point)
         trial = Trial(np.asarray(point), start, iteration, evaluation, objective, feasible)
         with self._lock:
-            self._done += 1
+            self._trials.append(trial)
             if trial.candidate:
                 self._best = float(np.fmin(self._best, objective))
-            self.progress(self._done, self.expected, self._best)
+            self.progress(len(self._trials), self.expected, self._best)
         return trial
 
     def _verify(self, trials: list[Trial]) -> tuple[Evaluation | None, dict[str, Any]]:
@@ -247,7 +326,7 @@ class Search:
         for candidate in ranked:
             if candidate.objective >= 1 or len(tried) >= 5:
                 break
-            if any(np.linalg.norm(candidate.point - p) < 0.02 for p in tried):
+            if _near(candidate.point, tried):
                 continue
             tried.append(candidate.point)
             evaluation = self.exact(self.problem.design(candidate.point))
@@ -262,7 +341,37 @@ class Search:
             if change <= _HOLDS_UP and objective < 1:
                 return evaluation, record | {"rejected": failures}
             failures.append(record | {"design": evaluation.design})
+            self._refuted.append(candidate.point)
         return None, {"holds_up": False, "rejected": failures}
+
+
+def until_stopped(work: Callable[[], T], stop: threading.Event, patience: float) -> T | None:
+    """`work()`, done in a thread of its own, whatever compiled code that is in; None if it has not
+    ended `patience` (s) after `stop` was set. A `KeyboardInterrupt` sets `stop`, a second one ends
+    the wait."""
+    future: Future[T] = Future()
+
+    def do() -> None:
+        try:
+            future.set_result(work())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=do, daemon=True).start()
+    late = float("inf")
+    while True:
+        try:
+            wait([future], _POLL)
+            if stop.is_set():
+                late = min(late, time.monotonic() + patience)
+        except KeyboardInterrupt:
+            if stop.is_set():
+                raise
+            stop.set()
+        if future.done():
+            return future.result()
+        if time.monotonic() > late:
+            return None
 
 
 def _rule(method: str, learning_rate: float, iterations: int) -> optax.GradientTransformation:
@@ -279,6 +388,11 @@ def _init(method, learning_rate, iterations, point):
 def _update(method, learning_rate, iterations, slope, state):
     """Step of an update rule, and its next state."""
     return _rule(method, learning_rate, iterations).update(slope, state)
+
+
+def _near(point: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> bool:
+    """Whether a point of the unit box is as good as the same as one of the others."""
+    return any(np.linalg.norm(point - other) < 0.02 for other in others)
 
 
 _candidate = operator.attrgetter("candidate")

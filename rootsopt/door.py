@@ -1,0 +1,257 @@
+"""The edge of the process: signals, standard streams, exit code.
+
+What a command line owns and a library must leave alone. Everything here lasts only while a command
+runs as the process's own (`main()` without arguments); called from Python with arguments, a command
+touches neither signals nor file descriptors. Loads little, so that an interrupt is answered even
+while the rest is being imported.
+"""
+
+import contextlib
+import errno
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+OK, BAD_INPUT, NO_RESULT = 0, 2, 3
+_NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
+_GONE = (errno.EPIPE, errno.EBADF, errno.ESHUTDOWN)
+"""Nobody reads a stream that fails so, and that is no error of ours."""
+_SHOW_CURSOR = "\x1b[?25h"
+
+
+class Signals:
+    """What SIGINT and SIGTERM do to a run.
+
+    A thread waits for them, as the main one may be in compiled code for long. The first signal
+    stops the run at once: `abandon` removes what is unfinished, one line says so, exit code 3.
+    With `patient`, the first one sets `stop` instead and only the second stops at once.
+    """
+
+    def __init__(self, command: str):
+        self.command = command
+        self.stop = threading.Event()
+        self.patient = False
+        self.promise = ""
+        self.abandon: Callable[[], str] = str
+        self._before: dict[int, Any] = {}
+        self._pipe: tuple[int, int] | None = None
+        self._wakeup = -1
+
+    def install(self) -> None:
+        """Take the signals over that nobody has claimed or told to be ignored."""
+        if threading.current_thread() is not threading.main_thread():
+            return
+        for number in _NAMES:
+            before = signal.getsignal(number)
+            if before in (signal.SIG_DFL, signal.default_int_handler):
+                self._before[number] = before
+        if not self._before:
+            return
+        reading, writing = self._pipe = os.pipe()
+        os.set_blocking(writing, False)
+        self._wakeup = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+        threading.Thread(target=self._wait, args=(reading,), daemon=True).start()
+        for number in self._before:
+            signal.signal(number, _nothing)
+
+    def remove(self) -> None:
+        """Leave the signals as they were."""
+        if self._pipe is None:
+            return
+        for number, before in self._before.items():
+            signal.signal(number, before)
+        signal.set_wakeup_fd(self._wakeup)
+        _, writing = self._pipe
+        self._pipe = None
+        os.close(writing)  # ends the thread, which closes the other end
+
+    def _wait(self, reading: int) -> None:
+        while numbers := os.read(reading, 1):
+            self._answer(_NAMES.get(signal.Signals(numbers[0]), "a signal"))
+        os.close(reading)
+
+    def _answer(self, what: str) -> None:
+        if self.patient and not self.stop.is_set():
+            self.say(f"{what}: {self.promise} (once more to stop at once)")
+            self.stop.set()
+            return
+        state = self.abandon()
+        self.say(f"stopped by {what}" + (f"; {state}" if state else ""))
+        os._exit(NO_RESULT)
+
+    def say(self, text: str) -> None:
+        """One line on stderr, whatever the streams are doing."""
+        shown = f"rootsopt {self.command}".rstrip()
+        try:
+            start = f"\r{_SHOW_CURSOR}" if os.isatty(2) else ""
+            os.write(2, f"{start}{shown}: {text}\n".encode(errors="replace"))
+        except OSError:
+            return
+
+
+def _nothing(number: int, frame: object) -> None:
+    """What the main thread does on a signal: go on."""
+
+
+_running: Signals | None = None
+
+
+@contextlib.contextmanager
+def patience(promise: str) -> Iterator[threading.Event]:
+    """An event that the first signal sets, instead of stopping the run; `promise` tells the user
+    what happens then. From a command that is not the process's own, an event nobody sets."""
+    signals = _running
+    if signals is None:
+        yield threading.Event()
+        return
+    signals.promise, signals.patient = promise, True
+    yield signals.stop  # Patient up to the end: results that took long are written.
+
+
+@contextlib.contextmanager
+def leaving(abandon: Callable[[], str]) -> Iterator[None]:
+    """Have `abandon` called if the process is stopped meanwhile; it returns what to tell."""
+    signals = _running
+    if signals is None:
+        yield
+        return
+    signals.abandon = abandon
+    try:
+        yield
+    finally:
+        signals.abandon = str
+
+
+class _Stream:
+    """A standard stream whose failures do not end the run, but are kept in `error`."""
+
+    def __init__(self, stream: Any, number: int | None):
+        self.stream, self.number = stream, number
+        self.error: OSError | None = None
+        self.closed_early = False
+
+    def write(self, text: str) -> int:
+        """As that of a file, without errors."""
+        if not self.closed_early:
+            self._guarded(lambda: self.stream.write(text))
+        return len(text)
+
+    def writelines(self, lines) -> None:
+        for line in lines:
+            self.write(line)
+
+    def flush(self) -> None:
+        """As that of a file, without errors."""
+        if not self.closed_early:
+            self._guarded(self.stream.flush)
+
+    def _guarded(self, work: Callable[[], object]) -> None:
+        try:
+            work()
+        except OSError as error:
+            self.closed_early = True
+            gone = _GONE + ((errno.EIO,) if self._terminal() else ())
+            if error.errno not in gone:
+                self.error = error
+            if self.number is not None:
+                # What is left in its buffer goes nowhere, at the end of the process too.
+                _nowhere(self.number)
+
+    def _terminal(self) -> bool:
+        try:
+            return self.stream.isatty()
+        except (OSError, ValueError):
+            return True
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
+def _nowhere(number: int) -> None:
+    """Let a file descriptor lead to the null device."""
+    with contextlib.suppress(OSError):
+        null = os.open(os.devnull, os.O_RDWR)
+        if null != number:
+            os.dup2(null, number)
+            os.close(null)
+
+
+@contextlib.contextmanager
+def _streams(own: bool) -> Iterator[_Stream]:
+    """Guard stdout and stderr; if they are the process's `own`, open those that are closed."""
+    if own:
+        for number in (0, 1, 2):
+            try:
+                os.fstat(number)
+            except OSError:
+                _nowhere(number)
+    before: tuple[Any, Any] = sys.stdout, sys.stderr
+    guards = []
+    for number, stream in enumerate(before, start=1):
+        if stream is None:
+            stream = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+        elif own:
+            with contextlib.suppress(AttributeError, ValueError, OSError):
+                # A terminal that lacks a letter shows a question mark.
+                stream.reconfigure(errors="replace")
+        guards.append(_Stream(stream, number if own else None))
+    sys.stdout, sys.stderr = guards
+    try:
+        yield guards[0]
+    finally:
+        for guard in guards:
+            guard.flush()
+        sys.stdout, sys.stderr = before
+
+
+def through(command: str, work: Callable[[], int], own: bool) -> int:
+    """Run a command's `work` and return its exit code, with the edges of the process guarded.
+
+    `own`: the process is the command's own. A reader that has gone (as in `| true`) does not change
+    the exit code; a stdout that cannot take what is written makes it 2.
+    """
+    global _running
+    if not own or _running is not None:
+        with _streams(own=False) as out:
+            code = work()
+            out.flush()
+        return _code(command, code, out)
+    signals = Signals(command)
+    signals.install()
+    _running = signals
+    try:
+        with _streams(own=True) as out:
+            try:
+                code = work()
+            except SystemExit as end:  # of the parser: help, or wrong arguments
+                code = end.code if isinstance(end.code, int) else NO_RESULT
+            out.flush()
+            code = _code(command, code, out)
+            sys.stderr.flush()
+            if signals.stop.is_set():
+                # Evaluations nobody waits for may still be running in other threads.
+                os._exit(code)
+    finally:
+        _running = None
+        signals.remove()
+    return code
+
+
+def _code(command: str, code: int, out: _Stream) -> int:
+    if out.error is None:
+        return code
+    why = (out.error.strerror or str(out.error)).lower()
+    message = f"rootsopt {command}: standard output cannot be written: {why}; redirect it elsewhere"
+    print(message, file=sys.stderr)
+    return BAD_INPUT
+
+
+def leave(code: int) -> None:
+    """End the process; a signal on the way out changes nothing."""
+    for number in _NAMES:
+        with contextlib.suppress(ValueError, OSError):
+            signal.signal(number, lambda *_: os._exit(code))
+    sys.exit(code)

@@ -1,0 +1,247 @@
+"""Runs that fail or die at a chosen file operation; `python -m tests.deaths` tries them all.
+
+Used by the tests and by the fuzzing campaign `kills`. Needs no JAX, so that it may fork.
+"""
+
+import argparse
+import errno
+import hashlib
+import itertools
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from rootsopt import disk, lock
+from rootsopt.errors import InputError
+from rootsopt.runs import RunFolder
+
+WRITING = ("open", "write", "fsync", "mkdir", "rename", "replace", "ftruncate", "pwrite")
+"""Operations that a full disk makes fail."""
+REMOVING = ("unlink", "rmdir")
+BEFORE = ("absent", "empty", "run", "overwritten")
+"""What is in the target: nothing, an empty folder, a run to be moved aside or replaced."""
+
+
+class _System:
+    """The `os` of a module, of which the operation number `at` is given to `fail`."""
+
+    def __init__(self, operations: tuple[str, ...], at: int, fail: Callable[[str, Any], Any]):
+        self.operations, self.at, self.fail, self.count = operations, at, fail, 0
+
+    def __getattr__(self, name: str) -> Any:
+        real = getattr(os, name)
+        return self.counted(name, real) if name in self.operations else real
+
+    def counted(self, name: str, real: Callable) -> Callable:
+        def call(*arguments, **options):
+            self.count += 1
+            if self.count == self.at:
+                return self.fail(name, lambda: real(*arguments, **options))
+            return real(*arguments, **options)
+
+        return call
+
+
+class faulty:  # noqa: N801
+    """While it lasts, operation number `at` of the file layer goes to `fail(name, do it)`."""
+
+    def __init__(self, operations, at: int, fail, exchanges: bool = True):
+        self.system = _System(operations, at, fail)
+        self.exchanges = exchanges
+
+    def __enter__(self) -> _System:
+        self.before = disk.os, lock.os, disk._exchanged, disk._renameat2, disk.shutil
+        disk.os = lock.os = self.system  # type: ignore[assignment]
+        if not self.exchanges:
+            disk._renameat2 = lambda: None  # type: ignore[assignment]
+        if "rename" in self.system.operations:
+            real = disk._exchanged
+
+            def exchanged(*arguments):
+                try:
+                    return self.system.counted("exchange", real)(*arguments)
+                except OSError as error:
+                    return error.errno
+
+            disk._exchanged = exchanged
+        if "unlink" in self.system.operations:
+            removed = self.system.counted("rmtree", _in_halves)
+            disk.shutil = SimpleNamespace(rmtree=removed)  # type: ignore[assignment]
+        return self.system
+
+    def __exit__(self, *_) -> None:
+        disk.os, lock.os, disk._exchanged, disk._renameat2, disk.shutil = self.before
+
+
+def _in_halves(path, ignore_errors=True) -> None:
+    shutil.rmtree(path, ignore_errors=ignore_errors)
+
+
+def full_disk(name: str, do: Callable[[], Any]) -> None:
+    """Fail as on a full disk, a write after having written nothing."""
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def die_before(name: str, do: Callable[[], Any]) -> None:
+    """End the process without any clean-up."""
+    os._exit(9)
+
+
+def die_after(name: str, do: Callable[[], Any]) -> None:
+    """The same once the operation is done."""
+    do()
+    os._exit(9)
+
+
+def write_run(target: Path, text: str, overwrite: bool = False) -> list[str]:
+    """A small run of which every file says `text`."""
+    with RunFolder(target, "simulate", overwrite) as folder:
+        folder.write_text("config.yaml", text)
+        folder.write_csv("response_design.csv", {"a": [1.0], "text": [text]})
+        folder.write_json("result.json", {"text": text})
+        folder.write_bytes("figures/force.png", text.encode() * 9000)
+        return folder.put_in_place()
+
+
+def digest(folder: Path) -> str | None:
+    """Names and contents of all files in a folder; None if there is none."""
+    if not folder.is_dir():
+        return None
+    found = hashlib.sha256()
+    for path in sorted(folder.rglob("*")):
+        found.update(os.fsencode(path.relative_to(folder)) + b"\0")
+        if path.is_file():
+            found.update(hashlib.sha256(path.read_bytes()).digest())
+    return found.hexdigest()
+
+
+def prepared(parent: Path, before: str) -> Path:
+    """A target in an empty folder `parent`, in the state asked for."""
+    target = parent / "run"
+    if before == "empty":
+        target.mkdir()
+    elif before in ("run", "overwritten"):
+        write_run(target, "old")
+    return target
+
+
+def scratch() -> Path:
+    """A new folder, in memory where that is possible: thousands of files are synchronised."""
+    memory = "/dev/shm"
+    usable = os.path.isdir(memory) and os.access(memory, os.W_OK)
+    return Path(tempfile.mkdtemp(prefix="deaths-", dir=memory if usable else None))
+
+
+def failures(kind: str, before: str, exchanges: bool, at: int) -> tuple[bool, list[str]]:
+    """Let operation number `at` of a run fail (`full`) or the process end before or after it;
+    whether there was such an operation, and what is wrong afterwards."""
+    place = scratch()
+    try:
+        return _failures(place, kind, before, exchanges, at)
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def _failures(place: Path, kind: str, before: str, exchanges: bool, at: int):
+    new = digest_of("new")
+    (place / "parent").mkdir()
+    target = prepared(place / "parent", before)
+    old, listing = digest(target), sorted(os.listdir(target.parent))
+    wrong: list[str] = []
+    hit, reported = _tried(target, kind, before, exchanges, at)
+    now = digest(target)
+    if now not in (old, new) and not (now is None and not exchanges):
+        wrong.append("the folder is neither the old run nor the new one")
+    if kind == "full":
+        if reported is not None and ("\n" in reported or "no space left" not in reported):
+            wrong.append(f"reported as {reported!r}")
+        if reported is not None and now != old:
+            wrong.append("the folder is not as it was")
+        if reported is None and now != new:
+            wrong.append("no failure reported, but the new run is not there")
+        left = [name for name in os.listdir(target.parent) if name.startswith(".")]
+        if left or (reported is not None and sorted(os.listdir(target.parent)) != listing):
+            wrong.append(f"left behind: {sorted(os.listdir(target.parent))}")
+    write_run(target, "next")
+    if digest(target) != digest_of("next"):
+        wrong.append("the next run is not whole")
+    names = os.listdir(target.parent)
+    if any(name.startswith(".") for name in names):
+        wrong.append(f"the next run leaves {names}")
+    kept = {digest(target.parent / name) for name in names}
+    if before == "run" and old not in kept:
+        wrong.append("the older run is lost")
+    if now == new and new not in kept:
+        wrong.append("the new run is lost")
+    allowed = {old, new, digest_of("next")}
+    if kept - allowed:
+        wrong.append("a folder aside is no whole run")
+    return hit, wrong
+
+
+def _tried(target: Path, kind: str, before: str, exchanges: bool, at: int):
+    """Whether the operation was met, and the message of the run that failed."""
+    overwrite = before == "overwritten"
+    if kind == "full":
+        with faulty(WRITING, at, full_disk, exchanges) as system:
+            try:
+                write_run(target, "new", overwrite)
+            except InputError as error:
+                return system.count >= at, str(error)
+        return system.count >= at, None
+    child = os.fork()
+    if not child:
+        try:
+            die = die_before if kind == "before" else die_after
+            with faulty((*WRITING, *REMOVING), at, die, exchanges):
+                write_run(target, "new", overwrite)
+        finally:
+            os._exit(0)
+    _, status = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(status) == 9, None
+
+
+def digest_of(text: str) -> str | None:
+    """The digest of a whole run."""
+    place = scratch()
+    try:
+        write_run(place / "run", text)
+        return digest(place / "run")
+    finally:
+        shutil.rmtree(place)
+
+
+def every_operation(kind: str) -> tuple[int, list[str]]:
+    """Try each operation of each kind of run; how many were tried, and what went wrong."""
+    tried, wrong = 0, []
+    for before, exchanges in itertools.product(BEFORE, (True, False)):
+        for at in itertools.count(1):
+            hit, found = failures(kind, before, exchanges, at)
+            where = f"{kind} at operation {at}, target {before}, exchange {exchanges}"
+            wrong += [f"{where}: {text}" for text in found]
+            if not hit:
+                break
+            tried += 1
+    return tried, wrong
+
+
+def main() -> int:
+    """Try every operation; one line for each thing that is wrong."""
+    parser = argparse.ArgumentParser(prog="python -m tests.deaths", description=__doc__)
+    parser.add_argument("kinds", nargs="*", default=["full", "before", "after"])
+    bad = False
+    for kind in parser.parse_args().kinds:
+        tried, wrong = every_operation(kind)
+        print(f"{kind}: {tried} operations, {len(wrong)} wrong")
+        print(*wrong, sep="\n", end="\n" if wrong else "")
+        bad |= bool(wrong) or tried < 40
+    return int(bad)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
