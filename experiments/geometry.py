@@ -10,6 +10,7 @@ number of lobes with the greatest relative errors and the design that has it.
 """
 
 import argparse
+import functools
 import sys
 from pathlib import Path
 from typing import Any
@@ -38,8 +39,8 @@ FAMILIES = tuple(family for family in FAMILY_KEYS if family != "outline")
 COEFFICIENTS = (3, 8, 24)
 """Sizes of a free form."""
 _LEVELS = 4
-_SHORT, _WHOLE = 64, 2048
-"""Sides of the finest polygon: on one of many short stretches, and on a whole segment."""
+_SHORT, _SPAN, _WHOLE = 64, 512, 2048
+"""Sides of the finest polygon: on an interval of a curve, a knot span of a free form, a segment."""
 _GRADED = 5
 """Power with which points crowd at both ends of a segment, where an outline may have a root."""
 _LONGEST_INVOLUTE = 1.02
@@ -55,6 +56,7 @@ def by_polygons(profile):
     if isinstance(profile, Curve):
         ends = profile.node
     elif isinstance(profile, FreeForm):
+        x = np.arange(_SPAN + 1) / _SPAN
         ends = jnp.append(0.0, jnp.stack([s.start for s in profile.stretches()[1:]]))
         ends = jnp.append(ends, profile.pitch_normal)
     else:
@@ -128,8 +130,13 @@ def _crowded(share, least):
     return np.where(share < 0.5, near, 1 - near)
 
 
-def sound(family: str, lobes: int, design) -> jax.Array:
-    """Whether a config with this design is accepted."""
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def judged(family: str, lobes: int, designs):
+    """Whether configs with these designs (n, d) are accepted, (n,)."""
+    return lax.map(functools.partial(_sound, family, lobes), designs)
+
+
+def _sound(family: str, lobes: int, design):
     profile = profile_of(family, lobes, jnp.asarray(RADIUS_MM * MM), design)
     if family in BY_LIMITS:
         alpha, length = design[0] * DEG, design[1]
@@ -151,9 +158,10 @@ def sound(family: str, lobes: int, design) -> jax.Array:
     return good
 
 
-def compared(family: str, lobes: int):
-    """A function of a design (config units) to its relative errors of area and polar moment and the
-    reference's own, infinite where the design is not sound."""
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def compared(family: str, lobes: int, designs):
+    """Relative errors of area and polar moment of designs (n, d) in config units, and the
+    reference's own, (n, 3)."""
 
     def compare(design):
         profile = profile_of(family, lobes, jnp.asarray(RADIUS_MM * MM), design)
@@ -162,22 +170,19 @@ def compared(family: str, lobes: int):
         errors = jnp.abs(jnp.stack([shape.area, shape.polar_area_moment]) / truth - 1)
         return jnp.append(errors, rest)
 
-    return compare
+    return lax.map(compare, designs)
 
 
 def errors(family: str, lobes: int, count: int, random: np.random.Generator, size: int = 8):
-    """Sound designs (n, d) among `count` drawn ones, and `compared` of each (n, 3)."""
-    designs = draw(family, lobes, count, random, size)
-    if not FAMILY_KEYS[family]:
-        designs = np.zeros((1, 0))
-    judge = jax.jit(lambda rows: lax.map(lambda row: sound(family, lobes, row), rows))
-    kept = designs[np.asarray(judge(jnp.asarray(designs)))]
+    """The sound designs (n, d) among `count` drawn ones, and what they `compared` to (n, 3)."""
+    # A family without parameters has one design.
+    designs = draw(family, lobes, count if FAMILY_KEYS[family] else 1, random, size)
+    kept = designs[np.asarray(judged(family, lobes, designs))]
     if not len(kept):
         return kept, np.zeros((0, 3))
-    run = jax.jit(lambda rows: lax.map(compared(family, lobes), rows))
     # One size for all, so that a family is compiled once.
     padded = np.concatenate([kept, np.repeat(kept[:1], len(designs) - len(kept), axis=0)])
-    return kept, np.asarray(run(jnp.asarray(padded)))[: len(kept)]
+    return kept, np.asarray(compared(family, lobes, padded))[: len(kept)]
 
 
 def study(draws: int, seed: int, families=FAMILIES, lobes=LOBES, say=lambda row: None):
@@ -213,7 +218,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     console = Console()
-    rows = study(options.draws, options.seed, say=lambda row: print(row, flush=True))
+    rows = study(options.draws, options.seed, say=lambda row: console.print(row, soft_wrap=True))
     folder = files.ResultFolder(options.output)
     folder.write_csv("geometry.csv", {key: [row[key] for row in rows] for key in rows[0]})
     table = Table(*rows[0])

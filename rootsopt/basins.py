@@ -309,8 +309,9 @@ class AttractorEvaluator(Evaluator):
     objective is greatest, each relative to `reference` (a response, usually the baseline's; by
     default the greatest among the motions). With `weighted`, response and gradient are averages
     with the shares of initial states as weights; how these change with the design is not in the
-    gradient. A motion without contact beside others has the force 0 and the gradient 0. A design from which some initial states lead to no stable periodic motion has the
-    status of what they lead to, and no gradient.
+    gradient. A motion without contact beside others has force 0 and gradient 0. A design from which
+    some initial states lead to no stable periodic motion has the status of what they lead to, and
+    no gradient.
     """
 
     def __call__(self, design=None, start=None, series=True) -> Evaluation:
