@@ -72,14 +72,16 @@ class Basins:
 
     @property
     def status(self) -> Status:
-        """Periodic if every initial state leads to a stable periodic motion; else what stands
-        against it."""
+        """Periodic if every initial state leads to a stable periodic motion, and some to one with
+        contact; else what stands against it."""
         for status in _LOST:
             if self.lost.get(status.label):
                 return status
+        pushes = any(attractor.evaluation.usable for attractor in self.attractors)
         for attractor in self.attractors:
-            if attractor.evaluation.status is not Status.PERIODIC:
-                return attractor.evaluation.status
+            one = attractor.evaluation
+            if not (one.usable or (pushes and closed(one))):
+                return one.status
         return Status.NOT_SETTLED if any(self.lost.values()) else Status.PERIODIC
 
     def records(self) -> list[dict[str, Any]]:
@@ -158,6 +160,12 @@ def find(
     )
 
 
+def closed(evaluation: Evaluation) -> bool:
+    """Whether the motion is a closed orbit, be it without contact (`idle`)."""
+    idle = evaluation.status is Status.IDLE and evaluation.state is not None
+    return evaluation.usable or idle
+
+
 class _Sorter:
     """Puts ends of transients to the motions they have led to."""
 
@@ -170,12 +178,12 @@ class _Sorter:
         self.tries = 0
 
     def periodic(self, number: int) -> bool:
-        return self.evaluations[number].usable
+        return closed(self.evaluations[number])
 
     def add(self, evaluation: Evaluation, end) -> int:
         """Number of the motion of an evaluation that began at `end`: a known one or a new one."""
         cycle = np.atleast_2d(end)
-        if evaluation.usable:
+        if closed(evaluation):
             # Built anew: the evaluation may have fitted the contact map to its motion.
             pair = self.evaluator.pair(self.design)
             states = _cycle(pair, evaluation.state, self.evaluator.orbit)
@@ -301,8 +309,9 @@ class AttractorEvaluator(Evaluator):
     objective is greatest, each relative to `reference` (a response, usually the baseline's; by
     default the greatest among the motions). With `weighted`, response and gradient are averages
     with the shares of initial states as weights; how these change with the design is not in the
-    gradient. A design from which some initial states lead to no stable periodic motion has the
-    status of what they lead to, and no gradient.
+    gradient. A motion without contact beside others has force 0 and gradient 0. A design from which
+    some initial states lead to no stable periodic motion has the status of what they lead to, and
+    no gradient.
     """
 
     def __call__(self, design=None, start=None, series=True) -> Evaluation:
@@ -312,9 +321,10 @@ class AttractorEvaluator(Evaluator):
         usable = [a for a in basins.attractors if a.evaluation.usable]
         if not usable:
             return _evaluate(self, design, None, series)
+        orbits = [a for a in basins.attractors if closed(a.evaluation)]
         chosen = max(usable, key=self._badness(usable)).evaluation
         if self.config.objective.motion == "weighted":
-            chosen = _averaged(chosen, usable)
+            chosen = _averaged(chosen, orbits)
         status = basins.status
         return dataclasses.replace(
             chosen,
@@ -322,7 +332,7 @@ class AttractorEvaluator(Evaluator):
             steady_state=chosen.steady_state | {"attractors": basins.summary()},
             status=status,
             message=status.value,
-            state=np.stack([np.asarray(a.evaluation.state) for a in usable]),
+            state=np.stack([np.asarray(a.evaluation.state) for a in orbits]),
         )
 
     def _badness(self, attractors: list[Attractor]) -> Callable[[Attractor], float]:
@@ -332,7 +342,8 @@ class AttractorEvaluator(Evaluator):
 
         def badness(attractor: Attractor) -> float:
             found = attractor.evaluation.response
-            return sum(w * found[k] / max(reference[k], 1e-12) for k, w in weights.items())
+            # A measure that is 0 in the reference is refused as soon as that is the baseline's.
+            return sum(w * found[k] / reference[k] for k, w in weights.items() if reference[k] > 0)
 
         return badness
 
@@ -347,11 +358,15 @@ def _averaged(one: Evaluation, attractors: list[Attractor]) -> Evaluation:
     def average(values: list[float]) -> float:
         return float(shares @ values)
 
+    def slope(evaluation: Evaluation, name: str, key: str) -> float:
+        # Where nothing touches, nothing changes with the design.
+        return evaluation.gradient[name][key] if evaluation.usable else 0.0
+
     return dataclasses.replace(
         one,
         response={k: average([e.response[k] for e in found]) for k in one.response},
         gradient={
-            name: {k: average([e.gradient[name][k] for e in found]) for k in row}
+            name: {k: average([slope(e, name, k) for e in found]) for k in row}
             for name, row in one.gradient.items()
         },
     )

@@ -32,6 +32,7 @@ from rootsopt.evaluate import (
     Evaluation,
     Evaluator,
     geometry_record,
+    idle_hint,
     lyapunov_program,
     unsettled,
 )
@@ -139,13 +140,18 @@ class EnsembleEvaluator(Evaluator):
         steady: dict[str, Any] = {"kind": "transient"}
         response: dict[str, float] = {}
         gradient: dict[str, dict[str, float]] = {}
-        series, state = None, None
+        series, state, hint = None, None, ""
         if status is Status.AVERAGED:
             values = members.responses
+            least = float(np.finfo(members.greatest.dtype).eps) * float(pair.force_scale)
+            if np.max(members.greatest) <= least:
+                status, hint = Status.IDLE, idle_hint(self.config, float(np.max(members.depth)))
             response = dict(zip(RESPONSES, map(float, values[:, 0]), strict=True))
             errors = dict(zip(ERRORS.values(), map(float, values[:, 1]), strict=True))
             greatest = float(np.max(members.greatest))
             found, series = self._kind(pair, members, with_series)
+            if status is Status.IDLE:
+                found["kind"] = "idle"
             drift, by_drift = mean_and_error(np.asarray(members.drift, np.float64))
             steady = found | size | errors
             steady |= {
@@ -176,7 +182,7 @@ class EnsembleEvaluator(Evaluator):
             gradient=gradient,
             steady_state=steady,
             status=status,
-            message=status.value,
+            message=status.value + hint,
             statistics={
                 "settle_mesh_periods": settings.settle_periods,
                 "neighbours": settings.designs // 2 * 2 if gradient else 0,

@@ -342,7 +342,7 @@ class Evaluator:
         response: dict[str, float] = {}
         gradient: dict[str, dict[str, float]] = {}
         steady: dict[str, Any] = {"kind": "transient"}
-        series, state = None, None
+        series, state, hint = None, None, ""
         statistics: dict[str, int | float] = {
             "transient_mesh_periods": outcome.used,
             "solver_steps": outcome.steps,
@@ -355,13 +355,7 @@ class Evaluator:
         if status is Status.PERIODIC and orbit is not None:
             period = int(outcome.transient.period)
             response, gradient = self._response(design, orbit, period)
-            steady = {
-                "kind": "periodic",
-                "period": period,
-                "floquet_multiplier": float(orbit.multiplier),
-                "floquet_multipliers": floquet(orbit.monodromy),
-                "residual": float(orbit.residual),
-            }
+            steady = {"kind": "periodic"} | _closed(orbit, period)
             state = np.asarray(orbit.state, np.float64)
             statistics |= {
                 "newton_steps": int(orbit.newton_steps),
@@ -379,9 +373,21 @@ class Evaluator:
                 status = Status.UNRESOLVED
             elif not found.certain:
                 status = Status.INACCURATE
+        elif status is Status.IDLE and orbit is not None:
+            steady, hint = {"kind": "idle"}, idle_hint(self.config, float(orbit.flow.depth))
+            rows = np.zeros((len(orbit.response), 1))
+            response = {name: 0.0 for name in self.measures.named(rows, 1)}
+            if outcome.found is not None and outcome.found.steady:
+                # Held by the timing gear; a pair that floats can rest anywhere.
+                period = int(outcome.transient.period)
+                steady |= _closed(orbit, period)
+                state = np.asarray(orbit.state, np.float64)
+                series = _orbit_series(pair, orbit, period) if with_series else None
         elif status is Status.NOT_SETTLED and not self.survey:
             window = lyapunov_program(pair, outcome.transient.state, CHAOS_WINDOW, self.transient)
             status, steady, response, series = unsettled(pair, window, with_series)
+            if status is Status.IDLE:
+                hint = idle_hint(self.config, float(np.max(window.flows.depth)))
         elif status is Status.SOLVER_FAILED and pair.pace is not None:
             swings = pair.mesh_period / (2 * np.pi * pair.pace.swing)
             statistics["swings_per_mesh_period"] = float(swings)
@@ -395,7 +401,7 @@ class Evaluator:
             gradient=gradient,
             steady_state=steady,
             status=status,
-            message=status.value,
+            message=status.value + hint,
             statistics=statistics,
             series=series,
             state=state,
@@ -414,6 +420,37 @@ class Evaluator:
             return response, {}
         slopes = {name: map(float, slope) for name, (_, slope) in found.items()}
         return response, {k: dict(zip(self.keys, v, strict=True)) for k, v in slopes.items()}
+
+
+def _closed(orbit: Orbit, period: int) -> dict[str, Any]:
+    """What the result file says of a closed orbit."""
+    return {
+        "period": period,
+        "floquet_multiplier": float(orbit.multiplier),
+        "floquet_multipliers": floquet(orbit.monodromy),
+        "residual": float(orbit.residual),
+    }
+
+
+def idle_hint(config: Config, depth: float) -> str:
+    """Advice for flanks that never touch: which clearance brings them together.
+
+    `depth` (m): greatest penetration, less than 0 by the least gap. The motion does not depend on
+    the clearance as long as nothing touches, so that the flanks touch where the clearance falls by
+    more than the least gap."""
+    gap, clearance = -depth / MM, config.contact.clearance_mm
+    if not (np.isfinite(gap) and 0 < gap < 0.9 * config.profile.pitch_radius_mm):
+        return ""
+    found = f" The least gap of the flanks is {gap:.4g} mm"
+    if gap < clearance:
+        return f"{found}: they touch with contact.clearance_mm below {clearance - gap:.4g}."
+    if config.scene.timing_gear is not None:
+        backlash = config.scene.timing_gear.backlash_mm
+        return (
+            f"{found}, and the timing gear holds them apart: they touch only with "
+            f"scene.timing_gear.backlash_mm above {backlash + 2 * gap:.4g}."
+        )
+    return f"{found}."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -552,6 +589,8 @@ def unsettled(pair, window, with_series):
         status = Status.NON_FINITE
     elif not np.all(flows.solved):
         status = Status.SOLVER_FAILED
+    elif np.max(flows.peak) <= np.finfo(window.state.dtype).eps * float(pair.force_scale):
+        status, kind = Status.IDLE, "idle"
     elif exponent > 3 * error:
         status, kind = Status.CHAOTIC, "chaotic"
     else:
@@ -562,7 +601,7 @@ def unsettled(pair, window, with_series):
         "lyapunov_standard_error": error if finite else None,
         "window_mesh_periods": CHAOS_WINDOW,
     }
-    if status not in (Status.CHAOTIC, Status.NOT_SETTLED):
+    if status not in (Status.CHAOTIC, Status.NOT_SETTLED, Status.IDLE):
         return status, steady, {}, None
     response = _response(
         np.mean(np.asarray(flows.mean)),

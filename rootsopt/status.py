@@ -42,8 +42,8 @@ class Status(enum.Enum):
         "contact.smoothing_mm."
     )
     IDLE = (
-        "No flank touches: the pair rests anywhere within its play, without contact force and "
-        "without a gradient. Raise scene.load.torque_N_m."
+        "No flank touches: the contact force is zero and has no gradient. Raise "
+        "scene.load.torque_N_m, or lower contact.clearance_mm."
     )
     NOT_IMPROVED = (
         "No feasible design better than the baseline was found. Lower "
@@ -56,7 +56,7 @@ class Status(enum.Enum):
     SOLVER_FAILED = (
         "The solver ran out of steps. Raise solver.max_steps_per_period (an explicit method takes "
         "ten and more for each of statistics.swings_per_mesh_period), loosen solver.rtol, or use "
-        "an implicit solver.method (kvaerno5)."
+        "an implicit solver.method (kvaerno5, with solver.precision float64)."
     )
     NON_FINITE = (
         "The simulation produced a number that is not finite. Loosen solver.rtol or check the "

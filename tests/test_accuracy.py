@@ -256,6 +256,9 @@ def test_batch_is_the_designs_one_by_one(default):
     failed = respond_many(lost, designs, jnp.zeros((3, 2)), evaluator.transient, evaluator.orbit)
     assert not np.any(failed.usable)
     assert np.all(np.isnan(failed.response))
+    apart = dataclasses.replace(evaluator.model, clearance=jnp.asarray(3e-4))
+    idle = respond_many(apart, designs, jnp.zeros((3, 2)), evaluator.transient, evaluator.orbit)
+    assert [STATUSES[i] for i in idle.status] == [Status.IDLE] * 3
 
 
 def test_batch_at_a_coarse_tolerance(default):

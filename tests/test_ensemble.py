@@ -296,6 +296,15 @@ def test_responses_stand_where_they_belong(monkeypatch):
     assert steady["greatest_force_N"] == 27
 
 
+def test_members_that_never_touch_are_idle(monkeypatch):
+    """Averages of nothing; one member with contact is enough for averages."""
+    evaluation = told(monkeypatch, lambda number: sound(0.0)._replace(means=np.zeros((4, 3))))
+    assert evaluation.status is Status.IDLE
+    assert set(evaluation.response.values()) == {0.0}
+    assert evaluation.gradient == {}
+    assert told(monkeypatch, lambda number: sound(3.0)).status is Status.AVERAGED
+
+
 def test_too_deep_is_no_average(monkeypatch):
     """One member beyond the validity of the contact law takes the result its usability."""
     depth = np.array([-1.0, 1.0, 1.0, 1.0]) * 0.0201 * 0.033

@@ -295,12 +295,14 @@ def test_mean_rms_and_peak_must_not_contradict_each_other():
     assert consistent(1e-4, -1e-8, 1e-4)
 
 
-def test_idle_is_without_force_and_without_return():
-    """No force at all, and a multiplier of 1 (free drift) or none."""
+def test_idle_is_without_force():
+    """No force at all, and free drift (a multiplier of 1, or none) or a steady orbit."""
     nothing = {"mean": 0.0, "peak": 0.0}
     assert bool(is_idle(orbit_of((1.0, 1.0), **nothing)))
     assert bool(is_idle(orbit_of((np.nan, 1.0), **nothing)))
     assert not bool(is_idle(orbit_of(**nothing)))
+    assert bool(is_idle(orbit_of(**nothing), 0.0, True))
+    assert not bool(is_idle(orbit_of(), 0.0, True))
     rounding = {"mean": 1e-50, "peak": 1e-48}
     assert bool(is_idle(orbit_of((1.0, 1.0), **rounding), 1e-18))
     assert not bool(is_idle(orbit_of((1.0, 1.0))))

@@ -197,7 +197,9 @@ class RotorPair(eqx.Module):
         return self.drive.speed / jnp.maximum(self.speed(state), creep)
 
     def motion(self, tau: Float[Array, "*k"], state: Float[Array, "*k n"]) -> Motion:
-        """Position and velocity from rotation in mesh periods and scaled state."""
+        """Position and velocity from rotation in mesh periods and scaled state, in the precision
+        of the pair whatever theirs is."""
+        tau, state = (jnp.asarray(x, self.angle_scale.dtype) for x in (tau, state))
         relative = self.angle_scale * state[..., 0]
         rate = self.angle_scale * state[..., 1] / self.mesh_period
         motion = Motion(2 * jnp.pi / self.lobes * tau, relative, rate, self.speed(state))

@@ -54,23 +54,27 @@ def verdict(
     law, pitch radius (m), force unit (N)."""
     exponent, radius, force = scales
     rounding = force_rounding(orbit.flow.depth, exponent, radius)
+    steady = judged(orbit, state, within, rtols, residual)
     return Verdict(
-        idle=is_idle(orbit, float(jnp.finfo(orbit.state.dtype).eps) * force),
-        steady=judged(orbit, state, within, rtols, residual),
+        idle=is_idle(orbit, float(jnp.finfo(orbit.state.dtype).eps) * force, steady),
+        steady=steady,
         rounding=jnp.where(orbit.flow.peak > 0, rounding, 0.0),
         consistent=is_consistent(orbit, 10 * rtols[1] * force),
         certain=is_certain(orbit, jnp.asarray(rtols[1])),
     )
 
 
-def is_idle(orbit: Orbit, least: Float[Array, ""] | float = 0.0) -> Bool[Array, ""]:
-    """Whether the pair floats: no flank ever touches, but for forces up to the `least` (N) of
-    rounding, and nothing brings it back when it is moved.
+def is_idle(
+    orbit: Orbit, least: Float[Array, ""] | float = 0.0, steady: Bool[Array, ""] | bool = False
+) -> Bool[Array, ""]:
+    """Whether no flank ever touches, but for forces up to the `least` (N) of rounding.
 
-    Then it can rest anywhere, and neither Newton's method nor a derivative has an answer.
+    Either the orbit is `steady`: the timing gear holds the pair. Or nothing brings the pair back
+    when it is moved: it can rest anywhere, and neither Newton's method nor a derivative has an
+    answer. Without contact, an orbit that is neither says nothing of the motion.
     """
     free = jnp.isnan(orbit.multiplier) | (orbit.multiplier > 1 - _FREE)
-    return (orbit.flow.mean <= least) & (orbit.flow.peak <= least) & free
+    return (orbit.flow.mean <= least) & (orbit.flow.peak <= least) & (free | steady)
 
 
 def judged(

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import importlib
 import itertools
+import math
 import threading
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -235,16 +236,28 @@ class Problem:
     def of(cls, config: Config, model: Model, baseline: Evaluation) -> "Problem":
         """The problem whose floors are those of the config or of the `baseline`.
 
-        Raises `InputError` where a spectral line is to fall that the baseline has not got."""
-        weighted = [order for order, w in config.objective.line_weights.items() if w]
-        for order, part in itertools.product(weighted, parts_of(baseline)):
+        Raises `InputError` where a measure is to fall that is 0 for the baseline: nothing is
+        relative to that."""
+        orders = {line_name(order): order for order in config.objective.line_weights}
+        counting = [part for part in parts_of(baseline) if part.share > 0]
+        for name, part in itertools.product(objective_weights(config), counting):
             one = part.evaluation
-            if not one.response[line_name(order)] > _NO_LINE * one.response["mean_force_N"]:
+            least = _NO_LINE * one.response["mean_force_N"] if name in orders else 0.0
+            if one.response[name] > least:
+                continue
+            at = "" if math.isnan(part.speed_rpm) else f" at {part.speed_rpm:g} rpm"
+            if name in orders:
                 period = one.steady_state.get("period")
                 raise InputError(
-                    f"`objective.line_weights` has the order {order:g}, but the baseline's force "
-                    f"has no such line (its motion repeats every {period} mesh periods); remove it"
+                    f"`objective.line_weights` has the order {orders[name]:g}, but the baseline's "
+                    f"force has no such line{at} (its motion repeats every {period} mesh periods); "
+                    "remove it"
                 )
+            raise InputError(
+                f"the weights of `objective` must be on forces that the baseline has, but its "
+                f"{name} is {one.response[name]:g}{at}; raise the load, lower "
+                "`contact.clearance_mm`, or set the weight to 0"
+            )
         return cls(config, baseline, Space.of(config, model, baseline.geometry["area_efficiency"]))
 
     def objective(self, evaluation: Evaluation) -> float:
@@ -255,7 +268,8 @@ class Problem:
         return sum(share * self._value(*pair) for share, *pair in self._counted(evaluation))
 
     def by_speed(self, evaluation: Evaluation) -> list[dict[str, float]]:
-        """The objective at each speed by itself, if there are several."""
+        """The objective at each speed by itself, if there are several; NaN where the baseline's is
+        relative to nothing, which no speed with a share is."""
         parts = zip(parts_of(evaluation), parts_of(self.baseline), strict=True)
         return [
             {
@@ -296,8 +310,10 @@ class Problem:
         return sum(w * evaluation.response[k] for k, w in self._weights(baseline).items())
 
     def _weights(self, baseline: Evaluation) -> dict[str, float]:
+        """Weights (1/N) of the measures of one speed, NaN for one that is 0 for the baseline."""
         weights = objective_weights(self.config)
-        return {k: w / max(baseline.response[k], 1e-12) for k, w in weights.items()}
+        forces = {key: baseline.response[key] or math.nan for key in weights}
+        return {key: weight / forces[key] for key, weight in weights.items()}
 
     def point(self, design) -> NDArray[np.float64]:
         """The nearest point of the unit box to a design in config units."""

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -75,6 +76,14 @@ class Arcs(Profile):
             Segment(name, start, stop, self.land and place == 0)
             for place, (name, start, stop) in enumerate(ends)
         )
+
+    def stretches(self) -> tuple[Segment, ...]:
+        parts: list[Segment] = []
+        for segment, (x, y) in zip(self.segments(), self.center, strict=True):
+            # The lever C × n is greatest where n is at right angles to C.
+            place = jnp.arctan2(lax.stop_gradient(x), -lax.stop_gradient(y)) % jnp.pi
+            parts += (segment,) if segment.land else self._cut(segment, place)
+        return tuple(parts)
 
     def _arc(self, nu):
         """Index of the arc with the normal `nu`; the first and the last go on beyond their ends."""

@@ -25,6 +25,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 
@@ -53,6 +54,16 @@ class Segment(NamedTuple):
     land: bool
 
 
+class Quadrature(NamedTuple):
+    """How integrals over a stretch of a profile are taken: `nodes` of Gauss and Legendre, on an
+    even scale or (`graded`) crowding towards both ends, and how many further places `between` are
+    looked at for undercut."""
+
+    nodes: int
+    graded: bool
+    between: int
+
+
 class Mate(NamedTuple):
     """A point of the partner's flank: `facing`, the direction (rad) of its outward normal from
     the axis of the valley; `lever` and `support` (m) of that normal."""
@@ -78,8 +89,25 @@ class Profile(eqx.Module):
         """The smooth stretches of the addendum, from the tip to the pitch point."""
 
     def stretches(self) -> tuple[Segment, ...]:
-        """The segments, cut where they are smooth to a few derivatives only, for quadrature."""
+        """The segments, cut for quadrature: where they are smooth to a few derivatives only, and
+        where the pressure angle is least inside of one.
+
+        There a normal may all but touch the pitch circle, where ψ has a root."""
         return self.segments()
+
+    @property
+    def quadrature(self) -> Quadrature:
+        """How integrals over each of the `stretches` are taken.
+
+        By default nodes crowd towards the ends, and resolve a root of ψ there to rounding even if
+        it lies 1e-4 of the stretch beyond."""
+        return Quadrature(64, True, 128)
+
+    def _cut(self, segment: Segment, place: Float[Array, ""]) -> tuple[Segment, Segment]:
+        """A segment in two parts; one of them is empty if `place` lies outside."""
+        name, start, stop, land = segment
+        middle = jnp.clip(lax.stop_gradient(place), start, stop)
+        return Segment(name, start, middle, land), Segment(name, middle, stop, land)
 
     @abc.abstractmethod
     def roll_angle(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:

@@ -67,6 +67,11 @@ class CIC(Profile):
             Segment("involute", self.arc_end, self.involute_end, False),
         )
 
+    def stretches(self) -> tuple[Segment, ...]:
+        land, arc, involute = self.segments()
+        # The normals of a short involute's arc come nearest to the pitch circle inside of it.
+        return (land, *self._cut(arc, self.tip_arc_angle + jnp.pi / 2), involute)
+
     def _arc_slide(self, turn):
         """Signed distance from the pitch point to the arc's centre along the normal."""
         c, r = self.arc_center_radius, self.pitch_radius

@@ -12,7 +12,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from rootsopt.profiles.base import Profile, Segment
+from rootsopt.profiles.base import Profile, Quadrature, Segment
 
 INTERVALS = 48
 """Intervals of a piece: the quintic between their ends misses a smooth curve by some 1e-11 r."""
@@ -101,6 +101,19 @@ class Curve(Profile):
     def segments(self) -> tuple[Segment, ...]:
         stretches = zip(self.names, self.ends[:-1], self.ends[1:], self.lands, strict=True)
         return tuple(Segment(*stretch) for stretch in stretches)
+
+    def stretches(self) -> tuple[Segment, ...]:
+        count = self.node.shape[0] // len(self.names)
+        return tuple(
+            Segment(self.names[k // count], self.node[k], self.node[k + 1], self.lands[k // count])
+            for k in range(self.node.shape[0] - 1)
+            if k % count < count - 1
+        )
+
+    @property
+    def quadrature(self) -> Quadrature:
+        # Between two nodes ψ is a quintic.
+        return Quadrature(6, False, 4)
 
     def _place(self, nu):
         """The last node before `nu`, which is none at the end of a piece but the last, and the

@@ -52,6 +52,10 @@ class TippedEpicycloid(Profile):
             Segment("epicycloid", self.joint, stop, False),
         )
 
+    def stretches(self) -> tuple[Segment, ...]:
+        arc, epicycloid = self.segments()
+        return (*self._cut(arc, jnp.asarray(jnp.pi / 2)), epicycloid)
+
     @property
     def _stop(self):
         return self.half_pitch + jnp.pi / 2

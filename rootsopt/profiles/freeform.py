@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.profiles.base import Profile, Segment
+from rootsopt.profiles.base import Profile, Quadrature, Segment
 from rootsopt.programs import Program
 
 _DEGREE = 2
@@ -98,6 +98,11 @@ class FreeForm(Profile):
         ends = [free.start + k * self.width for k in range(self._spans)] + [free.stop]
         spans = itertools.pairwise(ends)
         return (land, *(Segment(free.name, start, stop, False) for start, stop in spans))
+
+    @property
+    def quadrature(self) -> Quadrature:
+        # Inside of a knot span ψ is a cubic.
+        return Quadrature(24, False, 128)
 
     def _place(self, nu):
         """Knot span at `nu`, and the share of it; the first and the last go on."""

@@ -1,20 +1,22 @@
 """Integral and extreme properties of a profile: area, inertia, radii, margins, outline."""
 
+import functools
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
+from numpy.typing import NDArray
 
-from rootsopt.profiles.base import Profile
+from rootsopt.profiles.base import Profile, Quadrature
 from rootsopt.profiles.outline import Outline
 from rootsopt.programs import Program
 
-# Gauss-Legendre per smooth segment: the integrands are analytic inside a segment, and
-# 24 points bring area and inertia of every family here to rounding error.
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
-# Further places where undercut is looked for: that of an arc is worst inside.
-_BETWEEN = 128
+_GRADING = 4.0
+"""Nodes that crowd are even ones by the hyperbolic tangent of a scale this long to either side. Of
+powers, hyperbolic tangents and double exponentials with 32 to 96 nodes this one had the least
+error on a root 0.3 to 1e-4 of the length beyond an end: 1e-13."""
 
 
 class Geometry(eqx.Module):
@@ -46,12 +48,9 @@ def geometry(profile: Profile) -> Geometry:
     segments = profile.stretches()
     start = jnp.stack([s.start for s in segments])[:, None]
     length = jnp.stack([s.stop for s in segments])[:, None] - start
-    # Each end is looked at from just inside, so that it belongs to its segment.
-    between = np.arange(1, _BETWEEN) / _BETWEEN
-    shares = np.concatenate([[1e-12], (1 + _NODES) / 2, [1 - 1e-12], between])
-    weights = np.concatenate([[0.0], _WEIGHTS / 2, np.zeros(_BETWEEN)])
-    weights = jnp.asarray(weights) * length
-    nu = start + length * jnp.asarray(shares)
+    shares, weights = map(jnp.asarray, _rule(profile.quadrature))
+    weights = weights * length
+    nu = start + length * shares
     (_, psi, s), addendum, dedendum = profile.speeds(nu)
     sliding = r * jnp.sin(psi)
     sides = ((s, addendum), (-s, dedendum))
@@ -80,6 +79,19 @@ def geometry(profile: Profile) -> Geometry:
         undercut_margin=margin,
         seal_width=outer_radius * seal_angle,
     )
+
+
+@functools.cache
+def _rule(quadrature: Quadrature) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Shares of a stretch to look at, and their weights in its integral."""
+    nodes, weights = np.polynomial.legendre.leggauss(quadrature.nodes)
+    if quadrature.graded:
+        weights = weights * _GRADING / np.cosh(_GRADING * nodes) ** 2 / np.tanh(_GRADING)
+        nodes = np.tanh(_GRADING * nodes) / np.tanh(_GRADING)
+    # Each end is looked at from just inside, so that it belongs to its segment.
+    between = np.arange(1, quadrature.between) / quadrature.between
+    shares = np.concatenate([(1 + nodes) / 2, [1e-12, 1 - 1e-12], between])
+    return shares, np.append(weights / 2, np.zeros(len(shares) - len(nodes)))
 
 
 def _given(profile: Outline) -> Geometry:
