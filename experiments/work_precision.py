@@ -8,11 +8,10 @@ of transient and orbit runs from coarse to fine. Timed is one whole evaluation o
 transient, closed orbit, forces and gradient. The reference is the search at every call with
 dopri8 at a tolerance of 1e-11; its own error is taken from other tolerances and another solver.
 
-The second study rounds the corners of contact law and timing gear over more and more
-(`contact.smoothing_mm`): the bias against the law as it stands, solver steps, and the error of
-the gradient against central differences of tight orbits.
+What rounding the corners of contact law and timing gear costs is another study:
+experiments/smoothing.py.
 
-Writes work_precision.csv, smoothing.csv, work_precision.json, and a figure of each study.
+Writes work_precision.csv, work_precision.json and work_precision.png.
 """
 
 import argparse
@@ -44,11 +43,9 @@ from matplotlib.ticker import LogLocator, NullFormatter  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-from experiments.baselines import FD_STEPS  # noqa: E402
 from rootsopt import files  # noqa: E402
 from rootsopt.config import load  # noqa: E402
 from rootsopt.evaluate import Evaluation, Evaluator  # noqa: E402
-from rootsopt.model import design_vector  # noqa: E402
 
 SCENES: dict[str, tuple[str, tuple[str, ...]]] = {
     "cic": ("configs/cic.yaml", ()),
@@ -87,10 +84,6 @@ FLOOR = 1e-12
 """Least error drawn."""
 OTHER_ORBIT = 0.3
 """Distance (scaled) from the reference's orbit at φ = 0 beyond which it is another one."""
-SMOOTHING = (0.0, 1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
-DEFAULT_SMOOTHING = 1e-4
-FD_SHARE = 0.2
-"""Steps of the central differences in units of `FD_STEPS`: truncation some 1e-5."""
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MARKS = "osD^vPX"
 
@@ -279,83 +272,6 @@ def measure(curve: Curve, truth: Evaluation, repeats: int) -> list[dict[str, Any
     return rows
 
 
-# Smoothing
-
-
-def gradient_rows(found: Evaluation) -> np.ndarray:
-    """d(mean, peak) / d(design), (2, 3) in N per config unit."""
-    return np.array([list(found.gradient[key].values()) for key in FORCES.values()])
-
-
-def differences(run: Evaluator, found: Evaluation) -> np.ndarray:
-    """The same from central differences of tight orbits."""
-    design, columns = np.asarray(design_vector(run.config)), []
-    for i, step in enumerate(FD_STEPS):
-        moved = np.eye(len(design))[i] * step * FD_SHARE
-        ends = [run(design + sign * moved, found.state, series=False) for sign in (1, -1)]
-        if not all(end.usable for end in ends):
-            return np.full((2, len(design)), np.nan)
-        forces = [[end.response[key] for key in FORCES.values()] for end in ends]
-        columns.append((np.array(forces[0]) - forces[1]) / (2 * step * FD_SHARE))
-    return np.stack(columns, axis=1)
-
-
-def largest(off: np.ndarray, truth: np.ndarray) -> list[float]:
-    """Error of each force's gradient relative to its greatest entry."""
-    return list(np.abs(off - truth).max(axis=1) / np.abs(truth).max(axis=1))
-
-
-def smoothing_study(widths: Iterable[float], tight: Curve, usual: Curve) -> list[dict[str, Any]]:
-    """A row for every smoothing length (mm); the first must be 0.
-
-    Force and differences with `tight` at the reference's tolerance, where `gradient_error` is that
-    of the gradient against the differences; steps, and the gradient's noise against the tight
-    one, with `usual` at the config's tolerances.
-    """
-    rows: list[dict[str, Any]] = []
-    exact: Evaluation | None = None
-    for width in widths:
-        rounding = f"contact.smoothing_mm={width!r}"
-        choices = [
-            (*contact(curve.contact), f"solver.method={curve.method}", rounding)
-            for curve in (tight, usual)
-        ]
-        run = at(evaluator("cic", *choices[0]), REFERENCE_RTOL, transient=1e-8)
-        found = run(series=False)
-        common = evaluator("cic", *choices[1])(series=False)
-        row = {"smoothing_mm": width, "status": found.status.label}
-        row["usual_status"] = common.status.label
-        row |= dict.fromkeys(SMOOTHING_NUMBERS, math.nan)
-        rows.append(row)
-        exact = found if exact is None else exact
-        if not (exact.usable and found.usable and common.usable):
-            continue
-        off = errors(found, exact)
-        truth, own = differences(run, found), gradient_rows(found)
-        row["mean_bias"], row["peak_bias"] = off["mean"], off["peak"]
-        row["orbit_steps"] = common.statistics["orbit_steps"]
-        row["solver_steps"] = common.statistics["solver_steps"]
-        row["tight_orbit_steps"] = found.statistics["orbit_steps"]
-        row["mean_gradient_error"], row["peak_gradient_error"] = largest(own, truth)
-        noise = largest(gradient_rows(common), own)
-        row["mean_gradient_noise"], row["peak_gradient_noise"] = noise
-        say(f"smoothing {width:g} mm: bias {off}")
-    return rows
-
-
-SMOOTHING_NUMBERS = (
-    "mean_bias",
-    "peak_bias",
-    "orbit_steps",
-    "solver_steps",
-    "tight_orbit_steps",
-    "mean_gradient_error",
-    "peak_gradient_error",
-    "mean_gradient_noise",
-    "peak_gradient_noise",
-)
-
-
 # Figures and tables
 
 
@@ -434,46 +350,6 @@ def draw_curve(ax: Axes, number: int, label: str, rows: list[dict[str, Any]], na
     )
 
 
-def smoothing_figure(rows: list[dict[str, Any]]) -> Figure:
-    """Bias, steps and gradient error over the smoothing length."""
-    figure = sheet(14, 4.6)
-    axes = figure.subplots(1, 3)
-    widths = np.array([row["smoothing_mm"] for row in rows])
-    rounded = widths > 0
-    least = widths[rounded].min() if rounded.any() else 1e-6
-    place = np.where(rounded, widths, least / 10)
-
-    def draw(ax: Axes, key: str, label: str, style: int, keep: Any = slice(None)) -> None:
-        values = np.array([row[key] for row in rows], float)
-        values = np.where(values < FLOOR, FLOOR, values) if "steps" not in key else values
-        ax.plot(
-            place[keep], values[keep], marker=MARKS[style], color=COLORS[style],
-            lw=1.4, ms=5, label=label,
-        )  # fmt: skip
-
-    for style, name in enumerate(FORCES):
-        draw(axes[0], f"{name}_bias", f"{name} force", style, rounded)
-        draw(axes[2], f"{name}_gradient_error", f"{name}: tight, against differences", style)
-        draw(axes[2], f"{name}_gradient_noise", f"{name}: usual against tight", style + 2)
-    draw(axes[1], "orbit_steps", "usual settings", 0)
-    draw(axes[1], "tight_orbit_steps", "tight (dopri8, 1e-11)", 1)
-    axes[0].set_ylabel("relative bias against the law as it stands")
-    axes[1].set_ylabel("solver steps on the orbit (one mesh period)")
-    axes[2].set_ylabel("relative error of the gradient")
-    for ax in axes:
-        ax.set(xscale="log", xlabel="smoothing length (mm)")
-        ax.set_yscale("linear" if ax is axes[1] else "log")
-        decades = [10.0**k for k in range(round(math.log10(least)), -1)]
-        ax.set_xticks([least / 10, *decades], ["0", *(f"{x:.0e}" for x in decades)])
-        ax.axvline(DEFAULT_SMOOTHING, color="0.5", lw=0.8, ls=":", label="default")
-        ax.set_xlim(least / 20, 2 * widths.max())
-        ax.grid(True, which="major", color="0.9", lw=0.6)
-        ax.set_axisbelow(True)
-        ax.legend(fontsize=8)
-    axes[1].set_ylim(bottom=0)
-    return figure
-
-
 def show(title: str, rows: list[dict[str, Any]]) -> None:
     """Table on standard output."""
     table = Table(title=title)
@@ -491,7 +367,7 @@ def cell(value: Any) -> str:
 
 
 def parse() -> argparse.Namespace:
-    arguments = argparse.ArgumentParser(description="Error against run time, and smoothing.")
+    arguments = argparse.ArgumentParser(description="Error against run time.")
     arguments.add_argument("-o", "--output", type=Path, default=Path("results/work_precision"))
     arguments.add_argument(
         "--quick", action="store_true", help="one program and few tolerances, as in the tests"
@@ -502,7 +378,7 @@ def parse() -> argparse.Namespace:
 def main() -> int:
     options = parse()
     folder = files.ResultFolder(options.output)
-    curves, widths = (QUICK, SMOOTHING[::4]) if options.quick else (FULL, SMOOTHING)
+    curves = QUICK if options.quick else FULL
     compiling = warm_up(curves)
     references, measured = {}, []
     for scene in dict.fromkeys(curve.scene for curve in curves):
@@ -515,11 +391,7 @@ def main() -> int:
         measured.append((curve, rows))
         say(f"{number}/{len(curves)} {curve.scene}: {curve.label('')}")
     rows = [row for _, part in measured for row in part]
-    tight = next((c for c in curves if c.scene == "cic" and c.method == "dopri8"), curves[0])
-    usual = next((c for c in curves if c.scene == "cic" and c.contact == "search"), curves[0])
-    smoothing = smoothing_study(widths, tight, usual)
     folder.write_csv("work_precision.csv", files.row_columns(rows))
-    folder.write_csv("smoothing.csv", files.row_columns(smoothing))
     summary = {
         "references": {
             scene: {"response": r.found.response, "gradient": r.found.gradient, "error": r.error}
@@ -531,9 +403,7 @@ def main() -> int:
     }
     folder.write_json("work_precision.json", summary)
     folder.write_figure("work_precision.png", work_precision_figure(measured, references))
-    folder.write_figure("smoothing.png", smoothing_figure(smoothing))
     show("Work and precision", rows)
-    show("Smoothing", smoothing)
     left_out = [row for row in rows if row["status"] != "periodic"]
     print(f"{len(left_out)} of {len(rows)} runs are left out of the curves; see `status`")
     print(f"written to {options.output}")

@@ -251,9 +251,12 @@ class Planar:
             aside = relative - self.middle
             excess = abs(aside) - self.play
             width = self.rounding / self.radius
-            engaged = np.clip(excess / width, 0, 1)
-            engaged = engaged**2 * (3 - 2 * engaged)
-            hold = self.gear.stiffness_N_m_per_rad * np.sign(aside) * self.ramp(excess, width)
+            t = np.clip(excess / width, 0, 1)
+            # Cubic roundings, and as much of t² (1 - t)² as restores the integral.
+            bump = t**2 * (1 - t) ** 2
+            taken_up = self.ramp(excess, width) + 2.5 * width * bump
+            engaged = t**2 * (3 - 2 * t) + 15 * bump
+            hold = self.gear.stiffness_N_m_per_rad * np.sign(aside) * taken_up
             hold += self.gear_damping * engaged * rate
             torques += hold, -hold
         accelerations = torques / self.inertia

@@ -388,6 +388,20 @@ def _smooth_step(x):
 
 
 @_compiled
+def _balanced_ramp(x, width):
+    """`_ramp` with the integral of max(0, x)."""
+    t = min(max(x, 0.0) / width, 1.0) if width > 0 else 1.0
+    return max(x, 0.0) if t == 1 else width * t * t * (4.5 - 6 * t + 2.5 * t * t)
+
+
+@_compiled
+def _balanced_step(x):
+    """`_smooth_step` with the integral of a step at 0."""
+    t = min(max(x, 0.0), 1.0)
+    return t * t * (18 - 32 * t + 15 * t * t)
+
+
+@_compiled
 def _impact(motion, depth, rate):
     """IMPACT force (N) at a penetration (m) that grows at `rate` (m/s)."""
     if depth <= 0:
@@ -418,8 +432,8 @@ def _slope(rotor, motion, table, search, tau, angle, rate):
     torque = side * lever2 * force - motion.load_torque
     excess = abs(relative) - motion.half_backlash
     if excess > 0:
-        engaged = _smooth_step(excess / motion.gear_rounding) if motion.gear_rounding > 0 else 1.0
-        spring = -side * motion.gear_stiffness * _ramp(excess, motion.gear_rounding)
+        engaged = _balanced_step(excess / motion.gear_rounding) if motion.gear_rounding > 0 else 1.0
+        spring = -side * motion.gear_stiffness * _balanced_ramp(excess, motion.gear_rounding)
         torque -= spring + motion.gear_damping * engaged * speed2
     return torque * motion.agility, force
 

@@ -297,6 +297,18 @@ def _smooth_step(x: float) -> float:
     return t * t * (3 - 2 * t)
 
 
+def _balanced_ramp(x: float, width: float) -> float:
+    """`_ramp` with the integral of max(0, x)."""
+    t = min(max(x, 0.0) / width, 1.0) if width > 0 else 1.0
+    return max(x, 0.0) if t == 1 else width * t * t * (4.5 - 6 * t + 2.5 * t * t)
+
+
+def _balanced_step(x: float) -> float:
+    """`_smooth_step` with the integral of a step at 0."""
+    t = min(max(x, 0.0), 1.0)
+    return t * t * (18 - 32 * t + 15 * t * t)
+
+
 def _impact(motion: Motion, depth: float, rate: float) -> float:
     """IMPACT force (N) at a penetration (m) that grows at `rate` (m/s)."""
     if depth <= 0:
@@ -313,8 +325,8 @@ def _gear(motion: Motion, relative: float, rate: float) -> float:
     excess = abs(relative) - motion.half_backlash
     if excess <= 0:
         return 0.0
-    engaged = _smooth_step(excess / motion.gear_rounding) if motion.gear_rounding > 0 else 1.0
-    spring = motion.gear_stiffness * _ramp(excess, motion.gear_rounding)
+    engaged = _balanced_step(excess / motion.gear_rounding) if motion.gear_rounding > 0 else 1.0
+    spring = motion.gear_stiffness * _balanced_ramp(excess, motion.gear_rounding)
     return math.copysign(spring, relative) + motion.gear_damping * engaged * rate
 
 

@@ -239,7 +239,7 @@ class ContactConfig(Section):
         0.0, description="added to every flank gap"
     )
     smoothing_mm: Annotated[float, between(0, 1)] = Field(
-        1e-4, description="rounding of the law's corners; 0 is the law as it stands"
+        1e-5, description="rounding of the corners of law and gear; 0: as they stand"
     )
     friction: FrictionConfig | None = Field(None, description="absent: frictionless flanks")
 

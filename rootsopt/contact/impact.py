@@ -31,6 +31,29 @@ def smooth_step(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return t**2 * (3 - 2 * t)
 
 
+def balanced_ramp(x: Float[Array, "*n"], width: Float[Array, "*#n"]) -> Float[Array, "*n"]:
+    """max(0, x) with its corner rounded on 0 < x < width, C¹, and with the same integral.
+
+    A spring rounded so stores the same energy beyond the zone as the sharp one. It is `ramp` plus
+    the multiple of t² (1 - t)² that makes up for what `ramp` lacks: w (9 t² - 12 t³ + 5 t⁴) / 2.
+    """
+    safe = jnp.where(width > 0, width, 1.0)
+    t = jnp.clip(x / safe, 0.0, 1.0)
+    rounded = safe * t**2 * (9 - 12 * t + 5 * t**2) / 2
+    return jnp.where(x < width, rounded, jnp.maximum(x, 0.0))
+
+
+def balanced_step(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Step from 0 to 1 on 0 < x < 1, C¹, with the integral of a sharp step at 0.
+
+    A damper that sets in so takes the same momentum out of a motion that crosses the zone as one
+    that sets in at once. For that it exceeds 1 inside, by up to half; it is never negative.
+    `smooth_step` in its place takes half a width of damping away on every crossing.
+    """
+    t = jnp.clip(x, 0.0, 1.0)
+    return t**2 * (18 - 32 * t + 15 * t**2)
+
+
 def force_rounding(
     depth: Float[Array, ""], exponent: Float[Array, ""], radius: Float[Array, ""]
 ) -> Float[Array, ""]:

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rootsopt.contact.impact import ramp, smooth_step
+from rootsopt.contact.impact import balanced_ramp, balanced_step
 
 
 class TimingGear(eqx.Module):
@@ -12,7 +12,9 @@ class TimingGear(eqx.Module):
 
     The torque vanishes for |ε| ≤ `half_backlash` (rad); beyond, it is `stiffness`
     (N·m/rad) times the excess plus `damping` (N·m·s/rad) times dε/dt. Both ends of the
-    backlash are rounded over `rounding` (rad), as the contact law is at its onset. `offset`
+    backlash are rounded over the first `rounding` (rad) of the excess. There the torque keeps its
+    integral over ε: a motion that crosses it loses the same energy to the spring, and the same
+    momentum to the damper, as at a sharp edge. `offset`
     (rad): ε at the middle of the backlash, where the gear was mounted out of phase; None is none.
     """
 
@@ -28,10 +30,10 @@ class TimingGear(eqx.Module):
         excess = jnp.abs(relative) - self.half_backlash
         engaged = jnp.where(
             self.rounding > 0,
-            smooth_step(excess / jnp.where(self.rounding > 0, self.rounding, 1.0)),
+            balanced_step(excess / jnp.where(self.rounding > 0, self.rounding, 1.0)),
             jnp.where(excess > 0, 1.0, 0.0),
         )
-        spring = self.stiffness * jnp.sign(relative) * ramp(excess, self.rounding)
+        spring = self.stiffness * jnp.sign(relative) * balanced_ramp(excess, self.rounding)
         return spring + self.damping * engaged * rate
 
     def switches(self, relative: Float[Array, ""]) -> Bool[Array, "2"]:
