@@ -27,17 +27,24 @@ _WORDS = {
     "ceil": "floor", "ones_like": "zeros_like", "zeros_like": "ones_like",
     "sqrt": "square", "sign": "abs", "append": "maximum", "vstack": "hstack",
 }  # fmt: skip
-_SYMMETRIC = {"maximum", "minimum", "max", "min", "hypot", "dot", "isinstance", "isclose"}
+_ORDERLESS = {"maximum", "minimum", "hypot", "dot", "isclose"}
+_SHAPED = {"ones", "zeros", "full", "asarray", "array", "eye"}
+
+
+def _of_arrays(name) -> bool:
+    """Whether a name is that of a function of JAX or NumPy."""
+    dot = name.get_previous_leaf()
+    return dot is not None and dot.value == "." and dot.get_previous_leaf().value in ("jnp", "np")
 
 
 class ExchangeWord(Operator):
-    """Put the function in place of another one that is easily mistaken for it: sine for cosine."""
+    """Take another function or operator that is easily mistaken for it: sine for cosine."""
 
     def mutation_positions(self, node):
         if isinstance(node, parso.python.tree.Operator | parso.python.tree.Name):
             following = node.get_next_leaf()
             called = following is not None and following.value == "("
-            if node.value in _WORDS and (node.type == "operator" or called):
+            if node.value in _WORDS and (node.type == "operator" or (called and _of_arrays(node))):
                 yield node.start_pos, node.end_pos
 
     def mutate(self, node, index):
@@ -46,30 +53,41 @@ class ExchangeWord(Operator):
 
     @classmethod
     def examples(cls):
-        return (Example("x += sin(y)", "x -= sin(y)"), Example("x += sin(y)", "x += cos(y)", 1))
+        first = Example("x += jnp.sin(y)", "x -= jnp.sin(y)")
+        return first, Example("x += jnp.sin(y)", "x += jnp.cos(y)", 1)
 
 
 class ExchangeArguments(Operator):
-    """Exchange the first two arguments of a call."""
+    """Exchange the first two arguments of a function of arrays, or the branches of a `where`."""
 
     def mutation_positions(self, node):
         if node.type != "arglist" or node.parent.type != "trailer" or len(node.children) < 3:
             return
-        first, second = node.children[0], node.children[2]
-        unnamed = all(one.type not in ("argument", "operator") for one in (first, second))
         function = node.parent.get_previous_leaf()
+        first, second = self._pair(node, function)
+        if second is None or not _of_arrays(function):
+            return
+        unnamed = all(one.type not in ("argument", "operator") for one in (first, second))
         same = first.get_code().strip() == second.get_code().strip()
-        if unnamed and not same and function.value not in _SYMMETRIC:
+        if unnamed and not same and function.value not in _ORDERLESS | _SHAPED:
             yield first.start_pos, second.end_pos
 
+    @staticmethod
+    def _pair(node, function):
+        begin = 2 if function.value == "where" else 0
+        found = node.children[begin : begin + 3 : 2]
+        return found if len(found) == 2 else (None, None)
+
     def mutate(self, node, index):
-        first, comma, second, *rest = node.children
-        node.children = [second, comma, first, *rest]
+        begin = 2 if node.parent.get_previous_leaf().value == "where" else 0
+        children = list(node.children)
+        children[begin], children[begin + 2] = children[begin + 2], children[begin]
+        node.children = children
         return node
 
     @classmethod
     def examples(cls):
-        return (Example("f(a,b, c)", "f(b,a, c)"),)
+        return Example("np.f(a,b)", "np.f(b,a)"), Example("jnp.where(a,b,c)", "jnp.where(a,c,b)")
 
 
 class Double(Operator):
