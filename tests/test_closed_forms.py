@@ -5,6 +5,7 @@ adds up motions is given motions made by hand.
 """
 
 import dataclasses
+import threading
 import types
 
 import equinox as eqx
@@ -15,6 +16,7 @@ import pytest
 
 from rootsopt import ensemble, evaluate, files, members, orbits, speeds
 from rootsopt.arclength import Steps
+from rootsopt.batch import on_all_cores
 from rootsopt.config import load
 from rootsopt.contact.impact import ImpactLaw
 from rootsopt.contact.map import MARGIN
@@ -24,6 +26,7 @@ from rootsopt.dynamics.flow import Flow, Integrator
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import FlankForce, RotorPair
 from rootsopt.dynamics.parts import ConstantLoad, MotorDrive, PrescribedDrive, TimingGear
+from rootsopt.dynamics.verdict import TOO_DEEP
 from rootsopt.evaluate import RESPONSES, Evaluation, Evaluator
 from rootsopt.members import Members
 from rootsopt.model import Model
@@ -95,6 +98,8 @@ def test_multiplier_is_that_of_the_whole_orbit():
         )
         np.testing.assert_allclose(orbit.state, [rest, 0.0], atol=1e-8)
         assert float(orbit.residual) < 1e-9
+        # Of a linear equation one step of Newton's method finds the orbit.
+        assert int(orbit.newton_steps) < 8
 
 
 def test_inertia_of_a_motor_turns_with_rotor_1():
@@ -299,6 +304,18 @@ def test_series_has_drive_and_coast_where_they_belong(monkeypatch):
         np.testing.assert_allclose(columns[name], values, rtol=1e-14, err_msg=name)
 
 
+def test_work_is_divided_among_the_cores():
+    """Every row is done once and comes out in its place, whatever the shape of a row."""
+    rng = np.random.default_rng(0)
+    for count in (1, 2, 5, 8):
+        designs, states = jnp.asarray(rng.normal(size=(count, 3))), jnp.arange(float(count))
+        doubled, summed = on_all_cores(
+            lambda a, b: (2 * a, jnp.sum(a, axis=-1) + b), designs, states
+        )
+        np.testing.assert_array_equal(doubled, 2 * designs)
+        np.testing.assert_allclose(summed, np.sum(designs, axis=1) + np.arange(count))
+
+
 class Near(eqx.Module):
     """Flanks that overlap by the radius of 0.03 m times the turn towards them."""
 
@@ -316,6 +333,41 @@ def test_rotor_2_behind_touches_the_drive_flank():
         assert float(found.total) == pytest.approx(1e9 * (0.03 * 1e-3) ** 1.5, rel=1e-12)
         assert float(found.torque2) == pytest.approx((1 if drives else -1) * 0.03 * max(forces))
         assert float(found.torque1) == pytest.approx(-float(found.torque2))
+
+
+def test_switches_of_a_pair_are_those_of_its_parts():
+    """They change where the penetration passes the rounding of the onset and the depth of full
+    damping, and |ε| the backlash and its rounding; a flank out of reach is of no account."""
+    pair = oscillator(contact=Near())
+    switches = jax.jit(lambda relative: pair.switches(jnp.asarray(0.2), relative))
+    places = {1: 1e-7 / 0.03, 2: 1e-5 / 0.03, 6: HALF_BACKLASH, 7: HALF_BACKLASH + 1e-6}
+    for side in (-1, 1):
+        for number, place in places.items():
+            seen = [
+                switches(jnp.array([side * share * place / SCALE, 0.0]))[0][number]
+                for share in (0.9999, 1.0001)
+            ]
+            assert seen == [False, True]
+        flags, counts = switches(jnp.array([side * 1e-3 / SCALE, 0.0]))
+        assert flags[0]
+        assert bool(flags[5]) == (side < 0)
+        assert np.all(counts)
+    _, counts = oscillator().switches(jnp.asarray(0.2), jnp.array([0.1, 0.0]))
+    assert counts.tolist() == 5 * [False] + 3 * [True]
+
+
+def test_limits_are_those_that_are_told():
+    """A pair is lost a quarter of the angle from a lobe's axis to its flank away; the depth that a
+    status tells of is the one that sets it."""
+    pair = oscillator()
+    limit = np.pi / 24 / SCALE
+    for share, lost in ((0.999, False), (1.001, True)):
+        for side in (-1, 1):
+            state = jnp.array([side * share * limit, 0.0])
+            assert bool(pair.lost(state)) == lost
+            slope, _ = pair.derivative(jnp.asarray(0.0), state)
+            assert bool(slope[1] == 0) == lost
+    assert f"({100 * TOO_DEEP:g} % of the pitch radius)" in Status.TOO_DEEP.value
 
 
 @pytest.mark.parametrize("period", [1, 3])
@@ -533,6 +585,78 @@ def test_an_ensemble_takes_no_infeasible_candidate():
     )
     assert objective == 0.8
     np.testing.assert_array_equal(point, [0.2, 0.3])
+
+
+class Told(Evaluator):
+    """An evaluator for which a quadratic bowl about 0.6 has no steady state beyond 0.3 at first."""
+
+    def __init__(self):
+        self.asked = []
+
+    def __call__(self, design=None, start=None, series=True):
+        self.asked.append((tuple(design), start))
+        lost = len(self.asked) == 2
+        force = 0.5 + float(np.sum((np.asarray(design) - 0.6) ** 2))
+        status = Status.NOT_SETTLED if lost else Status.PERIODIC
+        return evaluation_of(force, status, design, state=np.asarray(design))
+
+
+def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state():
+    """By the rule's own steps otherwise, each from the orbit of the trial before."""
+    search = searching(method="sgd", learning_rate=0.2, iterations=6)
+    search.problem.descent = lambda point, slope: slope
+    search.problem.slope = lambda evaluation, point: 2 * (point - 0.6)
+    search.patience, search.expected = np.inf, 7
+    search._lock, search._done, search._best = threading.Lock(), 0, float("nan")
+    progress = []
+    search.progress = lambda *numbers: progress.append(numbers)
+    evaluator = Told()
+    trials = search._descend(evaluator, 4, np.array([0.2, 0.3]))
+    points = np.array([trial.point for trial in trials])
+    assert len(trials) == 7
+    # Steps of gradient descent at a rate that falls along a cosine to a twentieth.
+    rates = [0.2 * (0.05 + 0.95 * (1 + np.cos(np.pi * k / 6)) / 2) for k in range(6)]
+    expected = [np.array([0.2, 0.3])]
+    expected.append(expected[0] - rates[0] * 2 * (expected[0] - 0.6))
+    expected.append((expected[0] + expected[1]) / 2)
+    for rate in rates[1:5]:
+        expected.append(expected[-1] - rate * 2 * (expected[-1] - 0.6))
+    np.testing.assert_allclose(points, expected, rtol=1e-6)
+    starts = [start for _, start in evaluator.asked]
+    assert starts[0] is None
+    assert starts[2] is None
+    for k in (1, 3, 4, 5, 6):
+        np.testing.assert_array_equal(starts[k], points[k - 1])
+    assert [trial.iteration for trial in trials] == list(range(7))
+    assert {trial.start for trial in trials} == {4}
+    done, wanted, best = np.array(progress).T
+    np.testing.assert_array_equal(done, np.arange(1, 8))
+    assert set(wanted) == {7}
+    objectives = [trial.objective for trial in trials]
+    np.testing.assert_array_equal(best, np.fmin.accumulate(objectives))
+
+
+def test_a_slope_is_stripped_only_of_what_is_forbidden():
+    """Steepest descent in a box with one linear constraint x + y ≥ 1: inside it is the slope
+    itself, on a face or on the constraint without its part across, in a corner nothing."""
+    problem = object.__new__(Problem)
+    normal = np.array([1.0, 1.0])
+    vars(problem)["look"] = lambda point: (
+        point, np.eye(2), np.array([normal @ point - 1]), normal[None]
+    )  # fmt: skip
+    cases = [
+        ([0.7, 0.8], [1.0, -2.0], [1.0, -2.0]),
+        ([0.7, 1.0], [1.0, -2.0], [1.0, 0.0]),
+        ([0.7, 1.0], [1.0, 2.0], [1.0, 2.0]),
+        ([1.0, 1.0], [-1.0, -2.0], [0.0, 0.0]),
+        ([0.6, 0.4], [1.0, 1.0], [0.0, 0.0]),
+        ([0.6, 0.4], [3.0, 1.0], [1.0, -1.0]),
+        ([0.6, 0.4], [-3.0, 1.0], [-3.0, 1.0]),
+        ([1.0, 0.0], [1.0, 3.0], [0.0, 0.0]),
+    ]
+    for point, slope, expected in cases:
+        found = problem.descent(np.array(point), np.array(slope))
+        np.testing.assert_allclose(found, expected, atol=1e-12, err_msg=str(point))
 
 
 def test_the_seed_of_a_search_chooses_its_screening():
