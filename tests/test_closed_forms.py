@@ -304,6 +304,23 @@ def test_series_has_drive_and_coast_where_they_belong(monkeypatch):
         np.testing.assert_allclose(columns[name], values, rtol=1e-14, err_msg=name)
 
 
+def test_long_steps_of_an_orbit_are_divided():
+    """No step of a continued orbit is longer than 1/256 mesh period and a quarter, the ends there
+    were stay, and none is added within a quarter of another, or beyond the orbit."""
+    given = np.array([0.3 / 256, 2.1 / 256, 0.1, 0.1001, 1.0, 1.5])
+    grid = np.concatenate([given, np.full(1024 - len(given), np.inf)])
+    made = np.asarray(orbits._without_long(jnp.asarray(grid), jnp.asarray(1.5)))
+    assert len(made) == 1024
+    ends = made[np.isfinite(made)]
+    assert np.all(np.isin(given, ends))
+    steps = np.diff(ends, prepend=0.0)
+    assert np.max(steps) <= 1.25 / 256 + 1e-15
+    added = ends[~np.isin(ends, given)]
+    np.testing.assert_allclose(256 * added, np.round(256 * added), atol=1e-12)
+    assert np.min(np.abs(added[:, None] - np.append(given, 0.0))) > 0.25 / 256
+    assert np.max(added) < 1.5
+
+
 def test_work_is_divided_among_the_cores():
     """Every row is done once and comes out in its place, whatever the shape of a row."""
     rng = np.random.default_rng(0)

@@ -65,6 +65,8 @@ def chosen(root: Path, seed: int, count: int) -> list[Mutant]:
     sizes = {file: len((root / file).read_text().splitlines()) for file in files}
     found = []
     for file, quota in _quotas(sizes, count).items():
+        if quota == 0:
+            continue
         places = sorted(_places(root, file, seed), key=lambda place: place.rank)
         fresh: list[Mutant] = []
         used: dict[str, int] = {}
