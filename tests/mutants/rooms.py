@@ -23,7 +23,7 @@ _OF = {
     "dynamics/measures": "measures extremes",
     "dynamics/pace": "extremes dynamics",
     "dynamics/pair": "closed_forms drive dynamics scene steady",
-    "dynamics/peak": "extremes steady gradients",
+    "dynamics/peak": "closed_forms extremes steady gradients",
     "dynamics/steady": "closed_forms measures steady gradients extremes",
     "dynamics/switches": "closed_forms steady gradients continuation",
     "dynamics/tangent": "closed_forms steady gradients measures",
@@ -33,7 +33,7 @@ _OF = {
     "dynamics/parts/gear": "closed_forms contact dynamics",
     "dynamics/parts/load": "load scene dynamics",
     "dynamics/parts/supports": "scene",
-    "optimize/bounds": "families optimize freeform",
+    "optimize/bounds": "closed_forms families optimize freeform",
     "optimize/noise": "ensemble",
     "optimize/problem": "closed_forms optimize speeds families freeform",
     "optimize/search": "closed_forms optimize speeds",
@@ -50,7 +50,7 @@ _OF = {
     "profiles/geometry": "profiles families",
     "profiles/outline": "outline",
     "profiles/trochoid": "families conjugacy",
-    "profiles/validity": "families",
+    "profiles/validity": "closed_forms families",
 }
 """Modules, and the words in `tests/test_WORD.py`."""
 
