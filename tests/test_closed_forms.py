@@ -34,8 +34,6 @@ from rootsopt.optimize import noise
 from rootsopt.optimize.bounds import around
 from rootsopt.optimize.problem import Problem, sobol
 from rootsopt.optimize.search import Search, Trial, _history
-from rootsopt.profiles import extended_cycloid
-from rootsopt.profiles.validity import margins
 from rootsopt.speeds import Part, SpeedsEvaluator, at_speed
 from rootsopt.status import Status
 
@@ -460,18 +458,6 @@ def test_stated_error_of_a_map_is_relative_to_the_static_depth(monkeypatch):
     assert asked == pytest.approx([2e-3 * depth])
     assert evaluator.map_error == pytest.approx(1.4e-3)
     assert evaluator.model.map_size == (256, 24)
-
-
-@pytest.mark.parametrize("ratio", [0.5, 0.6, 0.8])
-def test_margins_are_the_least_between_the_places_too(ratio):
-    """dβ/dν of an extended cycloid is least inside its flank: looked at in 400 places it is 4e-7
-    too great, and with the parabola through three of them right to 1e-8."""
-    profile = extended_cycloid(3, jnp.asarray(1.0), jnp.asarray(ratio))
-    (segment,) = profile.segments()
-    normals = jnp.linspace(segment.start, segment.stop, 80_001)[1:-1]
-    least = float(jnp.min(profile.roll_rate(normals)))
-    assert float(margins(profile).rolling) == pytest.approx(least, abs=1e-8)
-    assert least < float(jnp.min(profile.roll_rate(normals[99::200]))) - 1e-7
 
 
 def test_ranges_of_parameters_that_a_config_leaves_open():

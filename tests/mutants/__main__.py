@@ -9,6 +9,7 @@ a run go on where another one ended (--resume).
 import argparse
 import dataclasses
 import json
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -20,6 +21,8 @@ ROOT = Path(__file__).resolve().parents[2]
 def main() -> int:
     """Run, print the table, judge."""
     options = _options()
+    # As after Ctrl-C: the copy is removed, and the tests under way end.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     from tests.mutants.by_hand import by_hand
     from tests.mutants.candidates import chosen, equivalents
     from tests.mutants.trial import Copy, Outcome
@@ -116,4 +119,7 @@ def _options() -> argparse.Namespace:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit("stopped; what is done is in the record: go on with --resume")

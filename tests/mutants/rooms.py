@@ -50,7 +50,7 @@ _OF = {
     "profiles/geometry": "profiles families",
     "profiles/outline": "outline",
     "profiles/trochoid": "families conjugacy",
-    "profiles/validity": "closed_forms families",
+    "profiles/validity": "families",
 }
 """Modules, and the words in `tests/test_WORD.py`."""
 
