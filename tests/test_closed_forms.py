@@ -24,7 +24,7 @@ from rootsopt.contact.size import MapSize, _smallest
 from rootsopt.dynamics import steady
 from rootsopt.dynamics.flow import Flow, Integrator
 from rootsopt.dynamics.measures import Measures
-from rootsopt.dynamics.pair import FlankForce, RotorPair
+from rootsopt.dynamics.pair import FlankForce, RotorPair, SearchContact
 from rootsopt.dynamics.parts import ConstantLoad, MotorDrive, PrescribedDrive, TimingGear
 from rootsopt.dynamics.verdict import TOO_DEEP
 from rootsopt.evaluate import RESPONSES, Evaluation, Evaluator
@@ -34,6 +34,7 @@ from rootsopt.optimize import noise
 from rootsopt.optimize.bounds import around
 from rootsopt.optimize.problem import Problem, sobol
 from rootsopt.optimize.search import Search, Trial, _history
+from rootsopt.profiles import CIC
 from rootsopt.speeds import Part, SpeedsEvaluator, at_speed
 from rootsopt.status import Status
 
@@ -372,6 +373,16 @@ def test_switches_of_a_pair_are_those_of_its_parts():
         assert np.all(counts)
     _, counts = oscillator().switches(jnp.asarray(0.2), jnp.array([0.1, 0.0]))
     assert counts.tolist() == 5 * [False] + 3 * [True]
+
+
+def test_levers_may_jump_where_flanks_do_not_roll():
+    """At the nominal centre distance conjugate flanks roll on each other, with one closest
+    approach; anywhere else there may be two as deep."""
+    paper = CIC(3, 0.033, np.radians(36.43), 8e-3, np.radians(4.0))
+    assert not SearchContact.of(paper).jumps
+    displaced = SearchContact.of(paper, jnp.asarray(0.0662), both=True)
+    assert displaced.jumps
+    assert float(displaced.pair.center_distance) == 0.0662
 
 
 def test_limits_are_those_that_are_told():

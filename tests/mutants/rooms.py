@@ -10,7 +10,7 @@ _OF = {
     "members": "closed_forms ensemble",
     "orbits": "closed_forms continuation",
     "speeds": "closed_forms speeds",
-    "contact/closest": "contact accuracy conjugacy families gradients",
+    "contact/closest": "closed_forms contact accuracy conjugacy families gradients",
     "contact/impact": "impact contact extremes",
     "contact/linear": "fidelities",
     "contact/map": "contact accuracy",
