@@ -161,7 +161,7 @@ def _mutant(root: Path, file: str, place: _Place) -> Mutant | None:
 def _outside(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     """Spans that are no part of what is computed: annotations, messages, assertions, decorators."""
     lines = source.splitlines()
-    found: list[ast.AST | None] = []
+    found: list[ast.stmt | ast.expr | None] = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Assert | ast.Raise | ast.JoinedStr | ast.Import | ast.ImportFrom):
             found.append(node)
@@ -172,14 +172,13 @@ def _outside(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
         elif isinstance(node, ast.ClassDef):
             found += node.decorator_list
 
-    def column(line: int, offset: int) -> int:
-        return len(lines[line - 1].encode()[:offset].decode())
+    def place(line: int | None, offset: int | None) -> tuple[int, int]:
+        assert line is not None
+        # From bytes to characters.
+        return line, len(lines[line - 1].encode()[:offset].decode())
 
     return [
-        (
-            (node.lineno, column(node.lineno, node.col_offset)),
-            (node.end_lineno, column(node.end_lineno, node.end_col_offset)),
-        )
+        (place(node.lineno, node.col_offset), place(node.end_lineno, node.end_col_offset))
         for node in found
         if node is not None
     ]

@@ -7,6 +7,7 @@ of real numbers; and exchanges that no one makes by mistake (`+` for `>>`).
 from collections.abc import Iterator
 
 import parso
+import parso.python.tree as tree
 from cosmic_ray.operators.operator import Example, Operator
 from cosmic_ray.operators.provider import OperatorProvider
 
@@ -41,7 +42,7 @@ class ExchangeWord(Operator):
     """Take another function or operator that is easily mistaken for it: sine for cosine."""
 
     def mutation_positions(self, node):
-        if isinstance(node, parso.python.tree.Operator | parso.python.tree.Name):
+        if isinstance(node, tree.Operator | tree.Name):
             following = node.get_next_leaf()
             called = following is not None and following.value == "("
             if node.value in _WORDS and (node.type == "operator" or (called and _of_arrays(node))):
@@ -64,22 +65,21 @@ class ExchangeArguments(Operator):
         if node.type != "arglist" or node.parent.type != "trailer" or len(node.children) < 3:
             return
         function = node.parent.get_previous_leaf()
-        first, second = self._pair(node, function)
-        if second is None or not _of_arrays(function):
+        begin = self._begin(function)
+        if len(node.children) < begin + 3 or not _of_arrays(function):
             return
+        first, second = node.children[begin], node.children[begin + 2]
         unnamed = all(one.type not in ("argument", "operator") for one in (first, second))
         same = first.get_code().strip() == second.get_code().strip()
         if unnamed and not same and function.value not in _ORDERLESS | _SHAPED:
             yield first.start_pos, second.end_pos
 
     @staticmethod
-    def _pair(node, function):
-        begin = 2 if function.value == "where" else 0
-        found = node.children[begin : begin + 3 : 2]
-        return found if len(found) == 2 else (None, None)
+    def _begin(function) -> int:
+        return 2 if function.value == "where" else 0
 
     def mutate(self, node, index):
-        begin = 2 if node.parent.get_previous_leaf().value == "where" else 0
+        begin = self._begin(node.parent.get_previous_leaf())
         children = list(node.children)
         children[begin], children[begin + 2] = children[begin + 2], children[begin]
         node.children = children
