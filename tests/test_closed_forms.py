@@ -20,6 +20,7 @@ from rootsopt.batch import on_all_cores
 from rootsopt.config import load
 from rootsopt.contact.impact import ImpactLaw
 from rootsopt.contact.map import MARGIN
+from rootsopt.contact.nodes import signed_distance
 from rootsopt.contact.size import MapSize, _smallest
 from rootsopt.dynamics import peak, steady
 from rootsopt.dynamics.flow import Flow, Integrator
@@ -68,40 +69,6 @@ def oscillator(**changes) -> RotorPair:
 
 
 # Motions
-
-
-def test_multiplier_is_that_of_the_whole_orbit():
-    """Around its rest a damped oscillator decays by exp(-c t/2I): over k mesh periods, k times as
-    far as over one. The monodromy is its matrix exponential, and the multiplier no root or power
-    of that."""
-    pair = oscillator()
-    period = 2 * np.pi / (LOBES * SPEED)
-    matrix = np.array([[0.0, 1.0], [-STIFFNESS / INERTIA, -DAMPING / INERTIA]])
-    roots, vectors = np.linalg.eig(matrix)
-    assert roots[0].imag != 0
-    rest = -(HALF_BACKLASH + LOAD / STIFFNESS) / SCALE
-    how = Integrator("tsit5", jnp.asarray(1e-9), 512)
-    unit = np.diag([SCALE, SCALE / period])
-
-    @jax.jit
-    def close(length):
-        still = steady.no_tangents(pair)
-        return steady.close_orbit(
-            pair, still, jnp.array([rest + 0.01, 0.0]), length, how, samples=840
-        )
-
-    for length in (1, 2, 3):
-        orbit = close(jnp.asarray(length))
-        grown = (vectors * np.exp(roots * length * period)) @ np.linalg.inv(vectors)
-        expected = np.linalg.inv(unit) @ grown.real @ unit
-        np.testing.assert_allclose(orbit.monodromy, expected, atol=1e-6)
-        assert float(orbit.multiplier) == pytest.approx(
-            np.exp(-DAMPING / (2 * INERTIA) * length * period), rel=1e-5
-        )
-        np.testing.assert_allclose(orbit.state, [rest, 0.0], atol=1e-8)
-        assert float(orbit.residual) < 1e-9
-        # Of a linear equation one step of Newton's method finds the orbit.
-        assert int(orbit.newton_steps) < 8
 
 
 def test_motion_between_samples_and_within_steps():
@@ -416,6 +383,26 @@ def test_levers_may_jump_where_flanks_do_not_roll():
     displaced = SearchContact.of(paper, jnp.asarray(0.0662), both=True)
     assert displaced.jumps
     assert float(displaced.pair.center_distance) == 0.0662
+
+
+def test_distance_from_a_circle_of_few_nodes():
+    """Outside positive; to the chords too great by up to R (1 - cos π/n) outside, and by the cubics
+    with an error of fourth order."""
+    rng = np.random.default_rng(0)
+    radii, angles = rng.uniform(0.5, 1.5, 300), rng.uniform(0, 2 * np.pi, 300)
+    nodes = radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+    errors = []
+    for count in (32, 64):
+        turns = 2 * np.pi * np.arange(count + 1) / count
+        circle = np.column_stack([np.cos(turns), np.sin(turns)])
+        straight, cubic = (signed_distance(nodes, circle, refine) for refine in (False, True))
+        sagitta = 1 - np.cos(np.pi / count)
+        far = straight - (radii - 1)
+        assert -1e-12 < np.min(far) < 0.1 * sagitta
+        assert 0.9 * sagitta < np.max(far) < 1.001 * sagitta
+        errors.append(np.max(np.abs(cubic - (radii - 1))))
+        assert errors[-1] < 0.02 * sagitta
+    assert errors[0] / errors[1] == pytest.approx(16, rel=0.2)
 
 
 def test_limits_are_those_that_are_told():
@@ -752,3 +739,40 @@ def test_the_seed_of_a_search_chooses_its_screening():
     assert not np.any(samples[1] == samples[5])
     again = searching(screening=6, seed=5)._feasible(own)
     np.testing.assert_array_equal(again[1:], samples[5])
+
+
+# A whole orbit
+
+
+def test_multiplier_is_that_of_the_whole_orbit():
+    """Around its rest a damped oscillator decays by exp(-c t/2I): over k mesh periods, k times as
+    far as over one. The monodromy is its matrix exponential, and the multiplier no root or power
+    of that."""
+    pair = oscillator()
+    period = 2 * np.pi / (LOBES * SPEED)
+    matrix = np.array([[0.0, 1.0], [-STIFFNESS / INERTIA, -DAMPING / INERTIA]])
+    roots, vectors = np.linalg.eig(matrix)
+    assert roots[0].imag != 0
+    rest = -(HALF_BACKLASH + LOAD / STIFFNESS) / SCALE
+    how = Integrator("tsit5", jnp.asarray(1e-9), 512)
+    unit = np.diag([SCALE, SCALE / period])
+
+    @jax.jit
+    def close(length):
+        still = steady.no_tangents(pair)
+        return steady.close_orbit(
+            pair, still, jnp.array([rest + 0.01, 0.0]), length, how, samples=840
+        )
+
+    for length in (1, 2, 3):
+        orbit = close(jnp.asarray(length))
+        grown = (vectors * np.exp(roots * length * period)) @ np.linalg.inv(vectors)
+        expected = np.linalg.inv(unit) @ grown.real @ unit
+        np.testing.assert_allclose(orbit.monodromy, expected, atol=1e-6)
+        assert float(orbit.multiplier) == pytest.approx(
+            np.exp(-DAMPING / (2 * INERTIA) * length * period), rel=1e-5
+        )
+        np.testing.assert_allclose(orbit.state, [rest, 0.0], atol=1e-8)
+        assert float(orbit.residual) < 1e-9
+        # Of a linear equation one step of Newton's method finds the orbit.
+        assert int(orbit.newton_steps) < 8

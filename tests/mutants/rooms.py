@@ -14,7 +14,7 @@ _OF = {
     "contact/impact": "impact contact extremes",
     "contact/linear": "fidelities",
     "contact/map": "contact accuracy",
-    "contact/nodes": "contact accuracy conjugacy",
+    "contact/nodes": "closed_forms contact accuracy conjugacy",
     "contact/point": "scene",
     "contact/segments": "fidelities",
     "contact/size": "closed_forms accuracy",
