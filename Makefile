@@ -18,9 +18,9 @@ test-all: $(VENV)/.dev
 fuzz: $(VENV)/.dev
 	$(BIN)/python -m tests.fuzz
 
-# Mistakes put in on purpose, each to be noticed by a test (hours).
-mutants: $(VENV)/.dev
-	$(BIN)/python -m tests.mutants
+# Mistakes put in on purpose, each to be noticed by a test (hours; goes on where it was stopped).
+mutants: $(VENV)/.mutants
+	$(BIN)/python -m tests.mutants --resume
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
@@ -37,6 +37,10 @@ $(VENV)/.run: $(BIN)/python pyproject.toml constraints.txt
 
 $(VENV)/.dev: $(VENV)/.run
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+$(VENV)/.mutants: $(VENV)/.dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,mutants]'
 	touch $@
 
 clean:

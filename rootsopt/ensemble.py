@@ -232,12 +232,8 @@ class EnsembleEvaluator(Evaluator):
         if around.status is not Status.AVERAGED:
             return around.status, None
         values = np.stack([run.responses[:, 0] for run in around.runs])
-        slope, covariance = fitted_slope(values, steps)
-        # From the unit box to config units.
-        inverse = np.linalg.inv(np.asarray(jacobian))
-        spread = np.einsum("ik,rij,jl->rkl", inverse, covariance, inverse)
-        errors = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
-        return Status.AVERAGED, np.stack([slope @ inverse, errors])
+        found = per_config_unit(*fitted_slope(values, steps), np.asarray(jacobian))
+        return Status.AVERAGED, np.stack(found)
 
     def _space(self, design) -> Space:
         """The unit box of the search, made larger where the design lies outside."""
@@ -311,6 +307,16 @@ def fitted_slope(
     return np.asarray(slope.T, np.float64), np.asarray(covariance, np.float64)
 
 
+def per_config_unit(
+    slope: NDArray[np.float64], covariance: NDArray[np.float64], jacobian: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slopes (r, d) per config unit and their standard errors (r, d), from slopes (r, d) and their
+    covariances (r, d, d) in the unit box, and the `jacobian` (d, d) of the design in the box."""
+    inverse = np.linalg.inv(jacobian)
+    spread = np.einsum("ik,rij,jl->rkl", inverse, covariance, inverse)
+    return slope @ inverse, np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+
+
 _pair = Program(Model.pair_and_shape)
 
 
@@ -333,4 +339,5 @@ __all__ = [
     "EnsembleEvaluator",
     "fitted_slope",
     "neighbours",
+    "per_config_unit",
 ]

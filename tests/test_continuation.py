@@ -254,10 +254,11 @@ def test_period_doubling_leads_to_the_doubled_orbit(branch, monkeypatch):
     assert doubling.value == pytest.approx(3650.23, abs=0.5)
     assert below.points[doubling.after].stable
     assert not below.points[doubling.after + 1].stable
-    asked = []
+    asked, sides = [], []
 
     def one_side(orbits, place, *rest):
         asked.append(orbits.period)
+        sides.append(rest[0])
         if asked == [1, 2]:
             raise StoppedError(End.STEP_TOO_SMALL)
         return corrected(orbits, place, *rest)
@@ -265,6 +266,8 @@ def test_period_doubling_leads_to_the_doubled_orbit(branch, monkeypatch):
     monkeypatch.setattr("rootsopt.continuation.corrected", one_side)
     doubled = follow_doubled(below, doubling, Steps(3600, 4000, points=6))
     assert asked == [1, 2, 2]
+    assert np.linalg.norm(sides[1]) == pytest.approx(1)
+    np.testing.assert_array_equal(sides[2], -sides[1])
     assert doubled is not None
     assert doubled.ends[1] is not End.HALVED
     assert doubled.period == 2

@@ -2,6 +2,7 @@
 search makes of noise."""
 
 import csv
+import dataclasses
 import functools
 import io
 import itertools
@@ -420,6 +421,28 @@ def test_nothing_promised(problem):
     verdict = noise.verify(problem, judge, [trial([0.5, 0.5, 0.5], 1.4)])
     assert verdict.optimized is None
     assert "ensemble.members" in noise.message(verdict.record)
+
+
+class Particular(Judge):
+    """A judge for whom designs with a first angle above 35 degrees have no average."""
+
+    def __call__(self, design=None, start=None, series=True):
+        found = super().__call__(design, start, series)
+        lost = {"response": {}, "status": Status.PASSED_THROUGH}
+        return dataclasses.replace(found, **lost) if float(design[0]) > 35 else found
+
+
+def test_a_candidate_without_an_average_is_passed_over(problem):
+    """The next one is judged, though the first promised more; if there is no other, none."""
+    judge = Particular(0.8, 0.02, problem.config)
+    lost, good = trial([0.9, 0.5, 0.5], 0.3), trial([0.1, 0.5, 0.5], 0.7)
+    verdict = noise.verify(problem, judge, [lost, good])
+    assert verdict.optimized is not None
+    assert verdict.record["searched_objective"] == 0.7
+    assert len(verdict.record["candidates"]) == 2
+    alone = noise.verify(problem, judge, [lost])
+    assert alone.optimized is None
+    assert not alone.record["holds_up"]
 
 
 # Commands

@@ -143,6 +143,27 @@ def test_largest_single_arc_without_undercut(lobes, center, efficiency):
     assert float(found.area_efficiency) == pytest.approx(efficiency, abs=1e-5)
 
 
+def test_margins_are_the_least_between_the_places_too():
+    """Undercut and star margin of an arc are least inside a segment: in 400 places they are seen
+    up to 1e-5 too great, with the parabola through three of them right to 3e-7."""
+    sampled = []
+    for center in (0.89, 0.9, 0.92):
+        profile, fine, coarse = arc(3, 1.0, center), [], []
+        for segment in profile.segments():
+            share = np.linspace(1e-9, 1 - 1e-9, 1 + 399 * 200)
+            nu = float(segment.start) + float(segment.stop - segment.start) * share
+            point, _, dedendum = profile.speeds(jnp.asarray(nu))
+            sliding = np.sin(point.psi)
+            both = np.stack([dedendum, np.minimum(sliding + point.s, sliding - point.s)])
+            fine.append(np.min(both, axis=1))
+            coarse.append(np.min(both[:, ::200], axis=1))
+        least = np.min(fine, axis=0)
+        sampled.append(np.min(coarse, axis=0) - least)
+        found = margins(profile)
+        np.testing.assert_allclose([found.undercut, found.star], least, rtol=0, atol=3e-7)
+    assert np.all(np.max(sampled, axis=0) > 2e-6)
+
+
 def test_ranges_of_the_arc_and_involute_patent():
     """US 7,320,579, claim 1, with centre distance L and two lobes: base radius above L / 2√2 and
     arc above √2 π L / 16, where the involute is the longest at 45°; arc below (27 - 5√2) L / 56,

@@ -109,6 +109,10 @@ def test_rotor_stays_in_its_housing(problem):
         rows = [r for r in housed.constraint_rows(one) if r["name"] == "outer radius"]
         satisfied = {row["sense"]: row["satisfied"] for row in rows}
         assert satisfied == {">=": floor, "<=": ceiling}
+        assert not any(row["active"] for row in rows)
+    at_ceiling = dataclasses.replace(start, geometry=start.geometry | _radii(44.5 - 5e-5))
+    rows = [r for r in housed.constraint_rows(at_ceiling) if r["name"] == "outer radius"]
+    assert {row["sense"]: row["active"] for row in rows} == {">=": False, "<=": True}
     with pytest.raises(InputError, match=r"outer_radius_max_mm` must be greater"):
         config("constraints.outer_radius_min_mm=44.5", "constraints.outer_radius_max_mm=44.2")
 

@@ -1,0 +1,12 @@
+"""Pytest plugin: tests run in the order of the command line, cheapest first, whatever conftest
+prefers for a whole run."""
+
+import pytest
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection_modifyitems(items):
+    asked = list(items)
+    result = yield
+    items[:] = [item for item in asked if item in set(items)]
+    return result

@@ -1,0 +1,80 @@
+"""The numerical rooms, and the tests that should notice a change in each, quickest first."""
+
+from pathlib import Path
+
+_OF = {
+    "arclength": "closed_forms continuation",
+    "batch": "closed_forms accuracy",
+    "continuation": "continuation",
+    "ensemble": "closed_forms ensemble",
+    "members": "closed_forms ensemble",
+    "orbits": "closed_forms continuation",
+    "speeds": "closed_forms speeds",
+    "contact/closest": "closed_forms contact accuracy conjugacy families gradients",
+    "contact/impact": "impact contact extremes",
+    "contact/linear": "fidelities",
+    "contact/map": "contact accuracy",
+    "contact/nodes": "closed_forms contact accuracy conjugacy",
+    "contact/point": "scene",
+    "contact/segments": "fidelities",
+    "contact/size": "closed_forms accuracy",
+    "dynamics/flow": "closed_forms dynamics steady measures gradients scene extremes",
+    "dynamics/jump": "gradients steady",
+    "dynamics/measures": "measures extremes",
+    "dynamics/pace": "extremes dynamics",
+    "dynamics/pair": "closed_forms drive dynamics scene steady",
+    "dynamics/peak": "closed_forms extremes steady gradients",
+    "dynamics/steady": "closed_forms measures steady gradients extremes",
+    "dynamics/switches": "closed_forms steady gradients continuation",
+    "dynamics/tangent": "closed_forms steady gradients measures",
+    "dynamics/verdict": "closed_forms extremes steady accuracy",
+    "dynamics/parts/drive": "drive scene",
+    "dynamics/parts/friction": "friction scene",
+    "dynamics/parts/gear": "closed_forms contact dynamics",
+    "dynamics/parts/load": "load scene dynamics",
+    "dynamics/parts/supports": "scene",
+    "optimize/bounds": "closed_forms families optimize freeform",
+    "optimize/noise": "ensemble",
+    "optimize/problem": "closed_forms optimize speeds families freeform",
+    "optimize/search": "closed_forms optimize speeds",
+    "profiles/arc_families": "families conjugacy",
+    "profiles/arcs": "families conjugacy",
+    "profiles/base": "profiles contact conjugacy families",
+    "profiles/cic": "profiles contact conjugacy",
+    "profiles/curve": "families conjugacy freeform",
+    "profiles/departure": "freeform",
+    "profiles/ee": "profiles contact gradients",
+    "profiles/ellipse": "families conjugacy",
+    "profiles/epicycloid": "families conjugacy",
+    "profiles/freeform": "freeform conjugacy",
+    "profiles/geometry": "profiles families",
+    "profiles/outline": "outline",
+    "profiles/trochoid": "families conjugacy",
+    "profiles/validity": "families",
+}
+"""Modules, and the words in `tests/test_WORD.py`."""
+
+ROOMS = {
+    f"rootsopt/{module}.py": tuple(f"tests/test_{word}.py" for word in words.split())
+    for module, words in _OF.items()
+}
+
+
+def modules(root: Path) -> list[str]:
+    """The modules of the rooms; `LookupError` for one without tests, or tests without one."""
+    found = {path.relative_to(root).as_posix() for path in _numerical(root)}
+    if found != set(ROOMS):
+        odd = ", ".join(sorted(found ^ set(ROOMS)))
+        raise LookupError(f"tests/mutants/rooms.py and the package differ in {odd}")
+    return sorted(found)
+
+
+def _numerical(root: Path):
+    package = root / "rootsopt"
+    names = "arclength", "batch", "continuation", "ensemble", "members", "orbits", "speeds"
+    for name in names:
+        yield package / f"{name}.py"
+    for folder in ("contact", "dynamics", "optimize", "profiles"):
+        for path in (package / folder).rglob("*.py"):
+            if path.name not in ("__init__.py", "__main__.py"):
+                yield path
