@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from rootsopt.config import FAMILY_KEYS, LIST_KEYS, ProfileConfig, hint
+from rootsopt.config.words import shown
 from rootsopt.errors import InputError
 from rootsopt.outline.conjugacy import conjugacy
 from rootsopt.profiles import (
@@ -200,7 +201,9 @@ contact's nodes fall together."""
 
 
 def _written(value: float | tuple[float, ...]) -> str:
-    return f"{[*value]}" if isinstance(value, tuple) else f"{value:g}"
+    if isinstance(value, tuple):
+        return shown([float(f"{number:.6g}") for number in value])
+    return f"{value:g}"
 
 
 _FAULTS = {

@@ -1,11 +1,13 @@
 """Config files: what loads, what is refused, and that every refusal names its key."""
 
 from pathlib import Path
+from typing import Literal, get_args, get_origin
 
 import pytest
 import yaml
 
 from rootsopt.config import Config, describe_keys, load, parse
+from rootsopt.config.section import Section
 from rootsopt.errors import InputError
 from rootsopt.model import check_geometry
 
@@ -322,6 +324,209 @@ def test_bounds_are_two_increasing_numbers(value):
     """Bounds of the search: (low, high)."""
     message = refusal(MINIMAL, f"optimizer.bounds.involute_length_mm={value}")
     assert "optimizer.bounds.involute_length_mm" in message
+
+
+# Ranges, units, choices
+
+
+def leaves():
+    """Dotted key and field of every key that holds no keys of its own."""
+    sections = [(name, getattr(parse(MINIMAL), name)) for name in Config.model_fields]
+    kinds = [(name, type(section)) for name, section in sections]
+    while kinds:
+        prefix, model = kinds.pop()
+        for name, field in model.model_fields.items():
+            inner = [
+                part
+                for part in (field.annotation, *getattr(field.annotation, "__args__", ()))
+                if isinstance(part, type) and issubclass(part, Section)
+            ]
+            if inner:
+                kinds.append((f"{prefix}.{name}", inner[0]))
+            else:
+                yield f"{prefix}.{name}", field
+
+
+def numeric(annotation):
+    """Whether what is annotated holds numbers."""
+    if get_origin(annotation) is Literal:
+        return False
+    return annotation in (float, int) or any(numeric(part) for part in get_args(annotation))
+
+
+NUMERIC = [key for key, field in leaves() if numeric(field.annotation) and "bounds" not in key]
+PUMP = next(path for path in SHIPPED if path.name == "pump.yaml").read_text(encoding="utf-8")
+"""A config with every part of a scene."""
+
+
+@pytest.mark.parametrize("key", NUMERIC)
+def test_every_number_has_two_ends(key):
+    """No number is as small or as great as one likes, and the help says how far it may go."""
+    parts = "timing_gear", "motor", "supports", "load", "friction"
+    text = PUMP if any(part in key for part in parts) else MINIMAL
+    for number in ("1.0e300", "-1.0e300", 10**390, ".inf", ".nan"):
+        assert f"`{key}" in refusal(text, f"{key}={number}")
+    for value in ("[1.0e300, 2.0e300]", "{1: 1.0e300, from: 1.0e300}"):
+        assert f"`{key}" in refusal(text, f"{key}={value}")
+    line = next(line for line in describe_keys().splitlines() if line.split()[0] == key)
+    assert "from" in line or "above" in line
+    assert " to " in line or "below" in line
+
+
+def test_help_has_unit_default_range_and_choices():
+    """One line for each key."""
+    lines = {line.split()[0]: line for line in describe_keys().splitlines()}
+    assert lines["profile.pitch_radius_mm"].endswith("[mm, from 1 to 5000, required]")
+    assert lines["scene.timing_gear.damping_ratio"].endswith("[from 0 to 100, default 0.0]")
+    assert lines["scene.drive"].endswith("[prescribed | torque, default prescribed]")
+    assert lines["profile.tip_arc_angle_deg"].endswith("[°, from 0 below 45]")
+    assert "N·m/rad" in lines["scene.timing_gear.stiffness_N_m_per_rad"]
+    assert "from 1 to 80" in lines["optimizer.bounds.pressure_angle_deg"]
+
+
+@pytest.mark.parametrize(
+    ("text", "override", "words"),
+    [
+        (MINIMAL, "profile.pitch_radius_mm=0.033", "metres? write 33"),
+        (MINIMAL, "profile.pitch_radius_mm=33000", "micrometres? write 33"),
+        (MINIMAL, "profile.pressure_angle_deg=0.63", "radians? write 36.1"),
+        (MINIMAL, "profile.involute_length_mm=0.0085", "metres? write 8.5"),
+        (MINIMAL, "rotor.length_mm=0.1", "metres? write 100"),
+        (MINIMAL, "rotor.bore_mm=0.012", "metres? write 12"),
+        (MINIMAL, "rotor.density_kg_m3=7.8", "g/cm³? write 7800"),
+        (MINIMAL, "rotor.density_kg_m3=7.8e-6", "kg/mm³? write 7800"),
+        (MINIMAL, "rotor.density_kg_m3=7.8e-9", "t/mm³? write 7800"),
+        (MINIMAL, "constraints.outer_radius_max_mm=0.045", "metres? write 45"),
+        (MINIMAL, "constraints.area_efficiency_min=42", "percentage? write 0.42"),
+        (MINIMAL, "optimizer.bounds.pressure_angle_deg=[0.45, 0.79]", "radians? write 25.78"),
+        (EE_PROFILE, "profile={family: arc, lobes: 3, pitch_radius_mm: 33, arc_center_mm: 0.0297}",
+         "metres? write 29.7"),
+        (EE_PROFILE, "profile={family: ellipse, lobes: 3, pitch_radius_mm: 33, "
+         "ellipse_center_mm: 27, ellipse_height_mm: 0.018}", "metres? write 18"),
+        (EE_PROFILE, "profile={family: circle_epicycloid, lobes: 3, pitch_radius_mm: 33, "
+         "rolling_radius_mm: 7, tip_arc_turn_deg: 0.52}", "radians? write 29.79"),
+        (EE_PROFILE, "profile={family: arcs_epicycloid, lobes: 3, pitch_radius_mm: 33, "
+         "arc_center_mm: 27, tip_arc_angle_deg: 8, edge_radius_mm: 0.001}", "metres? write 1"),
+        (MINIMAL, "scene.speed_rpm='3000,5'", "write 3000.5"),
+    ],
+)  # fmt: skip
+def test_number_in_another_unit_is_recognised(text, override, words):
+    """What is out of range, but would be in range in a unit often written, is asked about."""
+    with pytest.raises(InputError) as caught:
+        check_geometry(parse(text, [override]))
+    message = str(caught.value)
+    assert words in message
+    assert f"`{override.partition('=')[0]}" in message
+
+
+@pytest.mark.parametrize("value", ["0", "-33", "1e-300", "1e300", "0.0005"])
+def test_hint_is_given_only_where_it_fits(value):
+    """A value that fits in no unit gets the range alone."""
+    assert "is that" not in refusal(MINIMAL, f"profile.pitch_radius_mm={value}")
+
+
+CHOICES = [
+    ("solver.fidelity", "search", ("SEARCH", "Search", " search ", "Sea-rch")),
+    ("solver.precision", "float32", ("Float32", "FLOAT-32", "float 32")),
+    ("solver.gradient", "reverse", ("Reverse",)),
+    ("optimizer.method", "rmsprop", ("RMSprop", "RMS prop", "rms-prop")),
+    ("objective.motion", "worst", ("WORST",)),
+    ("scene.drive", "prescribed", ("Prescribed",)),
+    ("constraints.area_efficiency_min", "baseline", ("Baseline", "BASE-LINE")),
+]
+
+
+@pytest.mark.parametrize(("key", "word", "spellings"), CHOICES)
+def test_choices_are_taken_in_any_spelling(key, word, spellings):
+    """Case, spaces and dashes do not matter; what is written down is the listed word."""
+    expected = parse(MINIMAL, [f"{key}={word}"])
+    for spelling in spellings:
+        config = parse(MINIMAL, [f"{key}='{spelling}'"])
+        assert config == expected
+        assert f": {word}\n" in config.to_yaml()
+
+
+@pytest.mark.parametrize(
+    ("spelling", "family"),
+    [
+        *(("CIC", "cic"), ("Cic", "cic"), ("EE", "ee"), ("Five arcs", "five_arcs")),
+        *(("Hypo-Epicycloid", "hypo_epicycloid"), ("extended cycloid", "extended_cycloid")),
+    ],
+)
+def test_family_is_taken_in_any_spelling(spelling, family):
+    """In the file and with --set; the key's own checks come after."""
+    keys = {
+        "cic": "pressure_angle_deg: 36, involute_length_mm: 8, tip_arc_angle_deg: 4",
+        "hypo_epicycloid": "tip_arc_angle_deg: 4",
+        "extended_cycloid": "trochoid_ratio: 1.3",
+        "five_arcs": "outer_radius_mm: 45, tip_arc_angle_deg: 3, tip_arc_radius_mm: 13, "
+        "tip_arc_turn_deg: 60",
+    }
+    body = f"lobes: 3, pitch_radius_mm: 33, {keys.get(family, '')}"
+    text = EE_PROFILE.partition("\n")[2]
+    config = parse(f"profile: {{family: {spelling}, {body}}}\n{text}")
+    assert config.profile.family == family
+    assert parse(text, [f"profile={{family: {spelling}, {body}}}"]) == config
+    assert f"family: {family}\n" in config.to_yaml()
+
+
+def test_keys_that_are_choices_are_taken_in_any_case():
+    """So are from, to and points of a sweep; but none may be given twice."""
+    given = parse(MINIMAL, ["sweep.speed_rpm={From: 300, TO: 6000, Points: 39}"])
+    assert given == parse(MINIMAL, ["sweep.speed_rpm={from: 300, to: 6000, points: 39}"])
+    message = refusal(MINIMAL, "sweep.speed_rpm={from: 300, From: 400, to: 6000, points: 39}")
+    assert "From" in message
+
+
+@pytest.mark.parametrize(
+    ("override", "word"),
+    [
+        ("profile.family=cid", "cic"),
+        ("solver.method=tsitt5", "tsit5"),
+        ("scene.drive=Torqe", "torque"),
+    ],
+)
+def test_near_miss_of_a_choice_names_what_was_meant(override, word):
+    """As for keys."""
+    assert f"did you mean {word}?" in refusal(MINIMAL, override)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("constraints.area_efficiency_min=2", "less than 1"),
+        ("constraints.area_efficiency_min=much", "one of 'baseline' or a number"),
+        ("optimizer.bounds.involute_length_mm=[1]", "two numbers"),
+        ("optimizer.bounds.involute_length_mm=[1, 2, 3]", "two numbers"),
+        ("objective.line_weights={1: 2e6}", "at most 1e+06"),
+        ("objective.line_weights={0: 1}", "greater than 0"),
+        ("objective.line_weights={1: 1, '1': 2}", "line_weights"),
+        ("objective.line_weights={" + ", ".join(f"{k}: 1" for k in range(1, 40)) + "}", "most 32"),
+        ("response.lines=[" + ", ".join(f"{k}" for k in range(1, 40)) + "]", "at most 32"),
+        ("attractors.relative_range_mrad=[-.inf, .inf]", "finite"),
+        ("attractors.rate_range_rad_s=[-1, 1e9]", "at most 1e+06"),
+        ("optimizer.seed=99999999999", "at most"),
+        ("objective={mean_weight: 1e-300, peak_weight: 0}", "must not all be 0"),
+        ("scene.speed_rpm=" + "9" * 399, "ordinary size"),
+        ("profile.outline_file='a\tb\u0007'", "outline_file"),
+        ("profile={family: outline, lobes: 3, pitch_radius_mm: 33, outline_file: \"a\\0b\"}",
+         "printed"),
+        ("float=1", "`float` is not a known key"),
+        ("profile.int=1", "`profile.int` is not a known key"),
+        ("'a[b'=1", "is not a known key"),
+        ("optimizer.bounds.arc_center_mm=[0.02, 0.03]", "metres? write 30"),
+    ],
+    ids=lambda text: text[:30],
+)  # fmt: skip
+def test_odd_values_have_their_words(override, words):
+    """What pydantic says of lists, unions and dictionaries is put into the words of a config."""
+    text = MINIMAL
+    if "arc_center" in override:
+        arc = "profile: {family: arc, lobes: 3, pitch_radius_mm: 33, arc_center_mm: 29.7}\n"
+        text = arc + EE_PROFILE.partition("\n")[2]
+    message = refusal(text, override)
+    assert words in message
+    assert len(message) <= 500
 
 
 # Files and YAML

@@ -30,7 +30,7 @@ SECONDS = 2.0
 LONGEST = 500
 """Longest message (characters)."""
 SHIPPED = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
-_GEOMETRIES = 0.05
+_GEOMETRIES = 0.02
 """Share of accepted configs whose geometry is made."""
 _ONES = (1, 1, 1, 2, 3, 8)
 """How many things are changed at a time."""
@@ -71,7 +71,7 @@ def tried(case: Case, folder: Path) -> tuple[Config | None, str | None]:
     try:
         with _guarded():
             config = load(path, overrides)
-        with _guarded(4 * SECONDS):
+        with _guarded(4):
             same = parse(config.to_yaml().encode().decode()) == config
         return config, None if same else "does not load again as it was written"
     except InputError as error:
@@ -123,8 +123,9 @@ _measured: Any = None
 
 
 @contextmanager
-def _guarded(seconds: float = SECONDS):
-    """Raise `_LateError` in what takes more CPU time."""
+def _guarded(times: float = 1):
+    """Raise `_LateError` in what takes more CPU time than `SECONDS`, so many times."""
+    seconds = times * SECONDS
 
     def late(*_):
         raise _LateError
@@ -390,6 +391,8 @@ DESIGNS: dict[str, dict[str, Any]] = {
     "free_form": {"tip_arc_angle_deg": 4.0, "coefficients": [0.2, 0.1, 0.0, 0.1, 0.3, 0.5]},
 }
 """A sound design of each family at 33 mm and three lobes."""
+TIED = ("solver.fidelity", "objective.motion", "objective.over_speeds")
+"""Choices that other keys must go with."""
 OPTIONAL = ("rotor.bore_mm", "contact.friction", "scene.timing_gear", "scene.supports")
 
 
@@ -416,7 +419,10 @@ def _numbers() -> dict[str, tuple[float, float, bool]]:
     for key in _keys():
         field: Any = field_of(Config, key.split("."))
         words = str(field.annotation)
-        low, high = limits_of(field.annotation, field.metadata).ends
+        limits = limits_of(field.annotation, field.metadata)
+        low, high = limits.ends
+        low += 1e-6 * (limits.gt is not None)
+        high -= 1e-6 * (limits.lt is not None)
         plain = "tuple" not in words and "dict" not in words and high < float("inf")
         if plain and not key.startswith("profile."):
             found[key] = low, high, "int" in words
@@ -456,15 +462,29 @@ def _valid(draw: random.Random) -> Case:
         if needed or draw.random() < 0.5 or key.startswith(("scene.load.", "contact.friction")):
             value = _inside(draw, low, high)
             _set(data, key, round(value) if whole else value)
+    if "contact.friction" not in gone:
+        friction = data["contact"]["friction"]
+        stiction = friction["stiction_speed_mm_s"]
+        friction["friction_speed_mm_s"] = stiction * _inside(draw, 1.01, 10)
+    constraints = data.get("constraints", {})
+    if (low := constraints.get("outer_radius_min_mm")) is not None:
+        constraints["outer_radius_max_mm"] = min(1e4, low * 1.1 + 1)
+        constraints["outer_radius_min_mm"] = min(low, 9e3)
+    if any(part not in gone for part in ("contact.friction", "scene.supports")):
+        _set(data, "solver.fidelity", draw.choice(("search", "Auto")))
+        data["scene"].pop("center_distance_error_mm", None)
     for part in set(OPTIONAL[1:]) - set(gone):
         _set(data, part, data.get(part.split(".")[0], {}).get(part.split(".")[1], {}))
     for key in _keys():
         words = choices(field_of(Config, key.split(".")).annotation)  # type: ignore[union-attr]
-        if words and not key.startswith(("profile.", "scene.", "sweep.")) and draw.random() < 0.2:
+        free = not key.startswith(("profile.", "scene.", "sweep.")) and key not in TIED
+        if words and free and draw.random() < 0.2:
             word = draw.choice(words)
             _set(data, key, draw.choice((word, word.upper(), word.replace("_", "-").title())))
     if draw.random() < 0.3:
-        data["objective"] = data.get("objective", {}) | {"speeds_rpm": [1000, 2000.5]}
+        word = draw.choice(("weighted", "Worst"))
+        _set(data, "objective.speeds_rpm", [1000, 2000.5])
+        _set(data, "objective.over_speeds", word)
     return yaml.safe_dump(data, sort_keys=False).encode(), ()
 
 
