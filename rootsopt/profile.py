@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rootsopt.cli import Outcome
     from rootsopt.config import Config
     from rootsopt.runs import RunFolder
+
 PURPOSE = "Geometry of one design: radii, area, inertia, margins; drawings, solids, animation."
 EXPORT = "dxf,svg"
 """What is written if nothing is said: a drawing takes less than a second, a solid ten."""

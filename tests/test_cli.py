@@ -86,6 +86,8 @@ def test_optimize_writes_the_contract(tmp_path):
         assert force.mean() == pytest.approx(result[name]["response"]["mean_force_N"], rel=1e-3)
         assert force.max() <= result[name]["response"]["peak_force_N"] * (1 + 1e-6)
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["optimizer"]["screening"] == 2
+    assert result["status"] == "periodic"
+    assert result["run"]["command"] == "optimize"
     figures = {path.name for path in (tmp_path / "figures").iterdir()}
     names = ("profiles", "meshing", "force", "spectrum", "history")
     assert figures == {f"{name}.png" for name in names}

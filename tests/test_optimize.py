@@ -2,6 +2,13 @@
 
 import dataclasses
 import itertools
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +20,7 @@ from rootsopt.errors import InputError
 from rootsopt.evaluate import Evaluation
 from rootsopt.model import Model
 from rootsopt.optimize.problem import Problem, sobol
-from rootsopt.optimize.search import Search
+from rootsopt.optimize.search import Search, until_stopped
 from rootsopt.profiles import geometry
 from rootsopt.status import Status
 
@@ -185,6 +192,178 @@ def test_search_improves_within_the_constraints():
         1 - result.optimized.response["mean_force_N"] / (result.baseline.response["mean_force_N"])
     )
     assert gains["mean_force_N"] == pytest.approx(reduction)
+
+
+SMALL = (
+    "optimizer.screening=4",
+    "optimizer.starts=1",
+    "optimizer.iterations=6",
+    "solver.map_rolls=96",
+    "solver.map_relatives=16",
+)
+
+
+def _stopped(after, patience, hinder=lambda search: None):
+    """Outcome of a search that is stopped after some evaluations, and the search."""
+    stop, seen = threading.Event(), []
+
+    def progress(done, expected, best):
+        seen.append(best)
+        if done == after:
+            stop.set()
+
+    search = Search(config(*SMALL), progress, stop)
+    hinder(search)
+    result = until_stopped(search.run, stop, patience)
+    return result or search.so_far(), search
+
+
+def test_a_stopped_search_keeps_the_best_so_far():
+    """Verified, as there is time for it; no more designs are tried than those under way."""
+    result, search = _stopped(8, patience=600.0)
+    assert result.interrupted
+    assert result.status is Status.INTERRUPTED
+    assert not result.status.usable
+    assert 8 <= len(result.history) <= 8 + os.cpu_count()
+    assert result.verification["holds_up"]
+    assert result.optimized.series is not None
+    best = min(row["objective"] for row in result.history if row["feasible"])
+    assert search.problem.objective(result.optimized) == pytest.approx(best, rel=0.01)
+    assert best < 1
+
+
+def test_a_stopped_search_without_time_to_verify():
+    """The best trial itself, and it says that nothing was verified."""
+
+    def hinder(search):
+        exact = search.exact
+
+        def slow(design=None, **options):
+            if design is not None:
+                time.sleep(600)
+            return type(exact).__call__(exact, design, **options)
+
+        search.exact = _Wrapped(exact, slow)
+
+    result, search = _stopped(8, patience=0.0, hinder=hinder)
+    assert result.interrupted
+    assert result.verification["holds_up"] is None
+    trials = [row["objective"] for row in result.history if row["feasible"]]
+    assert search.problem.objective(result.optimized) == min(trials) < 1
+    assert all(row["satisfied"] for row in result.constraints)
+
+
+class _Wrapped:
+    """An evaluator whose calls go elsewhere."""
+
+    def __init__(self, evaluator, call):
+        self.evaluator, self.call = evaluator, call
+
+    def __call__(self, *arguments, **options):
+        return self.call(*arguments, **options)
+
+    def __getattr__(self, name):
+        return getattr(self.evaluator, name)
+
+
+def test_a_search_stopped_before_it_found_anything():
+    """During screening's first design; and before the baseline was simulated."""
+    stop = threading.Event()
+    search = Search(config(*SMALL), None, stop)
+    assert search.so_far() is None
+    search._side_by_side = lambda *_: stop.set() or []
+    result = search.run()
+    assert result.interrupted
+    assert result.optimized is None
+    assert result.history == []
+    assert result.baseline.usable
+
+
+def test_designs_that_did_not_hold_up_are_not_reported():
+    result, search = _stopped(8, patience=600.0)
+    design = np.array(list(result.optimized.design.values()))
+    search._refuted = [search.problem.point(design)]
+    assert search.so_far().optimized.design != result.optimized.design
+
+
+def test_an_interrupt_stops_a_search_and_a_second_one_the_wait():
+    """`KeyboardInterrupt`, as Python raises it where no command line owns the process."""
+    stop = threading.Event()
+
+    def interrupt(seconds):
+        import _thread
+
+        threading.Timer(seconds, _thread.interrupt_main).start()
+
+    interrupt(0.2)
+    assert until_stopped(lambda: stop.wait(60) and "kept", stop, 60.0) == "kept"
+    interrupt(0.2)
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        until_stopped(lambda: time.sleep(5), stop, 60.0)
+    assert time.monotonic() - began < 4
+    assert until_stopped(lambda: time.sleep(5), stop, 0.0) is None
+    with pytest.raises(InputError, match="passed on"):
+        until_stopped(lambda: _refuse(), threading.Event(), 0.0)
+
+
+def _refuse():
+    raise InputError("passed on")
+
+
+INTERRUPTED = """
+import os, signal, sys
+from rootsopt.optimize import __main__ as command
+from rootsopt.optimize.search import Search
+wanted, number = int(sys.argv.pop(1)), signal.Signals[sys.argv.pop(1)]
+command._PATIENCE = 600.0 if wanted else 0.0
+evaluate, run = Search._evaluate, Search.run
+def counted(self, *arguments, **options):
+    found = evaluate(self, *arguments, **options)
+    if len(self._trials) == wanted:
+        os.kill(os.getpid(), number)
+        self.stop.wait(60)
+    return found
+def begun(self):
+    if wanted == 0:
+        os.kill(os.getpid(), number)
+        import time; time.sleep(60)
+    return run(self)
+Search._evaluate, Search.run = counted, begun
+command.door.leave(command.main())
+"""
+
+
+@pytest.mark.parametrize(("after", "number"), [(0, "SIGINT"), (8, "SIGINT"), (9, "SIGTERM")])
+def test_signals_to_the_command(tmp_path, after, number):
+    """Status, exit code, and a folder that is complete."""
+    path = tmp_path / "scene.yaml"
+    path.write_text(SCENE)
+    overrides = [part for text in SMALL for part in ("--set", text)]
+    arguments = [str(path), "-o", str(tmp_path / "run"), *overrides, "--no-figures"]
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, str(after), number, *arguments],
+        cwd=Path(__file__).parents[1], capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 3, done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert "interrupted" in done.stdout
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["status"] == "interrupted"
+    written = {p.name for p in (tmp_path / "run").iterdir()}
+    assert written == set(result["run"]["files"])
+    if after == 0:
+        assert result["baseline"] is None
+        assert result["optimized"] is None
+        assert written == {"config.yaml", "result.json"}
+    else:
+        assert result["optimized"]["status"] == "periodic"
+        assert result["verification"]["holds_up"]
+        assert result["improvement"]["objective"] > 0
+        names = {"history.csv", "optimized.yaml", "profile_optimized.csv", "response_optimized.csv"}
+        assert names <= written
+    assert sorted(os.listdir(tmp_path)) == ["run", "scene.yaml"]
 
 
 def test_objective_slope_agrees_with_finite_differences():

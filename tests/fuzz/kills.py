@@ -1,0 +1,186 @@
+"""Runs killed (SIGKILL) at random instants while they write into a folder with an older run.
+
+What is written is what real commands have written, again by the same file layer, in a process
+forked for each case: on a disk and in memory, with and without `--overwrite`, moving or exchanging
+folders. Some cases are whole commands, killed at any instant from their start on. Afterwards the
+folder must be the older run or the new one, whole, and the run that follows must leave whole runs
+and nothing else.
+"""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from rootsopt.runs import RESULT, RunFolder
+from tests.deaths import digest, faulty, scratch
+from tests.fuzz.report import Report
+
+ROOT = Path(__file__).parents[2]
+COMMANDS = {
+    "profile": ["--export", "dxf,svg"],
+    "simulate": ["--no-figures", "--set", "solver.fidelity=linear"],
+}
+_WHOLE = 20
+"""One case of so many is a whole command."""
+
+
+class Recorded(NamedTuple):
+    """Files that a command has written, by name, and what its result holds."""
+
+    command: str
+    files: dict[str, bytes]
+    result: dict
+
+    def write(self, folder: Path, overwrite: bool = False) -> None:
+        """The same run, into another folder."""
+        with RunFolder(folder, self.command, overwrite) as run:
+            for name, data in self.files.items():
+                run.write_bytes(name, data)
+            run.write_json(RESULT, self.result)
+            run.put_in_place()
+
+
+def run(report: Report, seed: int) -> None:
+    """Kill until the report is over."""
+    chance = random.Random(seed)
+    disk, memory = Path(tempfile.mkdtemp(prefix="kills-")), scratch()
+    os.environ["ROOTSOPT_CACHE"] = str(disk / "cache")
+    try:
+        known, seconds = _recorded(disk)
+        count = 0
+        while not report.over:
+            count += 1
+            place = Path(tempfile.mkdtemp(dir=chance.choice([disk, memory])))
+            if count % _WHOLE == 0:
+                _whole(report, chance, place, seconds)
+            else:
+                _replayed(report, chance, place, known)
+            shutil.rmtree(place)
+    finally:
+        shutil.rmtree(disk, ignore_errors=True)
+        shutil.rmtree(memory, ignore_errors=True)
+
+
+def _arguments(command: str, folder: Path, *more: str) -> list[str]:
+    module = f"rootsopt.{command}"
+    start = [sys.executable, "-m", module, "configs/cic.yaml", "-o", str(folder)]
+    return [*start, *COMMANDS[command], *more]
+
+
+def _recorded(place: Path) -> tuple[list[Recorded], float]:
+    """Two different runs of each command, and how long one takes (s)."""
+    found = []
+    for command in COMMANDS:
+        for design in ("30.0", "33.0"):
+            folder = place / f"{command}-{design}"
+            more = ["--set", f"profile.pressure_angle_deg={design}"]
+            more += ["--set", "profile.involute_length_mm=7.0"]
+            began = time.monotonic()
+            arguments = _arguments(command, folder, *more)
+            subprocess.run(arguments, cwd=ROOT, check=True, capture_output=True)
+            seconds = time.monotonic() - began
+            paths = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+            files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+            result = json.loads(files.pop(RESULT))
+            del result["run"]
+            found.append(Recorded(command, files, result))
+    return found, seconds
+
+
+def _replayed(report: Report, chance: random.Random, place: Path, known: list[Recorded]) -> None:
+    older, new, after = chance.sample(known, 3)
+    overwrite, exchanges = chance.random() < 0.5, chance.random() < 0.8
+    whole = {}
+    for one in (older, new, after):
+        began = time.monotonic()
+        one.write(place / "alone")
+        span = time.monotonic() - began
+        whole[id(one)] = digest(place / "alone")
+        shutil.rmtree(place / "alone")
+    folder = place / "run"
+    older.write(folder)
+    reading, writing = os.pipe()
+    child = os.fork()
+    if not child:
+        try:
+            with faulty((), 0, None, exchanges):
+                os.write(writing, b"x")
+                new.write(folder, overwrite)
+        finally:
+            os._exit(0)
+    os.read(reading, 1)
+    share = chance.uniform(0.0, 1.2)
+    time.sleep(share * span)
+    os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    os.close(reading)
+    os.close(writing)
+    now = digest(folder)
+    wrong = []
+    missing = now is None and not exchanges  # between two renames; the next run finishes it
+    if now not in (whole[id(older)], whole[id(new)]) and not missing:
+        wrong.append("the folder is neither the older run nor the new one")
+    after.write(folder)
+    wrong += _afterwards(place, set(whole.values()))
+    if digest(folder) != whole[id(after)]:
+        wrong.append("the next run is not whole")
+    kept = {digest(path) for path in place.iterdir()}
+    if not overwrite and whole[id(older)] not in kept:
+        wrong.append("the older run is lost")
+    killed = os.waitstatus_to_exitcode(status) == -signal.SIGKILL
+    kind = f"{new.command} over {older.command}" + (", --overwrite" if overwrite else "")
+    kind += "" if exchanges else ", no exchange"
+    kind += "" if killed else ", too late"
+    text = f"at {share:.3f} of {span:.3f} s: {'; '.join(wrong)}"
+    report.add(kind, text if wrong else None)
+
+
+def _afterwards(place: Path, whole: set[str | None]) -> list[str]:
+    """What is wrong with what a kill and the run after it have left."""
+    names = os.listdir(place)
+    wrong = [f"the next run leaves {name}" for name in names if name.startswith(".")]
+    if any(digest(place / name) not in whole for name in names):
+        wrong.append("a folder aside is no whole run")
+    return wrong
+
+
+def _whole(report: Report, chance: random.Random, place: Path, seconds: float) -> None:
+    """A command from its start on."""
+    command = chance.choice(list(COMMANDS))
+    arguments = _arguments(command, place / "run")
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": ROOT}
+    subprocess.run(arguments, check=True, **quiet)
+    older = digest(place / "run")
+    process = subprocess.Popen(arguments, **quiet)
+    share = chance.uniform(0.3, 1.1)
+    time.sleep(share * seconds)
+    process.kill()
+    process.wait()
+    wrong = []
+    if digest(place / "run") != older and not _consistent(place / "run"):
+        wrong.append("the folder is neither the older run nor the new one")
+    if subprocess.run(arguments, check=False, **quiet).returncode:
+        wrong.append("the next run fails")
+    wrong += [f"the next run leaves {name}" for name in os.listdir(place) if name.startswith(".")]
+    if not all(_consistent(path) for path in place.iterdir()):
+        wrong.append("a folder is no whole run")
+    kind = f"whole {command}" + ("" if process.returncode < 0 else ", too late")
+    report.add(kind, f"at {share:.3f} of {seconds:.1f} s: {'; '.join(wrong)}" if wrong else None)
+
+
+def _consistent(folder: Path) -> bool:
+    """Whether a folder holds the files its result lists and no others."""
+    try:
+        listed = json.loads((folder / RESULT).read_bytes())["run"]["files"]
+    except (OSError, ValueError):
+        return False
+    files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    return files == set(listed)
