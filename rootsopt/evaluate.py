@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config
 from rootsopt.contact.size import size_map
-from rootsopt.dynamics.flow import Flow, Integrator
+from rootsopt.dynamics.flow import IMPLICIT, Flow, Integrator
 from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import (
@@ -40,6 +40,10 @@ RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 _NEARLY = 0.05
 _CLOSEST = 1e-12
 """Scaled difference below which states repeat exactly: a closer look would show no more."""
+_SINGLE = (
+    " In single precision the iterations of an implicit method rarely converge: set "
+    "solver.precision to float64, or solver.method to tsit5."
+)
 CHAOS_WINDOW = 128
 _THINNING = 6
 
@@ -391,6 +395,8 @@ class Evaluator:
         elif status is Status.SOLVER_FAILED and pair.pace is not None:
             swings = pair.mesh_period / (2 * np.pi * pair.pace.swing)
             statistics["swings_per_mesh_period"] = float(swings)
+            if self.model.precision == "float32" and self.orbit.method in IMPLICIT:
+                hint = _SINGLE
         if status is not Status.PERIODIC:
             gradient = {}
         statistics["seconds"] = seconds
@@ -546,11 +552,13 @@ def _reverse(model: Model, design, orbit: Orbit, period, how: Integrator, measur
 def _contact_series(pair: RotorPair, tau, states):
     lapse = pair.lapse(states) if pair.drive.free else jnp.ones_like(tau)
     contact = jax.vmap(pair.contact_at)(tau, states)
-    return pair.mesh_period, lapse, pair.physical(tau, states), contact
+    return pair.mesh_period, lapse, pair.physical(tau, states)[1:], contact
 
 
 def _series(pair: RotorPair, tau, states) -> Series:
-    period, lapse, (phi, relative, rate), contact = _contact_series(pair, tau, states)
+    # Within a turn of the rotor: single precision resolves late times as well as early ones.
+    turn = np.mod(tau, pair.lobes)
+    period, lapse, (relative, rate), contact = _contact_series(pair, turn, states)
     time = period * tau
     if pair.drive.free:
         from scipy.integrate import cumulative_simpson  # Half a second, for motors alone.
@@ -559,7 +567,7 @@ def _series(pair: RotorPair, tau, states) -> Series:
     double = functools.partial(np.asarray, dtype=np.float64)
     return Series(
         time=double(time),
-        rotation=double(phi),
+        rotation=2 * np.pi / pair.lobes * np.asarray(tau, np.float64),
         relative=double(relative),
         rate=double(rate),
         drive_force=double(contact.drive),

@@ -278,6 +278,17 @@ def _check_involute(profile_config: ProfileConfig) -> None:
             f"but is {length:g}: the tip arc would touch nothing on the other rotor; lengthen it, "
             "or raise the pressure angle or the tip arc"
         )
+    # Beyond the longest involute the tip arc turns back, until nothing is left of its radius.
+    turn = (half - tip) * DEG - length / (radius * sine)
+    across = math.cos(alpha * DEG - turn)
+    rho = length / math.tan(alpha * DEG) + radius * math.sin(turn) / across if across > 0 else 0.0
+    if rho <= 0:
+        raise InputError(
+            f"`profile.involute_length_mm` must be less than {longest:.4g} at "
+            f"`profile.pressure_angle_deg` = {alpha:g} and `profile.tip_arc_angle_deg` = {tip:g}, "
+            f"but is {length:g}: the tip arc would have no radius; shorten it or lower the "
+            "pressure angle"
+        )
     # On the dedendum the involute's end is the first to be undercut.
     uncut = radius * sine * math.tan(alpha * DEG)
     if length > uncut * (1 + 1e-9):

@@ -56,7 +56,7 @@ class Status(enum.Enum):
     SOLVER_FAILED = (
         "The solver ran out of steps. Raise solver.max_steps_per_period (an explicit method takes "
         "ten and more for each of statistics.swings_per_mesh_period), loosen solver.rtol, or use "
-        "an implicit solver.method (kvaerno5, with solver.precision float64)."
+        "an implicit solver.method (kvaerno5)."
     )
     NON_FINITE = (
         "The simulation produced a number that is not finite. Loosen solver.rtol or check the "
