@@ -1,6 +1,7 @@
 """Outlines from DXF drawings, text or binary: entities out of the file, points on them."""
 
 import io
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ _SPACING = 1 / 400
 """Distance between points on arcs and splines, relative to the drawing's size."""
 _LAYER = "OUTLINE"
 _KINDS = ("LINE", "ARC", "SPLINE", "ELLIPSE", "LWPOLYLINE", "POLYLINE")
+_CURVES = ("LINE", "ARC", "SPLINE", "ELLIPSE")
 _PARTS = ("VERTEX", "INSERT")
 _ENTITIES = 100_000
 """Number of entities (vertices of a POLYLINE counted) above which a drawing is refused."""
@@ -64,14 +66,24 @@ _UNITS = {
 def from_dxf(data: bytes, name: str) -> Loop:
     """The closed loop of the largest area in a drawing. Raises `InputError`."""
     binary = data.startswith(_BINARY)
-    _check_tags(data, binary, name)
+    counted = _check_tags(data, binary, name)
     with guarded(name, _NOT, _AGAIN):
         if binary:
             document = Drawing.load(binary_tags_loader(data))
-            document.audit()
+            auditor = document.audit()
         else:
-            document, _ = recover.read(io.BytesIO(data))
+            document, auditor = recover.read(io.BytesIO(data))
         unit = document.header.get("$INSUNITS", 0)
+        kept = Counter(e.dxftype() for e in document.entitydb.values() if e.is_alive)
+        reasons = [str(fix.message) for fix in auditor.fixes]
+    for kind in _CURVES:
+        if kept[kind] < counted[kind]:
+            # The library has taken them out: what is left may be another outline.
+            reason = next((text for text in reasons if kind in text), "damaged")
+            raise InputError(
+                f"{name}: {counted[kind] - kept[kind]} of {counted[kind]} {kind} make no sense "
+                f"({short(reason, 100)}); mend or remove them in the drawing"
+            )
     scale = _UNITS.get(unit) if isinstance(unit, int) else None
     if scale is None:
         raise InputError(
@@ -103,19 +115,21 @@ def from_dxf(data: bytes, name: str) -> Loop:
     return joined([chain(part, spacing) for part in parts], _LAYER, name)
 
 
-def _check_tags(data: bytes, binary: bool, name: str) -> None:
-    """Raise `InputError` unless the file is whole and the numbers of its entities are sound.
+def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
+    """Number of entities of each kind. Raises `InputError` unless the file is whole and the numbers
+    of its entities are sound.
 
     The library reads "1,5" as 1, and a number that the end of the file cut off as what is left.
     """
     tags = binary_tags_loader(data) if binary else recover.bytes_loader(io.BytesIO(data))
-    count, kind, ended = 0, "", False
+    counted: Counter[str] = Counter()
+    kind, ended = "", False
     for number, tag in enumerate(each(iter(tags), name, _NOT, _AGAIN), 1):
         code, value = tag.code, tag.value
         if code == 0:
             kind = (value if isinstance(value, str) else value.decode("latin-1")).strip().upper()
             ended = kind == "EOF"
-            count += kind in _KINDS or kind in _PARTS
+            counted[kind] += 1
             continue
         if kind not in _KINDS and kind not in _PARTS:
             continue
@@ -131,6 +145,7 @@ def _check_tags(data: bytes, binary: bool, name: str) -> None:
                     f"{_LARGEST:g}, but is {short(_raw(value).decode('latin-1'))!r}; mend or "
                     "remove the entity, or export the drawing again"
                 )
+    count = sum(counted[kind] for kind in (*_KINDS, *_PARTS))
     if count > _ENTITIES:
         raise InputError(
             f"{name}: must have at most {_ENTITIES} lines, arcs and vertices, but has {count}; "
@@ -140,6 +155,7 @@ def _check_tags(data: bytes, binary: bool, name: str) -> None:
         raise InputError(
             f"{name}: must end with the mark EOF of a whole drawing, but does not; {_AGAIN}"
         )
+    return counted
 
 
 def _raw(value: Any) -> bytes:

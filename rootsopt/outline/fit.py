@@ -67,6 +67,11 @@ def imported(
     Raises `InputError` where there is no rotor of so many lobes in the file, or none that can be
     simulated.
     """
+    if smoothing_mm > _OFF * pitch_radius_mm:
+        raise InputError(
+            "`profile.outline_smoothing_mm` must be the scatter (RMS) of the points in mm, at most "
+            f"{_OFF:g} of the pitch radius, but is {smoothing_mm:g}; lower it"
+        )
     # What overflows or divides by zero all the same is found in the outcome.
     with np.errstate(all="ignore"):
         outline, checks = _imported(loop, lobes, pitch_radius_mm, smoothing_mm)

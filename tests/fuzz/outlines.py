@@ -1,8 +1,9 @@
 """Malformed outline files against the reader, the fit and the roll check.
 
 Good files of this program are damaged: bytes, DXF tags, entities, headers, cells, encodings, and
-the outline itself. A file passes if it gives a profile or one `InputError` of one line, with nothing
-on stderr, in 20 s of processor time and 8 GB of address space. A few go through the command itself.
+the outline itself. A file passes if it gives a profile or one `InputError` of one line, with
+nothing on stderr, in 20 s of processor time and 8 GB of address space. A few go through the command
+itself.
 """
 
 import contextlib
@@ -370,14 +371,16 @@ def fault_of(error: BaseException) -> str | None:
     return None
 
 
-def tried(path: Path, smoothing: float) -> str | None:
+def tried(path: Path, smoothing: float, roll: bool = True) -> str | None:
     """Read, fit and roll the outline in a file, as `rootsopt profile` does; what went wrong."""
     from rootsopt.outline.conjugacy import conjugacy
     from rootsopt.outline.fit import imported
     from rootsopt.outline.reading import read
 
     try:
-        conjugacy(imported(read(path), 3, _R, smoothing)[0])
+        found, _ = imported(read(path), 3, _R, smoothing)
+        if roll:
+            conjugacy(found)
     except Exception as error:
         return fault_of(error)
     return None
