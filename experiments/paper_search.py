@@ -99,14 +99,14 @@ def rotors_of(family: str) -> Rotors:
         exponent=contact_config.exponent,
         damping=contact_config.max_damping_N_s_per_mm * 1e3,
         full_damping_depth=contact_config.full_damping_depth_mm * 1e-3,
-        smoothing=contact_config.smoothing_mm * 1e-3,
+        smoothing=contact_config.rounding_mm * 1e-3,
         clearance=math.nan,
         speed=scene.speed_rpm * 2 * math.pi / 60,
         load_torque=math.nan,
         gear_stiffness=math.nan,
         gear_damping_ratio=math.nan,
         half_backlash=math.nan,
-        gear_rounding=contact_config.smoothing_mm * 1e-3 / radius,
+        gear_rounding=contact_config.rounding_mm * 1e-3 / radius,
     )
     return Rotors(float(geometry(profile).polar_area_moment), table, rotor, idle, unset)
 

@@ -96,7 +96,7 @@ class Model(eqx.Module):
             exponent=jnp.asarray(scale),
             damping=jnp.asarray(contact.max_damping_N_s_per_mm / MM),
             full_damping_depth=jnp.asarray(contact.full_damping_depth_mm * MM),
-            smoothing=jnp.asarray(contact.smoothing_mm * MM),
+            smoothing=jnp.asarray(contact.rounding_mm * MM),
         )
         gear = None
         damping_ratio = 0.0
@@ -106,7 +106,7 @@ class Model(eqx.Module):
                 stiffness=jnp.asarray(scene.timing_gear.stiffness_N_m_per_rad),
                 damping=jnp.asarray(0.0),
                 half_backlash=jnp.asarray(scene.timing_gear.backlash_mm * MM / (2 * radius)),
-                rounding=jnp.asarray(contact.smoothing_mm * MM / radius),
+                rounding=jnp.asarray(contact.rounding_mm * MM / radius),
                 offset=_optional(scene.phase_error_mrad, 1e-3),
             )
         if deepest is None:
@@ -125,7 +125,7 @@ class Model(eqx.Module):
             law=law,
             clearance=jnp.asarray(contact.clearance_mm * MM),
             speed=jnp.asarray(scene.speed_rpm * 2 * math.pi / 60),
-            load_torque=jnp.asarray(_load_torque(config)),
+            load_torque=jnp.asarray(config.load_torque),
             gear=gear,
             gear_damping_ratio=jnp.asarray(damping_ratio),
             deepest=jnp.asarray(deepest),
@@ -300,17 +300,6 @@ def _optional(value: float | None, unit: float = 1.0) -> Float[Array, ""] | None
     return None if value is None else jnp.asarray(value * unit)
 
 
-def _load_torque(config: Config) -> float:
-    """Torque against rotor 2 (N·m); of a gas load about the mean, for the units alone: with an
-    outer radius of 1.4 pitch radii and an area efficiency of 0.45."""
-    load = config.scene.load
-    if load.torque_N_m is not None:
-        return load.torque_N_m
-    assert load.pressure_difference_Pa is not None
-    across = load.pressure_difference_Pa * config.rotor.length_mm * MM
-    return across * (1.4 * config.profile.pitch_radius_mm * MM) ** 2 * 0.45 / 2
-
-
 def _parts(config: Config) -> dict[str, Any]:
     """The parts of a model that a design does not change; what it does is filled in with it."""
     scene, friction = config.scene, config.contact.friction
@@ -349,7 +338,7 @@ def _expected_rotation(config: Config) -> float:
     play = contact.clearance_mm
     if scene.timing_gear is not None:
         play += scene.timing_gear.backlash_mm / 2
-    force = 20 * max(_load_torque(config), 0.01) / (radius * MM)
+    force = 20 * max(config.load_torque, 0.01) / (radius * MM)
     depth = (force / contact.stiffness_N_per_mm_e) ** (1 / contact.exponent)
     return -min((1.3 * play + 1.5 * depth) / radius, math.pi / (8 * config.profile.lobes))
 

@@ -74,14 +74,14 @@ class Scene:
             exponent=contact.exponent,
             damping=contact.max_damping_N_s_per_mm / _MM,
             full_damping_depth=contact.full_damping_depth_mm * _MM,
-            smoothing=contact.smoothing_mm * _MM,
+            smoothing=contact.rounding_mm * _MM,
             clearance=contact.clearance_mm * _MM,
             speed=scene.speed_rpm * 2 * math.pi / 60,
             load_torque=torque,
             gear_stiffness=gear.stiffness_N_m_per_rad if gear else 0.0,
             gear_damping_ratio=gear.damping_ratio if gear else 0.0,
             half_backlash=gear.backlash_mm * _MM / (2 * radius) if gear else 0.0,
-            gear_rounding=contact.smoothing_mm * _MM / radius,
+            gear_rounding=contact.rounding_mm * _MM / radius,
         )
 
 

@@ -16,6 +16,7 @@ from rootsopt.config.scene import (
     length_limits,
 )
 from rootsopt.config.section import Section
+from rootsopt.config.smoothing import following_mm
 from rootsopt.config.study import (
     AttractorsConfig,
     ConstraintsConfig,
@@ -65,6 +66,34 @@ class Config(Section):
             "profile.outline_file": self.profile.outline_file,
         }
         return tuple(key for key, part in parts.items() if part is not None)
+
+    @property
+    def load_torque(self) -> float:
+        """Torque against rotor 2 (N·m); of a gas load about the mean, for units alone: with an
+        outer radius of 1.4 pitch radii and an area efficiency of 0.45."""
+        load = self.scene.load
+        if load.torque_N_m is not None:
+            return load.torque_N_m
+        assert load.pressure_difference_Pa is not None
+        across = load.pressure_difference_Pa * self.rotor.length_mm * 1e-3
+        return across * (1.4 * self.profile.pitch_radius_mm * 1e-3) ** 2 * 0.45 / 2
+
+    @model_validator(mode="after")
+    def _smoothed(self):
+        contact, gear = self.contact, self.scene.timing_gear
+        if contact.smoothing_mm is not None:
+            return self
+        law = contact.stiffness_N_per_mm_e, contact.exponent, contact.full_damping_depth_mm
+        length = following_mm(
+            self.load_torque,
+            self.profile.pitch_radius_mm,
+            None if gear is None else gear.stiffness_N_m_per_rad,
+            law,
+            self.solver.precision,
+        )
+        return self.model_copy(
+            update={"contact": contact.model_copy(update={"smoothing_mm": length})}
+        )
 
     @model_validator(mode="after")
     def _searched(self):

@@ -1,8 +1,8 @@
 """Sections of a config that say what is simulated: profile, rotor, contact, scene."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from rootsopt.config.section import Radius, Section, Speed, Torque, between
 from rootsopt.config.units import hint
@@ -224,6 +224,11 @@ class FrictionConfig(Section):
         return self
 
 
+def _none_for_auto(value: Any) -> Any:
+    """None for the word `auto`."""
+    return None if value == "auto" else value
+
+
 class ContactConfig(Section):
     """The IMPACT contact law."""
 
@@ -238,10 +243,20 @@ class ContactConfig(Section):
     clearance_mm: Annotated[float, between(0, 10)] = Field(
         0.0, description="added to every flank gap"
     )
-    smoothing_mm: Annotated[float, between(0, 1)] = Field(
-        1e-5, description="rounding of the corners of law and gear; 0: as they stand"
+    smoothing_mm: Annotated[
+        Annotated[float, between(0, 1)] | None, BeforeValidator(_none_for_auto)
+    ] = Field(
+        None,
+        description="rounding of the corners of law and gear; 0: as they stand; absent or auto: "
+        "1e-4, or less where the load twists the gear or dents the flanks little",
     )
     friction: FrictionConfig | None = Field(None, description="absent: frictionless flanks")
+
+    @property
+    def rounding_mm(self) -> float:
+        """The smoothing length of a whole config, in which none is left open."""
+        assert self.smoothing_mm is not None
+        return self.smoothing_mm
 
 
 class LoadConfig(Section):
