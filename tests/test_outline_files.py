@@ -228,6 +228,16 @@ def test_damaged_drawings_are_not_read_as_others(tmp_path, capfd):
     assert capfd.readouterr().err == ""
 
 
+def test_what_the_library_says_stays_inside(tmp_path, caplog):
+    """It logs what it repairs; without a handler of the program's that would go to stderr."""
+    whole = text_of(polyline(ROTOR))
+    odd = whole.replace(" 90\n60\n", " 90\n60.0\n")
+    assert odd != whole
+    (tmp_path / "drawing.dxf").write_text(odd)
+    assert read(tmp_path / "drawing.dxf").points == pytest.approx(ROTOR)
+    assert not caplog.records
+
+
 @pytest.mark.parametrize(
     ("code", "length"),
     [(1, 25.4), (2, 304.8), (8, 2.54e-5), (9, 0.0254), (14, 100.0), (21, 304.8006)],
