@@ -672,6 +672,17 @@ def test_involute_past_its_longest_is_refused():
     assert "9.2" in message
 
 
+def test_tip_arc_without_radius_is_refused():
+    """Near 90° an involute only 1.8 % past its longest leaves no tip arc."""
+    message = geometry_refusal(
+        "profile.pressure_angle_deg=89.78",
+        "profile.tip_arc_angle_deg=0.475",
+        "profile.involute_length_mm=17.3",
+    )
+    assert "`profile.involute_length_mm` must be less than 17" in message
+    assert "no radius" in message
+
+
 def test_undercut_is_refused():
     """α below the canonical 27.64° with nearly the longest involute undercuts the root."""
     message = geometry_refusal(

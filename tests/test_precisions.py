@@ -39,7 +39,7 @@ def pair_of(config):
 
 
 STATES = np.array([[-1.02, 0.0], [-1.05, 0.3], [0.5, 0.1], [-1.1, -0.2]])
-TIMES = np.array([0.1, 1.4, 2.2, 250.7])
+TIMES = np.array([0.7, 1.6, 2.2, 250.7])
 
 
 def series_of(precision, contact):
@@ -52,7 +52,7 @@ def test_series_of_every_contact(contact):
     """Times are double whatever the states are, and late times lose nothing in single precision."""
     single, double = (series_of(precision, contact) for precision in reversed(PRECISIONS))
     assert all(getattr(single, f.name).dtype == np.float64 for f in dataclasses.fields(single))
-    assert np.sum(double.force > 0) == 3
+    assert np.all(double.force > 0)
     # The gap is known to some 3 nm where it is searched for, of a depth of micrometres.
     np.testing.assert_allclose(single.force, double.force, rtol=0.01)
     np.testing.assert_allclose(single.rotation, double.rotation, rtol=1e-12)
