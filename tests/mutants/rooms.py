@@ -34,7 +34,7 @@ _OF = {
     "dynamics/parts/load": "load scene dynamics",
     "dynamics/parts/supports": "scene",
     "optimize/bounds": "closed_forms families optimize freeform",
-    "optimize/noise": "ensemble",
+    "optimize/noise": "closed_forms noise ensemble",
     "optimize/problem": "closed_forms optimize speeds families freeform",
     "optimize/search": "closed_forms optimize speeds",
     "profiles/arc_families": "families conjugacy",

@@ -1,0 +1,117 @@
+"""What a search makes of noise: candidates, and a verification by ensembles of other motions."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rootsopt.config import DESIGN_KEYS, load
+from rootsopt.ensemble import ERRORS, SIGNIFICANT, EnsembleEvaluator
+from rootsopt.evaluate import RESPONSES, Evaluation, Evaluator
+from rootsopt.optimize import noise
+from rootsopt.optimize.problem import Problem
+from rootsopt.optimize.search import Trial
+from rootsopt.status import Status
+
+INSIDE = (30.0, 4.0, 3.0)
+
+
+def made_up(objective, error=0.02, design=(30.0, 4.0, 3.0)):
+    """An evaluation whose forces are `objective` of the baseline's, with a standard error."""
+    return Evaluation(
+        design=dict(zip(DESIGN_KEYS, map(float, design), strict=True)),
+        geometry={"area_efficiency": 0.43},
+        response={name: 100.0 * objective for name in RESPONSES},
+        gradient={},
+        steady_state={key: 100.0 * error for key in ERRORS.values()},
+        status=Status.AVERAGED,
+        message="",
+        statistics={},
+        series=None,
+    )
+
+
+def trial(point, objective, error=0.02):
+    return Trial(np.asarray(point), 0, 0, made_up(objective, error), objective, True)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    settings = load("configs/cic.yaml", ["objective.motion=ensemble"])
+    return Problem.of(settings, Evaluator(settings).model, made_up(1.0))
+
+
+def test_a_lucky_trial_is_no_candidate_on_its_own(problem):
+    """One trial far below its near neighbours ranks behind a place where all are good; what
+    is repeated counts once."""
+    good = [trial([0.2, 0.2, 0.2 + 0.01 * k], 0.7) for k in range(4)]
+    lucky = [trial([0.8, 0.8, 0.8 + 0.01 * k], 0.9 if k else 0.5) for k in range(3)]
+    found = noise.candidates(problem, [*lucky, lucky[0], lucky[0], *good])
+    assert found[0][0] == pytest.approx(0.7)
+    np.testing.assert_allclose(found[0][1][:2], 0.2)
+    assert found[1][0] == pytest.approx((0.5 + 0.9 + 0.9) / 3)
+    assert noise.candidates(problem, [trial([0.5, 0.5, 0.5], 1.2)]) == []
+
+
+class Judge(EnsembleEvaluator):
+    """An evaluator that knows the truth about every design: 1 for the baseline's."""
+
+    def __init__(self, truth, error, config):
+        self.truth, self.error, self.config, self.asked = truth, error, config, []
+
+    def independent(self, number):
+        self.asked.append(number)
+        return self
+
+    def __call__(self, design=None, start=None, series=True):
+        base = np.allclose(np.asarray(design), INSIDE)
+        return made_up(1.0 if base else self.truth, self.error, np.asarray(design))
+
+
+@pytest.mark.parametrize(("truth", "accepted"), [(0.9, True), (0.93, False), (1.1, False)])
+def test_only_a_significant_difference_holds_up(problem, truth, accepted):
+    """0.9 is beyond three combined standard errors of 0.02·√(1 + 1), 0.93 is not; whatever the
+    search promised."""
+    judge = Judge(truth, 0.02, problem.config)
+    verdict = noise.verify(problem, judge, [trial([0.5, 0.5, 0.5], 0.4)])
+    assert judge.asked == [1, 2]
+    assert (verdict.optimized is not None) == accepted
+    record = verdict.record
+    assert record["holds_up"] == accepted
+    assert record["verified_objective"] == pytest.approx(truth)
+    assert record["combined_standard_error"] == pytest.approx(0.02 * np.sqrt(2))
+    text = noise.message(record)
+    assert "within the noise" in text
+    assert "ensemble.members" in text
+    assert f"{SIGNIFICANT:g}" in text
+    assert noise.message({"holds_up": False, "rejected": []}) == ""
+
+
+def test_nothing_promised(problem):
+    """No trial below the baseline: no verdict, and a message that says what to raise."""
+    judge = Judge(1.0, 0.02, problem.config)
+    verdict = noise.verify(problem, judge, [trial([0.5, 0.5, 0.5], 1.4)])
+    assert verdict.optimized is None
+    assert "ensemble.members" in noise.message(verdict.record)
+
+
+class Particular(Judge):
+    """A judge for whom designs with a first angle above 35 degrees have no average."""
+
+    def __call__(self, design=None, start=None, series=True):
+        found = super().__call__(design, start, series)
+        lost = {"response": {}, "status": Status.PASSED_THROUGH}
+        return dataclasses.replace(found, **lost) if float(design[0]) > 35 else found
+
+
+def test_a_candidate_without_an_average_is_passed_over(problem):
+    """The next one is judged, though the first promised more; if there is no other, none."""
+    judge = Particular(0.8, 0.02, problem.config)
+    lost, good = trial([0.9, 0.5, 0.5], 0.3), trial([0.1, 0.5, 0.5], 0.7)
+    verdict = noise.verify(problem, judge, [lost, good])
+    assert verdict.optimized is not None
+    assert verdict.record["searched_objective"] == 0.7
+    assert len(verdict.record["candidates"]) == 2
+    alone = noise.verify(problem, judge, [lost])
+    assert alone.optimized is None
+    assert not alone.record["holds_up"]
