@@ -5,50 +5,62 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.smoothing import DEFAULT, LIMIT, SHAKY
+from experiments.smoothing import LIMIT, SHAKY
 from rootsopt.config import load
-from rootsopt.config.scene import ContactConfig
 from rootsopt.evaluate import Evaluator
 from rootsopt.status import Status
 
 FORCES = ("mean_force_N", "peak_force_N", "rms_force_N")
+STIFF = (
+    "scene.speed_rpm=2965",
+    "scene.load.torque_N_m=2.09",
+    "scene.timing_gear.stiffness_N_m_per_rad=4.2e5",
+    "scene.timing_gear.damping_ratio=0.38",
+    "scene.timing_gear.backlash_mm=0.07",
+)
 SCENES = {
     "shipped": ("cic", ()),
     "period two": ("cic", SHAKY),
     "the paper's": ("paper_cic", ()),
-    "stiff gear, little load": (
-        "cic",
-        (
-            "scene.speed_rpm=1313",
-            "scene.load.torque_N_m=1.05",
-            "scene.timing_gear.stiffness_N_m_per_rad=7.6e5",
-            "scene.timing_gear.damping_ratio=0.11",
-            "scene.timing_gear.backlash_mm=0.077",
-        ),
-    ),
+    "stiff gear, little load": ("cic", STIFF),
 }
-SHARPER = 3e-7
-"""Smoothing length (mm) of the reference: the bias falls faster than in proportion."""
 
 
 def forces(name, *changes):
     path, own = SCENES[name]
-    found = Evaluator(load(f"configs/{path}.yaml", [*own, *changes]))(series=False)
+    config = load(f"configs/{path}.yaml", [*own, *changes])
+    found = Evaluator(config)(series=False)
     assert found.status is Status.PERIODIC
-    return np.array([found.response[key] for key in FORCES])
+    return np.array([found.response[key] for key in FORCES]), config.contact.rounding_mm
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_default_smoothing_does_not_change_the_forces(name):
-    """Mean, peak and RMS force by less than 1e-4 (experiments/smoothing.py looks at many more
-    scenes). A rounding that lacks damping changes those of the period-two orbit by 4e-4."""
-    sharp = forces(name, f"contact.smoothing_mm={SHARPER}")
-    np.testing.assert_allclose(forces(name), sharp, rtol=LIMIT)
+    """Mean, peak and RMS force by less than 1e-4; experiments/smoothing.py has many more scenes.
+    Half the length takes away at least half of a bias that falls in proportion or faster."""
+    default, length = forces(name)
+    half, _ = forces(name, f"contact.smoothing_mm={length / 2!r}")
+    np.testing.assert_allclose(half, default, rtol=LIMIT / 2)
 
 
-def test_shipped_configs_have_the_default():
-    """The length that was measured is the one that is used."""
-    assert ContactConfig.model_fields["smoothing_mm"].default == DEFAULT
+def length_of(*changes):
+    return load("configs/cic.yaml", changes).contact.rounding_mm
+
+
+def test_smoothing_length_follows_the_scene():
+    """1e-4 mm in all shipped scenes; less where the load twists the gear little, or dents the
+    flanks little; what is given stands, and the resolved config has the number."""
     shipped = sorted(Path("configs").glob("*.yaml"))
     assert len(shipped) >= 6
-    assert {load(path).contact.smoothing_mm for path in shipped} == {DEFAULT}
+    assert {load(path).contact.rounding_mm for path in shipped} == {1e-4}
+    twist = 2.09 / 4.2e5 * 33
+    assert length_of(*STIFF) == pytest.approx(0.05 * twist, rel=0.05)
+    stiff = "contact.stiffness_N_per_mm_e=1e7"
+    depth = (4.775 / 0.033 / 1e7) ** (1 / 2.2)
+    assert length_of(stiff) == pytest.approx(min(1e-4, 0.02 * depth), rel=0.05)
+    assert length_of("contact.full_damping_depth_mm=2e-4") == pytest.approx(2e-5)
+    assert length_of("scene.load.torque_N_m=0") == pytest.approx(1e-6)
+    assert length_of("scene.load.torque_N_m=0", "solver.precision=float32") == pytest.approx(1e-5)
+    for given, found in (("auto", 1e-4), ("3e-5", 3e-5), ("0", 0.0)):
+        assert length_of(f"contact.smoothing_mm={given}") == found
+    assert f"smoothing_mm: {length_of(*STIFF)!r}" in load("configs/cic.yaml", STIFF).to_yaml()
