@@ -41,6 +41,8 @@ from rootsopt.families import MM
 from rootsopt.profiles import Geometry, Outline, Profile, geometry, outline
 from rootsopt.programs import Program
 
+_ORBIT_STEPS = 4
+"""Steps allowed for a whole orbit, in units of those for a mesh period."""
 _ROLLS, _RELATIVES = 384, 16
 """Map of a model nobody has sized."""
 
@@ -364,11 +366,14 @@ _profile = Program(Model.profile)
 
 
 def integrators(config: Config) -> tuple[Integrator, Integrator]:
-    """(transient, orbit) integrators of a config."""
+    """(transient, orbit) integrators of a config.
+
+    An orbit has several mesh periods, and many short steps about its kinks."""
     solver = config.solver
+    steps = solver.max_steps_per_period
     return (
-        Integrator(solver.method, jnp.asarray(solver.transient_rtol), solver.max_steps_per_period),
-        Integrator(solver.method, jnp.asarray(solver.rtol), solver.max_steps_per_period),
+        Integrator(solver.method, jnp.asarray(solver.transient_rtol), steps),
+        Integrator(solver.method, jnp.asarray(solver.rtol), _ORBIT_STEPS * steps),
     )
 
 
