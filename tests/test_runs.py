@@ -114,6 +114,22 @@ def test_places_that_no_folder_can_take(tmp_path, monkeypatch, where):
     assert digest(tmp_path) == before
 
 
+def test_the_current_folder_is_refused_even_if_empty(tmp_path, monkeypatch):
+    """Another one would take its place, and whoever stands in it would stand nowhere."""
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    for where in (".", str(here), "../here"):
+        with pytest.raises(InputError, match="current folder"):
+            RunFolder(where, "simulate")
+    monkeypatch.chdir(tmp_path)
+    write_run(here, "old")
+    monkeypatch.chdir(here / "figures")
+    with pytest.raises(InputError, match="current folder"):
+        RunFolder("..", "simulate", overwrite=True)
+    assert digest(here) == digest_of("old")
+
+
 def test_mount_points_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "_mount_points", lambda: {os.path.realpath(tmp_path / "mounted")})
     (tmp_path / "mounted").mkdir()
@@ -140,6 +156,25 @@ def test_a_second_process_is_kept_out(tmp_path):
         assert len(list(tmp_path.iterdir())) == 3  # two of the run that goes on
     assert os.listdir(tmp_path) == ["other"]
     write_run(target, "free again")
+
+
+def test_a_lock_on_a_file_that_is_gone_is_none(tmp_path, monkeypatch):
+    """Between opening and locking it, the last holder removes the file."""
+    real, calls = lock.fcntl.flock, []
+
+    def late(*arguments):
+        calls.append(arguments)
+        if len(calls) == 1:
+            os.unlink(tmp_path / "lock")
+        return real(*arguments)
+
+    monkeypatch.setattr(lock.fcntl, "flock", late)
+    held = lock.Lock(tmp_path / "lock")
+    assert len(calls) == 2
+    with pytest.raises(lock.TakenError):
+        lock.Lock(tmp_path / "lock")
+    held.release()
+    assert os.listdir(tmp_path) == []
 
 
 def test_a_dead_process_keeps_nobody_out(tmp_path):

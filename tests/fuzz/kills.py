@@ -28,7 +28,7 @@ COMMANDS = {
     "profile": ["--export", "dxf,svg"],
     "simulate": ["--no-figures", "--set", "solver.fidelity=linear"],
 }
-_WHOLE = 20
+_WHOLE = 60
 """One case of so many is a whole command."""
 
 
@@ -116,13 +116,13 @@ def _replayed(report: Report, chance: random.Random, place: Path, known: list[Re
                 new.write(folder, overwrite)
         finally:
             os._exit(0)
+    os.close(writing)
     os.read(reading, 1)
     share = chance.uniform(0.0, 1.2)
     time.sleep(share * span)
     os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
     os.close(reading)
-    os.close(writing)
     now = digest(folder)
     wrong = []
     missing = now is None and not exchanges  # between two renames; the next run finishes it
