@@ -13,6 +13,7 @@ from test_config import MINIMAL
 
 from rootsopt.config import load, parse
 from rootsopt.config.document import MOST_BYTES, read_document
+from rootsopt.config.words import named, sentence, shown
 from rootsopt.errors import InputError
 from tests.fuzz import configs
 from tests.fuzz.report import Report
@@ -172,6 +173,13 @@ def test_odd_override_is_refused_in_one_line(override):
     refusal(MINIMAL, override)
 
 
+@pytest.mark.parametrize("written", ['"\\uD800"', '"x \\uDFFF"', '{"\\uDBFF": 1}'])
+def test_half_a_character_is_refused(written):
+    """No file could hold what is read from it."""
+    with pytest.raises(InputError, match="half of a character"):
+        read_document(written, "text")
+
+
 def test_merge_keys_work():
     """`<<` takes one section or a list of them; own keys come first, then those merged first."""
     text = MINIMAL.replace("rotor:\n", "rotor:\n  <<: [*one, *two]\n").replace(
@@ -308,6 +316,22 @@ def test_long_path_is_shown_by_its_end(tmp_path):
         load(folder / "scene.yaml")
     assert "scene.yaml" in str(caught.value)
     assert len(str(caught.value)) < LONGEST
+
+
+# Words
+
+
+def test_words_are_bounded():
+    """Values, keys, paths and messages are each cut, however large they are, and on one line."""
+    endless = [["x" * 10_000] * 1000] * 1000
+    for value in (endless, {k: endless for k in range(1000)}, "x" * 10**6, 10**3999, "a\nb"):
+        assert len(shown(value)) <= 160
+        assert shown(value).isprintable()
+    assert shown([1, 2.5, "a", None]) == "[1, 2.5, 'a', None]"
+    assert len(named("k" * 1000)) <= 60
+    assert named("a\x1bb") == "a\\x1bb"
+    assert len(sentence("word " * 1000)) <= LONGEST
+    assert sentence("one\n two") == "one two"
 
 
 # Commands and random configs
