@@ -345,15 +345,16 @@ def main() -> int:
     widths, compared, differentiated = WIDTHS, COMPARED, 20
     if options.quick:
         counts, widths, compared, differentiated = {"cic": 5}, (1e-6, 1e-4, DEFAULT), (DEFAULT,), 2
-    found = [
-        measure(kind, count, options.seed, widths, compared, differentiated)
-        for kind, count in counts.items()
-    ]
-    rows = [row for measured in found for row in rows_of(measured)]
-    folder.write_csv("smoothing.csv", files.row_columns(rows))
-    record = {measured.kind: summary(measured) for measured in found}
-    folder.write_json("smoothing.json", record | {"versions": files.versions()})
-    folder.write_figure("smoothing.png", draw_figure(found))
+    found: list[Measured] = []
+    record: dict[str, Any] = {}
+    for kind, count in counts.items():
+        found.append(measure(kind, count, options.seed, widths, compared, differentiated))
+        # Written after every kind: the last one compiles for long.
+        rows = [row for measured in found for row in rows_of(measured)]
+        folder.write_csv("smoothing.csv", files.row_columns(rows))
+        record[kind] = summary(found[-1])
+        folder.write_json("smoothing.json", record | {"versions": files.versions()})
+        folder.write_figure("smoothing.png", draw_figure(found))
     for kind, part in record.items():
         print(f"{kind}: {part['settled']} of {part['scenes']} scenes settle")
         for width, row in part["by_width"].items():
