@@ -31,6 +31,7 @@ from rootsopt.config import FAMILY_KEYS  # noqa: E402
 from rootsopt.families import BY_LIMITS, DEG, INHERENT, MM, profile_of  # noqa: E402
 from rootsopt.optimize.bounds import around  # noqa: E402
 from rootsopt.profiles import Curve, FreeForm, geometry  # noqa: E402
+from rootsopt.profiles.cic import CIC  # noqa: E402
 from rootsopt.profiles.validity import PURE, margins  # noqa: E402
 
 RADIUS_MM = 33.0
@@ -147,6 +148,7 @@ def _sound(family: str, lobes: int, design):
         shortest = edge * (half - tip - 2 * alpha) + 1e-6 * RADIUS_MM
         uncut = edge * jnp.tan(alpha) * (1 + 1e-9)
         good = (length <= longest) & (length >= shortest) & (length <= uncut) & (length > 0)
+        assert isinstance(profile, CIC)
         return good & (profile.arc_radius > 0) & (profile.arc_center_radius > 0)
     good = jnp.ones((), bool)
     for name, value in margins(profile)._asdict().items():
