@@ -688,3 +688,29 @@ def test_no_root_is_lost_on_a_node():
     contact = table(design)
     assert np.all(np.asarray(contact.found)[flank])
     assert np.max(np.asarray(contact.gap)[flank][:, relative <= 0]) < 1e-12
+
+
+@pytest.mark.parametrize(("lobes", "tip"), [(2, 0.5), (2, 3.28), (3, 4.0)])
+def test_contact_beside_a_land_is_not_lost_between_nodes(lobes, tip):
+    """Where the contact begins, the stretch of the flank on which it can be is far shorter than the
+    distance of the nodes; on a dense grid of normals it is seen. Lost, the contact began at a depth
+    of 1 µm, and the gradient of the mean force was 3e-3 off."""
+    profile = cic(lobes, 0.67, 0.5, tip * DEG)
+    pair = FlankPair.of(profile)
+    low, high = float(profile.segments()[0].stop), float(pair.nodes.normal[-1])
+    beyond = np.concatenate([[0.0], np.geomspace(1e-5, 0.2, 4000), [0.3, 0.5, 1.0]])
+    normals = low + (high - low) * beyond
+
+    def dense(pose):
+        folded, _ = pair.folded(pose[0])
+        offset, gap = jax.vmap(lambda normal: pair._mesh(normal, folded, pose[1])[:2])(normals)
+        falls = (offset[:-1] >= 0) & (offset[1:] < 0)
+        return pair(*pose), jnp.min(jnp.where(falls, gap[:-1], jnp.inf))
+
+    rolls, relatives = np.linspace(-0.08, 0.03, 45), np.array([-4e-3, -1e-3, -1e-4])
+    poses = np.array([(low + roll, relative) for relative in relatives for roll in rolls])
+    found, least = jax.jit(lambda poses: jax.lax.map(dense, poses))(poses)
+    seen = np.abs(least) < 1e-5
+    assert 10 < np.sum(seen) < len(poses)
+    assert np.asarray(found.found)[seen].all()
+    assert np.asarray(found.gap)[seen] == pytest.approx(np.asarray(least)[seen], abs=1e-9)

@@ -58,6 +58,8 @@ _NEAR_CUSP = 1e-3
 _DEEPEST = 0.1
 # Rounding of T relative to the pitch radius, by bytes of a number.
 _SLACK = {8: 1e-13, 4: 1e-6}
+# Nodes between the edge of a land and the next node, each at half the distance of the next.
+_CROWD = 12
 
 
 class ClosestApproach(NamedTuple):
@@ -140,7 +142,14 @@ class FlankPair(eqx.Module):
         near = jnp.concatenate([fraction, 1 - crowd, jnp.ones(1), 1 + crowd[::-1]])
         beyond = 1 + jnp.arange(1, 1 + count // 2) / count
         pieces.append(start + (stop - start) * jnp.concatenate([near, beyond]))
-        normal = jnp.concatenate(pieces)
+        tip = frozen.segments()[0]
+        if tip.land:
+            # Beside a land the contact begins on a stretch of the flank that grows from nothing:
+            # its ends are where the point of rotor 1 and that of rotor 2 are at the land's edge.
+            after = frozen.segments()[1]
+            step = (after.stop - after.start) / count
+            pieces.append(tip.stop + step * 0.5 ** jnp.arange(_CROWD, 0, -1))
+        normal = jnp.sort(jnp.concatenate(pieces))
         mate = frozen.mate(normal)
         nodes = FlankNodes(
             normal=normal,
