@@ -25,7 +25,10 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         return _unknown(model, place)
     field = field_of(model, place)
     first = _branch(first, problems, place)
-    key = ".".join(map(named, place + [part for part in rest if isinstance(part, int)]))
+    # Behind a key, pydantic names places of lists, keys of dictionaries, and types.
+    mapping = field is not None and "dict[" in str(field.annotation)
+    within = [part for k, part in enumerate(rest) if isinstance(part, int) or (mapping and k == 0)]
+    key = ".".join(map(named, place + within))
     kind, value, context = first["type"], first.get("input"), first.get("ctx", {})
     if kind == "missing" and not rest:
         note = f" ({field.description})" if field is not None and field.description else ""
@@ -105,7 +108,8 @@ def _allowed(kind: str, value: Any, context: dict, message: str, field: FieldInf
         if name in context:
             return f"{word} {context[name]:g}"
     if kind == "literal_error":
-        ranges = _range(field) if field is not None else ""
+        mapping = field is not None and "dict[" in str(field.annotation)
+        ranges = _range(field) if field is not None and not mapping else ""
         other = f" or a number ({ranges})" if ranges else ""
         return f"one of {context['expected']}{other}"
     return f"valid ({message[0].lower() + message[1:]})"

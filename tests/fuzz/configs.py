@@ -326,7 +326,9 @@ def _structure(draw: random.Random) -> Case:
             elif change == 2:
                 target[key] = _tree(draw)
             elif change == 3 and isinstance(target[key], int | float):
-                target[key] *= draw.choice((0, -1, 1e-3, 1e3, 0.5, 2, 1e300, 57.3, 1 / 57.3))
+                target[key] = min(abs(target[key]), 1e308) * draw.choice(
+                    (0, -1, 1e-3, 1e3, 0.5, 2, 1e300, 57.3, 1 / 57.3)
+                )
             elif change == 4:
                 target[key] = draw.choice(([target[key]], {"a": target[key]}, str(target[key])))
             else:
