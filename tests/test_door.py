@@ -38,12 +38,16 @@ sys.exit(door.through("test", work, own=True))
 """
 
 
+# What is left in a buffer is written at the very end of the process.
+BUFFERED = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
+
+
 def shell(redirection, code, size=10):
     """Exit code and stderr of work that prints, with a shell's redirection."""
     command = f'"$0" -c "$1" {code} {size} {redirection}'
     done = subprocess.run(
         ["bash", "-c", f"{command}; exit ${{PIPESTATUS[0]}}", sys.executable, WORK],
-        cwd=ROOT, capture_output=True, text=True, check=False,
+        cwd=ROOT, capture_output=True, text=True, check=False, env=BUFFERED,
     )  # fmt: skip
     return done.returncode, done.stderr
 
@@ -79,7 +83,7 @@ def test_help_into_a_closed_pipe(arguments, code):
     os.close(reading)
     done = subprocess.run(
         [sys.executable, "-m", "rootsopt", *arguments],
-        cwd=ROOT, stdout=writing, stderr=subprocess.PIPE, text=True, check=False,
+        cwd=ROOT, stdout=writing, stderr=subprocess.PIPE, text=True, check=False, env=BUFFERED,
     )  # fmt: skip
     os.close(writing)
     assert (done.returncode, done.stderr) == (code, "")
@@ -166,9 +170,10 @@ def test_a_second_signal_stops_a_patient_run(tmp_path):
 def test_signals_that_are_ignored_stay_so():
     """As those of a job in the background of a script."""
     code = (
-        "import os, signal, sys; from rootsopt import door;"
+        "import os, signal, sys, time; from rootsopt import door;"
         "signal.signal(signal.SIGINT, signal.SIG_IGN);"
-        "sys.exit(door.through('test', lambda: os.kill(os.getpid(), signal.SIGINT) or 0, own=True))"
+        "kill = lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(1));"
+        "sys.exit(door.through('test', lambda: kill() and 0, own=True))"
     )
     process = python(code)
     assert process.communicate() == ("", "")

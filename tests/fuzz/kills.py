@@ -138,9 +138,9 @@ def _replayed(report: Report, chance: random.Random, place: Path, known: list[Re
     killed = os.waitstatus_to_exitcode(status) == -signal.SIGKILL
     kind = f"{new.command} over {older.command}" + (", --overwrite" if overwrite else "")
     kind += "" if exchanges else ", no exchange"
-    kind += "" if killed else ", too late"
-    text = f"at {share:.3f} of {span:.3f} s: {'; '.join(wrong)}"
-    report.add(kind, text if wrong else None)
+    if killed or wrong:  # else the run was over
+        text = f"at {share:.3f} of {span:.3f} s: {'; '.join(wrong)}"
+        report.add(kind, text if wrong else None)
 
 
 def _afterwards(place: Path, whole: set[str | None]) -> list[str]:
@@ -172,8 +172,9 @@ def _whole(report: Report, chance: random.Random, place: Path, seconds: float) -
     wrong += [f"the next run leaves {name}" for name in os.listdir(place) if name.startswith(".")]
     if not all(_consistent(path) for path in place.iterdir()):
         wrong.append("a folder is no whole run")
-    kind = f"whole {command}" + ("" if process.returncode < 0 else ", too late")
-    report.add(kind, f"at {share:.3f} of {seconds:.1f} s: {'; '.join(wrong)}" if wrong else None)
+    if process.returncode < 0 or wrong:
+        text = f"at {share:.3f} of {seconds:.1f} s: {'; '.join(wrong)}"
+        report.add(f"whole {command}", text if wrong else None)
 
 
 def _consistent(folder: Path) -> bool:
