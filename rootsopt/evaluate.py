@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config
 from rootsopt.contact.size import size_map
-from rootsopt.dynamics.flow import IMPLICIT, Flow, Integrator
+from rootsopt.dynamics.flow import Flow, Integrator
 from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import (
@@ -40,10 +40,6 @@ RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 _NEARLY = 0.05
 _CLOSEST = 1e-12
 """Scaled difference below which states repeat exactly: a closer look would show no more."""
-_SINGLE = (
-    " In single precision the iterations of an implicit method rarely converge: set "
-    "solver.precision to float64, or solver.method to tsit5."
-)
 CHAOS_WINDOW = 128
 _THINNING = 6
 
@@ -395,8 +391,6 @@ class Evaluator:
         elif status is Status.SOLVER_FAILED and pair.pace is not None:
             swings = pair.mesh_period / (2 * np.pi * pair.pace.swing)
             statistics["swings_per_mesh_period"] = float(swings)
-            if self.model.precision == "float32" and self.orbit.method in IMPLICIT:
-                hint = _SINGLE
         if status is not Status.PERIODIC:
             gradient = {}
         statistics["seconds"] = seconds

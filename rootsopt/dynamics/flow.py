@@ -29,6 +29,11 @@ METHODS: dict[str, Callable[..., diffrax.AbstractSolver]] = {
 IMPLICIT = ("kvaerno3", "kvaerno5")
 
 
+_STAGES = 1e5
+"""Roundings to which the stages of an implicit method are known: the gap is the difference of
+lengths ten thousand times a penetration, and the force a power of it. Iterations that are asked for
+less never end, and a repeated step cannot be made shorter. (Each is a whole step of Newton's
+method, so that the last one gains more than was asked for.)"""
 _FIRST_STEP = 1e-3, 0.05
 """First step: in mesh periods, and in units of the pair's quickest swing; the shorter counts. Too
 large a one is rejected by the error control."""
@@ -65,7 +70,8 @@ class Integrator(eqx.Module):
         method = METHODS[self.method]
         if self.method not in IMPLICIT:
             return method(scan_kind=loops)
-        rtol: Any = self.tolerance(dtype)
+        least = _STAGES * float(jnp.finfo(dtype).eps)
+        rtol: Any = jnp.maximum(self.tolerance(dtype), least).astype(dtype)
         # With a Jacobian for every iteration: one kept from the step's begin does not converge
         # across a kink, and a repeated step cannot be made shorter.
         return method(scan_kind=loops, root_finder=optimistix.Newton(rtol=rtol, atol=rtol))
