@@ -19,7 +19,7 @@ a loop that does not repeat its first point counts as closed."""
 _BYTES = 50_000_000
 """Size of a file (bytes) above which it is refused unread."""
 _POINTS = 500_000
-"""Number of points above which an outline is refused: reading and fitting take 20 µs for each."""
+"""Number of points above which an outline is refused: each takes some 20 µs to read and fit."""
 _SIZES = 0.1, 1e5
 """Sizes of an outline (mm) below and above which its units must be wrong."""
 _SAME = 1e-9
