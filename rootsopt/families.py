@@ -238,6 +238,7 @@ def _check_edge(config: ProfileConfig) -> None:
         raise InputError(
             f"`profile.edge_radius_mm` must be at least {least:g} ({_SHARPEST:g} pitch radii), but "
             f"is {edge:g}: a sharp edge has no contact law; round it"
+            + hint("edge_radius_mm", edge, 0.01 * config.pitch_radius_mm, config.pitch_radius_mm)
         )
 
 

@@ -39,6 +39,8 @@ _LONGEST = 5e4
 _Length = Annotated[float, between(1e-3, _LONGEST)]
 _SHARES = 0.002, 10.0
 """Least and greatest length of a profile, in pitch radii."""
+_USUAL = 0.01, 2.0
+"""The same for lengths of usual size."""
 _Share = Annotated[float, between(-1, 1)]
 
 
@@ -131,7 +133,7 @@ class ProfileConfig(Section):
             share = _SHARES[0] if value < low else _SHARES[1]
             raise ValueError(
                 f"`profile.{key}` must be {word} ({share:g} pitch radii), but is {value:g}"
-                + hint(key, value, low, high)
+                + hint(key, value, *(share * self.pitch_radius_mm for share in _USUAL))
             )
         return self
 
@@ -172,7 +174,7 @@ def length_limits(key: str, pitch_radius_mm: float) -> tuple[float, float] | Non
     """Least and greatest value of a length of a profile that goes with the pitch radius."""
     if key not in _SIZED:
         return None
-    least = 0.0 if key == "ellipse_center_mm" else _SHARES[0] * pitch_radius_mm
+    least = 0.0 if key in _MAY_BE_SMALL else _SHARES[0] * pitch_radius_mm
     return least, _SHARES[1] * pitch_radius_mm
 
 
@@ -186,6 +188,8 @@ _SIZED = (
     "ellipse_height_mm",
 )
 """Lengths of a profile that go with the pitch radius."""
+_MAY_BE_SMALL = "ellipse_center_mm", "edge_radius_mm"
+"""Those without a floor here; that of an edge is the family's own."""
 
 
 class RotorConfig(Section):
