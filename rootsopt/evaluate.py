@@ -270,10 +270,11 @@ class Evaluator:
             transient, orbit, found, status = self._close(pair, tangents, transient, tolerance)
             steps += int(orbit.flow.steps)
             late = used >= self.max_periods or tolerance < _CLOSEST
-            if status is not Status.NOT_SETTLED or late:
+            if status not in (Status.NOT_SETTLED, Status.INACCURATE) or late:
                 break
-            # Newton left the neighbourhood or found an unstable orbit: it was not the
-            # steady state yet, or too coarse an image of it. Go on, and look more closely.
+            # Newton left the neighbourhood or found an unstable orbit, or one whose derivatives
+            # are not known: it was not the steady state yet, or too coarse an image of it. Go on,
+            # and look more closely.
             tolerance /= 10
             how = dataclasses.replace(how, rtol=jnp.maximum(how.rtol / 10, self.orbit.rtol))
         return _Outcome(pair, shape, transient, orbit, found, status, used, steps)
@@ -329,6 +330,8 @@ class Evaluator:
         else:
             slopes = np.all(np.isfinite(orbit.sensitivity))
             status = Status.PERIODIC if slopes else Status.NON_FINITE
+            if slopes and not found.certain:
+                status = Status.INACCURATE
         return found, status
 
     def _scales(self, pair: RotorPair):
@@ -352,7 +355,7 @@ class Evaluator:
             statistics |= {"map_rolls": rolls, "map_relatives": relatives}
             if self.sized:
                 statistics["map_error"] = self.map_error
-        if status is Status.PERIODIC and orbit is not None:
+        if status in (Status.PERIODIC, Status.INACCURATE) and orbit is not None:
             period = int(outcome.transient.period)
             response, gradient = self._response(design, orbit, period)
             steady = {"kind": "periodic"} | _closed(orbit, period)
@@ -371,8 +374,6 @@ class Evaluator:
                 status = Status.TOO_DEEP
             elif found.rounding > UNRESOLVED or not found.consistent:
                 status = Status.UNRESOLVED
-            elif not found.certain:
-                status = Status.INACCURATE
         elif status is Status.IDLE and orbit is not None:
             steady, hint = {"kind": "idle"}, idle_hint(self.config, float(orbit.flow.depth))
             rows = np.zeros((len(orbit.response), 1))
