@@ -432,7 +432,7 @@ SCENES = {
     ),
     "tripled": config_of(*gear(backlash=0.1, damping=0.05, load=2.0, speed=6000)),
     "noisy": config_of(*gear(backlash=0.1, damping=0.05, load=4.775, speed=6000)),
-    "chaotic": config_of(*gear(backlash=0.2, damping=0.0, load=1.0)),
+    "chaotic": config_of(*gear(backlash=0.1, damping=0.0, load=4.775, speed=6000)),
     "impatient": config_of(
         *gear(backlash=0.2, damping=0.05, load=2.0, speed=4000), "solver.max_mesh_periods=16"
     ),
