@@ -19,6 +19,7 @@ OK, BAD_INPUT, NO_RESULT = 0, 2, 3
 _NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 _GONE = (errno.EPIPE, errno.EBADF, errno.ESHUTDOWN)
 """Nobody reads a stream that fails so, and that is no error of ours."""
+_WAITING = "rootsopt signals"
 _SHOW_CURSOR = "\x1b[?25h"
 
 
@@ -53,7 +54,8 @@ class Signals:
         reading, writing = self._pipe = os.pipe()
         os.set_blocking(writing, False)
         self._wakeup = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
-        threading.Thread(target=self._wait, args=(reading,), daemon=True).start()
+        waiting = threading.Thread(target=self._wait, args=(reading,), name=_WAITING, daemon=True)
+        waiting.start()
         for number in self._before:
             signal.signal(number, _nothing)
 
@@ -250,8 +252,17 @@ def _code(command: str, code: int, out: _Stream) -> int:
 
 
 def leave(code: int) -> None:
-    """End the process; a signal on the way out changes nothing."""
+    """End the process; a signal on the way out changes nothing.
+
+    Threads that still compile what nobody waits for any more are not waited for either, and Python
+    is not taken down around them: that can abort the process, with another exit code."""
     for number in _NAMES:
         with contextlib.suppress(ValueError, OSError):
             signal.signal(number, lambda *_: os._exit(code))
+    names = {one.name for one in threading.enumerate()}
+    if names - {threading.main_thread().name, _WAITING}:
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(AttributeError, OSError, ValueError):
+                stream.flush()
+        os._exit(code)
     sys.exit(code)

@@ -89,6 +89,21 @@ def test_help_into_a_closed_pipe(arguments, code):
     assert (done.returncode, done.stderr) == (code, "")
 
 
+@pytest.mark.parametrize("daemon", [True, False])
+def test_threads_that_go_on_do_not_keep_the_process(daemon):
+    """Nor are they waited for, as a compilation that nobody needs any more."""
+    code = (
+        "import threading, time; from rootsopt import door;"
+        f"go = lambda: threading.Thread(target=time.sleep, args=(60,), daemon={daemon}).start();"
+        "door.leave(door.through('test', lambda: go() or print('said') or 3, own=True))"
+    )
+    began = time.monotonic()
+    process = python(code, env=BUFFERED)
+    assert process.communicate() == ("said\n", "")
+    assert process.returncode == 3
+    assert time.monotonic() - began < 30
+
+
 def test_letters_that_the_terminal_lacks():
     code = (
         "import sys; from rootsopt import door;"

@@ -224,7 +224,8 @@ def test_a_stopped_search_keeps_the_best_so_far():
     assert result.interrupted
     assert result.status is Status.INTERRUPTED
     assert not result.status.usable
-    assert 8 <= len(result.history) <= 8 + os.cpu_count()
+    time.sleep(2)  # Nor does anything go on in the background.
+    assert 8 <= len(result.history) <= len(search._trials) <= 8 + os.cpu_count()
     assert result.verification["holds_up"]
     assert result.optimized.series is not None
     best = min(row["objective"] for row in result.history if row["feasible"])
