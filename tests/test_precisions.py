@@ -40,7 +40,7 @@ def pair_of(config):
 
 STATES = np.array([[-1.02, 0.0], [-1.05, 0.3], [0.5, 0.1], [-1.1, -0.2], [-1.1, -0.2]])
 # The last two are one instant of a turn of three lobes.
-TIMES = np.array([0.7, 1.6, 2.2, 1.7, 30_001.7])
+TIMES = np.array([0.7, 1.6, 2.2, 1.7, 30_000_001.7])
 
 
 def series_of(precision, contact):
