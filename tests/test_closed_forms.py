@@ -287,14 +287,14 @@ def test_series_has_drive_and_coast_where_they_belong(monkeypatch):
         drive=one, coast=10 * one, depth=2 * one, closing=3 * one, lever1=4 * one, lever2=5 * one,
         torque1=6 * one, torque2=7 * one,
     )  # fmt: skip
-    physical = 0.1 * one, 0.2 * one, 0.3 * one
+    physical = 0.2 * one, 0.3 * one
     monkeypatch.setattr(
         evaluate, "_contact_series", lambda *args: (0.02, np.ones(count), physical, contact)
     )
     columns = files.response_columns(evaluate._series(oscillator(), tau, states))
     expected = {
         "time_s": 0.02 * tau,
-        "rotation_deg": np.degrees(0.1 * one),
+        "rotation_deg": 120 * tau,  # three lobes
         "relative_rotation_rad": 0.2 * one,
         "relative_speed_rad_s": 0.3 * one,
         "drive_flank_force_N": one,
@@ -568,6 +568,7 @@ def searching(truth=lambda point: 1.0, **settings) -> Search:
     """A search whose designs are points of the unit box, and whose verification finds the `truth`
     about them."""
     search = object.__new__(Search)
+    search.stop, search._refuted, search._trials = threading.Event(), [], []
     search.settings = types.SimpleNamespace(screening=0, seed=0, starts=2)
     vars(search.settings).update(settings)
     search.problem = types.SimpleNamespace(

@@ -86,6 +86,7 @@ def polar_area_moment(rotor):
 # Closest approach
 
 _ARC_NODES = 32
+_EDGE_NODES = 12
 _INVOLUTE_NODES = 12
 
 
@@ -178,15 +179,18 @@ class Search(NamedTuple):
 def search_of(rotor):
     """The nodes for a rotor, with a start in the middle of the flank."""
     involute = rotor.involute_end - rotor.arc_end
-    nodes = np.empty((_ARC_NODES + _INVOLUTE_NODES + 1, 5))
-    for i in range(nodes.shape[0]):
+    nodes = np.empty((_EDGE_NODES + _ARC_NODES + _INVOLUTE_NODES + 1, 5))
+    for place in range(nodes.shape[0]):
+        # Beside the land, where the contact begins, each node at half the distance of the next.
+        near = 0 < place <= _EDGE_NODES
+        i = 0.5 ** (_EDGE_NODES + 1 - place) if near else 1.0 * max(place - _EDGE_NODES, 0)
         if i < _ARC_NODES:
             normal = rotor.land_end + (rotor.arc_end - rotor.land_end) * i / _ARC_NODES
         else:
             # Half an involute more: rotor 2 may touch a little beyond its pitch point.
             normal = rotor.arc_end + 1.5 * involute * (i - _ARC_NODES) / _INVOLUTE_NODES
         facing, _, lever, _ = _mate(rotor, normal)
-        nodes[i] = normal, facing, math.sin(facing), math.cos(facing), lever
+        nodes[place] = normal, facing, math.sin(facing), math.cos(facing), lever
     return nodes, np.array([rotor.arc_end])
 
 

@@ -171,8 +171,9 @@ def _place_files(data: dict, folder: Path) -> None:
 
 def _read(path: Path) -> str:
     name = placed(path)
+    regular_file(path, "a config")
     try:
-        with regular_file(path, "a config").open("rb") as file:
+        with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)
     except FileNotFoundError:
         raise InputError(f"{name}: there is no such file; give the path of a config") from None
