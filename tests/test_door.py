@@ -24,6 +24,8 @@ CIC = str(ROOT / "configs" / "cic.yaml")
 def python(code, *arguments, **options):
     """A process that runs `code`, its streams as pipes."""
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
+    # Whoever started the tests in the background has Ctrl-C ignored, in its children too.
+    options |= {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
     return subprocess.Popen([sys.executable, "-c", code, *arguments], cwd=ROOT, **options)
 
 
@@ -133,8 +135,9 @@ def work():
 door.leave(door.through("test", work, own=True))
 """
 AT_ONCE = "print('here', flush=True); time.sleep(60)"
+# Unlike a sleep of the C library, this does not end at a signal.
 COMPILED = """print('here', flush=True)
-        import ctypes; ctypes.CDLL(None).sleep(60)"""
+        import hashlib; hashlib.pbkdf2_hmac("sha256", b"a", b"b", 10**9)"""
 PATIENT = """
         with door.patience("finishing") as stop:
             print('here', flush=True)

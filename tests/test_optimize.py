@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -345,6 +346,7 @@ def test_signals_to_the_command(tmp_path, after, number):
     done = subprocess.run(
         [sys.executable, "-c", INTERRUPTED, str(after), number, *arguments],
         cwd=Path(__file__).parents[1], capture_output=True, text=True, check=False,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     assert done.returncode == 3, done.stderr
     assert "Traceback" not in done.stderr
