@@ -102,7 +102,9 @@ def pace(play=1e-3, torque=5.0, inertia=2e-3, exponent=1.0, stiffness=1e7):
     gear = TimingGear(*(jnp.asarray(x) for x in (2e4, 0.0, play / 2, 0.0)))
     radius = 0.033
     force = jnp.asarray(torque / radius)
-    return Pace.of(law, gear, None, jnp.asarray(inertia), force, jnp.asarray(radius))
+    return Pace.of(
+        law, gear, None, jnp.asarray(inertia), force, jnp.asarray(radius), jnp.asarray(0.0)
+    )
 
 
 def test_pace_in_closed_form():
@@ -136,7 +138,7 @@ def test_steps_follow_the_scene(speed, stiffness):
     how = Integrator("tsit5", jnp.asarray(1e-8), 4096)
     swing, fall = (float(t / pair.mesh_period) for t in (pair.pace.swing, pair.pace.fall))
     first = float(first_step(pair, np.dtype(float)))
-    longest = float(how.controller(np.dtype(float), pair=pair).dtmax)
+    longest = float(how.controller(np.dtype(float), pair=pair).base.dtmax)
     assert first == pytest.approx(min(1e-3, swing / 20))
     assert longest == pytest.approx(min(1 / 32, max(fall / 8, 4 / 4096)))
     if speed == 1:
@@ -233,6 +235,9 @@ def orbit_of(
         response=flow.response,
         sensitivity=jnp.zeros((3, 0)),
         newton_steps=jnp.zeros((), int),
+        drift=jnp.zeros(()),
+        defect=jnp.zeros(()),
+        disagreement=jnp.zeros(()),
     )
 
 
