@@ -34,6 +34,8 @@ rounding layer the error of the gradients is in proportion to the square of this
 _GRADES = 8.0, 64.0
 """Further ends beside a change, in units of that half step: a change that lies a little outside its
 step is still in a short one."""
+_WHOLE = 2.5 * _ASIDE[1]
+"""Steps up to this length (mesh periods) may hold a change, and are not divided."""
 _APART = 1e-10
 """Ends of steps closer than this (mesh periods) are one."""
 
@@ -118,11 +120,15 @@ def with_switches(
 
 
 def halved(grid: Float[Array, " steps"]) -> Float[Array, " steps"]:
-    """The grid with its steps divided in two; where there is no room for all, the longest."""
+    """The grid with its steps divided in two; where there is no room for all, the longest.
+
+    Steps that hold a change stay as they are: their middle is the change itself, where rounding
+    decides on which side of it the derivatives are taken.
+    """
     begins = jnp.concatenate([jnp.zeros_like(grid[:1]), grid[:-1]])
     taken = grid < jnp.inf
     lengths = jnp.where(taken, grid - jnp.where(taken, begins, 0.0), 0.0)
     rank = jnp.argsort(jnp.argsort(-lengths))
-    chosen = (rank < grid.shape[0] - jnp.sum(taken)) & (lengths > 2 * _APART)
+    chosen = (rank < grid.shape[0] - jnp.sum(taken)) & (lengths > _WHOLE)
     middles = jnp.where(chosen, begins + lengths / 2, jnp.inf)
     return jnp.sort(jnp.concatenate([grid, middles]))[: grid.shape[0]]
