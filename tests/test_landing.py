@@ -196,6 +196,9 @@ def test_halved_steps():
     assert np.asarray(halved(grid))[:6] == pytest.approx([0.05, 0.1, 0.25, 0.4, 0.45, 0.5])
     # Without room for all the longest are halved.
     assert np.asarray(halved(grid[:4])) == pytest.approx([0.1, 0.25, 0.4, 0.5])
+    # A step about a change is not divided there.
+    about = jnp.asarray([0.1, 0.1 + 2e-6, 0.3, jnp.inf, jnp.inf])
+    assert np.asarray(halved(about)) == pytest.approx([0.05, 0.1, 0.1 + 2e-6, 0.2, 0.3], abs=1e-5)
 
 
 def test_disagreement_is_that_of_the_orbits_derivatives():

@@ -54,8 +54,6 @@ is closed is not given away."""
 _AGREE = 10.0, 1e-3, 3e-2
 """Disagreement of the derivatives on a grid and on one with its steps halved that is accepted: in
 square roots of the tolerance, but within these limits."""
-_SINGLE = 10.0
-"""The same limit in single precision, in units of that in double."""
 _SMALL = 1e-9, 1e-3
 """Newton step (scaled) from which on the solver's steps are kept: a thousand times its
 tolerance, but within these."""
@@ -386,8 +384,7 @@ def agreement(tolerance: Float[Array, ""]) -> Float[Array, ""]:
     """Largest `disagreement` with which derivatives of an orbit at a relative `tolerance` are
     reported."""
     scale, least, most = _AGREE
-    limit = jnp.clip(scale * jnp.sqrt(tolerance), least, most)
-    return limit * (1.0 if limit.dtype == jnp.float64 else _SINGLE)
+    return jnp.clip(scale * jnp.sqrt(tolerance), least, most)
 
 
 def disagreement(

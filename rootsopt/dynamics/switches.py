@@ -28,6 +28,8 @@ _ASIDE = 1e-9, 1e-6
 """Half a step (mesh periods) that holds a change: so many times the tolerance of the motion as
 `_LOOSE`, but within these. What it does to the gradients is in proportion to it."""
 _LOOSE = 1e3
+_ROUNDINGS = 16.0
+"""The same in roundings of the time, at least: in single precision that is the longest of these."""
 _SHARE = 1e-4
 """The same as a share of the time to the next change, at most: beside a change of curvature in a
 rounding layer the error of the gradients is in proportion to the square of this share."""
@@ -110,6 +112,7 @@ def with_switches(
     # rounding would decide on which side.
     apart = jnp.minimum(brief, jnp.diff(found, prepend=-jnp.inf))
     aside = jnp.minimum(jnp.clip(_LOOSE * tolerance, *_ASIDE), _SHARE * apart)
+    aside = jnp.maximum(aside, _ROUNDINGS * float(jnp.finfo(found.dtype).eps) * periods)
     beside = [sign * grade * aside for grade in (1.0, *_GRADES) for sign in (-1, 1)]
     added = [*(found + apart for apart in beside), inside.ravel()]
     merged = jnp.sort(jnp.concatenate([out.grid if base is None else base, *added]))
