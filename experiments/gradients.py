@@ -242,6 +242,7 @@ def judge(rows: list[dict[str, Any]]) -> int:
         if usable[0] and not all(usable):
             broken += 1
             print("WORSE", [found[rtol]["status"] for rtol in TOLERANCES], scene)
+    print(f"{broken} promises broken")
     return broken
 
 

@@ -40,6 +40,9 @@ RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 _NEARLY = 0.05
 _CLOSEST = 1e-12
 """Scaled difference below which states repeat exactly: a closer look would show no more."""
+_TRUSTED = 1e-8
+"""Tolerance down to which an orbit is integrated more finely than asked for, where it does not
+close or its derivatives are not known."""
 CHAOS_WINDOW = 128
 _THINNING = 6
 
@@ -243,7 +246,7 @@ class Evaluator:
         pair, tangents, shape = _build(self.model, design)
         dtype = pair.angle_scale.dtype
         state = np.zeros(pair.states, dtype) if start is None else np.asarray(start, dtype)
-        how, used, steps = self.transient, 0, 0
+        how, closing, used, steps = self.transient, self.orbit, 0, 0
         tolerance = float(settled_within(how.rtol))
         while True:
             transient = jax.device_get(
@@ -267,7 +270,9 @@ class Evaluator:
                 transient = transient._replace(period=transient.nearest)
             elif status is not None:
                 break
-            transient, orbit, found, status = self._close(pair, tangents, transient, tolerance)
+            transient, orbit, found, status = self._close(
+                pair, tangents, transient, closing, tolerance
+            )
             steps += int(orbit.flow.steps)
             late = used >= self.max_periods or tolerance < _CLOSEST
             if status not in (Status.NOT_SETTLED, Status.INACCURATE) or late:
@@ -276,14 +281,17 @@ class Evaluator:
             # are not known: it was not the steady state yet, or too coarse an image of it. Go on,
             # and look more closely.
             tolerance /= 10
-            how = dataclasses.replace(how, rtol=jnp.maximum(how.rtol / 10, self.orbit.rtol))
-        return _Outcome(pair, shape, transient, orbit, found, status, used, steps)
+            least = jnp.minimum(self.orbit.rtol, _TRUSTED)
+            closing = dataclasses.replace(closing, rtol=jnp.maximum(closing.rtol / 100, least))
+            how = dataclasses.replace(how, rtol=jnp.maximum(how.rtol / 10, closing.rtol))
+        return _Outcome(pair, shape, transient, orbit, closing, found, status, used, steps)
 
-    def _close(self, pair, tangents, transient: Transient, tolerance: float):
-        """Orbit the transient leads to, of the least period, the verdict on it and its status."""
-        settings = self.orbit, self.measures
+    def _close(self, pair, tangents, transient: Transient, how: Integrator, tolerance: float):
+        """Orbit the transient leads to, of the least period, integrated as `how` says, the verdict
+        on it and its status."""
+        settings = how, self.measures
         orbit = jax.device_get(_close(pair, tangents, transient.state, transient.period, *settings))
-        found, status = self._judged(pair, orbit, transient, tolerance)
+        found, status = self._judged(pair, orbit, transient, how, tolerance)
         if status is not Status.PERIODIC:
             return transient, orbit, found, status
         # Noise of the transient can hide that a motion repeats sooner.
@@ -293,7 +301,7 @@ class Evaluator:
                 period = np.asarray(shorter)
                 simpler = jax.device_get(_close(pair, tangents, orbit.state, period, *settings))
                 reduced = transient._replace(period=period, state=orbit.state)
-                other, its_status = self._judged(pair, simpler, reduced, tolerance)
+                other, its_status = self._judged(pair, simpler, reduced, how, tolerance)
                 if its_status is Status.PERIODIC:
                     return reduced, simpler, other, its_status
         return transient, orbit, found, status
@@ -309,12 +317,17 @@ class Evaluator:
         return None if int(transient.period) > 0 else Status.NOT_SETTLED
 
     def _judged(
-        self, pair: RotorPair, orbit: Orbit, transient: Transient, tolerance: float
+        self,
+        pair: RotorPair,
+        orbit: Orbit,
+        transient: Transient,
+        closing: Integrator,
+        tolerance: float,
     ) -> tuple[Verdict, Status]:
-        """The verdict on an orbit, and its status as a motion; whether its forces are known is
-        asked in the report."""
+        """The verdict on an orbit integrated as `closing` says, and its status as a motion; whether
+        its forces are known is asked in the report."""
         dtype = orbit.state.dtype
-        rtols = tuple(np.asarray(how.tolerance(dtype)) for how in (self.transient, self.orbit))
+        rtols = tuple(np.asarray(how.tolerance(dtype)) for how in (self.transient, closing))
         within, limit = (np.asarray(x, dtype) for x in (tolerance, RESIDUAL[self.model.precision]))
         scales = self._scales(pair)
         found = jax.device_get(_verdict(orbit, transient.state, within, rtols, limit, scales))
@@ -363,6 +376,7 @@ class Evaluator:
             statistics |= {
                 "newton_steps": int(orbit.newton_steps),
                 "orbit_steps": int(orbit.flow.steps),
+                "orbit_rtol": float(outcome.closing.rtol),
                 "orbit_defect": float(orbit.defect),
                 "gradient_disagreement": float(orbit.disagreement),
             }
@@ -460,6 +474,7 @@ class _Outcome:
     shape: Geometry
     transient: Transient
     orbit: Orbit | None
+    closing: Integrator
     found: Verdict | None
     status: Status
     used: int

@@ -47,7 +47,7 @@ _SETTINGS = (
 )
 """Settings of JAX that change what is traced or compiled."""
 _VARIABLES = ("XLA_FLAGS", "EQX_ON_ERROR")
-OPTIONS: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": False}
+OPTIONS: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
 """Options of the compiler on CPUs: the older way of making code from fused operations takes two
 thirds of the time, and what it makes is as fast."""
 _PACKAGE = Path(__file__).parent

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments import gradients
 from experiments.baselines import Scene
 from experiments.baselines.scipy_nodes import ScipyNodes
 from experiments.families import FORCES
@@ -73,6 +74,29 @@ def test_work_precision(tmp_path, programs):
     assert is_picture(tmp_path / "work_precision.png")
     summary = json.loads((tmp_path / "work_precision.json").read_text())
     assert summary["references"]["cic"]["error"]["mean"] < 1e-7
+
+
+@pytest.mark.long
+def test_gradients(tmp_path, programs):
+    """Gradients of a few random pairs are those of differences, at every tolerance."""
+    said = run("gradients", tmp_path, programs)
+    assert said.endswith("0 promises broken\n")
+    rows = rows_of(tmp_path / "gradients_0_of_1.csv")
+    assert len(rows) == 12
+    assert max(numbers(rows, "mean_force_N_error")) < 1e-4
+    assert is_picture(tmp_path / "gradients.png")
+
+
+def test_gradients_that_are_off_are_told(capsys):
+    """A gradient beyond its check, and a tighter tolerance that does worse, break a promise."""
+    good = {"scene": "one", "period": 1, "status": "periodic", "gradient_disagreement": 1e-6}
+    good |= {"mean_force_N_error": 1e-6, "peak_force_N_error": 1e-6}
+    rows = [good | {"rtol": rtol} for rtol in gradients.TOLERANCES]
+    assert gradients.judge(rows) == 0
+    assert gradients.judge([*rows[:2], rows[2] | {"mean_force_N_error": 1e-2}]) == 1
+    assert gradients.judge([*rows[:2], rows[2] | {"status": "not_settled"}]) == 1
+    said = capsys.readouterr().out
+    assert ("OFF 1e-10" in said, "WORSE" in said) == (True, True)
 
 
 @pytest.mark.long

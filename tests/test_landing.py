@@ -17,6 +17,7 @@ from rootsopt.dynamics.switches import halved
 from rootsopt.dynamics.verdict import is_certain
 from rootsopt.evaluate import Evaluator
 from rootsopt.model import Model, design_vector
+from rootsopt.status import Status
 
 LIVELY = (
     "scene.speed_rpm=1700",
@@ -189,6 +190,18 @@ def test_a_touch_between_two_stages_is_met(rtol):
     state = np.asarray(end(control_of))
     energy = state[0] + state[1] ** 2 / 2
     assert energy == pytest.approx(0.5, abs=max(300 * rtol, 1e-9))
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6])
+def test_an_orbit_that_a_loose_tolerance_does_not_close_is_integrated_more_finely(lively, rtol):
+    """It is the orbit of the usual tolerance, and the statistics say at which it was found."""
+    evaluator = Evaluator(load("configs/cic.yaml", [*LIVELY, f"solver.rtol={rtol}"]))
+    found = evaluator(series=False)
+    assert found.status is Status.PERIODIC
+    assert found.statistics["orbit_rtol"] == pytest.approx(1e-8)
+    usual = lively[1e-8]
+    for name, value in usual.response.items():
+        assert found.response[name] == pytest.approx(value, rel=1e-6)
 
 
 def test_halved_steps():

@@ -44,7 +44,8 @@ class SolverConfig(Section):
         "tsit5", description="explicit: tsit5, dopri5, dopri8; implicit: kvaerno3, kvaerno5"
     )
     rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] = Field(
-        1e-8, description="tolerance on the orbit and its statistics"
+        1e-8,
+        description="tolerance on the orbit and its statistics; finer where it does not close",
     )
     transient_rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] = Field(
         1e-7, description="tolerance while the transient passes"
