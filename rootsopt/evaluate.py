@@ -302,7 +302,8 @@ class Evaluator:
                 simpler = jax.device_get(_close(pair, tangents, orbit.state, period, *settings))
                 reduced = transient._replace(period=period, state=orbit.state)
                 other, its_status = self._judged(pair, simpler, reduced, how, tolerance)
-                if its_status is Status.PERIODIC:
+                # One whose derivatives are not known is the motion all the same.
+                if its_status in (Status.PERIODIC, Status.INACCURATE):
                     return reduced, simpler, other, its_status
         return transient, orbit, found, status
 

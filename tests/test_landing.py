@@ -13,7 +13,7 @@ from rootsopt.dynamics.flow import Flow, Integrator
 from rootsopt.dynamics.landing import LandingControl
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.steady import Orbit, agreement, disagreement
-from rootsopt.dynamics.switches import halved
+from rootsopt.dynamics.switches import halved, has_room
 from rootsopt.dynamics.verdict import is_certain
 from rootsopt.evaluate import Evaluator
 from rootsopt.model import Model, design_vector
@@ -202,6 +202,40 @@ def test_an_orbit_that_a_loose_tolerance_does_not_close_is_integrated_more_finel
     usual = lively[1e-8]
     for name, value in usual.response.items():
         assert found.response[name] == pytest.approx(value, rel=1e-6)
+
+
+def test_two_changes_at_one_instant():
+    """The seal and the contact pass the same joint of the flank 1e-9 mesh periods apart: each was
+    at the end of a step of no length, and the gradient 6e-4 off at any tolerance."""
+    scene = [
+        "scene.speed_rpm=3831.1",
+        "scene.timing_gear.backlash_mm=0.276",
+        "scene.timing_gear.damping_ratio=0.06",
+        "scene.timing_gear.stiffness_N_m_per_rad=44582",
+        "scene.load={pressure_difference_Pa: 2.0e4}",
+        "profile.pressure_angle_deg=35.23",
+        "profile.involute_length_mm=5.77",
+        "profile.tip_arc_angle_deg=1.68",
+    ]
+    evaluator = Evaluator(load("configs/cic.yaml", scene), survey=True)
+    design, step, way = np.array([35.23, 5.77, 1.68]), 5e-5, np.array([1.0, -0.7, 0.8])
+    found = evaluator(series=False)
+    assert found.status is Status.PERIODIC
+    assert found.statistics["gradient_disagreement"] < 1e-4
+    ends = [
+        evaluator(jnp.asarray(design + sign * step * way), start=found.state, series=False)
+        for sign in (1, -1)
+    ]
+    slope = np.subtract(*(one.response["mean_force_N"] for one in ends)) / (2 * step)
+    row = np.array(list(found.gradient["mean_force_N"].values()))
+    assert row @ way == pytest.approx(slope, abs=1e-4 * np.max(np.abs(row)))
+
+
+def test_a_check_without_room_is_none():
+    """Where a grid cannot hold all its steps halved, nothing is compared."""
+    grid = jnp.asarray([0.1, 0.1 + 2e-6, 0.5, jnp.inf, jnp.inf])
+    assert bool(has_room(grid))
+    assert not bool(has_room(grid[:4]))
 
 
 def test_halved_steps():

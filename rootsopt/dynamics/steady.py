@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.flow import Flow, Integrator, flow, strobe
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.switches import halved, with_switches
+from rootsopt.dynamics.switches import halved, has_room, with_switches
 
 BLOCK = 4
 """Mesh periods integrated between two looks at the transient."""
@@ -319,9 +319,11 @@ def close_orbit(
             drift=drift,
         )
         apart = disagreement(now.orbit.flow.slope, out.slope, count)
+        # Where not all steps can be divided nothing is compared.
+        apart = jnp.where(has_room(now.orbit.flow.grid), apart, jnp.inf)
         compared = now.orbit._replace(defect=residual, disagreement=apart)
         orbit = _choose(checking, compared, found)
-        finer = checking & (apart > agreement(tolerance)) & (now.refined < 1)
+        finer = checking & (apart > agreement(tolerance)) & (apart < jnp.inf) & (now.refined < 1)
         base = jnp.where(now.repeat, now.base, out.grid)
         base = lax.cond(finer, lambda: halved(base), lambda: base)
         grid = lax.cond(

@@ -8,7 +8,7 @@ linearised motion far more than the motion itself.
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.pair import RotorPair
@@ -17,8 +17,8 @@ from rootsopt.dynamics.peak import Steps, blended
 _LOOKS, _LONGEST = 252, 8
 """Places in a mesh period where changes are looked for, beside the ends of the steps, and mesh
 periods that there are places for."""
-_CHANGES = 192
-"""Changes found in one stretch of motion, at most."""
+_CHANGES = 1024
+"""Changes found in one stretch of motion, at most; a mesh period has some 20 to 100."""
 _LANES = 16
 """Places looked at together."""
 _HALVINGS = 26
@@ -36,8 +36,8 @@ rounding layer the error of the gradients is in proportion to the square of this
 _GRADES = 8.0, 64.0
 """Further ends beside a change, in units of that half step: a change that lies a little outside its
 step is still in a short one."""
-_WHOLE = 2.5 * _ASIDE[1]
-"""Steps up to this length (mesh periods) may hold a change, and are not divided."""
+_HOLDS = 2.5
+"""Steps up to this length, in units of the longest half step that holds a change, stay whole."""
 _APART = 1e-10
 """Ends of steps closer than this (mesh periods) are one."""
 
@@ -112,7 +112,9 @@ def with_switches(
     # rounding would decide on which side.
     apart = jnp.minimum(brief, jnp.diff(found, prepend=-jnp.inf))
     aside = jnp.minimum(jnp.clip(_LOOSE * tolerance, *_ASIDE), _SHARE * apart)
-    aside = jnp.maximum(aside, _ROUNDINGS * float(jnp.finfo(found.dtype).eps) * periods)
+    # Of two changes at almost the same instant each would be at an end of a step of no length.
+    least = jnp.maximum(_ASIDE[0], _ROUNDINGS * float(jnp.finfo(found.dtype).eps) * periods)
+    aside = jnp.maximum(aside, least)
     beside = [sign * grade * aside for grade in (1.0, *_GRADES) for sign in (-1, 1)]
     added = [*(found + apart for apart in beside), inside.ravel()]
     merged = jnp.sort(jnp.concatenate([out.grid if base is None else base, *added]))
@@ -128,10 +130,25 @@ def halved(grid: Float[Array, " steps"]) -> Float[Array, " steps"]:
     Steps that hold a change stay as they are: their middle is the change itself, where rounding
     decides on which side of it the derivatives are taken.
     """
-    begins = jnp.concatenate([jnp.zeros_like(grid[:1]), grid[:-1]])
+    lengths, whole = _lengths(grid)
     taken = grid < jnp.inf
-    lengths = jnp.where(taken, grid - jnp.where(taken, begins, 0.0), 0.0)
+    begins = jnp.concatenate([jnp.zeros_like(grid[:1]), grid[:-1]])
     rank = jnp.argsort(jnp.argsort(-lengths))
-    chosen = (rank < grid.shape[0] - jnp.sum(taken)) & (lengths > _WHOLE)
+    chosen = (rank < grid.shape[0] - jnp.sum(taken)) & (lengths > whole)
     middles = jnp.where(chosen, begins + lengths / 2, jnp.inf)
     return jnp.sort(jnp.concatenate([grid, middles]))[: grid.shape[0]]
+
+
+def has_room(grid: Float[Array, " steps"]) -> Bool[Array, ""]:
+    """Whether `halved` divides all steps that it is to divide."""
+    lengths, whole = _lengths(grid)
+    return jnp.sum(grid < jnp.inf) + jnp.sum(lengths > whole) <= grid.shape[0]
+
+
+def _lengths(grid):
+    """Lengths of the steps, and that up to which a step may hold a change."""
+    taken = grid < jnp.inf
+    begins = jnp.concatenate([jnp.zeros_like(grid[:1]), grid[:-1]])
+    lengths = jnp.where(taken, grid - jnp.where(taken, begins, 0.0), 0.0)
+    rounding = float(jnp.finfo(grid.dtype).eps) * jnp.max(jnp.where(taken, grid, 0.0))
+    return lengths, _HOLDS * jnp.maximum(_ASIDE[1], _ROUNDINGS * rounding)
