@@ -261,6 +261,7 @@ def test_batch_is_the_designs_one_by_one(default):
     assert [STATUSES[i] for i in idle.status] == [Status.IDLE] * 3
 
 
+@pytest.mark.long
 def test_batch_at_a_coarse_tolerance(default):
     """Kinks are looked for again where the orbit has moved away from the first look: else gradients
     would be some 1e-2 off at this tolerance."""

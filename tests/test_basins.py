@@ -222,6 +222,7 @@ def test_command(tmp_path, capsys):
     assert main([*lost, "-o", str(tmp_path / "lost"), "--no-figures"]) == 3
 
 
+@pytest.mark.long
 def test_optimiser_over_all_motions(tmp_path):
     """`worst` improves the worst motion of the baseline, and says so of all."""
     small = (

@@ -209,6 +209,7 @@ def test_an_interrupt_during_imports(tmp_path, command, module):
     process = subprocess.Popen(
         [sys.executable, "-m", command, *arguments, "-o", str(tmp_path / "run")],
         cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     assert process.stdout.readline() == "here\n"
     process.send_signal(signal.SIGINT)

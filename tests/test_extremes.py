@@ -342,6 +342,7 @@ def test_boundary_scenes_end_as_they_must(name):
         assert 1e5 < evaluation.statistics["swings_per_mesh_period"] < 1e7
 
 
+@pytest.mark.long
 def test_a_pair_with_a_motor_that_floats_is_idle():
     """Newton's equations are singular then, and the state is kept."""
     scene = {"scene__drive": "torque", "scene__motor": "{slope_N_m_s_per_rad: 0.1}"}

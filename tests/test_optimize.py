@@ -288,7 +288,15 @@ def test_designs_that_did_not_hold_up_are_not_reported():
     assert search.so_far().optimized.design != result.optimized.design
 
 
-def test_an_interrupt_stops_a_search_and_a_second_one_the_wait():
+@pytest.fixture
+def interruptible():
+    """Ctrl-C raises, also where whoever started the tests has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_stops_a_search_and_a_second_one_the_wait(interruptible):
     """`KeyboardInterrupt`, as Python raises it where no command line owns the process."""
     stop = threading.Event()
 

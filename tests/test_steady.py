@@ -313,6 +313,7 @@ def test_recorded_steps_give_the_same_motion(sharp, orbits):
         np.testing.assert_allclose(difference, once.slope[:2, 1], atol=1e-6)
 
 
+@pytest.mark.long
 def test_repeated_steps_tell_of_their_error(sharp, orbits):
     """Steps chosen for this motion repeat it within a tolerance or so; half as many do not, nor
     those of another motion. Steps just chosen tell nothing, nor do those over a contact that jumps.
