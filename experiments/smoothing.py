@@ -55,7 +55,7 @@ COMPARED = (1e-6, 1e-5, DEFAULT)
 LIMIT = 1e-4
 """Bias that the default must stay below."""
 USUAL, TIGHT = (1e-6, 1e-8), (1e-8, 1e-10)
-"""Tolerances of transient and orbit: of the orbit that is looked for, and of what is measured."""
+"""Tolerances of transient and orbit, while an orbit is searched for and while it is measured."""
 PERIODS = 200, 100
 """Mesh periods the transient may last, there."""
 SAME = 0.02

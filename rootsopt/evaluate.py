@@ -379,8 +379,9 @@ class Evaluator:
                 "orbit_steps": int(orbit.flow.steps),
                 "orbit_rtol": float(outcome.closing.rtol),
                 "orbit_defect": float(orbit.defect),
-                "gradient_disagreement": float(orbit.disagreement),
             }
+            if np.isfinite(orbit.disagreement):  # else there was no room for a comparison
+                statistics["gradient_disagreement"] = float(orbit.disagreement)
             series = _orbit_series(pair, orbit, period) if with_series else None
             found = outcome.found
             assert found is not None

@@ -219,10 +219,13 @@ def _split(args: tuple) -> tuple[list, _Kind]:
 
 
 def _finished(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-    """The program compiled with `OPTIONS`, or without those where this compiler has none such."""
-    if jax.default_backend() == "cpu":
+    """The program compiled with those of `OPTIONS` that XLA_FLAGS says nothing of, or without them
+    where this compiler has none such."""
+    said = os.environ.get("XLA_FLAGS", "")
+    options = {name: value for name, value in OPTIONS.items() if name not in said}
+    if options and jax.default_backend() == "cpu":
         with contextlib.suppress(jax.errors.JaxRuntimeError):
-            return lowered.compile(compiler_options=OPTIONS)
+            return lowered.compile(compiler_options=options)
     return lowered.compile()
 
 

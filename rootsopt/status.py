@@ -39,7 +39,7 @@ class Status(enum.Enum):
     INACCURATE = (
         "The orbit is closed, but with the solver's steps halved it or its derivatives are others: "
         "they are not known well enough to be reported. Tighten solver.rtol, or raise "
-        "contact.smoothing_mm."
+        "contact.smoothing_mm or solver.max_steps_per_period."
     )
     IDLE = (
         "No flank touches: the contact force is zero and has no gradient. Raise "

@@ -93,7 +93,8 @@ def test_gradients_that_are_off_are_told(capsys):
     good |= {"mean_force_N_error": 1e-6, "peak_force_N_error": 1e-6}
     rows = [good | {"rtol": rtol} for rtol in gradients.TOLERANCES]
     assert gradients.judge(rows) == 0
-    assert gradients.judge([*rows[:2], rows[2] | {"mean_force_N_error": 1e-2}]) == 1
+    for name in gradients.MEASURES:
+        assert gradients.judge([*rows[:2], rows[2] | {f"{name}_error": 1e-2}]) == 1
     assert gradients.judge([*rows[:2], rows[2] | {"status": "not_settled"}]) == 1
     said = capsys.readouterr().out
     assert ("OFF 1e-10" in said, "WORSE" in said) == (True, True)
