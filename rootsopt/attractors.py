@@ -20,14 +20,16 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     import numpy as np
     from rich.console import Console
 
-    from rootsopt import auto, basins, cli, files, report
-    from rootsopt.evaluate import Evaluator
+    from rootsopt import cli, files, report
     from rootsopt.model import check_geometry
+    from rootsopt.response.attractors import find
+    from rootsopt.response.choice import resolve
+    from rootsopt.response.evaluation import Evaluator
 
     check_geometry(config)
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
-        config, choice = auto.resolve(config)
-        found = basins.find(Evaluator(config), series=True)
+        config, choice = resolve(config)
+        found = find(Evaluator.of(config), series=True)
     files.write_config(folder, config)
     data = {
         "attractors": found.records(),

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from rootsopt.config import Config
-    from rootsopt.evaluate import Series
+    from rootsopt.response.evaluation import Series
 
 DPI = 150
 """Resolution of the figures written."""

@@ -6,6 +6,7 @@ A design is a vector of the config's design parameters in the config's own units
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -36,6 +37,7 @@ from rootsopt.dynamics.parts import (
     Supports,
     TimingGear,
 )
+from rootsopt.dynamics.steady import Solver
 from rootsopt.errors import InputError
 from rootsopt.families import MM
 from rootsopt.profiles import Geometry, Outline, Profile, geometry, outline
@@ -47,11 +49,12 @@ _ROLLS, _RELATIVES = 384, 16
 """Map of a model nobody has sized."""
 
 
-class Model(eqx.Module):
-    """Everything about a config but the design: builds a rotor pair from a design.
+class Scene(eqx.Module):
+    """Everything but the design, in SI units: builds a rotor pair from a design.
 
-    Numbers are leaves, choices are static, so that one compiled program serves every
-    config of the same kind.
+    Physical quantities are leaves that one may differentiate with respect to, choices are static,
+    so that one compiled program serves every scene of the same kind. `solver`: how its steady
+    motion is found.
     """
 
     family: str = eqx.field(static=True)
@@ -71,6 +74,7 @@ class Model(eqx.Module):
     gear: TimingGear | None
     gear_damping_ratio: Float[Array, ""]
     deepest: Float[Array, ""]
+    solver: Solver
     bore_radius: Float[Array, ""] | None = None
     pressure: Float[Array, ""] | None = None
     motor: MotorDrive | None = None
@@ -80,17 +84,13 @@ class Model(eqx.Module):
     outline: Outline | None = None
 
     @classmethod
-    def of(cls, config: Config, deepest: float | None = None) -> "Model":
-        """Model of a config; `deepest` (rad < 0) is the relative rotation the contact map
-        must reach, estimated from the scene when not given.
+    def from_config(cls, config: Config, deepest: float | None = None) -> "Scene":
+        """Return the scene of a config; `deepest` (rad < 0) is the relative rotation that the
+        contact map must reach, estimated from the scene when not given.
 
         Raises RuntimeError where the config asks for a precision JAX is not set to."""
         contact, scene, solver = config.contact, config.scene, config.solver
-        if solver.precision == "float64" and not jax.config.read("jax_enable_x64"):
-            raise RuntimeError(
-                "JAX computes in single precision here: call rootsopt.cli.use_float64() before "
-                "anything else, or set solver.precision to float32"
-            )
+        check_precision(solver.precision)
         radius = config.profile.pitch_radius_mm * MM
         scale = contact.exponent
         law = ImpactLaw(
@@ -131,6 +131,7 @@ class Model(eqx.Module):
             gear=gear,
             gear_damping_ratio=jnp.asarray(damping_ratio),
             deepest=jnp.asarray(deepest),
+            solver=solver_of(config),
             bore_radius=_optional(config.rotor.bore_mm, MM / 2),
             pressure=_optional(scene.load.pressure_difference_Pa),
             center_distance_error=_optional(scene.center_distance_error_mm, MM),
@@ -182,7 +183,7 @@ class Model(eqx.Module):
         if self.fidelity == "auto":
             raise InputError(
                 "`solver.fidelity` must be chosen before a pair is built, but is auto; call "
-                "rootsopt.auto.choose first"
+                "rootsopt.response.choice.choose first"
             )
         if not self.both:
             return SearchContact.of(profile)
@@ -214,25 +215,14 @@ class Model(eqx.Module):
         return self.pair_and_shape(design)[0]
 
     def pair_and_tangents(
-        self, design: Float[Array, " d"]
+        self, design: Float[Array, " d"], directions: Float[Array, "n d"] | tuple[()] | None = None
     ) -> tuple[RotorPair, RotorPair, Geometry]:
-        """The rotor pair, its derivatives by the design stacked along a leading axis (in the
-        pair's own structure), and the rotor's geometry."""
-
-        def build(design):
-            pair, shape = self.pair_and_shape(design)
-            dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
-            return dynamic, (_Static(static), shape)
-
-        count = design.shape[0]
-        if count == 0:
-            dynamic, (static, shape) = build(design)
-            tangents = jax.tree.map(lambda x: jnp.zeros((0, *x.shape), x.dtype), dynamic)
-        else:
-            push = functools.partial(jax.jvp, build, (design,), has_aux=True)
-            each = jax.vmap(lambda t: push((t,)), out_axes=(None, 0, None))
-            dynamic, tangents, (static, shape) = each(jnp.eye(count))
-        return eqx.combine(dynamic, static.value), tangents, shape
+        """The rotor pair, its derivatives along the `directions` of the design (by default those of
+        its parameters; () for none) stacked along a leading axis in the pair's own structure, and
+        the rotor's geometry."""
+        if directions is None:
+            directions = jnp.eye(design.shape[0])
+        return along(lambda design: self.pair_and_shape(design), design, directions)
 
     def pair_and_shape(self, design: Float[Array, " d"]) -> tuple[RotorPair, Geometry]:
         """The rotor pair and the geometry of one rotor.
@@ -258,10 +248,12 @@ class Model(eqx.Module):
         angle = self.law.depth_at(force) / self.pitch_radius
         if gear is not None:
             angle = angle + gear.half_backlash
+        # Units, no quantities: nothing depends on them.
+        force, angle = jax.lax.stop_gradient((force, angle))
         supports = self.supports
         if supports is not None:
             mass = self.mass(shape)
-            unit = angle * self.pitch_radius
+            unit = jax.lax.stop_gradient(angle * self.pitch_radius)
             supports = eqx.tree_at(lambda s: (s.mass, s.unit), supports, (mass, unit))
         load = self._load(profile, shape)
         pair = RotorPair(
@@ -286,6 +278,29 @@ class Model(eqx.Module):
             # Built in double precision; single only where it is integrated.
             pair = jax.tree.map(_single, pair)
         return pair, shape
+
+
+def along(
+    build: Callable[[Any], tuple[RotorPair, Geometry]], primal: Any, directions: Any
+) -> tuple[RotorPair, RotorPair, Geometry]:
+    """The rotor pair and geometry that `build(primal)` gives, and the pair's derivatives along the
+    `directions` of the primal (stacked along a leading axis; there may be none), stacked likewise
+    in the pair's own structure."""
+
+    def parted(primal):
+        pair, shape = build(primal)
+        dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
+        return dynamic, (_Static(static), shape)
+
+    leaves = jax.tree.leaves(directions)
+    if not leaves or leaves[0].shape[0] == 0:
+        dynamic, (static, shape) = parted(primal)
+        tangents = jax.tree.map(lambda x: jnp.zeros((0, *x.shape), x.dtype), dynamic)
+    else:
+        push = functools.partial(jax.jvp, parted, (primal,), has_aux=True)
+        each = jax.vmap(lambda t: push((t,)), out_axes=(None, 0, None))
+        dynamic, tangents, (static, shape) = each(directions)
+    return eqx.combine(dynamic, static.value), tangents, shape
 
 
 class _Static(eqx.Module):
@@ -358,11 +373,11 @@ def design_keys(config: Config) -> tuple[str, ...]:
 def outline_mm(config: Config, design: ArrayLike | None = None) -> NDArray[np.float64]:
     """Closed counter-clockwise outline (n, 2) in mm of a design, by default the config's."""
     design = design_vector(config) if design is None else jnp.asarray(design)
-    profile = _profile(Model.of(config), design)
+    profile = _profile(Scene.from_config(config), design)
     return np.asarray(outline(profile, points=240)) / MM
 
 
-_profile = Program(Model.profile)
+_profile = Program(Scene.profile)
 
 
 def integrators(config: Config) -> tuple[Integrator, Integrator]:
@@ -375,6 +390,31 @@ def integrators(config: Config) -> tuple[Integrator, Integrator]:
         Integrator(solver.method, jnp.asarray(solver.transient_rtol), steps),
         Integrator(solver.method, jnp.asarray(solver.rtol), _ORBIT_STEPS * steps),
     )
+
+
+def solver_of(config: Config) -> Solver:
+    """How a config asks for its steady motion to be found."""
+    settings = config.solver
+    transient, orbit = integrators(config)
+    return Solver(
+        transient=transient,
+        orbit=orbit,
+        measures=measures(config),
+        max_periods=jnp.asarray(float(settings.max_mesh_periods)),
+        examine=jnp.asarray(1.0),
+        max_orbit=settings.max_orbit_periods,
+        precision=settings.precision,
+    )
+
+
+def check_precision(precision: str) -> None:
+    """Raise RuntimeError unless JAX is set to this `precision` (float64 or float32)."""
+    if precision == "float64" and not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(
+            "JAX computes in single precision here: call "
+            'jax.config.update("jax_enable_x64", True) before anything else, or set '
+            "solver.precision to float32"
+        )
 
 
 def measures(config: Config) -> Measures:
@@ -393,7 +433,7 @@ def check_geometry(config: Config) -> None:
     bore = config.rotor.bore_mm
     if bore is None:
         return
-    root = float(_shape(Model.of(config), design_vector(config)).root_radius) / MM
+    root = float(_shape(Scene.from_config(config), design_vector(config)).root_radius) / MM
     if bore >= 2 * root:
         raise InputError(
             f"`rotor.bore_mm` must be less than {2 * root:.6g} (the root circle), but is "
@@ -402,7 +442,7 @@ def check_geometry(config: Config) -> None:
 
 
 @Program
-def _shape(model: Model, design):
+def _shape(model: Scene, design):
     """Geometry of a design in config units."""
     return geometry(model.profile(design))
 

@@ -25,7 +25,7 @@ from rootsopt.dynamics.steady import SAMPLES
 from rootsopt.dynamics.switches import with_switches
 from rootsopt.dynamics.verdict import RESIDUAL, TOO_DEEP
 from rootsopt.errors import InputError
-from rootsopt.model import MM, Model, check_geometry, design_keys, design_vector, integrators
+from rootsopt.model import MM, Scene, check_geometry, design_keys, design_vector, integrators
 from rootsopt.programs import Program
 
 PLACES = {
@@ -176,7 +176,7 @@ class Orbits:
         self.names = parameters(config)
         self.values = np.array([value_of(config, name) for name in self.names])
         self.index = self.names.index(parameter)
-        self.model = Model.of(config)
+        self.model = Scene.from_config(config)
         self.how = integrators(config)[1]
         self.width = limits.high - limits.low
         self.steps = dataclasses.replace(limits, low=0.0, high=1.0)
@@ -298,7 +298,7 @@ def _longest_gap(touching: NDArray[np.bool_]) -> float:
 
 
 def _build(
-    model: Model, names: tuple[str, ...], values: Float[Array, " p"]
+    model: Scene, names: tuple[str, ...], values: Float[Array, " p"]
 ) -> tuple[RotorPair, Float[Array, ""]]:
     """The pair with these values of the parameters (config's units), and its angle scale."""
     at = dict(zip(names, values, strict=True))
@@ -326,7 +326,7 @@ def _unit(model, names, values):
 
 @Program
 def _shoot(
-    model: Model,
+    model: Scene,
     names: tuple[str, ...],
     values: Float[Array, " p"],
     direction: Float[Array, " p"],

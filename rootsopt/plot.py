@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import DESIGN_KEYS, FAMILY_KEYS, LIST_KEYS, Config
 from rootsopt.contact.nodes import place_pair
-from rootsopt.evaluate import Evaluation, Series
 from rootsopt.files import ResultFolder
 from rootsopt.model import design_keys, outline_mm
+from rootsopt.response.evaluation import Evaluation, Series
 
 # Okabe and Ito's palette, told apart with any colour vision and in grey.
 BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"

@@ -11,9 +11,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from rootsopt import plot
-from rootsopt.basins import Attractor, Basins
 from rootsopt.config import Config
 from rootsopt.files import ResultFolder
+from rootsopt.response.attractors import Attractor, Basins
 
 _COLORS = (plot.BLUE, plot.VERMILION, plot.GREEN, plot.PURPLE, plot.ORANGE, plot.SKY)
 _LOST = "#000000"

@@ -8,7 +8,7 @@ from matplotlib.lines import Line2D
 
 from rootsopt import plot
 from rootsopt.files import ResultFolder
-from rootsopt.speeds import Part
+from rootsopt.response.speeds import Part
 
 _COLORS = (plot.BLUE, plot.VERMILION, plot.GREEN, plot.PURPLE, plot.ORANGE, plot.SKY)
 _DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), "-.")

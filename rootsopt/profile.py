@@ -22,17 +22,17 @@ EXPORT = "dxf,svg"
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Check, measure, write, print."""
     from rootsopt import cli, export, files, report
-    from rootsopt.evaluate import geometry_record
     from rootsopt.families import margins_of
-    from rootsopt.model import Model, check_geometry, design_keys, design_vector, outline_mm
+    from rootsopt.model import Scene, check_geometry, design_keys, design_vector, outline_mm
     from rootsopt.outline import report as outline_report
     from rootsopt.profiles import geometry
+    from rootsopt.response.evaluation import geometry_record
     from rootsopt.status import Status
 
     formats = export.chosen(options.export)
     check_geometry(config)
     coefficients = _coefficients(options.project)
-    model, design = Model.of(config), design_vector(config)
+    model, design = Scene.from_config(config), design_vector(config)
     shape = geometry(model.profile(design))
     record = {
         "design": dict(zip(design_keys(config), map(float, design), strict=True)),

@@ -89,7 +89,7 @@ class _Made(NamedTuple):
     """A compiled program, called with the arrays alone, and its result with shapes for arrays."""
 
     call: Callable[..., Any]
-    outline: Any
+    result_shape: Any
 
 
 class Program:
@@ -114,7 +114,7 @@ class Program:
             self._make(future, kind)
         made = future.result()
         results = iter(made.call(*leaves))
-        return jax.tree.map(lambda x: next(results) if _is_array(x) else x, made.outline)
+        return jax.tree.map(lambda x: next(results) if _is_array(x) else x, made.result_shape)
 
     def prepare(self, *args: Any) -> None:
         """Compile for arguments like these, of which arrays may be `jax.ShapeDtypeStruct`, in
@@ -124,7 +124,7 @@ class Program:
         if new:
             threading.Thread(target=self._make, args=(future, kind)).start()
 
-    def outline(self, *args: Any) -> Any:
+    def result_shape(self, *args: Any) -> Any:
         """The result with `jax.ShapeDtypeStruct` for arrays, known before it is compiled."""
         _, kind = _split(args)
         place = self._place(kind)
@@ -133,7 +133,7 @@ class Program:
             self.prepare(*args)
         future = self._made.get(kind)
         if future is not None and (kept or future.done()):
-            return future.result().outline
+            return future.result().result_shape
         return jax.tree.map(_outline, eqx.filter_eval_shape(self.function, *args))
 
     def _future(self, kind: _Kind) -> tuple[Future[_Made], bool]:
@@ -241,7 +241,7 @@ def _save(place: _Place, made: _Made, number: int) -> None:
     if "custom-call" in made.call.as_text():  # pyright: ignore[reportFunctionMemberAccess]
         return
     payload, _, _ = serialize_executable.serialize(made.call)  # pyright: ignore[reportArgumentType]
-    data = zlib.compress(pickle.dumps((payload, number, made.outline)), 1)
+    data = zlib.compress(pickle.dumps((payload, number, made.result_shape)), 1)
     place.store.write(place.name, place.purpose, data)
 
 
@@ -253,15 +253,15 @@ def _loaded(place: _Place | None) -> _Made | None:
         data = place.store.read(place.name, place.purpose)
         if data is None:
             return None
-        payload, number, outline = pickle.loads(zlib.decompress(data))
-        results = sum(map(_is_array, jax.tree.leaves(outline)))
+        payload, number, result_shape = pickle.loads(zlib.decompress(data))
+        results = sum(map(_is_array, jax.tree.leaves(result_shape)))
         takes = jax.tree.structure(((0,) * number, {}))
         call = serialize_executable.deserialize_and_load(
             payload, takes, jax.tree.structure([0] * results)
         )
     except Exception:
         return None
-    return _Made(call, outline)
+    return _Made(call, result_shape)
 
 
 def _modules(kind: _Kind) -> set[str]:

@@ -12,7 +12,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from rootsopt.evaluate import Evaluation
+from rootsopt.response.evaluation import Evaluation
 from rootsopt.status import Status
 
 DASH = "-"
@@ -94,7 +94,7 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
 
 
 def sweep_table(rows: list[dict[str, Any]]) -> RenderableType:
-    """One design at many speeds, a row each; `rows` as `rootsopt.speeds.Part.row` gives them."""
+    """One design at many speeds, a row each; `rows` as `speeds.Part.row` gives them."""
     columns = "mean, N", "peak, N", "period", "multiplier", "status"
     table = _table("Contact force over speed", *columns)
     table.columns[0].header = Text("speed, rpm")

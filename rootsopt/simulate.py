@@ -19,16 +19,17 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     """Check, simulate, write, print."""
     from rich.console import Console
 
-    from rootsopt import auto, cli, export, files, report
-    from rootsopt.evaluators import evaluator_for
+    from rootsopt import cli, export, files, report
     from rootsopt.model import check_geometry, outline_mm
     from rootsopt.outline import report as outline_report
-    from rootsopt.speeds import alone
+    from rootsopt.response.choice import resolve
+    from rootsopt.response.evaluators import evaluator_for
+    from rootsopt.response.speeds import alone
 
     formats = export.chosen(options.export)
     check_geometry(config)
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
-        config, choice = auto.resolve(config)
+        config, choice = resolve(config)
         evaluation = evaluator_for(alone(config))()
     files.write_config(folder, config)
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))

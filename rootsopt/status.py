@@ -1,6 +1,8 @@
 """What can be said of a result. No number is reported without one of these."""
 
 import enum
+import operator
+from typing import SupportsIndex
 
 
 class Status(enum.Enum):
@@ -12,6 +14,10 @@ class Status(enum.Enum):
         "average over a neighbourhood of the design."
     )
     GEOMETRY_ONLY = "The profile is valid; nothing was simulated."
+    OFF_MAP = (
+        "The motion left the contact map, which says nothing of the flanks there. Set "
+        "solver.fidelity to search, or build the scene anew with a greater reach."
+    )
     CHAOTIC = (
         "The motion is chaotic: mean and peak are averages over a finite window and have no "
         "usable gradient. Set objective.motion to ensemble to optimise what an ensemble of motions "
@@ -62,6 +68,23 @@ class Status(enum.Enum):
         "The simulation produced a number that is not finite. Loosen solver.rtol or check the "
         "contact parameters."
     )
+
+    @property
+    def code(self) -> int:
+        """The number that stands for the status in arrays."""
+        return list(Status).index(self)
+
+    @classmethod
+    def of(cls, code: SupportsIndex) -> "Status":
+        """Return the status with this `code`.
+
+        Raises ValueError for a number that is no code."""
+        number = operator.index(code)
+        if not 0 <= number < len(cls):
+            raise ValueError(
+                f"Argument `code` must be a status code from 0 to {len(cls) - 1}, but is {number}"
+            )
+        return list(cls)[number]
 
     @property
     def usable(self) -> bool:

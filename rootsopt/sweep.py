@@ -20,14 +20,16 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     """Check, simulate, write, print."""
     from rich.console import Console
 
-    from rootsopt import auto, cli, files, report, speeds
-    from rootsopt.evaluators import evaluator_for, without_gradient
+    from rootsopt import cli, files, report
     from rootsopt.model import check_geometry, design_keys, design_vector
+    from rootsopt.response import speeds
+    from rootsopt.response.choice import resolve
+    from rootsopt.response.evaluators import evaluator_for
 
     check_geometry(config)
     with _progress(Console(stderr=True)) as progress:
-        config, choice = auto.resolve(config)
-        evaluator = without_gradient(evaluator_for(speeds.alone(config)))
+        config, choice = resolve(config)
+        evaluator = evaluator_for(speeds.alone(config)).without_gradient()
         parts = speeds.sweep(evaluator, speeds.swept_speeds(config), progress=progress)
     rows = [part.row() for part in parts]
     status, message = speeds.overall(parts)

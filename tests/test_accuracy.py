@@ -12,15 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rootsopt import auto
-from rootsopt.batch import STATUSES, respond_many
+from rootsopt.response.batch import STATUSES, respond_many
 from rootsopt.config import load
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.map import MapContact
 from rootsopt.contact.nodes import pair_gap
 from rootsopt.contact.size import RELATIVES, ROLLS, size_map
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Evaluator
-from rootsopt.model import Model, design_vector
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.model import Scene, design_vector
 from rootsopt.profiles import CIC, EE
 from rootsopt.status import Status
 
@@ -305,7 +305,7 @@ def test_auto_must_be_resolved_before_use():
     """A pair of a config with `auto` says what to call."""
     config = load("configs/cic.yaml", ["solver.fidelity=auto"])
     with pytest.raises(InputError, match=r"auto\.choose"):
-        Model.of(config).pair(design_vector(config))
+        Scene.from_config(config).pair(design_vector(config))
 
 
 @pytest.mark.parametrize("settles", [True, False])

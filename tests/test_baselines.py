@@ -17,8 +17,8 @@ from experiments.baselines.scipy_nodes import (
 )
 from rootsopt.config import load
 from rootsopt.contact import FlankPair
-from rootsopt.evaluate import RESPONSES, Evaluator
-from rootsopt.model import Model
+from rootsopt.response.evaluation import RESPONSES, Evaluator
+from rootsopt.model import Scene
 from rootsopt.profiles import CIC
 
 pytest.importorskip("numba")
@@ -81,7 +81,7 @@ def gradient_error(gradient):
 
 @every_design
 def test_constants_are_those_of_the_model(design):
-    pair = _pair(Model.of(CONFIG), jnp.asarray(design))
+    pair = _pair(Scene.from_config(CONFIG), jnp.asarray(design))
     rotor = rotor_of(SCENE, design)
     moment = polar_area_moment(rotor)
     assert numba_pair.polar_area_moment(rotor) == pytest.approx(moment, rel=1e-13)

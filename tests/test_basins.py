@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.basins import AttractorEvaluator, _Sorter, find
+from rootsopt.response.attractors import AttractorEvaluator, _Sorter, find
 from rootsopt.cli import main
 from rootsopt.config import load
 from rootsopt.dynamics.flow import Integrator, strobe
-from rootsopt.evaluate import Evaluator, evaluate
-from rootsopt.evaluators import evaluator_for
+from rootsopt.response.evaluation import Evaluator, evaluate
+from rootsopt.response.evaluators import evaluator_for
 from rootsopt.programs import Program
 from rootsopt.status import Status
 
@@ -186,7 +186,7 @@ def test_a_cycle_is_that_of_the_pair_last_evaluated(coexisting, monkeypatch):
         used.append(pair)
         return np.tile(state, (8, 1))
 
-    monkeypatch.setattr("rootsopt.basins._cycle", cycle)
+    monkeypatch.setattr("rootsopt.response.attractors._cycle", cycle)
     sorter = _Sorter(Refitting(evaluator.config), jnp.array([36.43, 9.0, 4.0]), False)
     for one in found.attractors:
         sorter.add(one.evaluation, one.cycle[0])

@@ -14,7 +14,7 @@ import yaml
 
 from rootsopt import profile, profiles, programs
 from rootsopt.config import load
-from rootsopt.model import Model, design_vector
+from rootsopt.model import Scene, design_vector
 from rootsopt.outline.reading import read, signed_area
 
 ROOT = Path(__file__).parents[1]
@@ -49,7 +49,7 @@ def columns(path):
 def profile_in(folder):
     """The profile of the optimised config in a result folder."""
     config = load(folder / "optimized.yaml")
-    return Model.of(config).profile(design_vector(config))
+    return Scene.from_config(config).profile(design_vector(config))
 
 
 def test_optimize_writes_the_contract(tmp_path):

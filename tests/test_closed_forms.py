@@ -16,7 +16,7 @@ import pytest
 
 from rootsopt import ensemble, evaluate, files, members, orbits, speeds
 from rootsopt.arclength import Steps
-from rootsopt.batch import on_all_cores
+from rootsopt.response.batch import on_all_cores
 from rootsopt.config import load
 from rootsopt.contact.impact import ImpactLaw
 from rootsopt.contact.map import MARGIN
@@ -28,15 +28,15 @@ from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import FlankForce, RotorPair, SearchContact
 from rootsopt.dynamics.parts import ConstantLoad, MotorDrive, PrescribedDrive, TimingGear
 from rootsopt.dynamics.verdict import TOO_DEEP
-from rootsopt.evaluate import RESPONSES, Evaluation, Evaluator
-from rootsopt.members import Members
-from rootsopt.model import Model
+from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
+from rootsopt.response.members import Members
+from rootsopt.model import Scene
 from rootsopt.optimize import noise
 from rootsopt.optimize.bounds import around
 from rootsopt.optimize.problem import Problem, sobol
 from rootsopt.optimize.search import Search, Trial, _history
 from rootsopt.profiles import CIC
-from rootsopt.speeds import Part, SpeedsEvaluator, at_speed
+from rootsopt.response.speeds import Part, SpeedsEvaluator, at_speed
 from rootsopt.status import Status
 
 LOBES, SPEED, INERTIA, STIFFNESS, DAMPING, LOAD = 3, 300.0, 2e-3, 2e3, 1.5, 0.4
@@ -124,7 +124,7 @@ def test_inertia_of_a_motor_turns_with_rotor_1():
 def test_motor_of_a_config_is_that_of_its_pair():
     motor = "{slope_N_m_s_per_rad: 0.3, torque_N_m: 6, inertia_kg_m2: 0.004}"
     config = load("configs/cic.yaml", ["scene.drive=torque", f"scene.motor={motor}"])
-    drive = Model.of(config)._drive(ConstantLoad(jnp.asarray(LOAD)))
+    drive = Scene.from_config(config)._drive(ConstantLoad(jnp.asarray(LOAD)))
     assert isinstance(drive, MotorDrive)
     numbers = [float(x) for x in (drive.speed, drive.torque, drive.slope, drive.inertia)]
     assert numbers == pytest.approx([100 * np.pi, 6, 0.3, 0.004])
@@ -534,7 +534,7 @@ def test_every_speed_simulated_counts_in_the_status(monkeypatch, failing):
     none."""
     config = load("configs/cic.yaml", ["objective.speeds_rpm=[4000, 2000]"])
     evaluator = object.__new__(SpeedsEvaluator)
-    evaluator.config, evaluator.model = config, at_speed(Model.of(config), 3000.0)
+    evaluator.config, evaluator.model = config, at_speed(Scene.from_config(config), 3000.0)
 
     def single(self, design, start, series):
         here = float(self.model.speed) * 60 / (2 * np.pi)

@@ -31,7 +31,7 @@ from rootsopt.continuation import (
     with_value,
 )
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Evaluator
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.orbits import Orbits, _longest_gap
 from rootsopt.status import Status
 

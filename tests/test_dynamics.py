@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from rootsopt.config import load
 from rootsopt.dynamics.flow import Integrator, flow, strobe
 from rootsopt.dynamics.steady import settle
-from rootsopt.model import Model, design_vector, outline_mm
+from rootsopt.model import Scene, design_vector, outline_mm
 
 R, LOBES = 0.033, 3
 MESH = 2 * np.pi / LOBES
@@ -250,7 +250,7 @@ def integrator(method="tsit5", rtol=1e-9, max_steps=20000):
 
 def pair_of(path, overrides=(), deepest=-4e-3):
     config = load(path, list(overrides))
-    return build(Model.of(config, deepest), design_vector(config)), config
+    return build(Scene.from_config(config, deepest), design_vector(config)), config
 
 
 @eqx.filter_jit
@@ -521,7 +521,7 @@ def test_an_absent_gear_costs_nothing():
     assert transient.state.shape == (2,)
     free = load("configs/cic.yaml").model_dump(exclude_none=True)
     free["scene"].pop("timing_gear")
-    model = Model.of(type(config).model_validate(free))
+    model = Scene.from_config(type(config).model_validate(free))
     assert model.gear is None
     assert build(model, design_vector(config)).gear is None
 

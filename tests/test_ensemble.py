@@ -15,16 +15,16 @@ import pytest
 
 from rootsopt import optimize, report, simulate
 from rootsopt.config import DESIGN_KEYS, EnsembleConfig, load
-from rootsopt.ensemble import (
+from rootsopt.response.ensemble import (
     ERRORS,
     SIGNIFICANT,
     EnsembleEvaluator,
     fitted_slope,
     neighbours,
 )
-from rootsopt.evaluate import RESPONSES, Evaluator
-from rootsopt.evaluators import evaluator_for, without_gradient
-from rootsopt.members import Members
+from rootsopt.response.evaluation import RESPONSES, Evaluator
+from rootsopt.response.evaluators import evaluator_for, without_gradient
+from rootsopt.response.members import Members
 from rootsopt.status import Status
 
 PERIODIC = ("ensemble.members=8", "ensemble.settle_periods=24", "ensemble.periods=8")
@@ -277,7 +277,7 @@ def test_one_member_that_fails_is_enough():
 def told(monkeypatch, run, gradient=False):
     """Evaluation of members that `run(number of the pair)` makes up."""
     made = lambda pairs, *rest: [run(k) for k in range(len(pairs))]  # noqa: E731
-    monkeypatch.setattr("rootsopt.ensemble.run_members", made)
+    monkeypatch.setattr("rootsopt.response.ensemble.run_members", made)
     return averaged("ensemble.members=4", "ensemble.designs=12", gradient=gradient)
 
 

@@ -20,7 +20,7 @@ from experiments.baselines.scipy_nodes import ScipyNodes
 from experiments.families import FORCES
 from experiments.paper_scene import PAPER, Response, config_of, pair_of, polished
 from rootsopt.config import load
-from rootsopt.model import Model, design_vector
+from rootsopt.model import Scene, design_vector
 
 pytest.importorskip("numba")
 
@@ -233,8 +233,8 @@ def test_pair_of_quantities():
     values = np.array([123.0, 4.5, 6.7e4, 0.21, 0.43, 0.065])
     config = config_of("ee", values, "solver.fidelity=linear")
     design = design_vector(config)
-    expected = jax.tree.leaves(Model.of(config).pair(design))
-    shipped = Model.of(config_of("ee", None, "solver.fidelity=linear"))
+    expected = jax.tree.leaves(Scene.from_config(config).pair(design))
+    shipped = Scene.from_config(config_of("ee", None, "solver.fidelity=linear"))
     found = jax.tree.leaves(pair_of(shipped, design, jnp.asarray(values)))
     assert len(found) == len(expected)
     for one, other in zip(found, expected, strict=True):

@@ -18,14 +18,14 @@ from rootsopt import profile, simulate
 from rootsopt.config import load
 from rootsopt.contact.nodes import place_pair, signed_distance
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Series
+from rootsopt.response.evaluation import Series
 from rootsopt.export import chosen, solid, svg
 from rootsopt.export.animation import rolling_contacts, simulation_gif
 from rootsopt.export.drawing import Drawing
 from rootsopt.export.dxf import dxf_bytes
 from rootsopt.export.pieces import Arc, Spline, outline_pieces, polyline
 from rootsopt.families import profile_of
-from rootsopt.model import Model, check_geometry, design_keys, design_vector
+from rootsopt.model import Scene, check_geometry, design_keys, design_vector
 from rootsopt.optimize.problem import Space
 from rootsopt.profiles import CIC, EE, geometry, outline
 
@@ -377,8 +377,8 @@ def test_bore_takes_mass_and_inertia():
     """Less a cylinder's π/2 ρ L r⁴ and π ρ L r², with the design's derivative unchanged; an
     optimisation keeps the root circle outside."""
     plain, bored = (load(ROOT / "configs/cic.yaml", sets) for sets in ([], ["rotor.bore_mm=20"]))
-    shape = geometry(Model.of(plain).profile(design_vector(plain)))
-    one, other = Model.of(plain), Model.of(bored)
+    shape = geometry(Scene.from_config(plain).profile(design_vector(plain)))
+    one, other = Scene.from_config(plain), Scene.from_config(bored)
     cylinder = 7800.0 * 0.1 * np.pi * 0.01**2
     assert float(one.mass(shape) - other.mass(shape)) == pytest.approx(cylinder, rel=1e-9)
     lost = float(one.inertia(shape) - other.inertia(shape))
@@ -411,7 +411,7 @@ def test_notes_name_the_design():
     config = load(ROOT / "configs/cic.yaml", ["rotor.bore_mm=12", "rotor.helix_deg=30"])
     values = design_vector(config)
     design = dict(zip(design_keys(config), map(float, values), strict=True))
-    made = Drawing.of(config, Model.of(config).profile(jnp.asarray(values)), design)
+    made = Drawing.of(config, Scene.from_config(config).profile(jnp.asarray(values)), design)
     text = "\n".join(made.notes)
     for words in ("pressure_angle_deg = 36.43", "bore 12 mm", "twist 30 deg", "66 mm", "3 lobes"):
         assert words in text

@@ -20,8 +20,8 @@ from rootsopt.dynamics.peak import Steps, locate_peak
 from rootsopt.dynamics.steady import Orbit
 from rootsopt.dynamics.verdict import is_consistent, is_idle, judged
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Evaluator
-from rootsopt.model import Model, check_geometry, design_vector
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.model import Scene, check_geometry, design_vector
 from rootsopt.profiles import geometry
 from rootsopt.status import Status
 
@@ -31,7 +31,7 @@ def config_of(**changes):
     return load("configs/cic.yaml", [f"{k.replace('__', '.')}={v}" for k, v in changes.items()])
 
 
-pair_of = eqx.filter_jit(Model.pair)
+pair_of = eqx.filter_jit(Scene.pair)
 
 
 # The contact law at the ends of its ranges
@@ -134,7 +134,7 @@ def test_steps_follow_the_scene(speed, stiffness):
     """The first step is short against a swing and the longest against a flight, but not so short
     that steps as long as that use up those allowed."""
     config = config_of(scene__speed_rpm=speed, contact__stiffness_N_per_mm_e=stiffness)
-    pair = pair_of(Model.of(config), design_vector(config))
+    pair = pair_of(Scene.from_config(config), design_vector(config))
     how = Integrator("tsit5", jnp.asarray(1e-8), 4096)
     swing, fall = (float(t / pair.mesh_period) for t in (pair.pace.swing, pair.pace.fall))
     first = float(first_step(pair, np.dtype(float)))
@@ -152,7 +152,7 @@ def test_steps_follow_the_scene(speed, stiffness):
 def test_motion_inside_a_step_is_a_cubic():
     """Between the ends of the steps, ε and its rate are those of any cubic motion."""
     config = config_of(solver__fidelity="linear")
-    pair = pair_of(Model.of(config), design_vector(config))
+    pair = pair_of(Scene.from_config(config), design_vector(config))
     ends = np.array([0.1, 0.4, 0.45, np.inf])
     begins = np.array([0.0, 0.1, 0.4, 0.45])
 
@@ -175,7 +175,7 @@ def test_impact_between_the_samples_is_found():
     """A dip into the flank a hundredth of a period long lies between two of 60 samples; the steps
     of the solver are short there. The greatest force is where the dip is deepest."""
     config = config_of(solver__fidelity="linear", contact__max_damping_N_s_per_mm=0)
-    pair = pair_of(Model.of(config), design_vector(config))
+    pair = pair_of(Scene.from_config(config), design_vector(config))
     middle, width = 0.7083, 1e-3
 
     def motion(tau):
@@ -199,7 +199,7 @@ def test_impact_between_the_samples_is_found():
 def test_the_greatest_sample_need_not_lie_by_the_greatest_peak():
     """The deeper of two dips has its bottom half way between two samples, the other on one."""
     config = config_of(solver__fidelity="linear", contact__max_damping_N_s_per_mm=0)
-    pair = pair_of(Model.of(config), design_vector(config))
+    pair = pair_of(Scene.from_config(config), design_vector(config))
     bottoms, depths, width = np.array([[20 / 60], [42.5 / 60]]), [[0.5], [0.501]], 0.02
 
     def motion(tau):
@@ -354,7 +354,7 @@ def test_a_pair_with_a_motor_that_floats_is_idle():
 
 def test_a_force_lost_in_rounding_is_no_result(monkeypatch):
     """Beyond the limit of `force_rounding` the numbers come with a status and no gradient."""
-    monkeypatch.setattr("rootsopt.evaluate.UNRESOLVED", 1e-14)
+    monkeypatch.setattr("rootsopt.response.evaluation.UNRESOLVED", 1e-14)
     evaluation = Evaluator(config_of())(series=False)
     assert evaluation.status is Status.UNRESOLVED
     assert not evaluation.usable
@@ -383,7 +383,7 @@ def test_motion_of_many_swings_agrees_with_scipy():
     config = config_of(**changes)
     evaluation = Evaluator(config)(series=False)
     assert evaluation.status is Status.PERIODIC
-    pair = pair_of(Model.of(config), design_vector(config))
+    pair = pair_of(Scene.from_config(config), design_vector(config))
 
     @jax.jit
     def rates(tau, state):
@@ -438,5 +438,5 @@ def test_profiles_on_their_limits_are_finite_or_refused(angle, tip):
     configs = [config_of(**keys, profile__involute_length_mm=length) for length in lengths]
     allowed = [config for config in configs if not refused(config)]
     for config in allowed[:1] + allowed[-1:]:
-        shape = shape_of(Model.of(config), design_vector(config))
+        shape = shape_of(Scene.from_config(config), design_vector(config))
         assert all(np.isfinite(value) for value in jax.tree.leaves(shape))

@@ -14,7 +14,7 @@ from rich.console import Console
 from rootsopt import files, plot, report
 from rootsopt.config import parse
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Evaluation, Series
+from rootsopt.response.evaluation import Evaluation, Series
 from rootsopt.status import Status
 
 CONFIG = """

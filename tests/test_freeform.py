@@ -12,9 +12,9 @@ from test_optimize import SCENE
 from rootsopt.config import parse
 from rootsopt.contact.nodes import pair_gap
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Evaluator
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.families import check, free_form_of, keys_of, profile_of, with_design
-from rootsopt.model import Model, design_vector
+from rootsopt.model import Scene, design_vector
 from rootsopt.optimize.problem import Problem, sobol
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import CIC, EE, FreeForm, geometry, project
@@ -294,7 +294,7 @@ def test_points_of_any_box_become_sound_profiles(family, inside):
         "constraints.area_efficiency_min=0.42",
         "constraints.seal_width_min_mm=0",
     )
-    model, design = Model.of(settings), design_vector(settings)
+    model, design = Scene.from_config(settings), design_vector(settings)
     problem = Problem.of(settings, model, _geometry_alone(model, design))
     start = problem.project(problem.point(design))
     assert problem.feasible(start)

@@ -12,7 +12,7 @@ from rootsopt.config import DESIGN_KEYS, load
 from rootsopt.contact.closest import FlankPair
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.steady import close_orbit, reverse_sensitivity, settle, settled_within
-from rootsopt.evaluate import Evaluator
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.model import design_vector
 from rootsopt.profiles.ee import EE
 

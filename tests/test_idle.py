@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.basins import Attractor, AttractorEvaluator, Basins, _averaged
+from rootsopt.response.attractors import Attractor, AttractorEvaluator, Basins, _averaged
 from rootsopt.config import load
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Evaluation, Evaluator, idle_hint, unsettled
-from rootsopt.model import Model
+from rootsopt.response.evaluation import Evaluation, Evaluator, idle_hint, unsettled
+from rootsopt.model import Scene
 from rootsopt.optimize import __main__ as optimize
 from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import geometry
-from rootsopt.speeds import Part, SpeedsEvaluation, overall
+from rootsopt.response.speeds import Part, SpeedsEvaluation, overall
 from rootsopt.status import Status
 
 CIC = "configs/cic.yaml"
@@ -34,7 +34,7 @@ def made_up(response, status=Status.PERIODIC, state=(0.1, 0.0)) -> Evaluation:
     """An evaluation of the shipped design with made-up forces."""
     config = config_of()
     design = {"pressure_angle_deg": 36.43, "involute_length_mm": 9.0, "tip_arc_angle_deg": 4.0}
-    shape = geometry(Model.of(config).profile(jnp.asarray(list(design.values()))))
+    shape = geometry(Scene.from_config(config).profile(jnp.asarray(list(design.values()))))
     slopes = {name: dict.fromkeys(design, 1.0) for name in response}
     return Evaluation(
         design=design,
@@ -51,7 +51,7 @@ def made_up(response, status=Status.PERIODIC, state=(0.1, 0.0)) -> Evaluation:
 
 
 def problem_of(config, baseline):
-    return Problem.of(config, Model.of(config), baseline)
+    return Problem.of(config, Scene.from_config(config), baseline)
 
 
 # Whole scenes; the program is that of the shipped one
@@ -231,7 +231,7 @@ def test_a_motion_without_contact_beside_others_counts_as_zero(monkeypatch):
     averaged = _averaged(noisy, list(basins_of(noisy, quiet).attractors))
     assert averaged.response == pytest.approx({k: v / 2 for k, v in FORCES.items()})
     assert averaged.gradient["mean_force_N"]["tip_arc_angle_deg"] == 0.5
-    monkeypatch.setattr("rootsopt.basins.find", lambda *rest: basins_of(quiet, noisy))
+    monkeypatch.setattr("rootsopt.response.attractors.find", lambda *rest: basins_of(quiet, noisy))
     for motion, share in (("worst", 1.0), ("weighted", 0.5)):
         found = AttractorEvaluator(config_of(f"objective.motion={motion}"))()
         assert found.status is Status.PERIODIC

@@ -15,8 +15,8 @@ from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.steady import Orbit, agreement, disagreement
 from rootsopt.dynamics.switches import halved, has_room
 from rootsopt.dynamics.verdict import is_certain
-from rootsopt.evaluate import Evaluator
-from rootsopt.model import Model, design_vector
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.model import Scene, design_vector
 from rootsopt.status import Status
 
 LIVELY = (
@@ -80,7 +80,7 @@ def control(**over) -> LandingControl:
             *over.get("more", ()),
         ],
     )
-    pair = Model.of(config).pair(design_vector(config))
+    pair = Scene.from_config(config).pair(design_vector(config))
     how = Integrator("tsit5", jnp.asarray(1e-8), 4096)
     found = how.controller(jnp.dtype("float64"), 1.0, pair)
     assert isinstance(found, LandingControl)
@@ -89,7 +89,7 @@ def control(**over) -> LandingControl:
 
 def test_edges_are_those_of_clearance_and_backlash():
     config = load("configs/cic.yaml", ["scene.timing_gear.backlash_mm=0.2"])
-    pair = Model.of(config).pair(design_vector(config))
+    pair = Scene.from_config(config).pair(design_vector(config))
     edges = np.sort(np.asarray(control().edges)) * float(pair.angle_scale)
     half = 0.1 / 33
     assert edges == pytest.approx([-half, 0, 0, half], abs=1e-15)

@@ -8,7 +8,7 @@ import pytest
 from test_scene import pair_of
 
 from rootsopt.config import load
-from rootsopt.model import Model, design_vector, outline_mm
+from rootsopt.model import Scene, design_vector, outline_mm
 
 GAS = ["scene.load={pressure_difference_Pa: 4e4}"]
 LENGTH = 0.1
@@ -61,7 +61,7 @@ def test_gas_torque_follows_the_radius_of_contact(family):
 def test_gas_torque_has_no_jump_and_its_derivative_is_that_of_differences(length):
     """Also at and past the longest involute, where the whole tip arc meshes at once."""
     config = load("configs/cic.yaml", [*GAS, f"profile.involute_length_mm={length}"])
-    model, design = Model.of(config), design_vector(config)
+    model, design = Scene.from_config(config), design_vector(config)
     phi = jnp.linspace(0.001, 1.04, 4001)
 
     @eqx.filter_jit

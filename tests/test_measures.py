@@ -15,7 +15,7 @@ from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import close_orbit, no_tangents, spectral_radius
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Evaluator, floquet, objective_weights
+from rootsopt.response.evaluation import Evaluator, floquet, objective_weights
 from rootsopt.optimize.problem import Problem
 
 LIVELY = (

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rootsopt.config import DESIGN_KEYS, load
-from rootsopt.ensemble import ERRORS, SIGNIFICANT, EnsembleEvaluator
-from rootsopt.evaluate import RESPONSES, Evaluation, Evaluator
+from rootsopt.response.ensemble import ERRORS, SIGNIFICANT, EnsembleEvaluator
+from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.optimize import noise
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Trial

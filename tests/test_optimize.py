@@ -18,8 +18,8 @@ import pytest
 
 from rootsopt.config import parse
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Evaluation
-from rootsopt.model import Model
+from rootsopt.response.evaluation import Evaluation
+from rootsopt.model import Scene
 from rootsopt.optimize.problem import Problem, sobol
 from rootsopt.optimize.search import Search, until_stopped
 from rootsopt.profiles import geometry
@@ -45,7 +45,7 @@ def config(*overrides):
 
 def baseline(settings) -> Evaluation:
     """An evaluation with made-up forces: the space needs only its geometry."""
-    model = Model.of(settings)
+    model = Scene.from_config(settings)
     design = {"pressure_angle_deg": 36.43, "involute_length_mm": 8.0, "tip_arc_angle_deg": 4.0}
     shape = geometry(model.profile(jnp.asarray(list(design.values()))))
     return Evaluation(
@@ -64,7 +64,7 @@ def baseline(settings) -> Evaluation:
 @pytest.fixture(scope="module")
 def problem():
     settings = config()
-    return Problem.of(settings, Model.of(settings), baseline(settings))
+    return Problem.of(settings, Scene.from_config(settings), baseline(settings))
 
 
 def test_unit_box_and_design_are_inverse(problem):
@@ -101,7 +101,7 @@ def test_rotor_stays_in_its_housing(problem):
     """Floor and ceiling of the outer radius bind on their own sides, and are reported as such."""
     limits = "constraints.outer_radius_min_mm=44.2", "constraints.outer_radius_max_mm=44.5"
     settings = config(*limits, "constraints.area_efficiency_min=0.4")
-    model, start = Model.of(settings), baseline(settings)
+    model, start = Scene.from_config(settings), baseline(settings)
     start = dataclasses.replace(start, geometry=start.geometry | _radii(44.3))
     housed = Problem.of(settings, model, start)
     free = [float(_outer(model, problem.design(p))) * 1e3 for p in sobol(32, 3)]
@@ -155,7 +155,7 @@ def test_contradicting_constraints_are_bad_input():
     """No feasible design: one message, before anything is searched."""
     settings = config("constraints.area_efficiency_min=0.9", "optimizer.screening=4")
     search = Search(settings)
-    search.problem = Problem.of(settings, Model.of(settings), baseline(settings))
+    search.problem = Problem.of(settings, Scene.from_config(settings), baseline(settings))
     with pytest.raises(InputError, match=r"constraints\.area_efficiency_min"):
         search._feasible(np.full(3, 0.5))
 

@@ -16,7 +16,7 @@ from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.nodes import pair_gap
 from rootsopt.errors import InputError
 from rootsopt.families import free_form_of
-from rootsopt.model import Model, check_geometry, design_vector
+from rootsopt.model import Scene, check_geometry, design_vector
 from rootsopt.optimize.search import Search
 from rootsopt.outline.conjugacy import conjugacy
 from rootsopt.outline.curves import _jumps
@@ -328,7 +328,7 @@ def test_pair_has_the_forces_of_the_profile(tmp_path):
         ],
     )
     poses = np.random.default_rng(1).uniform([0, -2e-3, -5], [2.1, 2e-3, 5], (200, 3))
-    pairs = [Model.of(c).pair(design_vector(c)) for c in (config, truth)]
+    pairs = [Scene.from_config(c).pair(design_vector(c)) for c in (config, truth)]
     forces = [
         jax.jit(lambda x, p=p: jax.lax.map(lambda s: p.contact_force(*s), x))(poses) for p in pairs
     ]

@@ -15,8 +15,8 @@ import pytest
 from rootsopt import auto, simulate
 from rootsopt.config import load
 from rootsopt.dynamics.flow import METHODS, Integrator, strobe
-from rootsopt.evaluate import Evaluator, _series
-from rootsopt.model import Model, design_vector
+from rootsopt.response.evaluation import Evaluator, _series
+from rootsopt.model import Scene, design_vector
 from rootsopt.status import Status
 
 CIC = "configs/cic.yaml"
@@ -35,7 +35,7 @@ def config_of(precision, contact="search", method="tsit5", *overrides):
 
 
 def pair_of(config):
-    return eqx.filter_jit(Model.pair)(Model.of(config), design_vector(config))
+    return eqx.filter_jit(Scene.pair)(Scene.from_config(config), design_vector(config))
 
 
 STATES = np.array([[-1.02, 0.0], [-1.05, 0.3], [0.5, 0.1], [-1.1, -0.2], [-1.1, -0.2]])

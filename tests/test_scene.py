@@ -13,8 +13,8 @@ from scipy.integrate import solve_ivp
 from rootsopt.config import load
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Evaluator
-from rootsopt.model import Model, design_vector
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.model import Scene, design_vector
 from rootsopt.status import Status
 
 MOTOR = ["scene.drive=torque", "scene.motor={slope_N_m_s_per_rad: 0.1}"]
@@ -39,7 +39,7 @@ def build(model, design):
 
 def pair_of(overrides, family="cic"):
     config = load(f"configs/{family}.yaml", list(overrides))
-    return build(Model.of(config), design_vector(config))[0], config
+    return build(Scene.from_config(config), design_vector(config))[0], config
 
 
 def planar_of(pair, config):
@@ -210,7 +210,7 @@ def equations(jaxpr):
 def size(overrides):
     """States, equations and numbers of a scene's right-hand side."""
     config = load("configs/cic.yaml", overrides)
-    pair = eqx.filter_eval_shape(Model.pair, Model.of(config), design_vector(config))
+    pair = eqx.filter_eval_shape(Scene.pair, Scene.from_config(config), design_vector(config))
     numbers, static = eqx.partition(pair, lambda x: isinstance(x, jax.ShapeDtypeStruct))
     program = jax.make_jaxpr(lambda tau, y, n: eqx.combine(n, static).derivative(tau, y)[0])(
         jnp.zeros(()), jnp.zeros(pair.states), numbers

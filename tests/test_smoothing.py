@@ -7,7 +7,7 @@ import pytest
 
 from experiments.smoothing import LIMIT, SHAKY
 from rootsopt.config import load
-from rootsopt.evaluate import Evaluator
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
 
 FORCES = ("mean_force_N", "peak_force_N", "rms_force_N")

@@ -12,11 +12,11 @@ from rootsopt import auto, evaluate, speeds
 from rootsopt.cli import main
 from rootsopt.config import load, parse
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Evaluator
-from rootsopt.evaluators import evaluator_for
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.evaluators import evaluator_for
 from rootsopt.model import design_vector
 from rootsopt.optimize.problem import Problem
-from rootsopt.speeds import Part, SpeedsAttractorEvaluator, SpeedsEvaluator
+from rootsopt.response.speeds import Part, SpeedsAttractorEvaluator, SpeedsEvaluator
 from rootsopt.status import Status
 
 CIC = "configs/cic.yaml"

@@ -13,7 +13,7 @@ from rootsopt.config import DESIGN_KEYS, load
 from rootsopt.dynamics.flow import Integrator, flow, strobe
 from rootsopt.dynamics.peak import BESIDE, one_sided
 from rootsopt.dynamics.steady import no_tangents, spectral_radius
-from rootsopt.evaluate import RESPONSES, Evaluator, evaluate
+from rootsopt.response.evaluation import RESPONSES, Evaluator, evaluate
 from rootsopt.status import Status
 
 # The scene of the shipped configs as it was when the figures below were measured.

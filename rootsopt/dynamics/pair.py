@@ -158,6 +158,19 @@ class RotorPair(eqx.Module):
         return 2 + self.drive.free + 8 * (self.supports is not None)
 
     @property
+    def units(self) -> Float[Array, " n"]:
+        """Units of the scaled states: rad and rad/s of ε, rad/s of a motor's speed beside
+        `drive.speed`, m and m/s of displaced axes."""
+        angle, period = self.angle_scale, self.mesh_period
+        parts = [jnp.stack([angle, angle / period])]
+        if self.drive.free:
+            parts.append((angle / period)[None])
+        if self.supports is not None:
+            unit = jnp.repeat(self.supports.unit[None], 4)
+            parts += [unit, unit / period]
+        return jnp.concatenate(parts)
+
+    @property
     def mesh_period(self) -> Float[Array, ""]:
         """Duration of one lobe pitch (s) at the drive's speed."""
         return 2 * jnp.pi / (self.lobes * self.drive.speed)

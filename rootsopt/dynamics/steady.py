@@ -1,533 +1,349 @@
-"""Steady state: let the transient pass, check that it has, close the orbit.
+"""The steady motion that a state leads to, with its status and derivatives, as a pure function.
 
-The pair is forced with the mesh period. After a transient the states at the end of each
-mesh period (the stroboscopic map) settle on a cycle of k points; Newton's method on the
-k-fold map closes it, and the monodromy matrix tells whether it is stable. Where it does
-not settle, the largest Lyapunov exponent tells chaos from a long transient.
+A transient is let pass (`settle`), the cycle it ends on is closed and differentiated
+(`close_orbit`) and judged (`verdict`). What does not hold is tried again more closely. Where there
+is no orbit, a window of the motion tells chaos from a long transient. All attempts are turns of one
+loop, so that a program holds one copy of every part.
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.flow import Flow, Integrator, flow, strobe
+from rootsopt.dynamics.flow import Flow, Integrator
 from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.orbit import SAMPLES, Orbit, Shots, orbit_or_window
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.switches import halved, has_room, with_switches
+from rootsopt.dynamics.settle import Transient, settle, settled_within
+from rootsopt.dynamics.verdict import RESIDUAL, TOO_DEEP, UNRESOLVED, Verdict, verdict
+from rootsopt.dynamics.window import PERIODS, Window
+from rootsopt.status import Status
 
-BLOCK = 4
-"""Mesh periods integrated between two looks at the transient."""
-_MEMORY = 20
-"""Stroboscopic states remembered; more than twice the longest period looked for."""
-SAMPLES = 2520
-"""Uniform samples of an orbit; divisible by every period up to ten, so that a sample
-falls on the end of each mesh period."""
-_NEWTON_STEPS = 24
-_CLOSED = 4000, 1e-3, 1e-10
-"""Residual (scaled) at which Newton stops: in roundings (1e-12 in double precision), or in
-tolerances of the motion up to a limit."""
-_PATIENCE = 32, 1e-5
-"""Mesh periods after which a transient that has not settled goes on with steps at this tolerance
-at most: their noise hides that the motion repeats."""
-NOISE = 100.0
-"""Noise that adaptive steps give the stroboscopic states, in tolerances and relative to them."""
-_KEPT = 4
-"""Integrations after which the steps are kept in any case."""
-_LOOKS = 6
-"""Times that kinks are looked for while an orbit is closed, at most."""
-_DRIFT = 30.0, 1e-9, 1e-6
-"""Distance (scaled) that an orbit may have moved from where its kinks were looked for, in
-tolerances, but within these limits. The kinks lie that far outside their steps, which costs
-accuracy in first order."""
-_STRAIN = 10.0
-"""Error of a repeated step, in tolerances, with which the steps are chosen anew."""
-_AFTER = 3
-"""Integrations that must be left for looking at kinks again, or choosing steps anew: an orbit that
-is closed is not given away."""
-_AGREE = 10.0, 1e-3, 3e-2
-"""Disagreement of the derivatives on a grid and on one with its steps halved that is accepted: in
-square roots of the tolerance, but within these limits."""
-_SMALL = 1e-9, 1e-3
-"""Newton step (scaled) from which on the solver's steps are kept: a thousand times its
-tolerance, but within these."""
+_NEARLY = 0.05
+"""Scaled difference below which states are near enough to repeating for Newton's method to tell,
+and an orbit may be one of a shorter period."""
+_CLOSEST = 1e-12
+"""Scaled difference below which states repeat exactly: a closer look would show no more."""
+_TRUSTED = 1e-8
+"""Tolerance down to which an orbit is integrated more finely than asked for, where it does not
+close or its derivatives are not known."""
 
 
-class Transient(NamedTuple):
-    """End of a transient.
+class Solver(eqx.Module):
+    """How a steady motion is found.
 
-    `state`: last stroboscopic state; `period`: its cycle length k in mesh periods, 0 if
-    it has not settled; `nearest`: the k with which the last states repeat best, and
-    `spread` the scaled difference that leaves; `periods`: mesh periods simulated; `lost`:
-    `RotorPair.lost`; `solved`: whether the solver got through; `steps`:
-    solver steps.
+    `transient` and `orbit`: how they are integrated; `measures` of the force beside mean and mean
+    square; `max_periods`: mesh periods that the transient may take; `examine`: 1 to look at a
+    window of a motion that does not settle, 0 to give it up (both floats, so that all leaves are);
+    `max_orbit`: longest period looked for, at most 8; `precision`: float64 or float32.
+
+    For coarse surveys of many designs: `shots` allowed for closing an orbit, which is closed to
+    `closed` tolerances; `samples` of it; `check` of the derivatives on halved steps; number of
+    `attempts`; `windows`: mesh periods of a window (a multiple of 16, or 0 for none at all).
     """
 
-    state: Float[Array, " n"]
+    transient: Integrator
+    orbit: Integrator
+    measures: Measures
+    max_periods: Float[Array, ""]
+    examine: Float[Array, ""]
+    max_orbit: int = eqx.field(static=True)
+    precision: str = eqx.field(static=True, default="float64")
+    shots: int = eqx.field(static=True, default=24)
+    closed: float = eqx.field(static=True, default=0.0)
+    samples: int = eqx.field(static=True, default=SAMPLES)
+    check: bool = eqx.field(static=True, default=True)
+    attempts: int = eqx.field(static=True, default=16)
+    windows: int = eqx.field(static=True, default=PERIODS)
+
+
+class Steady(NamedTuple):
+    """What a state leads to.
+
+    `status`: code of a `Status`; `orbit` of `period` mesh periods, as it was closed last at the
+    tolerance `rtol`, and the `verdict` on it; `window` of a motion that did not settle;
+    `settled`: end of the transient; mesh periods `used` by transients and solver `steps` of all.
+    """
+
+    status: Int[Array, ""]
+    orbit: Orbit
     period: Int[Array, ""]
-    nearest: Int[Array, ""]
-    spread: Float[Array, ""]
-    periods: Int[Array, ""]
-    lost: Bool[Array, ""]
-    solved: Bool[Array, ""]
+    rtol: Float[Array, ""]
+    verdict: Verdict
+    window: Window
+    settled: Transient
+    used: Int[Array, ""]
     steps: Int[Array, ""]
 
+    @property
+    def forces(self) -> Float[Array, " r"]:
+        """Mean (N), mean square (N²), peak (N) and the other measures: of the orbit, of the window
+        where there is one (NaN for the others), 0 without contact, else NaN."""
+        closed = self.orbit.response
+        unknown = jnp.full_like(closed, jnp.nan)
+        found = jnp.where(among(self.status, CLOSED), closed, unknown)
+        if self.window.growth.shape[0]:
+            whole = self.window.done == self.window.growth.shape[0]
+            window = among(self.status, (Status.CHAOTIC, Status.NOT_SETTLED)) & whole
+            found = jnp.where(window, unknown.at[:3].set(self.window.forces), found)
+        return jnp.where(self.status == Status.IDLE.code, jnp.zeros_like(closed), found)
 
-class Orbit(NamedTuple):
-    """A closed orbit of k mesh periods with first derivatives.
+    @property
+    def sensitivity(self) -> Float[Array, "r d"]:
+        """Derivatives of `forces` along the directions asked for; NaN unless periodic."""
+        return jnp.where(self.status == Status.PERIODIC.code, self.orbit.sensitivity, jnp.nan)
 
-    `state` at φ1 = 0; `flow` over the orbit; `residual` |Φ(z) - z| in scaled units;
-    `monodromy` dΦ/dz and `multiplier`, the greatest modulus of its eigenvalues; `response`:
-    (mean, mean square, peak, other measures); `sensitivity` (r, d): their derivatives along the
-    orbit family with respect to the design; `newton_steps`. `drift`: distance (scaled) from where
-    the kinks were looked for. `defect`: residual on a grid with every step halved, and
-    `disagreement` of the derivatives on both, relative to the greatest; 0 where there was no check.
+
+CLOSED = (Status.PERIODIC, Status.INACCURATE, Status.TOO_DEEP, Status.UNRESOLVED)
+"""Statuses of a closed orbit with contact."""
+
+
+def among(code: Int[Array, "*n"], statuses: tuple[Status, ...]) -> Bool[Array, "*n"]:
+    """Return whether a status code is that of one of the `statuses`."""
+    return jnp.any(jnp.stack([code == status.code for status in statuses]), axis=0)
+
+
+class _Search(NamedTuple):
+    """Where the attempts stand: what is known (`found`), and what comes next.
+
+    A `shorter` period to be tried (0: none), a window (`windowed`), or else a transient from
+    `state` at tolerances `coarse`, until it repeats `within` some scaled distance, and an orbit at
+    `fine`. `tries`: attempts made; `over`: nothing comes next.
     """
 
+    found: Steady
     state: Float[Array, " n"]
-    flow: Flow
-    residual: Float[Array, ""]
-    monodromy: Float[Array, "n n"]
-    multiplier: Float[Array, ""]
-    response: Float[Array, " r"]
-    sensitivity: Float[Array, "r d"]
-    newton_steps: Int[Array, ""]
-    drift: Float[Array, ""]
-    defect: Float[Array, ""]
-    disagreement: Float[Array, ""]
+    coarse: Float[Array, ""]
+    fine: Float[Array, ""]
+    within: Float[Array, ""]
+    shorter: Int[Array, ""]
+    windowed: Bool[Array, ""]
+    tries: Int[Array, ""]
+    over: Bool[Array, ""]
 
-    @classmethod
-    def empty(cls, state: Float[Array, " n"], directions: int, flow: Flow) -> "Orbit":
-        """An orbit from `state` that has not been integrated yet, with derivatives along d
-        `directions` of the design; `flow` is `Flow.empty`."""
-        count, dtype = state.shape[0], state.dtype
-        infinite = jnp.asarray(jnp.inf, dtype)
-        return cls(
-            state=state,
-            flow=flow,
-            residual=infinite,
-            monodromy=jnp.zeros((count, count), dtype),
-            multiplier=infinite,
-            response=flow.response,
-            sensitivity=jnp.zeros((flow.response.shape[0], directions), dtype),
-            newton_steps=jnp.zeros((), int),
-            drift=jnp.zeros((), dtype),
-            defect=jnp.zeros((), dtype),
-            disagreement=jnp.zeros((), dtype),
+
+class _Attempts(eqx.Module):
+    """What `steady_motion` was asked for; `start` and `step` are its loop."""
+
+    pair: RotorPair
+    tangents: RotorPair
+    solver: Solver
+    radius: Float[Array, ""]
+
+    def start(self, state: Float[Array, " n"]) -> _Search:
+        """Nothing known of the motion from the scaled `state`."""
+        solver, dtype, count = self.solver, state.dtype, state.shape[0]
+        directions = jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
+        steps = solver.orbit.max_steps
+        flow = Flow.empty(count, directions, solver.samples, steps, solver.measures, dtype)
+        infinite, no = jnp.full((), jnp.inf, dtype), jnp.zeros((), bool)
+        one, zero = jnp.ones((), int), jnp.zeros((), int)
+        found = Steady(
+            status=jnp.asarray(Status.NOT_SETTLED.code),
+            orbit=Orbit.empty(state, directions, flow),
+            period=one,
+            rtol=solver.orbit.rtol,
+            verdict=Verdict(no, no, jnp.zeros((), dtype), no, no),
+            window=Window.empty(state, solver.windows),
+            settled=Transient(state, zero, one, infinite, zero, no, ~no, zero),
+            used=zero,
+            steps=zero,
+        )
+        coarse, fine = solver.transient.rtol, solver.orbit.rtol
+        within = settled_within(coarse).astype(dtype)
+        return _Search(found, state, coarse, fine, within, zero, no, zero, no)
+
+    def step(self, now: _Search) -> _Search:
+        """One turn: a transient and its orbit, an orbit of a shorter period, or a window."""
+        solver, found = self.solver, now.found
+        shorter = now.shorter > 0
+        fresh = ~shorter & ~now.windowed
+        settled = settle(
+            self.pair,
+            now.state,
+            dataclasses.replace(solver.transient, rtol=now.coarse),
+            now.within,
+            jnp.where(fresh, solver.max_periods - found.used, 0).astype(int),
+            solver.max_orbit,
+        )
+        used = found.used + jnp.where(fresh, settled.periods, 0)
+        steps = found.steps + jnp.where(fresh, settled.steps, 0)
+        settled = _choose(fresh, settled, found.settled)
+        failure = transient_status(self.pair, settled)
+        # Time is out, but the motion nearly repeats: noise of the coarse transient may be all that
+        # is left. Newton's method tells.
+        nearly = (failure == Status.NOT_SETTLED.code) & (settled.spread < _NEARLY) & fresh
+        within = jnp.where(nearly, settled.spread, now.within)
+        settled = settled._replace(period=jnp.where(nearly, settled.nearest, settled.period))
+        lost = fresh & (failure >= 0) & ~nearly
+        period = jnp.maximum(jnp.where(shorter, now.shorter, settled.period), 1)
+        start = jnp.where(shorter, found.orbit.state, settled.state)
+        rtol = jnp.where(now.windowed, solver.transient.rtol, now.fine)
+        shots = Shots(
+            how=dataclasses.replace(solver.orbit, rtol=rtol),
+            measures=solver.measures,
+            count=jnp.where(lost, 0, solver.shots),
+            closed=solver.closed * solver.orbit.rtol,
+            samples=solver.samples,
+            check=solver.check,
+        )
+        orbit, window = orbit_or_window(
+            self.pair, self.tangents, start, period, shots, now.windowed, solver.windows
+        )
+        judged, status = self._judged(orbit, start, now.fine, within)
+        # An orbit of a shorter period whose derivatives are not known is the motion all the same.
+        holds = among(status, (Status.PERIODIC, Status.INACCURATE))
+        taken = jnp.where(shorter, holds, ~lost) & ~now.windowed
+        status = jnp.where(lost, failure, jnp.where(taken, status, found.status))
+        new = Steady(
+            status=jnp.where(now.windowed, self._unsettled(window), status),
+            orbit=_choose(taken, orbit, found.orbit),
+            period=jnp.where(taken, period, found.period),
+            rtol=jnp.where(taken, now.fine, found.rtol),
+            verdict=_choose(taken, judged, found.verdict),
+            window=_choose(now.windowed, window, found.window),
+            settled=settled,
+            used=used,
+            steps=steps + jnp.where(now.windowed, 0, orbit.flow.steps),
+        )
+        return self._next(now, new, within, lost, taken & shorter)
+
+    def _next(self, now: _Search, new: Steady, within, lost, shortened) -> _Search:
+        """What comes after an attempt that has left `new`."""
+        solver = self.solver
+        candidate = self._shorter(new, now.shorter)
+        looks = (new.status == Status.PERIODIC.code) & ~shortened & ~now.windowed & ~lost
+        # Newton left the neighbourhood or found an unstable orbit, or one whose derivatives are
+        # not known: it was not the steady state yet, or too coarse an image of it. Go on, and look
+        # more closely.
+        late = (new.used >= solver.max_periods) | (within < _CLOSEST)
+        late |= now.tries + 1 >= solver.attempts
+        weak = among(new.status, (Status.NOT_SETTLED, Status.INACCURATE)) & ~now.windowed
+        again = weak & ~late & ~lost
+        least = jnp.minimum(solver.orbit.rtol, _TRUSTED)
+        fine = jnp.where(again, jnp.maximum(now.fine / 100, least), now.fine)
+        coarse = jnp.where(again, jnp.maximum(now.coarse / 10, fine), now.coarse)
+        unsettled = (new.status == Status.NOT_SETTLED.code) & ~again & ~now.windowed
+        windowed = unsettled & (solver.windows > 0) & (solver.examine > 0)
+        shorter = jnp.where(looks, candidate, 0)
+        return _Search(
+            found=new,
+            state=new.settled.state,
+            coarse=coarse,
+            fine=fine,
+            within=jnp.where(again, within / 10, within),
+            shorter=shorter,
+            windowed=windowed,
+            tries=now.tries + again,
+            over=~(again | windowed | (shorter > 0)),
         )
 
-
-class _Closing(NamedTuple):
-    """An orbit that is being closed.
-
-    `state` and `grid` of the next integration, whose steps are kept if `repeat`; `held`: whether
-    those of the last one were; `improving`: whether it came closer; `base`: the steps without those
-    made for kinks; `best` residual on this grid; kinks were looked for `looks` times, last along
-    the orbit from `looked`; `refined`: times the steps were halved because derivatives disagreed;
-    `checked`: whether the derivatives were compared.
-    """
-
-    orbit: Orbit
-    state: Float[Array, " n"]
-    repeat: Bool[Array, ""]
-    held: Bool[Array, ""]
-    improving: Bool[Array, ""]
-    base: Float[Array, " steps"]
-    grid: Float[Array, " steps"]
-    best: Float[Array, ""]
-    looks: Int[Array, ""]
-    looked: Float[Array, " n"]
-    refined: Int[Array, ""]
-    checked: Bool[Array, ""]
-
-
-def settled_within(rtol: Float[Array, ""]) -> Float[Array, ""]:
-    """Scaled difference below which states count as repeating, for a transient integrated
-    at `rtol`: the noise of adaptive steps is some hundred times the tolerance."""
-    return jnp.clip(1000 * rtol, 3e-3, 3e-2)
-
-
-def settle(
-    pair: RotorPair,
-    state: Float[Array, " n"],
-    how: Integrator,
-    tolerance: Float[Array, ""],
-    max_periods: Int[Array, ""],
-    max_orbit: int,
-) -> Transient:
-    """Integrate block by block until the last states repeat with some period k.
-
-    What has not settled after `_PATIENCE` goes on in finer steps. Settled means: the last k + 1
-    states differ from those k periods earlier by less than `tolerance` (scaled units; or the noise
-    of steps in states far from 0), for the smallest such k ≤ `max_orbit` ≤ 8.
-    """
-    orders = jnp.arange(1, max_orbit + 1)
-    age = jnp.arange(_MEMORY)[::-1]
-
-    def cycle(states, rtol):
-        # Of states far from 0 the noise of adaptive steps is in proportion to them.
-        noise = jnp.maximum(1.0, NOISE * rtol * jnp.abs(states) / tolerance)
-        noise = jnp.where(jnp.isfinite(noise), noise, 1.0)
-
-        def spread(k):
-            change = jnp.max(jnp.abs(states - jnp.roll(states, k, axis=0)) / noise, axis=1)
-            # Before the start the memory holds inf, and inf - inf is no difference.
-            change = jnp.where(jnp.isnan(change), jnp.inf, change)
-            return jnp.max(jnp.where(age <= k, change, 0.0))
-
-        spreads = jax.vmap(spread)(orders)
-        settled = spreads < tolerance
-        period = jnp.where(jnp.any(settled), orders[jnp.argmax(settled)], 0)
-        nearest = jnp.argmin(spreads)
-        return period, orders[nearest], spreads[nearest]
-
-    def go_on(loop):
-        carry, _ = loop
-        alive = ~carry.lost & carry.solved & jnp.all(jnp.isfinite(carry.state))
-        return (carry.period == 0) & alive & (carry.periods < max_periods)
-
-    def advance(loop):
-        carry, memory = loop
-        longest, fine = _PATIENCE
-        rtol = jnp.where(carry.periods < longest, how.rtol, jnp.minimum(how.rtol, fine))
-        part = strobe(pair, carry.state, BLOCK, dataclasses.replace(how, rtol=rtol))
-        memory = jnp.concatenate([memory[BLOCK:], part.states])
-        end = part.states[-1]
-        lost = pair.lost(end)
-        sound = part.solved & ~lost & jnp.all(jnp.isfinite(end))
-        period, nearest, spread = cycle(memory, rtol.astype(memory.dtype))
-        new = Transient(
-            state=end,
-            period=jnp.where(sound, period, 0),
-            nearest=nearest,
-            spread=spread,
-            periods=carry.periods + BLOCK,
-            lost=lost,
-            solved=part.solved,
-            steps=carry.steps + part.steps,
+    def _judged(self, orbit: Orbit, start, fine, within) -> tuple[Verdict, Int[Array, ""]]:
+        """The verdict on an orbit integrated at the tolerance `fine`, and its status as a motion;
+        whether its forces are known is asked at the end."""
+        pair, solver, dtype = self.pair, self.solver, start.dtype
+        closing = dataclasses.replace(solver.orbit, rtol=fine)
+        rtols = solver.transient.tolerance(dtype), closing.tolerance(dtype)
+        open_by = jnp.maximum(solver.closed * solver.orbit.rtol, RESIDUAL[solver.precision])
+        scales = pair.law.exponent, self.radius, pair.force_scale
+        found = verdict(orbit, start, within, rtols, open_by.astype(dtype), scales)
+        numbers = jnp.concatenate([orbit.response, orbit.state])
+        status = _first(
+            (~orbit.flow.solved, Status.SOLVER_FAILED),
+            (found.idle, Status.IDLE),
+            (~jnp.all(jnp.isfinite(numbers)), Status.NON_FINITE),
+            # Of what multiplies errors no derivative is known either.
+            (~found.steady, Status.NOT_SETTLED),
+            (~jnp.all(jnp.isfinite(orbit.sensitivity)), Status.NON_FINITE),
+            (~found.certain, Status.INACCURATE),
+            default=Status.PERIODIC.code,
         )
-        return new, memory
+        return found, status
 
-    start = Transient(
-        state=state,
-        period=jnp.zeros((), int),
-        nearest=jnp.ones((), int),
-        spread=jnp.full_like(state[0], jnp.inf),
-        periods=jnp.zeros((), int),
-        lost=jnp.zeros((), bool),
-        solved=jnp.ones((), bool),
-        steps=jnp.zeros((), int),
+    def _shorter(self, found: Steady, beyond) -> Int[Array, ""]:
+        """Least period above `beyond` that divides that of the orbit and after which the orbit
+        nearly repeats, or 0: noise of the transient can hide that a motion repeats sooner."""
+        periods = jnp.arange(1, max(self.solver.max_orbit // 2, 1) + 1)
+        place = periods * self.solver.samples // found.period
+        states = found.orbit.flow.states[jnp.minimum(place, self.solver.samples - 1)]
+        near = jnp.max(jnp.abs(states - found.orbit.state), axis=1) < _NEARLY
+        divides = (found.period % periods == 0) & (periods < found.period)
+        fits = near & divides & (periods > beyond)
+        return jnp.where(jnp.any(fits), periods[jnp.argmax(fits)], 0)
+
+    def _unsettled(self, window: Window) -> Int[Array, ""]:
+        """Code of the status of a motion that has not settled, from a window of it."""
+        if not self.solver.windows:
+            return jnp.asarray(Status.NOT_SETTLED.code)
+        return window_status(self.pair, window)
+
+    def final(self, found: Steady) -> Steady:
+        """`found`, with the forces of its orbit looked at."""
+        orbit, judged = found.orbit, found.verdict
+        closed = among(found.status, (Status.PERIODIC, Status.INACCURATE))
+        deep = orbit.flow.depth > TOO_DEEP * self.radius
+        vague = (judged.rounding > UNRESOLVED) | ~judged.consistent
+        status = jnp.where(closed & vague, Status.UNRESOLVED.code, found.status)
+        return found._replace(status=jnp.where(closed & deep, Status.TOO_DEEP.code, status))
+
+
+def transient_status(pair: RotorPair, settled: Transient) -> Int[Array, ""]:
+    """Code of the status of a transient that leads to no orbit, or -1."""
+    return _first(
+        (~settled.solved, Status.SOLVER_FAILED),
+        (~jnp.all(jnp.isfinite(settled.state)), Status.NON_FINITE),
+        (settled.lost & pair.stalled(settled.state), Status.STALLED),
+        (settled.lost, Status.PASSED_THROUGH),
+        (settled.period == 0, Status.NOT_SETTLED),
+        default=-1,
     )
-    memory = jnp.full((_MEMORY, *state.shape), jnp.inf, state.dtype)
-    return lax.while_loop(go_on, advance, (start, memory))[0]
 
 
-def close_orbit(
-    pair: RotorPair,
-    tangents: RotorPair,
-    state: Float[Array, " n"],
-    period: Int[Array, ""],
-    how: Integrator,
-    measures: Measures | None = None,
-    samples: int = SAMPLES,
-    shots: Int[Array, ""] | int = _NEWTON_STEPS,
-    closed: Float[Array, ""] | float = 0.0,
-    check: bool = True,
-) -> Orbit:
-    """Newton shooting on Φ(z) = z, then the implicit function theorem for gradients.
-
-    `tangents` holds d pair / d design, stacked along a leading axis. `samples` must be
-    divisible by the period. Newton stops after `shots` integrations, or at the residual
-    `closed` (at least some thousand roundings and a thousandth of the tolerance). Once its steps
-    are small those of the solver are kept, with ends added where the equation is not smooth: so
-    the map it solves is smooth and closes to rounding, and its derivative is as accurate as the
-    motion. With `check`, orbit and derivatives are compared with those on a grid with every step
-    halved; where they disagree the orbit is closed once more, on that one.
-    """
-    count, dtype = state.shape[0], state.dtype
-    tolerance = how.tolerance(dtype)
-    roundings, tolerances, most = _CLOSED
-    enough = jnp.minimum(tolerances * tolerance, most)
-    enough = jnp.maximum(roundings * float(jnp.finfo(dtype).eps), enough)
-    closed = jnp.maximum(closed, enough).astype(dtype)
-    far = jnp.clip(_DRIFT[0] * tolerance, *_DRIFT[1:])
-    length = period.astype(dtype)
-    measures = Measures() if measures is None else measures
-    frozen = lax.stop_gradient(pair)
-    # A contact that may jump anywhere has derivatives of the steps, not of the motion.
-    check = check and pair.smooth
-
-    def shoot(state, grid, repeat, peak):
-        top = jnp.where(peak > 0, peak, frozen.force_scale)
-        return flow(
-            pair, state, length, how, samples, tangents, grid, repeat, measures=measures, top=top
-        )
-
-    def is_open(now):
-        done = now.orbit.newton_steps
-        left = (now.orbit.residual > closed) & ((done < 3) | now.improving)
-        # Chosen anew, the steps depend on the state, and that leaves a floor.
-        return (left | ~now.held) & (done < shots + now.refined * shots // 2)
-
-    def go_on(now):
-        sound = now.held & now.orbit.flow.solved & jnp.isfinite(now.orbit.residual)
-        return is_open(now) | (sound & ~now.checked & check)
-
-    def step(now):
-        checking = ~is_open(now)
-        start = jnp.where(checking, now.orbit.state, now.state)
-        grid = lax.cond(checking, lambda: halved(now.orbit.flow.grid), lambda: now.grid)
-        out = shoot(start, grid, now.repeat | checking, now.orbit.flow.peak)
-        monodromy = out.slope[:count, :count]
-        miss = out.end - start
-        residual = jnp.max(jnp.abs(miss))
-        correction = solved(jnp.eye(count, dtype=dtype) - monodromy, miss[:, None])[:, 0]
-        # A pair that floats stays where the transient led to: any place is as good.
-        floats = jnp.all(jnp.isfinite(miss)) & ~jnp.all(jnp.isfinite(correction))
-        correction = jnp.where(floats, 0.0, correction)
-        size = jnp.max(jnp.abs(correction))
-        # Keep the first steps inside the neighbourhood the transient pointed to.
-        new = start + correction * jnp.minimum(1.0, 0.5 / jnp.maximum(size, 1e-30))
-        done = now.orbit.newton_steps + 1
-        known = size < jnp.clip(1000 * tolerance, *_SMALL)
-        following = now.repeat | known | (done >= jnp.minimum(shots // 3, _KEPT))
-        improving = residual < 0.5 * now.best
-        # Kinks are looked for again where the motion has moved them out of their steps.
-        few = now.looks < _LOOKS
-        stalled = now.repeat & ~improving & (residual > closed) & few
-        drift = jnp.max(jnp.abs(start - now.looked))
-        again = now.repeat & (residual <= closed) & few & (done + _AFTER <= shots)
-        # A jump that no switch tells stays where the steps have it.
-        strayed = again & (drift > far) & pair.smooth
-        strained = again & ~(out.strain <= _STRAIN)
-        # Steps of a solver that did not get through are none to be repeated.
-        following &= ~strained & (out.solved | now.repeat | ~jnp.all(jnp.isfinite(start)))
-        look = following & (~now.repeat | stalled | strayed)
-
-        found = now.orbit._replace(
-            state=start,
-            flow=out,
-            residual=residual,
-            monodromy=monodromy,
-            newton_steps=done,
-            drift=drift,
-        )
-        apart = disagreement(now.orbit.flow.slope, out.slope, count)
-        # Where not all steps can be divided nothing is compared.
-        apart = jnp.where(has_room(now.orbit.flow.grid), apart, jnp.inf)
-        compared = now.orbit._replace(defect=residual, disagreement=apart)
-        orbit = _choose(checking, compared, found)
-        finer = checking & (apart > agreement(tolerance)) & (apart < jnp.inf) & (now.refined < 1)
-        base = jnp.where(now.repeat, now.base, out.grid)
-        base = lax.cond(finer, lambda: halved(base), lambda: base)
-        grid = lax.cond(
-            jnp.where(checking, finer, look),
-            lambda: with_switches(frozen, out, length, tolerance, base),
-            lambda: jnp.where(now.repeat, now.grid, out.grid),
-        )
-        renewed = jnp.where(checking, finer, look)
-        # Residuals compare on the same steps only.
-        best = jnp.where(renewed | ~now.repeat, jnp.inf, jnp.minimum(now.best, residual))
-        return _Closing(
-            orbit=orbit,
-            state=new,
-            repeat=following | checking,
-            held=jnp.where(checking, ~finer, now.repeat & ~strayed & ~strained),
-            improving=improving | renewed,
-            base=base,
-            grid=grid,
-            best=best,
-            looks=now.looks + renewed,
-            looked=jnp.where(renewed, start, now.looked),
-            refined=now.refined + finer,
-            checked=checking & ~finer,
-        )
-
-    # The loop holds the only copy of the integration: one shot is compiled, not two.
-    designs = jax.tree.leaves(eqx.filter(tangents, eqx.is_inexact_array))[0].shape[0]
-    none = Flow.empty(count, designs, samples, how.max_steps, measures, dtype)
-    no, zero = jnp.zeros((), bool), jnp.zeros((), int)
-    start = _Closing(
-        orbit=Orbit.empty(state, designs, none),
-        state=state,
-        repeat=no,
-        held=no,
-        improving=no,
-        base=none.grid,
-        grid=none.grid,
-        best=jnp.asarray(jnp.inf, dtype),
-        looks=zero,
-        looked=state,
-        refined=zero,
-        checked=no,
+def window_status(pair: RotorPair, window: Window) -> Int[Array, ""]:
+    """Code of the status of a motion that has not settled, from a `window` of it."""
+    finite = jnp.all(jnp.isfinite(window.response)) & jnp.isfinite(window.exponent)
+    lost = pair.lost(window.end)
+    least = float(jnp.finfo(window.end.dtype).eps) * pair.force_scale
+    return _first(
+        (lost & pair.stalled(window.end), Status.STALLED),
+        (lost, Status.PASSED_THROUGH),
+        (~finite, Status.NON_FINITE),
+        (~window.solved, Status.SOLVER_FAILED),
+        (jnp.max(window.response[:, 2]) <= least, Status.IDLE),
+        (window.exponent > 3 * window.error, Status.CHAOTIC),
+        default=Status.NOT_SETTLED.code,
     )
-    orbit = lax.while_loop(go_on, step, start).orbit
-    slope = orbit.flow.slope
-    moved = solved(jnp.eye(count, dtype=dtype) - orbit.monodromy, slope[:count, count:])
-    sensitivity = slope[count:, count:] + slope[count:, :count] @ moved
-    return orbit._replace(
-        multiplier=spectral_radius(orbit.monodromy),
-        response=orbit.flow.response,
-        sensitivity=sensitivity,
-    )
+
+
+def _first(*cases: tuple[Bool[Array, ""], Status], default: int) -> Int[Array, ""]:
+    """Code of the status of the first case that holds."""
+    conditions, statuses = zip(*cases, strict=True)
+    return jnp.select(conditions, [jnp.asarray(s.code) for s in statuses], jnp.asarray(default))
 
 
 def _choose(condition, new, old):
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
 
 
-def agreement(tolerance: Float[Array, ""]) -> Float[Array, ""]:
-    """Largest `disagreement` with which derivatives of an orbit at a relative `tolerance` are
-    reported."""
-    scale, least, most = _AGREE
-    return jnp.clip(scale * jnp.sqrt(tolerance), least, most)
-
-
-def disagreement(
-    first: Float[Array, "rows columns"], second: Float[Array, "rows columns"], count: int
-) -> Float[Array, ""]:
-    """Largest difference of two estimates of an orbit's derivatives, each kind relative to its
-    greatest: (I - M)⁻¹, and those of the state and of mean and mean square force with respect to
-    the design. `first` and `second`: `Flow.slope` of `count` states on two grids.
-    """
-
-    def derivatives(slope):
-        unit = jnp.eye(count, dtype=slope.dtype)
-        right = jnp.concatenate([unit, slope[:count, count:]], axis=1)
-        moved = solved(unit - slope[:count, :count], right)
-        forces = slope[count : count + 2]
-        along = forces[:, count:] + forces[:, :count] @ moved[:, count:]
-        return [moved[:, :count], moved[:, count:], *along]
-
-    def apart(one, other):
-        size = jnp.max(jnp.abs(one), initial=0.0)
-        return jnp.max(jnp.abs(one - other), initial=0.0) / jnp.where(size > 0, size, 1.0)
-
-    pairs = zip(derivatives(first), derivatives(second), strict=True)
-    return jnp.max(jnp.stack([apart(one, other) for one, other in pairs]))
-
-
-def reverse_sensitivity(
-    build: Callable[[Float[Array, " d"]], RotorPair],
-    design: Float[Array, " d"],
+def steady_motion(
+    pair: RotorPair,
+    tangents: RotorPair,
     state: Float[Array, " n"],
-    period: Int[Array, ""],
-    how: Integrator,
-    grid: Float[Array, " steps"],
-    measures: Measures | None = None,
-    top: Float[Array, ""] | None = None,
-) -> Float[Array, "r d"]:
-    """The same sensitivity by reverse mode, through diffrax's checkpointed adjoint (where the
-    contact may jump, which that knows nothing of, through the steps themselves).
+    radius: Float[Array, ""],
+    solver: Solver,
+) -> Steady:
+    """Find the steady motion of `pair` from the scaled `state` at φ1 = 0, with derivatives along
+    the directions `tangents` of its parameters (stacked along a leading axis).
 
-    On the steps `grid` of the closed orbit, whose peak is `top` (N). With cotangents v of a
-    response and w of the end state, the implicit function theorem asks for
-    (I - M)ᵀ w = R_zᵀ v and gives dR/dp = R_pᵀ v + Φ_pᵀ w.
+    `radius`: pitch radius (m), beside which penetrations are judged.
     """
-    count = state.shape[0]
-    length = period.astype(state.dtype)
-    adjoint = diffrax.RecursiveCheckpointAdjoint()
-
-    def run(state, design):
-        kept = {"grid": grid, "adjoint": adjoint, "measures": measures, "top": top}
-        out = flow(build(design), state, length, how, SAMPLES, **kept)
-        return jnp.concatenate([out.end, out.response])
-
-    end, pull = jax.vjp(run, state, design)
-    by_state, by_design = jax.vmap(pull)(jnp.eye(end.shape[0], dtype=state.dtype))
-    monodromy, response = by_state[:count], by_state[count:]
-    weight = solved((jnp.eye(count, dtype=state.dtype) - monodromy).T, response.T)
-    return by_design[count:] + weight.T @ by_design[:count]
-
-
-def no_tangents(pair: RotorPair) -> RotorPair:
-    """No directions of the parameters of `pair`, stacked: derivatives in the state only."""
-    return jax.tree.map(
-        lambda x: jnp.zeros((0, *x.shape), x.dtype), eqx.filter(pair, eqx.is_inexact_array)
+    attempts = _Attempts(pair, tangents, solver, radius)
+    search = lax.while_loop(
+        lambda now: ~now.over, lambda now: attempts.step(now), attempts.start(state)
     )
-
-
-class Lyapunov(NamedTuple):
-    """Largest Lyapunov exponent per mesh period, its standard error, and statistics of
-    the force over the window it was measured on."""
-
-    exponent: Float[Array, ""]
-    error: Float[Array, ""]
-    flows: Flow
-    state: Float[Array, " n"]
-
-
-def lyapunov(pair: RotorPair, state: Float[Array, " n"], periods: int, how: Integrator) -> Lyapunov:
-    """Growth of a tangent vector over `periods` mesh periods, renormalised each period.
-
-    The standard error comes from 16 batch means.
-    """
-    one = jnp.ones_like(state[0])
-    still = no_tangents(pair)
-
-    def step(carry, _):
-        state, tangent = carry
-        out = flow(pair, state, one, how, SAMPLES // 4, still)
-        moved = out.slope[: state.shape[0]] @ tangent
-        size = jnp.linalg.norm(moved)
-        safe = jnp.where(size > 0, size, 1.0)
-        return (out.end, moved / safe), (jnp.log(safe), out)
-
-    direction = jnp.zeros_like(state).at[0].set(1.0)
-    (end, _), (growth, flows) = lax.scan(step, (state, direction), length=periods)
-    batches = jnp.mean(growth.reshape(16, -1), axis=1)
-    error = jnp.std(batches, ddof=1) / 4
-    return Lyapunov(jnp.mean(growth), error, flows, end)
-
-
-def solved(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """Solution of a few linear equations, by elimination with row pivoting.
-
-    In plain arithmetic: a call into LAPACK costs more than the solution of two equations, and
-    a program that holds one cannot be kept between processes.
-    """
-    rows = jnp.concatenate([matrix, right], axis=1)
-    count = matrix.shape[0]
-    place = jnp.arange(count)
-    for k in range(count):
-        size = jnp.where(place >= k, jnp.abs(rows[:, k]), -1.0)
-        pivot = jnp.argmax(size)
-        order = jnp.where(place == k, pivot, jnp.where(place == pivot, k, place))
-        rows = rows[order]
-        row = rows[k] / rows[k, k]
-        rows = jnp.where((place == k)[:, None], row, rows - rows[:, k : k + 1] * row)
-    return rows[:, count:]
-
-
-_SQUARINGS = 40
-
-
-def spectral_radius(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
-    """Greatest modulus of the eigenvalues, in real arithmetic.
-
-    Of two, from trace and determinant; of more, as the growth of the powers of the matrix, which
-    repeated squaring takes so far that nothing is left of the choice of norm.
-    """
-    if matrix.shape[0] == 2:
-        half = jnp.trace(matrix) / 2
-        determinant = jnp.linalg.det(matrix)
-        square = half**2 - determinant
-        root = jnp.sqrt(jnp.abs(square))
-        return jnp.where(square >= 0, jnp.abs(half) + root, jnp.sqrt(jnp.abs(determinant)))
-
-    def double(_, carry):
-        power, growth, share = carry
-        size = jnp.max(jnp.abs(power))
-        scaled = power / jnp.where(size > 0, size, 1.0)
-        growth = growth + share * jnp.log(size)
-        # Written as a sum: a matrix product this small costs more in its call.
-        return jnp.sum(scaled[:, :, None] * scaled[None], axis=1), growth, share / 2
-
-    start = matrix, jnp.zeros((), matrix.dtype), jnp.ones((), matrix.dtype)
-    return jnp.exp(lax.fori_loop(0, _SQUARINGS, double, start)[1])
+    return attempts.final(search.found)

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rootsopt.contact.impact import force_rounding
-from rootsopt.dynamics.steady import NOISE, Orbit, agreement, solved
+from rootsopt.dynamics.linear import solved
+from rootsopt.dynamics.orbit import Orbit, agreement
+from rootsopt.dynamics.settle import NOISE
 
 RESIDUAL = {"float64": 1e-9, "float32": 1e-3}
 """Largest residual (scaled) of an orbit that counts as closed, by precision."""

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rootsopt.contact.nodes import place_pair
-from rootsopt.evaluate import Series
 from rootsopt.export.drawing import Drawing
 from rootsopt.export.pieces import polyline
 from rootsopt.plot import BLUE, GREY, ORANGE, SKY, VERMILION, figure
 from rootsopt.profiles import Profile
 from rootsopt.programs import Program
+from rootsopt.response.evaluation import Series
 
 _MM = 1e3
 _FRAMES = 40  # per mesh period

@@ -8,8 +8,8 @@ from rootsopt.errors import InputError
 
 if TYPE_CHECKING:
     from rootsopt.config import Config
-    from rootsopt.evaluate import Evaluation, Series
     from rootsopt.files import ResultFolder
+    from rootsopt.response.evaluation import Evaluation, Series
 
 FORMATS = {
     "dxf": "rotor.dxf, true arcs and splines on layers",
@@ -71,10 +71,10 @@ def write(
     import numpy as np
 
     from rootsopt.export.drawing import Drawing
-    from rootsopt.model import Model
+    from rootsopt.model import Scene
 
     values = jnp.asarray(np.array(list(design.values()), dtype=float))
-    profile = Model.of(config).profile(values)
+    profile = Scene.from_config(config).profile(values)
     drawing = Drawing.of(config, profile, design)
     files: dict[str, bytes] = {}
     if "dxf" in formats:

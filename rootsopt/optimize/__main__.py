@@ -79,13 +79,13 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 def _searched(config: "Config", progress, stop: threading.Event):
     """Config without `auto`, what was chosen there, and the search's outcome: None if it was
     stopped before the baseline was simulated."""
-    from rootsopt import auto
     from rootsopt.optimize.search import Search, until_stopped
+    from rootsopt.response.choice import resolve
 
     state: dict[str, Any] = {"config": config, "choice": {}}
 
     def work():
-        state["config"], state["choice"] = auto.resolve(config)
+        state["config"], state["choice"] = resolve(config)
         state["search"] = Search(state["config"], progress, stop)
         return state["search"].run()
 
@@ -116,11 +116,11 @@ def _alike(config: "Config", result) -> dict:
         return {}
     import jax.numpy as jnp
 
-    from rootsopt.model import Model
+    from rootsopt.model import Scene
     from rootsopt.resemblance import likenesses
 
     design = list(result.optimized.design.values())
-    found = likenesses(Model.of(config).profile(jnp.asarray(design)))
+    found = likenesses(Scene.from_config(config).profile(jnp.asarray(design)))
     return {"resembles": [one.record() for one in found]}
 
 

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.ensemble import ERRORS, SIGNIFICANT, EnsembleEvaluator
-from rootsopt.evaluate import Evaluation
 from rootsopt.optimize.problem import Problem
+from rootsopt.response.ensemble import ERRORS, SIGNIFICANT, EnsembleEvaluator
+from rootsopt.response.evaluation import Evaluation
 
 _NEAR = 0.1
 """Distance in the unit box up to which trials count as one candidate."""
@@ -55,8 +55,7 @@ def add_errors(rows: list[dict[str, Any]], trials: Sequence, problem: Problem) -
 def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> Verdict:
     """Choose among the best candidates by one larger ensemble, and compare the one chosen with
     the baseline by another. Gradients are from ensembles of the search's size."""
-    chooser, judge = evaluator.independent(1), evaluator.independent(2)
-    chooser.differentiate = judge.differentiate = False
+    chooser, judge = (evaluator.independent(k).without_gradient() for k in (1, 2))
     settings = judge.settings
     record: dict[str, Any] = {
         "holds_up": False,

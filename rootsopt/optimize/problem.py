@@ -27,14 +27,14 @@ from scipy.optimize import nnls
 from rootsopt.config import Config
 from rootsopt.dynamics.measures import line_name
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Evaluation, objective_weights
 from rootsopt.families import BY_LIMITS, DEG, INHERENT, MM, keys_of
-from rootsopt.model import Model
+from rootsopt.model import Scene
 from rootsopt.optimize.bounds import bounds_of
 from rootsopt.profiles import Geometry, geometry
 from rootsopt.profiles.validity import Margins, margins
 from rootsopt.programs import Program
-from rootsopt.speeds import counted, parts_of
+from rootsopt.response.evaluation import Evaluation, objective_weights
+from rootsopt.response.speeds import counted, parts_of
 
 _SHORTEST = 0.1
 """Least involute, as a share of the longest, where the config sets no bound."""
@@ -97,14 +97,14 @@ class _Involute(NamedTuple):
 class Space(eqx.Module):
     """The unit box of d design parameters and the constraints in it."""
 
-    model: Model
+    scene: Scene
     lower: Float[Array, " d"]
     upper: Float[Array, " d"]
     constraints: tuple[Constraint, ...]
     involute: _Involute | None = eqx.field(static=True)
 
     @classmethod
-    def of(cls, config: Config, model: Model, area_efficiency: float) -> "Space":
+    def of(cls, config: Config, scene: Scene, area_efficiency: float) -> "Space":
         """Bounds and floors of a config whose baseline has this `area_efficiency`; raises
         `InputError` where they leave no design."""
         limits, family = config.constraints, config.profile.family
@@ -121,8 +121,8 @@ class Space(eqx.Module):
             _constraint("undercut margin", undercut, "mm", margin, MM, MM, sound),
             _constraint("seal width", "seal_width", "mm", limits.seal_width_min_mm * MM, MM, MM),
         )
-        if model.bore_radius is not None:
-            room = model.bore_radius
+        if scene.bore_radius is not None:
+            room = scene.bore_radius
             constraints += (_constraint("root radius", "root_radius", "mm", room, MM, MM),)
         radii = ((True, limits.outer_radius_max_mm), (False, limits.outer_radius_min_mm))
         for ceiling, radius in radii:
@@ -139,7 +139,7 @@ class Space(eqx.Module):
             tip = "tip_arc_angle_deg"
             angle, length = map(keys.index, ("pressure_angle_deg", "involute_length_mm"))
             involute = _Involute(angle, length, keys.index(tip) if tip in keys else None)
-        return cls(model, jnp.asarray(lower), jnp.asarray(upper), constraints, involute)
+        return cls(scene, jnp.asarray(lower), jnp.asarray(upper), constraints, involute)
 
     def design(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
         """Design in config units at `point` of the unit box."""
@@ -172,8 +172,8 @@ class Space(eqx.Module):
         """Shortest and longest involute (mm) at α, θ1 (deg)."""
         assert self.involute is not None
         low, high = self.lower[self.involute.length], self.upper[self.involute.length]
-        half = jnp.pi / (2 * self.model.lobes)
-        radius = self.model.pitch_radius / MM
+        half = jnp.pi / (2 * self.scene.lobes)
+        radius = self.scene.pitch_radius / MM
         longest = radius * jnp.sin(alpha * DEG) * (half - tip * DEG)
         most = jnp.minimum(longest, high)
         return jnp.minimum(jnp.maximum(low, _SHORTEST * longest), 0.999 * most), most
@@ -184,7 +184,7 @@ class Space(eqx.Module):
 
     def slacks_of(self, design: Float[Array, " d"]) -> Float[Array, " m"]:
         """Scaled slack of every constraint at a design in config units."""
-        profile = self.model.profile(design)
+        profile = self.scene.profile(design)
         shape = geometry(profile)
         found = margins(profile) if any(c.margin for c in self.constraints) else None
         return jnp.stack([c.slack(shape, found) for c in self.constraints])
@@ -217,7 +217,7 @@ def _nearest(space: Space, design):
 @Program
 def _longest(space: Space, point):
     """Longest involute (mm) at a point of the unit box, bounds aside."""
-    profile = space.model.profile(space.design(point))
+    profile = space.scene.profile(space.design(point))
     return profile.longest_involute / MM  # type: ignore[attr-defined]
 
 
@@ -233,7 +233,7 @@ class Problem:
     space: Space
 
     @classmethod
-    def of(cls, config: Config, model: Model, baseline: Evaluation) -> "Problem":
+    def of(cls, config: Config, scene: Scene, baseline: Evaluation) -> "Problem":
         """The problem whose floors are those of the config or of the `baseline`.
 
         Raises `InputError` where a measure is to fall that is 0 for the baseline: nothing is
@@ -258,7 +258,7 @@ class Problem:
                 f"{name} is {one.response[name]:g}{at}; raise the load, lower "
                 "`contact.clearance_mm`, or set the weight to 0"
             )
-        return cls(config, baseline, Space.of(config, model, baseline.geometry["area_efficiency"]))
+        return cls(config, baseline, Space.of(config, scene, baseline.geometry["area_efficiency"]))
 
     def objective(self, evaluation: Evaluation) -> float:
         """Weighted measures of the force relative to the baseline's (1 at the baseline), over the

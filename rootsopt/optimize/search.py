@@ -8,7 +8,6 @@ at a tighter tolerance before it is reported. A search may be stopped at any tim
 goes on to that last step with what it has.
 """
 
-import copy
 import dataclasses
 import operator
 import os
@@ -24,11 +23,12 @@ from numpy.typing import NDArray
 
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Evaluation, Evaluator
-from rootsopt.evaluators import evaluator_for, without_gradient
 from rootsopt.model import design_vector
 from rootsopt.optimize.problem import Problem, Space, sobol
 from rootsopt.programs import Program
+from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.evaluators import evaluator_for
+from rootsopt.response.wrapper import Evaluates
 from rootsopt.status import Status
 
 T = TypeVar("T")
@@ -140,8 +140,6 @@ class Search:
         self.expected = self.settings.screening + self.settings.starts * (
             self.settings.iterations + 1
         )
-        # The search needs a gradient and an order of designs, not the last digits.
-        self.fast = evaluator_for(config, rtol=max(1e-6, config.solver.rtol), survey=True)
         self.exact = evaluator_for(config)
         # Where every objective has its noise, not to have found a better one says little.
         self.noisy = config.objective.motion == "ensemble"
@@ -155,17 +153,16 @@ class Search:
     def run(self) -> Optimization:
         """Baseline, screening, descents, verification. After `stop`, what was found before it,
         verified too unless that takes ensembles."""
-        self.exact.prepare(design_vector(self.config))
-        Space.of(self.config, self.exact.model, 0.0).prepare()
-        baseline = self.exact()
+        exact = self.exact.prepare(design_vector(self.config))
+        Space.of(self.config, exact.scene, 0.0).prepare()
+        exact, baseline = exact.fit()
         if not baseline.usable:
             return Optimization(None, baseline, None, [], {}, self.stop.is_set())
-        self.fast.model = self.exact.model
         # What the forces of motions that coexist are relative to.
-        self.fast.relate(baseline)
-        self.exact.relate(baseline)
-        self.fast.fitted = self.fast.prepared = True
-        self.problem = Problem.of(self.config, self.exact.model, baseline)
+        self.exact = exact = exact.relative_to(baseline)
+        # The search needs a gradient and an order of designs, not the last digits.
+        self.fast = exact.at_tolerance(max(1e-6, self.config.solver.rtol)).surveying()
+        self.problem = Problem.of(self.config, exact.scene, baseline)
         self._baseline = baseline
         start = self.problem.point(list(baseline.design.values()))
         points = self._feasible(start)
@@ -180,8 +177,8 @@ class Search:
             trials = self._in_order()
         rows = _history(trials)
         if self.noisy:
-            from rootsopt.ensemble import EnsembleEvaluator
             from rootsopt.optimize import noise
+            from rootsopt.response.ensemble import EnsembleEvaluator
 
             assert isinstance(self.exact, EnsembleEvaluator)
             noise.add_errors(rows, trials, self.problem)
@@ -226,13 +223,12 @@ class Search:
             return sorted(self._trials, key=lambda trial: (trial.start, trial.iteration))
 
     def _side_by_side(self, work: Callable[..., list[Trial]], tasks: Sequence) -> list[Trial]:
-        """The trials of `work(evaluator, *task)` for every task, in their order. Each has its own
-        evaluator, so that the result does not depend on which is done first.
+        """The trials of `work(*task)` for every task, in their order.
 
         After `stop` none, and nobody waits for the evaluations that go on."""
         pool = ThreadPoolExecutor(os.cpu_count())
         tasks = tasks if not self.stop.is_set() else []
-        done = [pool.submit(work, copy.copy(self.fast), *task) for task in tasks]
+        done = [pool.submit(work, *task) for task in tasks]
         try:
             pending = set(done)
             while pending and not self.stop.is_set():
@@ -258,10 +254,10 @@ class Search:
             )
         return points
 
-    def _screen(self, evaluator: Evaluator, point) -> list[Trial]:
+    def _screen(self, point) -> list[Trial]:
         if self.stop.is_set():
             return []
-        return [self._evaluate(without_gradient(evaluator), point, start=-1, iteration=0)]
+        return [self._evaluate(self.fast.without_gradient(), point, start=-1, iteration=0)]
 
     def _starts(self, trials: list[Trial]) -> list[NDArray[np.float64]]:
         """The best of the screened designs that are apart from each other."""
@@ -272,9 +268,7 @@ class Search:
                 chosen.append(trial.point)
         return chosen
 
-    def _descend(
-        self, evaluator: Evaluator, number: int, point: NDArray[np.float64]
-    ) -> list[Trial]:
+    def _descend(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
         """Local descent from `point`."""
         settings = self.settings
         rule = settings.method, settings.learning_rate, settings.iterations
@@ -286,7 +280,7 @@ class Search:
             if self.stop.is_set():
                 break
             orbit = last.evaluation.state if last is not None and last is trials[-1] else None
-            trial = self._evaluate(evaluator, point, number, iteration, orbit)
+            trial = self._evaluate(self.fast, point, number, iteration, orbit)
             trials.append(trial)
             if np.isnan(trial.objective):
                 # No steady state there: go half way back to the last good design.
@@ -306,7 +300,7 @@ class Search:
             point = self.problem.toward(point + np.asarray(update), point)
         return trials
 
-    def _evaluate(self, evaluator: Evaluator, point, start, iteration, orbit=None) -> Trial:
+    def _evaluate(self, evaluator: Evaluates, point, start, iteration, orbit=None) -> Trial:
         evaluation = evaluator(self.problem.design(point), start=orbit, series=False)
         objective = self.problem.objective(evaluation)
         feasible = self.problem.feasible(point)

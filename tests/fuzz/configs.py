@@ -100,7 +100,7 @@ def wrong_geometry(config: Config) -> str | None:
     import jax
     import numpy as np
 
-    from rootsopt.model import Model, check_geometry, design_vector
+    from rootsopt.model import Scene, check_geometry, design_vector
     from rootsopt.profiles import geometry
     from rootsopt.programs import Program
 
@@ -109,7 +109,7 @@ def wrong_geometry(config: Config) -> str | None:
         _measured = Program(lambda model, design: geometry(model.profile(design)))
     try:
         check_geometry(config)
-        model = Model.of(config)
+        model = Scene.from_config(config)
         shape = _measured(model, design_vector(config))
     except InputError as error:
         return wrong_message(str(error))

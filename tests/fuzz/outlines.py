@@ -138,10 +138,10 @@ def good() -> dict[str, bytes]:
     from rootsopt.config import load
     from rootsopt.export.drawing import Drawing
     from rootsopt.export.dxf import dxf_bytes
-    from rootsopt.model import Model, design_vector
+    from rootsopt.model import Scene, design_vector
 
     config = load(Path(__file__).parents[2] / "configs" / "cic.yaml")
-    profile = Model.of(config).profile(design_vector(config))
+    profile = Scene.from_config(config).profile(design_vector(config))
     text = io.StringIO(dxf_bytes(Drawing.of(config, profile, {})).decode())
     entities = list(ezdxf.read(text).modelspace())
     chance = random.Random(0)

@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from rootsopt.config import Config, SolverConfig
-from rootsopt.evaluate import Evaluation, Evaluator
-from rootsopt.speeds import alone, shares
+from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.speeds import alone, shares
 from rootsopt.status import Status
 
 _JUDGED = ("mean_force_N", "peak_force_N")
@@ -89,7 +89,7 @@ def choose(config: Config) -> Choice:
 
 def _evaluations(config: Config) -> list[Evaluation]:
     """The config's own design at every speed of its objective."""
-    return [Evaluator(alone(config, speed))(series=False) for speed in shares(config)]
+    return [Evaluator.of(alone(config, speed))(series=False) for speed in shares(config)]
 
 
 def resolve(config: Config) -> tuple[Config, dict[str, Any]]:

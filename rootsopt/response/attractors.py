@@ -15,14 +15,16 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.batch import on_all_cores
 from rootsopt.config import Config
 from rootsopt.dynamics.flow import Integrator, strobe
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import BLOCK, Transient, settle, settled_within
-from rootsopt.evaluate import Evaluation, Evaluator, lost_status, objective_weights
+from rootsopt.dynamics.settle import BLOCK, Transient, settle, settled_within
+from rootsopt.dynamics.steady import transient_status
 from rootsopt.model import design_vector
 from rootsopt.programs import Program
+from rootsopt.response.batch import on_all_cores
+from rootsopt.response.evaluation import Evaluation, Evaluator, objective_weights
+from rootsopt.response.wrapper import Wrapper
 from rootsopt.status import Status
 
 _LONGEST = 8
@@ -33,10 +35,9 @@ _TRIES = 24
 """Motions looked at closely, at most."""
 _DEPTHS = 3.0
 """The grid reaches so many static penetrations into the flanks."""
-_evaluate = Evaluator.__call__
-"""One motion of a design, also for evaluators that look at several."""
 _LOST = (Status.PASSED_THROUGH, Status.STALLED, Status.SOLVER_FAILED, Status.NON_FINITE)
 """Of initial states from which there is no motion to describe."""
+_GONE = tuple(status.code for status in _LOST)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,16 +57,17 @@ class Basins:
 
     `relative` (rad) and `rate` (rad/s): axes of the grid; `leads_to` (rates, relatives): index of
     the attractor, or -1 where the motion is lost; `attractors`: greatest share first, the last
-    ones maybe chaotic or not settled, as their status says; `lost`: shares of initial states from
-    which there is no motion, or none that was told from the others (`not_settled`), by the label of
-    the status; `angle_scale` (rad), `mesh_period` (s):
-    units of scaled states.
+    ones maybe chaotic or not settled, as their status says; `rest`: evaluation from rest; `lost`:
+    shares of initial states from which there is no motion, or none that was told from the others
+    (`not_settled`), by the label of the status; `angle_scale` (rad), `mesh_period` (s): units of
+    scaled states.
     """
 
     relative: NDArray[np.float64]
     rate: NDArray[np.float64]
     leads_to: NDArray[np.int64]
     attractors: tuple[Attractor, ...]
+    rest: Evaluation
     lost: dict[str, float]
     angle_scale: float
     mesh_period: float
@@ -122,9 +124,19 @@ def find(
     of a neighbouring design, which may have too small a basin for the grid. The numbers of the
     attractors are those of `evaluator`, with their `series` if asked for.
     """
+    return find_fitted(evaluator, design, known, series)[1]
+
+
+def find_fitted(
+    evaluator: Evaluator,
+    design: Float[Array, " d"] | None = None,
+    known: Iterable[NDArray[np.float64]] = (),
+    series: bool = False,
+) -> tuple[Evaluator, Basins]:
+    """`find`, which also returns another evaluator, fitted to the motion from rest."""
     config = evaluator.config
     design = design_vector(config) if design is None else jnp.asarray(design)
-    rest = _evaluate(evaluator, design, None, series)
+    evaluator, rest = evaluator.fit(design, None, series)
     pair = evaluator.pair(design)
     scale, period = float(pair.angle_scale), float(pair.mesh_period)
     relative, rate = _axes(config, pair)
@@ -132,11 +144,11 @@ def find(
     # Everything else begins at rest, or at the drive's speed.
     grid = np.pad(grid, ((0, 0), (0, pair.states - 2)))
     starts = np.concatenate([grid, *(np.atleast_2d(state) for state in known)])
-    ends = _settled(evaluator, pair, starts)
+    ends, failures = _settled(evaluator, pair, starts)
     found = _Sorter(evaluator, design, series)
     found.add(rest, np.zeros(grid.shape[1]))
     for k in range(len(starts)):
-        found.place(jax.tree.map(lambda x, k=k: x[k], ends))
+        found.place(jax.tree.map(lambda x, k=k: x[k], ends), int(failures[k]))
     numbers = np.asarray(found.numbers[: len(grid)])
     shares = np.bincount(numbers[numbers >= 0], minlength=len(found.evaluations)) / len(grid)
     order = sorted(range(len(shares)), key=lambda i: (not found.periodic(i), -shares[i]))
@@ -149,11 +161,12 @@ def find(
     kept = [i for i in order if found.evaluations[i].status not in _LOST]
     rank[kept] = np.arange(len(kept))
     lost = [label for label, number in zip(found.lost, numbers, strict=False) if number < 0]
-    return Basins(
+    return evaluator, Basins(
         relative=relative,
         rate=rate,
         leads_to=rank[numbers].reshape(len(rate), len(relative)),
         attractors=attractors,
+        rest=rest,
         lost={label: lost.count(label) / len(grid) for label in dict.fromkeys(lost)},
         angle_scale=scale,
         mesh_period=period,
@@ -184,9 +197,8 @@ class _Sorter:
         """Number of the motion of an evaluation that began at `end`: a known one or a new one."""
         cycle = np.atleast_2d(end)
         if closed(evaluation):
-            # Built anew: the evaluation may have fitted the contact map to its motion.
             pair = self.evaluator.pair(self.design)
-            states = _cycle(pair, evaluation.state, self.evaluator.orbit)
+            states = _cycle(pair, evaluation.state, self.evaluator.scene.solver.orbit)
             cycle = np.asarray(states)[: evaluation.steady_state["period"]]
             number = self._same(cycle[0])
         else:
@@ -197,15 +209,11 @@ class _Sorter:
         self.cycles.append(cycle)
         return len(self.evaluations) - 1
 
-    def place(self, end: Transient) -> None:
-        """Note the motion that a transient has led to."""
+    def place(self, end: Transient, failure: int) -> None:
+        """Note the motion that a transient has led to; `failure`: its `transient_status`."""
         number, label = -1, ""
-        if not bool(end.solved):
-            label = Status.SOLVER_FAILED.label
-        elif not np.all(np.isfinite(end.state)):
-            label = Status.NON_FINITE.label
-        elif bool(end.lost):
-            label = lost_status(self.evaluator.pair(self.design), end.state).label
+        if failure in _GONE:
+            label = Status.of(failure).label
         else:
             number, label = self._motion(end)
         self.numbers.append(number)
@@ -217,7 +225,7 @@ class _Sorter:
         if number is None and self.tries < _TRIES:
             self.tries += 1
             state = np.asarray(end.state, np.float64)
-            evaluation = _evaluate(self.evaluator, self.design, state, self.series)
+            evaluation = self.evaluator(self.design, state, self.series)
             number = self.add(evaluation, state)
         if number is None:
             return -1, Status.NOT_SETTLED.label
@@ -226,7 +234,7 @@ class _Sorter:
 
     def _same(self, state) -> int | None:
         """The known cycle that `state` is on, as far as a transient can tell."""
-        tolerance = float(settled_within(self.evaluator.transient.rtol))
+        tolerance = float(settled_within(self.evaluator.scene.solver.transient.rtol))
         best, number = np.inf, None
         for i in filter(self.periodic, range(len(self.evaluations))):
             memory = 1 - self.evaluations[i].steady_state["floquet_multiplier"]
@@ -270,9 +278,10 @@ def _spread(low: float, high: float, count: int) -> NDArray[np.float64]:
     return np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
 
 
-def _settled(evaluator: Evaluator, pair: RotorPair, starts) -> Transient:
-    """Ends of the transients from scaled states (m, n), with a leading axis (m,)."""
-    how = evaluator.transient
+def _settled(evaluator: Evaluator, pair: RotorPair, starts) -> tuple[Transient, Any]:
+    """Ends of the transients from scaled states (m, n), with a leading axis (m,), and what
+    `transient_status` says of each."""
+    how = evaluator.scene.solver.transient
     dtype = pair.angle_scale.dtype
     limit = np.asarray(max(evaluator.config.solver.max_mesh_periods // 4, 8 * BLOCK))
     tolerance = np.asarray(settled_within(how.rtol), dtype)
@@ -286,14 +295,19 @@ def _settled(evaluator: Evaluator, pair: RotorPair, starts) -> Transient:
     return jax.device_get(ends)
 
 
-@Program
-def _in_turn(pair, states, *settings) -> Transient:
-    return jax.lax.map(lambda state: settle(pair, state, *settings), states)
+def _end(pair, state, *settings):
+    end = settle(pair, state, *settings)
+    return end, transient_status(pair, end)
 
 
 @Program
-def _together(pair, states, *settings) -> Transient:
-    return jax.vmap(lambda state: settle(pair, state, *settings))(states)
+def _in_turn(pair, states, *settings):
+    return jax.lax.map(lambda state: _end(pair, state, *settings), states)
+
+
+@Program
+def _together(pair, states, *settings):
+    return jax.vmap(lambda state: _end(pair, state, *settings))(states)
 
 
 @Program
@@ -302,25 +316,32 @@ def _cycle(pair: RotorPair, state, how: Integrator):
     return jnp.concatenate([state[None], strobe(pair, state, _LONGEST - 1, how).states])
 
 
-class AttractorEvaluator(Evaluator):
-    """An `Evaluator` of what all coexisting motions of a design come to.
+@dataclasses.dataclass(frozen=True)
+class AttractorEvaluator(Wrapper):
+    """Evaluates what all coexisting motions of a design come to.
 
     With `objective.motion` `worst`, the motion counts whose weighted sum of the measures in the
-    objective is greatest, each relative to `reference` (a response, usually the baseline's; by
-    default the greatest among the motions). With `weighted`, response and gradient are averages
-    with the shares of initial states as weights; how these change with the design is not in the
-    gradient. A motion without contact beside others has force 0 and gradient 0. A design from which
-    some initial states lead to no stable periodic motion has the status of what they lead to, and
-    no gradient.
+    objective is greatest, each relative to the `reference` of the evaluator of one motion (a
+    response, usually the baseline's; by default the greatest among the motions). With `weighted`,
+    response and gradient are averages with the shares of initial states as weights; how these
+    change with the design is not in the gradient. A motion without contact beside others has force
+    0 and gradient 0. A design from which some initial states lead to no stable periodic motion has
+    the status of what they lead to, and no gradient.
     """
 
-    def __call__(self, design=None, start=None, series=True) -> Evaluation:
-        """As `Evaluator`; `start`: scaled states (m, n) on motions of a neighbouring design."""
+    single: Evaluator
+
+    def fit(self, design=None, start=None, series=True) -> tuple["AttractorEvaluator", Evaluation]:
+        """As `Evaluator.fit`; `start`: scaled states (m, n) on motions of a neighbouring design."""
         known = () if start is None else tuple(np.atleast_2d(start))
-        basins = find(self, design, known, series)
+        single, basins = find_fitted(self.single, design, known, series)
+        return dataclasses.replace(self, single=single), self._of(basins)
+
+    def _of(self, basins: Basins) -> Evaluation:
+        """The evaluation that the motions come to."""
         usable = [a for a in basins.attractors if a.evaluation.usable]
         if not usable:
-            return _evaluate(self, design, None, series)
+            return basins.rest
         orbits = [a for a in basins.attractors if closed(a.evaluation)]
         chosen = max(usable, key=self._badness(usable)).evaluation
         if self.config.objective.motion == "weighted":
@@ -338,7 +359,7 @@ class AttractorEvaluator(Evaluator):
     def _badness(self, attractors: list[Attractor]) -> Callable[[Attractor], float]:
         weights = objective_weights(self.config)
         responses = [a.evaluation.response for a in attractors]
-        reference = self.reference or {k: max(r[k] for r in responses) for k in weights}
+        reference = self.single.reference or {k: max(r[k] for r in responses) for k in weights}
 
         def badness(attractor: Attractor) -> float:
             found = attractor.evaluation.response

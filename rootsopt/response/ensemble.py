@@ -13,6 +13,7 @@ import dataclasses
 import functools
 import os
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -20,14 +21,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.config import Config, EnsembleConfig
+from rootsopt.config import EnsembleConfig
+from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.verdict import TOO_DEEP
-from rootsopt.evaluate import (
-    CHAOS_WINDOW,
+from rootsopt.dynamics.window import PERIODS
+from rootsopt.model import Scene, design_vector
+from rootsopt.optimize.problem import Space
+from rootsopt.profiles import Geometry
+from rootsopt.programs import Program
+from rootsopt.response.evaluation import (
     RESPONSES,
     Evaluation,
     Evaluator,
@@ -35,18 +40,16 @@ from rootsopt.evaluate import (
     idle_hint,
     lyapunov_program,
     unsettled,
+    unsettled_status,
 )
-from rootsopt.members import (
+from rootsopt.response.members import (
     Members,
     initial_states,
     mean_and_error,
     prepare_members,
     run_members,
 )
-from rootsopt.model import Model
-from rootsopt.optimize.problem import Space
-from rootsopt.profiles import Geometry
-from rootsopt.programs import Program
+from rootsopt.response.wrapper import Wrapper
 from rootsopt.status import Status
 
 _RTOL = 1e-6
@@ -55,6 +58,8 @@ what the steps leave (docs/chaos.md)."""
 _AGAIN = 4
 """Motions that begin where those of a neighbouring design ended settle in this part of
 `ensemble.settle_periods`."""
+_MAPS = 5
+"""Contact maps tried for one ensemble, at most."""
 VERIFYING = 4
 """Times as many members verify a search's winner."""
 SIGNIFICANT = 3.0
@@ -63,8 +68,9 @@ ERRORS = {name: name.replace("_N", "_standard_error_N") for name in RESPONSES}
 """Keys of the standard errors in `steady_state`, by response."""
 
 
-class EnsembleEvaluator(Evaluator):
-    """Evaluates designs of one config by an ensemble; called like an `Evaluator`.
+@dataclasses.dataclass(frozen=True)
+class EnsembleEvaluator(Wrapper):
+    """Evaluates designs by an ensemble of motions in the scene of `single`.
 
     `start` (members, n) of a call: scaled states to begin from, such as the `state` of a
     neighbouring design's evaluation; by default they are spread over the play.
@@ -81,44 +87,74 @@ class EnsembleEvaluator(Evaluator):
     their last scaled states, the `start` of a neighbouring design. `series` is that of one
     member.
 
-    `rtol` is not used: averages need no closed orbit. With `survey` the Lyapunov exponent is
-    not looked for. Without `differentiate` there is no gradient, which takes most of the time.
+    The orbit tolerance is not used: averages need no closed orbit. In a survey the Lyapunov
+    exponent is not looked for. Without `differentiate` there is no gradient, which takes most of
+    the time.
     """
 
-    def __init__(self, config: Config, rtol: float | None = None, survey: bool = False):
-        super().__init__(config, rtol, survey)
-        self.differentiate = True
-        self.how = dataclasses.replace(self.transient, rtol=jnp.maximum(self.transient.rtol, _RTOL))
+    single: Evaluator
+    differentiate: bool = True
+
+    @property
+    def how(self) -> Integrator:
+        """How the motions are integrated."""
+        transient = self.scene.solver.transient
+        return dataclasses.replace(transient, rtol=jnp.maximum(transient.rtol, _RTOL))
 
     @property
     def settings(self) -> EnsembleConfig:
         """Size and seed of the ensemble."""
         return self.config.ensemble
 
+    def without_gradient(self) -> "EnsembleEvaluator":
+        """Return another evaluator, which leaves out the gradient."""
+        return dataclasses.replace(self, differentiate=False)
+
     def independent(self, number: int) -> "EnsembleEvaluator":
-        """The `number`-th of those with another seed and `VERIFYING` times as many members, to
-        judge what was chosen by this one; it shares the model, and the compiled programs."""
+        """Return the `number`-th of those with another seed and `VERIFYING` times as many members,
+        to judge what was chosen by this one; it shares the scene, and the compiled programs."""
         settings = self.settings
         larger = {"members": VERIFYING * settings.members, "seed": settings.seed + number}
         ensemble = settings.model_copy(update=larger)
-        other = EnsembleEvaluator(self.config.model_copy(update={"ensemble": ensemble}))
-        other.model, other.fitted, other.prepared = self.model, self.fitted, self.prepared
-        other.sized, other.map_error = self.sized, self.map_error
-        return other
+        config = self.config.model_copy(update={"ensemble": ensemble})
+        return self._around(dataclasses.replace(self.single, config=config, survey=False))
 
-    def prepare(self, design: Float[Array, " d"], series: bool = True) -> None:
+    def prepare(self, design=None, series: bool = True) -> "EnsembleEvaluator":
         """Compile, in the background, what evaluating `design` (config units) takes."""
-        self.prepared = True
-        self._size(design)
-        pair, _ = _pair.outline(self.model, design)
+        design = design_vector(self.config) if design is None else jnp.asarray(design)
+        now = self._around(self.single._sized(design))
+        pair, _ = _pair.result_shape(now.scene, design)
         prepare_members(pair, self.how)
-        if not self.survey:
+        if not self.single.survey:
             state = jax.ShapeDtypeStruct((pair.states,), pair.angle_scale.dtype)
-            lyapunov_program.prepare(pair, state, CHAOS_WINDOW, self.transient)
-        _pair.prepare(self.model, design)
+            lyapunov_program.prepare(pair, state, PERIODS, self.scene.solver.transient)
+        _pair.prepare(now.scene, design)
+        return now
+
+    def fit(self, design=None, start=None, series=True) -> tuple["EnsembleEvaluator", Evaluation]:
+        """As `Evaluator.fit`; `start` (members, n): see above."""
+        began = time.perf_counter()
+        design = design_vector(self.config) if design is None else jnp.asarray(design)
+        now, outcome = self._fitted(design, lambda now: now._attempt(design, start))
+        return now, now._report(design, outcome, began, series)
+
+    def _fitted(
+        self, design, attempt: Callable[["EnsembleEvaluator"], "_Outcome"]
+    ) -> tuple["EnsembleEvaluator", "_Outcome"]:
+        """The outcome of `attempt`, again as long as it asks for another contact map, and the
+        evaluator it was made with."""
+        now, single = self, self.single._sized(design)
+        for _ in range(_MAPS):
+            now = self._around(single)
+            outcome = attempt(now)
+            other = single.reaching(outcome.reached, False, outcome.pair.angle_limit)
+            if other is None:
+                break
+            single = other._sized(design)
+        return now, outcome
 
     def _attempt(self, design, start) -> "_Outcome":
-        pair, shape = _pair(self.model, design)
+        pair, shape = _pair(self.scene, design)
         settle = self.settings.settle_periods
         if start is None:
             states = initial_states(pair, self.settings.members, self.settings.seed)
@@ -160,14 +196,14 @@ class EnsembleEvaluator(Evaluator):
                 "greatest_force_N": greatest,
             }
             state = np.asarray(members.states, np.float64)
-            if float(np.max(members.depth)) > TOO_DEEP * float(self.model.pitch_radius):
+            if float(np.max(members.depth)) > TOO_DEEP * float(self.scene.pitch_radius):
                 status = Status.TOO_DEEP
-        if status is Status.AVERAGED and self.keys and self.differentiate:
+        if status is Status.AVERAGED and self.single.keys and self.differentiate:
             status, slopes = self._slopes(design, members)
             if slopes is not None:
                 gradient, steady["gradient_standard_error"] = (
                     {
-                        name: dict(zip(self.keys, map(float, row), strict=True))
+                        name: dict(zip(self.single.keys, map(float, row), strict=True))
                         for name, row in zip(RESPONSES, rows, strict=True)
                     }
                     for rows in slopes
@@ -176,8 +212,8 @@ class EnsembleEvaluator(Evaluator):
                 # A neighbour fails: what is left stands for no neighbourhood.
                 response, steady, series, state = {}, {"kind": "transient"}, None, None
         return Evaluation(
-            design=dict(zip(self.keys, map(float, design), strict=True)),
-            geometry=geometry_record(self.model, outcome.shape),
+            design=dict(zip(self.single.keys, map(float, design), strict=True)),
+            geometry=geometry_record(self.scene, outcome.shape),
             response=response,
             gradient=gradient,
             steady_state=steady,
@@ -201,12 +237,13 @@ class EnsembleEvaluator(Evaluator):
         kind: dict[str, Any] = {"kind": "transient"}
         if every.any():
             kind = {"kind": "periodic", "period": int(np.argmax(every)) + 1}
-        if self.survey or (every.any() and not with_series):
+        if self.single.survey or (every.any() and not with_series):
             return kind, None
         typical = int(np.argmin(np.any(members.repeats, axis=1)))
         state = jnp.asarray(members.states[typical])
-        window = lyapunov_program(pair, state, CHAOS_WINDOW, self.transient)
-        _, steady, _, series = unsettled(pair, window, with_series)
+        found = lyapunov_program(pair, state, PERIODS, self.scene.solver.transient)
+        status = Status.of(int(unsettled_status(pair, found)))
+        steady, _, series = unsettled(pair, status, jax.device_get(found), with_series)
         del steady["window_mesh_periods"]
         return steady | (kind if every.any() else {}), series
 
@@ -221,14 +258,14 @@ class EnsembleEvaluator(Evaluator):
         designs, jacobian = _around(space, design, points)
         settle = -(-self.settings.settle_periods // _AGAIN)
 
-        def attempt() -> _Outcome:
+        def attempt(now: EnsembleEvaluator) -> _Outcome:
             with ThreadPoolExecutor(os.cpu_count()) as pool:
-                built = list(pool.map(functools.partial(_pair, self.model), designs))
+                built = list(pool.map(functools.partial(_pair, now.scene), designs))
             pairs, shapes = zip(*built, strict=True)
             runs = run_members(pairs, members.states, settle, self.settings.periods, self.how)
             return _Outcome(pairs[0], shapes[0], runs)
 
-        around = self._fitted(design, attempt)
+        _, around = self._fitted(design, attempt)
         if around.status is not Status.AVERAGED:
             return around.status, None
         values = np.stack([run.responses[:, 0] for run in around.runs])
@@ -237,7 +274,7 @@ class EnsembleEvaluator(Evaluator):
 
     def _space(self, design) -> Space:
         """The unit box of the search, made larger where the design lies outside."""
-        space = Space.of(self.config, self.model, 0.0)
+        space = Space.of(self.config, self.scene, 0.0)
         lower, upper = np.minimum(space.lower, design), np.maximum(space.upper, design)
         bounds = jnp.asarray(lower), jnp.asarray(upper)
         return eqx.tree_at(lambda s: (s.lower, s.upper), space, bounds)
@@ -317,7 +354,7 @@ def per_config_unit(
     return slope @ inverse, np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
 
 
-_pair = Program(Model.pair_and_shape)
+_pair = Program(Scene.pair_and_shape)
 
 
 @Program

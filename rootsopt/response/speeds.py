@@ -3,7 +3,6 @@
 The speed is a number of the model, so that every speed is evaluated by the same compiled programs.
 """
 
-import copy
 import dataclasses
 import math
 import os
@@ -11,15 +10,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.basins import AttractorEvaluator
 from rootsopt.config import Config
-from rootsopt.evaluate import RESPONSES, Evaluation, Evaluator
-from rootsopt.model import Model
+from rootsopt.response.evaluation import RESPONSES, Evaluation
+from rootsopt.response.wrapper import Evaluates, Wrapper
 from rootsopt.status import Status
 
 _STEADY = (
@@ -65,53 +61,57 @@ class SpeedsEvaluation(Evaluation):
         }
 
 
-class SpeedsEvaluator(Evaluator):
-    """Evaluates designs at every speed of `objective.speeds_rpm` and at the scene's own.
+@dataclasses.dataclass(frozen=True)
+class SpeedsEvaluator(Wrapper):
+    """Evaluates designs at every speed of `objective.speeds_rpm` and at the scene's own, by the
+    evaluator `single` for each.
 
     The scene's speed is what the response is reported at. If it is not one of those of the
-    objective, it has no share in that, but its status counts.
+    objective, it has no share in that, but its status counts. `baseline`: the parts of the
+    evaluation that forces at each speed are relative to.
     """
 
-    references: Sequence[dict[str, float] | None] = ()
+    baseline: tuple["Part", ...] = ()
 
-    def relate(self, baseline: Evaluation) -> None:
-        """Take the forces at each speed relative to those of the `baseline` at that speed."""
-        self.references = [part.evaluation.response for part in parts_of(baseline)]
+    def relative_to(self, baseline: Evaluation) -> "SpeedsEvaluator":
+        """Return another evaluator, whose forces at each speed are compared relative to those of
+        the `baseline` at that speed."""
+        return dataclasses.replace(self, baseline=parts_of(baseline))
 
-    def __call__(self, design=None, start=None, series=True) -> SpeedsEvaluation:
-        """As `Evaluator`; `start`: the `state` of a neighbouring design's evaluation."""
-        config = self.config
+    def fit(self, design=None, start=None, series=True) -> tuple["SpeedsEvaluator", Evaluation]:
+        """As `Evaluator.fit`; `start`: the `state` of a neighbouring design's evaluation."""
+        config, now = self.config, self.single
         own = config.scene.speed_rpm
         parts = []
-        try:
-            for number, (speed, share) in enumerate(shares(config).items()):
-                self.model = at_speed(self.model, speed)
-                self.reference = self.references[number] if self.references else None
-                known = None if start is None else _rows(start, number)
-                found = super().__call__(design, known, series and speed == own)
-                parts.append(Part(speed, share, found))
-        finally:
-            self.model = at_speed(self.model, own)
-        (head,) = (part.evaluation for part in parts if part.speed_rpm == own)
-        status, message = overall(parts)
-        seconds = sum(part.evaluation.statistics["seconds"] for part in parts)
-        return SpeedsEvaluation(
-            design=head.design,
-            geometry=head.geometry,
-            response=head.response,
-            gradient=head.gradient if status.usable else {},
-            steady_state=head.steady_state,
-            status=status,
-            message=message,
-            statistics=head.statistics | {"speeds": len(parts), "seconds": seconds},
-            series=head.series,
-            state=_states(parts) if status.usable else None,
-            parts=tuple(parts),
-        )
+        for number, (speed, share) in enumerate(shares(config).items()):
+            now = now.at_speed(speed)
+            if self.baseline:
+                now = now.relative_to(self.baseline[number].evaluation)
+            known = None if start is None else _rows(start, number)
+            now, found = now.fit(design, known, series and speed == own)
+            parts.append(Part(speed, share, found))
+        fitted = dataclasses.replace(self, single=now.at_speed(own))
+        return fitted, together(parts, own)
 
 
-class SpeedsAttractorEvaluator(SpeedsEvaluator, AttractorEvaluator):
-    """A `SpeedsEvaluator` of what all motions that coexist at each speed come to."""
+def together(parts: Sequence["Part"], own: float) -> SpeedsEvaluation:
+    """Return the evaluation at several speeds, reported at the speed `own` (rpm)."""
+    (head,) = (part.evaluation for part in parts if part.speed_rpm == own)
+    status, message = overall(parts)
+    seconds = sum(part.evaluation.statistics["seconds"] for part in parts)
+    return SpeedsEvaluation(
+        design=head.design,
+        geometry=head.geometry,
+        response=head.response,
+        gradient=head.gradient if status.usable else {},
+        steady_state=head.steady_state,
+        status=status,
+        message=message,
+        statistics=head.statistics | {"speeds": len(parts), "seconds": seconds},
+        series=head.series,
+        state=_states(parts) if status.usable else None,
+        parts=tuple(parts),
+    )
 
 
 def _states(parts: Sequence[Part]) -> NDArray[np.float64]:
@@ -123,12 +123,6 @@ def _states(parts: Sequence[Part]) -> NDArray[np.float64]:
 def _rows(start: NDArray[np.float64], number: int) -> NDArray[np.float64]:
     states = start[start[:, 0] == number, 1:]
     return states[0] if len(states) == 1 else states
-
-
-def at_speed(model: Model, speed_rpm: float) -> Model:
-    """`model` at another speed."""
-    speed = jnp.asarray(speed_rpm * 2 * math.pi / 60)
-    return eqx.tree_at(lambda m: m.speed, model, speed)
 
 
 def alone(config: Config, speed_rpm: float | None = None) -> Config:
@@ -193,7 +187,7 @@ def swept_speeds(config: Config) -> list[float]:
 
 
 def sweep(
-    evaluator: Evaluator,
+    evaluator: Evaluates,
     speeds_rpm: Sequence[float],
     design: Any = None,
     progress: Callable[[int, int], None] = lambda done, expected: None,
@@ -206,9 +200,8 @@ def sweep(
     parts: list[Part] = []
 
     def at(speed: float) -> Part:
-        own = copy.copy(evaluator)
-        own.model = at_speed(evaluator.model, speed)
-        return Part(speed, 1 / len(speeds_rpm), own(design, series=False))
+        found = evaluator.at_speed(speed)(design, series=False)
+        return Part(speed, 1 / len(speeds_rpm), found)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for part in pool.map(at, speeds_rpm):

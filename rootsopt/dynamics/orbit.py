@@ -1,0 +1,441 @@
+"""Close a periodic orbit by shooting, and differentiate it.
+
+Newton's method on the k-fold stroboscopic map closes the orbit, its monodromy matrix tells whether
+it is stable, and the implicit function theorem gives the derivatives. Where there is no orbit, the
+same loop integrates a window of the motion (`rootsopt.dynamics.window`).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from rootsopt.dynamics.flow import Flow, Integrator, flow
+from rootsopt.dynamics.linear import solved, spectral_radius
+from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.switches import halved, has_room, with_switches
+from rootsopt.dynamics.window import Window
+
+SAMPLES = 2520
+"""Uniform samples of an orbit; divisible by every period up to ten, so that a sample
+falls on the end of each mesh period."""
+_NEWTON_STEPS = 24
+_CLOSED = 4000, 1e-3, 1e-10
+"""Residual (scaled) at which Newton stops: in roundings (1e-12 in double precision), or in
+tolerances of the motion up to a limit."""
+_KEPT = 4
+"""Integrations after which the steps are kept in any case."""
+_LOOKS = 6
+"""Times that kinks are looked for while an orbit is closed, at most."""
+_DRIFT = 30.0, 1e-9, 1e-6
+"""Distance (scaled) that an orbit may have moved from where its kinks were looked for, in
+tolerances, but within these limits. The kinks lie that far outside their steps, which costs
+accuracy in first order."""
+_STRAIN = 10.0
+"""Error of a repeated step, in tolerances, with which the steps are chosen anew."""
+_AFTER = 3
+"""Integrations that must be left for looking at kinks again, or choosing steps anew: an orbit that
+is closed is not given away."""
+_AGREE = 10.0, 1e-3, 3e-2
+"""Disagreement of the derivatives on a grid and on one with its steps halved that is accepted: in
+square roots of the tolerance, but within these limits."""
+_SMALL = 1e-9, 1e-3
+"""Newton step (scaled) from which on the solver's steps are kept: a thousand times its
+tolerance, but within these."""
+
+
+class Orbit(NamedTuple):
+    """A closed orbit of k mesh periods with first derivatives.
+
+    `state` at φ1 = 0; `flow` over the orbit; `residual` |Φ(z) - z| in scaled units;
+    `monodromy` dΦ/dz and `multiplier`, the greatest modulus of its eigenvalues; `response`:
+    (mean, mean square, peak, other measures); `sensitivity` (r, d): their derivatives along the
+    orbit family with respect to the design, and `moved` (n, d): those of the state;
+    `newton_steps`. `drift`: distance (scaled) from where
+    the kinks were looked for. `defect`: residual on a grid with every step halved, and
+    `disagreement` of the derivatives on both, relative to the greatest; 0 where there was no check.
+    """
+
+    state: Float[Array, " n"]
+    flow: Flow
+    residual: Float[Array, ""]
+    monodromy: Float[Array, "n n"]
+    multiplier: Float[Array, ""]
+    response: Float[Array, " r"]
+    sensitivity: Float[Array, "r d"]
+    moved: Float[Array, "n d"]
+    newton_steps: Int[Array, ""]
+    drift: Float[Array, ""]
+    defect: Float[Array, ""]
+    disagreement: Float[Array, ""]
+
+    @classmethod
+    def empty(cls, state: Float[Array, " n"], directions: int, flow: Flow) -> "Orbit":
+        """An orbit from `state` that has not been integrated yet, with derivatives along d
+        `directions` of the design; `flow` is `Flow.empty`."""
+        count, dtype = state.shape[0], state.dtype
+        infinite = jnp.asarray(jnp.inf, dtype)
+        return cls(
+            state=state,
+            flow=flow,
+            residual=infinite,
+            monodromy=jnp.zeros((count, count), dtype),
+            multiplier=infinite,
+            response=flow.response,
+            sensitivity=jnp.zeros((flow.response.shape[0], directions), dtype),
+            moved=jnp.zeros((count, directions), dtype),
+            newton_steps=jnp.zeros((), int),
+            drift=jnp.zeros((), dtype),
+            defect=jnp.zeros((), dtype),
+            disagreement=jnp.zeros((), dtype),
+        )
+
+
+class _Closing(NamedTuple):
+    """An orbit that is being closed, or a window that is being integrated.
+
+    `state` and `grid` of the next integration, whose steps are kept if `repeat`; `held`: whether
+    those of the last one were; `improving`: whether it came closer; `base`: the steps without those
+    made for kinks; `best` residual on this grid; kinks were looked for `looks` times, last along
+    the orbit from `looked`; `refined`: times the steps were halved because derivatives disagreed;
+    `checked`: whether the derivatives were compared.
+    """
+
+    orbit: Orbit
+    window: Window
+    state: Float[Array, " n"]
+    repeat: Bool[Array, ""]
+    held: Bool[Array, ""]
+    improving: Bool[Array, ""]
+    base: Float[Array, " steps"]
+    grid: Float[Array, " steps"]
+    best: Float[Array, ""]
+    looks: Int[Array, ""]
+    looked: Float[Array, " n"]
+    refined: Int[Array, ""]
+    checked: Bool[Array, ""]
+
+
+class _Closer(eqx.Module):
+    """What `close_orbit` was asked for; `start`, `go_on` and `step` are its loop."""
+
+    pair: RotorPair
+    tangents: RotorPair
+    period: Int[Array, ""]
+    how: Integrator
+    measures: Measures
+    shots: Int[Array, ""]
+    closed: Float[Array, ""]
+    tolerance: Float[Array, ""]
+    windowed: Bool[Array, ""]
+    samples: int = eqx.field(static=True)
+    check: bool = eqx.field(static=True)
+    periods: int = eqx.field(static=True)
+
+    def start(self, state: Float[Array, " n"]) -> _Closing:
+        """Nothing known of the orbit near `state`."""
+        count, dtype = state.shape[0], state.dtype
+        directions = jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
+        steps = self.how.max_steps
+        none = Flow.empty(count, directions, self.samples, steps, self.measures, dtype)
+        no, zero = jnp.zeros((), bool), jnp.zeros((), int)
+        return _Closing(
+            orbit=Orbit.empty(state, directions, none),
+            window=Window.empty(state, self.periods),
+            state=state,
+            repeat=no,
+            held=no,
+            improving=no,
+            base=none.grid,
+            grid=none.grid,
+            best=jnp.asarray(jnp.inf, dtype),
+            looks=zero,
+            looked=state,
+            refined=zero,
+            checked=no,
+        )
+
+    def is_open(self, now: _Closing) -> Bool[Array, ""]:
+        """Whether Newton's method goes on."""
+        done = now.orbit.newton_steps
+        left = (now.orbit.residual > self.closed) & ((done < 3) | now.improving)
+        # Chosen anew, the steps depend on the state, and that leaves a floor.
+        return (left | ~now.held) & (done < self.shots + now.refined * self.shots // 2)
+
+    def go_on(self, now: _Closing) -> Bool[Array, ""]:
+        """Whether there is anything left to integrate."""
+        sound = now.held & now.orbit.flow.solved & jnp.isfinite(now.orbit.residual)
+        closing = self.is_open(now) | (sound & ~now.checked & self.check)
+        alive = now.window.solved & jnp.all(jnp.isfinite(now.window.end))
+        window = (now.window.done < self.periods) & alive
+        return jnp.where(self.windowed, window, closing)
+
+    def step(self, now: _Closing) -> _Closing:
+        """One integration: of the orbit for Newton's method, of the orbit on halved steps for the
+        check, or of the window's next mesh period."""
+        checking = ~self.is_open(now) & ~self.windowed
+        start = jnp.where(checking, now.orbit.state, now.state)
+        start = jnp.where(self.windowed, now.window.end, start)
+        grid = lax.cond(checking, lambda: halved(now.orbit.flow.grid), lambda: now.grid)
+        length = jnp.where(self.windowed, 1, self.period).astype(start.dtype)
+        frozen = lax.stop_gradient(self.pair)
+        peak = now.orbit.flow.peak
+        out = flow(
+            self.pair,
+            start,
+            length,
+            self.how,
+            self.samples,
+            self.tangents,
+            grid,
+            (now.repeat | checking) & ~self.windowed,
+            measures=self.measures,
+            top=jnp.where(peak > 0, peak, frozen.force_scale),
+        )
+        if not self.periods:
+            return self._newton(now, start, checking, out)
+        return lax.cond(
+            self.windowed,
+            lambda: now._replace(window=now.window.after(out)),
+            lambda: self._newton(now, start, checking, out),
+        )
+
+    def _newton(self, now: _Closing, start, checking, out: Flow) -> _Closing:
+        """What follows from the flow `out` from `start`: the next state, and the next steps."""
+        count, dtype = start.shape[0], start.dtype
+        monodromy = out.slope[:count, :count]
+        miss = out.end - start
+        residual = jnp.max(jnp.abs(miss))
+        correction = solved(jnp.eye(count, dtype=dtype) - monodromy, miss[:, None])[:, 0]
+        # A pair that floats stays where the transient led to: any place is as good.
+        floats = jnp.all(jnp.isfinite(miss)) & ~jnp.all(jnp.isfinite(correction))
+        correction = jnp.where(floats, 0.0, correction)
+        size = jnp.max(jnp.abs(correction))
+        # Keep the first steps inside the neighbourhood the transient pointed to.
+        new = start + correction * jnp.minimum(1.0, 0.5 / jnp.maximum(size, 1e-30))
+        done = now.orbit.newton_steps + 1
+        improving = residual < 0.5 * now.best
+        following, look, again = self._kept(now, start, out, size, residual, improving)
+        found = now.orbit._replace(
+            state=start,
+            flow=out,
+            residual=residual,
+            monodromy=monodromy,
+            newton_steps=done,
+            drift=jnp.max(jnp.abs(start - now.looked)),
+        )
+        apart = disagreement(now.orbit.flow.slope, out.slope, count)
+        # Where not all steps can be divided nothing is compared.
+        apart = jnp.where(has_room(now.orbit.flow.grid), apart, jnp.inf)
+        compared = now.orbit._replace(defect=residual, disagreement=apart)
+        finer = checking & (apart > agreement(self.tolerance)) & (apart < jnp.inf)
+        finer &= now.refined < 1
+        renewed = jnp.where(checking, finer, look)
+        base, grid = self._steps(now, out, renewed, finer)
+        # Residuals compare on the same steps only.
+        best = jnp.where(renewed | ~now.repeat, jnp.inf, jnp.minimum(now.best, residual))
+        return _Closing(
+            orbit=_choose(checking, compared, found),
+            window=now.window,
+            state=new,
+            repeat=following | checking,
+            held=jnp.where(checking, ~finer, now.repeat & ~again),
+            improving=improving | renewed,
+            base=base,
+            grid=grid,
+            best=best,
+            looks=now.looks + renewed,
+            looked=jnp.where(renewed, start, now.looked),
+            refined=now.refined + finer,
+            checked=checking & ~finer,
+        )
+
+    def _kept(self, now: _Closing, start, out: Flow, size, residual, improving):
+        """Whether the steps of `out` are kept from now on, whether kinks are looked for along it,
+        and whether those that were kept are given up."""
+        done, smooth = now.orbit.newton_steps + 1, self.pair.smooth
+        known = size < jnp.clip(1000 * self.tolerance, *_SMALL)
+        following = now.repeat | known | (done >= jnp.minimum(self.shots // 3, _KEPT))
+        # Kinks are looked for again where the motion has moved them out of their steps.
+        few = now.looks < _LOOKS
+        stalled = now.repeat & ~improving & (residual > self.closed) & few
+        again = now.repeat & (residual <= self.closed) & few & (done + _AFTER <= self.shots)
+        # A jump that no switch tells stays where the steps have it.
+        far = jnp.clip(_DRIFT[0] * self.tolerance, *_DRIFT[1:])
+        strayed = again & (jnp.max(jnp.abs(start - now.looked)) > far) & smooth
+        strained = again & ~(out.strain <= _STRAIN)
+        # Steps of a solver that did not get through are none to be repeated.
+        following &= ~strained & (out.solved | now.repeat | ~jnp.all(jnp.isfinite(start)))
+        look = following & (~now.repeat | stalled | strayed)
+        return following, look, strayed | strained
+
+    def _steps(self, now: _Closing, out: Flow, renewed, finer):
+        """The steps without those made for kinks, and the next grid."""
+        base = jnp.where(now.repeat, now.base, out.grid)
+        base = lax.cond(finer, lambda: halved(base), lambda: base)
+        length = self.period.astype(out.end.dtype)
+        frozen = lax.stop_gradient(self.pair)
+        grid = lax.cond(
+            renewed,
+            lambda: with_switches(frozen, out, length, self.tolerance, base),
+            lambda: jnp.where(now.repeat, now.grid, out.grid),
+        )
+        return base, grid
+
+
+class Shots(eqx.Module):
+    """How an orbit is closed.
+
+    `how` it is integrated, with what `measures` of the force; `count`: integrations allowed;
+    `closed`: residual (scaled) at which Newton's method may stop. `samples` of an orbit, a number
+    that its period divides. With `check`, orbit and derivatives are compared with those on a grid
+    with every step halved; where they disagree the orbit is closed once more, on that one.
+    """
+
+    how: Integrator
+    measures: Measures = eqx.field(default_factory=Measures)
+    count: Int[Array, ""] | int = _NEWTON_STEPS
+    closed: Float[Array, ""] | float = 0.0
+    samples: int = eqx.field(static=True, default=SAMPLES)
+    check: bool = eqx.field(static=True, default=True)
+
+
+def close_orbit(
+    pair: RotorPair,
+    tangents: RotorPair,
+    state: Float[Array, " n"],
+    period: Int[Array, ""],
+    shots: Shots,
+) -> Orbit:
+    """Close the orbit of `period` mesh periods near the scaled `state`, and differentiate it.
+
+    As `orbit_or_window`, without windows.
+    """
+    return orbit_or_window(pair, tangents, state, period, shots)[0]
+
+
+def orbit_or_window(
+    pair: RotorPair,
+    tangents: RotorPair,
+    state: Float[Array, " n"],
+    period: Int[Array, ""],
+    shots: Shots,
+    windowed: Bool[Array, ""] | bool = False,
+    periods: int = 0,
+) -> tuple[Orbit, Window]:
+    """Newton shooting on Φ(z) = z, then the implicit function theorem for gradients; or, where
+    `windowed`, a window of so many mesh `periods` from `state`.
+
+    `tangents` holds d pair / d design, stacked along a leading axis. Newton stops after
+    `shots.count` integrations, or at the residual `shots.closed` (at least some thousand roundings
+    and a thousandth of the tolerance). Once its steps are small those of the solver are kept, with
+    ends added where the equation is not smooth: so the map it solves is smooth and closes to
+    rounding, and its derivative is as accurate as the motion.
+    """
+    count, dtype = state.shape[0], state.dtype
+    tolerance = shots.how.tolerance(dtype)
+    roundings, tolerances, most = _CLOSED
+    enough = jnp.minimum(tolerances * tolerance, most)
+    enough = jnp.maximum(roundings * float(jnp.finfo(dtype).eps), enough)
+    closer = _Closer(
+        pair=pair,
+        tangents=tangents,
+        period=period,
+        how=shots.how,
+        measures=shots.measures,
+        shots=jnp.asarray(shots.count),
+        closed=jnp.maximum(shots.closed, enough).astype(dtype),
+        tolerance=tolerance,
+        windowed=jnp.asarray(windowed),
+        samples=shots.samples,
+        # A contact that may jump anywhere has derivatives of the steps, not of the motion.
+        check=shots.check and pair.smooth,
+        periods=periods,
+    )
+    # The loop holds the only copy of the integration: one shot is compiled, not two.
+    found = lax.while_loop(
+        lambda now: closer.go_on(now), lambda now: closer.step(now), closer.start(state)
+    )
+    orbit = found.orbit
+    slope = orbit.flow.slope
+    moved = solved(jnp.eye(count, dtype=dtype) - orbit.monodromy, slope[:count, count:])
+    return orbit._replace(
+        multiplier=spectral_radius(orbit.monodromy),
+        response=orbit.flow.response,
+        sensitivity=slope[count:, count:] + slope[count:, :count] @ moved,
+        moved=moved,
+    ), found.window
+
+
+def _choose(condition, new, old):
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
+
+
+def agreement(tolerance: Float[Array, ""]) -> Float[Array, ""]:
+    """Largest `disagreement` with which derivatives of an orbit at a relative `tolerance` are
+    reported."""
+    scale, least, most = _AGREE
+    return jnp.clip(scale * jnp.sqrt(tolerance), least, most)
+
+
+def disagreement(
+    first: Float[Array, "rows columns"], second: Float[Array, "rows columns"], count: int
+) -> Float[Array, ""]:
+    """Largest difference of two estimates of an orbit's derivatives, each kind relative to its
+    greatest: (I - M)⁻¹, and those of the state and of mean and mean square force with respect to
+    the design. `first` and `second`: `Flow.slope` of `count` states on two grids.
+    """
+
+    def derivatives(slope):
+        unit = jnp.eye(count, dtype=slope.dtype)
+        right = jnp.concatenate([unit, slope[:count, count:]], axis=1)
+        moved = solved(unit - slope[:count, :count], right)
+        forces = slope[count : count + 2]
+        along = forces[:, count:] + forces[:, :count] @ moved[:, count:]
+        return [moved[:, :count], moved[:, count:], *along]
+
+    def apart(one, other):
+        size = jnp.max(jnp.abs(one), initial=0.0)
+        return jnp.max(jnp.abs(one - other), initial=0.0) / jnp.where(size > 0, size, 1.0)
+
+    pairs = zip(derivatives(first), derivatives(second), strict=True)
+    return jnp.max(jnp.stack([apart(one, other) for one, other in pairs]))
+
+
+def reverse_sensitivity(
+    build: Callable[[Float[Array, " d"]], RotorPair],
+    design: Float[Array, " d"],
+    state: Float[Array, " n"],
+    period: Int[Array, ""],
+    how: Integrator,
+    grid: Float[Array, " steps"],
+    measures: Measures | None = None,
+    top: Float[Array, ""] | None = None,
+) -> Float[Array, "r d"]:
+    """The same sensitivity by reverse mode, through diffrax's checkpointed adjoint (where the
+    contact may jump, which that knows nothing of, through the steps themselves).
+
+    On the steps `grid` of the closed orbit, whose peak is `top` (N). With cotangents v of a
+    response and w of the end state, the implicit function theorem asks for
+    (I - M)ᵀ w = R_zᵀ v and gives dR/dp = R_pᵀ v + Φ_pᵀ w.
+    """
+    count = state.shape[0]
+    length = period.astype(state.dtype)
+    adjoint = diffrax.RecursiveCheckpointAdjoint()
+
+    def run(state, design):
+        kept = {"grid": grid, "adjoint": adjoint, "measures": measures, "top": top}
+        out = flow(build(design), state, length, how, SAMPLES, **kept)
+        return jnp.concatenate([out.end, out.response])
+
+    end, pull = jax.vjp(run, state, design)
+    by_state, by_design = jax.vmap(pull)(jnp.eye(end.shape[0], dtype=state.dtype))
+    monodromy, response = by_state[:count], by_state[count:]
+    weight = solved((jnp.eye(count, dtype=state.dtype) - monodromy).T, response.T)
+    return by_design[count:] + weight.T @ by_design[:count]

@@ -1,0 +1,127 @@
+"""Let the transient pass, and check that it has.
+
+The pair is forced with the mesh period. After a transient the states at the end of each mesh
+period (the stroboscopic map) settle on a cycle of k points.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from rootsopt.dynamics.flow import Integrator, strobe
+from rootsopt.dynamics.pair import RotorPair
+
+BLOCK = 4
+"""Mesh periods integrated between two looks at the transient."""
+_MEMORY = 20
+"""Stroboscopic states remembered; more than twice the longest period looked for."""
+_PATIENCE = 32, 1e-5
+"""Mesh periods after which a transient that has not settled goes on with steps at this tolerance
+at most: their noise hides that the motion repeats."""
+NOISE = 100.0
+"""Noise that adaptive steps give the stroboscopic states, in tolerances and relative to them."""
+
+
+class Transient(NamedTuple):
+    """End of a transient.
+
+    `state`: last stroboscopic state; `period`: its cycle length k in mesh periods, 0 if
+    it has not settled; `nearest`: the k with which the last states repeat best, and
+    `spread` the scaled difference that leaves; `periods`: mesh periods simulated; `lost`:
+    `RotorPair.lost`; `solved`: whether the solver got through; `steps`:
+    solver steps.
+    """
+
+    state: Float[Array, " n"]
+    period: Int[Array, ""]
+    nearest: Int[Array, ""]
+    spread: Float[Array, ""]
+    periods: Int[Array, ""]
+    lost: Bool[Array, ""]
+    solved: Bool[Array, ""]
+    steps: Int[Array, ""]
+
+
+def settled_within(rtol: Float[Array, ""]) -> Float[Array, ""]:
+    """Scaled difference below which states count as repeating, for a transient integrated
+    at `rtol`: the noise of adaptive steps is some hundred times the tolerance."""
+    return jnp.clip(1000 * rtol, 3e-3, 3e-2)
+
+
+def settle(
+    pair: RotorPair,
+    state: Float[Array, " n"],
+    how: Integrator,
+    tolerance: Float[Array, ""],
+    max_periods: Int[Array, ""],
+    max_orbit: int,
+) -> Transient:
+    """Integrate block by block until the last states repeat with some period k.
+
+    What has not settled after `_PATIENCE` goes on in finer steps. Settled means: the last k + 1
+    states differ from those k periods earlier by less than `tolerance` (scaled units; or the noise
+    of steps in states far from 0), for the smallest such k ≤ `max_orbit` ≤ 8.
+    """
+    orders = jnp.arange(1, max_orbit + 1)
+    age = jnp.arange(_MEMORY)[::-1]
+
+    def cycle(states, rtol):
+        # Of states far from 0 the noise of adaptive steps is in proportion to them.
+        noise = jnp.maximum(1.0, NOISE * rtol * jnp.abs(states) / tolerance)
+        noise = jnp.where(jnp.isfinite(noise), noise, 1.0)
+
+        def spread(k):
+            change = jnp.max(jnp.abs(states - jnp.roll(states, k, axis=0)) / noise, axis=1)
+            # Before the start the memory holds inf, and inf - inf is no difference.
+            change = jnp.where(jnp.isnan(change), jnp.inf, change)
+            return jnp.max(jnp.where(age <= k, change, 0.0))
+
+        spreads = jax.vmap(spread)(orders)
+        settled = spreads < tolerance
+        period = jnp.where(jnp.any(settled), orders[jnp.argmax(settled)], 0)
+        nearest = jnp.argmin(spreads)
+        return period, orders[nearest], spreads[nearest]
+
+    def go_on(loop):
+        carry, _ = loop
+        alive = ~carry.lost & carry.solved & jnp.all(jnp.isfinite(carry.state))
+        return (carry.period == 0) & alive & (carry.periods < max_periods)
+
+    def advance(loop):
+        carry, memory = loop
+        longest, fine = _PATIENCE
+        rtol = jnp.where(carry.periods < longest, how.rtol, jnp.minimum(how.rtol, fine))
+        part = strobe(pair, carry.state, BLOCK, dataclasses.replace(how, rtol=rtol))
+        memory = jnp.concatenate([memory[BLOCK:], part.states])
+        end = part.states[-1]
+        lost = pair.lost(end)
+        sound = part.solved & ~lost & jnp.all(jnp.isfinite(end))
+        period, nearest, spread = cycle(memory, rtol.astype(memory.dtype))
+        new = Transient(
+            state=end,
+            period=jnp.where(sound, period, 0),
+            nearest=nearest,
+            spread=spread,
+            periods=carry.periods + BLOCK,
+            lost=lost,
+            solved=part.solved,
+            steps=carry.steps + part.steps,
+        )
+        return new, memory
+
+    start = Transient(
+        state=state,
+        period=jnp.zeros((), int),
+        nearest=jnp.ones((), int),
+        spread=jnp.full_like(state[0], jnp.inf),
+        periods=jnp.zeros((), int),
+        lost=jnp.zeros((), bool),
+        solved=jnp.ones((), bool),
+        steps=jnp.zeros((), int),
+    )
+    memory = jnp.full((_MEMORY, *state.shape), jnp.inf, state.dtype)
+    return lax.while_loop(go_on, advance, (start, memory))[0]

@@ -1,0 +1,121 @@
+"""A window of a motion that has not settled: its forces, and its largest Lyapunov exponent.
+
+The exponent tells chaos from a long transient (Benettin et al., Meccanica 15 (1980) 9-20: growth of
+a tangent vector that is renormalised every mesh period).
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from rootsopt.dynamics.flow import Flow, Integrator, flow
+from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.pair import RotorPair
+
+PERIODS = 128
+"""Mesh periods of a window."""
+_BATCHES = 16
+"""Batches of a window, whose means give the standard error of the exponent."""
+_KEPT = 105
+"""States kept of each mesh period."""
+_SAMPLES = 630
+"""Uniform samples of a mesh period among which its peak is looked for; a multiple of `_KEPT`."""
+
+
+class Window(NamedTuple):
+    """A motion over p mesh periods, of which the first `done` are known.
+
+    `growth` (p,): logarithm of the factor by which a tangent vector grew in each; `response`
+    (p, 3): mean (N), mean square (N²) and peak (N) of the contact force; `states` (p, s, n):
+    uniform samples, scaled; `depth` (m): greatest penetration, negative: least gap; `solved`:
+    whether the solver got through; `end`: last scaled state, and the unit tangent vector
+    `direction` there.
+    """
+
+    growth: Float[Array, " p"]
+    response: Float[Array, "p 3"]
+    states: Float[Array, "p s n"]
+    depth: Float[Array, ""]
+    solved: Bool[Array, ""]
+    end: Float[Array, " n"]
+    direction: Float[Array, " n"]
+    done: Int[Array, ""]
+
+    @classmethod
+    def empty(cls, state: Float[Array, " n"], periods: int) -> "Window":
+        """Return the window of a motion from the scaled `state` before its first period."""
+        count, dtype = state.shape[0], state.dtype
+        return cls(
+            growth=jnp.zeros(periods, dtype),
+            response=jnp.zeros((periods, 3), dtype),
+            states=jnp.zeros((periods, _KEPT, count), dtype),
+            depth=jnp.full((), -jnp.inf, dtype),
+            solved=jnp.ones((), bool),
+            end=state,
+            direction=jnp.zeros_like(state).at[0].set(1.0),
+            done=jnp.zeros((), int),
+        )
+
+    def after(self, out: Flow) -> "Window":
+        """Return the window with one more mesh period, of which `out` is the flow."""
+        count = self.end.shape[0]
+        moved = out.slope[:count, :count] @ self.direction
+        size = jnp.linalg.norm(moved)
+        safe = jnp.where(size > 0, size, 1.0)
+        every = out.states.shape[0] // _KEPT
+        return Window(
+            growth=self.growth.at[self.done].set(jnp.log(safe)),
+            response=self.response.at[self.done].set(out.response[:3]),
+            states=self.states.at[self.done].set(out.states[::every][:_KEPT]),
+            depth=jnp.maximum(self.depth, out.depth),
+            solved=self.solved & out.solved,
+            end=out.end,
+            direction=moved / safe,
+            done=self.done + 1,
+        )
+
+    @property
+    def exponent(self) -> Float[Array, ""]:
+        """Largest Lyapunov exponent per mesh period."""
+        return _numpy_of(self.growth).mean(self.growth)
+
+    @property
+    def error(self) -> Float[Array, ""]:
+        """Standard error of `exponent`, from the means of batches."""
+        xp = _numpy_of(self.growth)
+        batches = xp.mean(self.growth.reshape(_BATCHES, -1), axis=1)
+        return xp.std(batches, ddof=1) / _BATCHES**0.5
+
+    @property
+    def forces(self) -> Float[Array, " 3"]:
+        """Mean (N), mean square (N²) and peak (N) of the contact force over the window."""
+        xp = _numpy_of(self.response)
+        mean, square, peak = self.response.T
+        return xp.stack([xp.mean(mean), xp.mean(square), xp.max(peak)])
+
+
+def _numpy_of(array: Any) -> Any:
+    """NumPy for arrays that have left the device, so that nothing is compiled for them."""
+    return np if isinstance(array, np.ndarray) else jnp
+
+
+def lyapunov(pair: RotorPair, state: Float[Array, " n"], periods: int, how: Integrator) -> Window:
+    """Integrate a window of `periods` mesh periods (a multiple of 16) from the scaled `state`."""
+    one, still = jnp.ones_like(state[0]), no_tangents(pair)
+
+    def step(_: Any, window: Window) -> Window:
+        return window.after(flow(pair, window.end, one, how, _SAMPLES, still, measures=Measures()))
+
+    return lax.fori_loop(0, periods, step, Window.empty(state, periods))
+
+
+def no_tangents(pair: RotorPair) -> RotorPair:
+    """Return no directions of the parameters of `pair`, stacked: derivatives in the state only."""
+    return jax.tree.map(
+        lambda x: jnp.zeros((0, *x.shape), x.dtype), eqx.filter(pair, eqx.is_inexact_array)
+    )

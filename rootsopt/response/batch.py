@@ -1,0 +1,160 @@
+"""Many designs at once: one compiled program over a batch, of the same function that a single
+evaluation uses.
+
+A batch is for surveys: one attempt at each design, no check of the derivatives on halved steps, and
+orbits closed to a tenth of the tolerance. A design that needs more is reported as not settled or
+inaccurate, and can be given to an `Evaluator`.
+"""
+
+import dataclasses
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.steady import Solver, steady_motion
+from rootsopt.model import Scene
+from rootsopt.programs import Program
+from rootsopt.status import Status
+
+SAMPLES = 840
+"""Uniform samples of an orbit, among which the peak is looked for; divisible by all
+periods up to eight."""
+
+
+class Batch(NamedTuple):
+    """Outcome of n designs with d parameters; NaN where there is no periodic orbit.
+
+    `response` (n, 3): mean, peak and RMS force (N); `gradient` (n, 3, d) per config unit;
+    `state` (n, s): scaled state of the orbit at φ1 = 0, a start for neighbouring designs;
+    `period` (mesh periods), largest Floquet `multiplier`, `residual` of the closed orbit;
+    `deepest`: least ε (rad) on the orbit; `steps` of the solver; `status`: codes of `Status`.
+    """
+
+    response: Float[Array, "*n 3"]
+    gradient: Float[Array, "*n 3 d"]
+    state: Float[Array, "*n s"]
+    period: Int[Array, "*n"]
+    multiplier: Float[Array, "*n"]
+    residual: Float[Array, "*n"]
+    deepest: Float[Array, "*n"]
+    steps: Int[Array, "*n"]
+    status: Int[Array, "*n"]
+
+    @property
+    def usable(self) -> Bool[Array, "*n"]:
+        """Where the pair settled on a stable periodic orbit."""
+        return self.status == Status.PERIODIC.code
+
+
+def coarse(
+    scene: Scene,
+    transient: Integrator,
+    orbit: Integrator,
+    max_periods: int = 64,
+    max_orbit: int = 8,
+) -> Solver:
+    """Return how a batch finds the steady motions of a `scene`."""
+    return dataclasses.replace(
+        scene.solver,
+        transient=transient,
+        orbit=orbit,
+        max_periods=jnp.asarray(float(max_periods)),
+        max_orbit=max_orbit,
+        precision=scene.precision,
+        shots=8,
+        closed=0.1,
+        samples=SAMPLES,
+        check=False,
+        attempts=1,
+        windows=0,
+    )
+
+
+def respond(
+    scene: Scene,
+    design: Float[Array, " d"],
+    state: Float[Array, " s"],
+    solver: Solver,
+    gradient: bool = True,
+) -> Batch:
+    """Return the steady response of one design from the scaled `state`, as a pure function.
+
+    Traceable: map it over `design`, `state` or the leaves of `scene`.
+    """
+    if gradient:
+        pair, tangents, _ = scene.pair_and_tangents(design)
+    else:
+        pair, tangents, _ = scene.pair_and_tangents(design, ())
+    found = steady_motion(
+        pair, tangents, state.astype(pair.angle_scale.dtype), scene.pitch_radius, solver
+    )
+    orbit = found.orbit
+    mean, square, peak = found.forces[:3]
+    rms = jnp.sqrt(jnp.maximum(square, 0.0))
+    by_mean, by_square, by_peak = found.sensitivity[:3]
+    rows = jnp.stack([by_mean, by_peak, by_square / (2 * jnp.maximum(rms, 1e-30))])
+    usable = found.status == Status.PERIODIC.code
+    return Batch(
+        response=jnp.where(usable, jnp.stack([mean, peak, rms]), jnp.nan),
+        gradient=jnp.where(usable, rows, jnp.nan),
+        state=orbit.state,
+        period=found.period,
+        multiplier=orbit.multiplier,
+        residual=orbit.residual,
+        deepest=pair.angle_scale * jnp.min(orbit.flow.states[:, 0]),
+        steps=found.steps,
+        status=found.status,
+    )
+
+
+def respond_many(
+    scene: Scene,
+    designs: Float[Array, "n d"],
+    states: Float[Array, "n s"],
+    solver: Solver,
+    gradient: bool = True,
+) -> Batch:
+    """`respond` over designs (n, d) in config units, each from its own scaled state.
+
+    On CPUs a thread for each core takes the designs one by one: stepping many together, each
+    would wait for the slowest at every turn. On other devices all are stepped together.
+    """
+    if jax.default_backend() != "cpu":
+        return _together(scene, designs, states, solver, gradient)
+    return on_all_cores(
+        lambda designs, states: _in_turn(scene, designs, states, solver, gradient), designs, states
+    )
+
+
+def on_all_cores(work: Callable[..., Any], *arrays: Any) -> Any:
+    """`work(*arrays)` with the leading axis (n,) of all arrays, and of its result, divided among
+    threads, one for each core.
+
+    The parts have one size, so that they share a compiled program.
+    """
+    count = arrays[0].shape[0]
+    workers = max(1, min(os.cpu_count() or 1, count))
+    size = -(-count // workers)
+    # The last entry fills the last part up.
+    index = np.minimum(np.arange(workers * size), count - 1).reshape(workers, size)
+    with ThreadPoolExecutor(workers) as pool:
+        parts = list(pool.map(lambda rows: work(*(x[rows] for x in arrays)), index))
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *parts)
+
+
+@Program
+def _together(scene, designs, states, *settings) -> Batch:
+    return jax.vmap(lambda design, state: respond(scene, design, state, *settings))(designs, states)
+
+
+@Program
+def _in_turn(scene, designs, states, *settings) -> Batch:
+    return lax.map(lambda at: respond(scene, *at, *settings), (designs, states))

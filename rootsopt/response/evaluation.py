@@ -1,0 +1,547 @@
+"""One design in one scene, from design vector to steady state, response and gradient."""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rootsopt.config import Config
+from rootsopt.contact.size import size_map
+from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
+from rootsopt.dynamics.orbit import Orbit, reverse_sensitivity
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.settle import BLOCK
+from rootsopt.dynamics.steady import Steady, steady_motion, window_status
+from rootsopt.dynamics.window import Window, lyapunov
+from rootsopt.model import MM, Scene, design_keys, design_vector
+from rootsopt.profiles import Geometry
+from rootsopt.programs import Program
+from rootsopt.status import Status
+
+if TYPE_CHECKING:
+    import xarray
+
+RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
+_MAPS = 5
+"""Contact maps tried for one motion, at most."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Series:
+    """Motion, force and penetration (negative: gap) over the reported window, uniform in
+    time (SI units, numpy)."""
+
+    time: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    relative: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    drive_force: NDArray[np.float64]
+    coast_force: NDArray[np.float64]
+    depth: NDArray[np.float64]
+
+    @property
+    def force(self) -> NDArray[np.float64]:
+        """Contact force (N): sum of the normal forces."""
+        return self.drive_force + self.coast_force
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """Everything known about one design in one scene.
+
+    `response` and `gradient` use the result file's keys (N, N per config unit);
+    `gradient` is empty where there is none to trust. `steady_state` says what kind of
+    motion it is. `series` covers whole orbits, at least one revolution.
+    """
+
+    design: dict[str, float]
+    geometry: dict[str, float]
+    response: dict[str, float]
+    gradient: dict[str, dict[str, float]]
+    steady_state: dict[str, Any]
+    status: Status
+    message: str
+    statistics: dict[str, int | float]
+    series: Series | None
+    state: NDArray[np.float64] | None = None
+
+    @property
+    def usable(self) -> bool:
+        """Whether the numbers stand for a steady state with a gradient."""
+        return self.status.usable
+
+    def to_dataset(self) -> "xarray.Dataset":
+        """Return the reported window as an `xarray.Dataset` over time, with units and long names;
+        design, geometry, response and status are attributes.
+
+        Raises ValueError where there is no window to report."""
+        if self.series is None:
+            raise ValueError(
+                f"An evaluation must have a series to become a dataset, but this one is "
+                f"{self.status.label} and has none; pass `series=True`, or choose another design"
+            )
+        from rootsopt.response.dataset import dataset
+
+        return dataset(self)
+
+    def record(self) -> dict[str, Any]:
+        """The record of the result file."""
+        return {
+            "design": self.design,
+            "geometry": self.geometry,
+            "response": self.response,
+            "gradient": self.gradient,
+            "steady_state": self.steady_state,
+            "status": self.status.label,
+            "message": self.message,
+            "statistics": self.statistics,
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluator:
+    """Evaluates designs of one config in its `scene`; compiled programs are shared between designs.
+
+    Nothing of it changes: what returns "another" evaluator leaves this one as it is. `reference`:
+    the response that the forces in the objective are relative to, where motions are compared.
+    `fitted`: whether the contact map has been fitted to a motion. `survey`: give up a design that
+    does not settle within a quarter of the allowed transient.
+    """
+
+    config: Config
+    scene: Scene
+    survey: bool = False
+    reference: dict[str, float] | None = None
+    fitted: bool = False
+    map_error: float = float("nan")
+
+    @classmethod
+    def of(cls, config: Config, rtol: float | None = None, survey: bool = False) -> "Evaluator":
+        """Return the evaluator of a `config`; `rtol` overrides its orbit tolerance."""
+        found = cls(config, Scene.from_config(config))
+        if rtol is not None:
+            found = found.at_tolerance(rtol)
+        return found.surveying() if survey else found
+
+    def at_tolerance(self, rtol: float) -> "Evaluator":
+        """Return another evaluator, with this orbit tolerance."""
+        return self._solving(lambda solver: solver.orbit.rtol, jnp.asarray(rtol))
+
+    def surveying(self) -> "Evaluator":
+        """Return another evaluator for a search over many designs, which need a gradient and an
+        order, not the last digits."""
+        least = max(self.config.solver.max_mesh_periods // 4, 8 * BLOCK)
+        hasty = self._solving(
+            lambda solver: (solver.max_periods, solver.examine),
+            (jnp.asarray(float(least)), jnp.asarray(0.0)),
+        )
+        return dataclasses.replace(hasty, survey=True)
+
+    def _solving(self, where, value) -> "Evaluator":
+        scene = eqx.tree_at(lambda scene: where(scene.solver), self.scene, value)
+        return dataclasses.replace(self, scene=scene)
+
+    def relative_to(self, baseline: Evaluation) -> "Evaluator":
+        """Return another evaluator, whose motions are compared by their forces relative to those
+        of the `baseline`."""
+        return dataclasses.replace(self, reference=baseline.response)
+
+    def at_speed(self, speed_rpm: float) -> "Evaluator":
+        """Return another evaluator, at this speed."""
+        return dataclasses.replace(self, scene=at_speed(self.scene, speed_rpm))
+
+    def without_gradient(self) -> "Evaluator":
+        """Return another evaluator that leaves out the gradient where that takes most of the time:
+        here it does not."""
+        return self
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Names of the design parameters."""
+        return design_keys(self.config)
+
+    def __call__(
+        self,
+        design: ArrayLike | None = None,
+        start: NDArray[np.float64] | None = None,
+        series: bool = True,
+    ) -> Evaluation:
+        """Evaluate `design` (config units; default: the config's own).
+
+        `start` is the scaled state to begin from, such as the orbit of a neighbouring design; by
+        default the contract's ε = 0, dε/dt = 0 at φ = 0.
+        """
+        return self.fit(design, start, series)[1]
+
+    def fit(
+        self,
+        design: ArrayLike | None = None,
+        start: NDArray[np.float64] | None = None,
+        series: bool = True,
+    ) -> tuple["Evaluator", Evaluation]:
+        """Evaluate as a call does; also return another evaluator, for neighbouring designs, whose
+        contact map has the size and the reach that this design's motion takes."""
+        began = time.perf_counter()
+        design = design_vector(self.config) if design is None else jnp.asarray(design)
+        now = other = self._sized(design)
+        for _ in range(_MAPS):
+            now = other
+            pair, tangents, shape = _build(now.scene, design)
+            dtype = pair.angle_scale.dtype
+            state = np.zeros(pair.states, dtype) if start is None else np.asarray(start, dtype)
+            found = jax.device_get(now._motion(pair, tangents, state))
+            other = now._refitted(pair, found)
+            if other is None:
+                break
+            if float(other.scene.deepest) < float(now.scene.deepest):
+                other = other._sized(design)
+        return now, now._report(design, (pair, shape), found, began, series)
+
+    def _motion(self, pair: RotorPair, tangents: RotorPair, state) -> Steady:
+        return _motion(pair, tangents, state, self.scene.pitch_radius, self.scene.solver)
+
+    def pair(self, design: ArrayLike) -> RotorPair:
+        """Return the rotor pair of `design` (config units)."""
+        return _build(self.scene, jnp.asarray(design))[0]
+
+    def prepare(self, design: ArrayLike | None = None, series: bool = True) -> "Evaluator":
+        """Compile, in the background, what evaluating `design` (config units) takes; return another
+        evaluator with the contact map that takes."""
+        design = design_vector(self.config) if design is None else jnp.asarray(design)
+        now = self._sized(design)
+        pair, tangents, _ = _build.result_shape(now.scene, design)
+        dtype = pair.angle_scale.dtype
+        state = jax.ShapeDtypeStruct((pair.states,), dtype)
+        # The one that takes longest first.
+        _motion.prepare(pair, tangents, state, now.scene.pitch_radius, now.scene.solver)
+        _build.prepare(now.scene, design)
+        if series:
+            count = pair.lobes * now.scene.solver.samples
+            times = jax.ShapeDtypeStruct((count,), float)
+            _contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, pair.states), dtype))
+        return now
+
+    def _sized(self, design) -> "Evaluator":
+        """Another evaluator, whose contact map is large enough for `design`, where the config
+        leaves its size open.
+
+        It only grows, so that neighbouring designs share a program. A survey keeps the size it was
+        given.
+        """
+        solver, scene = self.config.solver, self.scene
+        given = solver.map_rolls, solver.map_relatives
+        if scene.fidelity != "map" or self.survey or None not in given:
+            return self
+        depth = scene.static_depth
+        wanted = size_map(scene.profile(design), float(scene.deepest), solver.map_error * depth)
+        known = (0, 0) if np.isnan(self.map_error) else scene.map_size
+        least = wanted.rolls, wanted.relatives
+        sizes = (size or max(pair) for size, *pair in zip(given, known, least, strict=True))
+        scene = dataclasses.replace(scene, map_size=tuple(sizes))
+        return dataclasses.replace(self, scene=scene, map_error=wanted.error / depth)
+
+    def _refitted(self, pair: RotorPair, found: Steady) -> "Evaluator | None":
+        """Another evaluator with a contact map that fits the motion, or None if this one does.
+
+        A motion that left the map is not described by it; one that uses a small part of it wastes
+        its resolution (looked at once, so that neighbouring designs share a map).
+        """
+        status, reached = Status.of(found.status), _reached(pair, found)
+        return self.reaching(reached, status is Status.PERIODIC, pair.angle_limit)
+
+    def reaching(self, reached: float, steady: bool, most: Any) -> "Evaluator | None":
+        """Another evaluator with a contact map for motions that reach |ε| = `reached` (rad), at
+        most `most`; None where the map fits, or there is none. Whether it is too large is asked of
+        a `steady` motion."""
+        covered = -float(self.scene.deepest)
+        if self.scene.fidelity != "map" or not np.isfinite(reached):
+            return None
+        wasteful = steady and not self.fitted and reached < 0.6 * covered
+        deepest = min(1.3 * reached, float(most))
+        if not (reached > covered or wasteful) or deepest == covered:
+            return None
+        scene = eqx.tree_at(lambda scene: scene.deepest, self.scene, jnp.asarray(-deepest))
+        return dataclasses.replace(self, scene=scene, fitted=True)
+
+    def _report(self, design, built, found: Steady, began: float, series: bool) -> Evaluation:
+        """The evaluation that a motion which was looked for since `began` comes to."""
+        seconds = time.perf_counter() - began
+        (pair, shape), status, orbit = built, Status.of(found.status), found.orbit
+        period = int(found.period)
+        statistics: dict[str, int | float] = {
+            "transient_mesh_periods": int(found.used),
+            "solver_steps": int(found.steps),
+        } | self._map_statistics()
+        steady: dict[str, Any] = {"kind": "transient"}
+        response: dict[str, float] = {}
+        hint, motion, state = "", None, None
+        if status in _CLOSED:
+            named = self.scene.solver.measures.named(orbit.response[:, None], period)
+            response = {name: value for name, (value, _) in named.items()}
+            steady = {"kind": "periodic"} | _closed(orbit, period)
+            statistics |= _orbit_statistics(found)
+            motion = _orbit_series(pair, orbit, period) if series else None
+            state = np.asarray(orbit.state, np.float64)
+        elif status is Status.IDLE:
+            steady = {"kind": "idle"}
+            names = self.scene.solver.measures.named(np.zeros((len(orbit.response), 1)), 1)
+            response = dict.fromkeys(names, 0.0)
+            if int(found.window.done):
+                hint = idle_hint(self.config, float(found.window.depth))
+                steady |= _of_window(found.window)
+                motion = _window_series(pair, found.window) if series else None
+            else:
+                hint = idle_hint(self.config, float(orbit.flow.depth))
+            if found.verdict.steady:
+                # Held by the timing gear; a pair that floats can rest anywhere.
+                steady |= _closed(orbit, period)
+                state = np.asarray(orbit.state, np.float64)
+                motion = _orbit_series(pair, orbit, period) if series else None
+        elif int(found.window.done):
+            steady, response, motion = unsettled(pair, status, found.window, series)
+        elif status is Status.SOLVER_FAILED and pair.pace is not None:
+            swings = pair.mesh_period / (2 * np.pi * pair.pace.swing)
+            statistics["swings_per_mesh_period"] = float(swings)
+        return Evaluation(
+            design=dict(zip(self.keys, map(float, design), strict=True)),
+            geometry=geometry_record(self.scene, shape),
+            response=response,
+            gradient=self._gradient(design, found) if status is Status.PERIODIC else {},
+            steady_state=steady,
+            status=status,
+            message=status.value + hint,
+            statistics=statistics | {"seconds": seconds},
+            series=motion,
+            state=state,
+        )
+
+    def _map_statistics(self) -> dict[str, int | float]:
+        """Size and error of the contact map, if there is one."""
+        if self.scene.fidelity != "map":
+            return {}
+        rolls, relatives = self.scene.map_size
+        found: dict[str, int | float] = {"map_rolls": rolls, "map_relatives": relatives}
+        return found if np.isnan(self.map_error) else found | {"map_error": self.map_error}
+
+    def _gradient(self, design, found: Steady) -> dict[str, dict[str, float]]:
+        """Gradient of a closed orbit in the result file's keys."""
+        if not self.keys:
+            return {}
+        orbit, solver = found.orbit, self.scene.solver
+        sensitivity = orbit.sensitivity
+        if self.config.solver.gradient == "reverse":
+            settings = np.asarray(found.period), solver.orbit, solver.measures
+            sensitivity = _reverse(self.scene, design, orbit, *settings)
+        rows = np.column_stack([orbit.response, sensitivity])
+        named = solver.measures.named(rows, int(found.period))
+        return {
+            name: dict(zip(self.keys, map(float, slope), strict=True))
+            for name, (_, slope) in named.items()
+        }
+
+
+_CLOSED = (Status.PERIODIC, Status.INACCURATE, Status.TOO_DEEP, Status.UNRESOLVED)
+"""Statuses of a closed orbit with contact."""
+
+
+def at_speed(scene: Scene, speed_rpm: float) -> Scene:
+    """Return the `scene` at another speed."""
+    speed = jnp.asarray(speed_rpm * 2 * np.pi / 60)
+    return eqx.tree_at(lambda scene: scene.speed, scene, speed)
+
+
+def _reached(pair: RotorPair, found: Steady) -> float:
+    """Largest |ε| (rad) of the steady motion, as far as known."""
+    scale = float(pair.angle_scale)
+    if Status.of(found.status) in (*_CLOSED, Status.IDLE):
+        return scale * float(np.max(np.abs(found.orbit.flow.states[:, 0])))
+    if int(found.window.done):
+        return scale * float(np.max(np.abs(found.window.states[..., 0])))
+    return scale * abs(float(found.settled.state[0]))
+
+
+def _orbit_statistics(found: Steady) -> dict[str, int | float]:
+    """How a closed orbit was found, and how well it is known."""
+    orbit = found.orbit
+    statistics: dict[str, int | float] = {
+        "newton_steps": int(orbit.newton_steps),
+        "orbit_steps": int(orbit.flow.steps),
+        "orbit_rtol": float(found.rtol),
+        "orbit_defect": float(orbit.defect),
+        "force_rounding": float(found.verdict.rounding),
+    }
+    if np.isfinite(orbit.disagreement):  # else there was no room for a comparison
+        statistics["gradient_disagreement"] = float(orbit.disagreement)
+    return statistics
+
+
+def _closed(orbit: Orbit, period: int) -> dict[str, Any]:
+    """What the result file says of a closed orbit."""
+    return {
+        "period": period,
+        "floquet_multiplier": float(orbit.multiplier),
+        "floquet_multipliers": floquet(orbit.monodromy),
+        "residual": float(orbit.residual),
+    }
+
+
+def idle_hint(config: Config, depth: float) -> str:
+    """Advice for flanks that never touch: which clearance brings them together.
+
+    `depth` (m): greatest penetration, less than 0 by the least gap. The motion does not depend on
+    the clearance as long as nothing touches, so that the flanks touch where the clearance falls by
+    more than the least gap."""
+    gap, clearance = -depth / MM, config.contact.clearance_mm
+    if not (np.isfinite(gap) and 0 < gap < 0.9 * config.profile.pitch_radius_mm):
+        return ""
+    found = f" The least gap of the flanks is {gap:.4g} mm"
+    if gap < clearance:
+        return f"{found}: they touch with contact.clearance_mm below {clearance - gap:.4g}."
+    if config.scene.timing_gear is not None:
+        backlash = config.scene.timing_gear.backlash_mm
+        return (
+            f"{found}, and the timing gear holds them apart: they touch only with "
+            f"scene.timing_gear.backlash_mm above {backlash + 2 * gap:.4g}."
+        )
+    return f"{found}."
+
+
+def geometry_record(scene: Scene, shape: Geometry) -> dict[str, float]:
+    """Geometry in the result file's keys and units."""
+    return {
+        "outer_radius_mm": float(shape.outer_radius) / MM,
+        "root_radius_mm": float(shape.root_radius) / MM,
+        "area_mm2": float(shape.area) / MM**2,
+        "area_efficiency": float(shape.area_efficiency),
+        "polar_inertia_kg_m2": float(scene.inertia(shape)),
+        "undercut_margin_mm": float(shape.undercut_margin) / MM,
+        "seal_width_mm": float(shape.seal_width) / MM,
+    }
+
+
+_build = Program(Scene.pair_and_tangents)
+_motion = Program(steady_motion)
+lyapunov_program = Program(lyapunov)
+unsettled_status = Program(window_status)
+
+
+def objective_weights(config: Config) -> dict[str, float]:
+    """Weights of the responses in the objective, by name; they add up to 1."""
+    wanted = config.objective
+    peak = PEAK_NORM if wanted.peak_norm is not None else "peak_force_N"
+    shares = {
+        "mean_force_N": wanted.mean_weight,
+        peak: wanted.peak_weight,
+        "rms_force_N": wanted.rms_weight,
+        **{line_name(order): weight for order, weight in wanted.line_weights.items()},
+    }
+    total = sum(shares.values())
+    return {name: share / total for name, share in shares.items() if share}
+
+
+def floquet(monodromy) -> list[list[float]]:
+    """Floquet multipliers, the eigenvalues of a monodromy matrix (n, n), as [real, imaginary] and
+    greatest first."""
+    values = np.linalg.eigvals(np.asarray(monodromy, np.float64))
+    ordered = sorted(values, key=lambda z: (-abs(z), -z.imag))
+    return [[float(z.real), float(z.imag)] for z in ordered]
+
+
+@Program
+def _reverse(scene: Scene, design, orbit: Orbit, period, how: Integrator, measures: Measures):
+    grid, peak = orbit.flow.grid, orbit.flow.peak
+    return reverse_sensitivity(
+        scene.pair, design, orbit.state, period, how, grid, measures, jnp.maximum(peak, 1e-30)
+    )
+
+
+@Program
+def _contact_series(pair: RotorPair, tau, states):
+    lapse = pair.lapse(states) if pair.drive.free else jnp.ones_like(tau)
+    contact = jax.vmap(pair.contact_at)(tau, states)
+    return pair.mesh_period, lapse, pair.physical(tau, states)[1:], contact
+
+
+def _series(pair: RotorPair, tau, states) -> Series:
+    # Within a turn of the rotor: single precision resolves late times as well as early ones.
+    turn = np.mod(tau, pair.lobes)
+    period, lapse, (relative, rate), contact = _contact_series(pair, turn, states)
+    time = period * tau
+    if pair.drive.free:
+        from scipy.integrate import cumulative_simpson  # Half a second, for motors alone.
+
+        time = period * cumulative_simpson(lapse, x=tau, initial=0.0)
+    double = functools.partial(np.asarray, dtype=np.float64)
+    return Series(
+        time=double(time),
+        rotation=2 * np.pi / pair.lobes * np.asarray(tau, np.float64),
+        relative=double(relative),
+        rate=double(rate),
+        drive_force=double(contact.drive),
+        coast_force=double(contact.coast),
+        depth=double(contact.depth),
+    )
+
+
+def _orbit_series(pair: RotorPair, orbit: Orbit, period: int) -> Series:
+    """The orbit repeated over at least one revolution, in whole cycles."""
+    samples = orbit.flow.states.shape[0]
+    cycles = -(-pair.lobes // period)
+    tau = period * np.arange(cycles * samples) / samples
+    return _series(pair, tau, np.tile(np.asarray(orbit.flow.states), (cycles, 1)))
+
+
+def unsettled(
+    pair: RotorPair, status: Status, window: Window, series: bool
+) -> tuple[dict[str, Any], dict[str, float], Series | None]:
+    """Return the steady state, the response and, if asked for, the series of a motion that has not
+    settled, from a `window` of it with this `status`."""
+    steady = {"kind": _KINDS.get(status, "transient")} | _of_window(window)
+    if status not in (Status.CHAOTIC, Status.NOT_SETTLED, Status.IDLE):
+        return steady, {}, None
+    mean, square, peak = np.asarray(window.forces, np.float64)
+    values = map(float, (mean, peak, np.sqrt(square)))
+    response: dict[str, float] = dict(zip(RESPONSES, values, strict=True))
+    return steady, response, _window_series(pair, window) if series else None
+
+
+_KINDS = {Status.CHAOTIC: "chaotic", Status.IDLE: "idle"}
+
+
+def _of_window(window: Window) -> dict[str, Any]:
+    """What the result file says of a window."""
+    known = bool(np.all(np.isfinite(window.response)) and np.isfinite(window.exponent))
+    return {
+        "lyapunov_exponent_per_mesh_period": float(window.exponent) if known else None,
+        "lyapunov_standard_error": float(window.error) if known else None,
+        "window_mesh_periods": int(window.done),
+    }
+
+
+def _window_series(pair: RotorPair, window: Window) -> Series:
+    states = np.asarray(window.states)
+    periods, samples, count = states.shape
+    return _series(pair, np.arange(periods * samples) / samples, states.reshape(-1, count))
+
+
+def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) -> Evaluation:
+    """Evaluate one design of a config: response, gradient, steady state and series.
+
+    `design` (d,) in config units; by default the config's own. Raises `InputError` for a scene that
+    cannot be simulated, `RuntimeError` where JAX is not set to the precision it asks for.
+
+    >>> config = rootsopt.load_config("configs/cic.yaml")
+    >>> rootsopt.response.evaluation(config).response["mean_force_N"]
+    """
+    return Evaluator.of(config)(None if design is None else jnp.asarray(design, float))
+
+
+__all__ = ["RESPONSES", "Evaluation", "Evaluator", "Series", "evaluate"]

@@ -1,0 +1,25 @@
+"""Which evaluator a config asks for: of one motion, of all that coexist, or of an ensemble; at one
+speed or over several."""
+
+from rootsopt.config import Config
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.wrapper import Evaluates
+
+
+def evaluator_for(config: Config) -> Evaluates:
+    """Return the evaluator that `objective.motion` and `objective.speeds_rpm` ask for."""
+    single = Evaluator.of(config)
+    found: Evaluates = single
+    if config.objective.motion == "ensemble":
+        from rootsopt.response.ensemble import EnsembleEvaluator
+
+        found = EnsembleEvaluator(single)
+    elif config.objective.motion in ("worst", "weighted"):
+        from rootsopt.response.attractors import AttractorEvaluator
+
+        found = AttractorEvaluator(single)
+    if config.objective.speeds_rpm:
+        from rootsopt.response.speeds import SpeedsEvaluator
+
+        found = SpeedsEvaluator(found)
+    return found

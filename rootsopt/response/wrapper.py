@@ -1,0 +1,127 @@
+"""What every evaluator can do, and the base of those that wrap another one."""
+
+import dataclasses
+from typing import Any, Protocol, Self
+
+from numpy.typing import ArrayLike, NDArray
+
+from rootsopt.config import Config
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.model import Scene
+from rootsopt.response.evaluation import Evaluation
+
+
+class Evaluates(Protocol):
+    """Evaluates designs of one config, and changes nothing of itself (see `Evaluator`)."""
+
+    @property
+    def config(self) -> Config:
+        """The config whose designs are evaluated."""
+        ...
+
+    @property
+    def scene(self) -> Scene:
+        """The scene they are evaluated in."""
+        ...
+
+    def __call__(
+        self, design: Any = None, start: NDArray | None = None, series: bool = True
+    ) -> Evaluation:
+        """Evaluate a design."""
+        ...
+
+    def fit(
+        self, design: Any = None, start: NDArray | None = None, series: bool = True
+    ) -> tuple["Evaluates", Evaluation]:
+        """Evaluate a design; also return an evaluator fitted to its motion."""
+        ...
+
+    def prepare(self, design: Any = None, series: bool = True) -> "Evaluates":
+        """Compile in the background what a design takes; return an evaluator sized for it."""
+        ...
+
+    def pair(self, design: ArrayLike) -> RotorPair:
+        """Return the rotor pair of a design."""
+        ...
+
+    def at_speed(self, speed_rpm: float) -> "Evaluates":
+        """Return another evaluator, at this speed."""
+        ...
+
+    def at_tolerance(self, rtol: float) -> "Evaluates":
+        """Return another evaluator, with this orbit tolerance."""
+        ...
+
+    def surveying(self) -> "Evaluates":
+        """Return another evaluator, for a search over many designs."""
+        ...
+
+    def relative_to(self, baseline: Evaluation) -> "Evaluates":
+        """Return another evaluator, whose motions are compared relative to a baseline."""
+        ...
+
+    def without_gradient(self) -> "Evaluates":
+        """Return another evaluator without the gradient where that takes most of the time."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Wrapper:
+    """An evaluator of what the evaluations of another one, `single`, come to.
+
+    What is asked of it is asked of `single`; a wrapper of its own kind writes `fit`.
+    """
+
+    single: Evaluates
+
+    @property
+    def config(self) -> Config:
+        """The config whose designs are evaluated."""
+        return self.single.config
+
+    @property
+    def scene(self) -> Scene:
+        """The scene they are evaluated in."""
+        return self.single.scene
+
+    def __call__(self, design=None, start=None, series=True) -> Evaluation:
+        """Evaluate `design` (config units; default: the config's own)."""
+        return self.fit(design, start, series)[1]
+
+    def fit(self, design=None, start=None, series=True) -> tuple[Self, Evaluation]:
+        """Evaluate a design; also return an evaluator fitted to its motion."""
+        raise NotImplementedError
+
+    def pair(self, design: ArrayLike) -> RotorPair:
+        """Return the rotor pair of `design` (config units)."""
+        return self.single.pair(design)
+
+    def prepare(self, design=None, series=True) -> Self:
+        """Compile in the background what a design takes; return an evaluator sized for it."""
+        return self._around(self.single.prepare(design, series))
+
+    def at_speed(self, speed_rpm: float) -> Self:
+        """Return another evaluator, at this speed."""
+        return self._around(self.single.at_speed(speed_rpm))
+
+    def at_tolerance(self, rtol: float) -> Self:
+        """Return another evaluator, with this orbit tolerance."""
+        return self._around(self.single.at_tolerance(rtol))
+
+    def surveying(self) -> Self:
+        """Return another evaluator, for a search over many designs."""
+        return self._around(self.single.surveying())
+
+    def relative_to(self, baseline: Evaluation) -> Self:
+        """Return another evaluator, whose motions are compared relative to a `baseline`."""
+        return self._around(self.single.relative_to(baseline))
+
+    def without_gradient(self) -> Self:
+        """Return another evaluator without the gradient where that takes most of the time."""
+        return self._around(self.single.without_gradient())
+
+    def _around(self, single: Evaluates) -> Self:
+        return dataclasses.replace(self, single=single)
+
+
+__all__ = ["Evaluates", "Wrapper"]
