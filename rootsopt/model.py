@@ -64,6 +64,7 @@ class Scene(eqx.Module):
     map_size: tuple[int, int] = eqx.field(static=True)
     nodes: int = eqx.field(static=True)
     straight: bool = eqx.field(static=True)
+    design_size: int = eqx.field(static=True)
     pitch_radius: Float[Array, ""]
     length: Float[Array, ""]
     density: Float[Array, ""]
@@ -121,6 +122,7 @@ class Scene(eqx.Module):
             map_size=(solver.map_rolls or _ROLLS, solver.map_relatives or _RELATIVES),
             nodes=solver.nodes,
             straight=config.rotor.helix_deg == 0,
+            design_size=len(design_keys(config)),
             pitch_radius=jnp.asarray(radius),
             length=jnp.asarray(config.rotor.length_mm * MM),
             density=jnp.asarray(config.rotor.density_kg_m3),

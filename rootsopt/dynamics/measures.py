@@ -64,6 +64,22 @@ class Measures(eqx.Module):
             factors = factors.at[-1].set(size / (self.norm.astype(averages.dtype) * power))
         return values, factors
 
+    def amplitudes(
+        self, others: Any, slopes: Any, period: Any
+    ) -> tuple[Float[Array, " lines"], list[Float[Array, " d"]]]:
+        """Amplitudes (N) of the lines of a closed orbit of `period` mesh periods and their
+        derivatives, from the values and derivatives behind mean, mean square and peak. An order
+        that is no line of the motion has amplitude 0."""
+        sizes, rows = [], []
+        for k, order in enumerate(self.orders):
+            cos, sin = others[k], others[k + self.orders.shape[0]]
+            size = jnp.hypot(cos, sin)
+            present = jnp.abs(order * period - jnp.round(order * period)) < 1e-6
+            slope = cos * slopes[k] + sin * slopes[k + self.orders.shape[0]]
+            sizes.append(jnp.where(present, 2 * size, 0.0))
+            rows.append(jnp.where(present, 2 * slope / jnp.maximum(size, 1e-150), 0.0))
+        return jnp.stack(sizes) if sizes else jnp.zeros(0), rows
+
     def named(self, response: Any, period: int) -> dict[str, tuple[float, Any]]:
         """Response of a closed orbit by the names of the result file.
 

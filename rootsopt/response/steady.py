@@ -1,0 +1,266 @@
+"""The steady response as a pure function of scene and design, differentiable in both.
+
+The derivative of an orbit is that of the implicit function theorem: the search for it is never
+differentiated through. All derivatives asked for are columns of one matrix, which is found with the
+orbit; a transformation of JAX only multiplies with it. So forward and reverse mode agree to
+rounding, and what is not asked for is not computed.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Complex, Float, Int
+from numpy.typing import ArrayLike
+
+from rootsopt.dynamics.linear import eigenvalues
+from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.steady import CLOSED, Steady, among, steady_motion
+from rootsopt.model import Scene, along, check_precision
+from rootsopt.programs import Program
+from rootsopt.status import Status
+
+
+class Response(NamedTuple):
+    """The steady response of one design in one scene; with leading axes where it was mapped.
+
+    `mean`, `peak`, `rms` of the contact force (N); amplitudes `lines` (N) of the spectral lines
+    that the scene asks for, in their order (0: no line of this motion); `peak_norm` (N), or None
+    where the scene asks for none. `period` of the motion in mesh periods; Floquet `multipliers`,
+    greatest modulus first; `residual`: scaled distance by which the orbit does not close; `status`:
+    code of a `Status` (`Status.of(code)`); `state` at φ1 = 0 in SI units: ε (rad), dε/dt (rad/s),
+    then those of parts, such as a motor's speed beside the scene's (rad/s).
+
+    Forces are those of the orbit; 0 without contact; for a motion that does not settle those of a
+    window of 128 mesh periods; else NaN. Of a motion that is not periodic, period is 0 and
+    multipliers and residual are NaN.
+    """
+
+    mean: Float[Array, ""]
+    peak: Float[Array, ""]
+    rms: Float[Array, ""]
+    lines: Float[Array, " lines"]
+    peak_norm: Float[Array, ""] | None
+    period: Int[Array, ""]
+    multipliers: Complex[Array, " n"]
+    residual: Float[Array, ""]
+    status: Int[Array, ""]
+    state: Float[Array, " n"]
+
+
+def steady_response(
+    scene: Scene, design: ArrayLike, start: Float[Array, " n"] | None = None
+) -> Response:
+    """Return the steady response of a `design` (d,) in config units, in a `scene`.
+
+    `start` (n,): state at φ1 = 0 from which the motion begins (SI units, as `Response.state`); by
+    default at rest. The response does not depend on it, as long as it leads to the same motion.
+
+    A pure function: it works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and `jacrev` with respect
+    to the design and to every physical quantity of the scene. Derivatives of forces and `state` are
+    those of the orbit by the implicit function theorem, and NaN where the status is not periodic.
+    Those of the multipliers are NaN: nobody computes them. The residual is a constant.
+
+    Raises ValueError for a design of another size; RuntimeError where JAX is not set to the
+    precision of the scene.
+
+    >>> config = rootsopt.load_config("configs/cic.yaml")
+    >>> scene = rootsopt.Scene.from_config(config)
+    >>> jax.grad(lambda design: rootsopt.steady_response(scene, design).mean)(config.design)
+    """
+    check_precision(scene.precision)
+    design = jnp.asarray(design, float)
+    if design.ndim != 1:
+        raise ValueError(
+            f"Argument `design` must be an array (d,), but has shape {design.shape}; map over "
+            "several designs with jax.vmap"
+        )
+    expected = scene.design_size
+    if design.shape[0] != expected:
+        raise ValueError(
+            f"Argument `design` must have {expected} entries for this scene, but has "
+            f"{design.shape[0]}; see `config.design_keys`"
+        )
+    return _response(scene, design, start)
+
+
+@eqx.filter_custom_jvp
+def _response(scene: Scene, design, start) -> Response:
+    return _solved(scene, design, start, ())[0]
+
+
+@_response.def_jvp
+def _response_jvp(primals, tangents):
+    scene, design, start = primals
+    moved, without = _moved(*tangents[:2])
+    response, slopes = _solved(scene, design, start, tuple(at for at, _ in moved))
+    flat = [jnp.ravel(tangent) for _, tangent in moved]
+    vector = jnp.concatenate(flat) if flat else jnp.zeros(0, design.dtype)
+    # What nobody differentiates with respect to has no derivative to give.
+    unknown = jnp.nan * sum((jnp.sum(tangent) for tangent in without), start=jnp.sum(vector))
+    rows = iter(_split(slopes @ vector, response))
+    change = Response(
+        mean=next(rows) + _only(without, unknown),
+        peak=next(rows) + _only(without, unknown),
+        rms=next(rows) + _only(without, unknown),
+        lines=next(rows),
+        peak_norm=None if response.peak_norm is None else next(rows),
+        period=None,
+        multipliers=jnp.broadcast_to(unknown, response.multipliers.shape).astype(
+            response.multipliers.dtype
+        ),
+        residual=None,
+        status=None,
+        state=next(rows),
+    )
+    return response, change
+
+
+def _only(without, unknown):
+    return unknown if without else 0.0
+
+
+def _moved(scene: Any, design: Any) -> tuple[list[tuple[int, Array]], list[Array]]:
+    """Tangents that are not zero, with the numbers of their leaves in `_leaves`; and those of
+    leaves that describe a measured outline, with respect to which nothing is differentiated."""
+    numbers, leaves = [], []
+    for number, (path, leaf) in enumerate(_leaves((scene, design))):
+        if leaf is None:
+            continue
+        name = getattr(path[1], "name", "") if len(path) > 1 else ""
+        if name in _SETTINGS:
+            continue
+        if name == "outline":
+            leaves.append(leaf)
+        else:
+            numbers.append((number, leaf))
+    return numbers, leaves
+
+
+_SETTINGS = ("solver", "deepest")
+"""Fields of a scene that no response depends on."""
+
+
+def _leaves(tree: Any) -> list[tuple[Any, Any]]:
+    """All leaves with their places, None among them."""
+    return jax.tree_util.tree_flatten_with_path(tree, is_leaf=lambda x: x is None)[0]
+
+
+def _split(values, response: Response):
+    """The entries of `values` that belong to each differentiated field of a `response`."""
+    lines, states = response.lines.shape[0], response.state.shape[0]
+    yield from values[:3]
+    yield values[3 : 3 + lines]
+    if response.peak_norm is not None:
+        yield values[3 + lines]
+    yield values[-states:] if states else values[:0]
+
+
+def _solved(scene: Scene, design, start, along: tuple[int, ...]) -> tuple[Response, Array]:
+    """The response, and the derivatives (rows, m) of its differentiated fields along the m entries
+    of the leaves numbered `along`."""
+    arguments = scene, design, start, along
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
+        return _inline(*arguments)
+    return _compiled(*arguments)
+
+
+def _solve(scene: Scene, design, start, numbers: tuple[int, ...]) -> tuple[Response, Array]:
+    leaves, tree = jax.tree.flatten((scene, design), is_leaf=lambda x: x is None)
+    chosen = [leaves[k] for k in numbers]
+
+    def build(values):
+        every = list(leaves)
+        for k, value in zip(numbers, values, strict=True):
+            every[k] = value
+        moved, parameters = jax.tree.unflatten(tree, every)
+        return moved.pair_and_shape(parameters)
+
+    pair, tangents, _ = along(build, chosen, _basis(chosen))
+    units = pair.units
+    state = jnp.zeros(pair.states) if start is None else jnp.asarray(start) / units
+    found = steady_motion(
+        pair, tangents, state.astype(units.dtype), scene.pitch_radius, scene.solver
+    )
+    moved_units = jax.vmap(lambda t: _units_along(pair, t))(
+        eqx.filter(tangents, eqx.is_inexact_array)
+    )
+    return _named(scene.solver.measures, pair, found, moved_units)
+
+
+def _units_along(pair: RotorPair, tangent: RotorPair):
+    dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
+    return jax.jvp(lambda p: eqx.combine(p, static).units, (dynamic,), (tangent,))[1]
+
+
+def _basis(leaves: list[Array]) -> list[Array]:
+    """Unit directions of all entries of the `leaves`, stacked along a leading axis."""
+    sizes = [leaf.size for leaf in leaves]
+    unit, begin, rows = np.eye(sum(sizes)), 0, []
+    for leaf, size in zip(leaves, sizes, strict=True):
+        part = unit[:, begin : begin + size].reshape(-1, *leaf.shape)
+        rows.append(jnp.asarray(part, leaf.dtype))
+        begin += size
+    return rows
+
+
+def _named(measures: Measures, pair: RotorPair, found: Steady, moved_units):
+    """The response of a motion, and the derivatives of its differentiated fields."""
+    orbit, period = found.orbit, found.period
+    closed = among(found.status, CLOSED)
+    mean, square, peak, *others = found.forces
+    by_mean, by_square, by_peak, *by_others = found.sensitivity
+    rms = jnp.sqrt(jnp.maximum(square, 0.0))
+    by_rms = by_square / (2 * jnp.maximum(rms, 1e-150))
+    sizes, slopes = measures.amplitudes(others, by_others, period)
+    settled = jnp.where(closed | (found.status == Status.IDLE.code), orbit.state, jnp.nan)
+    state = jnp.where(jnp.isnan(settled), found.settled.state, settled)
+    by_state = orbit.moved * pair.units[:, None] + orbit.state[:, None] * moved_units.T
+    rows = [by_mean, by_peak, by_rms, *slopes]
+    norm = None
+    if measures.norm is not None:
+        norm = others[-1]
+        rows.append(by_others[-1])
+    periodic = found.status == Status.PERIODIC.code
+    rows = jnp.concatenate([jnp.stack(rows), by_state])
+    monodromy = jnp.where(closed, orbit.monodromy, jnp.nan)
+    response = Response(
+        mean=mean,
+        peak=peak,
+        rms=rms,
+        lines=sizes,
+        peak_norm=norm,
+        period=jnp.where(closed, period, 0),
+        multipliers=eigenvalues(monodromy),
+        residual=jnp.where(closed, orbit.residual, jnp.nan),
+        status=found.status,
+        state=state * pair.units,
+    )
+    wide = jnp.result_type(float)
+    response, rows = jax.tree.map(
+        lambda x: x.astype(wide) if eqx.is_inexact_array(x) and jnp.isrealobj(x) else x,
+        (response, rows),
+    )
+    return response, jnp.where(periodic, rows, jnp.nan)
+
+
+@eqx.filter_custom_jvp
+def _once(scene, design, start, numbers):
+    return _solve(scene, design, start, numbers)
+
+
+@_once.def_jvp
+def _once_jvp(primals, tangents):
+    del primals, tangents
+    raise NotImplementedError(
+        "The steady response has first derivatives only: differentiate it once, and use a method "
+        "that needs no second ones (BFGS, Gauss-Newton)"
+    )
+
+
+_inline = eqx.filter_jit(_once)
+_compiled = Program(_solve)
