@@ -31,7 +31,7 @@ from matplotlib.figure import Figure  # noqa: E402
 from rootsopt import auto, files  # noqa: E402
 from rootsopt.config import Config, load  # noqa: E402
 from rootsopt.errors import InputError  # noqa: E402
-from rootsopt.response.evaluation import Evaluator  # noqa: E402
+from rootsopt.evaluate import Evaluator  # noqa: E402
 from rootsopt.status import Status  # noqa: E402
 
 REQUESTS = (1e-2, 1e-3, 1e-4)

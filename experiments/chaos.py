@@ -32,9 +32,9 @@ from matplotlib.figure import Figure  # noqa: E402
 from rootsopt import files  # noqa: E402
 from rootsopt.config import Config, load  # noqa: E402
 from rootsopt.dynamics.flow import flow  # noqa: E402
-from rootsopt.response.ensemble import ERRORS, EnsembleEvaluator  # noqa: E402
-from rootsopt.response.members import run_members  # noqa: E402
-from rootsopt.model import Scene  # noqa: E402
+from rootsopt.ensemble import ERRORS, EnsembleEvaluator  # noqa: E402
+from rootsopt.members import run_members  # noqa: E402
+from rootsopt.model import Model  # noqa: E402
 from rootsopt.optimize.noise import standard_error  # noqa: E402
 from rootsopt.optimize.problem import Problem  # noqa: E402
 from rootsopt.optimize.search import Optimization, Search  # noqa: E402
@@ -94,7 +94,7 @@ SIZES = {
 }
 
 
-def resized(config: Config, model: Scene, **changes) -> EnsembleEvaluator:
+def resized(config: Config, model: Model, **changes) -> EnsembleEvaluator:
     """An evaluator without gradients for an ensemble of another size."""
     ensemble = config.ensemble.model_copy(update=changes)
     evaluator = EnsembleEvaluator(config.model_copy(update={"ensemble": ensemble}), survey=True)
@@ -103,7 +103,7 @@ def resized(config: Config, model: Scene, **changes) -> EnsembleEvaluator:
     return evaluator
 
 
-def line(config: Config, model: Scene, designs: np.ndarray, size: Size) -> list[dict]:
+def line(config: Config, model: Model, designs: np.ndarray, size: Size) -> list[dict]:
     """Averages along a line of designs: of the motion from rest, and of an ensemble."""
     evaluator = resized(config, model, members=size.members, periods=size.window)
     settle = config.ensemble.settle_periods
@@ -121,11 +121,11 @@ def line(config: Config, model: Scene, designs: np.ndarray, size: Size) -> list[
     return rows
 
 
-_pair = Program(Scene.pair)
+_pair = Program(Model.pair)
 
 
 @Program
-def _pathwise(model: Scene, design, periods, how):
+def _pathwise(model: Model, design, periods, how):
     """Derivative of the mean force from the motion's begin to the end of each mesh period by
     the design, along the single motion from rest."""
     pair, tangents, _ = model.pair_and_tangents(design)
@@ -153,7 +153,7 @@ def pathwise(evaluator: EnsembleEvaluator, design, size: Size) -> list[dict]:
     ]
 
 
-def errors_by_members(config: Config, model: Scene, design, size: Size) -> list[dict]:
+def errors_by_members(config: Config, model: Model, design, size: Size) -> list[dict]:
     """Stated standard error of the mean force, and the scatter of independent groups of
     members, taken from one large ensemble, with the standard error of that scatter."""
     evaluator = resized(config, model, members=size.large)
@@ -179,7 +179,7 @@ def errors_by_members(config: Config, model: Scene, design, size: Size) -> list[
     return rows
 
 
-def gradients(config: Config, model: Scene, design, size: Size) -> list[dict]:
+def gradients(config: Config, model: Model, design, size: Size) -> list[dict]:
     """Gradient of the mean force by the pressure angle with its stated standard error, from
     more members or from more designs."""
     rows = []

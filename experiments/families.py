@@ -45,9 +45,9 @@ from experiments.families_parts.reach import (  # noqa: E402
 from experiments.families_parts.show import profiles_figure, ranking_figure, tables  # noqa: E402
 from rootsopt import files  # noqa: E402
 from rootsopt.config import Config, load  # noqa: E402
-from rootsopt.response.evaluation import Evaluation, Evaluator  # noqa: E402
+from rootsopt.evaluate import Evaluation, Evaluator  # noqa: E402
 from rootsopt.families import CLASSICAL, MM, free_form_of, with_design  # noqa: E402
-from rootsopt.model import Scene, check_geometry, design_vector, outline_mm  # noqa: E402
+from rootsopt.model import Model, check_geometry, design_vector, outline_mm  # noqa: E402
 from rootsopt.optimize.search import Search  # noqa: E402
 from rootsopt.profiles import Profile  # noqa: E402
 from rootsopt.profiles.departure import departure  # noqa: E402
@@ -151,7 +151,7 @@ def placed(
 def row_of(study: str, config: Config, reference: dict[str, float]) -> dict[str, Any]:
     """Everything about one design."""
     check_geometry(config)
-    profile = Scene.from_config(config).profile(design_vector(config))
+    profile = Model.of(config).profile(design_vector(config))
     here = Evaluator(config)(series=False)
     row: dict[str, Any] = {
         "study": study,
@@ -212,7 +212,7 @@ def free_form(path: str, best: dict[str, Any], quick: bool) -> dict[str, Any]:
     began = time.perf_counter()
     _, base = reference_of(path, quick)
     config = parse(best["config"])
-    start = Scene.from_config(config).profile(design_vector(config))
+    start = Model.of(config).profile(design_vector(config))
     profile, _ = free_form_of(config.profile, COEFFICIENTS)
     settings: dict[str, Any] = {"bounds": {"tip_arc_angle_deg": (0.0, 45 / config.profile.lobes)}}
     settings |= SEARCH_FREE | ({"iterations": 2} if quick else {})
@@ -223,7 +223,7 @@ def free_form(path: str, best: dict[str, Any], quick: bool) -> dict[str, Any]:
         solver={"gradient": "reverse"},
     )
     config, count = optimised(config, base.response)
-    made = Scene.from_config(config).profile(design_vector(config))
+    made = Model.of(config).profile(design_vector(config))
     return {
         **row_of(Path(path).stem, config, base.response),
         "reached": best["reached"],

@@ -22,9 +22,9 @@ from matplotlib.figure import Figure  # noqa: E402
 from experiments.families import objective  # noqa: E402
 from rootsopt import files  # noqa: E402
 from rootsopt.config import Config, load  # noqa: E402
-from rootsopt.response.evaluation import Evaluation, Evaluator  # noqa: E402
+from rootsopt.evaluate import Evaluation, Evaluator  # noqa: E402
 from rootsopt.families import with_design  # noqa: E402
-from rootsopt.model import Scene  # noqa: E402
+from rootsopt.model import Model  # noqa: E402
 from rootsopt.optimize.search import Search  # noqa: E402
 from rootsopt.plot import BLUE, figure  # noqa: E402
 from rootsopt.profiles import Profile  # noqa: E402
@@ -37,7 +37,7 @@ MM, UM = 1e-3, 1e-6
 
 def profile_of(config: Config, evaluation: Evaluation) -> Profile:
     """The profile of a design that was simulated."""
-    return Scene.from_config(config).profile(jnp.asarray(list(evaluation.design.values())))
+    return Model.of(config).profile(jnp.asarray(list(evaluation.design.values())))
 
 
 def draw(start: Profile, found: Profile) -> Figure:

@@ -35,8 +35,8 @@ from rootsopt import files  # noqa: E402
 from rootsopt.config import Config, load  # noqa: E402
 from rootsopt.dynamics.flow import Integrator  # noqa: E402
 from rootsopt.dynamics.steady import agreement, close_orbit, no_tangents  # noqa: E402
-from rootsopt.response.evaluation import Evaluation, Evaluator  # noqa: E402
-from rootsopt.model import Scene  # noqa: E402
+from rootsopt.evaluate import Evaluation, Evaluator  # noqa: E402
+from rootsopt.model import Model  # noqa: E402
 
 TOLERANCES = (1e-8, 1e-9, 1e-10)
 MEASURES = ("mean_force_N", "peak_force_N")
@@ -108,7 +108,7 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
 
 
 @eqx.filter_jit
-def forces(model: Scene, design, state, period, how: Integrator):
+def forces(model: Model, design, state, period, how: Integrator):
     """(mean, peak) force of the closed orbit, its residual and whether it was integrated."""
     pair = model.pair(design)
     orbit = close_orbit(pair, no_tangents(pair), state, period, how, check=False)

@@ -22,8 +22,8 @@ import numpy as np  # noqa: E402
 from rootsopt import files  # noqa: E402
 from rootsopt.config import Config, load  # noqa: E402
 from rootsopt.contact.nodes import signed_distance  # noqa: E402
-from rootsopt.response.evaluation import Evaluator  # noqa: E402
-from rootsopt.model import Scene, check_geometry, design_keys, design_vector  # noqa: E402
+from rootsopt.evaluate import Evaluator  # noqa: E402
+from rootsopt.model import Model, check_geometry, design_keys, design_vector  # noqa: E402
 from rootsopt.outline.conjugacy import Conjugacy, conjugacy, gaps_um  # noqa: E402
 from rootsopt.outline.source import outline_of  # noqa: E402
 from rootsopt.plot import BLUE, GREY, figure, plot_conjugacy  # noqa: E402
@@ -104,7 +104,7 @@ def main() -> int:
     options = arguments.parse_args()
     folder = files.ResultFolder(options.output)
     config = load(options.config)
-    design = Scene.from_config(config).profile(design_vector(config))
+    design = Model.of(config).profile(design_vector(config))
     points = measured(design)
     columns = {"x_mm": np.real(points), "y_mm": np.imag(points)}
     path = folder.write_csv("measured.csv", columns).absolute()

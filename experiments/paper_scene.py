@@ -21,8 +21,8 @@ from rootsopt.config import Config, load
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import close_orbit
-from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.model import MM, Scene, design_vector
+from rootsopt.evaluate import Evaluation, Evaluator
+from rootsopt.model import MM, Model, design_vector
 from rootsopt.programs import Program
 from rootsopt.status import Status
 
@@ -158,7 +158,7 @@ def _slopes(evaluator: Evaluator, one: Evaluation, values) -> NDArray[np.float64
     return np.stack([by_mean / mean, by_peak / peak]) * values
 
 
-def pair_of(model: Scene, design, values: Float[Array, " p"]) -> RotorPair:
+def pair_of(model: Model, design, values: Float[Array, " p"]) -> RotorPair:
     """The rotor pair with these values of the quantities (config's units)."""
     length, torque, stiffness, damping_ratio, backlash, clearance = values
     half = backlash * MM / (2 * model.pitch_radius)
@@ -175,7 +175,7 @@ def pair_of(model: Scene, design, values: Float[Array, " p"]) -> RotorPair:
 
 
 @Program
-def _orbit(model: Scene, design, values: Float[Array, " p"], state, period, how: Integrator):
+def _orbit(model: Model, design, values: Float[Array, " p"], state, period, how: Integrator):
     """The closed orbit, with derivatives by the values."""
 
     def arrays(values):

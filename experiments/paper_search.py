@@ -23,7 +23,7 @@ from experiments.baselines import Motion, Rotor, Scene, motion_of
 from experiments.baselines.numba_pair import Search, Table, integrate
 from experiments.paper_scene import FAMILIES, PAPER, QUANTITIES, Quantity, config_of
 from rootsopt.contact.map import MapContact
-from rootsopt.model import Scene, design_vector
+from rootsopt.model import Model, design_vector
 from rootsopt.profiles import geometry
 
 _DEEPEST = -0.035
@@ -78,7 +78,7 @@ class Samples(NamedTuple):
 def rotors_of(family: str) -> Rotors:
     """What all scenes with a pair have in common."""
     config = config_of(family, None, "solver.fidelity=map")
-    profile = Scene.from_config(config).profile(design_vector(config))
+    profile = Model.of(config).profile(design_vector(config))
     contact = jax.jit(lambda p: MapContact.of(p, _DEEPEST, _ROLLS, _RELATIVES))(profile)  # pyright: ignore[reportArgumentType]
     table = Table(
         np.asarray(contact.coefficients),

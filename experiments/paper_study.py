@@ -21,7 +21,7 @@ from experiments.paper_scene import (
     polished,
 )
 from rootsopt import basins
-from rootsopt.response.evaluation import CHAOS_WINDOW, Evaluator, lyapunov_program, unsettled
+from rootsopt.evaluate import CHAOS_WINDOW, Evaluator, lyapunov_program, unsettled
 from rootsopt.model import design_vector
 
 WINDOWS = ((0.0, 0.1), (0.0, 0.2), (0.05, 0.2), (0.1, 0.2), (0.1, 0.8))

@@ -27,8 +27,8 @@ from rich.table import Table  # noqa: E402
 
 from rootsopt import files  # noqa: E402
 from rootsopt.config import Config, load  # noqa: E402
-from rootsopt.response.evaluation import Evaluator  # noqa: E402
-from rootsopt.model import Scene, design_vector  # noqa: E402
+from rootsopt.evaluate import Evaluator  # noqa: E402
+from rootsopt.model import Model, design_vector  # noqa: E402
 
 # A light load at high speed, which flanks alone can hold; slower, lobes pass through each other.
 BARE = (
@@ -62,7 +62,7 @@ def equations(jaxpr) -> int:
 
 def right_hand_side(config: Config, calls: int) -> dict[str, float]:
     """States, equations, and time (µs) of one right-hand side along a slowly moving state."""
-    pair = eqx.filter_jit(Scene.pair)(Scene.from_config(config), design_vector(config))
+    pair = eqx.filter_jit(Model.pair)(Model.of(config), design_vector(config))
     numbers, static = eqx.partition(pair, eqx.is_array)
     state = jnp.full(pair.states, 0.05)
 

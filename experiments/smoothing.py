@@ -39,11 +39,11 @@ from numpy.typing import NDArray  # noqa: E402
 from experiments.baselines import FD_STEPS  # noqa: E402
 from experiments.extremes_parts.scenes import stacked  # noqa: E402
 from rootsopt import files, plot  # noqa: E402
-from rootsopt.response.batch import STATUSES, Batch, on_all_cores, respond  # noqa: E402
+from rootsopt.batch import STATUSES, Batch, on_all_cores, respond  # noqa: E402
 from rootsopt.config import Config, load  # noqa: E402
 from rootsopt.dynamics.flow import Integrator  # noqa: E402
 from rootsopt.errors import InputError  # noqa: E402
-from rootsopt.model import MM, Scene, check_geometry, design_vector  # noqa: E402
+from rootsopt.model import MM, Model, check_geometry, design_vector  # noqa: E402
 from rootsopt.programs import Program  # noqa: E402
 
 DEFAULT = 0.0
@@ -128,7 +128,7 @@ def scenes(kind: str, count: int, seed: int) -> list[Config]:
 
 
 @Program
-def _respond(models: Scene, designs, states, tolerances, periods, gradient: bool) -> Batch:
+def _respond(models: Model, designs, states, tolerances, periods, gradient: bool) -> Batch:
     def one(at):
         model, design, state = at
         transient, orbit = (Integrator("tsit5", tolerances[k], 4096) for k in range(2))
@@ -138,7 +138,7 @@ def _respond(models: Scene, designs, states, tolerances, periods, gradient: bool
 
 
 def responses(
-    models: Scene, designs, states, tolerances: tuple[float, float], periods: int, slopes=True
+    models: Model, designs, states, tolerances: tuple[float, float], periods: int, slopes=True
 ) -> Batch:
     """Of n scenes, each with its own design and scaled state to begin from."""
     leaves, structure = jax.tree.flatten(models)
@@ -152,7 +152,7 @@ def responses(
     return jax.tree.map(np.asarray, on_all_cores(work, designs, states, *leaves))
 
 
-def rounded(models: Scene, width: float) -> Model:
+def rounded(models: Model, width: float) -> Model:
     """The models with all corners rounded over `width` (mm), or as they are by default."""
     if width == DEFAULT:
         return models
@@ -170,7 +170,7 @@ def bias(found: Batch, truth: Batch) -> NDArray[np.float64]:
     return np.where(same, off, np.nan)
 
 
-def gradient_errors(models: Scene, designs, found: Batch) -> NDArray[np.float64]:
+def gradient_errors(models: Model, designs, found: Batch) -> NDArray[np.float64]:
     """Error (n, 3) of the gradients of mean, peak and RMS against central differences, relative
     to the greatest entry of each."""
     columns, same = [], np.asarray(found.usable)

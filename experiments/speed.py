@@ -31,12 +31,12 @@ from scipy.signal import find_peaks  # noqa: E402
 from rootsopt import files, plot  # noqa: E402
 from rootsopt.config import Config, load  # noqa: E402
 from rootsopt.dynamics.pair import RotorPair  # noqa: E402
-from rootsopt.response.evaluation import Evaluation, Evaluator, objective_weights  # noqa: E402
+from rootsopt.evaluate import Evaluation, Evaluator, objective_weights  # noqa: E402
 from rootsopt.model import design_vector  # noqa: E402
 from rootsopt.optimize.search import Search  # noqa: E402
 from rootsopt.plot_speeds import LABELS, legend_entries, plot_speeds  # noqa: E402
 from rootsopt.programs import Program  # noqa: E402
-from rootsopt.response.speeds import Part, sweep  # noqa: E402
+from rootsopt.speeds import Part, sweep  # noqa: E402
 
 SCENES = {"shipped": (), "light": ("scene.timing_gear.damping_ratio=0.1",)}
 TITLES = {"shipped": "shipped scene", "light": "gear damping ratio 0.1"}

@@ -45,7 +45,7 @@ from rich.table import Table  # noqa: E402
 
 from rootsopt import files  # noqa: E402
 from rootsopt.config import load  # noqa: E402
-from rootsopt.response.evaluation import Evaluation, Evaluator  # noqa: E402
+from rootsopt.evaluate import Evaluation, Evaluator  # noqa: E402
 
 SCENES: dict[str, tuple[str, tuple[str, ...]]] = {
     "cic": ("configs/cic.yaml", ()),

@@ -9,14 +9,14 @@ from jax import lax
 
 from rootsopt.dynamics.flow import Integrator, flow
 from rootsopt.dynamics.steady import SAMPLES
-from rootsopt.model import Scene
+from rootsopt.model import Model
 
 _FEW = 64
 """Samples of a mesh period whose peak is not asked for."""
 
 
 @eqx.filter_jit
-def averaged(model: Scene, design: Any, settle: Any, how: Integrator) -> tuple[Any, Any]:
+def averaged(model: Model, design: Any, settle: Any, how: Integrator) -> tuple[Any, Any]:
     """(mean, peak) of the mesh period (N) after `settle` others from rest, and their derivatives
     (2, d) per config unit."""
     pair, tangents, _ = model.pair_and_tangents(design)

@@ -44,7 +44,7 @@ def part_reference(job: Job) -> dict[str, Any]:
     """Forces by the tightest settings, at the baseline and checked designs; gradients by central
     differences of them, which owe nothing to how rootsopt differentiates."""
     use_jax()
-    from rootsopt.response.evaluation import Evaluator
+    from rootsopt.evaluate import Evaluator
 
     choice = ("solver.method=tsit5",) if job.quick else ("solver.method=dopri8",)
     tool = Evaluator(load(CONFIG, [*CONTACTS[job.contacts[-1]], *choice]))
@@ -86,8 +86,8 @@ def part_single(job: Job) -> dict[str, Any]:
     import equinox as eqx
     import jax.numpy as jnp
 
-    from rootsopt.response.batch import respond
-    from rootsopt.response.evaluation import Evaluator
+    from rootsopt.batch import respond
+    from rootsopt.evaluate import Evaluator
     from rootsopt.model import integrators
 
     truth, slope = job.known["forces"][0], job.known["slopes"][0]
@@ -162,8 +162,8 @@ def part_batch(job: Job) -> dict[str, Any]:
     import jax
     import jax.numpy as jnp
 
-    from rootsopt.response.batch import respond_many
-    from rootsopt.model import Scene, integrators
+    from rootsopt.batch import respond_many
+    from rootsopt.model import Model, integrators
     from rootsopt.timing import CompileClock
 
     if job.part == "gpu" and jax.default_backend() != "gpu":
@@ -179,7 +179,7 @@ def part_batch(job: Job) -> dict[str, Any]:
             dataclasses.replace(transient, rtol=jnp.asarray(coarse)),
             dataclasses.replace(orbit, rtol=jnp.asarray(rtol)),
         )
-        model = Scene.from_config(config, job.known["deepest"][contact])
+        model = Model.of(config, job.known["deepest"][contact])
         return ready(respond_many(model, designs, states, *how, gradient=gradient))
 
     def looked_at(out: Any) -> tuple[int, float, list[float]]:

@@ -47,10 +47,10 @@ def part_table(job: Job) -> dict[str, Any]:
     import jax.numpy as jnp
 
     from rootsopt.contact.map import MapContact
-    from rootsopt.model import Scene
+    from rootsopt.model import Model
 
     config = load(CONFIG)
-    model = Scene.from_config(config, job.known["deepest"].get("map 384x16"))
+    model = Model.of(config, job.known["deepest"].get("map 384x16"))
     rolls, relatives = (64, 12) if job.quick else model.map_size
     size = f"{rolls}x{relatives}"
 
@@ -77,7 +77,7 @@ def part_orbit(job: Job) -> dict[str, Any]:
     import jax.numpy as jnp
 
     from experiments.baselines.transient import averaged
-    from rootsopt.response.evaluation import Evaluator
+    from rootsopt.evaluate import Evaluator
 
     contact = CONTACTS["linear" if job.quick else "search"]
     wanted = 1e-4 if job.quick else ORBIT_ACCURACY
@@ -129,12 +129,12 @@ def part_revolutions(job: Job) -> dict[str, Any]:
     import jax.numpy as jnp
 
     from rootsopt.dynamics.flow import strobe
-    from rootsopt.model import Scene, integrators
+    from rootsopt.model import Model, integrators
 
     contact = "linear" if job.quick else "search"
     config = load(CONFIG, CONTACTS[contact])
-    model = Scene.from_config(config, job.known["deepest"].get(contact))
-    pair = eqx.filter_jit(Scene.pair)(model, jnp.asarray(BASELINE))
+    model = Model.of(config, job.known["deepest"].get(contact))
+    pair = eqx.filter_jit(Model.pair)(model, jnp.asarray(BASELINE))
     how = integrators(config)[0]
     compiled = eqx.filter_jit(strobe)
     rows = []
@@ -164,11 +164,11 @@ def part_reverse(job: Job) -> dict[str, Any]:
     import jax.numpy as jnp
 
     from rootsopt.dynamics.flow import Integrator, flow
-    from rootsopt.model import Scene
+    from rootsopt.model import Model
 
     contact = "linear" if job.quick else "search"
     config = load(CONFIG, CONTACTS[contact])
-    model = Scene.from_config(config, job.known["deepest"].get(contact))
+    model = Model.of(config, job.known["deepest"].get(contact))
     count = 3 if job.quick else 200
     periods = count * MESH_PERIODS
     how = Integrator(config.solver.method, jnp.asarray(1e-6), 200 * periods)

@@ -11,7 +11,7 @@ from rootsopt import continuation
 from rootsopt.config import Config
 from rootsopt.continuation import Branch, End, Kind, Steps
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluator
+from rootsopt.evaluate import Evaluator
 
 QUIET = 4.0
 """An orbit is quiet up to this peak force, in units of the force that carries the load at the pitch

@@ -12,13 +12,13 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from experiments.extremes_parts.scenes import Kind, stacked
-from rootsopt.response.batch import STATUSES, respond
+from rootsopt.batch import STATUSES, respond
 from rootsopt.config import Config
 from rootsopt.contact.impact import force_rounding
 from rootsopt.dynamics.flow import Integrator, flow, strobe
 from rootsopt.dynamics.steady import close_orbit, no_tangents
-from rootsopt.response.evaluation import Evaluator
-from rootsopt.model import Scene, design_vector
+from rootsopt.evaluate import Evaluator
+from rootsopt.model import Model, design_vector
 from rootsopt.programs import Program
 
 HORIZON = 24
@@ -71,7 +71,7 @@ def _law_values(laws, depths, rates):
 
 
 @eqx.filter_jit
-def _equation_values(models: Scene, designs, poses):
+def _equation_values(models: Model, designs, poses):
     def one(at):
         model, design, poses = at
 
@@ -93,7 +93,7 @@ def _equation_values(models: Scene, designs, poses):
 
 def law(cases: list[Case]) -> dict[str, Any]:
     """Values of the law that are not finite, or negative, among all scenes."""
-    laws = [jax.tree.map(np.asarray, Scene.from_config(case.config).law) for case in cases]
+    laws = [jax.tree.map(np.asarray, Model.of(case.config).law) for case in cases]
     laws = jax.tree.map(lambda *leaves: np.stack(leaves), *laws)
     found: dict[str, Any] = {}
     for dtype in (np.float32, np.float64):
@@ -140,7 +140,7 @@ def equation(cases: list[Case], seed: int) -> dict[str, Any]:
 
 
 @Program
-def _simulate(model: Scene, design, tolerances, method: str):
+def _simulate(model: Model, design, tolerances, method: str):
     pair = model.pair(design)
     transient, orbit = (Integrator(method, tolerances[k], STEPS) for k in range(2))
     out = respond(model, design, jnp.zeros(pair.states), transient, orbit, HORIZON)
@@ -152,7 +152,7 @@ def _simulate(model: Scene, design, tolerances, method: str):
 
 
 def _arguments(case: Case) -> tuple[Any, ...]:
-    model = jax.tree.map(np.asarray, Scene.from_config(case.config))
+    model = jax.tree.map(np.asarray, Model.of(case.config))
     solver = case.config.solver
     tolerances = np.array([solver.transient_rtol, solver.rtol])
     return model, np.asarray(design_vector(case.config)), tolerances, case.kind.method
@@ -194,7 +194,7 @@ def simulate(case: Case) -> None:
 
 
 @Program
-def _sharp(model: Scene, design, state, period):
+def _sharp(model: Model, design, state, period):
     method, rtol, steps = SHARP
     pair = model.pair(design)
     how = Integrator(method, jnp.asarray(rtol), steps)
@@ -203,7 +203,7 @@ def _sharp(model: Scene, design, state, period):
 
 
 @Program
-def _patient(model: Scene, design, state, period):
+def _patient(model: Model, design, state, period):
     """The last round of plain motion, without Newton's method, and the state it begins with."""
     method, rtol, steps = SHARP
     pair = model.pair(design)
@@ -215,7 +215,7 @@ def _patient(model: Scene, design, state, period):
 
 
 @eqx.filter_jit
-def _pair(model: Scene, design):
+def _pair(model: Model, design):
     return model.pair(design)
 
 
@@ -227,7 +227,7 @@ def _rates(pair, tau, state):
 
 def refine(case: Case) -> None:
     """Deviation of a periodic result from the orbit that the sharp settings find beside it."""
-    model = dataclasses.replace(Scene.from_config(case.config), precision="float64")
+    model = dataclasses.replace(Model.of(case.config), precision="float64")
     design = np.asarray(design_vector(case.config))
     period = np.asarray(case.row["period"])
     orbit = jax.device_get(_sharp(model, design, case.state, period))
@@ -265,7 +265,7 @@ def refine(case: Case) -> None:
 def by_scipy(case: Case) -> None:
     """Along the orbit (that of the reference, if there is one): how far SciPy's end is from its
     start, and its mean force."""
-    model = dataclasses.replace(Scene.from_config(case.config), precision="float64")
+    model = dataclasses.replace(Model.of(case.config), precision="float64")
     pair = _pair(model, design_vector(case.config))
     period = case.row["period"]
     done = solve_ivp(

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from rootsopt.config import DESIGN_KEYS, Config, load
-from rootsopt.model import Scene
+from rootsopt.model import Model
 
 _OVERLENGTH = 1.02
 """Longest involute the program tolerates, in units of u_max."""
@@ -219,7 +219,7 @@ def stacked(configs: list[Config], precision: str) -> Model:
     """The models of scenes with one kind of pair, at one precision, their numbers stacked along a
     leading axis (n,)."""
     models = [
-        jax.tree.map(np.asarray, dataclasses.replace(Scene.from_config(config), precision=precision))
+        jax.tree.map(np.asarray, dataclasses.replace(Model.of(config), precision=precision))
         for config in configs
     ]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *models)

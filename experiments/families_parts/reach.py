@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from rootsopt.config import FAMILY_KEYS, Config
-from rootsopt.model import MM, Scene, design_keys, design_vector
+from rootsopt.model import MM, Model, design_keys, design_vector
 from rootsopt.optimize.bounds import around
 from rootsopt.optimize.problem import Problem, Space, sobol
 from rootsopt.profiles import geometry
@@ -73,7 +73,7 @@ def in_housing(config: Config, bore_radius_mm: float, area_efficiency: float) ->
 
 def problem_of(config: Config) -> Problem:
     """The geometric side of a design problem: constraints, without a baseline."""
-    return Problem(config, cast(Any, None), Space.of(config, Scene.from_config(config), 0.0))
+    return Problem(config, cast(Any, None), Space.of(config, Model.of(config), 0.0))
 
 
 def reach(config: Config, sample: int = SAMPLE) -> Reach | None:
@@ -99,7 +99,7 @@ def reach(config: Config, sample: int = SAMPLE) -> Reach | None:
 
 def _only(config: Config) -> Reach | None:
     """That of a family without design parameters."""
-    shape = geometry(Scene.from_config(config).profile(design_vector(config)))
+    shape = geometry(Model.of(config).profile(design_vector(config)))
     limits = config.constraints
     low, high = limits.outer_radius_min_mm, limits.outer_radius_max_mm
     assert low is not None
