@@ -266,7 +266,8 @@ def part_batch(job: Job) -> dict[str, Any]:
         return {"rows": [], "note": "no GPU found"}
     batch = _Batch(job)
     setting = job.known.get("batch_setting") or batch.choose()
-    rows = [batch.timed(setting, gradient) for gradient in ((True,) if job.quick else (True, False))]
+    gradients = (True,) if job.quick else (True, False)
+    rows = [batch.timed(setting, gradient) for gradient in gradients]
     return {
         "rows": rows,
         "batch_setting": setting,

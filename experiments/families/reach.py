@@ -123,7 +123,7 @@ def _efficiency(problem: Problem, point) -> float:
 
 
 def _extreme(problem: Problem, start, sign: float) -> NDArray[np.float64]:
-    """Find the point near `start` with the greatest (`sign` 1) or the least (-1) area efficiency."""
+    """Find the greatest (`sign` 1) or the least (-1) area efficiency near `start`."""
 
     def goal(point):
         return -sign * problem.look(point)[2][0], -sign * problem.look(point)[3][0]
