@@ -72,7 +72,7 @@ def profiles_figure(data: dict[str, Any]) -> Figure:
             lines = {"family": np.array(row["outline_mm"]), "best": best}
             plot_flank(ax, lines, row["lobes"], row["pitch_radius_mm"])
             text = f"{row['family'].replace('_', ' ')}, bore {bore:.1f} mm"
-            ax.settitle(text, fontsize=9)
+            ax.set_title(text, fontsize=9)
             ax.set(xlabel="x (mm)" if place + _COLUMNS >= len(rows) else "")
             ax.set(ylabel="" if place % _COLUMNS else "y (mm)")
     lines = (BLUE, "-", "this family"), (VERMILION, (0, (5, 1.5)), "best of this housing")

@@ -23,7 +23,7 @@ from rootsopt.optimize.search import Search
 Row = dict[str, Any]
 GRID = 10
 """Points of the first grid along each axis."""
-QUICK_GRID = 4
+QUICK_GRID = 6
 """The same in a reduced run."""
 QUICK = (
     "solver.fidelity=linear",
