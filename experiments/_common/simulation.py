@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,15 +19,32 @@ pair_of_model = eqx.filter_jit(Model.pair)
 """The rotor pair of a model and a design, compiled."""
 
 
-def evaluate(config: Config, start: Any = None) -> Evaluation:
-    """Simulate the design of a config, from rest or from a scaled state; no time series."""
-    return Evaluator(config)(start=start, series=False)
+def evaluator_of(config: Config, give_up_early: bool = False, prepared: bool = False) -> Evaluator:
+    """Make the evaluator of a config.
+
+    `give_up_early`: give up motions that settle late. `prepared`: do not prepare it for the motion
+    of the config's design, such as by fitting a contact map.
+    """
+    evaluator = Evaluator(config, survey=give_up_early)
+    evaluator.prepared = evaluator.prepared or prepared
+    return evaluator
+
+
+def evaluate(config: Config) -> Evaluation:
+    """Simulate the design of a config from rest; no time series."""
+    return evaluator_of(config)(series=False)
+
+
+def orbit_at(evaluator: Evaluator, rtol: float) -> Evaluator:
+    """Set the tolerance of the orbit alone; nothing is compiled anew."""
+    evaluator.orbit = dataclasses.replace(evaluator.orbit, rtol=jnp.asarray(rtol))
+    return evaluator
 
 
 def at(evaluator: Evaluator, rtol: float, transient: float | None = None) -> Evaluator:
     """Set the tolerances of orbit and transient (default: the same); nothing is compiled anew."""
     coarse = rtol if transient is None else transient
-    evaluator.orbit = dataclasses.replace(evaluator.orbit, rtol=jnp.asarray(rtol))
+    orbit_at(evaluator, rtol)
     evaluator.transient = dataclasses.replace(evaluator.transient, rtol=jnp.asarray(coarse))
     return evaluator
 

@@ -43,11 +43,10 @@ def part_reference(job: Job) -> dict[str, Any]:
     Gradients are central differences of its forces, independent of how rootsopt differentiates.
     """
     start_process()
-    from experiments._common.simulation import at
-    from rootsopt.evaluate import Evaluator
+    from experiments._common.simulation import at, evaluator_of
 
     choice = ("solver.method=tsit5",) if job.quick else ("solver.method=dopri8",)
-    tool = Evaluator(load(CIC, [*CONTACTS[job.contacts[-1]], *choice]))
+    tool = evaluator_of(load(CIC, [*CONTACTS[job.contacts[-1]], *choice]))
     loose = at(tool, 1e-10, 1e-8)(series=False)
     at(tool, REFERENCE_RTOL, 1e-8)
     designs = sample_designs(2 if job.quick else CHECKED)
@@ -90,14 +89,13 @@ def part_single(job: Job) -> dict[str, Any]:
 
     from experiments._common.simulation import at
     from rootsopt.batch import respond
-    from rootsopt.evaluate import Evaluator
     from rootsopt.model import integrators
 
     truth, slope = job.known["forces"][0], job.known["slopes"][0]
     repeats = 2 if job.quick else 9
     tried, tools, compiling = [], {}, {}
     for contact in job.contacts:
-        tools[contact] = tool = Evaluator(load(CIC, CONTACTS[contact]))
+        tools[contact] = tool = evaluator_of(load(CIC, CONTACTS[contact]))
         call = functools.partial(tool, series=False)
         compiling[contact], _, _ = first_and_warm(call, 1)
         for rtol, coarse in TOLERANCES[1:2] if job.quick else TOLERANCES:

@@ -76,8 +76,7 @@ def part_orbit(job: Job) -> dict[str, Any]:
     import jax.numpy as jnp
 
     from experiments._common.engines.transient import averaged
-    from experiments._common.simulation import at
-    from rootsopt.evaluate import Evaluator
+    from experiments._common.simulation import at, evaluator_of
 
     contact = CONTACTS["linear" if job.quick else "search"]
     wanted = 1e-4 if job.quick else ORBIT_ACCURACY
@@ -85,7 +84,7 @@ def part_orbit(job: Job) -> dict[str, Any]:
     repeats = 3 if job.quick else 15
     rows = []
     for scene, changes in list(ORBIT_SCENES.items())[: 1 if job.quick else None]:
-        tool = Evaluator(load(CIC, [*contact, *changes]))
+        tool = evaluator_of(load(CIC, [*contact, *changes]))
         truth = at(tool, 1e-11, 1e-9)(series=False)
         forces, slopes = forces_of(truth.response), slopes_of(truth.gradient)
         forgets = f"multiplier {truth.steady_state['floquet_multiplier']:.2g}"

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from experiments._common.scenes import shipped
+from experiments._common.simulation import evaluator_of
 from rootsopt import continuation
 from rootsopt.config import Config
 from rootsopt.continuation import Branch, End, Kind, Steps
 from rootsopt.errors import InputError
-from rootsopt.evaluate import Evaluator
 
 Row = dict[str, Any]
 Say = Callable[[str], None]
@@ -111,7 +111,7 @@ def explore(plan: Plan, say: Say) -> Diagram:
     diagram = Diagram(plan.scene, config.profile.family, plan.parameter, low, high, [], [])
     for value in np.linspace(low, high, plan.seeds + 2)[1:-1]:
         here = continuation.with_value(config, plan.parameter, float(value))
-        patient, hasty = Evaluator(here), Evaluator(here, survey=True)
+        patient, hasty = evaluator_of(here), evaluator_of(here, give_up_early=True)
         found: list[tuple[float, float]] = []
         for number, start in enumerate(plan.starts):
             # A chaotic motion takes long to tell, and need not be told from everywhere.

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from experiments._common.simulation import evaluator_of as make_evaluator
 from experiments._common.simulation import pair_of_model, stacked
 from experiments.extremes.scenes import Kind
 from rootsopt.batch import STATUSES, respond
@@ -311,4 +312,4 @@ def evaluator_of(config: Config, horizon: int) -> Evaluator:
     """Make an evaluator of a config with a transient of at most `horizon` mesh periods."""
     changes = {"max_mesh_periods": horizon, "max_steps_per_period": STEPS}
     solver = config.solver.model_copy(update=changes)
-    return Evaluator(config.model_copy(update={"solver": solver}))
+    return make_evaluator(config.model_copy(update={"solver": solver}))

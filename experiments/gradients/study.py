@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments._common.scenes import CIC, FORCES
+from experiments._common.simulation import evaluator_of, orbit_at
 from rootsopt.config import Config, load
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.steady import agreement, close_orbit, no_tangents
@@ -130,11 +131,9 @@ def differences(evaluator: Evaluator, found: Evaluation, step: float = STEP) -> 
 
 def evaluated(config: Config) -> Iterator[tuple[float, Evaluation]]:
     """Evaluate the design at every tolerance, each from rest, the loosest first."""
-    evaluator = Evaluator(config, survey=True)
-    evaluator.prepared = True
+    evaluator = evaluator_of(config, give_up_early=True, prepared=True)
     for rtol in TOLERANCES:
-        evaluator.orbit = dataclasses.replace(evaluator.orbit, rtol=jnp.asarray(rtol))
-        yield rtol, evaluator(series=False)
+        yield rtol, orbit_at(evaluator, rtol)(series=False)
 
 
 def errors(found: Evaluation, truth: np.ndarray) -> list[float]:
@@ -161,7 +160,7 @@ def rows_of(
             row[name] = one.statistics.get(name)
         if one.usable:
             if truth is None:
-                evaluator = Evaluator(config, survey=True)
+                evaluator = evaluator_of(config, give_up_early=True)
                 truth = differences(evaluator, one)
                 if max(errors(one, truth)) > CLOSER:
                     truth = (16 * differences(evaluator, one, STEP / 4) - truth) / 15

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
 from experiments._common.scenes import FORCES, shipped
+from experiments._common.simulation import evaluator_of
 from rootsopt.config import Config
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.pair import RotorPair
@@ -121,12 +122,12 @@ class Response:
 class Pairs:
     """Evaluates both pairs for values of the quantities; compiled programs are shared.
 
-    With `survey` a motion that settles late is given up (see `Evaluator`); `overrides` of the
-    configs, as `dotted.key=value`.
+    With `give_up_early` a motion that settles late is given up; `overrides` of the configs, each
+    `dotted.key=value`.
     """
 
-    def __init__(self, *overrides: str, survey: bool = False):
-        self.overrides, self.survey = overrides, survey
+    def __init__(self, *overrides: str, give_up_early: bool = False):
+        self.overrides, self.give_up_early = overrides, give_up_early
 
     def __call__(
         self,
@@ -138,7 +139,8 @@ class Pairs:
         values = np.asarray(values, float)
         evaluations, rows = [], []
         for family in FAMILIES:
-            evaluator = Evaluator(config_of(family, values, *self.overrides), survey=self.survey)
+            config = config_of(family, values, *self.overrides)
+            evaluator = evaluator_of(config, self.give_up_early)
             one = evaluator(series=series)
             evaluations.append(one)
             if slopes and one.usable:

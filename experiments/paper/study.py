@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from experiments._common.driver import NoResultError
+from experiments._common.simulation import evaluator_of
 from experiments.paper.scene import (
     FAMILIES,
     PAPER,
@@ -29,7 +30,7 @@ from experiments.paper.scene import (
     values_of,
 )
 from rootsopt import basins
-from rootsopt.evaluate import CHAOS_WINDOW, Evaluator, lyapunov_program, unsettled
+from rootsopt.evaluate import CHAOS_WINDOW, lyapunov_program, unsettled
 from rootsopt.model import design_vector
 
 WINDOWS = ((0.0, 0.1), (0.0, 0.2), (0.05, 0.2), (0.1, 0.2), (0.1, 0.8))
@@ -84,7 +85,7 @@ def motions(values: ArrayLike) -> list[Row]:
     """Find the motions that coexist with these values; a row for each."""
     rows = []
     for family in FAMILIES:
-        found = basins.find(Evaluator(config_of(family, values, *GRID)))
+        found = basins.find(evaluator_of(config_of(family, values, *GRID)))
         rows += [{"pair": family} | row for row in found.summary()]
         rows += [{"pair": family, "status": k, "share": v} for k, v in found.lost.items()]
     return rows
@@ -97,7 +98,7 @@ def definitions(values: ArrayLike) -> list[Row]:
     """
     runs = []
     for family in FAMILIES:
-        evaluator = Evaluator(config_of(family, values))
+        evaluator = evaluator_of(config_of(family, values))
         pair = evaluator.pair(design_vector(evaluator.config))
         window = lyapunov_program(pair, np.zeros(2), CHAOS_WINDOW, evaluator.transient)
         *_, series = unsettled(pair, window, True)
@@ -194,7 +195,7 @@ def run(
     unless both motions are periodic and both configs hold the same values.
     """
     settings = QUICK if quick else ()
-    many = Pairs(*settings, survey=True)
+    many = Pairs(*settings, give_up_early=True)
     values = values_of(config_of("cic"))
     if not np.array_equal(values, values_of(config_of("ee"))):
         raise NoResultError(
@@ -268,7 +269,7 @@ def look(
     generations, population = QUICK_SEARCH if quick else (GENERATIONS, POPULATION)
     samples = explore(seed, generations, population, box, report)
     seconds = time.perf_counter() - began
-    pairs, solved = Pairs(survey=True), {}
+    pairs, solved = Pairs(give_up_early=True), {}
     for place in [] if quick else regimes(samples, 0.3)[:POLISHED]:
         periods = tuple(map(int, samples.periods[place]))
         solved[periods] = samples.misfits[place], polished(pairs, samples.values[place])

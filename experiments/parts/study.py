@@ -16,10 +16,9 @@ import jax
 import jax.numpy as jnp
 
 from experiments._common.scenes import CIC, shipped
-from experiments._common.simulation import pair_of_model
+from experiments._common.simulation import evaluator_of, pair_of_model
 from experiments._common.timing import ready, times_of
 from rootsopt.config import Config, load
-from rootsopt.evaluate import Evaluator
 from rootsopt.model import Model, design_vector
 
 Row = dict[str, Any]
@@ -78,7 +77,7 @@ def right_hand_side(config: Config, calls: int) -> dict[str, float]:
 
 def evaluation(config: Config, repeats: int) -> dict[str, float | str]:
     """Time the first evaluation (s) and later ones (ms), value and gradient."""
-    evaluator = Evaluator(config)
+    evaluator = evaluator_of(config)
     began = time.perf_counter()
     found = evaluator(series=False)
     first = time.perf_counter() - began

@@ -18,9 +18,10 @@ import numpy as np
 from scipy.signal import find_peaks
 
 from experiments._common.scenes import shipped
+from experiments._common.simulation import evaluator_of
 from rootsopt.config import Config
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.evaluate import Evaluation, Evaluator, objective_weights
+from rootsopt.evaluate import Evaluation, objective_weights
 from rootsopt.model import design_vector
 from rootsopt.optimize.search import Search
 from rootsopt.plot_speeds import LABELS
@@ -186,7 +187,7 @@ class Study:
 def study(scene: str, speeds, listed, quick: bool) -> Study:
     """Sweep, optimise and linearise the pairs in a scene."""
     small = QUICK if quick else ()
-    evaluators = {f: Evaluator(settings(scene, f, *small)) for f in ("cic", "ee")}
+    evaluators = {f: evaluator_of(settings(scene, f, *small)) for f in ("cic", "ee")}
     found = Study(evaluators["cic"].config, {}, {}, [])
     for family, evaluator in evaluators.items():
         found.designs[family.upper()] = sweep(evaluator, speeds)

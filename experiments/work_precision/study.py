@@ -22,7 +22,7 @@ import numpy as np
 
 from experiments._common.driver import NoResultError
 from experiments._common.scenes import shipped
-from experiments._common.simulation import at
+from experiments._common.simulation import at, evaluator_of
 from experiments._common.timing import median_time
 from rootsopt.evaluate import Evaluation, Evaluator
 
@@ -112,7 +112,7 @@ def evaluator(scene: str, *overrides: str) -> Evaluator:
     """Make an evaluator of a scene with more overrides."""
     name, settings = SCENES[scene]
     periods = f"solver.max_mesh_periods={PERIODS}"
-    return Evaluator(shipped(name, *settings, periods, *overrides))
+    return evaluator_of(shipped(name, *settings, periods, *overrides))
 
 
 FULL = (
