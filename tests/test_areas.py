@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments import geometry as study
+from experiments.geometry import study
 from rootsopt.config import FAMILY_KEYS
 from rootsopt.families import MM, profile_of
 from rootsopt.profiles import geometry
 
 ERROR = 1e-11
-"""Relative; the study in experiments/geometry.py finds 1e-13."""
+"""Relative; the study in experiments/geometry finds 1e-13."""
 HARD = {
     # The normals of the arc all but touch the pitch circle, at its end or inside of it.
     "cic": (5, [[36.43, 6.0, 4.0], [9.90309962, 4.61058857e-06, 0.00440706401]]),

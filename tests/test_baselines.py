@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.baselines import FD_STEPS, Scene, motion_of, rotor_of
-from experiments.baselines.scipy_nodes import (
+from experiments._common.engines import FD_STEPS, Scene, motion_of, rotor_of
+from experiments._common.engines.scipy_nodes import (
     NODES_1E3,
     NodeContact,
     ScipyNodes,
@@ -23,8 +23,13 @@ from rootsopt.profiles import CIC
 
 pytest.importorskip("numba")
 
-from experiments.baselines import numba_pair
-from experiments.baselines.numba_pair import MAP_1E3, SEARCH_1E3, SEARCH_GRADIENT_1E3, NumbaPair
+from experiments._common.engines import numba_pair
+from experiments._common.engines.numba_pair import (
+    MAP_1E3,
+    SEARCH_1E3,
+    SEARCH_GRADIENT_1E3,
+    NumbaPair,
+)
 
 CONFIG = load(
     "configs/cic.yaml", ["solver.fidelity=search", "solver.method=dopri8", "solver.rtol=1e-12"]

@@ -316,7 +316,7 @@ def test_longest_gap_goes_around():
 @pytest.mark.long
 def test_experiment(tmp_path):
     """The quick run finds a fold with two stable orbits beside it, and writes its files."""
-    command = [sys.executable, "experiments/bifurcation.py", "--quick", "-o", str(tmp_path)]
+    command = [sys.executable, "-m", "experiments.bifurcation", "--quick", "-o", str(tmp_path)]
     environment = os.environ | {"JAX_PLATFORMS": "cpu"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""The experiments run, write their files, and give sane numbers; with `--quick` throughout."""
+"""Studies run, write their files, and give sane numbers; with `--quick` throughout."""
 
 import csv
 import json
@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import gradients
-from experiments.baselines import Scene
-from experiments.baselines.scipy_nodes import ScipyNodes
-from experiments.families import FORCES
-from experiments.paper_scene import PAPER, Response, config_of, pair_of, polished
+from experiments._common.engines import Scene
+from experiments._common.engines.scipy_nodes import ScipyNodes
+from experiments._common.scenes import FORCES
+from experiments.gradients import study as gradients
+from experiments.paper.scene import PAPER, Response, config_of, pair_of, polished
 from rootsopt.config import load
 from rootsopt.model import Scene, design_vector
 
@@ -29,7 +29,7 @@ PNG = b"\x89PNG"
 
 @pytest.fixture(scope="module")
 def programs(tmp_path_factory):
-    """Environment in which the scripts keep their compiled programs in one place."""
+    """Environment in which the studies keep their compiled programs in one place."""
     return os.environ | {
         "JAX_PLATFORMS": "cpu",
         "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("programs")),
@@ -38,9 +38,9 @@ def programs(tmp_path_factory):
     }
 
 
-def run(script, folder, environment):
-    """Run an experiment; its standard output."""
-    command = [sys.executable, f"experiments/{script}.py", "--quick", "-o", str(folder)]
+def run(study, folder, environment, *options):
+    """Make a reduced run of a study; return its standard output."""
+    command = [sys.executable, "-m", f"experiments.{study}", "--quick", "-o", str(folder), *options]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -87,17 +87,17 @@ def test_gradients(tmp_path, programs):
     assert is_picture(tmp_path / "gradients.png")
 
 
-def test_gradients_that_are_off_are_told(capsys):
+def test_gradients_that_are_off_are_told():
     """A gradient beyond its check, and a tighter tolerance that does worse, break a promise."""
     good = {"scene": "one", "period": 1, "status": "periodic", "gradient_disagreement": 1e-6}
     good |= {"mean_force_N_error": 1e-6, "peak_force_N_error": 1e-6}
     rows = [good | {"rtol": rtol} for rtol in gradients.TOLERANCES]
-    assert gradients.judge(rows) == 0
-    for name in gradients.MEASURES:
-        assert gradients.judge([*rows[:2], rows[2] | {f"{name}_error": 1e-2}]) == 1
-    assert gradients.judge([*rows[:2], rows[2] | {"status": "not_settled"}]) == 1
-    said = capsys.readouterr().out
-    assert ("OFF 1e-10" in said, "WORSE" in said) == (True, True)
+    assert gradients.judge(rows).broken == []
+    for name in FORCES:
+        (said,) = gradients.judge([*rows[:2], rows[2] | {f"{name}_error": 1e-2}]).broken
+        assert said.startswith("OFF 1e-10")
+    (said,) = gradients.judge([*rows[:2], rows[2] | {"status": "not_settled"}]).broken
+    assert said.startswith("WORSE")
 
 
 @pytest.mark.long
@@ -189,6 +189,7 @@ def test_parts(tmp_path, programs):
     assert first["states"] == "2"
     assert all(int(row["equations"]) > int(first["equations"]) for row in others)
     assert others[-1]["states"] == "11"
+    assert is_picture(tmp_path / "parts.png")
 
 
 def test_paper(tmp_path, programs):
@@ -259,6 +260,48 @@ def test_polished():
         found = polished(cast(Any, pairs), start, held=held)
         assert found.misfit < 1e-4
         assert found.values[held] == pytest.approx(start[held], rel=1e-12)
+
+
+@pytest.mark.long
+def test_paper_search(tmp_path, programs):
+    """A generation of a search simulates all its scenes, within the box that was asked for."""
+    run("paper", tmp_path, programs, "--search", "--seed", "1", "--least-clearance", "0.1")
+    rows = rows_of(tmp_path / "paper_search.csv")
+    record = json.loads((tmp_path / "paper_search.json").read_text())
+    assert len(rows) == record["scenes"] > 10
+    assert min(numbers(rows, "contact.clearance_mm")) >= 0.1
+    assert record["seed"] == 1
+    assert is_picture(tmp_path / "paper_search.png")
+
+
+@pytest.mark.long
+def test_auto_accuracy(tmp_path, programs):
+    """What `auto` chooses is within the error asked for."""
+    run("auto_accuracy", tmp_path, programs)
+    record = json.loads((tmp_path / "auto.json").read_text())
+    assert record["judged"] == record["within_request"] == 1
+    assert is_picture(tmp_path / "auto.png")
+
+
+@pytest.mark.long
+def test_landscape(tmp_path, programs):
+    """No design of the grid is better than the optimum by more than one percent."""
+    run("landscape", tmp_path, programs)
+    record = json.loads((tmp_path / "landscape.json").read_text())
+    assert record["within_one_percent"]
+    rows = rows_of(tmp_path / "landscape.csv")
+    assert len(rows) == record["grid_designs"] > 5
+    assert is_picture(tmp_path / "landscape.png")
+
+
+@pytest.mark.long
+def test_geometry(tmp_path, programs):
+    """Area and inertia are those of the polygons, in every family of the reduced run."""
+    run("geometry", tmp_path, programs)
+    rows = rows_of(tmp_path / "geometry.csv")
+    assert {(row["family"], row["lobes"]) for row in rows} >= {("cic", "2"), ("ee", "3")}
+    assert max(numbers(rows, "area_error") + numbers(rows, "polar_moment_error")) < 1e-11
+    assert is_picture(tmp_path / "geometry.png")
 
 
 @pytest.mark.long

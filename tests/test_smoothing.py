@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.smoothing import LIMIT, SHAKY
+from experiments.smoothing.study import LIMIT, SHAKY
 from rootsopt.config import load
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
@@ -36,7 +36,7 @@ def forces(name, *changes):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_default_smoothing_does_not_change_the_forces(name):
-    """Mean, peak and RMS force by less than 1e-4; experiments/smoothing.py has many more scenes.
+    """Mean, peak and RMS force by less than 1e-4; experiments/smoothing has many more scenes.
     Half the length takes away at least half of a bias that falls in proportion or faster."""
     default, length = forces(name)
     half, _ = forces(name, f"contact.smoothing_mm={length / 2!r}")

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from experiments.speed import equilibria
+from experiments.speed.study import equilibria
 from rootsopt import auto, evaluate, speeds
 from rootsopt.cli import main
 from rootsopt.config import load, parse

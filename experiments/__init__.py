@@ -1,0 +1,6 @@
+"""Studies of rootsopt, one folder each; README.md lists them."""
+
+import os
+
+# Equinox reads this once, when it is first imported; `rootsopt.cli` says why its checks are off.
+os.environ.setdefault("EQX_ON_ERROR", "off")

@@ -1,0 +1,228 @@
+"""Independent engines: the same scene simulated with other tools, for CIC rotors.
+
+`scipy_nodes` is SciPy with a node-to-segment contact, `numba_pair` is compiled by Numba. Both
+differentiate by central differences. Here are the scene in SI units, the constants of rotor and
+motion, and the result, which both share. `transient` is rootsopt's own integration without closed
+orbits.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.config import Config
+
+_MM = 1e-3
+_DEG = math.pi / 180
+
+Design = Sequence[float]
+"""Pressure angle (deg), involute length (mm), tip arc angle (deg)."""
+
+FD_STEPS = (0.05, 0.025, 0.05)
+"""Steps (deg, mm, deg) of the central differences. Around the paper's baseline their truncation
+error is 1e-4 of the gradient, at worst 1e-3; the noise of tolerances looser than 1e-7 asks for
+steps two to four times as long."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """Everything but the design (SI units): lobes, pitch radius (m), rotor length (m), density
+    (kg/m³); IMPACT stiffness (N/m^e), exponent, damping (N·s/m), depth of full damping (m),
+    smoothing (m), clearance (m); speed of rotor 1 (rad/s), load torque (N·m); timing gear
+    (stiffness 0: none) with half its backlash and the rounding of its edges (rad).
+    """
+
+    lobes: int
+    pitch_radius: float
+    length: float
+    density: float
+    stiffness: float
+    exponent: float
+    damping: float
+    full_damping_depth: float
+    smoothing: float
+    clearance: float
+    speed: float
+    load_torque: float
+    gear_stiffness: float
+    gear_damping_ratio: float
+    half_backlash: float
+    gear_rounding: float
+
+    @classmethod
+    def of(cls, config: Config) -> "Scene":
+        """Scene of a config. Raises `ValueError` unless its family is cic, and it has no other
+        parts than a constant load and a timing gear."""
+        if config.profile.family != "cic":
+            raise ValueError(f"`profile.family` must be 'cic', but is {config.profile.family!r}")
+        contact, scene, gear = config.contact, config.scene, config.scene.timing_gear
+        torque = scene.load.torque_N_m
+        if config.needs_search or scene.motor or scene.phase_error_mrad or torque is None:
+            raise ValueError(
+                "`scene` must hold a constant load and a timing gear alone; remove its other parts"
+            )
+        radius = config.profile.pitch_radius_mm * _MM
+        return cls(
+            lobes=config.profile.lobes,
+            pitch_radius=radius,
+            length=config.rotor.length_mm * _MM,
+            density=config.rotor.density_kg_m3,
+            stiffness=contact.stiffness_N_per_mm_e / _MM**contact.exponent,
+            exponent=contact.exponent,
+            damping=contact.max_damping_N_s_per_mm / _MM,
+            full_damping_depth=contact.full_damping_depth_mm * _MM,
+            smoothing=contact.rounding_mm * _MM,
+            clearance=contact.clearance_mm * _MM,
+            speed=scene.speed_rpm * 2 * math.pi / 60,
+            load_torque=torque,
+            gear_stiffness=gear.stiffness_N_m_per_rad if gear else 0.0,
+            gear_damping_ratio=gear.damping_ratio if gear else 0.0,
+            half_backlash=gear.backlash_mm * _MM / (2 * radius) if gear else 0.0,
+            gear_rounding=contact.rounding_mm * _MM / radius,
+        )
+
+
+class Rotor(NamedTuple):
+    """Constants of a CIC rotor (m, rad): the land ends and the arc begins at the normal angle
+    `land_end`, the arc of radius `arc_radius` about a centre at radius `arc_center` ends at
+    `arc_end`, the involute at `involute_end`. See `rootsopt.profiles.cic`.
+    """
+
+    lobes: int
+    radius: float
+    alpha: float
+    half_pitch: float
+    land_end: float
+    arc_end: float
+    involute_end: float
+    base_radius: float
+    arc_center: float
+    arc_radius: float
+
+
+def rotor_of(scene: Scene, design: Design) -> Rotor:
+    """Constants of the rotor of a design."""
+    alpha, length, tip = design[0] * _DEG, design[1] * _MM, design[2] * _DEG
+    r, half = scene.pitch_radius, math.pi / (2 * scene.lobes)
+    start = half - length / (r * math.sin(alpha))
+    offset = start - tip
+    return Rotor(
+        lobes=scene.lobes,
+        radius=r,
+        alpha=alpha,
+        half_pitch=half,
+        land_end=tip,
+        arc_end=start + math.pi / 2 - alpha,
+        involute_end=half + math.pi / 2 - alpha,
+        base_radius=r * math.cos(alpha),
+        arc_center=r * math.cos(alpha) / math.cos(alpha - offset),
+        arc_radius=length / math.tan(alpha) + r * math.sin(offset) / math.cos(alpha - offset),
+    )
+
+
+class Motion(NamedTuple):
+    """Constants of the equation of motion. Time counts in mesh periods of `period` (s), ε in
+    units of `angle_scale` (rad), force in units of `force_scale` (N); `turn` is the rotation
+    (rad) of rotor 1 in a period, `agility` turns a torque (N·m) into scaled acceleration.
+    """
+
+    period: float
+    turn: float
+    speed: float
+    angle_scale: float
+    angle_limit: float
+    force_scale: float
+    agility: float
+    load_torque: float
+    stiffness: float
+    exponent: float
+    damping: float
+    full_damping_depth: float
+    smoothing: float
+    clearance: float
+    gear_stiffness: float
+    gear_damping: float
+    half_backlash: float
+    gear_rounding: float
+
+
+def motion_of(scene: Scene, polar_area_moment: float) -> Motion:
+    """Constants of the motion of rotors with `polar_area_moment` (m⁴)."""
+    inertia = scene.density * scene.length * polar_area_moment
+    period = 2 * math.pi / (scene.lobes * scene.speed)
+    force = max(scene.load_torque, 1e-3) / scene.pitch_radius
+    depth = (force / scene.stiffness) ** (1 / scene.exponent)
+    angle = depth / scene.pitch_radius + scene.half_backlash
+    return Motion(
+        period=period,
+        turn=2 * math.pi / scene.lobes,
+        speed=scene.speed,
+        angle_scale=angle,
+        angle_limit=math.pi / (8 * scene.lobes),
+        force_scale=force,
+        agility=period**2 / (angle * inertia),
+        load_torque=scene.load_torque,
+        stiffness=scene.stiffness,
+        exponent=scene.exponent,
+        damping=scene.damping,
+        full_damping_depth=scene.full_damping_depth,
+        smoothing=scene.smoothing,
+        clearance=scene.clearance,
+        gear_stiffness=scene.gear_stiffness,
+        # The damping ratio is meant for the reduced inertia of two equal rotors.
+        gear_damping=2 * scene.gear_damping_ratio * math.sqrt(scene.gear_stiffness * inertia / 2),
+        half_backlash=scene.half_backlash,
+        gear_rounding=scene.gear_rounding,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """Mean, peak and RMS contact force (N) over the window, solver steps (rejected ones
+    included), evaluations of the right-hand side, and the largest |ε| (rad) of the window.
+    """
+
+    mean: float
+    peak: float
+    rms: float
+    steps: int
+    rhs_calls: int
+    reached: float
+
+    @property
+    def response(self) -> NDArray[np.float64]:
+        """(mean, peak, RMS) in N."""
+        return np.array([self.mean, self.peak, self.rms])
+
+
+class Simulator(Protocol):
+    """What both competitors offer."""
+
+    def simulate(self, design: Design) -> Result:
+        """From ε = 0, dε/dt = 0 at φ = 0, settle, then average over the window."""
+        ...
+
+    def gradient(
+        self, design: Design, steps: Sequence[float] = FD_STEPS
+    ) -> tuple[Result, NDArray[np.float64]]:
+        """The result and d(mean, peak, RMS) / d(design), N per config unit, (3, 3)."""
+        ...
+
+
+def central_differences(
+    simulate: Callable[[Design], Result], design: Design, steps: Sequence[float]
+) -> tuple[Result, NDArray[np.float64]]:
+    """Result at `design` and its (3, 3) derivative from six more simulations."""
+    columns = []
+    for i, step in enumerate(steps):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = [float(value) for value in design]
+            moved[i] += sign * step
+            ends.append(simulate(moved).response)
+        columns.append((ends[0] - ends[1]) / (2 * step))
+    return simulate(design), np.stack(columns, axis=1)

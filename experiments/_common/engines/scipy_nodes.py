@@ -1,0 +1,439 @@
+"""Competitor (a): SciPy's `solve_ivp` with a node-to-segment contact in NumPy.
+
+The paper's Eq. 9: nodes of rotor 1's flank against the segments of its mate on rotor 2,
+straight or, which is as fast and far more accurate, bulging with the flank's curvature.
+Only one flank pair can touch at a pose, and on it the search is confined to a window
+around the last contact; a coarse look along the whole flank finds it when it is not there.
+Gradients by central differences. Poses and signs are those of `rootsopt.contact.closest`;
+points are complex numbers.
+"""
+
+import cmath
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from experiments._common.engines import (
+    FD_STEPS,
+    Design,
+    Motion,
+    Result,
+    Rotor,
+    Scene,
+    central_differences,
+    motion_of,
+    rotor_of,
+)
+
+_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
+
+# The cheapest settings found in configs/cic.yaml, on designs around the baseline, that reach a
+# relative error of 1e-3 in mean, peak and RMS force.
+NODES_1E3: dict[str, Any] = {"method": "LSODA", "nodes": 800, "rtol": 3e-5, "settle": 1}
+
+# Rotor geometry
+
+
+@dataclasses.dataclass(frozen=True)
+class _Addendum:
+    """Points of the addendum at normal angles: roll angle β, r sin ψ, r cos ψ, distance s from
+    the pitch point, and arc length per normal angle there and on the mating dedendum."""
+
+    beta: NDArray[np.float64]
+    height: NDArray[np.float64]
+    lever: NDArray[np.float64]
+    s: NDArray[np.float64]
+    speed: NDArray[np.float64]
+    mate_speed: NDArray[np.float64]
+
+
+def _addendum(rotor: Rotor, normal: NDArray[np.float64]) -> _Addendum:
+    r, c = rotor.radius, rotor.arc_center
+    turn = np.clip(normal, rotor.land_end, rotor.arc_end) - rotor.land_end
+    arc = normal < rotor.arc_end
+    lever = np.where(arc, c * np.sin(turn), rotor.base_radius)
+    height = np.sqrt(r * r - lever * lever)
+    beta = normal - np.arcsin(lever / r)
+    slide = c * np.cos(turn) - height
+    s = np.where(arc, rotor.arc_radius + slide, rotor.base_radius * (rotor.involute_end - normal))
+    rate = np.where(arc, -slide / height, 1.0)
+    return _Addendum(beta, height, lever, s, height * rate + s, (height - 2 * s) * rate + s)
+
+
+def polar_area_moment(rotor: Rotor) -> float:
+    """∫ r² dA (m⁴) of a rotor about its axis, by Green's theorem; exact to rounding."""
+    r = rotor.radius
+    reach = rotor.arc_radius + rotor.arc_center - r
+    total = ((r + reach) ** 4 + (r - reach) ** 4) * rotor.land_end / 4
+    ends = rotor.land_end, rotor.arc_end, rotor.involute_end
+    for start, stop in itertools.pairwise(ends):
+        point = _addendum(rotor, start + (stop - start) * (1 + _GAUSS_NODES) / 2)
+        for s, speed in ((point.s, point.speed), (-point.s, point.mate_speed)):
+            square = r * r + 2 * s * point.height + s * s
+            total += np.sum(square * (point.height + s) * speed * _GAUSS_WEIGHTS) * (
+                (stop - start) / 8
+            )
+    return float(2 * rotor.lobes * total)
+
+
+def _flank(rotor: Rotor, nodes: int) -> NDArray[np.complex128]:
+    """Flank (m) from the end of the tip land to that of the root land, an odd number of about
+    `nodes` points; the k-th from one end meshes with the k-th from the other."""
+    start, stop = rotor.land_end, rotor.involute_end
+    fine = np.linspace(start, stop, 513)
+    point = _addendum(rotor, (fine[1:] + fine[:-1]) / 2)
+    # As dense as the longer of the two mating elements asks for.
+    speed = np.maximum(np.abs(point.speed), np.abs(point.mate_speed))
+    length = np.concatenate([[0.0], np.cumsum(speed)])
+    even = np.linspace(0, length[-1], nodes // 2 + 1)
+    normal = np.interp(even, length, fine)
+    point = _addendum(rotor, normal)
+    r = rotor.radius
+    unit = (point.height + 1j * point.lever) / r
+    tip = np.exp(1j * point.beta) * (r + point.s * unit)
+    root = np.exp(1j * (math.pi / rotor.lobes - point.beta)) * (r - point.s * unit)
+    return np.concatenate([tip, root[-2::-1]])
+
+
+# Contact
+
+_WINDOW = 8
+"""Nodes of the window on either side of the last contact."""
+_COARSE = 64
+"""Nodes of the coarse look along the whole flank."""
+_PAD = 4
+"""Segments more than nodes on either side: how far the contact may slide at one call."""
+
+
+class _Segments(NamedTuple):
+    """Segments: first corner, conjugate of the unit direction, length (m), and the curvature
+    (1/m, to the left positive) of the flank there, 0 for straight ones."""
+
+    corners: NDArray[np.complex128]
+    towards: NDArray[np.complex128]
+    lengths: NDArray[np.float64]
+    bends: NDArray[np.float64]
+
+    def part(self, first: int, stop: int) -> "_Segments":
+        corners, towards, lengths, bends = self
+        part = slice(first, stop)
+        return _Segments(corners[part], towards[part], lengths[part], bends[part])
+
+
+def _segments(corners: NDArray[np.complex128], curved: bool) -> _Segments:
+    chords = np.diff(corners)
+    lengths = np.abs(chords)
+    bends = np.zeros(len(chords))
+    if curved:
+        # A segment that leads from one arc into another takes the mean of both.
+        turns = np.angle(chords[1:] * np.conj(chords[:-1])) * 2 / (lengths[1:] + lengths[:-1])
+        bends = (np.append(turns, turns[-1]) + np.append(turns[0], turns)) / 2
+    towards = np.asarray(np.conj(chords) / lengths, dtype=np.complex128)
+    return _Segments(corners[:-1], towards, lengths, bends)
+
+
+class NodeContact:
+    """Gap of a flank of rotor 1 against its mate on rotor 2, each of about `nodes` nodes.
+
+    With `curved`, the segments bulge by the flank's curvature and the deepest point is that
+    of the parabola through three nodes, so that the gap errs by less and is smoother; else
+    straight segments and the deepest node count, as Eq. 9 has it.
+    """
+
+    def __init__(self, rotor: Rotor, nodes: int, curved: bool = True):
+        self.curved = curved
+        self.rotor = rotor
+        flank = _flank(rotor, nodes)
+        # Rotor 1 or rotor 2 may touch with the end of its tip land, never with its root land.
+        self.land = round(nodes * rotor.land_end)
+        turns = np.linspace(0, rotor.land_end, self.land, endpoint=False)
+        self.points = np.concatenate([abs(flank[0]) * np.exp(1j * turns), flank])
+        self.segments = _segments(self.points[::-1], curved)
+        self.stride = max(len(self.points) // _COARSE, 1)
+        self.coarse = _segments(self.points[:: -self.stride], False)
+        self.mates = len(self.points) - self.land
+        self.last: tuple[int, int] | None = None
+
+    def __call__(self, roll: float, relative: float) -> tuple[float, float, float]:
+        """Gap (m, negative: penetration) and levers (m) about rotor 1 and rotor 2."""
+        half = self.rotor.half_pitch
+        centered = (roll + half) % (4 * half) - 2 * half
+        # Contact starts before the tip passes the line of centres, by about √|ε|.
+        if abs(centered) > half + 2 * math.sqrt(max(-relative, 0.0)) + 0.02:
+            return 1.0, 0.0, 0.0
+        roll = centered + half
+        phi1, phi2 = -roll - relative / 2, -roll + relative / 2
+        # Rotor 1's nodes in rotor 2's frame, mirrored so that both flanks run alike.
+        onto = cmath.exp(1j * (phi2 + 2 * half))
+        turn = onto * cmath.exp(1j * phi1)
+        shift = 2 * self.rotor.radius * onto
+        return self._search(shift, turn)
+
+    def _search(self, shift: complex, turn: complex) -> tuple[float, float, float]:
+        """Gap and levers: near the last contact or, if it is not there, anywhere, with windows
+        that narrow down."""
+        if self.last is not None:
+            window = self._window(shift, turn, *self.last, 1)
+            # On a land, or at an end of the window, the flank may be deeper elsewhere.
+            on_flank = window.node >= self.land and window.segment(window.i) < self.mates
+            if on_flank and window.gap < 0 and window.enclosed:
+                return self._contact(window, shift)
+        stride = self.stride
+        gaps, nearest, _ = _signed_distances(shift - turn * self.points[::stride], self.coarse)
+        i = int(gaps.argmin())
+        node, segment = i * stride, int(nearest[i]) * stride
+        while True:
+            stride = max(stride // (_WINDOW // 2), 1)
+            window = self._window(shift, turn, node, segment, stride)
+            node, segment = window.node, window.segment(window.i)
+            if stride == 1:
+                return self._contact(window, shift)
+
+    def _window(
+        self, shift: complex, turn: complex, node: int, segment: int, stride: int
+    ) -> "_Window":
+        """Every `stride`-th node around `node` against the segments around `segment`."""
+        reach = _WINDOW * stride
+        low = max(node - reach, 0)
+        first = max(segment - reach - _PAD * stride, 0)
+        nodes = shift - turn * self.points[low : node + reach + 1 : stride]
+        segments = self.segments.part(first, segment + reach + _PAD * stride + 1)
+        gaps, nearest, feet = _signed_distances(nodes, segments)
+        i = int(gaps.argmin())
+        return _Window(low + i * stride, i, first, nodes, gaps, nearest, feet)
+
+    def _contact(self, window: "_Window", shift: complex) -> tuple[float, float, float]:
+        """Gap and levers at the deepest point of a window, which is remembered."""
+        i, gap = window.i, window.gap
+        if not gap < 1.0:
+            self.last = None
+            return 1.0, 0.0, 0.0
+        self.last = window.node, window.segment(i)
+        lever1, lever2 = self._levers(window, i, shift)
+        if self.curved and window.enclosed:
+            left, right = window.gaps[i - 1 : i + 2 : 2].tolist()
+            bend = left - 2 * gap + right
+            if bend > 0:
+                aside = (left - right) / (2 * bend)
+                gap -= bend * aside * aside / 2
+                other1, other2 = self._levers(window, i + (1 if aside > 0 else -1), shift)
+                lever1 += abs(aside) * (other1 - lever1)
+                lever2 += abs(aside) * (other2 - lever2)
+        return gap, lever1, lever2
+
+    def _levers(self, window: "_Window", i: int, shift: complex) -> tuple[float, float]:
+        """Distances of the normal at a node's foot from the two axes."""
+        segment, point = window.segment(i), complex(window.nodes[i])
+        towards = complex(self.segments.towards[segment])
+        if self.curved:
+            middle = float(self.segments.lengths[segment]) / 2
+            lean = float(self.segments.bends[segment]) * (float(window.feet[i]) - middle)
+            towards *= complex(math.cos(lean), -math.sin(lean))
+        return ((shift - point) * towards).real, (point * towards).real
+
+
+class _Window(NamedTuple):
+    """Nodes looked at, seen from rotor 2; the deepest is the i-th, number `node` of the flank.
+    Their gaps (m), their nearest segments, counted from `first`, and their feet (m) on it."""
+
+    node: int
+    i: int
+    first: int
+    nodes: NDArray[np.complex128]
+    gaps: NDArray[np.float64]
+    nearest: NDArray[np.intp]
+    feet: NDArray[np.float64]
+
+    @property
+    def gap(self) -> float:
+        return float(self.gaps[self.i])
+
+    @property
+    def enclosed(self) -> bool:
+        """Whether there is a deepest node with neighbours that are not so deep."""
+        around = self.gaps[max(self.i - 1, 0) : self.i + 2]
+        return len(around) == 3 and bool(around.max() < 1.0)
+
+    def segment(self, i: int) -> int:
+        return self.first + int(self.nearest[i])
+
+
+def _signed_distances(nodes, segments):
+    """Signed distance of each node to the nearest segment, which it is and the foot on it; inf
+    for a node whose foot would lie beyond either end of the segments."""
+    local = (nodes[:, None] - segments.corners) * segments.towards
+    along, height = local.real, local.imag
+    feet = np.minimum(np.maximum(along, 0.0), segments.lengths)
+    squares = (along - feet) ** 2 + height * height
+    nearest = squares.argmin(axis=1)
+    at = np.arange(len(nearest)), nearest
+    foot = feet[at]
+    gaps = np.copysign(np.sqrt(squares[at]), height[at])
+    gaps += 0.5 * segments.bends[nearest] * foot * (segments.lengths[nearest] - foot)
+    off = along[at] - foot
+    outside = ((nearest == 0) & (off < 0)) | ((nearest == squares.shape[1] - 1) & (off > 0))
+    gaps[outside] = np.inf
+    return gaps, nearest, foot
+
+
+# Equation of motion
+
+
+def _ramp(x: float, width: float) -> float:
+    if x >= width:
+        return max(x, 0.0)
+    t = max(x, 0.0) / width
+    return width * t * t * (2 - t)
+
+
+def _smooth_step(x: float) -> float:
+    t = min(max(x, 0.0), 1.0)
+    return t * t * (3 - 2 * t)
+
+
+def _balanced_ramp(x: float, width: float) -> float:
+    """`_ramp` with the integral of max(0, x)."""
+    t = min(max(x, 0.0) / width, 1.0) if width > 0 else 1.0
+    return max(x, 0.0) if t == 1 else width * t * t * (4.5 - 6 * t + 2.5 * t * t)
+
+
+def _balanced_step(x: float) -> float:
+    """`_smooth_step` with the integral of a step at 0."""
+    t = min(max(x, 0.0), 1.0)
+    return t * t * (18 - 32 * t + 15 * t * t)
+
+
+def _impact(motion: Motion, depth: float, rate: float) -> float:
+    """IMPACT force (N) at a penetration (m) that grows at `rate` (m/s)."""
+    if depth <= 0:
+        return 0.0
+    delta = _ramp(depth, motion.smoothing)
+    elastic = motion.stiffness * delta**motion.exponent
+    damped = motion.damping * _smooth_step(delta / motion.full_damping_depth) * rate
+    share = min(motion.smoothing / motion.full_damping_depth, 1.0)
+    return _ramp(elastic + damped, share * elastic)
+
+
+def _gear(motion: Motion, relative: float, rate: float) -> float:
+    """Torque (N·m) of the timing gear that holds ε back."""
+    excess = abs(relative) - motion.half_backlash
+    if excess <= 0:
+        return 0.0
+    engaged = _balanced_step(excess / motion.gear_rounding) if motion.gear_rounding > 0 else 1.0
+    spring = motion.gear_stiffness * _balanced_ramp(excess, motion.gear_rounding)
+    return math.copysign(spring, relative) + motion.gear_damping * engaged * rate
+
+
+class _Equation:
+    """Right-hand side for the scaled state, or for the state with the integrals of force and
+    force² (scaled)."""
+
+    def __init__(self, motion: Motion, contact: NodeContact):
+        self.motion, self.contact = motion, contact
+        self.calls = 0
+
+    def __call__(self, tau: float, y: NDArray[np.float64]) -> list[float]:
+        angle, rate = y[:2].tolist()
+        acceleration, force = self.slope(tau, angle, rate)
+        self.calls += 1
+        if len(y) == 2:
+            return [rate, acceleration]
+        share = force / self.motion.force_scale
+        return [rate, acceleration, share, share * share]
+
+    def slope(self, tau: float, angle: float, rate: float) -> tuple[float, float]:
+        """Scaled acceleration and contact force (N)."""
+        motion = self.motion
+        relative = motion.angle_scale * angle
+        speed2 = motion.angle_scale * rate / motion.period
+        if abs(relative) >= motion.angle_limit:
+            return 0.0, 0.0
+        side = 1.0 if relative < 0 else -1.0
+        roll = -side * (motion.turn * tau + relative / 2)
+        gap, lever1, lever2 = self.contact(roll, side * relative)
+        closing = side * (lever1 * motion.speed - lever2 * (motion.speed + speed2))
+        force = _impact(motion, -gap - motion.clearance, closing)
+        torque = side * lever2 * force - motion.load_torque - _gear(motion, relative, speed2)
+        return torque * motion.agility, force
+
+
+@dataclasses.dataclass(frozen=True)
+class ScipyNodes:
+    """Simulator of a scene with SciPy.
+
+    `nodes` per flank and `curved`: see `NodeContact`; `method` of `solve_ivp`; `rtol` also
+    serves as absolute tolerance of the scaled state; `settle`, `window` and `max_step` in mesh
+    periods.
+    """
+
+    scene: Scene
+    nodes: int = 800
+    curved: bool = True
+    method: Literal["LSODA", "DOP853", "RK45"] = "LSODA"
+    rtol: float = 1e-5
+    settle: int = 2
+    window: int = 1
+    max_step: float = 0.1
+
+    def simulate(self, design: Design) -> Result:
+        """From ε = 0, dε/dt = 0 at φ = 0, settle, then average over the window."""
+        rotor = rotor_of(self.scene, design)
+        motion = motion_of(self.scene, polar_area_moment(rotor))
+        equation = _Equation(motion, NodeContact(rotor, self.nodes, self.curved))
+        before = self._solve(equation, self.settle, np.zeros(2), False)
+        start = np.append(before.y[:, -1], [0.0, 0.0])
+        # Rotor and flanks repeat with the mesh period.
+        run = self._solve(equation, self.window, start, True)
+        total, square = run.y[2:, -1] / self.window
+        return Result(
+            mean=float(total) * motion.force_scale,
+            peak=_peak(equation, run),
+            rms=math.sqrt(square) * motion.force_scale,
+            steps=len(before.t) + len(run.t) - 2,
+            rhs_calls=equation.calls,
+            reached=float(np.abs(run.y[0]).max()) * motion.angle_scale,
+        )
+
+    def gradient(
+        self, design: Design, steps: Sequence[float] = FD_STEPS
+    ) -> tuple[Result, NDArray[np.float64]]:
+        """The result and d(mean, peak, RMS) / d(design), N per config unit, (3, 3)."""
+        return central_differences(self.simulate, design, steps)
+
+    def _solve(self, equation, periods, start, dense):
+        run = solve_ivp(
+            equation,
+            (0.0, float(periods)),
+            start,
+            method=self.method,
+            rtol=self.rtol,
+            atol=self.rtol,
+            first_step=1e-3,
+            max_step=self.max_step,
+            dense_output=dense,
+        )
+        if not run.success:
+            raise RuntimeError(f"solve_ivp failed: {run.message}")
+        return run
+
+
+def _peak(equation: _Equation, run) -> float:
+    """Greatest force (N) of the accepted motion: at the steps' ends, then between them."""
+
+    def forces(times):
+        states = run.sol(times).T[:, :2].tolist()
+        return [equation.slope(t, *y)[1] for t, y in zip(times.tolist(), states, strict=True)]
+
+    times = run.t
+    for points in (9, 9, 9):
+        values = forces(times)
+        k = int(np.argmax(values))
+        low, high = times[max(k - 1, 0)], times[min(k + 1, len(times) - 1)]
+        times = np.linspace(low, high, points)
+    return max(values[k], *forces(times))

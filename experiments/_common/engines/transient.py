@@ -1,0 +1,43 @@
+"""The plain way to a steady state, for comparison with closed orbits.
+
+Integrates until the transient has passed, then averages over one more repetition. Derivatives are
+carried along all the way.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+
+from rootsopt.dynamics.flow import Integrator, flow
+from rootsopt.dynamics.steady import SAMPLES
+from rootsopt.model import Model
+
+_FEW = 64
+"""Samples of a mesh period whose peak is not needed."""
+
+
+@eqx.filter_jit
+def averaged(model: Model, design: Any, settle: Any, how: Integrator) -> tuple[Any, Any]:
+    """Average the mesh period after `settle` others from rest.
+
+    Returns (mean, peak) in N, and their derivatives (2, d) per config unit.
+    """
+    pair, tangents, _ = model.pair_and_tangents(design)
+    one = jnp.asarray(1.0)
+
+    def chained(out: Any, before: Any) -> Any:
+        moved = out.slope[:, :2] @ before
+        return moved + out.slope[:, 2:]
+
+    def pass_by(_: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+        state, before = carry
+        out = flow(pair, state, one, how, _FEW, tangents)
+        return out.end, chained(out, before)[:2]
+
+    start = jnp.zeros(2), jnp.zeros((2, design.shape[0]))
+    state, before = lax.fori_loop(0, settle, pass_by, start)
+    out = flow(pair, state, one, how, SAMPLES, tangents)
+    slopes = chained(out, before)
+    return jnp.stack([out.mean, out.peak]), jnp.stack([slopes[2], slopes[4]])

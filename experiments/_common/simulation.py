@@ -1,0 +1,73 @@
+"""The calls into rootsopt's evaluators and models that several studies make."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from experiments._common.scenes import FORCES
+from rootsopt.config import Config
+from rootsopt.evaluate import Evaluation, Evaluator
+from rootsopt.model import Model, design_vector
+from rootsopt.profiles import Profile
+
+pair_of_model = eqx.filter_jit(Model.pair)
+"""The rotor pair of a model and a design, compiled."""
+
+
+def evaluator_of(config: Config, give_up_early: bool = False, prepared: bool = False) -> Evaluator:
+    """Make the evaluator of a config.
+
+    `give_up_early`: give up motions that settle late. `prepared`: do not prepare it for the motion
+    of the config's design, such as by fitting a contact map.
+    """
+    evaluator = Evaluator(config, survey=give_up_early)
+    evaluator.prepared = evaluator.prepared or prepared
+    return evaluator
+
+
+def evaluate(config: Config) -> Evaluation:
+    """Simulate the design of a config from rest; no time series."""
+    return evaluator_of(config)(series=False)
+
+
+def orbit_at(evaluator: Evaluator, rtol: float) -> Evaluator:
+    """Set the tolerance of the orbit alone; nothing is compiled anew."""
+    evaluator.orbit = dataclasses.replace(evaluator.orbit, rtol=jnp.asarray(rtol))
+    return evaluator
+
+
+def at(evaluator: Evaluator, rtol: float, transient: float | None = None) -> Evaluator:
+    """Set the tolerances of orbit and transient (default: the same); nothing is compiled anew."""
+    coarse = rtol if transient is None else transient
+    orbit_at(evaluator, rtol)
+    evaluator.transient = dataclasses.replace(evaluator.transient, rtol=jnp.asarray(coarse))
+    return evaluator
+
+
+def profile_of(config: Config, design: ArrayLike | None = None) -> Profile:
+    """Profile of a design (d,) in config units; by default that of the config."""
+    chosen = design_vector(config) if design is None else jnp.asarray(design)
+    return Model.of(config).profile(chosen)
+
+
+def stacked(configs: Sequence[Config], precision: str) -> Model:
+    """Models of scenes with one kind of pair, at one precision, their numbers stacked along a
+    leading axis (n,)."""
+    models = [
+        jax.tree.map(np.asarray, dataclasses.replace(Model.of(config), precision=precision))
+        for config in configs
+    ]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *models)
+
+
+def objective(evaluation: Evaluation, reference: dict[str, float]) -> float:
+    """Mean of mean and peak force, each relative to the reference's; NaN without a periodic
+    motion."""
+    if not evaluation.usable:
+        return float("nan")
+    return float(np.mean([evaluation.response[key] / reference[key] for key in FORCES]))

@@ -1,0 +1,48 @@
+"""Does `solver.fidelity: auto` keep within the error asked for?
+
+Writes auto.csv (a row for each scene), auto.json and auto.png. The exit status is 3 if a request
+was missed.
+"""
+
+import argparse
+import sys
+
+from experiments._common.driver import Run, drive, verdict
+
+FIGURES = {"auto.png": "auto.png"}
+
+
+def body(run: Run) -> int:
+    """Measure, write, print the counts."""
+    from experiments._common.tables import print_record
+    from experiments.auto_accuracy import figures, study
+
+    rows = study.run(run.quick, run.options.count, run.options.seed, run.say)
+    found = study.summary(rows)
+    run.csv("auto.csv", rows)
+    run.json("auto.json", found)
+    run.figure("auto.png", figures.errors(rows))
+    print_record(found)
+    return verdict(found["within_request"] == found["judged"])
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the size and the seed of the draw."""
+    parser.add_argument("--count", type=int, default=50, help="periodic scenes (default: 50)")
+    parser.add_argument("--seed", type=int, default=0, help="of the draw (default: 0)")
+
+
+def main() -> int:
+    """Run the study."""
+    return drive(
+        "auto_accuracy",
+        __doc__,
+        body,
+        quick="one scene",
+        published=FIGURES,
+        add_options=add_options,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,273 @@
+"""One design and batches of designs, by rootsopt."""
+
+import dataclasses
+import functools
+import math
+from typing import Any
+
+import numpy as np
+
+from experiments._common.driver import start_process
+from experiments._common.engines import FD_STEPS
+from experiments._common.scenes import CIC
+from experiments._common.timing import first_and_warm, median_time, ready
+from experiments.benchmark.job import (
+    ACCURACY,
+    BASELINE,
+    BATCH_SECONDS,
+    CONTACTS,
+    GRADIENT_ACCURACY,
+    Job,
+    Row,
+    forces_of,
+    gradient_error,
+    row,
+    sample_designs,
+    slopes_of,
+    value_error,
+)
+from rootsopt.config import load
+
+REFERENCE_RTOL = 1e-11
+REFERENCE_STEPS = tuple(step / 5 for step in FD_STEPS)
+"""Steps (deg, mm, deg) of the reference's central differences: truncation some 1e-5."""
+CHECKED = 8
+"""Designs of a batch whose reference is computed."""
+TOLERANCES = ((1e-4, 1e-4), (1e-5, 1e-5), (1e-6, 1e-6), (1e-5, 1e-6), (1e-7, 1e-7))
+"""Tolerances of orbit and transient."""
+
+
+def part_reference(job: Job) -> dict[str, Any]:
+    """Compute the reference by the tightest settings, at the baseline and the checked designs.
+
+    Gradients are central differences of its forces, independent of how rootsopt differentiates.
+    """
+    start_process()
+    from experiments._common.simulation import at, evaluator_of
+
+    choice = ("solver.method=tsit5",) if job.quick else ("solver.method=dopri8",)
+    tool = evaluator_of(load(CIC, [*CONTACTS[job.contacts[-1]], *choice]))
+    loose = at(tool, 1e-10, 1e-8)(series=False)
+    at(tool, REFERENCE_RTOL, 1e-8)
+    designs = sample_designs(2 if job.quick else CHECKED)
+    found = [tool(design, series=False) for design in designs]
+    if not all(one.usable for one in found):
+        raise SystemExit(f"the reference ended as {[one.status.label for one in found]}")
+
+    def differences(design: np.ndarray, start: Any) -> list[list[float]]:
+        columns = []
+        for i, step in enumerate(REFERENCE_STEPS):
+            moved = np.eye(3)[i] * step
+            ends = [tool(design + sign * moved, start, series=False) for sign in (1, -1)]
+            forces = [np.array(forces_of(end.response)) for end in ends]
+            columns.append((forces[0] - forces[1]) / (2 * step))
+        return np.stack(columns, axis=1).tolist()
+
+    forces = [forces_of(one.response) for one in found]
+    slopes = [differences(x, one.state) for x, one in zip(designs, found, strict=True)]
+    off = [
+        gradient_error(slopes_of(one.gradient), slope)
+        for one, slope in zip(found, slopes, strict=True)
+    ]
+    return {
+        "forces": forces,
+        "slopes": slopes,
+        "designs": designs.tolist(),
+        "error": value_error(forces_of(loose.response), forces[0]),
+        "error_of_differentiation": off,
+    }
+
+
+def part_single(job: Job) -> dict[str, Any]:
+    """Time one design through `Evaluator`, at the cheapest good setting and at the default one.
+
+    Times the traceable `respond`, too, with and without gradient.
+    """
+    start_process()
+    import equinox as eqx
+    import jax.numpy as jnp
+
+    from experiments._common.simulation import at
+    from rootsopt.batch import respond
+    from rootsopt.model import integrators
+
+    truth, slope = job.known["forces"][0], job.known["slopes"][0]
+    repeats = 2 if job.quick else 9
+    tried, tools, compiling = [], {}, {}
+    for contact in job.contacts:
+        tools[contact] = tool = evaluator_of(load(CIC, CONTACTS[contact]))
+        call = functools.partial(tool, series=False)
+        compiling[contact], _, _ = first_and_warm(call, 1)
+        for rtol, coarse in TOLERANCES[1:2] if job.quick else TOLERANCES:
+            at(tool, rtol, coarse)
+            tool(series=False)
+            seconds, found = median_time(call, 3)
+            off = value_error(forces_of(found.response), truth) if found.usable else math.nan
+            by = gradient_error(slopes_of(found.gradient), slope)
+            tried.append([contact, rtol, coarse, seconds, off, by, found.status.label])
+    good = [one for one in tried if one[4] <= ACCURACY] or tried
+    fine = [one for one in good if one[5] <= GRADIENT_ACCURACY] or good
+    value_only, choice = (min(x, key=lambda one: one[3])[:3] for x in (good, fine))
+
+    def evaluated(name: str, contact: str, rtol: float, coarse: float) -> Row:
+        tool = at(tools[contact], rtol, coarse)
+        seconds, found = median_time(lambda: tool(series=False), repeats)
+        return row(
+            f"rootsopt, {name}",
+            "value+gradient",
+            seconds,
+            compile_s=compiling[contact],
+            value_error=value_error(forces_of(found.response), truth),
+            gradient_error=gradient_error(slopes_of(found.gradient), slope),
+            settings=f"{contact}, rtol {rtol:g}, transient {coarse:g}",
+            note="Evaluator: checks settlement, closes the orbit, reports stability",
+        )
+
+    solver = load(CIC).solver
+    usual = "linear" if job.quick else "search"
+    default = evaluated("default", usual, solver.rtol, solver.transient_rtol)
+    rows = [default, evaluated("cheapest", *choice)]
+    design, state = jnp.asarray(BASELINE), jnp.zeros(2)
+    compiled = eqx.filter_jit(respond)
+    for gradient in () if job.quick else (False, True):
+        contact, rtol, coarse = choice if gradient else value_only
+        tool = tools[contact]
+        how = [
+            dataclasses.replace(one, rtol=jnp.asarray(value))
+            for one, value in zip(integrators(tool.config), (coarse, rtol), strict=True)
+        ]
+        call = functools.partial(compiled, tool.model, design, state, *how, gradient=gradient)
+        extra, seconds, out = first_and_warm(lambda call=call: ready(call()), repeats)
+        off = gradient_error(out.gradient[:2], slope) if gradient else None
+        rows.append(
+            row(
+                "rootsopt, one program",
+                "value+gradient" if gradient else "value",
+                seconds,
+                compile_s=extra,
+                value_error=value_error(np.asarray(out.response)[[0, 1]], truth),
+                gradient_error=off,
+                settings=f"{contact}, rtol {rtol:g}, transient {coarse:g}",
+                note="batch.respond: settlement checked, orbit closed, no second attempts",
+            )
+        )
+    # A little deeper, for designs that dip deeper than the baseline.
+    deepest = {name: 1.1 * float(tool.model.deepest) for name, tool in tools.items()}
+    return {"rows": rows, "tried": tried, "choice": choice, "deepest": deepest}
+
+
+class _Batch:
+    """Designs around the baseline, each simulated from rest, and the truth of the checked ones."""
+
+    def __init__(self, job: Job):
+        import jax.numpy as jnp
+
+        self.job = job
+        self.designs = jnp.asarray(sample_designs(job.size))
+        self.states = jnp.zeros((job.size, 2))
+        self.checked = min(len(job.known["forces"]), job.size)
+        self.truth, self.slope = (
+            np.asarray(job.known[key])[: self.checked] for key in ("forces", "slopes")
+        )
+        self.tried: list[list[Any]] = []
+
+    def run(self, contact: str, rtol: float, coarse: float, gradient: bool) -> Any:
+        """Simulate all designs with one setting."""
+        import jax.numpy as jnp
+
+        from rootsopt.batch import respond_many
+        from rootsopt.model import Model, integrators
+
+        config = load(CIC, CONTACTS[contact])
+        transient, orbit = integrators(config)
+        how = (
+            dataclasses.replace(transient, rtol=jnp.asarray(coarse)),
+            dataclasses.replace(orbit, rtol=jnp.asarray(rtol)),
+        )
+        model = Model.of(config, self.job.known["deepest"][contact])
+        return ready(respond_many(model, self.designs, self.states, *how, gradient=gradient))
+
+    def errors(self, out: Any) -> tuple[int, float, list[float]]:
+        """Count usable designs, and compare the checked ones with the truth.
+
+        Returns the count, the greatest error of the forces, and that of each gradient.
+        """
+        usable = np.asarray(out.usable)[: self.checked]
+        forces = np.asarray(out.response)[: self.checked, :2][usable]
+        found = np.asarray(out.gradient)[: self.checked, :2][usable]
+        off = value_error(forces, self.truth[usable]) if usable.any() else math.nan
+        pairs = zip(found, self.slope[usable], strict=True) if found.size else ()
+        return int(out.usable.sum()), off, [gradient_error(*pair) for pair in pairs]
+
+    def choose(self) -> tuple[str, float, float]:
+        """Choose the cheapest contact and tolerances with which all designs are good enough.
+
+        Where there are none, the finest are chosen.
+        """
+        job = self.job
+        contacts = job.contacts[job.contacts.index(job.known["choice"][0]) :]
+        for contact in contacts:
+            self.run(contact, *TOLERANCES[1], True)
+            for pair in TOLERANCES[1:2] if job.quick else TOLERANCES[1:]:
+                call = functools.partial(self.run, contact, *pair, True)
+                seconds, out = median_time(call, 2)
+                self.tried.append([contact, *pair, seconds, *self.errors(out)])
+            good = [
+                one
+                for one in self.tried
+                if one[4] == job.size
+                and one[5] <= ACCURACY
+                and np.median(one[6]) <= GRADIENT_ACCURACY
+            ]
+            if good:
+                return tuple(min(good, key=lambda one: one[3])[:3])
+        return contacts[-1], *TOLERANCES[-1]
+
+    def timed(self, setting: tuple[str, float, float], gradient: bool) -> Row:
+        """Time the batch with a setting; the first call is that of compilation."""
+        from rootsopt.timing import CompileClock
+
+        job, (contact, rtol, coarse) = self.job, setting
+        call = functools.partial(self.run, *setting, gradient)
+        with CompileClock() as clock:
+            call()
+        seconds, out = median_time(call, 1 if job.quick else 5, BATCH_SECONDS / 8)
+        usable, off, by = self.errors(out)
+        outside = int(np.sum(np.asarray(out.deepest) < job.known["deepest"][contact]))
+        return row(
+            f"rootsopt, batch of {job.size}" + (" (GPU)" if job.part == "gpu" else ""),
+            "value+gradient" if gradient else "value",
+            seconds,
+            designs=job.size,
+            # Compiled before, where this batch was the one to choose.
+            compile_s=clock.seconds if not (self.tried and gradient) else None,
+            value_error=off,
+            # Where the peak falls on a corner of the force a gradient may fail: the typical
+            # design counts, and the note tells the worst.
+            gradient_error=float(np.median(by)) if by else None,
+            settings=f"{contact}, rtol {rtol:g}, transient {coarse:g}",
+            note=f"{usable} of {job.size} periodic"
+            + (f", worst gradient error {max(by):.2g}" if by else "")
+            + (f", {outside} beyond the map" if "map" in contact and outside else ""),
+        )
+
+
+def part_batch(job: Job) -> dict[str, Any]:
+    """Time designs around the baseline through `respond_many`, each from rest.
+
+    The first batch looks for the cheapest setting that is good enough; later ones keep to it.
+    """
+    start_process(gpu=job.part == "gpu")
+    import jax
+
+    if job.part == "gpu" and jax.default_backend() != "gpu":
+        return {"rows": [], "note": "no GPU found"}
+    batch = _Batch(job)
+    setting = job.known.get("batch_setting") or batch.choose()
+    gradients = (True,) if job.quick else (True, False)
+    rows = [batch.timed(setting, gradient) for gradient in gradients]
+    return {
+        "rows": rows,
+        "batch_setting": setting,
+        "batch_tried": batch.tried or job.known["batch_tried"],
+    }

@@ -1,1 +1,0 @@
-"""Parts of `experiments/benchmark.py`: what each measures, and the report."""

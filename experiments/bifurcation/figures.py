@@ -1,0 +1,168 @@
+"""Figures of the branches, and of the ranges of quiet and noisy orbits."""
+
+import itertools
+
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter
+
+from experiments._common.style import BLUE, GREEN, ORANGE, VERMILION, grid_below, sheet
+from experiments.bifurcation.study import Diagram, beside, ranges
+from rootsopt.continuation import Bifurcation, Kind
+from rootsopt.status import Status
+
+NAMES = {
+    "speed_rpm": "speed (rpm)",
+    "torque_N_m": "load torque (N·m)",
+    "backlash_mm": "gear backlash (mm)",
+    "involute_length_mm": "involute length u (mm)",
+}
+MARKS = {
+    Kind.FOLD: ("o", "fold"),
+    Kind.PERIOD_DOUBLING: ("s", "period doubling"),
+    Kind.NEIMARK_SACKER: ("D", "Neimark-Sacker"),
+    Kind.CORNER: ("x", "touch begins or ends"),
+}
+TITLES = {
+    "shipped": "shipped scene: backlash 0.1 mm, gear damping 0.5",
+    "livelier": "livelier scene: backlash 0.2 mm, gear damping 0.2",
+}
+COLORS = {"cic": BLUE, "ee": VERMILION}
+
+
+def draw_branches(ax, diagram: Diagram, quantity: str, color: str) -> None:
+    """Draw stable parts solid, unstable ones dashed, and mark special points."""
+    for branch in diagram.branches:
+        points = branch.points
+        for stable, part in itertools.groupby(
+            itertools.pairwise(points), lambda pair: pair[0].stable and pair[1].stable
+        ):
+            pairs = list(part)
+            line = [pairs[0][0], *(pair[1] for pair in pairs)]
+            ax.plot(
+                [p.value for p in line],
+                [getattr(p, quantity) for p in line],
+                color=color,
+                linestyle="-" if stable else (0, (3, 2)),
+                linewidth=2.2 if stable else 0.9,
+                alpha=1.0 if stable else 0.75,
+            )
+    for special in drawn_specials(diagram):
+        marker, _ = MARKS[special.kind]
+        face = "white" if marker != "x" else color
+        ax.plot(
+            special.value, getattr(special.point, quantity), marker, color=color, ms=5.5,
+            mfc=face, mew=1.3, zorder=4,
+        )  # fmt: skip
+    unsettled = chaotic(diagram)
+    height = 0.03 if diagram.family == "cic" else 0.07
+    place = {"transform": ax.get_xaxis_transform()}
+    ax.plot(unsettled, [height] * len(unsettled), "*", color=color, ms=9, **place)
+
+
+def drawn_specials(diagram: Diagram) -> list[Bifurcation]:
+    """Return the special points where something stable begins or ends."""
+    return [
+        special
+        for branch in diagram.branches
+        for special in branch.bifurcations
+        if any(point.stable for point in beside(branch, special))
+    ]
+
+
+def chaotic(diagram: Diagram) -> list[float]:
+    """Return the values at which a simulation was chaotic."""
+    return sorted({v for v, status in diagram.seeds if status == Status.CHAOTIC.label})
+
+
+def legend_handles(diagrams: list[Diagram]) -> list:
+    """Make the entries of what the diagrams hold."""
+    families = dict.fromkeys(diagram.family for diagram in diagrams)
+    handles: list = [Patch(color=COLORS[name], label=name.upper()) for name in families]
+    handles += [
+        Line2D([], [], color="black", lw=2.2, label="stable"),
+        Line2D([], [], color="black", lw=0.9, ls=(0, (3, 2)), label="unstable"),
+    ]
+    drawn = {special.kind for diagram in diagrams for special in drawn_specials(diagram)}
+    for kind, (marker, label) in MARKS.items():
+        if kind in drawn:
+            handles.append(
+                Line2D([], [], color="black", marker=marker, ls="", mfc="white", label=label)
+            )
+    if any(map(chaotic, diagrams)):
+        label = "on the lower axis: chaotic when simulated there"
+        handles.append(Line2D([], [], color="black", marker="*", ls="", ms=9, label=label))
+    return handles
+
+
+def pictures(diagrams: list[Diagram]) -> dict[str, Figure]:
+    """Draw all figures, by name: over speed, over the other parameters (if any), and ranges."""
+    over_speed = [d for d in diagrams if d.parameter == "speed_rpm"]
+    scenes = list(dict.fromkeys(d.scene for d in over_speed))
+    columns = [[d for d in over_speed if d.scene == scene] for scene in scenes]
+    found = {"speed": draw_grid(columns, [TITLES[scene] for scene in scenes])}
+    others = [[d] for d in diagrams if d.parameter != "speed_rpm"]
+    if others:
+        found["scene"] = draw_grid(others, ["CIC, shipped scene, 3000 rpm"] * len(others))
+    return found | {"ranges": draw_ranges(over_speed)}
+
+
+def draw_grid(columns: list[list[Diagram]], titles: list[str]) -> Figure:
+    """Draw peak force above, mean force below; a column for each list of diagrams."""
+    count = len(columns)
+    figure, axes = sheet(1.5 + 5.2 * count, 7.4, 2, count, sharey="row", sharex="col")
+    for column, (diagrams, title) in enumerate(zip(columns, titles, strict=True)):
+        for row, (quantity, name) in enumerate((("peak", "peak"), ("mean", "mean"))):
+            ax = axes[row, column]
+            for diagram in diagrams:
+                draw_branches(ax, diagram, quantity, COLORS[diagram.family])
+            ax.set_yscale("log")
+            for which in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
+                which(
+                    FuncFormatter(
+                        lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "1235" else ""
+                    )
+                )
+            ax.set_xlim(diagrams[0].low, diagrams[0].high)
+            ax.grid(color="0.92", linewidth=0.6, which="both")
+            if column == 0:
+                ax.set_ylabel(f"{name} contact force (N)")
+        axes[0, column].set_title(title)
+        axes[1, column].set_xlabel(NAMES[diagrams[0].parameter])
+    handles = legend_handles([diagram for diagrams in columns for diagram in diagrams])
+    figure.legend(handles=handles, loc="outside lower center", ncols=3 * count, frameon=False)
+    return figure
+
+
+def draw_ranges(diagrams: list[Diagram]) -> Figure:
+    """Draw bars where a stable quiet and a stable noisy orbit exist."""
+    figure, axes = sheet(10, 1.2 + 0.75 * len(diagrams), 1, 1)
+    ax = axes[0, 0]
+    styles = {"quiet": (GREEN, "", 0.17), "noisy": (ORANGE, "//", -0.17)}
+    lowest = min(diagram.low for diagram in diagrams)
+    for line, diagram in enumerate(diagrams):
+        if diagram.low > lowest:
+            unknown = {"facecolor": "0.93", "hatch": "xx", "edgecolor": "0.8", "linewidth": 0}
+            ax.broken_barh([(lowest, diagram.low - lowest)], (line - 0.32, 0.64), **unknown)
+            text = f"not followed below {diagram.low:g}"
+            box = {"facecolor": "white", "edgecolor": "none", "pad": 2}
+            middle = (lowest + diagram.low) / 2
+            ax.text(middle, line, text, ha="center", va="center", fontsize=9, bbox=box)
+        found = ranges(diagram)
+        for name, (color, hatch, shift) in styles.items():
+            bars = [(low, high - low) for low, high in found[name]]
+            ax.broken_barh(
+                bars, (line - shift - 0.15, 0.3), facecolor=color, hatch=hatch, edgecolor="white"
+            )
+    ax.set_yticks(range(len(diagrams)), [f"{d.family.upper()}, {d.scene}" for d in diagrams])
+    ax.invert_yaxis()
+    ax.set_xlim(lowest, diagrams[0].high)
+    ax.set_xlabel(NAMES[diagrams[0].parameter])
+    grid_below(ax, color="0.9", axis="x", linewidth=0.8)
+    handles = [
+        Patch(facecolor=color, hatch=hatch, edgecolor="white", label=f"a stable {name} orbit")
+        for name, (color, hatch, _) in styles.items()
+    ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=2, frameon=False)
+    return figure

@@ -1,0 +1,338 @@
+"""Follows the periodic orbits of both rotor pairs over speed, load, backlash and design.
+
+Starts from rest and from up to five other states at a few values of a parameter. Follows every
+periodic orbit reached over the whole range, through folds and period doublings, stable or not
+(`rootsopt.continuation`). Reports where a stable quiet orbit exists, where a stable noisy one, and
+where both do.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from experiments._common.scenes import shipped
+from experiments._common.simulation import evaluator_of
+from rootsopt import continuation
+from rootsopt.config import Config
+from rootsopt.continuation import Branch, End, Kind, Steps
+from rootsopt.errors import InputError
+
+Row = dict[str, Any]
+Say = Callable[[str], None]
+STARTS = ((0.0, 0.0), (-0.2, -1.8), (-1.0, 0.0), (-3.0, 0.0), (0.8, 5.0), (-0.5, -8.0))
+"""Scaled initial states tried at every value of the parameter."""
+LIVELY = ("scene.timing_gear.backlash_mm=0.2", "scene.timing_gear.damping_ratio=0.2")
+SCENES = {"shipped": (), "livelier": LIVELY}
+SLOWEST = {"shipped": 300, "livelier": 3500}
+"""Lowest speed (rpm). Below it the livelier pair bounces so often within a mesh period that its
+orbits can hardly be followed."""
+QUIET = 4.0
+"""Peak force, in units of the force that carries the load at the pitch radius, above which the
+flanks hammer: the orbit is noisy."""
+POINTS, FEWEST = 100, 25
+"""Mesh periods in all points of a branch, and the least number of points of a branch."""
+LONGEST, DOUBLED = 4, 2
+"""Longest orbits (mesh periods) followed: reached by a simulation, and by a period doubling."""
+CELLS = 570
+"""Cells of a range, each searched for quiet and noisy orbits."""
+
+
+@dataclasses.dataclass
+class Diagram:
+    """Branches of one pair in one scene over one parameter.
+
+    `seeds`: (value, status) of the evaluations that looked for orbits.
+    """
+
+    scene: str
+    family: str
+    parameter: str
+    low: float
+    high: float
+    branches: list[Branch]
+    seeds: list[tuple[float, str]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """A pair in a scene, a parameter and its range, the number of values to start from, and the
+    scaled states tried at each."""
+
+    scene: str
+    config: Config
+    parameter: str
+    low: float
+    high: float
+    seeds: int
+    starts: tuple[tuple[float, float], ...]
+
+
+def plans(quick: bool) -> list[Plan]:
+    """List what is explored."""
+    configs = {
+        (scene, family): shipped(family, *overrides)
+        for scene, overrides in SCENES.items()
+        for family in ("cic", "ee")
+    }
+    if quick:
+        config = configs["livelier", "cic"]
+        return [Plan("livelier", config, "speed_rpm", 3500, 4500, 1, STARTS[1:2])]
+    cic = configs["shipped", "cic"]
+    return [
+        *(
+            Plan(scene, config, "speed_rpm", SLOWEST[scene], 6000, 6, STARTS[:3])
+            for (scene, _), config in configs.items()
+        ),
+        Plan("shipped", cic, "torque_N_m", 0.5, 10.0, 2, STARTS[:2]),
+        Plan("shipped", cic, "backlash_mm", 0.02, 0.4, 4, STARTS[:2]),
+        Plan("shipped", cic, "involute_length_mm", 1.0, 9.0, 2, STARTS[:2]),
+    ]
+
+
+def run(
+    quick: bool,
+    say: Say = lambda text: None,
+    keep: Callable[[list[Diagram]], None] = lambda diagrams: None,
+) -> list[Diagram]:
+    """Explore all plans; `keep` is given all diagrams so far after each."""
+    diagrams: list[Diagram] = []
+    for plan in plans(quick):
+        diagrams.append(explore(plan, say))
+        keep(diagrams)
+    return diagrams
+
+
+def explore(plan: Plan, say: Say) -> Diagram:
+    """Follow all orbits that can be reached from the plan's starts."""
+    config, low, high = plan.config, plan.low, plan.high
+    diagram = Diagram(plan.scene, config.profile.family, plan.parameter, low, high, [], [])
+    for value in np.linspace(low, high, plan.seeds + 2)[1:-1]:
+        here = continuation.with_value(config, plan.parameter, float(value))
+        patient, hasty = evaluator_of(here), evaluator_of(here, give_up_early=True)
+        found: list[tuple[float, float]] = []
+        for number, start in enumerate(plan.starts):
+            # A chaotic motion takes long to tell, and need not be told from everywhere.
+            evaluator = hasty if number else patient
+            evaluation = evaluator(start=np.array(start), series=False)
+            diagram.seeds.append((float(value), evaluation.status.label))
+            if not evaluation.usable or evaluation.state is None:
+                continue
+            forces = evaluation.response["mean_force_N"], evaluation.response["peak_force_N"]
+            if any(np.allclose(forces, other, rtol=1e-3) for other in found):
+                continue
+            found.append(forces)
+            period = evaluation.steady_state["period"]
+            follow_on(diagram, here, evaluation.state, period, forces, say)
+    return diagram
+
+
+def follow_on(diagram: Diagram, config: Config, state, period: int, forces, say: Say) -> None:
+    """Follow an orbit, and those it doubles to or came from, unless they are known."""
+    value = continuation.value_of(config, diagram.parameter)
+    if period > LONGEST or known(diagram, value, period, forces):
+        return
+    try:
+        first = continuation.follow(
+            config, diagram.parameter, state, period, limits(diagram, period)
+        )
+    except InputError as error:
+        say(f"{value:g}: {error}")
+        return
+    queue = [first]
+    while queue:
+        branch = queue.pop(0)
+        diagram.branches.append(branch)
+        say(described(diagram, branch))
+        for special in branch.bifurcations:
+            doubling = special.kind is Kind.PERIOD_DOUBLING
+            # A longer orbit born where the simple one was unstable before is unstable too.
+            if 2 * branch.period > DOUBLED or not doubling:
+                continue
+            if not any(p.stable for p in beside(branch, special)):
+                continue
+            doubled = continuation.follow_doubled(
+                branch, special, limits(diagram, 2 * branch.period)
+            )
+            if doubled is not None and not known_branch([*diagram.branches, *queue], doubled):
+                queue.append(doubled)
+        for end, point in zip(branch.ends, (branch.points[0], branch.points[-1]), strict=True):
+            if end is End.HALVED:
+                here = continuation.with_value(config, diagram.parameter, point.value)
+                half = branch.period // 2
+                try:
+                    simple = continuation.follow(
+                        here, diagram.parameter, point.state, half, limits(diagram, half)
+                    )
+                except InputError:
+                    continue
+                if not known_branch([*diagram.branches, *queue], simple):
+                    queue.append(simple)
+
+
+def beside(branch: Branch, special) -> tuple:
+    """Return the points of a branch on both sides of a special one."""
+    return branch.points[special.after : special.after + 2]
+
+
+def limits(diagram: Diagram, period: int) -> Steps:
+    """Return the range of a branch of this period, and how many points it may have."""
+    return Steps(diagram.low, diagram.high, points=max(POINTS // period, FEWEST))
+
+
+def known(diagram: Diagram, value: float, period: int, forces) -> bool:
+    """Tell whether a branch of the diagram has this orbit."""
+    return any(
+        np.allclose(forces, (point.mean, point.peak), rtol=1e-3)
+        for branch in diagram.branches
+        if branch.period == period
+        for point in branch.at(value)
+    )
+
+
+def known_branch(branches: list[Branch], new: Branch) -> bool:
+    """Tell whether the middle of a branch lies on another one of the same period."""
+    middle = new.points[len(new.points) // 2]
+    return any(
+        np.allclose((middle.mean, middle.peak), (point.mean, point.peak), rtol=1e-3)
+        for branch in branches
+        if branch.period == new.period
+        for point in branch.at(middle.value)
+    )
+
+
+def described(diagram: Diagram, branch: Branch) -> str:
+    """Describe a branch in a line."""
+    ends = " and ".join(end.name.lower().replace("_", " ") for end in branch.ends)
+    values = [point.value for point in branch.points]
+    return (
+        f"{diagram.scene} {diagram.family} {diagram.parameter}: period {branch.period}, "
+        f"{len(values)} points in {min(values):.5g} … {max(values):.5g}, "
+        f"{len(branch.bifurcations)} special, ends: {ends}"
+    )
+
+
+def ranges(diagram: Diagram) -> dict[str, list[list[float]]]:
+    """Find the ranges with a stable quiet orbit, a stable noisy one, both, and none."""
+    edges = np.linspace(diagram.low, diagram.high, CELLS + 1)
+    centres = (edges[1:] + edges[:-1]) / 2
+    quiet, noisy = np.zeros(CELLS, bool), np.zeros(CELLS, bool)
+    for branch in diagram.branches:
+        for old, new in itertools.pairwise(branch.points):
+            if not (old.stable and new.stable):
+                continue
+            (low, a), (high, b) = sorted((p.value, peak_ratio(branch, p)) for p in (old, new))
+            inside = (centres >= low) & (centres <= high)
+            ratio = np.interp(centres[inside], [low, high], [a, b])
+            quiet[inside] |= ratio <= QUIET
+            noisy[inside] |= ratio > QUIET
+    found = {"quiet": quiet, "noisy": noisy, "both": quiet & noisy, "none": ~(quiet | noisy)}
+    return {name: list(runs(mask, edges)) for name, mask in found.items()}
+
+
+def peak_ratio(branch: Branch, point) -> float:
+    """Divide the peak force by the static one."""
+    torque = branch.config.scene.load.torque_N_m
+    torque = point.value if branch.parameter == "torque_N_m" else torque
+    assert torque is not None  # Scenes here have a constant load.
+    return point.peak / (torque / (branch.config.profile.pitch_radius_mm * 1e-3))
+
+
+def runs(mask: np.ndarray, edges: np.ndarray) -> Iterator[list[float]]:
+    """Yield the ends of every run of true cells."""
+    change = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
+    for begin, end in change.reshape(-1, 2):
+        yield [float(edges[begin]), float(edges[end])]
+
+
+def overlaps(diagram: Diagram) -> list[list[float]]:
+    """Find the ranges in which more than one stable orbit exists, quiet or noisy."""
+    edges = np.linspace(diagram.low, diagram.high, CELLS + 1)
+    centres = (edges[1:] + edges[:-1]) / 2
+    count = np.zeros(CELLS, int)
+    for branch in diagram.branches:
+        for old, new in itertools.pairwise(branch.points):
+            if old.stable and new.stable:
+                low, high = sorted((old.value, new.value))
+                count += (centres > low) & (centres <= high)
+    return list(runs(count > 1, edges))
+
+
+# Rows and record
+
+
+def point_rows(diagrams: list[Diagram]) -> list[Row]:
+    """List all points of all branches."""
+    return [
+        {**where, **orbit_row(point)}
+        for where, branch in branches_of(diagrams)
+        for point in branch.points
+    ]
+
+
+def special_rows(diagrams: list[Diagram]) -> list[Row]:
+    """List all bifurcations and corners."""
+    return [
+        {**where, "kind": special.kind.name.lower(), **orbit_row(special.point)}
+        for where, branch in branches_of(diagrams)
+        for special in branch.bifurcations
+    ]
+
+
+def branches_of(diagrams: list[Diagram]) -> Iterator[tuple[Row, Branch]]:
+    """Yield every branch, with the columns that say which it is."""
+    for diagram in diagrams:
+        keys = {name: getattr(diagram, name) for name in ("scene", "family", "parameter")}
+        for number, branch in enumerate(diagram.branches):
+            yield keys | {"branch": number}, branch
+
+
+def orbit_row(point) -> Row:
+    """List the numbers of an orbit."""
+    row = {
+        "value": point.value,
+        "period": point.period,
+        "mean_force_N": point.mean,
+        "peak_force_N": point.peak,
+        "rms_force_N": point.rms,
+        "stable": point.stable,
+        "gap_time": point.gap_time,
+        "residual": point.residual,
+    }
+    for number, multiplier in enumerate(point.multipliers, 1):
+        row |= {f"multiplier_{number}_real": multiplier.real}
+        row |= {f"multiplier_{number}_imag": multiplier.imag}
+    return row
+
+
+def summary(diagrams: list[Diagram], seconds: float) -> dict[str, Any]:
+    """Record the ranges, the branches, and the starts that reached no periodic orbit."""
+    return {
+        "quiet_up_to_static_forces": QUIET,
+        "diagrams": [
+            {
+                "scene": diagram.scene,
+                "family": diagram.family,
+                "parameter": diagram.parameter,
+                "range": [diagram.low, diagram.high],
+                "stable": ranges(diagram),
+                "several_stable": overlaps(diagram),
+                "branches": [
+                    {
+                        "period": branch.period,
+                        "points": len(branch.points),
+                        "ends": [end.name.lower() for end in branch.ends],
+                    }
+                    for branch in diagram.branches
+                ],
+                "without_periodic_orbit": sorted(
+                    {seed for seed in diagram.seeds if seed[1] != "periodic"}
+                ),
+            }
+            for diagram in diagrams
+        ],
+        "largest_residual": max((row["residual"] for row in point_rows(diagrams)), default=None),
+        "seconds": seconds,
+    }

@@ -1,1 +1,0 @@
-"""Parts of `experiments/bifurcation.py`: orbits that are looked for, and the figures."""

@@ -1,0 +1,315 @@
+"""The checks of every scene: finite numbers, a named end, the truth, the public path."""
+
+import dataclasses
+import functools
+import math
+import time
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from experiments._common.simulation import evaluator_of as make_evaluator
+from experiments._common.simulation import pair_of_model, stacked
+from experiments.extremes.scenes import Kind
+from rootsopt.batch import STATUSES, respond
+from rootsopt.config import Config
+from rootsopt.contact.impact import force_rounding
+from rootsopt.dynamics.flow import Integrator, flow, strobe
+from rootsopt.dynamics.steady import close_orbit, no_tangents
+from rootsopt.evaluate import Evaluator
+from rootsopt.model import Model, design_vector
+from rootsopt.programs import Program
+
+HORIZON = 24
+"""Longest transient (mesh periods) of most scenes."""
+STEPS = 1024
+"""Most solver steps in a mesh period."""
+ALLOWED = 100.0
+"""Deviation of a force (tolerances, relative to the greater of the true and the static force) above
+which a promise is broken. In single precision five roundings of the gap are added."""
+CORNER = 1e-9
+"""Tolerance below which deviations are judged as at this one: a peak on a corner of the force is
+known to some 1e-8 only (docs/accuracy.md)."""
+SINGLE = 2.4e-6
+"""Finest tolerance that single precision holds."""
+SHARP = "dopri8", 1e-12, 20_000
+"""Method, tolerance and most steps of the reference."""
+FEW = 50
+"""Swings in a mesh period above which SciPy, an explicit method in Python, is not asked."""
+PATIENCE = 24
+"""Mesh periods of plain motion where Newton's method does not close a reference."""
+DEPTHS = np.concatenate([[-1e-3, 0.0], np.geomspace(1e-36, 1e-2, 39)])
+RATES = np.concatenate([-np.geomspace(1e-9, 1e3, 7), [0.0], np.geomspace(1e-9, 1e3, 4)])
+POSES = 4
+"""Random states of each scene at which the equation of motion is evaluated."""
+
+
+@dataclasses.dataclass
+class Case:
+    """A scene, its line of the table, and the scaled state of its orbit, once known."""
+
+    kind: Kind
+    config: Config
+    row: dict[str, Any]
+    state: Any = None
+
+
+# Promise 1: the law and the equation
+
+
+@eqx.filter_jit
+def _law_values(laws, depths, rates):
+    def one(law):
+        def at(depth, rate):
+            slopes = jax.grad(lambda *x: x[0](*x[1:]), argnums=(0, 1, 2))(law, depth, rate)
+            return jnp.stack([law(depth, rate), *jax.tree.leaves(slopes)])
+
+        table = jax.vmap(lambda d: jax.vmap(lambda r: at(d, r))(rates))(depths)
+        return jnp.sum(~jnp.isfinite(table)), jnp.sum(table[..., 0] < 0)
+
+    return jax.lax.map(one, laws)
+
+
+@eqx.filter_jit
+def _equation_values(models: Model, designs, poses):
+    def one(at):
+        model, design, poses = at
+
+        def slope(design, pose):
+            pair = model.pair(design)
+            scale = pair.angle_scale
+            state = pose[1:].astype(scale.dtype)
+            found, contact = pair.derivative(pose[0].astype(scale.dtype), state)
+            return jnp.append(found, contact.total)
+
+        def all_of(pose):
+            jacobians = jax.jacfwd(slope, argnums=(0, 1))(design, pose)
+            return jnp.concatenate([slope(design, pose), *(x.ravel() for x in jacobians)])
+
+        return jnp.sum(~jnp.isfinite(jax.vmap(all_of)(poses)))
+
+    return jax.lax.map(one, (models, designs, poses))
+
+
+def law(cases: list[Case]) -> dict[str, Any]:
+    """Count the values of the law that are not finite, or negative, among all scenes."""
+    laws = [jax.tree.map(np.asarray, Model.of(case.config).law) for case in cases]
+    laws = jax.tree.map(lambda *leaves: np.stack(leaves), *laws)
+    found: dict[str, Any] = {}
+    for dtype in (np.float32, np.float64):
+        single = jax.tree.map(functools.partial(jnp.asarray, dtype=dtype), laws)
+        bad, negative = _law_values(single, jnp.asarray(DEPTHS, dtype), jnp.asarray(RATES, dtype))
+        found[np.dtype(dtype).name] = {
+            "values": len(cases) * DEPTHS.size * RATES.size,
+            "not_finite": int(np.sum(bad)),
+            "negative": int(np.sum(negative)),
+        }
+    return found
+
+
+def equation(cases: list[Case], seed: int) -> dict[str, Any]:
+    """Count values of the equation of motion, and of its derivatives, that are not finite.
+
+    Derivatives are taken with respect to state and design. Times are random, and states lie some
+    static depths and plays to either side, at any speed.
+    """
+    draw = np.random.default_rng(seed)
+    found: dict[str, Any] = {}
+    groups: dict[tuple, list[Case]] = {}
+    for case in cases:
+        kind = case.kind
+        shape = kind.family, kind.lobes, kind.scene, kind.fidelity
+        groups.setdefault(shape, []).append(case)
+    for (family, lobes, scene, fidelity), members in groups.items():
+        if fidelity == "map" or lobes in (4, 5):
+            continue
+        states = members[0].kind.states
+        configs = [case.config for case in members]
+        designs = np.stack([np.asarray(design_vector(config)) for config in configs])
+        size = np.exp(draw.uniform(np.log(1e-9), np.log(30), (len(members), POSES, states)))
+        signed = size * draw.choice([-1, 1], size.shape)
+        signed[..., 1] *= 100
+        times = draw.uniform(0, 1, (*size.shape[:2], 1))
+        poses = np.concatenate([times, signed], axis=-1)
+        models = stacked(configs, "float64")
+        for precision in ("float32", "float64"):
+            bad = _equation_values(dataclasses.replace(models, precision=precision), designs, poses)
+            name = f"{family} {lobes}, {scene}, {precision}"
+            found[name] = {"scenes": len(members), "not_finite": int(np.sum(bad))}
+    return found
+
+
+# Promise 2: the motion
+
+
+@Program
+def _simulate(model: Model, design, tolerances, method: str):
+    pair = model.pair(design)
+    transient, orbit = (Integrator(method, tolerances[k], STEPS) for k in range(2))
+    out = respond(model, design, jnp.zeros(pair.states), transient, orbit, HORIZON)
+    assert pair.pace is not None
+    swings = pair.mesh_period / (2 * jnp.pi * pair.pace.swing)
+    # Share of the static penetration that is lost in rounding.
+    rounding = jnp.finfo(pair.angle_scale.dtype).eps * model.pitch_radius
+    return out, swings, rounding / pair.law.depth_at(pair.force_scale), pair.force_scale
+
+
+def _arguments(case: Case) -> tuple[Any, ...]:
+    model = jax.tree.map(np.asarray, Model.of(case.config))
+    solver = case.config.solver
+    tolerances = np.array([solver.transient_rtol, solver.rtol])
+    return model, np.asarray(design_vector(case.config)), tolerances, case.kind.method
+
+
+def prepare(case: Case) -> None:
+    """Compile in the background the program that simulates scenes of this kind."""
+    _simulate.prepare(*_arguments(case))
+
+
+def simulate(case: Case) -> None:
+    """Simulate a scene from rest and complete its row."""
+    arguments = _arguments(case)
+    began = time.perf_counter()
+    found = _simulate(*arguments)
+    out, swings, rounding, force = jax.device_get(found)
+    status = STATUSES[int(out.status)]
+    numbers = np.concatenate([np.ravel(out.response), np.ravel(out.gradient)])
+    mean, peak, rms = map(float, out.response)
+    case.state = np.asarray(out.state, np.float64)
+    case.row |= {
+        "seconds": time.perf_counter() - began,
+        "steps": int(out.steps),
+        "swings": float(swings),
+        "gap_rounding": float(rounding),
+        "static_force_N": float(force),
+        "status": status.label,
+        "period": int(out.period),
+        "multiplier": float(out.multiplier),
+        "mean_force_N": mean,
+        "peak_force_N": peak,
+        "rms_force_N": rms,
+        # What is called a result is finite, and nothing else looks like one.
+        "named": bool(np.all(np.isfinite(numbers)) if status.usable else np.all(np.isnan(numbers))),
+    }
+
+
+# Promise 3: the truth
+
+
+@Program
+def _sharp(model: Model, design, state, period):
+    method, rtol, steps = SHARP
+    pair = model.pair(design)
+    how = Integrator(method, jnp.asarray(rtol), steps)
+    orbit = close_orbit(pair, no_tangents(pair), state, period, how)
+    return orbit._replace(flow=orbit.flow._replace(grid=jnp.zeros(0)))
+
+
+@Program
+def _patient(model: Model, design, state, period):
+    """Integrate without Newton's method; return the last round and the state it starts from."""
+    method, rtol, steps = SHARP
+    pair = model.pair(design)
+    how = Integrator(method, jnp.asarray(100 * rtol), steps)
+    states = strobe(pair, state, PATIENCE, how).states
+    last = states[PATIENCE - 1 - period]
+    out = flow(pair, last, period.astype(float), how, 2520, no_tangents(pair))
+    return out._replace(grid=jnp.zeros(0)), last
+
+
+@eqx.filter_jit
+def _rates(pair, tau, state):
+    slope, contact = pair.derivative(tau, state)
+    return jnp.append(slope, contact.total / pair.force_scale)
+
+
+def refine(case: Case) -> None:
+    """Measure how far a periodic result is from the orbit that the sharp settings find nearby."""
+    model = dataclasses.replace(Model.of(case.config), precision="float64")
+    design = np.asarray(design_vector(case.config))
+    period = np.asarray(case.row["period"])
+    orbit = jax.device_get(_sharp(model, design, case.state, period))
+    closed = bool(orbit.flow.solved) and float(orbit.residual) < 1e-9
+    closed = closed and float(orbit.flow.strain) < 100.0  # Steps a solver would have taken.
+    state, numbers = orbit.state, orbit.response[:3]
+    if not closed:
+        out, state = jax.device_get(_patient(model, design, case.state, period))
+        closed = bool(out.solved) and float(np.max(np.abs(out.end - state))) < 1e-4
+        numbers = np.array([out.mean, out.mean_square, out.peak])
+    mean, square, peak = numbers
+    truth = np.array([mean, peak, np.sqrt(square)])
+    names = ("mean_force_N", "peak_force_N", "rms_force_N")
+    found = np.array([case.row[name] for name in names])
+    off = np.abs(found - truth) / np.maximum(truth, case.row["static_force_N"])
+    allowed = ALLOWED * max(case.config.solver.rtol, CORNER)
+    if case.kind.precision == "float32":
+        # Of the reference's gap in double; single rounds 2^29 times as coarsely.
+        depth, law = jnp.asarray(orbit.flow.depth), model.law
+        rounding = 2**29 * float(force_rounding(depth, law.exponent, model.pitch_radius))
+        allowed = ALLOWED * max(case.config.solver.rtol, SINGLE) + 5 * rounding
+    case.row |= {
+        "reference": "closed" if closed else "not closed",
+        "reference_mean_N": float(mean),
+        "reference_peak_N": float(peak),
+        "mean_off": float(off[0]),
+        "peak_off": float(off[1]),
+        "moved": float(np.max(np.abs(state - case.state))),
+        "reference_multiplier": float(orbit.multiplier),
+        "share_of_allowed": float(max(off[:2]) / allowed),
+    }
+    case.state = np.asarray(state)
+
+
+def by_scipy(case: Case) -> None:
+    """Follow the orbit by SciPy (that of the reference, if there is one).
+
+    Measures how far the end is from the start, and the mean force.
+    """
+    model = dataclasses.replace(Model.of(case.config), precision="float64")
+    pair = pair_of_model(model, design_vector(case.config))
+    period = case.row["period"]
+    done = solve_ivp(
+        lambda tau, y: np.asarray(_rates(pair, tau, y[:2])),
+        (0.0, float(period)),
+        np.append(case.state, 0.0),
+        method="DOP853",
+        rtol=1e-11,
+        atol=1e-11,
+        max_step=1 / 32,
+    )
+    mean = done.y[2, -1] / period * float(pair.force_scale)
+    truth = case.row.get("reference_mean_N", case.row["mean_force_N"])
+    case.row |= {
+        "scipy_end": float(np.max(np.abs(done.y[:2, -1] - case.state))),
+        "scipy_mean_off": abs(mean - truth) / max(truth, case.row["static_force_N"]),
+    }
+
+
+# Promise 4: the public path
+
+
+def evaluate(case: Case, evaluator: Evaluator) -> None:
+    """Simulate a scene as the commands do."""
+    began = time.perf_counter()
+    evaluation = evaluator(series=False)
+    record = evaluation.record()
+    numbers = [*record["response"].values()]
+    numbers += [x for row in record["gradient"].values() for x in row.values()]
+    case.row |= {
+        "evaluator_status": record["status"],
+        "evaluator_seconds": time.perf_counter() - began,
+        "evaluator_periods": int(record["statistics"]["transient_mesh_periods"]),
+        "evaluator_mean_N": record["response"].get("mean_force_N", math.nan),
+        "named": bool(case.row["named"] and np.all(np.isfinite(numbers))),
+    }
+
+
+def evaluator_of(config: Config, horizon: int) -> Evaluator:
+    """Make an evaluator of a config with a transient of at most `horizon` mesh periods."""
+    changes = {"max_mesh_periods": horizon, "max_steps_per_period": STEPS}
+    solver = config.solver.model_copy(update=changes)
+    return make_evaluator(config.model_copy(update={"solver": solver}))

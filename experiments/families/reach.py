@@ -1,0 +1,145 @@
+"""Finds what a family can do inside a housing, by geometry alone: designs, area efficiency."""
+
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from experiments._common.simulation import profile_of
+from rootsopt.config import FAMILY_KEYS, Config
+from rootsopt.model import MM, Model, design_keys
+from rootsopt.optimize.bounds import around
+from rootsopt.optimize.problem import Problem, Space, sobol
+from rootsopt.profiles import geometry
+
+BAND_MM = 1e-3
+"""Clearance (mm) below the bore's radius up to which an outer radius fills it."""
+SAMPLE = 256
+"""Points of a family's box among which designs to start from are chosen."""
+STARTS = 4
+_LEAST_SHARE = 1e-3
+"""Least value of a parameter that must not be 0, as a share of its bound."""
+_CLOSE = 1e-7
+"""Margin of the constraints in the search for the extremes of area efficiency."""
+
+
+class Reach(NamedTuple):
+    """Feasible points (n, d) of a family's unit box, the best area efficiency last, and their area
+    efficiencies (n,)."""
+
+    points: NDArray[np.float64]
+    efficiencies: NDArray[np.float64]
+
+
+def of_family(reference: Config, family: str) -> Config:
+    """Put a profile of a classical `family` of the same pitch radius into a reference's scene.
+
+    Its parameters are in the middle of their usual bounds.
+    """
+    size = reference.profile.pitch_radius_mm, reference.profile.lobes
+    bounds: dict[str, Any] = {}
+    for key in FAMILY_KEYS[family]:
+        low, high = around(key, *size)
+        bounds[key] = (max(low, _LEAST_SHARE * high), high)
+    if "tip_arc_angle_deg" in bounds:
+        bounds["tip_arc_angle_deg"] = (0.0, bounds["tip_arc_angle_deg"][1])
+    middle = {key: sum(pair) / 2 for key, pair in bounds.items()}
+    return changed(
+        reference,
+        profile={"family": family, "pitch_radius_mm": size[0], "lobes": size[1]} | middle,
+        optimizer={"bounds": bounds},
+    )
+
+
+def changed(config: Config, **sections: dict[str, Any]) -> Config:
+    """Change values in some `sections` of a config; a profile is replaced altogether."""
+    data = config.model_dump()
+    for section, values in sections.items():
+        data[section] = values if section == "profile" else data[section] | values
+    return Config.model_validate(data)
+
+
+def in_housing(config: Config, bore_radius_mm: float, area_efficiency: float) -> Config:
+    """Require rotors that fill a bore of this radius, and have this area efficiency at least."""
+    return changed(
+        config,
+        constraints={
+            "area_efficiency_min": area_efficiency,
+            "outer_radius_min_mm": bore_radius_mm - BAND_MM,
+            "outer_radius_max_mm": bore_radius_mm,
+            "seal_width_min_mm": 0.0,
+            "undercut_margin_min_mm": 0.0,
+        },
+    )
+
+
+def problem_of(config: Config) -> Problem:
+    """Make the geometric side of a design problem: constraints, without a baseline."""
+    return Problem(config, cast(Any, None), Space.of(config, Model.of(config), 0.0))
+
+
+def reach(config: Config, sample: int = SAMPLE) -> Reach | None:
+    """Find sound designs of a family in the housing of a config, without a floor of efficiency.
+
+    They come from a Sobol sample projected onto the constraints, and from climbing and descending
+    from there to the greatest and the least area efficiency. None if the family does not fit.
+    """
+    size = len(design_keys(config))
+    if size == 0:
+        return _only(config)
+    problem = problem_of(config)
+    points = [problem.project(point) for point in sobol(sample, 0, size)]
+    points = [point for point in points if problem.feasible(point)]
+    if not points:
+        return None
+    order = np.argsort([_efficiency(problem, point) for point in points])
+    ends = [points[k] for k in {*order[:STARTS], *order[-STARTS:]}]
+    climbed = [_extreme(problem, point, sign) for point in ends for sign in (1.0, -1.0)]
+    points += [point for point in climbed if problem.feasible(point)]
+    found = np.array([_efficiency(problem, point) for point in points])
+    order = np.argsort(found)
+    return Reach(np.array(points)[order], found[order])
+
+
+def _only(config: Config) -> Reach | None:
+    """Find the reach of a family without design parameters."""
+    shape = geometry(profile_of(config))
+    limits = config.constraints
+    low, high = limits.outer_radius_min_mm, limits.outer_radius_max_mm
+    assert low is not None
+    assert high is not None
+    if not low <= round(float(shape.outer_radius) / MM, 9) <= high:
+        return None
+    return Reach(np.zeros((1, 0)), np.array([float(shape.area_efficiency)]))
+
+
+def _efficiency(problem: Problem, point) -> float:
+    """Compute the area efficiency at a point of the box, -inf where it is NaN."""
+    first = problem.space.constraints[0]
+    assert first.quantity == "area_efficiency"
+    value = float(problem.look(point)[2][0]) * first.scale + float(first.limit)
+    return value if np.isfinite(value) else -np.inf
+
+
+def _extreme(problem: Problem, start, sign: float) -> NDArray[np.float64]:
+    """Find the greatest (`sign` 1) or the least (-1) area efficiency near `start`."""
+
+    def goal(point):
+        return -sign * problem.look(point)[2][0], -sign * problem.look(point)[3][0]
+
+    found = minimize(
+        goal,
+        start,
+        jac=True,
+        method="SLSQP",
+        bounds=[(0.0, 1.0)] * len(start),
+        constraints={
+            "type": "ineq",
+            "fun": lambda point: problem.look(point)[2][1:] - _CLOSE,
+            "jac": lambda point: problem.look(point)[3][1:],
+        },
+        options={"maxiter": 60},
+    )
+    finite = np.all(np.isfinite(found.x))
+    return problem.project(found.x) if finite else np.asarray(start)

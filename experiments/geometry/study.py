@@ -1,0 +1,228 @@
+"""Compares area and inertia of every profile family with polygons of its own outline.
+
+Draws designs of each family and number of lobes over the whole range that a config allows, keeps
+the sound ones, and compares `rootsopt.profiles.geometry` with polygons through points of the
+outline. The reference uses positions alone, neither arc lengths nor quadrature: polygons at four
+spacings, each half the last, extrapolated (Romberg).
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from rootsopt.config import FAMILY_KEYS
+from rootsopt.families import BY_LIMITS, DEG, INHERENT, MM, profile_of
+from rootsopt.optimize.bounds import around
+from rootsopt.profiles import Curve, FreeForm, geometry
+from rootsopt.profiles.cic import CIC
+from rootsopt.profiles.validity import PURE, margins
+
+Row = dict[str, Any]
+RADIUS_MM = 33.0
+LOBES = (2, 3, 4, 5, 6)
+FAMILIES = tuple(family for family in FAMILY_KEYS if family != "outline")
+COEFFICIENTS = (3, 8, 24)
+"""Sizes of a free form."""
+QUICK = ("cic", "ee", "arc"), (2, 3)
+"""Families and lobes of a reduced run."""
+QUICK_DRAWS = 50
+"""Designs drawn of each in a reduced run."""
+_LEVELS = 4
+_SHORT, _SPAN, _WHOLE = 64, 512, 2048
+"""Sides of the finest polygon: on an interval of a curve, a knot span of a free form, a segment."""
+_GRADED = 5
+"""Power with which points crowd at both ends of a segment, where an outline may have a root."""
+_LONGEST_INVOLUTE = 1.02
+"""Length of an involute that a config accepts, as a share of the longest."""
+_ROUNDING = 1e-9
+"""Margin, relative to its scale, that counts as 0."""
+
+
+def by_polygons(profile):
+    """Integrate area (m²) and polar moment of area (m⁴) from positions on the outline alone.
+
+    Returns both (2,), and an estimate of the greater of their relative errors.
+    """
+    x = np.arange(_SHORT + 1) / _SHORT
+    if isinstance(profile, Curve):
+        ends = profile.node
+    elif isinstance(profile, FreeForm):
+        x = np.arange(_SPAN + 1) / _SPAN
+        ends = jnp.append(0.0, jnp.stack([s.start for s in profile.stretches()[1:]]))
+        ends = jnp.append(ends, profile.pitch_normal)
+    else:
+        x = np.arange(_WHOLE + 1) / _WHOLE
+        x = x**_GRADED / (x**_GRADED + (1 - x) ** _GRADED)
+        segments = profile.segments()
+        ends = jnp.stack([segments[0].start, *(s.stop for s in segments)])
+    nu = ends[:-1, None] + jnp.diff(ends)[:, None] * jnp.asarray(x)
+    levels = jnp.zeros((_LEVELS, 2))
+    for sign, point in ((1.0, profile.addendum), (-1.0, profile.dedendum)):
+        # The dedendum runs from the root up, which is clockwise.
+        places = profile.position(point(nu))
+        levels += sign * jnp.stack([_polygon(places[:, :: 2**k]) for k in range(_LEVELS)])
+    before = after = levels
+    for power in range(1, _LEVELS):
+        before, after = after, (4.0**power * after[:-1] - after[1:]) / (4.0**power - 1)
+    rest = jnp.max(jnp.abs(after[0] / before[0] - 1))
+    return 2 * profile.lobes * after[0], rest
+
+
+def _polygon(places):
+    """Integrate ∫dA and ∫r² dA over the triangles between the axis and an open polygon's sides."""
+    here, there = places[:, :-1], places[:, 1:]
+    cross = here[..., 0] * there[..., 1] - here[..., 1] * there[..., 0]
+    square = jnp.sum(here**2 + here * there + there**2, axis=-1)
+    return jnp.stack([jnp.sum(cross) / 2, jnp.sum(cross * square) / 12])
+
+
+def draw(family: str, lobes: int, count: int, random: np.random.Generator, size: int = 8):
+    """Draw `count` designs (count, d) of a family in config units, not all of them sound.
+
+    Half lie within the usual bounds, the others as far as a config allows, crowding towards the
+    limits. `size` is the number of coefficients of a free form.
+    """
+    usual, wide = [np.zeros((count, 0))], [np.zeros((count, 0))]
+    half = 90.0 / lobes
+    for key in FAMILY_KEYS[family]:
+        shape = (count, size) if key == "coefficients" else (count, 1)
+        share = random.random(shape)
+        low, high = around(key, RADIUS_MM, lobes)
+        usual.append(low + (high - low) * share)
+        share = random.random(shape)
+        if key == "coefficients":
+            # Around an epicycloid, which is constant; many of these are sound.
+            level = random.uniform(-0.5, 1.0, (count, 1))
+            spread = 10.0 ** random.uniform(-3, 0, (count, 1))
+            wide.append(np.clip(level + spread * (2 * share - 1), -1.0, 1.0))
+        elif key == "tip_arc_angle_deg":
+            wide.append(min(half, 45.0) * _crowded(share, 1e-4))
+        elif key.endswith("_deg"):
+            wide.append((180.0 if key == "tip_arc_turn_deg" else 90.0) * _crowded(share, 1e-3))
+        elif key == "trochoid_ratio":
+            wide.append(10.0 ** (4 * share - 3))
+        else:
+            wide.append(RADIUS_MM * 3.0 * _crowded(share, 1e-4))
+    first = random.random((count, 1)) < 0.5
+    design = np.where(first, np.hstack(usual), np.hstack(wide))
+    keys = FAMILY_KEYS[family]
+    if "involute_length_mm" in keys:
+        # As a share of the longest one: no other length can be made.
+        angle, length = keys.index("pressure_angle_deg"), keys.index("involute_length_mm")
+        tip = design[:, 2] if family == "cic" else 0.0
+        longest = RADIUS_MM * np.sin(design[:, angle] * DEG) * (half - tip) * DEG
+        crowded = _crowded(random.random(count), 1e-6)
+        share = np.where(first[:, 0], random.random(count), crowded)
+        design[:, length] = longest * share * _LONGEST_INVOLUTE
+    return design
+
+
+def _crowded(share, least):
+    """Crowd even shares towards both ends, down to the `least` distance."""
+    near = 0.5 * (2 * least) ** (1 - np.abs(2 * share - 1))
+    return np.where(share < 0.5, near, 1 - near)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def judged(family: str, lobes: int, designs):
+    """Tell whether configs with these designs (n, d) are accepted, (n,)."""
+    return lax.map(functools.partial(_sound, family, lobes), designs)
+
+
+def _sound(family: str, lobes: int, design):
+    profile = profile_of(family, lobes, jnp.asarray(RADIUS_MM * MM), design)
+    if family in BY_LIMITS:
+        alpha, length = design[0] * DEG, design[1]
+        tip = design[2] * DEG if family == "cic" else 0.0
+        half = jnp.pi / (2 * lobes)
+        edge = RADIUS_MM * jnp.sin(alpha)
+        longest = edge * (half - tip) * _LONGEST_INVOLUTE
+        shortest = edge * (half - tip - 2 * alpha) + 1e-6 * RADIUS_MM
+        uncut = edge * jnp.tan(alpha) * (1 + 1e-9)
+        good = (length <= longest) & (length >= shortest) & (length <= uncut) & (length > 0)
+        assert isinstance(profile, CIC)
+        return good & (profile.arc_radius > 0) & (profile.arc_center_radius > 0)
+    good = jnp.ones((), bool)
+    for name, value in margins(profile)._asdict().items():
+        if (family, name) not in INHERENT:
+            scale = 1.0 if name in PURE else RADIUS_MM * MM
+            good &= value >= -_ROUNDING * scale
+    if family == "arcs_epicycloid":
+        good &= design[2] >= 0.002 * RADIUS_MM
+    return good
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def compared(family: str, lobes: int, designs):
+    """Compare designs (n, d), in config units, with polygons.
+
+    Returns (n, 3): relative errors of area and polar moment, and the reference's own.
+    """
+
+    def compare(design):
+        profile = profile_of(family, lobes, jnp.asarray(RADIUS_MM * MM), design)
+        truth, rest = by_polygons(profile)
+        shape = geometry(profile)
+        errors = jnp.abs(jnp.stack([shape.area, shape.polar_area_moment]) / truth - 1)
+        return jnp.append(errors, rest)
+
+    return lax.map(compare, designs)
+
+
+def errors(family: str, lobes: int, count: int, random: np.random.Generator, size: int = 8):
+    """Draw `count` designs; return the sound ones (n, d) and their errors (n, 3)."""
+    # A family without parameters has one design.
+    designs = draw(family, lobes, count if FAMILY_KEYS[family] else 1, random, size)
+    kept = designs[np.asarray(judged(family, lobes, designs))]
+    if not len(kept):
+        return kept, np.zeros((0, 3))
+    # One size for all, so that a family is compiled once.
+    padded = np.concatenate([kept, np.repeat(kept[:1], len(designs) - len(kept), axis=0)])
+    return kept, np.asarray(compared(family, lobes, padded))[: len(kept)]
+
+
+def run(
+    quick: bool,
+    draws: int = 2000,
+    seed: int = 0,
+    say: Callable[[str], None] = lambda text: None,
+) -> list[Row]:
+    """Compare all families; a row for each family, size and number of lobes.
+
+    A reduced run takes the families and lobes of `QUICK`, and few draws.
+    """
+    families, lobes = (FAMILIES, LOBES) if not quick else QUICK
+    random = np.random.default_rng(seed)
+    rows: list[Row] = []
+    for family in families:
+        for size in COEFFICIENTS if family == "free_form" else (0,):
+            for number in lobes:
+                count = QUICK_DRAWS if quick else draws
+                found = errors(family, number, count, random, size)
+                rows.append(row_of(family, number, size, *found))
+                worst = np.max(found[1], initial=0.0)
+                say(f"{rows[-1]['family']}, {number} lobes: {len(found[0])} sound, {worst:.1e}")
+    return rows
+
+
+def row_of(family: str, lobes: int, size: int, designs: np.ndarray, found: np.ndarray) -> Row:
+    """List the greatest errors among sound designs (n, d), and the design that has the worst.
+
+    `found` (n, 3) is as returned by `compared`; `size` is the number of coefficients, or 0.
+    """
+    row: Row = {
+        "family": f"{family} {size}" if size else family,
+        "lobes": lobes,
+        "sound": len(designs),
+    }
+    for k, name in enumerate(("area", "polar_moment", "reference")):
+        row[f"{name}_error"] = float(np.max(found[:, k])) if len(found) else np.nan
+    worst = int(np.argmax(np.max(found[:, :2], axis=1))) if len(found) else None
+    values = [] if worst is None else designs[worst]
+    row["worst_design"] = " ".join(f"{x:.9g}" for x in values) if FAMILY_KEYS[family] else ""
+    return row

@@ -1,0 +1,45 @@
+"""Figure of the errors of reported gradients."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments._common.scenes import FORCES
+from experiments._common.style import COLORS, sheet
+from experiments.gradients.study import TOLERANCES, Row
+
+
+def errors_of(rows: Sequence[Row]) -> Figure:
+    """Draw the error over the check's own figure, and its distribution at every tolerance."""
+    picture, axes = sheet(10, 4.2, 1, 2)
+    left, right = axes[0]
+    for rtol, color, marker in zip(TOLERANCES, COLORS[:3], "os^", strict=True):
+        good = [r for r in rows if float(r["rtol"]) == rtol and r["status"] == "periodic"]
+        off = np.array([float(r["mean_force_N_error"]) for r in good])
+        said = np.array([float(r["gradient_disagreement"]) for r in good])
+        kept = np.isfinite(off)
+        left.loglog(said[kept], off[kept], marker, color=color, ms=4, alpha=0.7, label=f"{rtol:g}")
+        for name, style in zip(FORCES, ("-", "--"), strict=True):
+            errors = np.sort([float(r[f"{name}_error"]) for r in good])
+            errors = errors[np.isfinite(errors)]
+            share = 100 * (np.arange(errors.size) + 1) / errors.size
+            what = name.split("_")[0]
+            right.semilogx(errors, share, style, color=color, label=f"{what}, rtol {rtol:g}")
+    left.plot([1e-9, 1e-2], [1e-9, 1e-2], "k:", lw=1, label="equal")
+    left.set(
+        xlabel="disagreement on halved steps (relative)",
+        ylabel="error of the gradient of the mean\nagainst differences (relative)",
+        title="Check against error",
+    )
+    left.legend(title="solver.rtol")
+    right.set(
+        xlabel="error of the gradient against differences (relative)",
+        ylabel="share of design–scene pairs below (%)",
+        title="Errors, mean and peak force",
+        ylim=(0, 100),
+    )
+    right.legend(fontsize=8)
+    for ax in (left, right):
+        ax.grid(alpha=0.3)
+    return picture

@@ -1,0 +1,309 @@
+"""Compares reported gradients of random designs and scenes with differences of orbits.
+
+Draws designs (CIC with two and three lobes, arc and involute) and scenes (speed, load, backlash,
+gear, with gas and friction or a motor). Keeps those that settle on a periodic orbit, as many as
+possible with periods beyond one and some beyond four, and evaluates each at rtol 1e-8, 1e-9 and
+1e-10. The derivatives of the mean and peak force are compared with central differences of the
+forces of orbits closed with another method (dopri8) at 1e-12.
+"""
+
+import csv
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from experiments._common.scenes import CIC, FORCES
+from experiments._common.simulation import evaluator_of, orbit_at
+from rootsopt.config import Config, load
+from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.steady import agreement, close_orbit, no_tangents
+from rootsopt.evaluate import Evaluation, Evaluator
+from rootsopt.model import Model
+
+Row = dict[str, Any]
+TOLERANCES = (1e-8, 1e-9, 1e-10)
+STEP = 2e-5
+"""Relative step of the differences: orbits are known to 1e-12, which leaves 1e-7."""
+CLOSER = 1e-4
+"""Disagreement above which the differences are taken again with a quarter of the step, and
+extrapolated to step 0: close to a bifurcation forces bend."""
+SHARE = 0.6
+"""Share of pairs with a period beyond one that a draw waits for."""
+QUICK_COUNT = 4
+"""Pairs of a reduced run."""
+KINDS: dict[str, tuple[str, list[str]]] = {
+    "cic, 3 lobes": ("cic", []),
+    "cic, 2 lobes": ("cic", ["profile.lobes=2"]),
+    "cic, gas and friction": (
+        "cic",
+        [
+            "scene.load={pressure_difference_Pa: 2.0e4}",
+            "contact.friction={static: 0.2, kinetic: 0.1, stiction_speed_mm_s: 100, "
+            "friction_speed_mm_s: 1000}",
+        ],
+    ),
+    "cic, motor": (
+        "cic",
+        [
+            "scene.drive=torque",
+            "scene.motor={slope_N_m_s_per_rad: 0.1, inertia_kg_m2: 1.0e-3}",
+        ],
+    ),
+    "arc and involute": ("arc_involute", []),
+    "cic, long periods": ("cic", []),
+}
+LONG = "cic, long periods"
+"""Kind of which only orbits of five periods or more are kept, from livelier scenes: one pair in
+twenty."""
+PATIENCE = 60
+"""Scenes of the kind `LONG` drawn for each pair wanted, at most."""
+
+
+def pairs(seed: int, kind: str) -> Iterator[list[str]]:
+    """Yield endless overrides of configs/cic.yaml of one kind."""
+    family, fixed = KINDS[kind]
+    draw = np.random.default_rng([seed, list(KINDS).index(kind)])
+    lobes = 2 if "2 lobes" in kind else 3
+    while True:
+        angle, tip = draw.uniform(29, 42), draw.uniform(0.5, 5.0)
+        longest = 33.0 * np.sin(np.radians(angle)) * (np.pi / 2 / lobes - np.radians(tip))
+        values: dict[str, Any] = {
+            "profile.family": family,
+            "profile.pressure_angle_deg": round(angle, 2),
+            "profile.involute_length_mm": round(draw.uniform(0.3, 0.95) * longest, 3),
+            "profile.tip_arc_angle_deg": round(tip, 2),
+            "scene.speed_rpm": round(10 ** draw.uniform(2.8, 3.7), 1),
+            "scene.load.torque_N_m": round(10 ** draw.uniform(-0.2, 1.2), 3),
+            "scene.timing_gear.backlash_mm": round(draw.uniform(0.02, 0.4), 3),
+            "scene.timing_gear.damping_ratio": round(10 ** draw.uniform(-1.3, -0.2), 3),
+            "scene.timing_gear.stiffness_N_m_per_rad": round(10 ** draw.uniform(3.6, 4.8), 0),
+        }
+        if kind == LONG:
+            values |= {
+                "scene.speed_rpm": round(draw.uniform(1000, 3000), 1),
+                "scene.load.torque_N_m": round(draw.uniform(0.8, 5.0), 3),
+                "scene.timing_gear.backlash_mm": round(draw.uniform(0.15, 0.4), 3),
+                "scene.timing_gear.damping_ratio": round(draw.uniform(0.05, 0.35), 3),
+            }
+        if family == "arc_involute":
+            values["profile.tip_arc_angle_deg"] = "null"
+        if "scene.load" in "".join(fixed):
+            values.pop("scene.load.torque_N_m")
+        yield [*(f"{key}={value}" for key, value in values.items()), *fixed]
+
+
+@eqx.filter_jit
+def forces(model: Model, design, state, period, how: Integrator):
+    """Close an orbit; return (mean, peak) force, the residual and whether it was integrated."""
+    pair = model.pair(design)
+    orbit = close_orbit(pair, no_tangents(pair), state, period, how, check=False)
+    return jnp.stack([orbit.response[0], orbit.response[2]]), orbit.residual, orbit.flow.solved
+
+
+def differences(evaluator: Evaluator, found: Evaluation, step: float = STEP) -> np.ndarray:
+    """Differentiate mean and peak force by central differences of a relative `step`.
+
+    Returns (2, d), NaN where an orbit does not close.
+    """
+    how = Integrator("dopri8", jnp.asarray(1e-12), evaluator.orbit.max_steps)
+    design = np.array(list(found.design.values()))
+    period = jnp.asarray(found.steady_state["period"])
+    columns = []
+    for k, value in enumerate(design):
+        sides = []
+        for sign in (1, -1):
+            moved = design.copy()
+            moved[k] += sign * step * value
+            state = jnp.asarray(found.state)
+            force, residual, solved = forces(
+                evaluator.model, jnp.asarray(moved), state, period, how
+            )
+            closed = bool(solved) and float(residual) < 1e-10
+            sides.append(np.asarray(force) if closed else np.full(2, np.nan))
+        columns.append((sides[0] - sides[1]) / (2 * step * value))
+    return np.stack(columns, axis=1)
+
+
+def evaluated(config: Config) -> Iterator[tuple[float, Evaluation]]:
+    """Evaluate the design at every tolerance, each from rest, the loosest first."""
+    evaluator = evaluator_of(config, give_up_early=True, prepared=True)
+    for rtol in TOLERANCES:
+        yield rtol, orbit_at(evaluator, rtol)(series=False)
+
+
+def errors(found: Evaluation, truth: np.ndarray) -> list[float]:
+    """Find the greatest error of each gradient, relative to its greatest component."""
+    slopes = [np.array(list(found.gradient[measure].values())) for measure in FORCES]
+    return [
+        float(np.max(np.abs(slope - row)) / np.max(np.abs(row)))
+        for slope, row in zip(slopes, truth, strict=True)
+    ]
+
+
+def rows_of(
+    config: Config, kind: str, overrides: list[str], found: dict[float, Evaluation]
+) -> list[dict[str, Any]]:
+    """List the evaluations and their errors, a row for each tolerance."""
+    truth = None
+    rows = []
+    for rtol, one in found.items():
+        row: dict[str, Any] = {"kind": kind, "rtol": rtol, "status": one.status.label}
+        row |= {"period": one.steady_state.get("period"), "scene": " ".join(overrides)}
+        for name in ("residual", "floquet_multiplier"):
+            row[name] = one.steady_state.get(name)
+        for name in ("gradient_disagreement", "orbit_defect", "orbit_steps", "seconds"):
+            row[name] = one.statistics.get(name)
+        if one.usable:
+            if truth is None:
+                evaluator = evaluator_of(config, give_up_early=True)
+                truth = differences(evaluator, one)
+                if max(errors(one, truth)) > CLOSER:
+                    truth = (16 * differences(evaluator, one, STEP / 4) - truth) / 15
+            for measure, error in zip(FORCES, errors(one, truth), strict=True):
+                row[measure], row[f"{measure}_error"] = one.response[measure], error
+        rows.append(row)
+    return rows
+
+
+@dataclasses.dataclass(frozen=True)
+class Draw:
+    """The pairs drawn: how many, from which seed, and which part of the kinds.
+
+    `part` (k, n): every n-th kind, from the k-th on.
+    """
+
+    count: int = 200
+    seed: int = 0
+    part: tuple[int, int] = (0, 1)
+
+
+def wanted_of(quick: bool, count: int) -> dict[str, int]:
+    """Distribute the pairs over the kinds; the first kind gets most of them."""
+    kinds = [kind for kind in KINDS if kind != LONG][: 1 if quick else None]
+    wanted = {
+        kind: count * (2 if k == 0 else 1) // (len(kinds) + 1) for k, kind in enumerate(kinds)
+    }
+    wanted[kinds[0]] += count - sum(wanted.values())
+    return wanted if quick else wanted | {LONG: count // 20}
+
+
+def run(
+    quick: bool,
+    draw: Draw | None = None,
+    say: Callable[[str], None] = lambda text: None,
+    keep: Callable[[list[Row]], None] = lambda rows: None,
+) -> list[Row]:
+    """Measure the pairs of a draw; three rows for each pair, one for each tolerance.
+
+    `keep` is given all rows so far after each pair. A reduced run measures four pairs of one kind.
+    """
+    draw = draw or Draw()
+    part, parts = draw.part
+    wanted = wanted_of(quick, QUICK_COUNT if quick else draw.count)
+    rows: list[Row] = []
+    for kind in list(wanted)[part::parts]:
+        for new in pairs_of_kind(kind, wanted[kind], draw.seed, say):
+            rows += new
+            keep(rows)
+    return rows
+
+
+def pairs_of_kind(
+    kind: str, wanted: int, seed: int, say: Callable[[str], None]
+) -> Iterator[list[Row]]:
+    """Yield the rows of each pair of a kind, until there are as many as wanted."""
+    lively = plain = 0
+    for number, overrides in enumerate(pairs(seed, kind)):
+        if lively + plain >= wanted or (kind == LONG and number > PATIENCE * wanted):
+            break
+        # Rare longer periods are waited for, but not for ever.
+        patient = number < 6 * wanted
+        config = load(CIC, overrides)
+        series = evaluated(config)
+        first = next(series)
+        scout = int(first[1].steady_state.get("period", 0)) if first[1].usable else 0
+        if (
+            not scout
+            or (kind == LONG and scout < 5)
+            or (scout == 1 and patient and plain >= (1 - SHARE) * wanted)
+        ):
+            continue
+        new = rows_of(config, kind, overrides, dict([first, *series]))
+        lively, plain = lively + (scout > 1), plain + (scout == 1)
+        found = {row["rtol"]: (row["status"], row.get("mean_force_N_error")) for row in new}
+        say(f"{kind} {lively} {plain} period {new[0]['period']} {found}")
+        yield new
+
+
+def read(folder: Path) -> list[dict[str, Any]]:
+    """Read the rows of all parts."""
+    rows = []
+    for path in sorted(folder.glob("gradients_*.csv")):
+        with open(path, newline="") as file:
+            rows += list(csv.DictReader(file))
+    return rows
+
+
+@dataclasses.dataclass(frozen=True)
+class Judgement:
+    """Pairs, counts of their periods, quantiles of the errors, and broken promises.
+
+    `errors`: rtol → (periodic pairs, all pairs, force → (median, 95 %, greatest, compared)).
+    `broken`: a line for each gradient that is further off than its check promises, and for each
+    pair that ends without a result at a tolerance although a looser one has one.
+    """
+
+    pairs: int
+    periods: dict[int, int]
+    errors: dict[float, tuple[int, int, dict[str, tuple[float, float, float, int]]]]
+    broken: list[str]
+
+    def lines(self) -> Iterator[str]:
+        """Yield the table as text."""
+        yield f"{self.pairs} pairs"
+        yield f"periods: {self.periods}"
+        for rtol, (good, count, forces) in self.errors.items():
+            parts = [f"rtol {rtol:g}: {good} periodic of {count}"]
+            for name, (median, most, worst, compared) in forces.items():
+                parts.append(
+                    f"{name}: median {median:.1e}, 95 % {most:.1e}, most {worst:.1e}"
+                    f" ({compared} compared)"
+                )
+            yield "; ".join(parts)
+        yield from self.broken
+        yield f"{len(self.broken)} promises broken"
+
+
+def judge(rows: Sequence[Row]) -> Judgement:
+    """Compare the rows of all parts with what the checks promise."""
+    scenes: dict[str, dict[float, Row]] = {}
+    for row in rows:
+        scenes.setdefault(row["scene"], {})[float(row["rtol"])] = row
+    periods = sorted(int(float(found[TOLERANCES[0]]["period"])) for found in scenes.values())
+    errors, broken = {}, []
+    for rtol in TOLERANCES:
+        mine = [found[rtol] for found in scenes.values()]
+        good = [row for row in mine if row["status"] == "periodic"]
+        quantiles = {}
+        for name in FORCES:
+            off = np.array([float(row[f"{name}_error"]) for row in good])
+            off = off[np.isfinite(off)]
+            shares = np.quantile(off, [0.5, 0.95, 1.0]).tolist() if off.size else [np.nan] * 3
+            quantiles[name] = (*shares, off.size)
+        errors[rtol] = len(good), len(mine), quantiles
+        limit = float(agreement(jnp.asarray(rtol)))
+        for row in good:
+            worst = np.nanmax([0.0, *(float(row[f"{name}_error"]) for name in FORCES)])
+            if worst > limit:
+                broken.append(f"OFF {rtol} {worst} {row['scene']}")
+    for scene, found in scenes.items():
+        usable = [found[rtol]["status"] == "periodic" for rtol in TOLERANCES]
+        if usable[0] and not all(usable):
+            broken.append(f"WORSE {[found[rtol]['status'] for rtol in TOLERANCES]} {scene}")
+    counts = {k: periods.count(k) for k in dict.fromkeys(periods)}
+    return Judgement(len(scenes), counts, errors, broken)

@@ -1,0 +1,101 @@
+"""Compares a measured rotor with its design: form, gap in rolling, contact force.
+
+Makes the points that a coordinate measuring machine may give of a rotor ground a little wrong. They
+lie along the outline of the config's profile, with a form error of its addenda, another for each
+lobe, and noise, in clockwise order and turned. The points are imported as family `outline`.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments._common.scenes import CIC
+from experiments._common.simulation import evaluate, profile_of
+from rootsopt.config import Config, load
+from rootsopt.contact.nodes import signed_distance
+from rootsopt.files import ResultFolder
+from rootsopt.model import check_geometry, design_keys
+from rootsopt.outline.conjugacy import Conjugacy, conjugacy
+from rootsopt.outline.source import outline_of
+from rootsopt.profiles import Profile, outline
+
+FORM, LOBES, NOISE = 20e-3, 3e-3, 1e-3
+"""Form error of the addenda, difference among the lobes, RMS noise (mm)."""
+TURN = 17.0
+"""Angle (deg) of a lobe in the coordinates of the measurement."""
+MM = 1e-3
+
+
+def complex_points(profile: Profile, points: int) -> np.ndarray:
+    """Return a closed outline (mm) without its last point, counter-clockwise from a tip on +x."""
+    return np.asarray(outline(profile, points))[:-1] @ [1, 1j] / MM
+
+
+def measured(profile: Profile, seed: int = 0) -> np.ndarray:
+    """Make the points (n,) of the rotor as measured (mm)."""
+    random = np.random.default_rng(seed)
+    points = complex_points(profile, 240)
+    along = np.roll(points, -1) - np.roll(points, 1)
+    normal = -1j * along / np.abs(along)
+    radius = float(profile.pitch_radius) / MM
+    above = np.clip((np.abs(points) - radius) / (np.max(np.abs(points)) - radius), 0, 1)
+    lobe = np.round(np.angle(points) * profile.lobes / (2 * np.pi))
+    error = FORM + LOBES * np.sin(2 * np.pi * lobe / profile.lobes)
+    error = error * np.sin(np.pi * above) ** 2 + random.normal(0, NOISE, len(points))
+    return (points + normal * error)[::-1] * np.exp(1j * np.radians(TURN))
+
+
+def imported(config: Config, path: Path) -> Config:
+    """Put the outline in a file in the place of a config's profile."""
+    gone = dict.fromkeys(design_keys(config))
+    found = {"family": "outline", "outline_file": str(path), "outline_smoothing_mm": NOISE}
+    profile = config.profile.model_copy(update=gone | found)
+    return config.model_copy(update={"profile": profile})
+
+
+def off_um(points: np.ndarray, design: Profile) -> np.ndarray:
+    """Measure the normal distance (µm) of points (mm) from a design."""
+    fine = np.asarray(outline(design, 2000)) / MM
+    return 1e3 * signed_distance(np.stack([np.real(points), np.imag(points)], axis=1), fine)
+
+
+@dataclasses.dataclass(frozen=True)
+class Results:
+    """Both profiles, the points on the axes of the design (mm), the gaps in rolling by name, and
+    the record of all numbers found."""
+
+    config: Config
+    design: Profile
+    profile: Profile
+    points: np.ndarray
+    gaps: dict[str, Conjugacy]
+    record: dict[str, Any]
+
+
+def run(quick: bool, folder: ResultFolder, config: str = CIC) -> Results:
+    """Make a measured rotor, import it, and compare it with its design.
+
+    The points are written into `folder` as measured.csv, which the import reads. A reduced run
+    leaves out the simulations.
+    """
+    settings = load(config)
+    design = profile_of(settings)
+    points = measured(design)
+    columns = {"x_mm": np.real(points), "y_mm": np.imag(points)}
+    other = imported(settings, folder.write_csv("measured.csv", columns).absolute())
+    check_geometry(other)
+    profile, checks = outline_of(other.profile)
+    gaps = {"design": conjugacy(design), "measured": conjugacy(profile)}
+    own = points * np.exp(1j * np.radians(checks.turned_deg))
+    record: dict[str, Any] = {
+        "outline": checks.record() | gaps["measured"].record(),
+        "form_found_um": float(np.max(off_um(complex_points(profile, 240), design))),
+        "form_given_um": FORM / MM,
+    }
+    if not quick:
+        for name, one in (("design", settings), ("measured", other)):
+            evaluation = evaluate(one)
+            record[name] = {"status": evaluation.status.label} | evaluation.response
+    return Results(settings, design, profile, own, gaps, record)

@@ -1,0 +1,78 @@
+"""Figures of the paper's scene: forces, how far they determine it, and the search."""
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+
+from experiments._common.style import BLUE, COLORS, grid_below, sheet
+from experiments.paper.scene import FAMILIES, PAPER, QUANTITIES, Response, config_of
+from experiments.paper.study import Found, Row
+from rootsopt.plot import plot_force, plot_spectrum
+
+LOWEST, HIGHEST = 0.1, 300.0
+"""Misfits (%) shown. Greater ones, and motions that are not periodic, stand at the upper edge."""
+MARKS = "os^Dvp"
+
+
+def force_figures(found: Response) -> tuple[Figure, Figure]:
+    """Draw the contact force over time and over frequency, EE above CIC as in the paper."""
+    series, responses = {}, {}
+    for family in ("ee", "cic"):
+        number = FAMILIES.index(family)
+        one = found.evaluations[number]
+        mean, peak = PAPER[number]
+        title = f"{family.upper()}; the paper: mean {mean:.1f} N, maximum {peak:.1f} N"
+        series[title], responses[title] = one.series, one.response
+    over_time, axes = sheet(10, 6, 2)
+    plot_force(axes[:, 0], series, responses)
+    over_frequency, axes = sheet(10, 6, 2)
+    series = {title.split(";")[0]: run for title, run in series.items()}
+    config = config_of("cic")
+    frequency = config.scene.speed_rpm / 60 * config.profile.lobes
+    plot_spectrum(axes[:, 0], series, frequency)
+    return over_time, over_frequency
+
+
+def uniqueness_figure(alone: list[Row], solved: list[Row]) -> Figure:
+    """Draw the misfit of a quantity changed alone, and with the others solved for again."""
+    made, axes = sheet(11, 4.8, 1, 2 if solved else 1, sharey=True)
+    panels = [(alone, "changed alone"), (solved, "the others solved for again")]
+    for ax, (rows, title) in zip(axes[0], panels, strict=False):
+        for quantity, color, mark in zip(QUANTITIES, COLORS, MARKS, strict=False):
+            own = [row for row in rows if row["changed"] == quantity.key]
+            own = [(100 * row["change"], 100 * row["misfit"]) for row in own]
+            change, misfit = np.array(sorted([*own, (0.0, LOWEST)])).T
+            label = quantity.label.split(" (")[0]
+            shown = np.clip(misfit, LOWEST, HIGHEST)
+            ax.plot(change, shown, marker=mark, color=color, label=label, clip_on=False)
+        ax.axhline(10, color="black", linestyle="--", linewidth=1)
+        ax.set(
+            xlabel="change of the quantity (%)", title=title, yscale="log", ylim=(LOWEST, HIGHEST)
+        )
+        grid_below(ax)
+    axes[0, 0].set_ylabel("greatest error of the four forces (%)")
+    axes[0, -1].legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
+    return made
+
+
+def search_figure(found: Found) -> Figure:
+    """Draw the misfit of the searched scenes over each quantity, periodic ones apart."""
+    made, axes = sheet(11, 6.4, 2, 3, sharey=True)
+    misfit = 100 * found.misfits
+    for number, (ax, quantity) in enumerate(zip(axes.flat, QUANTITIES, strict=True)):
+        for chosen, color, label in (
+            (~found.periodic, "0.75", "a motion does not repeat"),
+            (found.periodic, BLUE, "both motions periodic"),
+        ):
+            ax.plot(found.values[chosen, number], misfit[chosen], ".", color=color, ms=2.5,
+                    label=label, rasterized=True)  # fmt: skip
+        ax.axhline(10, color="black", linestyle="--", linewidth=1)
+        ax.set(xlabel=quantity.label, yscale="log", ylim=(1, 300))
+        if quantity.logarithmic:
+            ax.set_xscale("log")
+            ax.xaxis.set_minor_formatter(NullFormatter())
+        grid_below(ax)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("greatest error of the four forces (%)")
+    axes[0, 0].legend(loc="lower left", frameon=False, markerscale=4, fontsize=8)
+    return made

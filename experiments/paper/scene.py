@@ -1,0 +1,270 @@
+"""The quantities the paper leaves out, as numbers that can be searched and differentiated.
+
+`QUANTITIES` names them with plausible ranges. `Pairs` gives the four forces of the paper's section
+4 for values of them, with derivatives on periodic orbits. `polished` solves by these derivatives
+for values that give the paper's forces.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike, NDArray
+
+from experiments._common.scenes import FORCES, shipped
+from experiments._common.simulation import evaluator_of
+from rootsopt.config import Config
+from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.steady import close_orbit
+from rootsopt.evaluate import Evaluation, Evaluator
+from rootsopt.model import MM, Model, design_vector
+from rootsopt.programs import Program
+from rootsopt.status import Status
+
+
+@dataclasses.dataclass(frozen=True)
+class Quantity:
+    """A quantity that the paper does not state.
+
+    Its key in the config, the plausible range in the config's unit, whether it is searched on a
+    logarithmic scale, and its name in figures.
+    """
+
+    key: str
+    low: float
+    high: float
+    logarithmic: bool
+    label: str
+
+
+QUANTITIES = (
+    Quantity("rotor.length_mm", 30.0, 400.0, False, "rotor length (mm)"),
+    Quantity("scene.load.torque_N_m", 0.2, 9.55, False, "load torque (N·m)"),
+    Quantity("scene.timing_gear.stiffness_N_m_per_rad", 1e3, 1e6, True, "gear stiffness (N·m/rad)"),
+    Quantity("scene.timing_gear.damping_ratio", 0.01, 1.0, True, "gear damping ratio"),
+    Quantity("scene.timing_gear.backlash_mm", 0.02, 1.5, True, "gear backlash (mm)"),
+    Quantity("contact.clearance_mm", 0.005, 0.5, True, "flank clearance (mm)"),
+)
+"""In the order of all vectors of values (p,). Ranges and their reasons: docs/paper.md."""
+FAMILIES = ("cic", "ee")
+PAPER = np.array([[102.4, 1973.3], [1047.1, 5661.4]])
+"""Mean and maximum contact force (N) by pair (`FAMILIES`), from the paper's section 4."""
+_NEAR = 0.1
+"""Longest step of `polished`, in logarithms of the quantities."""
+
+
+def config_of(family: str, values: ArrayLike | None = None, *overrides: str) -> Config:
+    """Load the pair's shipped config, with other values (p,) of the quantities (config units)."""
+    at: list[str] = []
+    if values is not None:
+        numbers = np.asarray(values, float).tolist()
+        at = [f"{q.key}={value!r}" for q, value in zip(QUANTITIES, numbers, strict=True)]
+    return shipped(f"paper_{family}", *at, *overrides)
+
+
+def values_of(config: Config) -> NDArray[np.float64]:
+    """Read the values (p,) of the quantities from a config, in its units."""
+
+    def found(key: str) -> float:
+        return float(functools.reduce(getattr, key.split("."), config))  # pyright: ignore[reportArgumentType]
+
+    return np.array([found(quantity.key) for quantity in QUANTITIES])
+
+
+@dataclasses.dataclass(frozen=True)
+class Response:
+    """Both pairs with one set of `values` (p,).
+
+    `evaluations` are in the order of `FAMILIES`. `slopes` (2, 2, p): derivatives of the logarithms
+    of the forces with respect to those of the quantities; None unless both motions are periodic.
+    """
+
+    values: NDArray[np.float64]
+    evaluations: tuple[Evaluation, Evaluation]
+    slopes: NDArray[np.float64] | None
+
+    @property
+    def forces(self) -> NDArray[np.float64]:
+        """(2, 2) mean and peak force (N) by pair, NaN where there is none."""
+        return np.array(
+            [[one.response.get(name, np.nan) for name in FORCES] for one in self.evaluations]
+        )
+
+    @property
+    def errors(self) -> NDArray[np.float64]:
+        """(2, 2) relative differences from the paper's forces."""
+        return self.forces / PAPER - 1
+
+    @property
+    def misfit(self) -> float:
+        """The greatest relative difference, infinite without forces."""
+        worst = np.max(np.abs(self.errors))
+        return float(worst) if np.isfinite(worst) else np.inf
+
+    @property
+    def periods(self) -> tuple[int, ...]:
+        """Mesh periods after which each motion repeats; 0 where it does not."""
+        return tuple(int(one.steady_state.get("period", 0)) for one in self.evaluations)
+
+    @property
+    def usable(self) -> bool:
+        """Whether both motions are stable periodic orbits."""
+        return all(one.status is Status.PERIODIC for one in self.evaluations)
+
+
+class Pairs:
+    """Evaluates both pairs for values of the quantities; compiled programs are shared.
+
+    With `give_up_early` a motion that settles late is given up; `overrides` of the configs, each
+    `dotted.key=value`.
+    """
+
+    def __init__(self, *overrides: str, give_up_early: bool = False):
+        self.overrides, self.give_up_early = overrides, give_up_early
+
+    def __call__(
+        self,
+        values: ArrayLike,
+        slopes: bool = True,
+        series: bool = False,
+    ) -> Response:
+        """Simulate both pairs from rest with `values` (p,) in config units."""
+        values = np.asarray(values, float)
+        evaluations, rows = [], []
+        for family in FAMILIES:
+            config = config_of(family, values, *self.overrides)
+            evaluator = evaluator_of(config, self.give_up_early)
+            one = evaluator(series=series)
+            evaluations.append(one)
+            if slopes and one.usable:
+                rows.append(_slopes(evaluator, one, values))
+        complete = len(rows) == len(FAMILIES)
+        first, second = evaluations
+        return Response(values, (first, second), np.stack(rows) if complete else None)
+
+
+def _slopes(evaluator: Evaluator, one: Evaluation, values) -> NDArray[np.float64]:
+    """Differentiate log mean and log peak force with respect to the log quantities, (2, p)."""
+    orbit = _orbit(
+        evaluator.model,
+        design_vector(evaluator.config),
+        jnp.asarray(values),
+        jnp.asarray(one.state),
+        jnp.asarray(one.steady_state["period"]),
+        evaluator.orbit,
+    )
+    mean, _, peak = np.asarray(orbit.response)
+    by_mean, _, by_peak = np.asarray(orbit.sensitivity)
+    return np.stack([by_mean / mean, by_peak / peak]) * values
+
+
+def pair_of(model: Model, design, values: Float[Array, " p"]) -> RotorPair:
+    """Make the rotor pair with these values of the quantities (config units)."""
+    length, torque, stiffness, damping_ratio, backlash, clearance = values
+    half = backlash * MM / (2 * model.pitch_radius)
+    gear = eqx.tree_at(lambda g: (g.stiffness, g.half_backlash), model.gear, (stiffness, half))
+    tuned = dataclasses.replace(
+        model,
+        length=length * MM,
+        load_torque=torque,
+        gear=gear,
+        gear_damping_ratio=damping_ratio,
+        clearance=clearance * MM,
+    )
+    return tuned.pair(design)
+
+
+@Program
+def _orbit(model: Model, design, values: Float[Array, " p"], state, period, how: Integrator):
+    """Close the orbit, with derivatives with respect to the values."""
+
+    def arrays(values):
+        return eqx.filter(pair_of(model, design, values), eqx.is_inexact_array)
+
+    push = functools.partial(jax.jvp, arrays, (values,))
+    tangents = jax.vmap(lambda direction: push((direction,))[1])(jnp.eye(values.shape[0]))
+    return close_orbit(pair_of(model, design, values), tangents, state, period, how)
+
+
+def polished(
+    pairs: Pairs,
+    values: ArrayLike,
+    held: Sequence[int] = (),
+    within: float = 1e-4,
+    steps: int = 12,
+    target: NDArray[np.float64] = PAPER,
+) -> Response:
+    """Solve for the values nearest to `values` that give the `target` forces; `held` ones stay.
+
+    Gauss-Newton steps of least length in the logarithms, halved until the misfit falls and both
+    motions stay periodic; both start at rest every time. Ends when the misfit is `within`, or can
+    no longer be lowered. Returns the best response found, inside the plausible ranges.
+    """
+    free = [i for i in range(len(QUANTITIES)) if i not in held]
+    low, high = (np.log([getattr(q, end) for q in QUANTITIES]) for end in ("low", "high"))
+    best = pairs(values)
+    for _ in range(steps):
+        if best.slopes is None or best.misfit <= within:
+            break
+        wanted = np.log(target / best.forces).ravel()
+        place = np.log(best.values)
+        step = _least_step(best.slopes.reshape(4, -1), wanted, free)
+        # A quantity at an end of its range that would leave it stays there.
+        inside = [i for i in free if low[i] < place[i] + step[i] * 1e-3 < high[i]]
+        step = _least_step(best.slopes.reshape(4, -1), wanted, inside)
+        step *= min(1.0, _NEAR / max(np.max(np.abs(step)), 1e-12))
+        for _ in range(5):
+            at = np.clip(place + step, low, high)
+            tried = pairs(np.exp(at))
+            if tried.slopes is not None and tried.misfit < best.misfit:
+                break
+            step /= 2
+        else:
+            break
+        best = tried
+    return best
+
+
+def compensated(
+    values: NDArray[np.float64], slopes: NDArray[np.float64], number: int, factor: float
+) -> NDArray[np.float64]:
+    """Multiply the `number`-th value by `factor`, and change the others (p,) as little as possible.
+
+    The forces stay the same to first order, and the others within their ranges.
+    """
+    others = [i for i in range(len(values)) if i != number]
+    flat = slopes.reshape(-1, len(values))
+    step = _least_step(flat, -flat[:, number] * np.log(factor), others)
+    step[number] = np.log(factor)
+    low, high = ([getattr(q, end) for q in QUANTITIES] for end in ("low", "high"))
+    return np.clip(values * np.exp(step), low, high)
+
+
+def _least_step(slopes, wanted, free: Sequence[int]) -> NDArray[np.float64]:
+    """Find the shortest step (p,) of the `free` quantities that changes the forces as `wanted`."""
+    step = np.zeros(slopes.shape[1])
+    step[list(free)] = np.linalg.pinv(slopes[:, list(free)], rcond=1e-3) @ wanted
+    return step
+
+
+def summary(response: Response) -> dict[str, Any]:
+    """Record values, forces, errors and regimes."""
+    pairs = {}
+    for family, one, row, errors in zip(
+        FAMILIES, response.evaluations, response.forces, response.errors, strict=True
+    ):
+        pairs[family] = {
+            "status": one.status.label,
+            "steady_state": one.steady_state,
+            "forces_N": dict(zip(FORCES, map(float, row), strict=True)),
+            "errors": dict(zip(FORCES, map(float, errors), strict=True)),
+        }
+    values = {q.key: float(v) for q, v in zip(QUANTITIES, response.values, strict=True)}
+    return {"values": values, "misfit": response.misfit, **pairs}

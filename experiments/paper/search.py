@@ -1,0 +1,230 @@
+"""Global search for the quantities the paper leaves out, compiled by Numba.
+
+Simulates thousands of scenes from rest with `experiments._common.engines.numba_pair` and rootsopt's
+contact map of each rotor, made once for all scenes. That is coarse, but within a percent or so of
+the package on a periodic motion. SciPy's differential evolution minimises the distance of the four
+forces from the paper's over the whole box of plausible values.
+"""
+
+import dataclasses
+import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.optimize import differential_evolution
+
+from experiments._common.engines import Motion, Rotor, Scene, motion_of
+from experiments._common.engines.numba_pair import Search, Table, integrate
+from experiments._common.simulation import profile_of
+from experiments.paper.scene import FAMILIES, PAPER, QUANTITIES, Quantity, config_of
+from rootsopt.contact.map import MapContact
+from rootsopt.profiles import geometry
+
+_DEEPEST = -0.035
+"""Relative rotation (rad) down to which the flanks are mapped: all plays, and some more."""
+_ROLLS, _RELATIVES = 1024, 96
+_SETTLE, _WINDOW, _RTOL = 32, 12, 1e-5
+"""Mesh periods before the forces count and while they do; tolerance of the motion."""
+_LONGEST = 6
+"""Longest repetition looked for (mesh periods)."""
+_REPEATS = 1e-2
+"""Scaled difference below which a motion repeats."""
+_APERIODIC = 0.35
+"""What a pair that does not repeat adds to the cost of a scene, in logarithms of a force."""
+_LOST = 5.0
+"""Cost of a scene whose lobes pass through each other."""
+
+
+class Rotors(NamedTuple):
+    """A pair's polar area moment (m⁴) and contact map, and what its compiled motion needs."""
+
+    moment: float
+    table: Table
+    rotor: Rotor
+    search: Search
+    scene: Scene
+
+
+class Samples(NamedTuple):
+    """n scenes: `values` (n, p), `forces` (n, 2, 2) by pair (N, NaN if lost) and `periods`
+    (n, 2) in mesh periods, 0 where the motion does not repeat."""
+
+    values: NDArray[np.float64]
+    forces: NDArray[np.float64]
+    periods: NDArray[np.int64]
+
+    @property
+    def misfits(self) -> NDArray[np.float64]:
+        """(n,) greatest relative difference of a force from the paper's; inf if lost."""
+        worst = np.max(np.abs(self.forces / PAPER - 1), axis=(1, 2))
+        return np.where(np.isfinite(worst), worst, np.inf)
+
+    @property
+    def periodic(self) -> NDArray[np.bool_]:
+        """(n,) whether both motions repeat."""
+        return np.all(self.periods > 0, axis=1)
+
+    @classmethod
+    def joined(cls, parts: list["Samples"]) -> "Samples":
+        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def rotors_of(family: str) -> Rotors:
+    """Make what all scenes with a pair share."""
+    config = config_of(family, None, "solver.fidelity=map")
+    profile = profile_of(config)
+    contact = jax.jit(lambda p: MapContact.of(p, _DEEPEST, _ROLLS, _RELATIVES))(profile)  # pyright: ignore[reportArgumentType]
+    table = Table(
+        np.asarray(contact.coefficients),
+        *(float(x) for x in (contact.first_roll, contact.roll_step)),
+        *(float(x) for x in (contact.deepest, contact.relative_step)),
+    )
+    # With a map, the compiled motion asks the rotor for its pitch angle alone.
+    radius, lobes = config.profile.pitch_radius_mm * 1e-3, config.profile.lobes
+    rotor = Rotor(lobes, radius, 0.0, math.pi / (2 * lobes), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    idle = Search(np.zeros((1, 5)), np.zeros(1))
+    contact_config, scene = config.contact, config.scene
+    unset = Scene(
+        lobes=lobes,
+        pitch_radius=radius,
+        length=math.nan,
+        density=config.rotor.density_kg_m3,
+        stiffness=contact_config.stiffness_N_per_mm_e / 1e-3**contact_config.exponent,
+        exponent=contact_config.exponent,
+        damping=contact_config.max_damping_N_s_per_mm * 1e3,
+        full_damping_depth=contact_config.full_damping_depth_mm * 1e-3,
+        smoothing=contact_config.rounding_mm * 1e-3,
+        clearance=math.nan,
+        speed=scene.speed_rpm * 2 * math.pi / 60,
+        load_torque=math.nan,
+        gear_stiffness=math.nan,
+        gear_damping_ratio=math.nan,
+        half_backlash=math.nan,
+        gear_rounding=contact_config.rounding_mm * 1e-3 / radius,
+    )
+    return Rotors(float(geometry(profile).polar_area_moment), table, rotor, idle, unset)
+
+
+def motion_at(rotors: Rotors, values: NDArray[np.float64]) -> Motion:
+    """Constants of the motion with these values (p,) of the quantities."""
+    length, torque, stiffness, damping_ratio, backlash, clearance = map(float, values)
+    scene = dataclasses.replace(
+        rotors.scene,
+        length=length * 1e-3,
+        load_torque=torque,
+        gear_stiffness=stiffness,
+        gear_damping_ratio=damping_ratio,
+        half_backlash=backlash * 1e-3 / (2 * rotors.scene.pitch_radius),
+        clearance=clearance * 1e-3,
+    )
+    return motion_of(scene, rotors.moment)
+
+
+@njit(nogil=True, error_model="numpy")
+def _simulate(rotor, motion, table, search, settle, window, rtol):
+    """Mean and peak force (N) over the window from rest, and the period (0: none); NaN if the
+    lobes pass through each other."""
+    angle = rate = total = peak = 0.0
+    states = np.zeros((window, 2))
+    for i in range(settle + window):
+        angle, rate, part, _, top, _, _, _ = integrate(
+            rotor, motion, table, search, 0.0, 1.0, angle, rate, rtol, i >= settle
+        )
+        if not abs(angle) * motion.angle_scale < -table.deepest or math.isnan(part):
+            return math.nan, math.nan, 0
+        if i >= settle:
+            total += part
+            peak = max(peak, top)
+            states[i - settle] = angle, rate
+    period = 0
+    for k in range(_LONGEST, 0, -1):
+        if np.abs(states[k:] - states[:-k])[-_LONGEST:].max() < _REPEATS:
+            period = k
+    return total / window * motion.force_scale, peak, period
+
+
+def scan(pairs: list[Rotors], values: NDArray[np.float64]) -> Samples:
+    """Simulate both pairs for each of `values` (n, p), by a thread for each core."""
+
+    def one(at):
+        found = []
+        for rotors in pairs:
+            motion = motion_at(rotors, at)
+            settings = rotors.table, rotors.search, _SETTLE, _WINDOW, _RTOL
+            found.append(_simulate(rotors.rotor, motion, *settings))
+            if math.isnan(found[-1][0]):
+                return [(math.nan, math.nan, 0)] * len(pairs)
+        return found
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        found = np.array(list(pool.map(one, values)), float)
+    return Samples(values, found[..., :2], found[..., 2].astype(int))
+
+
+def costs(samples: Samples) -> NDArray[np.float64]:
+    """(n,) root mean square of log(force / paper's), more where a motion does not repeat."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        away = np.log(np.maximum(samples.forces, 1e-3) / PAPER)
+        cost = np.sqrt(np.mean(away**2, axis=(1, 2)))
+    cost += _APERIODIC * np.sum(samples.periods == 0, axis=1)
+    return np.where(np.isfinite(cost), cost, _LOST)
+
+
+def values_at(
+    points: NDArray[np.float64], quantities: Sequence[Quantity] = QUANTITIES
+) -> NDArray[np.float64]:
+    """Values (n, p) of the quantities at points (n, p) of the unit box of their ranges."""
+    low, high = (np.array([getattr(q, end) for q in quantities]) for end in ("low", "high"))
+    logarithmic = low * (high / low) ** points
+    return np.where([q.logarithmic for q in QUANTITIES], logarithmic, low + (high - low) * points)
+
+
+def explore(
+    seed: int,
+    generations: int,
+    population: int,
+    quantities: Sequence[Quantity] = QUANTITIES,
+    report: Callable[[Samples], None] = lambda samples: None,
+) -> Samples:
+    """All scenes that differential evolution from `seed` looks at, over the box of the ranges of
+    `quantities`; `population` scenes for each quantity in a generation."""
+    pairs = [rotors_of(family) for family in FAMILIES]
+    parts: list[Samples] = []
+
+    def cost(points):
+        parts.append(scan(pairs, values_at(points.T, quantities)))
+        report(parts[-1])
+        return costs(parts[-1])
+
+    differential_evolution(
+        cost,
+        [(0.0, 1.0)] * len(QUANTITIES),
+        maxiter=generations,
+        popsize=population,
+        mutation=(0.4, 0.9),
+        recombination=0.8,
+        tol=0.0,
+        init="sobol",
+        rng=np.random.default_rng(seed),
+        polish=False,
+        updating="deferred",
+        vectorized=True,
+    )
+    return Samples.joined(parts)
+
+
+def regimes(samples: Samples, within: float) -> list[int]:
+    """Indices of the best scene of every regime (periods of both motions), best first, among
+    those that repeat and have a misfit of at most `within`."""
+    order = np.argsort(samples.misfits)
+    found: dict[tuple[int, ...], int] = {}
+    for i in order[: np.searchsorted(samples.misfits[order], within, side="right")]:
+        if samples.periodic[i]:
+            found.setdefault(tuple(samples.periods[i]), int(i))
+    return list(found.values())

@@ -1,0 +1,277 @@
+"""Simulates the paper's scene, and studies how far its forces determine what it leaves out.
+
+Section 4 of the paper gives the mean and maximum contact force of a CIC and an EE pair, but not the
+rotors' length, load, timing gear or backlash. `run` simulates the values of
+`configs/paper_cic.yaml` and `configs/paper_ee.yaml` from rest. It looks for motions that coexist,
+takes other definitions of mean and maximum, changes each quantity alone, and changes each with the
+others solved for again. `look` searches for such values anew, in the box of plausible ones.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from experiments._common.driver import NoResultError
+from experiments._common.simulation import evaluator_of
+from experiments.paper.scene import (
+    FAMILIES,
+    PAPER,
+    QUANTITIES,
+    Pairs,
+    Quantity,
+    Response,
+    compensated,
+    config_of,
+    polished,
+    values_of,
+)
+from rootsopt import basins
+from rootsopt.evaluate import CHAOS_WINDOW, lyapunov_program, unsettled
+from rootsopt.model import design_vector
+
+WINDOWS = ((0.0, 0.1), (0.0, 0.2), (0.05, 0.2), (0.1, 0.2), (0.1, 0.8))
+"""Start and end (s) of the windows that mean and maximum may have been taken over."""
+THINNINGS = (1, 3, 15)
+"""Each keeps every n-th sample of the window."""
+GRID = ("attractors.relatives=24", "attractors.rates=18")
+"""Initial states of the motions that coexist."""
+OTHERS = {
+    "tight play": (330.0, 5.6142, 7252.4, 0.77, 0.41829, 0.076577),
+    "low gear damping": (361.942, 6.5715, 27871.46, 0.6085, 0.8734, 0.225),
+    "short rotor": (253.46, 5.6804, 16489.5, 0.9866, 1.0063, 0.2879),
+    "light load": (300.23, 0.21735, 31959.0, 0.93524, 0.99737, 0.29273),
+}
+"""Other values that came out of searches; they are solved again for the paper's forces."""
+CHANGES = {False: (-0.1, -0.05, -0.02, -0.01, 0.01, 0.02, 0.05, 0.1), True: (-1e-3, 1e-3)}
+"""Shares by which each quantity is changed alone, in a full and in a reduced run."""
+STEP, COUNT = 0.04, 6
+"""Factor (less 1) and greatest number of steps each way along the profile."""
+WITHIN, LIMIT = 5e-3, 0.03
+"""Misfit below which a place of the profile is good enough, and above which the profile ends."""
+GENERATIONS, POPULATION = 70, 16
+QUICK_SEARCH = 1, 2
+"""Generations and population of a reduced search."""
+QUICK = ("solver.fidelity=linear",)
+"""Settings of a reduced run: compiled in half the time, and some 3 % off."""
+TARGET = 0.1
+"""Error of a force above which a search has found nothing."""
+POLISHED = 4
+"""Regimes whose best scene is solved for the paper's forces."""
+Row = dict[str, Any]
+Say = Callable[[str], None]
+
+
+def row_of(response: Response) -> Row:
+    """List values, forces, periods and misfit."""
+    row: Row = {q.key: v for q, v in zip(QUANTITIES, response.values, strict=True)}
+    for family, (mean, peak), period, one in zip(
+        FAMILIES, response.forces, response.periods, response.evaluations, strict=True
+    ):
+        row |= {
+            f"{family}_status": one.status.label,
+            f"{family}_period": period,
+            f"{family}_multiplier": one.steady_state.get("floquet_multiplier"),
+            f"{family}_mean_force_N": mean,
+            f"{family}_peak_force_N": peak,
+        }
+    return row | {"misfit": response.misfit}
+
+
+def motions(values: ArrayLike) -> list[Row]:
+    """Find the motions that coexist with these values; a row for each."""
+    rows = []
+    for family in FAMILIES:
+        found = basins.find(evaluator_of(config_of(family, values, *GRID)))
+        rows += [{"pair": family} | row for row in found.summary()]
+        rows += [{"pair": family, "status": k, "share": v} for k, v in found.lost.items()]
+    return rows
+
+
+def definitions(values: ArrayLike) -> list[Row]:
+    """Take mean and maximum over windows of one motion from rest, start-up included or not.
+
+    Returns a row for each window and sampling rate.
+    """
+    runs = []
+    for family in FAMILIES:
+        evaluator = evaluator_of(config_of(family, values))
+        pair = evaluator.pair(design_vector(evaluator.config))
+        window = lyapunov_program(pair, np.zeros(2), CHAOS_WINDOW, evaluator.transient)
+        *_, series = unsettled(pair, window, True)
+        assert series is not None
+        runs.append(series)
+    rows = []
+    for begin, end in WINDOWS:
+        for thinning in THINNINGS:
+            forces = []
+            for run in runs:
+                inside = (run.time >= begin) & (run.time < end)
+                force = run.force[inside][::thinning]
+                forces.append([np.mean(force), np.max(force)])
+            rate = 1 / (thinning * (runs[0].time[1] - runs[0].time[0]))
+            row: dict[str, Any] = {"begin_s": begin, "end_s": end, "rate_Hz": rate}
+            for family, (mean, peak) in zip(FAMILIES, forces, strict=True):
+                row |= {f"{family}_mean_force_N": mean, f"{family}_max_force_N": peak}
+            rows.append(row | {"misfit": np.max(np.abs(np.array(forces) / PAPER - 1))})
+    return rows
+
+
+def slices(pairs: Pairs, values: ArrayLike, changes: Sequence[float], say: Say) -> list[Row]:
+    """Change each quantity alone by a share of itself; a row for each change."""
+    rows = []
+    for number, quantity in enumerate(QUANTITIES):
+        for change in changes:
+            at = np.array(values, float)
+            at[number] *= 1 + change
+            rows.append({"changed": quantity.key, "change": change})
+            rows[-1] |= row_of(pairs(at, slopes=False))
+        say(f"{quantity.key} changed alone")
+    return rows
+
+
+def profile(pairs: Pairs, found: Response, say: Say) -> list[Row]:
+    """Move each quantity away, and solve for the others again from where they were.
+
+    A quantity moves by factors of 1 ± `STEP`, at most `COUNT` times each way, until the misfit
+    stays above `LIMIT`. Returns a row for each place.
+    """
+    rows = []
+    for number, quantity in enumerate(QUANTITIES):
+        for factor in (1 / (1 + STEP), 1 + STEP):
+            last = found
+            for _ in range(COUNT):
+                at = last.values[number] * factor
+                if last.slopes is None or not quantity.low <= at <= quantity.high:
+                    break
+                guess = compensated(last.values, last.slopes, number, factor)
+                last = polished(pairs, guess, held=[number], within=WITHIN, steps=4)
+                change = last.values[number] / found.values[number] - 1
+                rows.append({"changed": quantity.key, "change": change} | row_of(last))
+                if last.misfit > LIMIT:
+                    break
+        say(f"{quantity.key} changed, the others solved for again")
+    return rows
+
+
+@dataclasses.dataclass(frozen=True)
+class Results:
+    """The shipped values, other values solved for the paper's forces, and tables of rows.
+
+    `alone`: each quantity changed alone. `solved`: with the others solved for again. `motions`,
+    `definitions`: as the functions of these names. A reduced run leaves all but `alone` empty.
+    """
+
+    shipped: Response
+    others: dict[str, Response]
+    alone: list[Row]
+    solved: list[Row]
+    motions: list[Row]
+    definitions: list[Row]
+
+    @property
+    def tables(self) -> dict[str, list[Row]]:
+        """Rows by the name of their part, without the empty ones."""
+        named = {
+            "motions": self.motions,
+            "definitions": self.definitions,
+            "slices": self.alone,
+            "profile": self.solved,
+        }
+        return {name: rows for name, rows in named.items() if rows}
+
+
+def run(
+    quick: bool,
+    say: Say = lambda text: None,
+    tell: Callable[[str, Response], None] = lambda name, response: None,
+) -> Results:
+    """Simulate the shipped values and study how far they are determined.
+
+    `tell` is given each response with its name, as soon as it is known. Raises `NoResultError`
+    unless both motions are periodic and both configs hold the same values.
+    """
+    settings = QUICK if quick else ()
+    many = Pairs(*settings, give_up_early=True)
+    values = values_of(config_of("cic"))
+    if not np.array_equal(values, values_of(config_of("ee"))):
+        raise NoResultError(
+            "configs/paper_cic.yaml and configs/paper_ee.yaml must share all values, but differ"
+        )
+    found = Pairs(*settings)(values, slopes=not quick, series=True)
+    tell("shipped", found)
+    if not found.usable:
+        raise NoResultError("the shipped values must give two periodic motions, but do not")
+    alone = slices(many, found.values, CHANGES[quick], say)
+    if quick:
+        return Results(found, {}, alone, [], [], [])
+    coexisting, defined = motions(found.values), definitions(found.values)
+    others = {}
+    for name, start in OTHERS.items():
+        others[name] = polished(many, start)
+        tell(name, others[name])
+    solved = profile(many, found, say)
+    return Results(found, others, alone, solved, coexisting, defined)
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """What a search finds: its scenes, seconds, and the best ones solved for the paper's forces.
+
+    `polished`: periods of both motions → (misfit of the search, response).
+    """
+
+    values: NDArray[np.float64]
+    forces: NDArray[np.float64]
+    periods: NDArray[np.int64]
+    misfits: NDArray[np.float64]
+    seconds: float
+    polished: dict[tuple[int, ...], tuple[float, Response]]
+
+    @property
+    def periodic(self) -> NDArray[np.bool_]:
+        """(n,) whether both motions repeat."""
+        return np.all(self.periods > 0, axis=1)
+
+    @property
+    def enough(self) -> bool:
+        """Whether some values give all four forces within `TARGET`."""
+        return any(response.misfit <= TARGET for _, response in self.polished.values())
+
+
+def look(
+    quick: bool,
+    seed: int = 0,
+    least_clearance: float = QUANTITIES[-1].low,
+    say: Say = lambda text: None,
+) -> Found:
+    """Search for values anew, with no clearance (mm) below the least.
+
+    A reduced run takes one generation, and solves for nothing.
+    """
+    # Numba is optional.
+    from experiments.paper.search import explore, regimes
+
+    began = time.perf_counter()
+    least = [np.inf]
+
+    def report(samples: Any) -> None:
+        best = int(np.argmin(np.where(samples.periodic, samples.misfits, np.inf)))
+        if samples.periodic[best] and samples.misfits[best] < least[0]:
+            least[0] = samples.misfits[best]
+            say(f"{least[0]:.1%} {samples.values[best]}")
+
+    *others, clearance = QUANTITIES
+    box: list[Quantity] = [*others, dataclasses.replace(clearance, low=least_clearance)]
+    generations, population = QUICK_SEARCH if quick else (GENERATIONS, POPULATION)
+    samples = explore(seed, generations, population, box, report)
+    seconds = time.perf_counter() - began
+    pairs, solved = Pairs(give_up_early=True), {}
+    for place in [] if quick else regimes(samples, 0.3)[:POLISHED]:
+        periods = tuple(map(int, samples.periods[place]))
+        solved[periods] = samples.misfits[place], polished(pairs, samples.values[place])
+        say(f"periods {periods}: {solved[periods][1].misfit:.2%}")
+    return Found(*samples, samples.misfits, seconds, solved)

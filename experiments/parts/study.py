@@ -1,0 +1,110 @@
+"""Measures what each part of a scene costs.
+
+Adds every part by itself to the smallest scene, contact driven at constant speed, and all of them
+together. Measures states, equations of the traced right-hand side, time of one right-hand side
+inside a compiled loop, and time of a simulation with gradient (warm, and the first with its
+compilation). Ratios are to the smallest scene in the same run.
+"""
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from experiments._common.scenes import CIC, shipped
+from experiments._common.simulation import evaluator_of, pair_of_model
+from experiments._common.timing import ready, times_of
+from rootsopt.config import Config, load
+from rootsopt.model import Model, design_vector
+
+Row = dict[str, Any]
+# A light load at high speed, which flanks alone can hold. Slower, lobes pass through each other.
+BARE = (
+    "scene.timing_gear=null",
+    "scene.speed_rpm=6000",
+    "scene.load.torque_N_m=0.1",
+    "profile.involute_length_mm=6",
+)
+GEAR = "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.5, backlash_mm: 0.1}"
+PARTS = {
+    "smallest": (),
+    "timing gear": (GEAR,),
+    "gear with phase error": (GEAR, "scene.phase_error_mrad=0.4"),
+    "motor": ("scene.drive=torque", "scene.motor={slope_N_m_s_per_rad: 0.1}"),
+    "gas load": ("scene.load={pressure_difference_Pa: 1000}",),
+    "friction": ("contact.friction={}",),
+    "centre distance error": ("scene.center_distance_error_mm=0.02",),
+    "supports": ("scene.supports={stiffness_N_per_mm: 2.0e5, damping_N_s_per_mm: 5}",),
+}
+
+
+def equations(jaxpr) -> int:
+    """Count the equations of a traced program, with those of its inner ones."""
+    total = len(jaxpr.eqns)
+    for equation in jaxpr.eqns:
+        for value in jax.tree.leaves(equation.params, is_leaf=lambda v: hasattr(v, "jaxpr")):
+            inner = getattr(value, "jaxpr", value)
+            total += equations(inner) if hasattr(inner, "eqns") else 0
+    return total
+
+
+def right_hand_side(config: Config, calls: int) -> dict[str, float]:
+    """Measure states, equations, and time (µs) of a right-hand side along a slowly moving state."""
+    pair = pair_of_model(Model.of(config), design_vector(config))
+    numbers, static = eqx.partition(pair, eqx.is_array)
+    state = jnp.full(pair.states, 0.05)
+
+    def derivative(tau, y, numbers):
+        return eqx.combine(numbers, static).derivative(tau, y)[0]
+
+    size = equations(jax.make_jaxpr(derivative)(jnp.zeros(()), state, numbers).jaxpr)
+
+    @jax.jit
+    def many(numbers):
+        def call(k, y):
+            return y + 1e-9 * derivative(k / calls, y, numbers)
+
+        return jax.lax.fori_loop(0, calls, call, state)
+
+    ready(many(numbers))
+    times = times_of(lambda: ready(many(numbers)), 5)
+    return {"states": pair.states, "equations": size, "rhs_us": 1e6 * min(times) / calls}
+
+
+def evaluation(config: Config, repeats: int) -> dict[str, float | str]:
+    """Time the first evaluation (s) and later ones (ms), value and gradient."""
+    evaluator = evaluator_of(config)
+    began = time.perf_counter()
+    found = evaluator(series=False)
+    first = time.perf_counter() - began
+    times = times_of(lambda: evaluator(series=False), repeats)
+    return {
+        "first_s": first,
+        "evaluation_ms": 1e3 * statistics.median(times),
+        "solver_steps": found.statistics["solver_steps"],
+        "status": found.status.label,
+    }
+
+
+def run(quick: bool, say: Callable[[str], None] = lambda text: None) -> list[Row]:
+    """Measure every part by itself, and all together; a row for each.
+
+    A reduced run measures the right-hand sides of three scenes alone, with few calls.
+    """
+    scenes = {name: load(CIC, [*BARE, *more]) for name, more in PARTS.items()}
+    scenes["all of them"] = shipped("pump")
+    if quick:
+        scenes = {name: scenes[name] for name in ("smallest", "timing gear", "all of them")}
+    rows: list[Row] = []
+    for name, config in scenes.items():
+        row: Row = {"part": name} | right_hand_side(config, 500 if quick else 20000)
+        row["rhs_ratio"] = row["rhs_us"] / (rows[0] if rows else row)["rhs_us"]
+        if not quick:
+            row |= evaluation(config, 5)
+        rows.append(row)
+        say(name)
+    return rows

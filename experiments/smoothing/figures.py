@@ -1,0 +1,58 @@
+"""Figure of the bias, the orbits closed and the errors of gradients over the smoothing length."""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments._common.style import BLUE, GREEN, VERMILION, grid_below, sheet
+from experiments.smoothing.study import DEFAULT, LIMIT, WIDTHS, Measured
+
+ORDER = (BLUE, VERMILION, GREEN)
+COLORS: dict[str, str] = {"cic": BLUE, "ee": VERMILION, "pump": GREEN}
+MARKS = {"cic": "o", "ee": "s", "pump": "^"}
+
+
+def lengths(found: list[Measured]) -> Figure:
+    """Draw bias, orbits closed and gradient error over the smoothing length."""
+    made, axes = sheet(13, 4.4, 1, 3)
+    (left, middle, right) = axes[0]
+    for measured in found:
+        kind, color = measured.kind, COLORS[measured.kind]
+        widths = np.array(sorted(set(measured.orbits) - {DEFAULT}))
+        beyond = widths[1:]
+        known = [measured.bias(width) for width in beyond]
+        for share, style in ((1.0, "-"), (0.5, ":")):
+            level = [np.nanquantile(values, share) for values in known]
+            name = "greatest" if share == 1 else "median"
+            left.loglog(
+                beyond, np.maximum(level, 1e-13), style, marker=MARKS[kind], color=color,
+                label=f"{kind}: {name} of {len(measured.configs)}",
+            )  # fmt: skip
+        own = [config.contact.rounding_mm for config in measured.configs]
+        left.loglog(
+            own, np.maximum(measured.bias(DEFAULT), 1e-13), MARKS[kind], color=color, mfc="none",
+            ms=5, label=f"{kind}: default, each scene",
+        )  # fmt: skip
+        closed = [100 * np.mean(measured.orbits[width].usable) for width in widths]
+        middle.semilogx(widths, closed, marker=MARKS[kind], color=color, label=kind)
+        for number, name in enumerate(("mean", "peak", "RMS")):
+            for width, off in measured.gradients.items():
+                values = off[:, number]
+                places = np.array(own[: len(values)]) if width == DEFAULT else width
+                right.loglog(
+                    places * 1.25 ** (number - 1) * np.ones_like(values),
+                    np.maximum(values, 1e-12),
+                    "os^"[number],
+                    color=ORDER[number],
+                    mfc="none",
+                    ms=4,
+                    label=name if width == DEFAULT else None,
+                )
+    left.axhline(LIMIT, color="black", linestyle="--", linewidth=1, label="limit")
+    left.set_ylabel(f"relative bias of the forces, against {WIDTHS[0]:g} mm")
+    middle.set(ylabel="orbits closed at 1e-10 (% of those that settle)", ylim=(0, 104))
+    right.set_ylabel("relative error of the gradient (cic)")
+    for ax in axes[0]:
+        ax.set_xlabel("contact.smoothing_mm (mm)")
+        grid_below(ax)
+        ax.legend(fontsize=8, frameon=False)
+    return made

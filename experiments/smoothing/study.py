@@ -1,0 +1,307 @@
+"""Measures what rounding the corners of contact law and timing gear changes, over many scenes.
+
+Random designs and scenes of both shipped pairs, the shipped configs themselves, those of the paper,
+and a blower with all parts are brought to their orbit at the default `contact.smoothing_mm`, which
+follows the scene. The orbit is closed again at that and at fixed smoothing lengths, at a tight
+tolerance. Bias is the relative difference of mean, peak and RMS force from those at the least
+length; the greatest of the three counts. Scenes whose orbit is not closed at a length are counted.
+The gradient by differentiation is compared with central differences of tight orbits.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments._common.engines import FD_STEPS
+from experiments._common.scenes import shipped
+from experiments._common.simulation import stacked
+from rootsopt.batch import STATUSES, Batch, on_all_cores, respond
+from rootsopt.config import Config
+from rootsopt.dynamics.flow import Integrator
+from rootsopt.errors import InputError
+from rootsopt.model import MM, Model, check_geometry, design_vector
+from rootsopt.programs import Program
+
+Say = Callable[[str], None]
+DEFAULT = 0.0
+"""Stands for the default of `contact.smoothing_mm` among the smoothing lengths (mm)."""
+WIDTHS = (1e-6, 1e-5, 3e-5, 1e-4, 1e-3, DEFAULT)
+"""Smoothing lengths (mm); the first is the reference."""
+COMPARED = (1e-6, 1e-5, DEFAULT)
+"""Smoothing lengths (mm) at which gradients are compared."""
+LIMIT = 1e-4
+"""Relative bias above which the default is too wide."""
+USUAL, TIGHT = (1e-6, 1e-8), (1e-8, 1e-10)
+"""Tolerances of transient and orbit: while an orbit is searched for, and while it is measured."""
+PERIODS = 200, 100
+"""Longest transients (mesh periods), in the same order."""
+SAME = 0.02
+"""Scaled distance at φ1 = 0 above which two orbits are different motions."""
+FD_SHARE = 0.05
+"""Steps of the central differences in units of `FD_STEPS`."""
+SHAKY = (
+    "scene.speed_rpm=1700",
+    "scene.load.torque_N_m=3",
+    "scene.timing_gear.backlash_mm=0.25",
+    "scene.timing_gear.damping_ratio=0.3",
+    "scene.timing_gear.stiffness_N_m_per_rad=9000",
+    "profile.pressure_angle_deg=30.7",
+    "profile.involute_length_mm=4",
+    "profile.tip_arc_angle_deg=1.5",
+)
+"""A stable orbit of two mesh periods, which magnifies what is changed."""
+KNOWN: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
+    "cic": (("cic", ()), ("cic", SHAKY), ("paper_cic", ())),
+    "ee": (("ee", ()), ("paper_ee", ())),
+    "pump": (("pump", ()),),
+}
+COUNTS = {"cic": 60, "ee": 30, "pump": 5}
+"""Random scenes of each kind."""
+
+
+def drawn(kind: str, seed: int) -> Iterator[Config]:
+    """Yield endless random scenes of a kind, with random designs where it has parameters."""
+    draw = np.random.default_rng([seed, *kind.encode()])
+
+    def even_in_logarithm(low: float, high: float) -> float:
+        return float(10 ** draw.uniform(np.log10(low), np.log10(high)))
+
+    while True:
+        backlash = even_in_logarithm(0.005, 0.5) if draw.uniform() < 0.9 else 0.0
+        values = {
+            "scene.speed_rpm": even_in_logarithm(600, 6000),
+            "scene.timing_gear.stiffness_N_m_per_rad": even_in_logarithm(3e3, 1e6),
+            "scene.timing_gear.damping_ratio": even_in_logarithm(0.02, 1),
+            "scene.timing_gear.backlash_mm": backlash,
+        }
+        if kind == "pump":
+            values["scene.load.pressure_difference_Pa"] = even_in_logarithm(5e3, 2e5)
+            values["contact.friction.kinetic"] = float(draw.uniform(0, 0.15))
+            values["scene.motor.slope_N_m_s_per_rad"] = even_in_logarithm(0.03, 1)
+        else:
+            values["scene.load.torque_N_m"] = even_in_logarithm(0.3, 30)
+        if kind != "ee":
+            values["profile.pressure_angle_deg"] = float(draw.uniform(26, 42))
+            values["profile.tip_arc_angle_deg"] = float(draw.uniform(0.7, 6))
+            values["profile.involute_length_mm"] = float(draw.uniform(1, 9))
+        try:
+            config = shipped(kind, *(f"{k}={v!r}" for k, v in values.items()))
+            check_geometry(config)
+        except InputError:
+            continue
+        yield config
+
+
+def scenes(kind: str, count: int, seed: int) -> list[Config]:
+    """Load the known scenes of a kind and draw `count` random ones."""
+    known = [shipped(name, *changes) for name, changes in KNOWN[kind]]
+    return [*known, *(config for config, _ in zip(drawn(kind, seed), range(count), strict=False))]
+
+
+@Program
+def _respond(models: Model, designs, states, tolerances, periods, gradient: bool) -> Batch:
+    def one(at):
+        model, design, state = at
+        transient, orbit = (Integrator("tsit5", tolerances[k], 4096) for k in range(2))
+        return respond(model, design, state, transient, orbit, periods, gradient=gradient)
+
+    return jax.lax.map(one, (models, designs, states))
+
+
+def responses(
+    models: Model, designs, states, tolerances: tuple[float, float], periods: int, slopes=True
+) -> Batch:
+    """Simulate n scenes, each with its own design and scaled state to start from."""
+    leaves, structure = jax.tree.flatten(models)
+
+    def work(designs, states, *leaves):
+        models = jax.tree.unflatten(structure, leaves)
+        return _respond(
+            models, designs, states, jnp.asarray(tolerances), jnp.asarray(periods), slopes
+        )
+
+    return jax.tree.map(np.asarray, on_all_cores(work, designs, states, *leaves))
+
+
+def rounded(models: Model, width: float) -> Model:
+    """Round all corners of the models over `width` (mm), or leave them as they are by default."""
+    if width == DEFAULT:
+        return models
+    length = np.full_like(models.pitch_radius, width * MM)
+    places = (length, length / models.pitch_radius)
+    return eqx.tree_at(lambda m: (m.law.smoothing, m.gear.rounding), models, places)
+
+
+def bias(found: Batch, truth: Batch) -> NDArray[np.float64]:
+    """Find the greatest relative difference (n,) of mean, peak and RMS.
+
+    NaN where one is not known, or where the motions are not the same.
+    """
+    same = np.max(np.abs(found.state - truth.state), axis=1) < SAME
+    same &= found.usable & truth.usable & (found.period == truth.period)
+    off = np.max(np.abs(found.response / truth.response - 1), axis=1)
+    return np.where(same, off, np.nan)
+
+
+def gradient_errors(models: Model, designs, found: Batch) -> NDArray[np.float64]:
+    """Compare the gradients of mean, peak and RMS with central differences.
+
+    Returns errors (n, 3), relative to the greatest entry of each.
+    """
+    columns, same = [], np.asarray(found.usable)
+    for k, step in enumerate(FD_STEPS):
+        moved = np.eye(designs.shape[1])[k] * step * FD_SHARE
+        up, down = (
+            responses(models, designs + sign * moved, found.state, TIGHT, PERIODS[1], False)
+            for sign in (1, -1)
+        )
+        for end in (up, down):
+            same &= end.usable & (end.period == found.period)
+            same &= np.max(np.abs(end.state - found.state), axis=1) < SAME
+        columns.append((up.response - down.response) / (2 * step * FD_SHARE))
+    truth = np.stack(columns, axis=2)
+    off = np.max(np.abs(found.gradient - truth), axis=2) / np.max(np.abs(truth), axis=2)
+    return np.where(same[:, None], off, np.nan)
+
+
+@dataclasses.dataclass(frozen=True)
+class Size:
+    """Random scenes of each kind, smoothing lengths (mm), those at which gradients are compared,
+    and the number of scenes whose gradients are."""
+
+    counts: dict[str, int]
+    widths: tuple[float, ...] = WIDTHS
+    compared: tuple[float, ...] = COMPARED
+    differentiated: int = 20
+
+
+def size_of(quick: bool, count: int | None) -> Size:
+    """Choose the size of a run; `count`: random scenes of CIC, and fewer of the others."""
+    if quick:
+        return Size({"cic": 5}, (1e-6, 1e-4, DEFAULT), (DEFAULT,), 2)
+    share = 1.0 if count is None else count / COUNTS["cic"]
+    return Size({kind: round(share * number) for kind, number in COUNTS.items()})
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """Scenes of a kind that settle, and their orbit at every smoothing length."""
+
+    kind: str
+    tried: int
+    configs: list[Config]
+    orbits: dict[float, Batch]
+    gradients: dict[float, NDArray[np.float64]]
+
+    def bias(self, width: float) -> NDArray[np.float64]:
+        """Bias (n,) at a smoothing length (mm)."""
+        return bias(self.orbits[width], self.orbits[WIDTHS[0]])
+
+
+def measure(kind: str, size: Size, seed: int, say: Say) -> Measured:
+    """Bring the scenes of a kind to their orbits, and those to other smoothing lengths."""
+    configs = scenes(kind, size.counts[kind], seed)
+    models = stacked(configs, "float64")
+    designs = np.stack([np.asarray(design_vector(config)) for config in configs])
+    rest = np.zeros((len(configs), 11 if kind == "pump" else 2))
+    began = time.perf_counter()
+    first = responses(models, designs, rest, USUAL, PERIODS[0])
+    held = np.flatnonzero(first.usable)
+    say(f"{kind}: {len(held)} of {len(configs)} settle ({time.perf_counter() - began:.0f} s)")
+    models, designs, states = jax.tree.map(lambda x: x[held], (models, designs, first.state))
+    orbits, gradients = {}, {}
+    some = slice(size.differentiated)
+    for width in size.widths:
+        changed = rounded(models, width)
+        orbits[width] = responses(changed, designs, states, TIGHT, PERIODS[1])
+        said = f"{kind}: {width:g} mm, {np.sum(orbits[width].usable)} closed"
+        if width in size.compared and kind == "cic":
+            picked = jax.tree.map(lambda x: x[some], (changed, designs, orbits[width]))
+            gradients[width] = gradient_errors(*picked)
+            said += f", gradients {np.nanmedian(gradients[width], axis=0)}"
+        say(f"{said} ({time.perf_counter() - began:.0f} s)")
+    return Measured(kind, len(configs), [configs[i] for i in held], orbits, gradients)
+
+
+def rows_of(measured: Measured) -> list[dict[str, Any]]:
+    """List every scene at every smoothing length."""
+    rows = []
+    for width, orbit in measured.orbits.items():
+        for k, config in enumerate(measured.configs):
+            gear, load_ = config.scene.timing_gear, config.scene.load
+            assert gear is not None
+            mean, peak, rms = orbit.response[k]
+            rows.append(
+                {
+                    "kind": measured.kind,
+                    "scene": k,
+                    "speed_rpm": config.scene.speed_rpm,
+                    "torque_N_m": load_.torque_N_m,
+                    "pressure_difference_Pa": load_.pressure_difference_Pa,
+                    "gear_stiffness_N_m_per_rad": gear.stiffness_N_m_per_rad,
+                    "gear_damping_ratio": gear.damping_ratio,
+                    "backlash_mm": gear.backlash_mm,
+                    "smoothing_mm": width,
+                    "status": STATUSES[orbit.status[k]].label,
+                    "period": orbit.period[k],
+                    "mean_force_N": mean,
+                    "peak_force_N": peak,
+                    "rms_force_N": rms,
+                    "bias": measured.bias(width)[k],
+                    "solver_steps": orbit.steps[k],
+                }
+            )
+    return rows
+
+
+def summary(measured: Measured) -> dict[str, Any]:
+    """Record counts, quantiles of the bias and of the gradient's error, by smoothing length."""
+    by_width = {}
+    for width, orbit in measured.orbits.items():
+        known = measured.bias(width)
+        known = known[np.isfinite(known)]
+        row: dict[str, Any] = {
+            "closed": int(np.sum(orbit.usable)),
+            "compared": len(known),
+            "median_bias": float(np.median(known)),
+            "ninth_decile_bias": float(np.quantile(known, 0.9)),
+            "greatest_bias": float(np.max(known)),
+            "beyond_limit": int(np.sum(known > LIMIT)),
+            "median_steps": float(np.median(orbit.steps[orbit.usable])),
+        }
+        if width in measured.gradients:
+            off = measured.gradients[width]
+            off = off[np.all(np.isfinite(off), axis=1)]
+            row["gradients"] = len(off)
+            row["median_gradient_error"] = np.median(off, axis=0).tolist()
+            row["greatest_gradient_error"] = np.max(off, axis=0).tolist()
+        by_width["default" if width == DEFAULT else f"{width:g}"] = row
+    return {"scenes": measured.tried, "settled": len(measured.configs), "by_width": by_width}
+
+
+def run(
+    quick: bool,
+    count: int | None = None,
+    seed: int = 0,
+    say: Say = lambda text: None,
+    keep: Callable[[list[Measured]], None] = lambda found: None,
+) -> list[Measured]:
+    """Measure all kinds of scenes; `keep` is given those so far after each."""
+    size = size_of(quick, count)
+    found: list[Measured] = []
+    for kind in size.counts:
+        found.append(measure(kind, size, seed, say))
+        keep(found)
+    return found
+
+
+def within_limit(found: list[Measured]) -> bool:
+    """Tell whether the default's bias stays below the limit in all scenes."""
+    return bool(max(np.nanmax(one.bias(DEFAULT)) for one in found) < LIMIT)

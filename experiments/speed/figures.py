@@ -1,0 +1,129 @@
+"""Figures of contact force, objective and resonances over speed."""
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from experiments._common.style import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    grid_below,
+    sheet,
+)
+from experiments.speed.study import OPTIMISED, Results
+from rootsopt.plot_speeds import LABELS, legend_entries, plot_speeds
+
+TITLES = {"shipped": "shipped scene", "light": "gear damping ratio 0.1"}
+
+
+def over_speed(results: Results) -> Figure:
+    """Draw mean and peak force over speed, a column for each scene."""
+    studies = results.studies
+    made, axes = sheet(13, 7.4, 2, len(studies), sharex=True, sharey="row")
+    *shown, _ = OPTIMISED
+    labels = ["CIC", "EE", *(f"CIC, optimised {name}" for name in shown)]
+    entries = {}
+    top = dict.fromkeys(LABELS, 0.0)
+    for column, (scene, found) in enumerate(studies.items()):
+        designs = {k: found.designs[k] for k in labels if k in found.designs}
+        entries |= {entry.get_label(): entry for entry in legend_entries(designs)}
+        for ax, force in zip(axes[:, column], LABELS, strict=True):
+            plot_speeds(ax, designs, force)
+            forces = (p.evaluation.response.get(force, 0) for d in designs.values() for p in d)
+            top[force] = max(top[force], *forces)
+        axes[0, column].set_title(TITLES[scene])
+        axes[1, column].set_xlabel("speed (rpm)")
+    for ax, force in zip(axes[:, 0], LABELS, strict=True):
+        ax.set_ylim(0, 1.05 * top[force])
+    made.legend(handles=list(entries.values()), loc="outside lower center", ncols=4, frameon=False)
+    made.suptitle("Contact force over speed, from rest")
+    return made
+
+
+def objectives(results: Results) -> Figure:
+    """Draw the objective of the optimised designs, relative to CIC at the same speed."""
+    studies = results.studies
+    made, axes = sheet(13, 4.6, 1, len(studies), sharey=True)
+    styles = dict(zip(OPTIMISED, ((GREEN, "-", "o"), (PURPLE, "--", "s"),
+                                  (ORANGE, ":", "^")), strict=True))  # fmt: skip
+    for ax, (scene, found) in zip(axes[0], studies.items(), strict=True):
+        base = found.designs["CIC"]
+        speeds = np.array([part.speed_rpm for part in base])
+        for name, (color, dashes, marker) in styles.items():
+            parts = found.designs.get(f"CIC, optimised {name}")
+            if parts is None:
+                continue
+            values = found.over(parts)
+            at = [3000.0] if name == "at 3000 rpm" else results.listed
+            ax.plot(speeds, values, color=color, linestyle=dashes, label=f"optimised {name}")
+            heights = np.interp(at, speeds, values)
+            ax.plot(at, heights, marker, color=color, markersize=5)
+            unsettled = np.array(
+                [not (p.evaluation.usable and b.evaluation.usable)
+                 for p, b in zip(parts, base, strict=True)]
+            )  # fmt: skip
+            ax.plot(speeds[unsettled], values[unsettled], "x", color=color, markersize=7)
+        ax.axhline(1, color="black", linewidth=0.8, linestyle=":")
+        ax.set(title=TITLES[scene], xlabel="speed (rpm)")
+        grid_below(ax)
+    axes[0, 0].set_ylabel("objective / CIC at the same speed")
+    lines, names = axes[0, 0].get_legend_handles_labels()
+    made.legend(lines, names, loc="outside lower center", ncols=3, frameon=False)
+    made.suptitle("What an optimum is worth at other speeds (markers: speeds of its objective)")
+    return made
+
+
+def resonances(results: Results) -> Figure:
+    """Draw the peak force with crossings and maxima: shipped pairs, optimised CIC."""
+    studies, rows, peaks = results.studies, results.resonances, results.peaks
+    shown = {
+        "CIC": BLUE,
+        "EE": VERMILION,
+        f"CIC, optimised {next(iter(OPTIMISED))}": SKY,
+    }
+    made, axes = sheet(13, 10.5, len(shown), len(studies), sharex=True)
+    modes = {"contact": (GREEN, "--"), "gear": (PURPLE, ":"), "average": ("0.45", "-.")}
+    for column, (scene, found) in enumerate(studies.items()):
+        for ax, (name, color) in zip(axes[:, column], shown.items(), strict=True):
+            if name not in found.designs:
+                continue
+            here = {"scene": scene, "design": name}.items()
+            parts = found.designs[name]
+            for line in plot_speeds(ax, {name: parts}, "peak_force_N").lines:
+                line.set_color(color)
+            ax.axhline(found.linear[name]["static_peak_N"], color="black", linewidth=0.9)
+            top = 1.25 * max(part.evaluation.response.get("peak_force_N", 0) for part in parts)
+            for row in rows:
+                if not here <= row.items() or row["order"] > 3:
+                    continue
+                shade, dashes = modes[row["mode"]]
+                ax.axvline(row["speed_rpm"], color=shade, linestyle=dashes, linewidth=1.1)
+                height = 0.97 - 0.055 * list(modes).index(row["mode"])
+                ax.text(row["speed_rpm"] + 30, height * top, str(row["order"]), color=shade,
+                        va="center", fontsize=9)  # fmt: skip
+            for peak in peaks:
+                if here <= peak.items() and peak["force"] == "peak_force_N":
+                    ax.plot(peak["speed_rpm"], 1.03 * peak["value_N"], "v", color="black", ms=5)
+            ax.set(title=f"{name}, {TITLES[scene]}", ylim=(0, top))
+    for ax in axes[-1]:
+        ax.set_xlabel("speed (rpm)")
+
+    def entry(label, **style):
+        return Line2D([], [], label=label, **style)
+
+    made.legend(
+        handles=[
+            *(entry(f"k × mesh frequency = {mode} frequency", color=c, linestyle=d)
+              for mode, (c, d) in modes.items()),
+            entry("peak at standstill", color="black", linewidth=0.9),
+            entry("local maximum", color="black", linestyle="", marker="v", markersize=5),
+            entry("chaotic, or not settled (+)", color="black", linestyle="", marker="x"),
+        ],
+        loc="outside lower center", ncols=3, frameon=False,
+    )  # fmt: skip
+    made.suptitle("Peak force over speed, and where harmonics k meet a natural frequency")
+    return made

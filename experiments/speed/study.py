@@ -1,0 +1,280 @@
+"""Relates speed to contact force: sweeps, optimised designs, and natural frequencies.
+
+Takes mean and peak contact force over speed, every speed from rest, of the shipped CIC and EE pairs
+and of CIC designs optimised at 3000 rpm, over the range (weighted mean) and for its worst speed; in
+the shipped scene and in one with less damping in the gear. Linearises the pair for its natural
+frequencies, and finds the speeds at which a harmonic of the mesh frequency meets one.
+"""
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.signal import find_peaks
+
+from experiments._common.scenes import shipped
+from experiments._common.simulation import evaluator_of
+from rootsopt.config import Config
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.evaluate import Evaluation, objective_weights
+from rootsopt.model import design_vector
+from rootsopt.optimize.search import Search
+from rootsopt.plot_speeds import LABELS
+from rootsopt.programs import Program
+from rootsopt.speeds import Part, sweep
+
+Row = dict[str, Any]
+SCENES = {"shipped": (), "light": ("scene.timing_gear.damping_ratio=0.1",)}
+OPTIMISED = {
+    "at 3000 rpm": (),
+    "over the range, mean": ("objective.over_speeds=weighted",),
+    "over the range, worst": ("objective.over_speeds=worst",),
+}
+"""Settings of each optimisation."""
+QUICK = ("optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=1")
+PHASES = 240
+"""Phases of a mesh period at which the pair is linearised."""
+ORDERS = 6
+"""Harmonics of the mesh frequency considered."""
+PROMINENCE = 0.02
+"""Rise above the surroundings, relative to the height, above which a point is a maximum."""
+NEAR = 0.03
+"""Relative difference of speed above which a maximum does not lie at a crossing."""
+
+
+def settings(scene: str, family: str, *more: str) -> Config:
+    """Load a shipped pair in one of the scenes."""
+    return shipped(family, *SCENES[scene], *more)
+
+
+@Program
+def equilibria(pair: RotorPair, phases):
+    """Find the static equilibria at phases (n,) of the mesh period, rotor 1 held.
+
+    Returns stiffness of the pair and of the flanks alone (N·m/rad), torque of the flanks (N·m) and
+    contact force (N), each (n,).
+    """
+    gear = pair.gear
+    assert gear is not None
+    still = jnp.asarray(0.0)
+
+    def flank(phase, relative):
+        # Without the damping that sliding at speed gives.
+        side = jnp.where(relative < 0, 1.0, -1.0)
+        pose = -side * (2 * np.pi / pair.lobes * phase + relative / 2), side * relative
+        gap, _, lever = pair.contact(*pose)
+        force = pair.law(-gap - pair.clearance, still)
+        return side * lever * force, force
+
+    def torque(phase, relative):
+        return flank(phase, relative)[0] - gear(relative, still)
+
+    def equilibrium(phase):
+        def halve(_, ends):
+            low, high = ends
+            middle = (low + high) / 2
+            carries = torque(phase, middle) > pair.load.torque
+            return jnp.where(carries, middle, low), jnp.where(carries, high, middle)
+
+        low = -2 * (gear.half_backlash + pair.load.torque / gear.stiffness) - pair.angle_scale
+        relative, _ = jax.lax.fori_loop(0, 60, halve, (low, jnp.zeros(())))
+        stiffness = -jax.grad(torque, argnums=1)(phase, relative)
+        on_flank = -jax.grad(lambda x: flank(phase, x)[0])(relative)
+        return stiffness, on_flank, *flank(phase, relative)
+
+    return jax.vmap(equilibrium)(phases)
+
+
+def linearised(pair: RotorPair) -> dict[str, float]:
+    """Find the natural frequencies (Hz) of the pair about its static equilibrium, rotor 1 held.
+
+    `contact`: of rotor 2 on the flanks, with the mean of their stiffness over the phases in which
+    they carry most of the load, a share `contact_share` of all; `gear`: on the gear; `average`:
+    mean over all phases of the local frequency, with whatever carries. `both_share`: share of the
+    phases in which flanks and gear both carry; `static_peak_N`, `static_mean_N`: contact force.
+    """
+    phases = (np.arange(PHASES) + 0.5) / PHASES
+    stiffness, on_flank, torque, force = map(np.asarray, equilibria(pair, phases))
+    assert pair.gear is not None
+    inertia, gear, load = (float(x) for x in (pair.inertia, pair.gear.stiffness, pair.load.torque))
+
+    def frequency(k):
+        return np.sqrt(np.maximum(k, 0) / inertia) / (2 * np.pi)
+
+    carries = torque > load / 2
+    return {
+        "contact": float(frequency(np.mean(on_flank[carries]))),
+        "gear": float(frequency(gear)),
+        "average": float(np.mean(frequency(stiffness))),
+        "contact_share": float(np.mean(carries)),
+        "both_share": float(np.mean((torque > 0.01 * load) & (torque < 0.99 * load))),
+        "gear_damping": float(pair.gear.damping) / (2 * math.sqrt(gear * inertia)),
+        "static_peak_N": float(np.max(force)),
+        "static_mean_N": float(np.mean(force)),
+    }
+
+
+def crossings(found: dict[str, float], lobes: int, speeds) -> list[Row]:
+    """Find the speeds (rpm) at which a harmonic of the mesh frequency meets a natural frequency."""
+    rows = []
+    for mode in ("contact", "gear", "average"):
+        for order in range(1, ORDERS + 1):
+            speed = 60 * found[mode] / (order * lobes)
+            if speeds[0] <= speed <= speeds[-1]:
+                row = {"mode": mode, "frequency_Hz": found[mode], "order": order}
+                rows.append(row | {"speed_rpm": speed})
+    return rows
+
+
+def maxima(parts: tuple[Part, ...], rows: list[Row]) -> list[Row]:
+    """Find the local maxima of mean and peak force over speed, each with the nearest crossing."""
+    speeds = np.array([part.speed_rpm for part in parts])
+    found = []
+    for force in LABELS:
+        values = np.array([part.evaluation.response.get(force, 0.0) for part in parts])
+        for k in find_peaks(values, prominence=PROMINENCE * np.max(values))[0]:
+            near = min(rows, key=lambda row: abs(math.log(row["speed_rpm"] / speeds[k])))
+            found.append(
+                {
+                    "force": force,
+                    "speed_rpm": speeds[k],
+                    "value_N": values[k],
+                    "status": parts[k].evaluation.status.label,
+                    "nearest_mode": near["mode"],
+                    "order": near["order"],
+                    "crossing_rpm": near["speed_rpm"],
+                    "apart": speeds[k] / near["speed_rpm"] - 1,
+                }
+            )
+    return found
+
+
+def covered(rows: list[Row], speeds) -> float:
+    """Return the share of the speeds that lie at a crossing: what chance alone would give."""
+    at = np.array([row["speed_rpm"] for row in rows])
+    return float(np.mean(np.min(np.abs(np.asarray(speeds)[:, None] / at - 1), axis=1) <= NEAR))
+
+
+def objective(config: Config, one: Evaluation, baseline: Evaluation) -> float:
+    """Return the objective at a speed; where the motion is not periodic, from averages."""
+    if not (one.response and baseline.response):
+        return math.nan
+    weights = objective_weights(config)
+    return sum(w * one.response[k] / baseline.response[k] for k, w in weights.items())
+
+
+@dataclasses.dataclass
+class Study:
+    """One scene: sweeps and linearised pairs by the design's name, optimisations, CIC's config."""
+
+    config: Config
+    designs: dict[str, tuple[Part, ...]]
+    linear: dict[str, dict[str, float]]
+    outcomes: list[Row]
+
+    def over(self, parts: tuple[Part, ...], baseline: tuple[Part, ...] | None = None) -> np.ndarray:
+        """Return the objective (n,) of a sweep, relative to CIC's (default: over all speeds)."""
+        base = self.designs["CIC"] if baseline is None else baseline
+        pairs = zip(parts, base, strict=True)
+        return np.array([objective(self.config, p.evaluation, b.evaluation) for p, b in pairs])
+
+
+def study(scene: str, speeds, listed, quick: bool) -> Study:
+    """Sweep, optimise and linearise the pairs in a scene."""
+    small = QUICK if quick else ()
+    evaluators = {f: evaluator_of(settings(scene, f, *small)) for f in ("cic", "ee")}
+    found = Study(evaluators["cic"].config, {}, {}, [])
+    for family, evaluator in evaluators.items():
+        found.designs[family.upper()] = sweep(evaluator, speeds)
+        pair = evaluator.pair(design_vector(evaluator.config))
+        found.linear[family.upper()] = linearised(pair)
+    for name, keys in list(OPTIMISED.items())[slice(1, 2) if quick else slice(None)]:
+        over = (f"objective.speeds_rpm={list(listed)}", *keys) if keys else ()
+        began = time.perf_counter()
+        result = Search(settings(scene, "cic", *small, *over)).run()
+        outcome: Row = {"scene": scene, "optimised": name}
+        if result.problem is not None and result.optimized is not None:
+            design = np.array(list(result.optimized.design.values()))
+            own = result.problem.objective(result.optimized)
+            outcome |= result.optimized.design | {"own_objective": own}
+            label = f"CIC, optimised {name}"
+            found.linear[label] = linearised(evaluators["cic"].pair(jnp.asarray(design)))
+            found.designs[label] = sweep(evaluators["cic"], speeds, design)
+            outcome |= worth(found.over(found.designs[label]), speeds)
+            at = sweep(evaluators["cic"], listed, design)
+            those = found.over(at, sweep(evaluators["cic"], listed))
+            outcome |= {
+                "mean_over_listed": float(np.mean(those)),
+                "worst_over_listed": float(np.max(those)),
+            }
+        found.outcomes.append(outcome | {"seconds": time.perf_counter() - began})
+    return found
+
+
+def worth(along: np.ndarray, speeds) -> Row:
+    """Summarise an objective (n,) over the speeds of the sweep."""
+    return {
+        "at_3000_rpm": along[int(np.argmin(np.abs(np.asarray(speeds) - 3000)))],
+        "mean_over_sweep": float(np.nanmean(along)),
+        "worst_over_sweep": float(np.nanmax(along)),
+        "worst_rpm": speeds[int(np.nanargmax(along))],
+        "share_of_speeds_better": float(np.mean(along < 1)),
+    }
+
+
+@dataclasses.dataclass
+class Results:
+    """Scenes by name, speeds (rpm) of the objective, and rows of sweeps, crossings and maxima.
+
+    `chance`: share of the maxima that chance puts at a crossing, by scene and design.
+    """
+
+    studies: dict[str, Study]
+    listed: tuple[float, ...]
+    rows: list[Row]
+    resonances: list[Row]
+    peaks: list[Row]
+    chance: dict[str, float]
+
+    def record(self) -> dict[str, Any]:
+        """Summarise frequencies, optimisations, maxima and statuses."""
+        return {
+            "linearised": {scene: found.linear for scene, found in self.studies.items()},
+            "optimisations": [row for found in self.studies.values() for row in found.outcomes],
+            "maxima": len(self.peaks),
+            "maxima_at_a_crossing": sum(abs(row["apart"]) <= NEAR for row in self.peaks),
+            "maxima_at_a_crossing_by_chance": sum(
+                self.chance[f"{row['scene']}, {row['design']}"] for row in self.peaks
+            ),
+            "statuses": {
+                f"{scene}, {name}": {
+                    status: sum(p.evaluation.status.label == status for p in parts)
+                    for status in dict.fromkeys(p.evaluation.status.label for p in parts)
+                }
+                for scene, found in self.studies.items()
+                for name, parts in found.designs.items()
+            },
+        }
+
+
+def run(quick: bool, say: Callable[[str], None] = lambda text: None) -> Results:
+    """Study all scenes; a reduced run takes one scene, few speeds and one short optimisation."""
+    speeds = np.linspace(300, 6000, 5 if quick else 115).tolist()
+    listed = (2000.0, 4000.0) if quick else tuple(np.arange(500.0, 6001.0, 500.0).tolist())
+    results = Results({}, listed, [], [], [], {})
+    for scene in list(SCENES)[: 1 if quick else None]:
+        found = results.studies[scene] = study(scene, speeds, listed, quick)
+        for name, parts in found.designs.items():
+            here = {"scene": scene, "design": name}
+            results.rows += [here | part.row() for part in parts]
+            across = crossings(found.linear[name], found.config.profile.lobes, speeds)
+            results.resonances += [here | row for row in across]
+            results.peaks += [here | row for row in maxima(parts, across)]
+            results.chance[f"{scene}, {name}"] = covered(across, speeds)
+        say(f"{scene}: {len(found.designs)} designs at {len(speeds)} speeds")
+    return results

@@ -1,0 +1,49 @@
+"""What does accuracy cost in run time?
+
+Writes work_precision.csv, work_precision.json and work_precision.png.
+"""
+
+import sys
+
+from experiments._common.driver import OK, Run, drive
+
+FIGURES = {"work_precision.png": "work_precision.png"}
+
+
+def body(run: Run) -> int:
+    """Measure, write, print the table."""
+    from experiments._common.tables import show
+    from experiments.work_precision import figures, study
+
+    results = study.run(run.quick, run.say)
+    run.csv("work_precision.csv", results.rows)
+    summary = {
+        "references": {
+            scene: {"response": r.found.response, "gradient": r.found.gradient, "error": r.error}
+            for scene, r in results.references.items()
+        },
+        "compile_seconds": results.compile_seconds,
+        "quick": run.quick,
+    }
+    run.json("work_precision.json", summary)
+    run.figure("work_precision.png", figures.errors(results))
+    show("Work and precision", results.rows)
+    left_out = [row for row in results.rows if row["status"] != "periodic"]
+    total = len(results.rows)
+    print(f"{len(left_out)} of {total} runs are left out of the curves; see `status`")
+    return OK
+
+
+def main() -> int:
+    """Run the study."""
+    return drive(
+        "work_precision",
+        __doc__,
+        body,
+        quick="one program and few tolerances",
+        published=FIGURES,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
