@@ -46,7 +46,7 @@ from experiments.families_parts.show import profiles_figure, ranking_figure, tab
 from rootsopt import files  # noqa: E402
 from rootsopt.config import Config, load  # noqa: E402
 from rootsopt.evaluate import Evaluation, Evaluator  # noqa: E402
-from rootsopt.families import CLASSICAL, MM, free_form_of, with_design  # noqa: E402
+from rootsopt.families import MM, classical, free_form_of, with_design  # noqa: E402
 from rootsopt.model import Model, check_geometry, design_vector, outline_mm  # noqa: E402
 from rootsopt.optimize.search import Search  # noqa: E402
 from rootsopt.profiles import Profile  # noqa: E402
@@ -272,7 +272,7 @@ def main() -> int:
     arguments = argparse.ArgumentParser(description="All profile families in the same housings.")
     arguments.add_argument("configs", nargs="*", default=["configs/ee.yaml", "configs/cic.yaml"])
     arguments.add_argument("-o", "--output", type=Path, default=Path("results/families"))
-    arguments.add_argument("--families", default=",".join(CLASSICAL), help="comma-separated")
+    arguments.add_argument("--families", default=",".join(classical()), help="comma-separated")
     arguments.add_argument("--jobs", type=int, default=2, help="families side by side")
     arguments.add_argument("--quick", action="store_true", help="one housing, two families")
     arguments.add_argument("--show", type=Path, help="families.json of an earlier run to show")

@@ -28,8 +28,8 @@ from rich.table import Table  # noqa: E402
 
 from rootsopt import files  # noqa: E402
 from rootsopt.config import FAMILY_KEYS  # noqa: E402
-from rootsopt.families import BY_LIMITS, DEG, INHERENT, MM, profile_of  # noqa: E402
-from rootsopt.optimize.bounds import around  # noqa: E402
+from rootsopt.config.families import family_of, parameters  # noqa: E402
+from rootsopt.families import DEG, MM, profile_of  # noqa: E402
 from rootsopt.profiles import Curve, FreeForm, geometry  # noqa: E402
 from rootsopt.profiles.cic import CIC  # noqa: E402
 from rootsopt.profiles.validity import PURE, margins  # noqa: E402
@@ -95,7 +95,7 @@ def draw(family: str, lobes: int, count: int, random: np.random.Generator, size:
     for key in FAMILY_KEYS[family]:
         shape = (count, size) if key == "coefficients" else (count, 1)
         share = random.random(shape)
-        low, high = around(key, RADIUS_MM, lobes)
+        low, high = parameters()[key].usually(RADIUS_MM, lobes)
         usual.append(low + (high - low) * share)
         share = random.random(shape)
         if key == "coefficients":
@@ -139,7 +139,7 @@ def judged(family: str, lobes: int, designs):
 
 def _sound(family: str, lobes: int, design):
     profile = profile_of(family, lobes, jnp.asarray(RADIUS_MM * MM), design)
-    if family in BY_LIMITS:
+    if family_of(family).by_limits:
         alpha, length = design[0] * DEG, design[1]
         tip = design[2] * DEG if family == "cic" else 0.0
         half = jnp.pi / (2 * lobes)
@@ -152,7 +152,7 @@ def _sound(family: str, lobes: int, design):
         return good & (profile.arc_radius > 0) & (profile.arc_center_radius > 0)
     good = jnp.ones((), bool)
     for name, value in margins(profile)._asdict().items():
-        if (family, name) not in INHERENT:
+        if name not in family_of(family).inherent:
             scale = 1.0 if name in PURE else RADIUS_MM * MM
             good &= value >= -_ROUNDING * scale
     if family == "arcs_epicycloid":

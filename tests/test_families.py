@@ -9,11 +9,11 @@ import pytest
 from scipy.optimize import brentq
 
 from rootsopt.config import FAMILY_KEYS, parse
+from rootsopt.config.families import family_of
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.nodes import pair_gap
 from rootsopt.errors import InputError
-from rootsopt.families import INHERENT, check, design_of, profile_of
-from rootsopt.optimize.bounds import around
+from rootsopt.families import check, design_of, profile_of
 from rootsopt.optimize.problem import sobol
 from rootsopt.profiles import CIC, EE, arc, geometry
 from rootsopt.profiles.validity import margins
@@ -302,14 +302,15 @@ def test_curve_is_the_one_its_normals_say(family):
 def test_what_margins_call_sound_is_one_curve(family):
     """Wherever in its bounds a member is sound, support function and lever go on without a jump,
     and the law of gearing holds: h′ = -lever."""
-    low, high = np.array([around(key, 1e3 * R, 3) for key in DESIGNS[family]]).T
+    inherent, parameters = family_of(family).inherent, family_of(family).parameters
+    low, high = np.array([one.usually(1e3 * R, 3) for one in parameters]).T
     sample = low + (high - low) * sobol(128, 1, len(low))
 
     def looked(design):
         profile = profile_of(family, 3, jnp.asarray(R), design)
         nu = profile.pitch_normal * jnp.linspace(0.0, 1.0, COUNT)
         found = margins(profile)._asdict()
-        least = [value for key, value in found.items() if (family, key) not in INHERENT]
+        least = [value for key, value in found.items() if key not in inherent]
         curved = jnp.max(profile.addendum_speed(nu))
         return jnp.min(jnp.stack(least)), curved, nu[1], profile.support(nu), profile.lever(nu)
 
