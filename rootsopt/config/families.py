@@ -258,13 +258,18 @@ def follow(update: Callable[[], None]) -> None:
 
 
 @contextlib.contextmanager
-def registered(family: Family) -> Iterator[Family]:
-    """Register a family for the time of a `with` block, for tests."""
-    register_family(family)
+def for_a_time() -> Iterator[None]:
+    """Take families that are registered in a `with` block out of the table at its end, for tests.
+
+    Programs that were compiled for them stay in memory: do not use their names again."""
+    before = dict(_families)
     try:
-        yield family
+        yield
     finally:
-        del _families[family.name]
+        _families.clear()
+        _families.update(before)
+        for name in _origins.keys() - before.keys():
+            del _origins[name]
         _follow()
 
 
