@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
 from rootsopt import disk, door, environment
-from rootsopt.config import Config, describe_keys, load
+from rootsopt.config import Config, describe_families, describe_keys, load
+from rootsopt.config.families import import_named
 from rootsopt.door import BAD_INPUT, NO_RESULT
 from rootsopt.door import OK as OK
 from rootsopt.environment import use_compiled_loops as use_compiled_loops
@@ -52,7 +53,8 @@ def parser(command: str, purpose: str) -> argparse.ArgumentParser:
     result = _Parser(
         prog=f"rootsopt {command}",
         description=purpose,
-        epilog=f"config keys (for --set and the file), units in the name:\n{describe_keys()}",
+        epilog=f"profile families (profile.family):\n{describe_families()}\n\n"
+        f"config keys (for --set and the file), units in the name:\n{describe_keys()}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     result.add_argument("config", type=Path, help="YAML file, for example configs/cic.yaml")
@@ -76,6 +78,7 @@ def parser(command: str, purpose: str) -> argparse.ArgumentParser:
         dest="overrides",
         help="override a config key, as in --set scene.speed_rpm=1500; repeatable",
     )
+    _add_import(result)
     result.add_argument("--no-figures", action="store_true", help="write no figures")
     result.add_argument(
         "--no-cache",
@@ -84,6 +87,28 @@ def parser(command: str, purpose: str) -> argparse.ArgumentParser:
         "(ROOTSOPT_CACHE=DIR names another folder, ROOTSOPT_CACHE=off is as this option)",
     )
     return result
+
+
+def _add_import(arguments: argparse.ArgumentParser) -> None:
+    arguments.add_argument(
+        "--import",
+        action="append",
+        default=[],
+        metavar="FILE_OR_MODULE",
+        dest="imports",
+        help="Python file, or module, to run first: it may register profile families; repeatable",
+    )
+
+
+def _import_extensions(command: str, argv: Sequence[str] | None) -> None:
+    """Import what `--import` names, before config keys are described and read."""
+    early = _Parser(prog=f"rootsopt {command}", add_help=False, allow_abbrev=False)
+    _add_import(early)
+    names = early.parse_known_args(argv)[0].imports
+    if names:
+        use_float64()
+    for name in names:
+        import_named(name)
 
 
 def run(
@@ -96,12 +121,15 @@ def run(
     """Parse, load, choose float64, run `body` in a folder of its own, put that in place, print;
     turn `InputError` into exit 2. `add_options` adds the command's own arguments."""
     environment.own_process()
-    arguments = parser(command, purpose)
-    add_options(arguments)
-    options = arguments.parse_args(argv)
-    if options.output is None:
-        options.output = os.path.join("results", f"{options.config.stem}-{command}")
     try:
+        _import_extensions(command, argv)
+        arguments = parser(command, purpose)
+        add_options(arguments)
+        options = arguments.parse_args(argv)
+        for name in options.imports:  # Those that only the whole parser knows: an abbreviation.
+            import_named(name)
+        if options.output is None:
+            options.output = os.path.join("results", f"{options.config.stem}-{command}")
         config = load(options.config, options.overrides)
         use_float64()
         if not options.no_cache:

@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.markers import CARETDOWN
 from numpy.typing import ArrayLike, NDArray
 
-from rootsopt.config import DESIGN_KEYS, FAMILY_KEYS, LIST_KEYS, Config
+from rootsopt.config import DESIGN_KEYS, FAMILY_KEYS, Config
+from rootsopt.config.families import is_list
 from rootsopt.contact.nodes import place_pair
 from rootsopt.files import ResultFolder
 from rootsopt.model import design_keys, outline_mm
@@ -252,7 +253,7 @@ def plot_history(
     keys = ("objective", *keys)
     for ax, key in zip(axes, keys, strict=True):
         for rows, style in _starts(history):
-            if key in LIST_KEYS:
+            if is_list(key):
                 _traces(ax, rows, key)
             else:
                 _trace(ax, rows, key, style)
@@ -334,7 +335,7 @@ def _best(axes, keys, history):
     winner = [row for row in history if row["objective"] == last][:1]
     star = {"color": "black", "markerfacecolor": "#F0E442", "markersize": 14, "zorder": 5}
     for ax, key in zip(axes, keys, strict=True):
-        if key in LIST_KEYS:
+        if is_list(key):
             continue
         x, y = [row["evaluation"] for row in winner], _values(winner, key)
         ax.plot(x, y, "*", label=f"best, {_number(last)}", **star)
@@ -367,7 +368,7 @@ def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, A
         _write(folder, "profiles", _profiles({config.profile.family.upper(): points}, config)),
         _write(folder, "meshing", _meshing(points, config)),
     ]
-    if config.profile.family == "outline":
+    if config.profile.from_file:
         from rootsopt.outline.conjugacy import conjugacy, gaps_um
         from rootsopt.outline.source import outline_of
 
@@ -455,7 +456,7 @@ def _force_figures(folder, designs, config) -> list[str]:
 
 
 def _history(history, keys):
-    heights = [2.2, *(1.8 if key in LIST_KEYS else 1 for key in keys)]
+    heights = [2.2, *(1.8 if is_list(key) else 1 for key in keys)]
     tall = 9 * sum(heights) / 5.2
     made, axes = figure(
         10, tall, len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights}

@@ -26,6 +26,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.experimental import serialize_executable
 
+from rootsopt.config.families import outside_modules
 from rootsopt.store import Store, UnsafeFolderError
 
 _PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "optax", "numpy")
@@ -176,7 +177,8 @@ class Program:
             return None
         if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
             return None  # What comes out of JAX's own cache cannot be kept a second time.
-        sources = _sources({self.function.__module__, *_modules(kind)})
+        outside = outside_modules()
+        sources = _sources({self.function.__module__, *_modules(kind), *outside})
         if sources is None:
             return None
         name = f"{self.function.__module__}.{self.function.__qualname__}"

@@ -11,9 +11,8 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from rootsopt.config import FAMILY_KEYS
-from rootsopt.families import CLASSICAL, INHERENT, MM, profile_of
-from rootsopt.optimize.bounds import around
+from rootsopt.config.families import family_of
+from rootsopt.families import MM, classical, profile_of
 from rootsopt.optimize.problem import sobol
 from rootsopt.profiles import Profile
 from rootsopt.profiles.departure import departure
@@ -58,20 +57,22 @@ def likenesses(profile: Profile) -> list[Likeness]:
     Sobol sample: a nearer member may be left unfound. Families without a sound one are left out.
     """
     found = []
-    for family in CLASSICAL:
-        likeness = _nearest(profile, family, FAMILY_KEYS[family])
+    for family in classical():
+        likeness = _nearest(profile, family)
         if likeness is not None:
             found.append(likeness)
     return sorted(found, key=lambda one: one.departure)
 
 
-def _nearest(profile: Profile, family: str, keys: tuple[str, ...]) -> Likeness | None:
+def _nearest(profile: Profile, family: str) -> Likeness | None:
     lobes, radius = profile.lobes, profile.pitch_radius
+    parameters, keys = family_of(family).parameters, family_of(family).keys
     look = _Look(profile, family)
     if not keys:
         starts = [np.zeros(0)]
     else:
-        low, high = np.array([around(key, float(radius) / MM, lobes) for key in keys]).T
+        size = float(radius) / MM, lobes
+        low, high = np.array([parameter.usually(*size) for parameter in parameters]).T
         sample = low + (high - low) * sobol(_SAMPLE, 0, len(keys))
         faults = np.array([look(one).fault for one in sample])
         starts = [_fitted(look, sample[k], high - low) for k in np.argsort(faults)[:_STARTS]]
@@ -189,7 +190,7 @@ def _compared(family: str, lobes: int, radius: Float[Array, ""], target, design)
         scaled = [
             value / (1.0 if name in PURE else radius)
             for name, value in found.items()
-            if (family, name) not in INHERENT
+            if name not in family_of(family).inherent
         ]
         values = away, jnp.stack(scaled)
         return values, values

@@ -18,6 +18,7 @@ from rootsopt import ensemble, evaluate, files, members, orbits, speeds
 from rootsopt.arclength import Steps
 from rootsopt.response.batch import on_all_cores
 from rootsopt.config import load
+from rootsopt.config.families import Parameter, parameters
 from rootsopt.contact.impact import ImpactLaw
 from rootsopt.contact.map import MARGIN
 from rootsopt.contact.nodes import signed_distance
@@ -32,7 +33,6 @@ from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.response.members import Members
 from rootsopt.model import Scene
 from rootsopt.optimize import noise
-from rootsopt.optimize.bounds import around
 from rootsopt.optimize.problem import Problem, sobol
 from rootsopt.optimize.search import Search, Trial, _history
 from rootsopt.profiles import CIC
@@ -494,6 +494,7 @@ def test_stated_error_of_a_map_is_relative_to_the_static_depth(monkeypatch):
 def test_ranges_of_parameters_that_a_config_leaves_open():
     """Lengths go with the pitch radius, the tip land with the lobe pitch, and every other one has
     the range of its kind; no length is negative."""
+    other = Parameter("some_other_angle_deg", "an angle", 0, 180)
     expected = {
         "arc_center_mm": (15.0, 29.97),
         "rolling_radius_mm": (0.3, 45.0),
@@ -506,7 +507,8 @@ def test_ranges_of_parameters_that_a_config_leaves_open():
         "some_other_angle_deg": (0.0, 90.0),
     }
     for key, pair in expected.items():
-        assert around(key, 30.0, 3) == pytest.approx(pair), key
+        found = (parameters() | {other.key: other})[key].usually(30.0, 3)
+        assert found == pytest.approx(pair), key
 
 
 # Speeds

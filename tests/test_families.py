@@ -1,118 +1,45 @@
-"""Families beside CIC and EE: known numbers, limits, conjugacy, contact, use by name."""
+"""Profile families: the conformance suite, known numbers, limits, refusals."""
 
-import functools
+import itertools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from rootsopt.config import FAMILY_KEYS, parse
-from rootsopt.contact.closest import FlankPair
-from rootsopt.contact.nodes import pair_gap
+from rootsopt.config.families import families
 from rootsopt.errors import InputError
-from rootsopt.families import INHERENT, check, design_of, profile_of
-from rootsopt.optimize.bounds import around
-from rootsopt.optimize.problem import sobol
-from rootsopt.profiles import CIC, EE, arc, geometry
+from rootsopt.families import check, profile_of
+from rootsopt.profiles import CIC, EE, arc
 from rootsopt.profiles.validity import margins
+from tests.conformance import families as suite
+from tests.conformance.families import COUNT, R, config_of, looked_at, made, maker, measure, sampled
 
-R = 0.033
 DEG = np.pi / 180
-measure = jax.jit(geometry)
-DESIGNS = {
-    "arc": {"arc_center_mm": 29.7},
-    "arc_involute": {"pressure_angle_deg": 36.0, "involute_length_mm": 6.0},
-    "four_arcs": {"arc_center_mm": 30.0, "tip_arc_radius_mm": 13.0, "tip_arc_turn_deg": 40.0},
-    "five_arcs": {
-        "outer_radius_mm": 45.0,
-        "tip_arc_angle_deg": 3.0,
-        "tip_arc_radius_mm": 13.0,
-        "tip_arc_turn_deg": 60.0,
-    },
-    "arcs_epicycloid": {"arc_center_mm": 27.0, "tip_arc_angle_deg": 8.0, "edge_radius_mm": 1.0},
-    "circle_epicycloid": {"rolling_radius_mm": 7.0, "tip_arc_turn_deg": 30.0},
-    "hypo_epicycloid": {"tip_arc_angle_deg": 4.0},
-    "extended_cycloid": {"trochoid_ratio": 1.3},
-    "ellipse": {"ellipse_center_mm": 27.0, "ellipse_height_mm": 18.0},
+FAMILIES = [name for name, family in families().items() if family.maker is not None]
+_ALIKE = {
+    suite.search_finds_the_closest_approach: (
+        *("arc", "four_arcs", "five_arcs", "arc_involute", "hypo_epicycloid", "ellipse", "ee"),
+    ),
+    suite.slopes_of_geometry_are_those_of_differences: ("arc", "five_arcs", "ellipse", "cic"),
+    suite.what_margins_call_sound_is_one_curve: ("arc_involute", "ee"),
 }
-COUNT = 1401
-"""Places on a flank, always as many, so that they are looked at by one program."""
-every_family = pytest.mark.parametrize("family", DESIGNS)
+"""Families that share the code of the rest in a check that compiles long: in long runs only."""
 
 
-def families_besides(*others):
-    """Every family, the `others` (which share the code of the rest) in long runs only."""
-    long = {family: pytest.param(family, marks=pytest.mark.long) for family in others}
-    return pytest.mark.parametrize("family", [long.get(family, family) for family in DESIGNS])
+def every_check():
+    """All pairs of a family and a check."""
+    pairs = []
+    for family, one in itertools.product(FAMILIES, suite.CHECKS):
+        marks = [pytest.mark.long] if family in _ALIKE.get(one, ()) else []
+        pairs.append(pytest.param(family, one, marks=marks, id=f"{family}-{one.__name__}"))
+    return pairs
 
 
-def config_of(family, lobes=3, **changes):
-    """The profile section of a config."""
-    with open("configs/cic.yaml", encoding="utf-8") as file:
-        rest = file.read().split("\nrotor:")[1]
-    keys = {"family": family, "lobes": lobes, "pitch_radius_mm": 33.0, **DESIGNS[family]} | changes
-    inside = ", ".join(f"{key}: {value}" for key, value in keys.items())
-    return parse(f"profile: {{{inside}}}\nrotor:{rest}").profile
-
-
-@functools.cache
-def maker(family):
-    """Design to profile."""
-    return jax.jit(lambda design: profile_of(family, 3, jnp.asarray(R), design))
-
-
-@functools.cache
-def made(family):
-    """The profile of the family's design."""
-    return maker(family)(design_of(config_of(family)))
-
-
-@jax.jit
-def looked_at(profile, nu):
-    """Everything the core says of normal angles, and slopes by them."""
-
-    def along(nu):
-        point = profile.addendum(nu)
-        return profile.position(point), point.s
-
-    (place, _), (speed, s_slope) = jax.jvp(along, (nu,), (jnp.ones_like(nu),))
-    return {
-        "addendum": place,
-        "dedendum": profile.position(profile.dedendum(nu)),
-        "speed": speed,
-        "s_slope": s_slope,
-        "lever": profile.lever(nu),
-        "support": profile.support(nu),
-        "rate": profile.roll_rate(nu),
-        "length": profile.addendum_speed(nu),
-        "inverse": profile.normal_at(profile.roll_angle(nu)),
-    }
-
-
-@functools.cache
-def sampled(family):
-    """Normal angles, always as many, with all joints, and what is there."""
-    segments = [(float(s.start), float(s.stop)) for s in made(family).segments()]
-    segments = [(start, stop) for start, stop in segments if stop > start]
-    counts = [max(60, round(1200 * (stop - start) / segments[-1][1])) for start, stop in segments]
-    counts[-1] += COUNT - 1 - sum(counts)
-    inside = [(np.arange(n) + 1e-9) / n for n in counts]
-    nu = [a + (b - a) * x for (a, b), x in zip(segments, inside, strict=True)]
-    nu = np.append(np.concatenate(nu), segments[-1][1])
-    found = looked_at(made(family), jnp.asarray(nu))
-    return nu, {key: np.asarray(value) for key, value in found.items()}
-
-
-@functools.cache
-def outline_of(family):
-    """Closed outline in mm, crowded where the flank turns."""
-    _, found = sampled(family)
-    flank = np.concatenate([found["addendum"], found["dedendum"][-2::-1]]) @ [1, 1j] * 1e3
-    lobe = np.concatenate([flank[:-1], (np.conj(flank) * np.exp(2j * np.pi / 3))[:0:-1]])
-    whole = np.concatenate([*(lobe * np.exp(2j * np.pi * k / 3) for k in range(3)), lobe[:1]])
-    return np.stack([whole.real, whole.imag], axis=-1)
+@pytest.mark.parametrize(("family", "holds"), every_check())
+def test_conforms(family, holds):
+    """Every family that the package registers passes the suite."""
+    holds(family)
 
 
 # Known numbers
@@ -272,142 +199,7 @@ def test_five_arcs_have_their_land():
     assert float(shape.seal_width) == pytest.approx(2 * 3 * DEG * 0.045)
 
 
-# What every family must hold
-
-
-@every_family
-def test_curve_is_the_one_its_normals_say(family):
-    """Normals, levers, arc lengths and the inverse of the roll angle, by differentiation of the
-    outline; the law of gearing ds/dβ = -r cos ψ."""
-    nu, found = sampled(family)
-    normal = np.stack([np.cos(nu), np.sin(nu)], axis=-1)
-    tangent = np.stack([-np.sin(nu), np.cos(nu)], axis=-1)
-    np.testing.assert_allclose(found["speed"], found["length"][:, None] * tangent, atol=1e-9)
-    place = found["addendum"]
-    np.testing.assert_allclose(np.sum(place * normal, axis=1), found["support"], atol=1e-13)
-    np.testing.assert_allclose(np.sum(place * tangent, axis=1), -found["lever"], atol=1e-13)
-    np.testing.assert_allclose(found["s_slope"], -found["lever"] * found["rate"], atol=1e-9)
-    assert place[0, 1] == pytest.approx(0, abs=1e-11)
-    crossing = R * np.array([np.cos(np.pi / 6), 0.5])
-    np.testing.assert_allclose(place[-1], crossing, atol=1e-15)
-    # Neighbours are next to each other: no joint is torn.
-    steps = np.hypot(*np.diff(place, axis=0).T)
-    assert np.max(steps) < 2e-3 * R
-    # Where one normal only has the roll angle.
-    apart = nu > (made(family).joints[2] if family == "arcs_epicycloid" else 0.0)
-    np.testing.assert_allclose(found["inverse"][apart], nu[apart], atol=1e-9)
-
-
-@every_family
-def test_what_margins_call_sound_is_one_curve(family):
-    """Wherever in its bounds a member is sound, support function and lever go on without a jump,
-    and the law of gearing holds: h′ = -lever."""
-    low, high = np.array([around(key, 1e3 * R, 3) for key in DESIGNS[family]]).T
-    sample = low + (high - low) * sobol(128, 1, len(low))
-
-    def looked(design):
-        profile = profile_of(family, 3, jnp.asarray(R), design)
-        nu = profile.pitch_normal * jnp.linspace(0.0, 1.0, COUNT)
-        found = margins(profile)._asdict()
-        least = [value for key, value in found.items() if (family, key) not in INHERENT]
-        curved = jnp.max(profile.addendum_speed(nu))
-        return jnp.min(jnp.stack(least)), curved, nu[1], profile.support(nu), profile.lever(nu)
-
-    designs = jnp.asarray(np.concatenate([[list(DESIGNS[family].values())], sample]))
-    found = jax.jit(lambda designs: jax.lax.map(looked, designs))(designs)
-    least, curved, step, support, lever = map(np.asarray, found)
-    # All but straight flanks: there the lever may change at any rate.
-    sound = (least >= -1e-9) & (curved < 3 * R)
-    assert np.sum(sound) >= 2
-    step, support, lever = step[sound, None], support[sound], lever[sound]
-    # By the distance of a centre of curvature from the axis.
-    assert np.max(np.abs(np.diff(lever)) / step) < 4 * R
-    fall = (lever[:, 1:] + lever[:, :-1]) / 2 * step
-    assert np.max(np.abs(np.diff(support) + fall)) < 2e-6 * R
-
-
-@every_family
-def test_area_is_that_of_the_outline(family):
-    points = outline_of(family) @ [1, 1j]
-    area = np.sum((np.conj(points[:-1]) * points[1:]).imag) / 2
-    assert float(measure(made(family)).area) * 1e6 == pytest.approx(area, rel=2e-6)
-
-
-@every_family
-def test_rolling_pair_touches_and_does_not_overlap(family):
-    """|gap| < 1 nm through a mesh period, by node search."""
-    gaps = [
-        pair_gap(outline_of(family), 3, 66.0, phi, phi)
-        for phi in 0.0123 + 2 * np.pi / 3 * np.arange(9) / 9
-    ]
-    assert np.max(np.abs(gaps)) < 1e-6
-
-
-@jax.jit
-def searched(profile, roll, relative):
-    pair = FlankPair.of(profile)
-
-    def one(pose):
-        attempts, best = pair._search(*pose)
-        return attempts == 1, best, pair._search(*pose, attempt=1)[1]
-
-    return jax.lax.map(one, (roll, relative))
-
-
-@families_besides("arc", "four_arcs", "five_arcs", "arc_involute", "hypo_epicycloid", "ellipse")
-def test_search_finds_the_closest_approach(family):
-    """What Newton's method calls certain is what the nodes find, and the nodes of outlines."""
-    profile = made(family)
-    rng = np.random.default_rng(3)
-    half = float(profile.half_pitch)
-    roll = rng.uniform(-half, half, 2000)
-    relative = -(10 ** rng.uniform(-7, np.log10(5e-3), 2000))
-    # Right before the middle of the mesh, and where the flank's contact begins.
-    begins = float(profile.roll_angle(profile.segments()[-1].start))
-    roll[:6] = [0.999 * half, 0.8 * half, 0.5 * half, begins + 1e-2, begins - 1e-3, begins - 1e-2]
-    relative[:6] = -1e-3
-    found = searched(profile, jnp.asarray(roll), jnp.asarray(relative))
-    certain, best, nodes = jax.tree.map(np.asarray, found)
-    assert np.mean(certain) > 0.5
-    both = certain & best.found & nodes.found
-    assert np.max(np.abs(best.gap - nodes.gap), where=both, initial=0.0) < 1e-13
-    assert not np.any(nodes.found & (nodes.gap < 0) & certain & ~best.found)
-    for x, turn, gap in zip(roll[:6], relative[:6], best.gap[:6], strict=True):
-        seen = pair_gap(outline_of(family), 3, 66.0, -x - turn / 2, -x + turn / 2)
-        assert min(gap * 1e3, seen) == pytest.approx(seen, abs=2e-6)
-
-
-@families_besides("arc", "five_arcs", "ellipse")
-def test_design_derivatives_of_geometry(family):
-    """By each design parameter, against central differences."""
-
-    @jax.jit
-    def look(design, way):
-        def shape(design):
-            found = geometry(profile_of(family, 3, jnp.asarray(R), design))
-            return jnp.stack([found.area, found.outer_radius, found.polar_area_moment])
-
-        return jax.jvp(shape, (design,), (way,))
-
-    design = design_of(config_of(family))
-    for way in jnp.diag(design):
-        value, slope = look(design, way)
-        up, down = (look(design + step * way, way)[0] for step in (1e-5, -1e-5))
-        difference = (up - down) / 2e-5
-        np.testing.assert_allclose(slope / value, difference / value, rtol=0, atol=1e-8)
-
-
 # Use by name
-
-
-@every_family
-def test_config_wants_the_keys_of_the_family(family):
-    check(config_of(family))
-    for key in FAMILY_KEYS[family]:
-        with pytest.raises(InputError, match=rf"profile\.{key}"):
-            config_of(family, **{key: "null"})
-    with pytest.raises(InputError, match=r"profile\..* does not belong to family"):
-        config_of(family, **{"ellipse_center_mm" if family != "ellipse" else "arc_center_mm": 20.0})
 
 
 @pytest.mark.parametrize(

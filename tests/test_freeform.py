@@ -320,7 +320,7 @@ def test_likeness_finds_the_family_it_came_from(monkeypatch):
     """A projected member of a family resembles that family, in its parameters too."""
     from rootsopt import resemblance
 
-    monkeypatch.setattr(resemblance, "CLASSICAL", ("ee", "arc"))
+    monkeypatch.setattr(resemblance, "classical", lambda: ("ee", "arc"))
     nearest, other = likenesses(project(made("arc", 29.7), 12))
     assert (nearest.family, other.family) == ("arc", "ee")
     assert nearest.design["arc_center_mm"] == pytest.approx(29.7, abs=1e-3)

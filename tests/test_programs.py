@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from rootsopt import cli, environment, programs, store
+from rootsopt.config.families import for_a_time, import_named
 from rootsopt.programs import Program
 from rootsopt.timing import CompileClock
 
@@ -410,6 +411,29 @@ def test_a_program_of_sources_elsewhere_follows_them(folder, monkeypatch, tmp_pa
     del own.__file__
     assert float(Program(own.function)(jnp.ones(2))[0]) == 3.0
     assert len(list(folder.iterdir())) == 4
+
+
+def test_programs_follow_the_files_of_families_from_outside(folder, monkeypatch, tmp_path):
+    """And what these import from their folder: a name in a config says nothing of either."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "own_helper.py").write_text("SIZE = 1\n")
+    (tmp_path / "own_family.py").write_text(
+        "import own_helper\n"
+        "from rootsopt import Family, register_family\n"
+        "def make(lobes, pitch_radius): return own_helper.SIZE\n"
+        "register_family(Family(name='of_a_helper', help='none', maker=make))\n"
+    )
+    before = place()
+    with for_a_time():
+        import_named("own_family")
+        found = [place()]
+        for name in ("own_helper", "own_family"):
+            (tmp_path / f"{name}.py").write_text("# changed\n")
+            found.append(place())
+        assert len({before, *found}) == 4
+    assert place() == before
+    for name in ("own_helper", "own_family"):
+        del sys.modules[name]
 
 
 def grown(part, x):

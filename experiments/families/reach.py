@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from experiments._common.simulation import profile_of
-from rootsopt.config import FAMILY_KEYS, Config
+from rootsopt.config import Config
+from rootsopt.config.families import family_of
 from rootsopt.model import MM, Model, design_keys
-from rootsopt.optimize.bounds import around
 from rootsopt.optimize.problem import Problem, Space, sobol
 from rootsopt.profiles import geometry
 
@@ -39,9 +39,9 @@ def of_family(reference: Config, family: str) -> Config:
     """
     size = reference.profile.pitch_radius_mm, reference.profile.lobes
     bounds: dict[str, Any] = {}
-    for key in FAMILY_KEYS[family]:
-        low, high = around(key, *size)
-        bounds[key] = (max(low, _LEAST_SHARE * high), high)
+    for parameter in family_of(family).parameters:
+        low, high = parameter.usually(*size)
+        bounds[parameter.key] = (max(low, _LEAST_SHARE * high), high)
     if "tip_arc_angle_deg" in bounds:
         bounds["tip_arc_angle_deg"] = (0.0, bounds["tip_arc_angle_deg"][1])
     middle = {key: sum(pair) / 2 for key, pair in bounds.items()}

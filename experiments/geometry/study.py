@@ -16,8 +16,8 @@ import numpy as np
 from jax import lax
 
 from rootsopt.config import FAMILY_KEYS
-from rootsopt.families import BY_LIMITS, DEG, INHERENT, MM, profile_of
-from rootsopt.optimize.bounds import around
+from rootsopt.config.families import family_of, parameters
+from rootsopt.families import DEG, MM, profile_of
 from rootsopt.profiles import Curve, FreeForm, geometry
 from rootsopt.profiles.cic import CIC
 from rootsopt.profiles.validity import PURE, margins
@@ -92,7 +92,7 @@ def draw(family: str, lobes: int, count: int, random: np.random.Generator, size:
     for key in FAMILY_KEYS[family]:
         shape = (count, size) if key == "coefficients" else (count, 1)
         share = random.random(shape)
-        low, high = around(key, RADIUS_MM, lobes)
+        low, high = parameters()[key].usually(RADIUS_MM, lobes)
         usual.append(low + (high - low) * share)
         share = random.random(shape)
         if key == "coefficients":
@@ -136,7 +136,7 @@ def judged(family: str, lobes: int, designs):
 
 def _sound(family: str, lobes: int, design):
     profile = profile_of(family, lobes, jnp.asarray(RADIUS_MM * MM), design)
-    if family in BY_LIMITS:
+    if family_of(family).by_limits:
         alpha, length = design[0] * DEG, design[1]
         tip = design[2] * DEG if family == "cic" else 0.0
         half = jnp.pi / (2 * lobes)
@@ -149,7 +149,7 @@ def _sound(family: str, lobes: int, design):
         return good & (profile.arc_radius > 0) & (profile.arc_center_radius > 0)
     good = jnp.ones((), bool)
     for name, value in margins(profile)._asdict().items():
-        if (family, name) not in INHERENT:
+        if name not in family_of(family).inherent:
             scale = 1.0 if name in PURE else RADIUS_MM * MM
             good &= value >= -_ROUNDING * scale
     if family == "arcs_epicycloid":

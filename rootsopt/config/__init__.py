@@ -5,19 +5,23 @@ in `rootsopt.model`. Anything wrong with a file, a key or a value raises `InputE
 with one message that names the key, the value and what is allowed.
 """
 
-from rootsopt.config.reading import Config, describe_keys, load, parse
-from rootsopt.config.scene import DESIGN_KEYS, FAMILY_KEYS, LIST_KEYS, ProfileConfig
+from rootsopt.config.families import FAMILY_KEYS
+from rootsopt.config.reading import Config, describe_families, describe_keys, load, parse
+from rootsopt.config.scene import ProfileConfig
 from rootsopt.config.study import EnsembleConfig, SolverConfig
 from rootsopt.config.units import hint
+
+DESIGN_KEYS = FAMILY_KEYS["cic"]
+"""The design parameters of a CIC rotor, as named in the config."""
 
 __all__ = [
     "DESIGN_KEYS",
     "FAMILY_KEYS",
-    "LIST_KEYS",
     "Config",
     "EnsembleConfig",
     "ProfileConfig",
     "SolverConfig",
+    "describe_families",
     "describe_keys",
     "hint",
     "load",

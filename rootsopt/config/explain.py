@@ -124,6 +124,8 @@ def _advice(place: list, kind: str, value: Any, field: FieldInfo | None) -> str:
         return hint(place[-1], value, low, high)
     if kind == "literal_error" and isinstance(value, str):
         near = difflib.get_close_matches(value[:80].casefold(), choices(field.annotation), n=1)
+        if not near and place == ["profile", "family"]:
+            return "; if that is a family of your own, name its file by `--import`"
         return f"; did you mean {near[0]}?" if near else ""
     if kind == "float_type" and isinstance(value, str) and len(value) < 20:
         try:

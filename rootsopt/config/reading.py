@@ -7,15 +7,20 @@ from pydantic import Field, ValidationError, model_validator
 
 from rootsopt.config.document import MOST_BYTES, read_document
 from rootsopt.config.explain import describe, explain
+from rootsopt.config.families import (
+    families,
+    family_of,
+    find_installed,
+    follow,
+    replace_fields,
+)
 from rootsopt.config.scene import (
-    FAMILY_KEYS,
     ContactConfig,
     ProfileConfig,
     RotorConfig,
     SceneConfig,
-    length_limits,
 )
-from rootsopt.config.section import Section
+from rootsopt.config.section import Section, bare
 from rootsopt.config.smoothing import following_mm
 from rootsopt.config.study import (
     AttractorsConfig,
@@ -108,8 +113,8 @@ class Config(Section):
     @model_validator(mode="after")
     def _sized_bounds(self):
         profile = self.profile
-        for key in FAMILY_KEYS[profile.family]:
-            limits = length_limits(key, profile.pitch_radius_mm)
+        for parameter in family_of(profile.family).parameters:
+            key, limits = parameter.key, parameter.limits(profile.pitch_radius_mm)
             pair = getattr(self.optimizer.bounds, key)
             if limits is None or pair is None or limits[0] <= pair[0] < pair[1] <= limits[1]:
                 continue
@@ -125,6 +130,9 @@ class Config(Section):
         """The resolved config, every default written out."""
         data = self.model_dump(mode="json", exclude_none=True)
         return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
+
+
+follow(lambda: replace_fields(Config, dict(Config.model_fields)))
 
 
 def load(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Config:
@@ -156,10 +164,19 @@ def parse(
     for override in overrides:
         _override(data, override)
     _place_files(data, Path())
+    _find_family(data)
     try:
         return Config.model_validate(data)
     except ValidationError as error:
         raise InputError(sentence(f"{name}: {explain(error, Config)}")) from None
+
+
+def _find_family(data: dict) -> None:
+    """Load the installed package that offers the family of a config, if none is registered."""
+    profile = data.get("profile")
+    name = profile.get("family") if isinstance(profile, dict) else None
+    if isinstance(name, str) and bare(name) not in map(bare, families()):
+        find_installed(name)
 
 
 def _place_files(data: dict, folder: Path) -> None:
@@ -214,3 +231,8 @@ def _override(data: dict, override: str) -> None:
 def describe_keys() -> str:
     """One line per key with meaning, unit, choices or range, and default, for `--help`."""
     return describe(Config)
+
+
+def describe_families() -> str:
+    """One line per registered family with its name and what it is made of, for `--help`."""
+    return "\n".join(f"  {name:<18} {family.help}" for name, family in families().items())

@@ -4,110 +4,32 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from rootsopt.config import catalogue as _catalogue  # noqa: F401  (fills the table)
+from rootsopt.config.families import (
+    families,
+    family_of,
+    follow,
+    parameters,
+    replace_fields,
+    users_of,
+)
 from rootsopt.config.section import Radius, Section, Speed, Torque, between
 from rootsopt.config.units import hint
 from rootsopt.config.words import shown
 
-DESIGN_KEYS = ("pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg")
-"""The design parameters of a CIC rotor, as named in the config."""
-FAMILY_KEYS: dict[str, tuple[str, ...]] = {
-    "cic": DESIGN_KEYS,
-    "ee": (),
-    "arc": ("arc_center_mm",),
-    "arcs_epicycloid": ("arc_center_mm", "tip_arc_angle_deg", "edge_radius_mm"),
-    "arc_involute": ("pressure_angle_deg", "involute_length_mm"),
-    "four_arcs": ("arc_center_mm", "tip_arc_radius_mm", "tip_arc_turn_deg"),
-    "five_arcs": (
-        "outer_radius_mm",
-        "tip_arc_angle_deg",
-        "tip_arc_radius_mm",
-        "tip_arc_turn_deg",
-    ),
-    "circle_epicycloid": ("rolling_radius_mm", "tip_arc_turn_deg"),
-    "hypo_epicycloid": ("tip_arc_angle_deg",),
-    "extended_cycloid": ("trochoid_ratio",),
-    "ellipse": ("ellipse_center_mm", "ellipse_height_mm"),
-    "outline": (),
-    "free_form": ("tip_arc_angle_deg", "coefficients"),
-}
-"""Profile families with their design parameters, as named in the config."""
-LIST_KEYS = ("coefficients",)
-"""Keys that hold a list of design parameters, each last of its family."""
-
-
-_LONGEST = 5e4
-_Length = Annotated[float, between(1e-3, _LONGEST)]
-_SHARES = 0.002, 10.0
-"""Least and greatest length of a profile, in pitch radii."""
 _USUAL = 0.01, 2.0
-"""The same for lengths of usual size."""
-_Share = Annotated[float, between(-1, 1)]
+"""Least and greatest length of a profile of usual size, in pitch radii."""
 
 
 class ProfileConfig(Section):
-    """The rotor profile."""
+    """The rotor profile.
 
-    family: Literal[
-        "cic",
-        "ee",
-        "arc",
-        "arcs_epicycloid",
-        "arc_involute",
-        "four_arcs",
-        "five_arcs",
-        "circle_epicycloid",
-        "hypo_epicycloid",
-        "extended_cycloid",
-        "ellipse",
-        "free_form",
-        "outline",
-    ] = Field(description="profile family; outline: from a file")
+    Beside these keys it has those of all registered families' parameters, each `None` unless it
+    belongs to the config's own `family`."""
+
+    family: str = Field(description="profile family; outline: from a file")
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
     pitch_radius_mm: Radius = Field(description="pitch radius; centre distance is twice that")
-    pressure_angle_deg: Annotated[float, Field(ge=1, lt=90)] | None = Field(
-        None, description="cic, arc_involute: pressure angle of the involute"
-    )
-    involute_length_mm: Annotated[float, between(1e-9, 1e4)] | None = Field(
-        None, description="cic, arc_involute: involute parameter u"
-    )
-    tip_arc_angle_deg: Annotated[float, Field(ge=0, lt=45)] | None = Field(
-        None,
-        description="cic, five_arcs, arcs_epicycloid, hypo_epicycloid, free_form: half angle of "
-        "the tip land",
-    )
-    arc_center_mm: _Length | None = Field(
-        None,
-        description="arc, arcs_epicycloid, four_arcs: distance of the arc's centre from the axis",
-    )
-    tip_arc_radius_mm: _Length | None = Field(
-        None, description="four_arcs, five_arcs: radius of the tip arc"
-    )
-    tip_arc_turn_deg: Annotated[float, Field(ge=1, lt=180)] | None = Field(
-        None,
-        description="four_arcs, five_arcs, circle_epicycloid: normal angle where the tip arc ends",
-    )
-    outer_radius_mm: _Length | None = Field(None, description="five_arcs: radius of the tip land")
-    edge_radius_mm: _Length | None = Field(
-        None, description="arcs_epicycloid: radius of the edge between tip land and arc"
-    )
-    rolling_radius_mm: _Length | None = Field(
-        None, description="circle_epicycloid: radius of the rolling circle"
-    )
-    trochoid_ratio: Annotated[float, between(1e-3, 10)] | None = Field(
-        None,
-        description="extended_cycloid: distance of the drawing point from the rolling circle's "
-        "centre at the tip, in its radii",
-    )
-    ellipse_center_mm: Annotated[float, between(0, _LONGEST)] | None = Field(
-        None, description="ellipse: distance of the ellipse's centre from the axis"
-    )
-    ellipse_height_mm: _Length | None = Field(None, description="ellipse: semi-axis along the lobe")
-    coefficients: Annotated[tuple[_Share, ...], Field(min_length=3, max_length=64)] | None = Field(
-        None,
-        description="free_form: fall of the pressure angle per turn of the normal, from tip to "
-        "pitch circle, 3 to 64 numbers up to 1 (arc about a pitch point); 0: involute, down to -1",
-    )
-
     outline_file: str | None = Field(
         None, description="outline: CSV or DXF file, relative to the config's folder"
     )
@@ -115,22 +37,35 @@ class ProfileConfig(Section):
         None, description="outline: scatter (RMS) of measured points; absent: 0, through them"
     )
 
+    @property
+    def parameters(self) -> dict[str, float | tuple[float, ...]]:
+        """The design parameters of the config's family by key, in the units of the keys."""
+        return {key: getattr(self, key) for key in family_of(self.family).keys}
+
+    @property
+    def from_file(self) -> bool:
+        """Whether the profile is in a file, and not made from parameters."""
+        return family_of(self.family).maker is None
+
     @model_validator(mode="before")
     @classmethod
-    def _list(cls, data):
-        if isinstance(data, dict) and isinstance(given := data.get("coefficients"), list):
-            return data | {"coefficients": tuple(given)}
-        return data
+    def _lists(cls, data):
+        if not isinstance(data, dict):
+            return data
+        lists = {key for key, parameter in parameters().items() if parameter.count is not None}
+        given = {key: data[key] for key in lists & data.keys() if isinstance(data[key], list)}
+        return data | {key: tuple(value) for key, value in given.items()}
 
     @model_validator(mode="after")
     def _sized(self):
-        for key in _SIZED:
-            value, limits = getattr(self, key), length_limits(key, self.pitch_radius_mm)
+        for key, parameter in parameters().items():
+            value, limits = getattr(self, key), parameter.limits(self.pitch_radius_mm)
             if value is None or limits is None or limits[0] <= value <= limits[1]:
                 continue
+            assert parameter.radii is not None
             low, high = limits
             word = f"at least {low:.4g}" if value < low else f"at most {high:.4g}"
-            share = _SHARES[0] if value < low else _SHARES[1]
+            share = parameter.radii[0] if value < low else parameter.radii[1]
             raise ValueError(
                 f"`profile.{key}` must be {word} ({share:g} pitch radii), but is {value:g}"
                 + hint(key, value, *(share * self.pitch_radius_mm for share in _USUAL))
@@ -138,28 +73,29 @@ class ProfileConfig(Section):
         return self
 
     @model_validator(mode="after")
-    def _from_file(self):
+    def _outline(self):
         if self.outline_file is not None and not self.outline_file.isprintable():
             raise ValueError(
                 "`profile.outline_file` must be the path of a file, but is "
                 f"{shown(self.outline_file)}, which has characters that cannot be printed"
             )
-        if self.family == "outline":
+        if self.from_file:
             if self.outline_file is None:
-                raise ValueError("`profile.outline_file` is required for family outline")
+                raise ValueError(f"`profile.outline_file` is required for family {self.family}")
             return self
+        readers = [name for name, family in families().items() if family.maker is None]
         for key in ("outline_file", "outline_smoothing_mm"):
             if getattr(self, key) is not None:
                 raise ValueError(
                     f"`profile.{key}` does not belong to family {self.family}; remove it, or set "
-                    "`profile.family` to outline"
+                    f"`profile.family` to {' or '.join(readers)}"
                 )
         return self
 
     @model_validator(mode="after")
     def _family_keys(self):
-        own = FAMILY_KEYS[self.family]
-        for key in dict.fromkeys(key for keys in FAMILY_KEYS.values() for key in keys):
+        own = family_of(self.family).keys
+        for key in parameters():
             given = getattr(self, key) is not None
             if key in own and not given:
                 raise ValueError(f"`profile.{key}` is required for family {self.family}")
@@ -170,26 +106,23 @@ class ProfileConfig(Section):
         return self
 
 
-def length_limits(key: str, pitch_radius_mm: float) -> tuple[float, float] | None:
-    """Least and greatest value of a length of a profile that goes with the pitch radius."""
-    if key not in _SIZED:
-        return None
-    least = 0.0 if key in _MAY_BE_SMALL else _SHARES[0] * pitch_radius_mm
-    return least, _SHARES[1] * pitch_radius_mm
+_FIELDS = dict(ProfileConfig.model_fields)
 
 
-_SIZED = (
-    "arc_center_mm",
-    "tip_arc_radius_mm",
-    "outer_radius_mm",
-    "edge_radius_mm",
-    "rolling_radius_mm",
-    "ellipse_center_mm",
-    "ellipse_height_mm",
-)
-"""Lengths of a profile that go with the pitch radius."""
-_MAY_BE_SMALL = "ellipse_center_mm", "edge_radius_mm"
-"""Those without a floor here; that of an edge is the family's own."""
+def _derive() -> None:
+    """Give `ProfileConfig` the families and keys of the table."""
+    first, last = (
+        {name: field for name, field in _FIELDS.items() if name.startswith("outline") is behind}
+        for behind in (False, True)
+    )
+    words = Literal[tuple(families())]  # type: ignore[valid-type]
+    first |= {"family": (words, Field(description=_FIELDS["family"].description))}
+    made = {key: parameter.field(users_of(key)) for key, parameter in parameters().items()}
+    replace_fields(ProfileConfig, first | made | last)
+
+
+_derive()
+follow(_derive)
 
 
 class RotorConfig(Section):

@@ -39,12 +39,12 @@ class Section(BaseModel):
             return data
         found = dict(data)
         for name, field in cls.model_fields.items():
-            words = {_bare(word): word for word in choices(field.annotation)}
+            words = {bare(word): word for word in choices(field.annotation)}
             value = found.get(name)
             if isinstance(value, str):
-                found[name] = words.get(_bare(value), value)
+                found[name] = words.get(bare(value), value)
             elif isinstance(value, dict) and words:
-                named = {words.get(_bare(str(key)), key): inner for key, inner in value.items()}
+                named = {words.get(bare(str(key)), key): inner for key, inner in value.items()}
                 found[name] = named if len(named) == len(value) else value
         return found
 
@@ -58,7 +58,8 @@ def choices(annotation: Any) -> tuple[str, ...]:
     return ()
 
 
-def _bare(word: str) -> str:
+def bare(word: str) -> str:
+    """A word without case, spaces, `-` and `_`, as choices are compared."""
     return re.sub(r"[-_\s]", "", word.casefold())
 
 

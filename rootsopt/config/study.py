@@ -1,11 +1,10 @@
 """Sections of a config that say how it is solved, and what is asked of it."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, create_model, model_validator
+from pydantic import Field, model_validator
 
-from rootsopt.config.explain import limits_of
-from rootsopt.config.scene import FAMILY_KEYS, ProfileConfig
+from rootsopt.config.families import follow, parameters, replace_fields
 from rootsopt.config.section import Order, Section, Speed, Weight, between, number, tuples
 from rootsopt.config.units import hint
 from rootsopt.config.words import shown
@@ -295,8 +294,10 @@ class ConstraintsConfig(Section):
         return self
 
 
-class _Bounds(Section):
-    """Box of the search, (low, high) for each design parameter of the family."""
+class BoundsConfig(Section):
+    """Box of the search, (low, high) for each design parameter of the family.
+
+    Its keys are those of all registered families' parameters."""
 
     @model_validator(mode="before")
     @classmethod
@@ -305,8 +306,9 @@ class _Bounds(Section):
 
     @model_validator(mode="after")
     def _ordered(self):
-        for key, pair in self:
-            least, most = _limits(key)
+        for key, parameter in parameters().items():
+            pair = getattr(self, key)
+            least, most = parameter.bounds_limits or (parameter.lowest, parameter.highest)
             if pair is not None and not least <= pair[0] < pair[1] <= most:
                 raise ValueError(
                     f"`optimizer.bounds.{key}` must be two increasing numbers in "
@@ -316,49 +318,14 @@ class _Bounds(Section):
         return self
 
 
-def _limits(key: str) -> tuple[float, float]:
-    """Least and greatest value that a bound of a design parameter may have."""
-    if (known := _KNOWN.get(key)) is not None:
-        return known
-    field = ProfileConfig.model_fields[key]
-    return limits_of(field.annotation, field.metadata).ends
+def _derive() -> None:
+    """Give `BoundsConfig` the keys of the table."""
+    made = {key: parameter.bounds_field() for key, parameter in parameters().items()}
+    replace_fields(BoundsConfig, made)
 
 
-_KNOWN = {"pressure_angle_deg": (1.0, 80.0), "tip_arc_angle_deg": (0.0, 44.0)}
-"""Limits of bounds where they are narrower than those of the key itself."""
-_Pair = tuple[float, float]
-_DEFAULTS: dict[str, _Pair] = {
-    "pressure_angle_deg": (25.0, 45.0),
-    "tip_arc_angle_deg": (0.5, 8.0),
-}
-"""Bounds that are the same for every rotor; the others are made for its size."""
-_AROUND = "default: half to one and a half of the config's own"
-_NOTES = {
-    "pressure_angle_deg": "default: 25 to 45",
-    "involute_length_mm": "default: 10 % to 100 % of the longest involute",
-    "tip_arc_angle_deg": "default: 0.5 to 8",
-    "arc_center_mm": "default: 0.5 to 0.999 pitch radii",
-    "edge_radius_mm": _AROUND,
-    "tip_arc_radius_mm": "default: 0.05 to 0.8 pitch radii",
-    "tip_arc_turn_deg": "default: 1 to 90",
-    "outer_radius_mm": "default: 1.1 to 1.7 pitch radii",
-    "rolling_radius_mm": _AROUND,
-    "trochoid_ratio": _AROUND,
-    "ellipse_center_mm": "default: 0 to 0.99 pitch radii",
-    "ellipse_height_mm": "default: 0.2 to 1.5 pitch radii",
-    "coefficients": "of each of them; default: -1 to 1",
-}
-_BOUNDS: dict[str, Any] = {
-    key: (
-        _Pair if key in _DEFAULTS else _Pair | None,
-        Field(
-            _DEFAULTS.get(key),
-            description="{}; from {:g} to {:g}".format(_NOTES[key], *_limits(key)),
-        ),
-    )
-    for key in dict.fromkeys(key for keys in FAMILY_KEYS.values() for key in keys)
-}
-BoundsConfig = create_model("BoundsConfig", __base__=_Bounds, __doc__=_Bounds.__doc__, **_BOUNDS)
+_derive()
+follow(_derive)
 
 
 class OptimizerConfig(Section):
@@ -376,6 +343,7 @@ class OptimizerConfig(Section):
         48, description="designs screened to place the starts; 0 starts at the baseline only"
     )
     seed: _Seed = Field(0, description="seed of the screening sample")
-    bounds: BoundsConfig = Field(  # type: ignore[valid-type]
-        default_factory=lambda: BoundsConfig.model_validate({})
-    )
+    bounds: BoundsConfig = Field(default_factory=lambda: BoundsConfig.model_validate({}))
+
+
+follow(lambda: replace_fields(OptimizerConfig, dict(OptimizerConfig.model_fields)))

@@ -28,6 +28,13 @@ def unit_of(key: str) -> str:
     return next((unit for end, (unit, _) in _UNITS.items() if key.endswith(end)), "")
 
 
+def si_unit(key: str) -> float:
+    """SI value of one unit of a design parameter's key: of millimetres, degrees, or none."""
+    if key.endswith("_deg"):
+        return math.pi / 180
+    return 1e-3 if key.endswith("_mm") else 1.0
+
+
 def hint(key: object, value: float, low: float, high: float) -> str:
     """A question whether `value`, which does not lie within `low` and `high`, is in a unit in which
     it does; "" if there is none."""

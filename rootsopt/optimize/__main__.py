@@ -112,7 +112,9 @@ def _nothing_known(config: "Config", folder: "RunFolder") -> "Outcome":
 
 def _alike(config: "Config", result) -> dict:
     """What a free form that was found resembles, for report and result file."""
-    if config.profile.family != "free_form" or result.optimized is None:
+    from rootsopt.config.families import family_of
+
+    if family_of(config.profile.family).classical or result.optimized is None:
         return {}
     import jax.numpy as jnp
 

@@ -1,10 +1,10 @@
 """The design problem: unit box, constraints, objective.
 
 The search runs in a unit box, onto whose sides the design parameters map linearly from their
-bounds, but for the length of an involute: that is a share of the longest one which pressure
-angle and tip land allow, so that u ≤ u_max holds by construction. Constraints depend on geometry
-alone and are cheap; where no limits of the parameters say whether a profile is sound, the margins
-of `rootsopt.profiles.validity` are constraints like the others.
+bounds, but for one whose range depends on the others (`Family.ranges`): that one is searched as a
+share of its range, so that an involute never exceeds its longest, u_max. Constraints depend on
+geometry alone and are cheap. Where no limits of the parameters say whether a profile is sound, the
+margins of `rootsopt.profiles.validity` are constraints like the others.
 """
 
 import dataclasses
@@ -14,7 +14,6 @@ import itertools
 import math
 import threading
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,9 +24,11 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from rootsopt.config import Config
+from rootsopt.config.families import Family, family_of
+from rootsopt.config.units import unit_of
 from rootsopt.dynamics.measures import line_name
 from rootsopt.errors import InputError
-from rootsopt.families import BY_LIMITS, DEG, INHERENT, MM, keys_of
+from rootsopt.families import DEG, MM
 from rootsopt.model import Scene
 from rootsopt.optimize.bounds import bounds_of
 from rootsopt.profiles import Geometry, geometry
@@ -36,8 +37,6 @@ from rootsopt.programs import Program
 from rootsopt.response.evaluation import Evaluation, objective_weights
 from rootsopt.response.speeds import counted, parts_of
 
-_SHORTEST = 0.1
-"""Least involute, as a share of the longest, where the config sets no bound."""
 _NO_LINE = 1e-9
 """Amplitude of a spectral line, relative to the mean force, that counts as none."""
 _DRAWN = 5
@@ -85,15 +84,6 @@ class Constraint(eqx.Module):
         return self.sign * (value - self.limit) / self.scale
 
 
-class _Involute(NamedTuple):
-    """Which entries of a design are the pressure angle, the involute's length, and the tip land's
-    half angle, if there is one."""
-
-    angle: int
-    length: int
-    tip: int | None
-
-
 class Space(eqx.Module):
     """The unit box of d design parameters and the constraints in it."""
 
@@ -101,19 +91,18 @@ class Space(eqx.Module):
     lower: Float[Array, " d"]
     upper: Float[Array, " d"]
     constraints: tuple[Constraint, ...]
-    involute: _Involute | None = eqx.field(static=True)
 
     @classmethod
     def of(cls, config: Config, scene: Scene, area_efficiency: float) -> "Space":
         """Bounds and floors of a config whose baseline has this `area_efficiency`; raises
         `InputError` where they leave no design."""
-        limits, family = config.constraints, config.profile.family
+        limits, family = config.constraints, family_of(config.profile.family)
         rows = bounds_of(config)
         floor = limits.area_efficiency_min
         if floor == "baseline":
             floor = area_efficiency
         margin = limits.undercut_margin_min_mm * MM
-        sound = family not in BY_LIMITS
+        sound = not family.by_limits
         # Looked at in more places where that decides whether the profile is sound.
         undercut = "undercut" if sound else "undercut_margin"
         constraints = (
@@ -130,24 +119,21 @@ class Space(eqx.Module):
                 row = "outer radius", "outer_radius", "mm", radius * MM, MM, MM
                 constraints += (_constraint(*row, ceiling=ceiling),)
         if sound:
-            rows_of = [row for row in _SOUND if (family, row[1]) not in INHERENT]
+            rows_of = [row for row in _SOUND if row[1] not in family.inherent]
             constraints += tuple(_constraint(*row, margin=True) for row in rows_of)
         lower, upper = np.array(rows, dtype=float).T
-        keys = keys_of(config.profile)
-        involute = None
-        if "involute_length_mm" in keys:
-            tip = "tip_arc_angle_deg"
-            angle, length = map(keys.index, ("pressure_angle_deg", "involute_length_mm"))
-            involute = _Involute(angle, length, keys.index(tip) if tip in keys else None)
-        return cls(scene, jnp.asarray(lower), jnp.asarray(upper), constraints, involute)
+        return cls(scene, jnp.asarray(lower), jnp.asarray(upper), constraints)
+
+    @property
+    def family(self) -> Family:
+        """The profile family whose designs these are."""
+        return family_of(self.scene.family)
 
     def design(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
         """Design in config units at `point` of the unit box."""
         limits = zip(self.lower, self.upper, point, strict=True)
         values = [low + (high - low) * share for low, high, share in limits]
-        if self.involute is not None:
-            place = self.involute.length
-            least, most = self._lengths(*self._angles(values))
+        for place, least, most in self._within(values):
             values[place] = least + (most - least) * point[place]
         return jnp.stack(values)
 
@@ -156,27 +142,23 @@ class Space(eqx.Module):
         values = jnp.clip(design, self.lower, self.upper)
         limits = zip(self.lower, self.upper, values, strict=True)
         shares = [(value - low) / (high - low) for low, high, value in limits]
-        if self.involute is not None:
-            place = self.involute.length
-            least, most = self._lengths(*self._angles(values))
+        for place, least, most in self._within(values):
             shares[place] = (values[place] - least) / (most - least)
         return jnp.clip(jnp.stack(shares), 0.0, 1.0)
 
-    def _angles(self, values):
-        """Pressure angle and the tip land's half angle (deg) of a design with an involute."""
-        assert self.involute is not None
-        angle, _, tip = self.involute
-        return values[angle], 0.0 if tip is None else values[tip]
-
-    def _lengths(self, alpha, tip):
-        """Shortest and longest involute (mm) at α, θ1 (deg)."""
-        assert self.involute is not None
-        low, high = self.lower[self.involute.length], self.upper[self.involute.length]
-        half = jnp.pi / (2 * self.scene.lobes)
+    def ranges(self, values) -> dict[str, tuple[Float[Array, ""], Float[Array, ""]]]:
+        """(low, high) by key of parameters whose range depends on the other `values` (d,)."""
         radius = self.scene.pitch_radius / MM
-        longest = radius * jnp.sin(alpha * DEG) * (half - tip * DEG)
-        most = jnp.minimum(longest, high)
-        return jnp.minimum(jnp.maximum(low, _SHORTEST * longest), 0.999 * most), most
+        named = dict(zip(self.family.keys, self.family.split(values), strict=True))
+        return dict(self.family.dependent(self.scene.lobes, radius, **named))
+
+    def _within(self, values):
+        """Place in the design, least and greatest value of these parameters within bounds."""
+        for key, (least, most) in self.ranges(values).items():
+            place = self.family.keys.index(key)
+            most = jnp.minimum(most, self.upper[place])
+            least = jnp.minimum(jnp.maximum(self.lower[place], least), 0.999 * most)
+            yield place, least, most
 
     def slacks(self, point: Float[Array, " d"]) -> Float[Array, " m"]:
         """Scaled slack of every constraint."""
@@ -215,10 +197,9 @@ def _nearest(space: Space, design):
 
 
 @Program
-def _longest(space: Space, point):
-    """Longest involute (mm) at a point of the unit box, bounds aside."""
-    profile = space.scene.profile(space.design(point))
-    return profile.longest_involute / MM  # type: ignore[attr-defined]
+def _ranges(space: Space, design):
+    """Ranges of parameters that depend on the others at a design, bounds aside."""
+    return space.ranges(design)
 
 
 _slacks_of = Program(Space.slacks_of)
@@ -352,7 +333,7 @@ class Problem:
         perhaps a profile cannot even be made, the point is drawn towards `inside`, a feasible one,
         until it does."""
         found = self.project(point)
-        if self.space.involute is not None:
+        if self.space.family.by_limits:
             return found
         for share in (*0.5 ** np.arange(1, _DRAWN + 1), 0.0):
             if self.feasible(found):
@@ -400,21 +381,23 @@ class Problem:
             slack = c.sign * (after - limit) * c.factor / c.scale
             sense = "<=" if c.ceiling else ">="
             rows.append(_row(c.name, before, after, limit, c.unit, slack, sense))
-        if self.space.involute is not None:
-            rows.append(self._length_row(optimized))
-        return rows
+        return rows + self._range_rows(optimized)
 
     def _slacks(self, evaluation: Evaluation) -> NDArray[np.float64]:
         """Scaled slack of every constraint for a design that was evaluated."""
         design = np.asarray(list(evaluation.design.values()), dtype=np.float64)
         return np.asarray(_slacks_of(self.space, design))
 
-    def _length_row(self, optimized: Evaluation) -> dict:
-        point = self.point(list(optimized.design.values()))
-        limit = float(_longest(self.space, point))
-        after = optimized.design["involute_length_mm"]
-        before = self.baseline.design["involute_length_mm"]
-        return _row("involute length", before, after, limit, "mm", limit - after, "<=")
+    def _range_rows(self, optimized: Evaluation) -> list[dict]:
+        """The upper ends of ranges that depend on the other parameters."""
+        design = np.asarray(list(optimized.design.values()), dtype=np.float64)
+        rows = []
+        for key, (_, most) in _ranges(self.space, design).items():
+            before, after, limit = self.baseline.design[key], optimized.design[key], float(most)
+            name, unit = key.removesuffix("_mm").removesuffix("_deg"), unit_of(key)
+            row = name.replace("_", " "), before, after, limit, unit, limit - after, "<="
+            rows.append(_row(*row))
+        return rows
 
 
 def _constraint(

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 def record(config: Config) -> dict[str, Any]:
     """`outline` of the result file: checks and conjugacy; nothing for other families."""
-    if config.profile.family != "outline":
+    if not config.profile.from_file:
         return {}
     from rootsopt.outline.source import outline_of
 
@@ -21,7 +21,7 @@ def record(config: Config) -> dict[str, Any]:
 
 def say(config: Config, out: "Console") -> None:
     """Print what must be known of the flank that stands for all, if there is anything."""
-    if config.profile.family != "outline":
+    if not config.profile.from_file:
         return
     from rootsopt.outline.source import note, outline_of
 

@@ -11,61 +11,62 @@ from jaxtyping import Float
 from rootsopt.profiles.arcs import Arcs
 
 
-def arc(lobes: int, pitch_radius: Float[ArrayLike, ""], center: Float[ArrayLike, ""]) -> Arcs:
-    """The lobe is one circular arc through both pitch crossings, with its `center` b (m) on the
+def arc(lobes: int, pitch_radius: Float[ArrayLike, ""], arc_center: Float[ArrayLike, ""]) -> Arcs:
+    """The lobe is one circular arc through both pitch crossings, with its `arc_center` b (m) on the
     lobe's axis: its radius is √(r² + b² - 2 r b cos π/2N). (The single arc of the literature.)"""
-    return Arcs.chain(lobes, pitch_radius, center, (), (), ("arc",))
+    return Arcs.chain(lobes, pitch_radius, arc_center, (), (), ("arc",))
 
 
 def four_arcs(
     lobes: int,
     pitch_radius: Float[ArrayLike, ""],
-    center: Float[ArrayLike, ""],
-    tip_radius: Float[ArrayLike, ""],
-    turn: Float[ArrayLike, ""],
+    arc_center: Float[ArrayLike, ""],
+    tip_arc_radius: Float[ArrayLike, ""],
+    tip_arc_turn: Float[ArrayLike, ""],
 ) -> Arcs:
     """Four curves a flank: two tangent arcs on the addendum, and their conjugates.
 
-    The tip arc has its `center` b (m) on the lobe's axis and the radius `tip_radius` ρ (m), and
-    ends at the normal angle `turn` (rad). The flank arc goes on from there through the pitch
-    crossing, which gives its radius. With ρ that of `arc` the two are one.
+    The tip arc has its `arc_center` b (m) on the lobe's axis and the radius `tip_arc_radius` ρ (m).
+    It ends at the normal angle `tip_arc_turn` (rad). The flank arc goes on from there through the
+    pitch crossing, which gives its radius. With ρ that of `arc` the two are one.
     """
     names = ("tip arc", "flank arc")
-    return Arcs.chain(lobes, pitch_radius, center, (tip_radius,), (turn,), names)
+    return Arcs.chain(lobes, pitch_radius, arc_center, (tip_arc_radius,), (tip_arc_turn,), names)
 
 
 def five_arcs(
     lobes: int,
     pitch_radius: Float[ArrayLike, ""],
     outer_radius: Float[ArrayLike, ""],
-    land: Float[ArrayLike, ""],
-    tip_radius: Float[ArrayLike, ""],
-    turn: Float[ArrayLike, ""],
+    tip_arc_angle: Float[ArrayLike, ""],
+    tip_arc_radius: Float[ArrayLike, ""],
+    tip_arc_turn: Float[ArrayLike, ""],
 ) -> Arcs:
     """Five arcs a lobe: a tip land, and on either side a tip arc and a flank arc, all tangent.
 
-    The land of half angle `land` θ1 (rad) lies at the `outer_radius` (m); the tip arc has the
-    radius `tip_radius` (m) and ends at the normal angle `turn` (rad); the flank arc goes on
-    through the pitch crossing.
+    The land of half angle `tip_arc_angle` θ1 (rad) lies at the `outer_radius` (m). The tip arc has
+    the radius `tip_arc_radius` (m) and ends at the normal angle `tip_arc_turn` (rad). The flank arc
+    goes on through the pitch crossing.
     """
     names = ("tip land", "tip arc", "flank arc")
-    radii, joints = (outer_radius, tip_radius), (land, turn)
+    radii, joints = (outer_radius, tip_arc_radius), (tip_arc_angle, tip_arc_turn)
     return Arcs.chain(lobes, pitch_radius, None, radii, joints, names)
 
 
 def arcs_epicycloid(
     lobes: int,
     pitch_radius: Float[ArrayLike, ""],
-    center: Float[ArrayLike, ""],
-    land: Float[ArrayLike, ""],
+    arc_center: Float[ArrayLike, ""],
+    tip_arc_angle: Float[ArrayLike, ""],
     edge_radius: Float[ArrayLike, ""],
 ) -> Arcs:
     """Circular arcs joined with a conjugate epicycloid: a single arc cut off by a tip land.
 
-    The lobe is the arc of `arc` around its `center` b (m), of radius ρ, and a land of half angle
-    `land` θ1 (rad). The edge between them is an arc of radius `edge_radius` e (m) tangent to both,
-    its centre on the ray θ1 at the distance d = b cos θ1 ± √((ρ - e)² - b² sin² θ1) from the axis,
-    and the outer radius d + e; an edge flatter than the arc (-, e > ρ) would have to turn back. On
+    The lobe is the arc of `arc` around its `arc_center` b (m), of radius ρ, and a land of half
+    angle `tip_arc_angle` θ1 (rad). The edge between them is an arc of radius `edge_radius` e (m)
+    tangent to both, its centre on the ray θ1 at the distance
+    d = b cos θ1 ± √((ρ - e)² - b² sin² θ1) from the axis, and the outer radius d + e; an edge
+    flatter than the arc (-, e > ρ) would have to turn back. On
     the partner the edge traces the curve at the distance e from the extended epicycloid that its
     centre describes (the epicycloid itself for e = 0); it joins the mates of land and arc.
 
@@ -77,7 +78,7 @@ def arcs_epicycloid(
     circle. (Derivation.)
     """
     r = jnp.asarray(pitch_radius)
-    b, theta, e = jnp.asarray(center), jnp.asarray(land), jnp.asarray(edge_radius)
+    b, theta, e = jnp.asarray(arc_center), jnp.asarray(tip_arc_angle), jnp.asarray(edge_radius)
     half = jnp.pi / (2 * lobes)
     zero = jnp.zeros_like(r)
     away, across = r * jnp.cos(half) - b, r * jnp.sin(half)

@@ -28,6 +28,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+_BRACKETS = 16
+"""Intervals of a segment between which the normal angle at a roll angle is searched."""
+_STEPS = 10
+"""Guarded Newton steps of this search; each at least halves the bracket where Newton's fails."""
+_POLISH = 3
+"""Plain Newton steps after these, with as many derivatives."""
+_FLAT = 1e-9
+"""Least dβ/dν in these steps: on an arc centred on the pitch circle it is 0."""
+
 
 class RollPoint(NamedTuple):
     """A flank point in roll-angle form.
@@ -76,9 +85,10 @@ class Mate(NamedTuple):
 class Profile(eqx.Module):
     """One flank of a conjugate Roots rotor; see the module's docstring.
 
-    Subclasses give `segments`, `roll_angle`, its inverse and `contact_distance` on
-    0 ≤ ν ≤ `pitch_normal`, continued analytically beyond the pitch point and, unless
-    the first segment is a land, over the tip (β odd and s even in ν).
+    Subclasses give `segments`, `roll_angle` and `contact_distance` on 0 ≤ ν ≤ `pitch_normal`,
+    continued analytically beyond the pitch point and, unless the first segment is a land, over
+    the tip (β odd and s even in ν). All else follows. `normal_at`, `lever` and `support` may be
+    given where there is a closed form, which is quicker and more exact.
     """
 
     lobes: eqx.AbstractVar[int]
@@ -117,13 +127,14 @@ class Profile(eqx.Module):
     def contact_distance(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """s(ν) in m."""
 
-    @abc.abstractmethod
     def normal_at(self, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """ν(β) in rad: the inverse of `roll_angle` up to the pitch point, in closed form.
+        """ν(β) in rad: the inverse of `roll_angle` up to the pitch point.
 
         Where several points mesh at one instant, or the roll angle turns back, it is the
-        one nearest to the pitch point.
+        one nearest to the pitch point. By default it is searched, with the derivatives of the
+        implicit function; a closed form is quicker.
         """
+        return _inverse(self, roll_angle)
 
     def lever(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Moment arm r cos ψ (m) of the contact normal about the rotor's axis."""
@@ -241,3 +252,33 @@ class Profile(eqx.Module):
         """Signed radius of curvature of the dedendum (m): positive convex, negative concave."""
         turning = 2 * self.roll_rate(nu) - 1
         return self.dedendum_speed(nu) / turning
+
+
+def _inverse(profile: Profile, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The greatest normal angle (rad) at which `profile` has a roll angle, by safeguarded Newton.
+
+    The search is not differentiated. Plain Newton steps at its end carry the derivatives with
+    respect to roll angle and design, and continue the flank analytically beyond its ends."""
+    fixed, want = jax.tree.map(lax.stop_gradient, (profile, roll_angle))
+
+    def rolled(profile, nu):
+        beta, rate = jax.jvp(profile.roll_angle, (nu,), (jnp.ones_like(nu),))
+        return beta, jnp.maximum(rate, _FLAT)
+
+    shares = jnp.arange(_BRACKETS) / _BRACKETS
+    nodes = [one.start + (one.stop - one.start) * shares for one in fixed.segments()]
+    nodes = jnp.append(jnp.concatenate(nodes), fixed.pitch_normal)
+    begun = fixed.roll_angle(nodes[:-1]) <= want[..., None]
+    last = jnp.max(jnp.where(begun, jnp.arange(len(nodes) - 1), 0), axis=-1)
+    low, high = nodes[last], nodes[last + 1]
+    nu = (low + high) / 2
+    for _ in range(_STEPS):
+        beta, rate = rolled(fixed, nu)
+        low, high = jnp.where(beta <= want, nu, low), jnp.where(beta > want, nu, high)
+        step = nu - (beta - want) / rate
+        nu = jnp.where((step >= low) & (step <= high), step, (low + high) / 2)
+    nu = lax.stop_gradient(nu)
+    for _ in range(_POLISH):
+        beta, rate = rolled(profile, nu)
+        nu = nu - (beta - roll_angle) / rate
+    return nu

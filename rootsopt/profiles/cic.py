@@ -2,9 +2,20 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from rootsopt.profiles.base import Profile, Segment
+
+
+def arc_involute(
+    lobes: int,
+    pitch_radius: Float[ArrayLike, ""],
+    pressure_angle: Float[ArrayLike, ""],
+    involute_length: Float[ArrayLike, ""],
+) -> "CIC":
+    """A CIC rotor without a tip land: arc and involute. Arguments as those of `CIC`."""
+    return CIC(lobes, pitch_radius, pressure_angle, involute_length, 0.0)
 
 
 class CIC(Profile):

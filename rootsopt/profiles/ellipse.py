@@ -10,12 +10,14 @@ from rootsopt.profiles.curve import Curve, Piece
 def ellipse(
     lobes: int,
     pitch_radius: Float[ArrayLike, ""],
-    center: Float[ArrayLike, ""],
-    height: Float[ArrayLike, ""],
+    ellipse_center: Float[ArrayLike, ""],
+    ellipse_height: Float[ArrayLike, ""],
 ) -> Curve:
-    """The lobe is an arc of an ellipse through both pitch crossings: its `center` b (m) and the
-    semi-axis `height` A (m) lie along the lobe's axis; the other one, B, follows from the
-    crossings, (r cos π/2N - b)² / A² + (r sin π/2N)² / B² = 1. With A = B it is the single arc."""
+    """The lobe is an arc of an ellipse through both pitch crossings: its `ellipse_center` b (m) and
+    the semi-axis `ellipse_height` A (m) lie along the lobe's axis; the other one, B, follows from
+    the crossings, (r cos π/2N - b)² / A² + (r sin π/2N)² / B² = 1. With A = B it is the single
+    arc."""
+    center, height = ellipse_center, ellipse_height
     r, half = jnp.asarray(pitch_radius), jnp.pi / (2 * lobes)
     x, y = (r * jnp.cos(half) - center) / height, r * jnp.sin(half)
     stop = jnp.arccos(x)

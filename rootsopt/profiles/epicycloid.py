@@ -113,22 +113,23 @@ def circle_epicycloid(
     lobes: int,
     pitch_radius: Float[ArrayLike, ""],
     rolling_radius: Float[ArrayLike, ""],
-    turn: Float[ArrayLike, ""],
+    tip_arc_turn: Float[ArrayLike, ""],
 ) -> TippedEpicycloid:
-    """A tip arc centred on the lobe's axis, which ends at the normal angle `turn` (rad), and an
-    epicycloid of `rolling_radius` (m). With the joint on the lobe's axis, that is
-    turn = π/2 - π r / 4N r_e, the arc is centred on the pitch circle and meshes all at once."""
-    return TippedEpicycloid(lobes, pitch_radius, rolling_radius, turn)
+    """A tip arc centred on the lobe's axis, and an epicycloid of `rolling_radius` (m).
+
+    The arc ends at the normal angle `tip_arc_turn` (rad). With the joint on the lobe's axis, that
+    is ν = π/2 - π r / 4N r_e, the arc is centred on the pitch circle and meshes all at once."""
+    return TippedEpicycloid(lobes, pitch_radius, rolling_radius, tip_arc_turn)
 
 
 def hypo_epicycloid(
-    lobes: int, pitch_radius: Float[ArrayLike, ""], land: Float[ArrayLike, ""]
+    lobes: int, pitch_radius: Float[ArrayLike, ""], tip_arc_angle: Float[ArrayLike, ""]
 ) -> TippedEpicycloid:
-    """Whole half arches of hypocycloid and epicycloid, with a land of half angle `land` θ1 (rad)
-    at tip and root.
+    """Whole half arches of hypocycloid and epicycloid, with a land at tip and root.
 
-    Both arches, for identical rotors at 1:1, are rolled by one circle, and ψ must reach π/2 where
+    The land has the half angle `tip_arc_angle` θ1 (rad). Both arches, for identical rotors at 1:1,
+    are rolled by one circle, and ψ must reach π/2 where
     the land begins: r_e = r (π/2N - θ1) / π. Without a land this is EE. (Derivation.)
     """
-    rolling = jnp.asarray(pitch_radius) * (1 / (2 * lobes) - jnp.asarray(land) / jnp.pi)
-    return TippedEpicycloid(lobes, pitch_radius, rolling, land, land=True)
+    rolling = jnp.asarray(pitch_radius) * (1 / (2 * lobes) - jnp.asarray(tip_arc_angle) / jnp.pi)
+    return TippedEpicycloid(lobes, pitch_radius, rolling, tip_arc_angle, land=True)

@@ -8,12 +8,12 @@ from rootsopt.profiles.curve import Curve, RollPiece
 
 
 def extended_cycloid(
-    lobes: int, pitch_radius: Float[ArrayLike, ""], ratio: Float[ArrayLike, ""]
+    lobes: int, pitch_radius: Float[ArrayLike, ""], trochoid_ratio: Float[ArrayLike, ""]
 ) -> Curve:
     """An epicycloid drawn by a point whose distance from the rolling circle's centre varies.
 
     With r_e = r / 2N the curve is P(θ) = e^{iθ} [r + r_e + λ(θ) r_e e^{2iNθ}], from the tip (θ = 0)
-    to the pitch crossing (θ = π/2N). The trochoid ratio λ falls or rises from `ratio` λ0 at the tip
+    to the pitch crossing (θ = π/2N). The ratio λ falls or rises from `trochoid_ratio` λ0 at the tip
     to 1 at the crossing by the quintic that has no slope and no bend at either end,
     λ = 1 + (λ0 - 1) u³ (10 - 15 u + 6 u²) with u = 1 - 2Nθ/π: the idea of Hsieh and Hwang (J. Mech.
     Des. 129 (2007) 1278), whose own formulas were not at hand. λ0 = 1 is EE; the outer radius is
@@ -30,7 +30,7 @@ def extended_cycloid(
     e = r_e² λ′ (cos 2Nδ - λ) / (δ M), and cos ψ = cos η + e / r. Of this
     sin²(ψ/2) = sin²(η/2) - e / 2r is left, of second order in δ, and β = θ - η + ψ. (Derivation.)
     """
-    r, ratio = jnp.asarray(pitch_radius), jnp.asarray(ratio)
+    r, ratio = jnp.asarray(pitch_radius), jnp.asarray(trochoid_ratio)
     half, n = jnp.pi / (2 * lobes), lobes
     rolling = r / (2 * lobes)
 

@@ -1,0 +1,210 @@
+"""The package's own profile families, registered as any other."""
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING
+
+from rootsopt.config.families import Family, Pair, Parameter, register_family
+from rootsopt.errors import InputError
+
+if TYPE_CHECKING:
+    from rootsopt.config.scene import ProfileConfig
+
+_LONGEST = 5e4
+_SHARES = 0.002, 10.0
+"""Least and greatest length of a profile, in pitch radii."""
+_NO_FLOOR = 0.0, 10.0
+
+
+@dataclasses.dataclass(frozen=True)
+class _LandAngle(Parameter):
+    """Half angle of a tip land, which leaves a quarter of the lobe pitch at most."""
+
+    def usually(self, pitch_radius_mm: float, lobes: int) -> Pair:
+        return 0.0, 45.0 / lobes
+
+    def check_bounds(self, bounds: Pair, lobes: int) -> None:
+        half = 90.0 / lobes
+        if bounds[1] >= half:
+            raise InputError(
+                f"`optimizer.bounds.{self.key}` must stay below {half:g} (a quarter of the lobe "
+                f"pitch), but is {list(bounds)}"
+            )
+
+
+class _Dependent(Parameter):
+    """A length that nothing bounds but a range which depends on the other parameters."""
+
+    def bounds(self, profile: "ProfileConfig") -> Pair:
+        del profile
+        return 0.0, math.inf
+
+
+def _length(key: str, meaning: str, usual: Pair | None = None, radii: Pair = _SHARES) -> Parameter:
+    least = 0.0 if key == "ellipse_center_mm" else 1e-3
+    return Parameter(key, meaning, least, _LONGEST, radii=radii, usual=usual)
+
+
+PRESSURE_ANGLE = Parameter(
+    "pressure_angle_deg",
+    "pressure angle of the involute",
+    *(1, 90),
+    below=True,
+    usual=(15.0, 60.0),
+    default_bounds=(25.0, 45.0),
+    bounds_limits=(1.0, 80.0),
+)
+INVOLUTE_LENGTH = _Dependent(
+    "involute_length_mm",
+    "involute parameter u",
+    *(1e-9, 1e4),
+    bounds_note="default: 10 % to 100 % of the longest involute",
+)
+TIP_ARC_ANGLE = _LandAngle(
+    "tip_arc_angle_deg",
+    "half angle of the tip land",
+    *(0, 45),
+    below=True,
+    default_bounds=(0.5, 8.0),
+    bounds_limits=(0.0, 44.0),
+)
+ARC_CENTER = _length("arc_center_mm", "distance of the arc's centre from the axis", (0.5, 0.999))
+# The family itself has a floor for the radius of an edge.
+EDGE_RADIUS = _length(
+    "edge_radius_mm", "radius of the edge between tip land and arc", radii=_NO_FLOOR
+)
+TIP_ARC_RADIUS = _length("tip_arc_radius_mm", "radius of the tip arc", (0.05, 0.8))
+TIP_ARC_TURN = Parameter(
+    "tip_arc_turn_deg", "normal angle where the tip arc ends", 1, 180, below=True, usual=(1.0, 90.0)
+)
+OUTER_RADIUS = _length("outer_radius_mm", "radius of the tip land", (1.1, 1.7))
+ROLLING_RADIUS = _length("rolling_radius_mm", "radius of the rolling circle")
+TROCHOID_RATIO = Parameter(
+    "trochoid_ratio",
+    "distance of the drawing point from the rolling circle's centre at the tip, in its radii",
+    *(1e-3, 10),
+)
+ELLIPSE_CENTER = _length(
+    "ellipse_center_mm", "distance of the ellipse's centre from the axis", (0.0, 0.99), _NO_FLOOR
+)
+ELLIPSE_HEIGHT = _length("ellipse_height_mm", "semi-axis along the lobe", (0.2, 1.5))
+COEFFICIENTS = Parameter(
+    "coefficients",
+    "fall of the pressure angle per turn of the normal, from tip to pitch circle, 3 to 64 numbers "
+    "up to 1 (arc about a pitch point); 0: involute, down to -1",
+    *(-1, 1),
+    usual=(-1.0, 1.0),
+    count=(3, 64),
+)
+
+_OWN = (
+    Family(
+        name="cic",
+        help="tip land, tip arc and involute: the rotor of the source paper",
+        maker="rootsopt.profiles.cic:CIC",
+        parameters=(PRESSURE_ANGLE, INVOLUTE_LENGTH, TIP_ARC_ANGLE),
+        example={"pressure_angle_deg": 36.43, "involute_length_mm": 8.0, "tip_arc_angle_deg": 4.0},
+        limits="rootsopt.profiles.involute:check",
+        by_limits=True,
+        ranges="rootsopt.profiles.involute:ranges",
+    ),
+    Family(
+        name="ee",
+        help="epicycloid on hypocycloid; it has no design parameter",
+        maker="rootsopt.profiles.ee:EE",
+    ),
+    Family(
+        name="arc",
+        help="one circular arc through both pitch crossings",
+        maker="rootsopt.profiles.arc_families:arc",
+        parameters=(ARC_CENTER,),
+        example={"arc_center_mm": 29.7},
+        remedy="move the centre: it must lie inside the pitch circle, and too far out undercuts",
+    ),
+    Family(
+        name="arcs_epicycloid",
+        help="the single arc cut off by a tip land, with a rounded edge between",
+        maker="rootsopt.profiles.arc_families:arcs_epicycloid",
+        parameters=(ARC_CENTER, TIP_ARC_ANGLE, EDGE_RADIUS),
+        example={"arc_center_mm": 27.0, "tip_arc_angle_deg": 8.0, "edge_radius_mm": 1.0},
+        remedy="widen the land, move the arc's centre inwards, or round the edge more (an edge is "
+        "sharper than its arc)",
+        # An edge outside of the pitch circle meshes twice.
+        inherent=frozenset({"rolling"}),
+        limits="rootsopt.profiles.edge:check",
+    ),
+    Family(
+        name="arc_involute",
+        help="tip arc and involute, without a land",
+        maker="rootsopt.profiles.cic:arc_involute",
+        parameters=(PRESSURE_ANGLE, INVOLUTE_LENGTH),
+        example={"pressure_angle_deg": 36.0, "involute_length_mm": 6.0},
+        limits="rootsopt.profiles.involute:check",
+        by_limits=True,
+        ranges="rootsopt.profiles.involute:ranges",
+    ),
+    Family(
+        name="four_arcs",
+        help="tip arc and flank arc, tangent to each other",
+        maker="rootsopt.profiles.arc_families:four_arcs",
+        parameters=(ARC_CENTER, TIP_ARC_RADIUS, TIP_ARC_TURN),
+        example={"arc_center_mm": 30.0, "tip_arc_radius_mm": 13.0, "tip_arc_turn_deg": 40.0},
+        remedy="move the tip arc's centre inwards, or change where it ends or its radius",
+    ),
+    Family(
+        name="five_arcs",
+        help="tip land, tip arc and flank arc, tangent to each other",
+        maker="rootsopt.profiles.arc_families:five_arcs",
+        parameters=(OUTER_RADIUS, TIP_ARC_ANGLE, TIP_ARC_RADIUS, TIP_ARC_TURN),
+        example={
+            "outer_radius_mm": 45.0,
+            "tip_arc_angle_deg": 3.0,
+            "tip_arc_radius_mm": 13.0,
+            "tip_arc_turn_deg": 60.0,
+        },
+        remedy="lower the outer radius, or change the tip arc's radius or where it ends",
+    ),
+    Family(
+        name="circle_epicycloid",
+        help="epicycloid with a circular tip",
+        maker="rootsopt.profiles.epicycloid:circle_epicycloid",
+        parameters=(ROLLING_RADIUS, TIP_ARC_TURN),
+        example={"rolling_radius_mm": 7.0, "tip_arc_turn_deg": 30.0},
+        remedy="let the tip arc end further from the tip, or change the rolling radius",
+    ),
+    Family(
+        name="hypo_epicycloid",
+        help="whole half arches of hypocycloid and epicycloid, with a land at tip and root",
+        maker="rootsopt.profiles.epicycloid:hypo_epicycloid",
+        parameters=(TIP_ARC_ANGLE,),
+        example={"tip_arc_angle_deg": 4.0},
+        remedy="make the tip arc angle less than 90° / lobes",
+    ),
+    Family(
+        name="extended_cycloid",
+        help="epicycloid with a trochoid ratio that varies from tip to pitch crossing",
+        maker="rootsopt.profiles.trochoid:extended_cycloid",
+        parameters=(TROCHOID_RATIO,),
+        example={"trochoid_ratio": 1.3},
+        remedy="bring the trochoid ratio closer to 1",
+    ),
+    Family(
+        name="ellipse",
+        help="an arc of an ellipse through both pitch crossings",
+        maker="rootsopt.profiles.ellipse:ellipse",
+        parameters=(ELLIPSE_CENTER, ELLIPSE_HEIGHT),
+        example={"ellipse_center_mm": 27.0, "ellipse_height_mm": 18.0},
+        remedy="move the centre, or change the height",
+    ),
+    Family(
+        name="free_form",
+        help="tip land and a B-spline of any number of coefficients",
+        maker="rootsopt.profiles.freeform:FreeForm",
+        parameters=(TIP_ARC_ANGLE, COEFFICIENTS),
+        example={"tip_arc_angle_deg": 4.0, "coefficients": (0.8, 0.7, 0.75)},
+        remedy="change the coefficients, or begin with `rootsopt profile --project`",
+    ),
+    Family(name="outline", help="from a file, as drawn or measured", maker=None),
+)
+for _family in _OWN:
+    register_family(_family)

@@ -1,0 +1,450 @@
+"""The table of profile families: names, parameters, limits, default bounds and help of each.
+
+A family is one `Family` object, and `register_family` is the only way into the table, for the
+package's own (`rootsopt.config.catalogue`) as for any other. Config keys, `--help`, messages, the
+optimiser's box and the checks of soundness all follow from the table. Nothing here needs JAX: what
+makes a profile may be named as "module:function" and is then loaded when first needed.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import importlib
+import importlib.machinery
+import importlib.util
+import inspect
+import re
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field, create_model
+from pydantic.fields import FieldInfo
+
+from rootsopt.config.section import bare, between
+from rootsopt.config.units import si_unit
+from rootsopt.config.words import placed, sentence
+from rootsopt.errors import InputError
+
+if TYPE_CHECKING:
+    from rootsopt.config.scene import ProfileConfig
+
+MARGINS = (
+    *("turning", "convexity", "reach", "fall", "rolling", "order", "undercut", "star", "root"),
+)
+"""What the soundness of a profile is judged by; `rootsopt.profiles.validity` has the meanings."""
+ENTRY_POINTS = "rootsopt.families"
+"""Group of entry points by which an installed package offers families, each under its name."""
+_ANY_LENGTH, _ANY_ANGLE, _ANY_NUMBER = (0.01, 1.5), (0.0, 90.0), (0.0, 2.0)
+"""Where a parameter of which nothing else is said usually lies; lengths in pitch radii."""
+_AROUND = (0.5, 1.5)
+"""Default bounds of such a parameter, in units of the config's own value."""
+_WORD = re.compile(r"[a-z][a-z0-9_]*")
+
+Pair = tuple[float, float]
+Hook = Callable[..., Any] | str
+"""A function, or where to find it: "module:function"."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """A design parameter as a config has it, shared by all families that name it.
+
+    `key`: name in the config; its ending is the unit, `_mm`, `_deg` or none.
+    `help`: meaning, a few words.
+    `lowest`, `highest`: the values a config may give; `below`: whether `highest` itself is out.
+    `radii`: for a length that goes with the rotor's size, the values allowed in pitch radii.
+    `usual`: where values usually lie, in pitch radii if `radii` is given; the default bounds of an
+    optimisation. `None`: half to one and a half of the config's own value.
+    `default_bounds`: default bounds that every config writes out, in place of `usual`.
+    `bounds_limits`: limits of bounds where they are narrower than those of the value.
+    `bounds_note`: what the help says of default bounds, if the above does not say it.
+    `count`: least and greatest length of a list of such parameters; `None`: one number.
+    """
+
+    key: str
+    help: str
+    lowest: float
+    highest: float
+    below: bool = False
+    radii: Pair | None = None
+    usual: Pair | None = None
+    default_bounds: Pair | None = None
+    bounds_limits: Pair | None = None
+    bounds_note: str = ""
+    count: tuple[int, int] | None = None
+
+    @property
+    def argument(self) -> str:
+        """Name of the parameter as an argument of a family's maker: the key without its unit."""
+        return self.key.removesuffix("_mm").removesuffix("_deg")
+
+    @property
+    def unit(self) -> float:
+        """SI value of one unit of the key."""
+        return si_unit(self.key)
+
+    def limits(self, pitch_radius_mm: float) -> Pair | None:
+        """Least and greatest value for a rotor of this size; `None` where that does not matter."""
+        if self.radii is None:
+            return None
+        return self.radii[0] * pitch_radius_mm, self.radii[1] * pitch_radius_mm
+
+    def usually(self, pitch_radius_mm: float, lobes: int) -> Pair:
+        """(low, high) between which values for a rotor of this size usually lie, in key units."""
+        del lobes
+        if self.usual is not None and self.radii is None:
+            return self.usual
+        if self.usual is not None or self.key.endswith("_mm"):
+            low, high = self.usual or _ANY_LENGTH
+            return low * pitch_radius_mm, high * pitch_radius_mm
+        return _ANY_ANGLE if self.key.endswith("_deg") else _ANY_NUMBER
+
+    def bounds(self, profile: "ProfileConfig") -> Pair:
+        """Bounds of an optimisation of this profile where its config gives none."""
+        if self.usual is not None:
+            return self.usually(profile.pitch_radius_mm, profile.lobes)
+        value = abs(getattr(profile, self.key))
+        return _AROUND[0] * value, _AROUND[1] * value
+
+    def check_bounds(self, bounds: Pair, lobes: int) -> None:
+        """Raise `InputError` for bounds that no rotor with so many lobes can have."""
+
+    def field(self, families: list[str]) -> tuple[Any, Any]:
+        """Annotation and pydantic field of the key, with the names of the families that take it."""
+        limits = between(self.lowest, self.highest)
+        if self.below:
+            limits = Field(ge=self.lowest, lt=self.highest)
+        kind: Any = Annotated[float, limits]
+        if self.count is not None:
+            least, most = self.count
+            many = tuple[kind, ...]
+            kind = Annotated[many, Field(min_length=least, max_length=most)]
+        return kind | None, Field(None, description=f"{', '.join(families)}: {self.help}")
+
+    def bounds_field(self) -> tuple[Any, Any]:
+        """Annotation and pydantic field of the key's bounds."""
+        least, most = self.bounds_limits or (self.lowest, self.highest)
+        note = f"{self._bounds_words()}; from {least:g} to {most:g}"
+        kind: Any = Pair if self.default_bounds is not None else Pair | None
+        return kind, Field(self.default_bounds, description=note)
+
+    def _bounds_words(self) -> str:
+        if self.bounds_note:
+            return self.bounds_note
+        pair = self.default_bounds or self.usual
+        if pair is None:
+            return "default: half to one and a half of the config's own"
+        size = " pitch radii" if self.radii is not None and self.default_bounds is None else ""
+        each = "of each of them; " if self.count is not None else ""
+        return f"{each}default: {pair[0]:g} to {pair[1]:g}{size}"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Family:
+    """A profile family: what a config may say of it, and how its profiles are made.
+
+    `name`: the word in `profile.family`; `help`: one line on what its addendum is made of.
+    `maker`: makes a `Profile` of `lobes`, `pitch_radius` (m) and the parameters in SI units, each
+    under its key without the unit: `maker(lobes, pitch_radius, arc_center=0.03)`. `None`: the
+    profile is in a file.
+    `parameters`: design parameters in the order of a design; a list comes last.
+    `example`: a sound design for three lobes and a pitch radius of 33 mm, by key.
+    `remedy`: what to change where a profile is not sound, as an advice without a full stop.
+    `inherent`: those of `MARGINS` that may be negative in this family.
+    `limits`: called with the `ProfileConfig`; raises `InputError` for what limits in closed form
+    forbid. `by_limits`: whether these say all there is of soundness, so that margins need no look.
+    `ranges`: called with `lobes`, `pitch_radius_mm` and the values by key; returns (low, high) by
+    key for parameters whose range depends on the others. Within its bounds such a parameter is
+    searched as a share of this range.
+
+    A subclass may override `make`, `check` and `dependent` instead of giving functions.
+    """
+
+    name: str
+    help: str
+    maker: Hook | None
+    parameters: tuple[Parameter, ...] = ()
+    example: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    remedy: str = ""
+    inherent: frozenset[str] = frozenset()
+    limits: Hook | None = None
+    by_limits: bool = False
+    ranges: Hook | None = None
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Config keys of the parameters."""
+        return tuple(parameter.key for parameter in self.parameters)
+
+    def split(self, design: Any) -> list[Any]:
+        """The values of a design (d,) by parameter: numbers, and a slice of it for a list."""
+        places = enumerate(self.parameters)
+        return [design[k] if one.count is None else design[k:] for k, one in places]
+
+    @property
+    def classical(self) -> bool:
+        """Whether profiles are made from a few numbers, each with a name."""
+        lists = any(parameter.count is not None for parameter in self.parameters)
+        return self.maker is not None and not lists
+
+    def make(self, lobes: int, pitch_radius: Any, **parameters: Any) -> Any:
+        """The `Profile` of these parameters, in SI units."""
+        return _found(self.maker)(lobes, pitch_radius, **parameters)
+
+    def check(self, profile: "ProfileConfig") -> None:
+        """Raise `InputError` where limits in closed form forbid a profile."""
+        if self.limits is not None:
+            _found(self.limits)(profile)
+
+    def dependent(self, lobes: int, pitch_radius_mm: Any, **values: Any) -> Mapping[str, Any]:
+        """(low, high) by key of parameters whose range depends on the others, in key units."""
+        if self.ranges is None:
+            return {}
+        return _found(self.ranges)(lobes, pitch_radius_mm, **values)
+
+
+_families: dict[str, Family] = {}
+_origins: dict[str, str] = {}
+_parameters: dict[str, Parameter] = {}
+_followers: list[Callable[[], None]] = []
+FAMILY_KEYS: dict[str, tuple[str, ...]] = {}
+"""Registered families with the keys of their design parameters, kept by `register_family`."""
+
+
+def register_family(family: Family) -> Family:
+    """Enter a family into the table; configs, commands and the optimiser know it from then on.
+
+    Returns the family. Raises `ValueError` where it is not complete or contradicts another one:
+    names are taken once, and a key has one meaning in all families.
+    """
+    _check(family)
+    _families[family.name] = family
+    _origins[family.name] = sys._getframe(1).f_globals.get("__name__", "")
+    _follow()
+    return family
+
+
+def families() -> dict[str, Family]:
+    """All registered families by name."""
+    return dict(_families)
+
+
+def family_of(name: str) -> Family:
+    """The registered family of this name."""
+    return _families[name]
+
+
+def parameters() -> dict[str, Parameter]:
+    """The parameters of all registered families by key."""
+    return dict(_parameters)
+
+
+def is_list(key: str) -> bool:
+    """Whether a key holds a list of design parameters."""
+    return key in _parameters and _parameters[key].count is not None
+
+
+def users_of(key: str) -> list[str]:
+    """Names of the families that take a key."""
+    return [family.name for family in _families.values() if key in family.keys]
+
+
+def follow(update: Callable[[], None]) -> None:
+    """Call `update` whenever the table has changed, in the order in which this is called."""
+    _followers.append(update)
+
+
+@contextlib.contextmanager
+def for_a_time() -> Iterator[None]:
+    """Take families that are registered in a `with` block out of the table at its end, for tests.
+
+    Programs that were compiled for them stay in memory: do not use their names again."""
+    before = dict(_families)
+    try:
+        yield
+    finally:
+        _families.clear()
+        _families.update(before)
+        for name in _origins.keys() - before.keys():
+            del _origins[name]
+        _follow()
+
+
+def find_installed(name: str) -> None:
+    """Load the installed package that offers a family under this `name`, if there is one."""
+    from importlib.metadata import entry_points  # Looks at every installed package.
+
+    for point in entry_points(group=ENTRY_POINTS):
+        if bare(point.name) == bare(name):
+            with _explained(f"profile family {point.name} of {point.value}"):
+                point.load()
+
+
+def outside_modules() -> set[str]:
+    """Names of the modules on which what families from outside the package make may depend.
+
+    These are the modules that register them or define their makers, and all that have been
+    imported from the same folder."""
+    names = set(_origins.values())
+    for family in _families.values():
+        for hook in (family.maker, family.limits, family.ranges, type(family)):
+            while isinstance(hook, functools.partial):
+                hook = hook.func
+            named = hook.partition(":")[0] if isinstance(hook, str) else None
+            names.add(named or getattr(hook, "__module__", None) or "")
+    own = __name__.partition(".")[0]
+    names = {name for name in names - {""} if name.partition(".")[0] != own}
+    folders = {path.parent for name in names if (path := _file(name)) and not _installed(path)}
+    if not folders:
+        return names
+    loaded = ((name, _file(name)) for name in list(sys.modules))
+    return names | {
+        name
+        for name, path in loaded
+        if path and not _installed(path) and not folders.isdisjoint(path.parents)
+    }
+
+
+def _file(module: str) -> Path | None:
+    found = getattr(sys.modules.get(module), "__file__", None)
+    return Path(found) if found else None
+
+
+def _installed(path: Path) -> bool:
+    return not {"site-packages", "dist-packages"}.isdisjoint(path.parts)
+
+
+def _follow() -> None:
+    _parameters.clear()
+    FAMILY_KEYS.clear()
+    for family in _families.values():
+        _parameters.update({parameter.key: parameter for parameter in family.parameters})
+        FAMILY_KEYS[family.name] = family.keys
+    for update in _followers:
+        update()
+
+
+def _found(hook: Hook | None) -> Callable[..., Any]:
+    if isinstance(hook, str):
+        module, _, name = hook.partition(":")
+        return getattr(importlib.import_module(module), name)
+    if hook is None:
+        raise TypeError("a family whose profiles are in files makes none from parameters")
+    return hook
+
+
+def _check(family: Family) -> None:
+    name, keys = family.name, family.keys
+    if not _WORD.fullmatch(name):
+        raise _wrong("name", "be lower-case letters, digits and _", name)
+    if taken := next((one for one in _families if bare(one) == bare(name)), None):
+        raise ValueError(
+            f"Argument `family` must have a name of its own, but {taken} is taken; choose another "
+            "one, or start Python anew to change a family: compiled programs go by its name"
+        )
+    for parameter in family.parameters:
+        _check_parameter(parameter)
+    if len(set(keys)) < len(keys):
+        raise _wrong("parameters", "have every key once", ", ".join(keys))
+    if any(parameter.count is not None for parameter in family.parameters[:-1]):
+        raise _wrong("parameters", "have a list of numbers last", ", ".join(keys))
+    if unknown := family.inherent - {*MARGINS}:
+        raise _wrong("inherent", f"be among {', '.join(MARGINS)}", ", ".join(sorted(unknown)))
+    if family.maker is None:
+        return
+    if not family.by_limits and not family.remedy and keys:
+        raise _wrong("remedy", "say what to change where a profile is not sound", "empty")
+    if {*family.example} != {*keys}:
+        raise _wrong("example", f"have the keys {', '.join(keys)}", ", ".join(family.example))
+    for parameter in family.parameters:
+        values = family.example[parameter.key]
+        for value in values if parameter.count is not None else (values,):
+            if not parameter.lowest <= value <= parameter.highest:
+                raise _wrong("example", f"respect the limits of {parameter.key}", value)
+    if callable(family.maker):
+        arguments = {parameter.argument: 0 for parameter in family.parameters}
+        try:
+            inspect.signature(family.maker).bind(0, 0, **arguments)
+        except TypeError as error:
+            wanted = ", ".join(("lobes", "pitch_radius", *arguments))
+            raise _wrong(
+                "maker", f"take the arguments {wanted}", f"a function with {error}"
+            ) from None
+
+
+def _check_parameter(parameter: Parameter) -> None:
+    key = parameter.key
+    if not _WORD.fullmatch(key):
+        raise ValueError(
+            "Argument `key` of a parameter must be lower-case letters, digits and _, but is "
+            f"{key!r}"
+        )
+    if key in _RESERVED:
+        raise ValueError(f"Argument `key` of a parameter must be a new one, but {key} is reserved")
+    if not parameter.lowest < parameter.highest:
+        raise ValueError(
+            f"Arguments `lowest` and `highest` of {key} must be increasing, but are "
+            f"{parameter.lowest:g} and {parameter.highest:g}"
+        )
+    if _parameters.get(key, parameter) != parameter:
+        raise ValueError(
+            f"Argument `key` of a parameter must have one meaning, but {key} of "
+            f"{', '.join(users_of(key))} has another one; take that (`parameters()[{key!r}]`), or "
+            "choose another key"
+        )
+
+
+_RESERVED = ("family", "lobes", "pitch_radius_mm", "outline_file", "outline_smoothing_mm")
+
+
+def _wrong(argument: str, wanted: str, found: Any) -> ValueError:
+    return ValueError(f"Argument `{argument}` of a family must {wanted}, but is {found}")
+
+
+def replace_fields(model: Any, fields: Mapping[str, Any]) -> None:
+    """Give a pydantic `model` these fields, made or as (annotation, field), and no others."""
+    new = {name: field for name, field in fields.items() if not isinstance(field, FieldInfo)}
+    made = create_model("Fields", **new).model_fields
+    found = {name: made.get(name, field) for name, field in fields.items()}
+    model.model_fields.clear()
+    model.model_fields.update(found)
+    model.model_rebuild(force=True)
+
+
+def import_named(name: str) -> None:
+    """Import a module by name, or run a Python file by path, once; it may register families.
+
+    Raises `InputError` where that fails."""
+    with _explained(f"`--import` {placed(name)}"):
+        if not (name.endswith(".py") or Path(name).is_file()):
+            importlib.import_module(name)
+            return
+        path = Path(name).resolve(strict=True)
+        known = "imported_" + re.sub(r"\W", "_", str(path))
+        if known in sys.modules:
+            return
+        loader = importlib.machinery.SourceFileLoader(known, str(path))
+        spec = importlib.util.spec_from_file_location(known, path, loader=loader)
+        assert spec is not None
+        module = sys.modules[known] = importlib.util.module_from_spec(spec)
+        try:
+            loader.exec_module(module)
+        except BaseException:
+            del sys.modules[known]
+            raise
+
+
+@contextlib.contextmanager
+def _explained(what: str) -> Iterator[None]:
+    """Turn what a module from outside fails with into one line."""
+    try:
+        yield
+    # Whatever it is, it is that module's fault.
+    except Exception as error:
+        kind = type(error).__name__
+        frames = traceback.extract_tb(error.__traceback__)
+        line = f" (line {frames[-1].lineno} of {placed(frames[-1].filename)})" if frames else ""
+        raise InputError(sentence(f"{what}: fails with {kind}: {error}{line}")) from error

@@ -1,0 +1,25 @@
+"""The least radius of an edge between a tip land and an arc."""
+
+from typing import TYPE_CHECKING, Any
+
+from rootsopt.config.units import hint
+from rootsopt.errors import InputError
+
+if TYPE_CHECKING:
+    from rootsopt.config.scene import ProfileConfig
+
+_SHARPEST = 0.002
+"""Least radius of an edge in pitch radii: less is a corner, along which the outline's and the
+contact's nodes fall together."""
+
+
+def check(profile: "ProfileConfig") -> None:
+    """Raise `InputError` for an edge that is a corner."""
+    edge: Any = profile.parameters["edge_radius_mm"]
+    least = _SHARPEST * profile.pitch_radius_mm
+    if edge < least:
+        raise InputError(
+            f"`profile.edge_radius_mm` must be at least {least:g} ({_SHARPEST:g} pitch radii), but "
+            f"is {edge:g}: a sharp edge has no contact law; round it"
+            + hint("edge_radius_mm", edge, 0.01 * profile.pitch_radius_mm, profile.pitch_radius_mm)
+        )

@@ -1,0 +1,101 @@
+"""What is known in closed form of the length of an involute: limits, and the range to search."""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rootsopt.config.units import hint
+from rootsopt.errors import InputError
+
+if TYPE_CHECKING:
+    from rootsopt.config.scene import ProfileConfig
+
+DEG = math.pi / 180
+_ANGLE, _LENGTH, _TIP = "pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg"
+_OVERLENGTH = 0.02
+"""How far u may exceed u_max, relative. Past u_max the roll angle turns back and two
+points of a flank mesh at once. Node search finds no interference (< 1 nm) up to 5 % over;
+the paper's printed Table 1 is 1.2 % over."""
+_CLEAR = 1e-6
+"""Least involute beyond that at which the tip arc is centred on the pitch circle a second time, in
+pitch radii."""
+_LEAST_INVOLUTE = 0.002
+"""Least involute in units of the longest: less makes no difference, and is a length in metres."""
+_SHORTEST = 0.1
+"""Least involute of a search, as a share of the longest, where the config sets no bound."""
+
+
+def ranges(
+    lobes: int,
+    pitch_radius_mm: Float[Array, ""],
+    pressure_angle_deg: Float[Array, ""],
+    involute_length_mm: Float[Array, ""],
+    tip_arc_angle_deg: Float[Array, ""] | float = 0.0,
+) -> dict[str, tuple[Float[Array, ""], Float[Array, ""]]]:
+    """Shortest and longest involute (mm) of a search at a pressure angle and tip land.
+
+    The longest is `CIC.longest_involute`, so that u ≤ u_max holds by construction."""
+    del involute_length_mm
+    half = jnp.pi / (2 * lobes)
+    longest = pitch_radius_mm * jnp.sin(pressure_angle_deg * DEG) * (half - tip_arc_angle_deg * DEG)
+    return {_LENGTH: (_SHORTEST * longest, longest)}
+
+
+def check(profile: "ProfileConfig") -> None:
+    """Raise `InputError` unless an involute of this length can be made and meshes."""
+    alpha: Any = getattr(profile, _ANGLE)
+    length: Any = getattr(profile, _LENGTH)
+    tip: Any = getattr(profile, _TIP) or 0.0
+    radius, sine = profile.pitch_radius_mm, math.sin(alpha * DEG)
+    half = 90.0 / profile.lobes
+    if tip >= half:
+        raise InputError(
+            f"`profile.tip_arc_angle_deg` must be less than {half:g} (a quarter of the lobe "
+            f"pitch) for {profile.lobes} lobes, but is {tip:g}"
+        )
+    longest = radius * sine * (half - tip) * DEG
+    limit = longest * (1 + _OVERLENGTH)
+    if length < _LEAST_INVOLUTE * longest:
+        raise InputError(
+            f"`profile.involute_length_mm` must be at least {_LEAST_INVOLUTE * longest:.4g} "
+            f"({_LEAST_INVOLUTE:g} of the longest, {longest:.4g}), but is {length:g}"
+            + hint("involute_length_mm", length, _LEAST_INVOLUTE * longest, limit)
+        )
+    if length > limit:
+        raise InputError(
+            f"`profile.involute_length_mm` must be at most {longest:.4g} at "
+            f"`profile.pressure_angle_deg` = {alpha:g} and `profile.tip_arc_angle_deg` = "
+            f"{tip:g} (up to {limit:.4g} is tolerated), but is {length:g}: the roll angle would "
+            "turn back; shorten it or raise the pressure angle"
+        )
+    # The tip arc's centre must lie inside the pitch circle, which all its normals cross.
+    shortest = radius * sine * (half - tip - 2 * alpha) * DEG
+    if length < shortest + _CLEAR * radius:
+        raise InputError(
+            f"`profile.involute_length_mm` must be at least {shortest + _CLEAR * radius:.4g} at "
+            f"`profile.pressure_angle_deg` = {alpha:g} and `profile.tip_arc_angle_deg` = {tip:g}, "
+            f"but is {length:g}: the tip arc would touch nothing on the other rotor; lengthen it, "
+            "or raise the pressure angle or the tip arc"
+        )
+    # Beyond the longest involute the tip arc turns back, until nothing is left of its radius.
+    turn = (half - tip) * DEG - length / (radius * sine)
+    across = math.cos(alpha * DEG - turn)
+    rho = length / math.tan(alpha * DEG) + radius * math.sin(turn) / across if across > 0 else 0.0
+    if rho <= 0:
+        raise InputError(
+            f"`profile.involute_length_mm` must be less than {longest:.4g} at "
+            f"`profile.pressure_angle_deg` = {alpha:g} and `profile.tip_arc_angle_deg` = {tip:g}, "
+            f"but is {length:g}: the tip arc would have no radius; shorten it or lower the "
+            "pressure angle"
+        )
+    # On the dedendum the involute's end is the first to be undercut.
+    uncut = radius * sine * math.tan(alpha * DEG)
+    if length > uncut * (1 + 1e-9):
+        raise InputError(
+            f"`profile.involute_length_mm` must be at most {uncut:.4g} at "
+            f"`profile.pressure_angle_deg` = {alpha:g}, but is {length:g}: the dedendum is "
+            f"undercut (margin {(uncut - length) / math.tan(alpha * DEG):.3g} mm); shorten it "
+            "or raise the pressure angle"
+        )

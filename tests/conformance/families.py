@@ -1,0 +1,313 @@
+"""What every profile family must hold, whoever registers it.
+
+Each of `CHECKS` takes the name of a registered family and looks at its example, a sound design for
+three lobes and a pitch radius of 33 mm. Lengths are in m but for outlines, which are in mm.
+"""
+
+import functools
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt.config import describe_families, describe_keys, parse
+from rootsopt.config.families import families, family_of
+from rootsopt.contact.closest import FlankPair
+from rootsopt.contact.nodes import pair_gap
+from rootsopt.errors import InputError
+from rootsopt.families import check, design_of, profile_of, with_design
+from rootsopt.model import Model
+from rootsopt.optimize.problem import Space, sobol
+from rootsopt.profiles import geometry
+from rootsopt.profiles.validity import margins
+
+R = 0.033
+LOBES = 3
+COUNT = 1401
+"""Places on a flank, always as many, so that they are looked at by one program."""
+measure = jax.jit(geometry)
+
+
+def text_of(family, lobes=LOBES, **changes):
+    """A whole config with the family's example."""
+    with open("configs/cic.yaml", encoding="utf-8") as file:
+        rest = file.read().split("\nrotor:")[1]
+    keys = {"family": family, "lobes": lobes, "pitch_radius_mm": 33.0}
+    keys |= {**family_of(family).example} | changes
+    lists = {key: [*value] for key, value in keys.items() if isinstance(value, tuple)}
+    inside = ", ".join(f"{key}: {value}" for key, value in (keys | lists).items())
+    return f"profile: {{{inside}}}\nrotor:{rest}"
+
+
+def config_of(family, lobes=LOBES, **changes):
+    """The profile section of such a config."""
+    return parse(text_of(family, lobes, **changes)).profile
+
+
+@functools.cache
+def maker(family):
+    """Design to profile."""
+    return jax.jit(lambda design: profile_of(family, LOBES, jnp.asarray(R), design))
+
+
+@functools.cache
+def made(family):
+    """The profile of the example."""
+    return maker(family)(design_of(config_of(family)))
+
+
+@jax.jit
+def looked_at(profile, nu):
+    """Everything the core says of normal angles, and slopes by them."""
+
+    def along(nu):
+        point = profile.addendum(nu)
+        return profile.position(point), point.s
+
+    (place, _), (speed, s_slope) = jax.jvp(along, (nu,), (jnp.ones_like(nu),))
+    return {
+        "addendum": place,
+        "dedendum": profile.position(profile.dedendum(nu)),
+        "speed": speed,
+        "s_slope": s_slope,
+        "beta": profile.roll_angle(nu),
+        "lever": profile.lever(nu),
+        "support": profile.support(nu),
+        "rate": profile.roll_rate(nu),
+        "length": profile.addendum_speed(nu),
+        "inverse": profile.normal_at(profile.roll_angle(nu)),
+    }
+
+
+@functools.cache
+def sampled(family):
+    """Normal angles, always as many, with all joints, and what is there."""
+    segments = [(float(s.start), float(s.stop)) for s in made(family).segments()]
+    segments = [(start, stop) for start, stop in segments if stop > start]
+    counts = [max(60, round(1200 * (stop - start) / segments[-1][1])) for start, stop in segments]
+    counts[-1] += COUNT - 1 - sum(counts)
+    inside = [(np.arange(n) + 1e-9) / n for n in counts]
+    nu = [a + (b - a) * x for (a, b), x in zip(segments, inside, strict=True)]
+    nu = np.append(np.concatenate(nu), segments[-1][1])
+    found = looked_at(made(family), jnp.asarray(nu))
+    return nu, {key: np.asarray(value) for key, value in found.items()}
+
+
+@functools.cache
+def outline_of(family):
+    """Closed outline in mm, crowded where the flank turns."""
+    _, found = sampled(family)
+    flank = np.concatenate([found["addendum"], found["dedendum"][-2::-1]]) @ [1, 1j] * 1e3
+    turn = np.exp(2j * np.pi / LOBES)
+    lobe = np.concatenate([flank[:-1], (np.conj(flank) * turn)[:0:-1]])
+    whole = np.concatenate([*(lobe * turn**k for k in range(LOBES)), lobe[:1]])
+    return np.stack([whole.real, whole.imag], axis=-1)
+
+
+def curve_is_the_one_its_normals_say(family):
+    """Normals, levers, arc lengths and the inverse of the roll angle, by differentiation of the
+    outline; the law of gearing ds/dβ = -r cos ψ."""
+    nu, found = sampled(family)
+    normal = np.stack([np.cos(nu), np.sin(nu)], axis=-1)
+    tangent = np.stack([-np.sin(nu), np.cos(nu)], axis=-1)
+    np.testing.assert_allclose(found["speed"], found["length"][:, None] * tangent, atol=1e-9)
+    place = found["addendum"]
+    np.testing.assert_allclose(np.sum(place * normal, axis=1), found["support"], atol=1e-13)
+    np.testing.assert_allclose(np.sum(place * tangent, axis=1), -found["lever"], atol=1e-13)
+    np.testing.assert_allclose(found["s_slope"], -found["lever"] * found["rate"], atol=1e-9)
+    assert place[0, 1] == pytest.approx(0, abs=1e-11)
+    half = np.pi / (2 * LOBES)
+    np.testing.assert_allclose(place[-1], R * np.array([np.cos(half), np.sin(half)]), atol=1e-15)
+    # Neighbours are next to each other: no joint is torn.
+    steps = np.hypot(*np.diff(place, axis=0).T)
+    assert np.max(steps) < 2e-3 * R
+    # Where the roll angle rises and none that follows is as small, one normal has it.
+    later = np.minimum.accumulate(found["beta"][::-1])[::-1]
+    single = (found["rate"] > 1e-6) & (found["beta"] <= later)
+    assert np.mean(single) > 0.5
+    np.testing.assert_allclose(found["inverse"][single], nu[single], atol=1e-9)
+
+
+def what_margins_call_sound_is_one_curve(family):
+    """Wherever in its bounds a member is sound, support function and lever go on without a jump,
+    and the law of gearing holds: h′ = -lever. Two members at least are sound."""
+    row, designs = family_of(family), [design_of(config_of(family))]
+    if row.classical and row.parameters:
+        low, high = np.array([one.usually(1e3 * R, LOBES) for one in row.parameters]).T
+        designs.extend(low + (high - low) * sobol(128, 1, len(low)))
+
+    def looked(design):
+        profile = profile_of(family, LOBES, jnp.asarray(R), design)
+        nu = profile.pitch_normal * jnp.linspace(0.0, 1.0, COUNT)
+        found = margins(profile)._asdict()
+        least = [value for key, value in found.items() if key not in row.inherent]
+        curved = jnp.max(profile.addendum_speed(nu))
+        return jnp.min(jnp.stack(least)), curved, nu[1], profile.support(nu), profile.lever(nu)
+
+    found = jax.jit(lambda designs: jax.lax.map(looked, designs))(jnp.asarray(designs))
+    least, curved, step, support, lever = map(np.asarray, found)
+    # All but straight flanks: there the lever may change at any rate.
+    sound = (least >= -1e-9) & (curved < 3 * R)
+    assert sound[0] or row.by_limits
+    assert np.sum(sound) >= min(2, len(designs))
+    step, support, lever = step[sound, None], support[sound], lever[sound]
+    # By the distance of a centre of curvature from the axis.
+    assert np.max(np.abs(np.diff(lever)) / step) < 4 * R
+    fall = (lever[:, 1:] + lever[:, :-1]) / 2 * step
+    assert np.max(np.abs(np.diff(support) + fall)) < 2e-6 * R
+
+
+def area_and_moment_are_those_of_the_outline(family):
+    """By the shoelace formula for the polygon of the outline."""
+    here, there = outline_of(family)[:-1] @ [1, 1j], outline_of(family)[1:] @ [1, 1j]
+    cross = (np.conj(here) * there).imag
+    square = abs(here) ** 2 + (np.conj(here) * there).real + abs(there) ** 2
+    shape = measure(made(family))
+    assert float(shape.area) * 1e6 == pytest.approx(np.sum(cross) / 2, rel=2e-6)
+    moment = np.sum(cross * square) / 12
+    assert float(shape.polar_area_moment) * 1e12 == pytest.approx(moment, rel=4e-6)
+
+
+def rolling_pair_touches_and_does_not_overlap(family):
+    """|gap| < 1 nm through a mesh period, by node search."""
+    pitch = 2 * np.pi / LOBES
+    gaps = [
+        pair_gap(outline_of(family), LOBES, 2e3 * R, phi, phi)
+        for phi in 0.0123 + pitch * np.arange(9) / 9
+    ]
+    assert np.max(np.abs(gaps)) < 1e-6
+
+
+@jax.jit
+def _searched(profile, roll, relative):
+    pair = FlankPair.of(profile)
+
+    def one(pose):
+        attempts, best = pair._search(*pose)
+        return attempts == 1, best, pair._search(*pose, attempt=1)[1]
+
+    return jax.lax.map(one, (roll, relative))
+
+
+def search_finds_the_closest_approach(family):
+    """What Newton's method calls certain is what the nodes find, and the nodes of outlines."""
+    profile = made(family)
+    rng = np.random.default_rng(3)
+    half = float(profile.half_pitch)
+    roll = rng.uniform(-half, half, 2000)
+    relative = -(10 ** rng.uniform(-7, np.log10(5e-3), 2000))
+    # Right before the middle of the mesh, and where the flank's contact begins.
+    begins = float(profile.roll_angle(profile.segments()[-1].start))
+    roll[:6] = [0.999 * half, 0.8 * half, 0.5 * half, begins + 1e-2, begins - 1e-3, begins - 1e-2]
+    relative[:6] = -1e-3
+    found = _searched(profile, jnp.asarray(roll), jnp.asarray(relative))
+    certain, best, nodes = jax.tree.map(np.asarray, found)
+    assert np.mean(certain) > 0.5
+    both = certain & best.found & nodes.found
+    assert np.max(np.abs(best.gap - nodes.gap), where=both, initial=0.0) < 1e-13
+    assert not np.any(nodes.found & (nodes.gap < 0) & certain & ~best.found)
+    for x, turn, gap in zip(roll[:6], relative[:6], best.gap[:6], strict=True):
+        seen = pair_gap(outline_of(family), LOBES, 2e3 * R, -x - turn / 2, -x + turn / 2)
+        assert min(gap * 1e3, seen) == pytest.approx(seen, abs=2e-6)
+
+
+def slopes_of_geometry_are_those_of_differences(family):
+    """By each design parameter, against central differences."""
+
+    @jax.jit
+    def look(design, way):
+        def shape(design):
+            found = geometry(profile_of(family, LOBES, jnp.asarray(R), design))
+            return jnp.stack([found.area, found.outer_radius, found.polar_area_moment])
+
+        return jax.jvp(shape, (design,), (way,))
+
+    design = design_of(config_of(family))
+    for way in jnp.diag(design):
+        value, slope = look(design, way)
+        up, down = (look(design + step * way, way)[0] for step in (1e-5, -1e-5))
+        difference = (up - down) / 2e-5
+        np.testing.assert_allclose(slope / value, difference / value, rtol=0, atol=1e-8)
+
+
+def designs_are_points_of_the_unit_box_and_back(family):
+    """The ends of the box are the bounds, or the ends of a range that depends on the others."""
+    row = family_of(family)
+    if not row.parameters:
+        return
+    config = parse(text_of(family))
+    space = Space.of(config, Model.of(config), 0.3)
+    size = len(space.lower)
+    there, back = jax.jit(jax.vmap(space.design)), jax.jit(jax.vmap(space.point))
+    points = np.vstack([np.zeros(size), np.ones(size), sobol(16, 2, size)])
+    designs = there(jnp.asarray(points))
+    np.testing.assert_allclose(back(designs), points, atol=1e-12)
+    assert np.all(designs >= space.lower - 1e-9)
+    assert np.all(designs <= space.upper * (1 + 1e-12))
+    ends = [k for k, key in enumerate(row.keys) if key not in space.ranges(space.lower)]
+    np.testing.assert_allclose(np.asarray(designs)[:2, ends], [
+        np.asarray(space.lower)[ends], np.asarray(space.upper)[ends]
+    ])  # fmt: skip
+
+
+def config_is_read_and_written(family):
+    """The example is accepted; a config written out is the same one; a design can be put in."""
+    config = parse(text_of(family))
+    check(config.profile)
+    assert parse(config.to_yaml()) == config
+    assert config.profile.parameters == {**family_of(family).example}
+    design = np.asarray(design_of(config.profile))
+    assert with_design(config.profile, design) == config.profile
+    for key, parameter in {p.key: p for p in family_of(family).parameters}.items():
+        assert maker(family)(jnp.asarray(design)).lobes == LOBES
+        for value in (parameter.lowest - 1e6, parameter.highest + 1e6):
+            given = [value] * 3 if parameter.count is not None else value
+            with pytest.raises(InputError, match=rf"profile\.{key}"):
+                config_of(family, **{key: given})
+
+
+def config_wants_the_keys_of_the_family(family):
+    """A missing key is named, a foreign one refused, a misspelt one corrected."""
+    own = family_of(family).keys
+    for key in own:
+        with pytest.raises(InputError, match=rf"profile\.{key}. is required for family {family}"):
+            config_of(family, **{key: "null"})
+        with pytest.raises(InputError, match=rf"did you mean `profile\.{key}`"):
+            config_of(family, **{f"{key}x": 1.0})
+    foreign = next(
+        (key, value)
+        for other in families().values()
+        for key, value in other.example.items()
+        if key not in own and not isinstance(value, tuple)
+    )
+    with pytest.raises(InputError, match=rf"{foreign[0]}. does not belong to family {family}"):
+        config_of(family, **dict([foreign]))
+
+
+def help_mentions_it(family):
+    """Its name, what it is made of, its keys with the families that take them, and their bounds."""
+    lines = {line.split()[0]: line for line in describe_keys().splitlines()}
+    assert family in re.findall(r"\w+", lines["profile.family"])
+    about = {line.split()[0]: line for line in describe_families().splitlines()}
+    assert family_of(family).help in about[family]
+    for parameter in family_of(family).parameters:
+        line = lines[f"profile.{parameter.key}"]
+        assert parameter.help in line
+        assert family in line.split(": ")[0].replace(",", " ").split()
+        assert "default" in lines[f"optimizer.bounds.{parameter.key}"]
+
+
+CHECKS = (
+    curve_is_the_one_its_normals_say,
+    what_margins_call_sound_is_one_curve,
+    area_and_moment_are_those_of_the_outline,
+    rolling_pair_touches_and_does_not_overlap,
+    search_finds_the_closest_approach,
+    slopes_of_geometry_are_those_of_differences,
+    designs_are_points_of_the_unit_box_and_back,
+    config_is_read_and_written,
+    config_wants_the_keys_of_the_family,
+    help_mentions_it,
+)
