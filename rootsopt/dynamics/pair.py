@@ -204,7 +204,7 @@ class RotorPair(eqx.Module):
     def _units(self) -> Units:
         return Units(self.angle_scale, self.mesh_period)
 
-    def own_states(self, state: Float[Array, "*k n"]) -> list[Float[Array, "*k _"]]:
+    def own_states(self, state: Float[Array, "*k n"]) -> list[Float[Array | np.ndarray, "*k _"]]:
         """Own states (SI) of each of `all_parts` in a scaled state."""
         found, place = [], 2 + self.free
         for part in self.all_parts:

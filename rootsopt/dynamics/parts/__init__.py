@@ -1,6 +1,6 @@
 """What may act on a rotor pair. A scene holds the parts it needs and no others."""
 
-from rootsopt.dynamics.parts.base import Context, Loads, Motion, Part, Units
+from rootsopt.dynamics.parts.base import Context, Loads, Motion, Own, Part, Units
 from rootsopt.dynamics.parts.drive import Drive, MotorDrive, PrescribedDrive
 from rootsopt.dynamics.parts.friction import Friction
 from rootsopt.dynamics.parts.gear import TimingGear
@@ -17,6 +17,7 @@ __all__ = [
     "Loads",
     "Motion",
     "MotorDrive",
+    "Own",
     "Part",
     "PrescribedDrive",
     "Supports",

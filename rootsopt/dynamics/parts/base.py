@@ -1,10 +1,15 @@
 """What every part of a scene is to the rotor pair, and what the pair tells a part."""
 
-from typing import NamedTuple, Self
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
+
+_Part = TypeVar("_Part", bound="Part")
+Own = Float[Array, " m"] | Float[np.ndarray, " m"]
+"""A part's own states (SI); of none an empty array of NumPy, which a program does not see."""
 
 
 class Motion(NamedTuple):
@@ -87,7 +92,7 @@ class Part(eqx.Module):
         """Inertia (kg·m²) that turns with rotor 1."""
         return None
 
-    def prepare(self, context: Context) -> Self:
+    def prepare(self: _Part, context: Context) -> _Part:
         """Return the part with what it needs of the scene filled in, differentiable."""
         del context
         return self
@@ -104,7 +109,7 @@ class Part(eqx.Module):
         del units
         return None
 
-    def rates(self, motion: Motion, own: Float[Array, " m"], loads: Loads) -> Float[Array, " m"]:
+    def rates(self, motion: Motion, own: Own, loads: Loads) -> Float[Array, " m"]:
         """Time derivatives of its own states `own`."""
         raise NotImplementedError(f"`{type(self).__name__}` has states, but no `rates`")
 
@@ -114,24 +119,24 @@ class Part(eqx.Module):
         """Displacements (m) of the axes and their velocities (m/s), of a part that `displaces`."""
         raise NotImplementedError(f"`{type(self).__name__}` displaces the axes, but has no `axes`")
 
-    def lost(self, own: Float[Array, " m"]) -> Bool[Array, ""] | None:
+    def lost(self, own: Own) -> Bool[Array, ""] | None:
         """Whether these states are no longer those of a running pair; None: they always are."""
         del own
         return None
 
     # What it does. None: nothing.
 
-    def torque_on_1(self, motion: Motion, own: Float[Array, " m"]) -> Float[Array, ""] | None:
+    def torque_on_1(self, motion: Motion, own: Own) -> Float[Array, ""] | None:
         """Torque (N·m) on rotor 1; asked for only where rotor 1 is free."""
         del motion, own
         return None
 
-    def torque_on_2(self, motion: Motion, own: Float[Array, " m"]) -> Float[Array, ""] | None:
+    def torque_on_2(self, motion: Motion, own: Own) -> Float[Array, ""] | None:
         """Torque (N·m) on rotor 2."""
         del motion, own
         return None
 
-    def force_on_axes(self, motion: Motion, own: Float[Array, " m"]) -> Float[Array, "2 2"] | None:
+    def force_on_axes(self, motion: Motion, own: Own) -> Float[Array, "2 2"] | None:
         """Forces (N) on the axes (rotor, x and y); asked for only where a part `displaces` them."""
         del motion, own
         return None
@@ -144,7 +149,7 @@ class Part(eqx.Module):
     # Where its equations are not smooth: one flag for every kink or jump, which changes there. An
     # integral is as accurate as promised, and a derivative is right, only if none is missing.
 
-    def switches(self, motion: Motion, own: Float[Array, " m"]) -> Bool[Array, " s"]:
+    def switches(self, motion: Motion, own: Own) -> Bool[Array, " s"]:
         """On which of their smooth pieces torques, forces and rates are."""
         del motion, own
         return jnp.zeros(0, bool)
