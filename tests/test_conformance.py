@@ -4,17 +4,19 @@ find wrong in broken ones."""
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from conformance.contacts import check_contact
 from conformance.laws import check_law
 from conformance.parts import SPEED, check_in_pair, check_part, size
-from test_closed_forms import oscillator
+from test_closed_forms import LOBES, SCALE, Far, oscillator
 
 from rootsopt.contact import ContactLaw, ImpactLaw
 from rootsopt.contact.linear import LinearContact
 from rootsopt.contact.map import MapContact
+from rootsopt.contact.point import ContactPoint
 from rootsopt.contact.search import SearchContact
 from rootsopt.contact.segments import NodeContact
 from rootsopt.dynamics.parts import (
@@ -150,11 +152,32 @@ class Unbalance(Part):
         return self.pull * jnp.stack([jnp.cos(turns), jnp.sin(turns)], axis=-1)
 
 
+class FarAnywhere(Far):
+    """The same at any distance of the axes."""
+
+    two_sided = True
+    center_distance = jnp.asarray(2 * R)
+
+    def at_distance(self, distance):
+        return self
+
+    def point(self, roll, relative, approach):
+        return ContactPoint(*(jnp.ones_like(roll) for _ in range(3)))
+
+
 def test_a_part_that_acts_on_axes_needs_them_to_move():
-    """In rigid bearings its force is nobody's; on supports it moves the axes by F / m."""
+    """In rigid bearings its force adds nothing; on supports each axis begins to move by F / m."""
     pair = oscillator()
-    pulled = dataclasses.replace(pair, parts=(Unbalance(jnp.asarray(7.0)),))
-    assert size(pulled)[:2] == size(pair)[:2]
+    pulls = (Unbalance(jnp.asarray(7.0)),)
+    assert size(dataclasses.replace(pair, parts=pulls))[:2] == size(pair)[:2]
+    supports = PARTS["supports"][0]()
+    moving = oscillator(contact=FarAnywhere(), two_sided=True, supports=supports, parts=pulls)
+    slope, _ = jax.jit(moving.derivative)(jnp.asarray(0.2), jnp.zeros(10))
+    turn = 0.2 * 2 * np.pi / LOBES
+    expected = 7.0 / 3.0 * np.array([np.cos(turn), np.sin(turn), np.cos(turn), -np.sin(turn)])
+    period = float(moving.mesh_period)
+    np.testing.assert_allclose(slope[6:], expected * period**2 / (SCALE * R), rtol=1e-12)
+    assert np.all(np.asarray(slope[2:6]) == 0)
 
 
 def test_parts_that_exclude_each_other_are_refused():

@@ -12,11 +12,11 @@ import optimistix
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.jump import MARKS, marks, saltation
 from rootsopt.dynamics.landing import LandingControl
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, Steps, locate_peak, one_sided
+from rootsopt.dynamics.saltation import MARKS, marks, saltation
 from rootsopt.dynamics.tangent import Linear, linearized, one_step, propagated
 
 METHODS: dict[str, Callable[..., diffrax.AbstractSolver]] = {

@@ -408,7 +408,7 @@ class RotorPair(eqx.Module):
             slope = self.lapse(state) * slope
         # A pair that has lost its mesh stands still rather than run to infinity; the
         # caller reports it.
-        return jnp.where(lax.stop_gradient(self.lost(state)), 0.0, slope), contact
+        return jnp.where(lax.stop_gradient(self._lost(state, acting)), 0.0, slope), contact
 
     def _loads(self, motion: Motion, acting, contact: FlankForce) -> Loads:
         """All that acts on the rotors, `acting` parts with their own states."""
@@ -427,8 +427,12 @@ class RotorPair(eqx.Module):
     def lost(self, state: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether a scaled state is no longer one of a running mesh: lobes have passed through
         each other, a part says so (an axis has left its place), or the motor has stalled."""
+        return self._lost(state, zip(self.all_parts, self.own_states(state), strict=True))
+
+    def _lost(self, state, acting) -> Bool[Array, ""]:
+        """`lost`, with the parts and their own states at hand."""
         lost = ~(jnp.abs(self.angle_scale * state[0]) < self.angle_limit)
-        for part, own in zip(self.all_parts, self.own_states(state), strict=True):
+        for part, own in acting:
             gone = part.lost(own)
             lost = lost if gone is None else lost | gone
         return lost | self.stalled(state) if self.free else lost
