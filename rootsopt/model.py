@@ -4,6 +4,7 @@ A design is a vector of the config's design parameters in the config's own units
 (`FAMILY_KEYS`; none for EE), so gradients come out per config unit.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -18,21 +19,26 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt import families
 from rootsopt.config import Config
+from rootsopt.contact.gap import Contact
 from rootsopt.contact.impact import ImpactLaw
+from rootsopt.contact.law import ContactLaw
 from rootsopt.contact.linear import LinearContact
 from rootsopt.contact.map import MapContact
+from rootsopt.contact.search import SearchContact
 from rootsopt.contact.segments import NodeContact
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pace import Pace
-from rootsopt.dynamics.pair import GapFunction, RotorPair, SearchContact
+from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import (
     ConstantLoad,
+    Context,
     Drive,
     Friction,
     GasLoad,
     Load,
     MotorDrive,
+    Part,
     PrescribedDrive,
     Supports,
     TimingGear,
@@ -68,7 +74,7 @@ class Scene(eqx.Module):
     pitch_radius: Float[Array, ""]
     length: Float[Array, ""]
     density: Float[Array, ""]
-    law: ImpactLaw
+    law: ContactLaw
     clearance: Float[Array, ""]
     speed: Float[Array, ""]
     load_torque: Float[Array, ""]
@@ -83,6 +89,7 @@ class Scene(eqx.Module):
     supports: Supports | None = None
     center_distance_error: Float[Array, ""] | None = None
     outline: Outline | None = None
+    extra: tuple[Part, ...] = ()
 
     @classmethod
     def from_config(cls, config: Config, deepest: float | None = None) -> "Scene":
@@ -172,9 +179,21 @@ class Scene(eqx.Module):
         """Whether drive and coast flanks may touch at once: the axes may be elsewhere than at the
         nominal centre distance, or the flanks are not conjugate."""
         odd = self.supports, self.center_distance_error, self.outline
-        return any(part is not None for part in odd)
+        moved = any(part.displaces for part in self.extra)
+        return moved or any(part is not None for part in odd)
 
-    def contact(self, profile: Profile) -> GapFunction:
+    def with_parts(self, *parts: Part) -> "Model":
+        """This model with further parts, which follow the others in the state of a motion.
+
+        Numbers that are their fields become arrays; responses are differentiable with respect to
+        them."""
+        return dataclasses.replace(self, extra=(*self.extra, *_as_arrays(parts)))
+
+    def with_law(self, law: ContactLaw) -> "Model":
+        """This model with another contact law, whose numbers become arrays."""
+        return dataclasses.replace(self, law=_as_arrays(law))
+
+    def contact(self, profile: Profile) -> Contact:
         """Gap and levers of `profile` at this model's fidelity."""
         if self.fidelity == "map":
             return MapContact.of(profile, self.deepest, *self.map_size)
@@ -191,15 +210,14 @@ class Scene(eqx.Module):
             return SearchContact.of(profile)
         error = self.center_distance_error
         distance = 2 * profile.pitch_radius + (0.0 if error is None else error)
-        return SearchContact.of(profile, distance, both=True)
+        return SearchContact.of(profile, distance, two_sided=True)
 
     def _drive(self, load: Load) -> Drive:
         """The drive; a motor without a torque of its own is given what the load takes."""
         motor = self.motor
         if motor is None:
             return PrescribedDrive(self.speed)
-        twice = isinstance(load, GasLoad)
-        torque = jnp.where(jnp.isnan(motor.torque), (1 + twice) * load.torque, motor.torque)
+        torque = jnp.where(jnp.isnan(motor.torque), load.total, motor.torque)
         return eqx.tree_at(lambda m: (m.speed, m.torque), motor, (self.speed, torque))
 
     def _load(self, profile: Profile, shape: Geometry) -> Load:
@@ -248,16 +266,22 @@ class Scene(eqx.Module):
             gear = eqx.tree_at(lambda g: g.damping, gear, damping)
         force = jnp.maximum(self.load_torque, 1e-3) / self.pitch_radius
         angle = self.law.depth_at(force) / self.pitch_radius
-        if gear is not None:
-            angle = angle + gear.half_backlash
+        for part in (gear, *self.extra):
+            if part is not None and part.play is not None:
+                angle = angle + part.play
         # Units, no quantities: nothing depends on them.
         force, angle = jax.lax.stop_gradient((force, angle))
-        supports = self.supports
-        if supports is not None:
-            mass = self.mass(shape)
-            unit = jax.lax.stop_gradient(angle * self.pitch_radius)
-            supports = eqx.tree_at(lambda s: (s.mass, s.unit), supports, (mass, unit))
         load = self._load(profile, shape)
+        context = Context(
+            inertia=inertia,
+            mass=self.mass(shape),
+            pitch_radius=self.pitch_radius,
+            angle=angle,
+            load_torque=load.torque,
+            speed=self.speed,
+        )
+        supports = None if self.supports is None else self.supports.prepare(context)
+        extra = tuple(part.prepare(context) for part in self.extra)
         pair = RotorPair(
             lobes=self.lobes,
             contact=contact,
@@ -271,11 +295,11 @@ class Scene(eqx.Module):
             force_scale=force,
             friction=self.friction,
             supports=supports,
-            both=self.both,
-            pace=Pace.of(
-                self.law, gear, supports, inertia, force, self.pitch_radius, self.clearance
-            ),
+            two_sided=self.both,
+            parts=extra,
         )
+        pace = Pace.of(self.law, pair.all_parts, inertia, force, self.pitch_radius, self.clearance)
+        pair = dataclasses.replace(pair, pace=pace)
         if self.precision == "float32":
             # Built in double precision; single only where it is integrated.
             pair = jax.tree.map(_single, pair)
@@ -315,6 +339,11 @@ def _single(leaf):
     return leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf
 
 
+def _as_arrays(tree):
+    """`tree` with arrays in place of numbers."""
+    return jax.tree.map(lambda x: jnp.asarray(x, float) if isinstance(x, int | float) else x, tree)
+
+
 def _optional(value: float | None, unit: float = 1.0) -> Float[Array, ""] | None:
     return None if value is None else jnp.asarray(value * unit)
 
@@ -344,7 +373,7 @@ def _parts(config: Config) -> dict[str, Any]:
             stiffness=jnp.asarray(scene.supports.stiffness_N_per_mm / MM),
             damping=jnp.asarray(scene.supports.damping_N_s_per_mm / MM),
             mass=missing,
-            unit=missing,
+            radius=missing,
         )
     return parts
 

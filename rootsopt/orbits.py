@@ -346,11 +346,7 @@ def _shoot(
 
     def build(values):
         pair, scale = _build(model, names, values)
-        fixed = eqx.tree_at(lambda p: p.angle_scale, pair, unit)
-        if fixed.supports is not None:
-            length = unit * model.pitch_radius
-            fixed = eqx.tree_at(lambda p: p.supports.unit, fixed, length)
-        return fixed, scale
+        return eqx.tree_at(lambda p: p.angle_scale, pair, unit), scale
 
     def arrays(values):
         return eqx.filter(build(values)[0], eqx.is_inexact_array)
@@ -369,7 +365,7 @@ def _shoot(
     times = period * jnp.arange(_LOOKS) / _LOOKS
 
     def touches(tau, state):
-        held = pair.gear is not None and jnp.any(pair.gear.switches(pair.physical(tau, state)[1]))
+        held = pair.gear is not None and jnp.any(pair.gear.switches(pair.motion(tau, state), None))
         return (pair.contact_at(tau, state).total > 0) | held
 
     touching = jax.vmap(touches)(times, out.states[::stride])

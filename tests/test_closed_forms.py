@@ -8,7 +8,6 @@ import dataclasses
 import threading
 import types
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,14 +18,16 @@ from rootsopt.arclength import Steps
 from rootsopt.response.batch import on_all_cores
 from rootsopt.config import load
 from rootsopt.config.families import Parameter, parameters
+from rootsopt.contact.gap import Contact
 from rootsopt.contact.impact import ImpactLaw
 from rootsopt.contact.map import MARGIN
 from rootsopt.contact.nodes import signed_distance
+from rootsopt.contact.search import SearchContact
 from rootsopt.contact.size import MapSize, _smallest
 from rootsopt.dynamics import peak, steady
 from rootsopt.dynamics.flow import Flow, Integrator
 from rootsopt.dynamics.measures import Measures
-from rootsopt.dynamics.pair import FlankForce, RotorPair, SearchContact
+from rootsopt.dynamics.pair import FlankForce, RotorPair
 from rootsopt.dynamics.parts import ConstantLoad, MotorDrive, PrescribedDrive, TimingGear
 from rootsopt.dynamics.verdict import TOO_DEEP
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
@@ -43,7 +44,7 @@ LOBES, SPEED, INERTIA, STIFFNESS, DAMPING, LOAD = 3, 300.0, 2e-3, 2e3, 1.5, 0.4
 HALF_BACKLASH, SCALE = 1e-3, 5e-3
 
 
-class Far(eqx.Module):
+class Far(Contact):
     """Flanks a metre apart in every position."""
 
     def __call__(self, roll, relative):
@@ -335,7 +336,7 @@ def test_work_is_divided_among_the_cores():
         np.testing.assert_allclose(summed, np.sum(designs, axis=1) + np.arange(count))
 
 
-class Near(eqx.Module):
+class Near(Contact):
     """Flanks that overlap by the radius of 0.03 m times the turn towards them."""
 
     def __call__(self, roll, relative):
@@ -380,7 +381,7 @@ def test_levers_may_jump_where_flanks_do_not_roll():
     approach; anywhere else there may be two as deep."""
     paper = CIC(3, 0.033, np.radians(36.43), 8e-3, np.radians(4.0))
     assert not SearchContact.of(paper).jumps
-    displaced = SearchContact.of(paper, jnp.asarray(0.0662), both=True)
+    displaced = SearchContact.of(paper, jnp.asarray(0.0662), two_sided=True)
     assert displaced.jumps
     assert float(displaced.pair.center_distance) == 0.0662
 

@@ -102,9 +102,7 @@ def pace(play=1e-3, torque=5.0, inertia=2e-3, exponent=1.0, stiffness=1e7):
     gear = TimingGear(*(jnp.asarray(x) for x in (2e4, 0.0, play / 2, 0.0)))
     radius = 0.033
     force = jnp.asarray(torque / radius)
-    return Pace.of(
-        law, gear, None, jnp.asarray(inertia), force, jnp.asarray(radius), jnp.asarray(0.0)
-    )
+    return Pace.of(law, (gear,), jnp.asarray(inertia), force, jnp.asarray(radius), jnp.asarray(0.0))
 
 
 def test_pace_in_closed_form():

@@ -40,5 +40,5 @@ def test_friction_is_odd_bounded_and_smooth(speed):
 def test_switches_mark_the_ends_of_the_steps():
     law = friction()
     speeds = np.array([-2.0, -0.5, 0.0, 0.5, 2.0])
-    flags = np.asarray([law.switches(jnp.asarray(v)) for v in speeds])
+    flags = np.asarray([law.drag_switches(jnp.asarray(v)) for v in speeds])
     assert len(np.unique(flags, axis=0)) == 5

@@ -75,7 +75,7 @@ def contact_of(profile):
     rolls, relatives = jnp.meshgrid(
         jnp.linspace(1e-3, np.pi / 3 - 1e-3, 121), jnp.array([0.0, -1e-4, -1e-3, -3e-3])
     )
-    pair = FlankPair.of(profile, 2 * profile.pitch_radius, both=True)
+    pair = FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True)
     return approaches(pair, rolls.ravel(), relatives.ravel())
 
 
@@ -115,7 +115,7 @@ def test_a_wrong_outline_leaves_the_gap_that_its_points_leave(profile, by):
     for i in range(7, 361, 59):
         seen = pair_gap(closed(points), 3, 2e3 * R, rolled.roll[i], rolled.roll[i]) * 1e-3
         assert rolled.gap[i] == pytest.approx(seen, abs=1e-9)
-    pair = FlankPair.of(found, 2 * found.pitch_radius, both=True)
+    pair = FlankPair.of(found, 2 * found.pitch_radius, two_sided=True)
     rolls, relatives = np.array([0.3, 0.6, 0.9]), np.array([-1e-3, -2e-3, -5e-4])
     for x, e, gap in zip(rolls, relatives, approaches(pair, rolls, relatives).gap, strict=True):
         seen = pair_gap(closed(points), 3, 2e3 * R, -x - e / 2, -x + e / 2) * 1e-3
@@ -125,7 +125,7 @@ def test_a_wrong_outline_leaves_the_gap_that_its_points_leave(profile, by):
 def test_levers_are_the_derivatives_of_the_gap():
     """Of flanks that are not conjugate, by central differences in φ1 and φ2."""
     found, _ = profile_of(bulged(points_of(CIC3), 0.02))
-    pair = FlankPair.of(found, 2 * found.pitch_radius, both=True)
+    pair = FlankPair.of(found, 2 * found.pitch_radius, two_sided=True)
     rolls, h = np.linspace(0.15, 0.9, 7), 1e-6
     relatives = np.full(7, -1e-3)
     here = approaches(pair, rolls, relatives)

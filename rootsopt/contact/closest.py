@@ -116,20 +116,20 @@ class FlankPair(eqx.Module):
         cls,
         profile: Profile,
         center_distance: Float[Array, ""] | None = None,
-        both: bool = False,
+        two_sided: bool = False,
     ) -> "FlankPair":
         """Prepare the search for `profile`; the nodes carry no derivative.
 
-        `center_distance` (m) is by default that of perfect rolling, 2r. With `both`, drive and
+        `center_distance` (m) is by default that of perfect rolling, 2r. With `two_sided`, drive and
         coast flanks are looked at side by side, as they can touch at once away from that: lands
         are then searched too, up to the lobe's axis, where the other side takes over.
         """
         frozen = lax.stop_gradient(profile)
-        segments = [s for s in frozen.segments() if both or not s.land]
+        segments = [s for s in frozen.segments() if two_sided or not s.land]
         count = frozen.search_nodes
         fraction = jnp.arange(count) / count
         pieces = [s.start + (s.stop - s.start) * fraction for s in segments[:-1]]
-        if not (both or frozen.segments()[0].land):
+        if not (two_sided or frozen.segments()[0].land):
             # A rounded tip: at the hand-over the contact slides over its top. (A land
             # carries no torque, and contact just ends where it begins.)
             first = segments[0]

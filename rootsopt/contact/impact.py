@@ -11,9 +11,10 @@ where max(0, ·) becomes the same ramp over the force h/d · K δ^e. The law is 
 outside these two zones, never adhesive, and exactly zero without penetration.
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+from rootsopt.contact.law import ContactLaw
 
 
 def ramp(x: Float[Array, "*n"], width: Float[Array, "*#n"]) -> Float[Array, "*n"]:
@@ -66,7 +67,7 @@ def force_rounding(
     return exponent * float(jnp.finfo(depth.dtype).eps) * radius / deep
 
 
-class ImpactLaw(eqx.Module):
+class ImpactLaw(ContactLaw):
     """IMPACT contact force between two flanks (SI units).
 
     `stiffness` K (N/m^e), `exponent` e ≥ 1, `damping` C (N·s/m) reached at the depth
@@ -117,5 +118,12 @@ class ImpactLaw(eqx.Module):
         return positive, elastic, elastic + damping * rate, width
 
     def depth_at(self, force: Float[Array, ""]) -> Float[Array, ""]:
-        """Static penetration (m) that carries `force` (N)."""
         return (force / self.stiffness) ** (1 / self.exponent)
+
+    def stiffness_at(self, depth: Float[Array, ""]) -> Float[Array, ""]:
+        # Not that of the rounded onset, which an impact leaves at once.
+        return self.exponent * self.stiffness * depth ** (self.exponent - 1)
+
+    def depth_absorbing(self, work: Float[Array, ""]) -> Float[Array, ""]:
+        e = self.exponent
+        return ((e + 1) * work / self.stiffness) ** (1 / (e + 1))

@@ -10,27 +10,28 @@ come from a potential. The error is of second order in ε over the smooth stretc
 grows towards a tip arc centred on the pitch circle, which all meshes at one instant.
 """
 
-from typing import ClassVar
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from rootsopt.contact.gap import Contact
 from rootsopt.profiles.base import Profile
 
 
-class LinearContact(eqx.Module):
+class LinearContact(Contact):
     """Gap and levers of a flank pair at a pose, to first order in ε.
 
     Call it with roll coordinate and ε (rad); see `FlankPair` for their meaning. `profile`:
     both rotors' profile.
     """
 
-    smooth: ClassVar[bool] = False
-    """Its levers jump, which no switch tells."""
     profile: Profile
+
+    @property
+    def smooth(self) -> bool:
+        """False: its levers jump, which no switch tells."""
+        return False
 
     @classmethod
     def of(cls, profile: Profile) -> "LinearContact":

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.contact.closest import FlankPair, contact_begins
+from rootsopt.contact.gap import Contact
 from rootsopt.profiles.base import Profile
 
 # Grid cells of ε beyond zero, so that the spline is in its interior where contact starts.
@@ -65,7 +66,7 @@ def _weights(t):
     return value, slope, bend
 
 
-class MapContact(eqx.Module):
+class MapContact(Contact):
     """Gap and levers of a flank pair at a pose, from a spline map.
 
     Call it with roll coordinate and ε (rad); see `FlankPair` for their meaning. Below

@@ -15,14 +15,13 @@ With a = x + ε/2 for rotor 1 and a = π/N - x + ε/2 for rotor 2, a point z of 
 E the centre distance: exchanging the rotors exchanges a and a′, nothing else.
 """
 
-from typing import ClassVar
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.contact.gap import Contact
 from rootsopt.profiles.base import Profile
 
 # Shares of the addendum's nodes that a flank is continued by: beyond the pitch point,
@@ -37,7 +36,7 @@ _TABLE = 64
 _DEEPEST = 0.1
 
 
-class NodeContact(eqx.Module):
+class NodeContact(Contact):
     """Gap and levers of a flank pair at a pose, from two polylines.
 
     Call it with roll coordinate and ε (rad); see `FlankPair` for their meaning. In the
@@ -48,13 +47,16 @@ class NodeContact(eqx.Module):
     little more is kept and of rotor 2 its mate: the rest of the mesh follows by exchange.
     """
 
-    smooth: ClassVar[bool] = False
-    """Its levers jump, which no switch tells."""
     nodes: Float[Array, "2 n 2"]
     tangent: Float[Array, "2 n 2"]
     normal: Float[Array, "2 n-1 2"]
     pitch_radius: Float[Array, ""]
     half_pitch: float = eqx.field(static=True)
+
+    @property
+    def smooth(self) -> bool:
+        """False: its levers jump, which no switch tells."""
+        return False
 
     @classmethod
     def of(cls, profile: Profile, nodes: int) -> "NodeContact":

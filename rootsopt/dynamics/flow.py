@@ -12,11 +12,11 @@ import optimistix
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.jump import MARKS, marks, saltation
 from rootsopt.dynamics.landing import LandingControl
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, Steps, locate_peak, one_sided
+from rootsopt.dynamics.saltation import MARKS, marks, saltation
 from rootsopt.dynamics.tangent import Linear, linearized, one_step, propagated
 
 METHODS: dict[str, Callable[..., diffrax.AbstractSolver]] = {
@@ -297,7 +297,7 @@ def flow(
         pair = eqx.combine(dynamic, static)
         slope, contact = pair.derivative(tau, y[:count])
         rates = measures.rates(tau, contact.total / force_unit, top)
-        if pair.drive.free:
+        if pair.free:
             # Averages are over time, which passes unevenly.
             rates = pair.lapse(y[:count]) * jnp.append(rates, jnp.ones_like(force_unit))
         return jnp.concatenate([slope, rates, *([marks(contact)] if marked else [])])
@@ -308,7 +308,7 @@ def flow(
     # Over the unit interval: limits known when it is traced make a smaller program.
     ends = jnp.full(how.max_steps, jnp.inf, dtype) if grid is None else grid / periods
     repeated = jnp.asarray(False if grid is None else repeat)
-    start = jnp.pad(state, (0, measures.count + pair.drive.free))
+    start = jnp.pad(state, (0, measures.count + pair.free))
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(whole),
         solver,
@@ -352,8 +352,8 @@ def flow(
             after, slopes = one_step(solver, term, begin, end, y, dynamic)
             return after, slopes[-1]
         after, slopes = one_step(solver, term, begin, end, jnp.pad(y, (0, MARKS)), dynamic)
-        period = pair.mesh_period * (pair.lapse(y[:count]) if pair.drive.free else 1.0)
-        moved = saltation(end - begin, slopes, period, pair.contact.pair.profile)
+        period = pair.mesh_period * (pair.lapse(y[:count]) if pair.free else 1.0)
+        moved = saltation(end - begin, slopes, period, pair.contact.length_scale)
         return after[:-MARKS] + moved, slopes[-1, :-MARKS]
 
     if retraced:
@@ -373,7 +373,7 @@ def flow(
     peak_time, depth = locate_peak(lax.stop_gradient(pair), states, periods, steps)
     holds = jnp.clip(jnp.sum(ends < peak_time), 0, last)
     peak_time = jnp.maximum(peak_time, begins[holds] + _SHORTEST)
-    duration = end[-1] if pair.drive.free else periods
+    duration = end[-1] if pair.free else periods
     raw = end[count : count + measures.count] / duration
     averages, factors = measures.values(raw, force_unit, top)
     noise = lax.stop_gradient(pair.rounding(depth))
@@ -381,7 +381,7 @@ def flow(
 
     def state_and_force(begin, end, y, dynamic):
         after, slope = one(begin, end, y, dynamic)
-        return jnp.append(after, slope[count] / slope[-1] if pair.drive.free else slope[count])
+        return jnp.append(after, slope[count] / slope[-1] if pair.free else slope[count])
 
     if tangents is None:
         there = state_and_force(begins[holds], peak_time, before[holds], dynamic)[:-1]
@@ -414,7 +414,7 @@ def flow(
         forces = beside.value[:, -1]
         peak, weights = one_sided(forces, noise)
         changes = along[count : count + measures.count]
-        if pair.drive.free:
+        if pair.free:
             changes = changes - raw[:, None] * along[-1]
         changes = changes * (factors / duration)[:, None]
         by_peak = force_unit * (weights @ slopes)[None]

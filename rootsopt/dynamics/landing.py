@@ -49,12 +49,9 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         scale = pair.angle_scale
         play = pair.pace.free / scale
         edges = [play, -play]
-        if pair.gear is not None:
-            middle = 0.0 if pair.gear.offset is None else pair.gear.offset
-            half = pair.gear.half_backlash
-            edges += [(middle + half) / scale, (middle - half) / scale]
+        edges += [edge / scale for part in pair.all_parts for edge in part.edges]
         inside = jnp.where(play > 0, play, jnp.inf)
-        if pair.both:
+        if pair.two_sided:
             inside = jnp.zeros_like(play)
         dtype = scale.dtype
         edge, inside = lax.stop_gradient((jnp.stack(edges), inside))

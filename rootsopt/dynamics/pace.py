@@ -1,20 +1,22 @@
 """How quickly a rotor pair can change, from which first and longest steps of a solver follow."""
 
+from collections.abc import Iterable
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from rootsopt.contact.impact import ImpactLaw
-from rootsopt.dynamics.parts import Supports, TimingGear
+from rootsopt.contact.law import ContactLaw
+from rootsopt.dynamics.parts import Part
 
 
 class Pace(eqx.Module):
     """Times (s) of the quickest swing and of free flight.
 
-    `swing`: in which the phase of rotor 2's swing on flank and timing gear, or that of a rotor on
-    its supports, advances by one radian; `fall`: from one end of the gear's play to the other under
-    the load, infinite where the play is less than the static penetration and the pair never flies.
+    `swing`: in which the phase of rotor 2's swing on flank and timing gear, or that of any other
+    part, advances by one radian; `fall`: from one end of the gear's play to the other under the
+    load, infinite where the play is less than the static penetration and the pair never flies.
     `free`: |ε| (rad) below which the clearance keeps the flanks apart at the nominal centre
     distance.
     """
@@ -26,9 +28,8 @@ class Pace(eqx.Module):
     @classmethod
     def of(
         cls,
-        law: ImpactLaw,
-        gear: TimingGear | None,
-        supports: Supports | None,
+        law: ContactLaw,
+        parts: Iterable[Part],
         inertia: Float[Array, ""],
         force: Float[Array, ""],
         radius: Float[Array, ""],
@@ -39,19 +40,22 @@ class Pace(eqx.Module):
         The contact is as stiff as at the static depth, or at that of an impact after a fall
         through the play if this is deeper (its energy is the work of the load).
         """
-        none = jnp.zeros_like(force)
-        play = none if gear is None else 2 * gear.half_backlash
-        e = law.exponent
+        parts = tuple(parts)
+        play = jnp.zeros_like(force)
+        for part in parts:
+            play = play if part.play is None else play + 2 * part.play
         static = law.depth_at(force)
-        impact = ((e + 1) * force * radius * play / law.stiffness) ** (1 / (e + 1))
-        deepest = jnp.maximum(static, impact)
-        stiffness = radius**2 * e * law.stiffness * deepest ** (e - 1)
-        stiffness += none if gear is None else gear.stiffness
+        deepest = jnp.maximum(static, law.depth_absorbing(force * radius * play))
+        stiffness = radius**2 * law.stiffness_at(deepest)
+        for part in parts:
+            holding = part.holding_stiffness
+            stiffness = stiffness if holding is None else stiffness + holding
         flies = play > static / radius
         fall = jnp.sqrt(2 * jnp.where(flies, play, 1.0) * inertia / (force * radius))
         swing = jnp.sqrt(inertia / stiffness)
-        if supports is not None:
-            swing = jnp.minimum(swing, jnp.sqrt(supports.mass / supports.stiffness))
+        for part in parts:
+            own = part.quickest(inertia)
+            swing = swing if own is None else jnp.minimum(swing, own)
         # No lever is longer than the pitch radius.
         free = jnp.maximum(clearance, 0.0) / radius
         found = cls(swing, jnp.where(flies, fall, jnp.inf), free)

@@ -1,83 +1,42 @@
 """The rotor pair as an ordinary differential equation.
 
-The smallest scene has two states, ε = φ2 - φ1 and its rate. Parts add what they need: a motor
-the speed of rotor 1, supports the displacements of both axes and their rates. The equation is
-counted in mesh periods τ of rotor 1's rotation (one lobe pitch), so that it is periodic whatever
-the speed does, ε in units of `angle_scale`, so that a solver sees numbers of order one.
+The smallest scene has two states, ε = φ2 - φ1 and its rate. A part that sets rotor 1 free adds the
+speed of rotor 1 as a third, and every part its own states behind these, in the order of the parts.
+The equation is counted in mesh periods τ of rotor 1's rotation (one lobe pitch), so that it is
+periodic whatever the speed does, ε in units of `angle_scale`, so that a solver sees numbers of
+order one.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from rootsopt.contact.closest import ClosestApproach, FlankPair
-from rootsopt.contact.impact import ImpactLaw, force_rounding
-from rootsopt.contact.point import ContactPoint, contact_point
+from rootsopt.contact.gap import Approach, Contact
+from rootsopt.contact.impact import force_rounding
+from rootsopt.contact.law import ContactLaw
+from rootsopt.contact.point import ContactPoint
 from rootsopt.dynamics.pace import Pace
 from rootsopt.dynamics.parts import (
     Drive,
     Friction,
     Load,
-    MotorDrive,
+    Loads,
+    Motion,
+    Part,
     Supports,
     TimingGear,
+    Units,
 )
-from rootsopt.profiles.base import Profile
+from rootsopt.errors import InputError
 
-GapFunction = Callable[
-    [Float[Array, ""], Float[Array, ""]],
-    tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]],
-]
 STALLED = 0.05
 """Share of the drive's speed below which a motor counts as stalled."""
-_DISPLACED = 0.1
-"""Displacement of an axis, relative to the centre distance, with which the mesh is lost."""
-
-
-class SearchContact(eqx.Module):
-    """Gap and levers by a search for the closest approach at every call: the reference."""
-
-    pair: FlankPair
-
-    @classmethod
-    def of(
-        cls,
-        profile: Profile,
-        center_distance: Float[Array, ""] | None = None,
-        both: bool = False,
-    ) -> "SearchContact":
-        return cls(FlankPair.of(profile, center_distance, both))
-
-    @property
-    def jumps(self) -> bool:
-        """Whether the levers may jump, from one minimum of the gap to another as deep."""
-        return self.pair.profile.cusp or not self.pair.rolling
-
-    def __call__(self, roll, relative):
-        found = self.pair(roll, relative)
-        return found.gap, found.lever1, found.lever2
-
-    def at_distance(self, distance: Float[Array, ""]) -> "SearchContact":
-        """The same flanks at another centre distance (m)."""
-        return eqx.tree_at(lambda contact: contact.pair.center_distance, self, distance)
-
-
-class Motion(NamedTuple):
-    """Position and velocity of the pair at an instant (SI units): angle φ1 and angular speed of
-    rotor 1, ε and its rate; with supports, displacements of both axes (rotor, x and y) and their
-    velocities."""
-
-    phi: Float[Array, "*n"]
-    relative: Float[Array, "*n"]
-    rate: Float[Array, "*n"]
-    speed: Float[Array, "*n"]
-    shift: Float[Array, "*n 2 2"] | None = None
-    drift: Float[Array, "*n 2 2"] | None = None
 
 
 class FlankForce(NamedTuple):
@@ -113,15 +72,13 @@ class _Sliding(NamedTuple):
 
 
 class _Touch(NamedTuple):
-    """A flank at a pose: penetration (m) and its rate (m/s), levers (m), roll coordinate (rad) and
-    what a search found there; `sliding` where a part asks for it."""
+    """A flank at a pose: penetration (m) and its rate (m/s), roll coordinate (rad), what the
+    contact says of the pose; `sliding` where a part asks for it."""
 
     depth: Float[Array, ""]
     closing: Float[Array, ""]
-    lever1: Float[Array, ""]
-    lever2: Float[Array, ""]
     roll: Float[Array, ""]
-    found: ClosestApproach | None
+    approach: Approach
     sliding: _Sliding | None
 
 
@@ -130,16 +87,18 @@ class RotorPair(eqx.Module):
 
     `contact`: gap and levers at a pose; `law`: contact force; `clearance` (m) added to
     every flank gap; `inertia` of one rotor (kg·m²); `drive`, `load`, `gear`, `friction`,
-    `supports`: parts; `angle_scale` (rad) and `force_scale` (N): units the solver works in;
-    `pace`: how quickly it can change, None if unknown.
-    `both`: whether drive and coast flanks can touch at once, which they cannot at the nominal
-    centre distance. A part that is absent is None and costs nothing. Friction, supports and
-    `both` need a `SearchContact`.
+    `supports`: parts that the scene names; `angle_scale` (rad) and `force_scale` (N): units the
+    solver works in; `pace`: how quickly it can change, None if unknown.
+    `two_sided`: whether drive and coast flanks can touch at once, which they cannot at the nominal
+    centre distance. `parts`: any others. A part that is absent is None and costs nothing.
+
+    Raises InputError where two parts let the axes move, or where both flanks can touch and the
+    contact does not know of flanks turned away from each other.
     """
 
     lobes: int = eqx.field(static=True)
-    contact: GapFunction
-    law: ImpactLaw
+    contact: Contact
+    law: ContactLaw
     clearance: Float[Array, ""]
     inertia: Float[Array, ""]
     drive: Drive
@@ -150,12 +109,51 @@ class RotorPair(eqx.Module):
     friction: Friction | None = None
     supports: Supports | None = None
     pace: Pace | None = None
-    both: bool = eqx.field(static=True, default=False)
+    two_sided: bool = eqx.field(static=True, default=False)
+    parts: tuple[Part, ...] = ()
+
+    def __check_init__(self):
+        displacing = [type(part).__name__ for part in self.all_parts if part.displaces]
+        if len(displacing) > 1:
+            raise InputError(
+                f"one part of a scene can let the axes move, but {' and '.join(displacing)} both "
+                "do; leave one of them out"
+            )
+        if displacing and not self.two_sided:
+            raise InputError(
+                f"the part `{displacing[0]}` lets the axes move, so that both flanks can touch at "
+                "once, but the pair has `two_sided` = False; set it to True"
+            )
+        if self.two_sided and not self.contact.two_sided:
+            raise InputError(
+                "drive and coast flanks of this scene can touch at once, but the contact "
+                f"`{type(self.contact).__name__}` is right for one of them at a time; use "
+                "`SearchContact` (`solver.fidelity` = search)"
+            )
+
+    @property
+    def all_parts(self) -> tuple[Part, ...]:
+        """Every part of the scene, in the order of their states."""
+        named = self.drive, self.load, self.gear, self.friction, self.supports
+        return (*(part for part in named if part is not None), *self.parts)
+
+    @property
+    def free(self) -> bool:
+        """Whether the speed of rotor 1 is a state of the motion."""
+        return any(part.free for part in self.all_parts)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states, with the units that they have before they are scaled."""
+        first = ("relative rotation (rad)", "relative speed (rad/s)")
+        speed = ("excess of the speed of rotor 1 over the drive's (rad/s)",) * self.free
+        return (*first, *speed, *(name for part in self.all_parts for name in part.states))
 
     @property
     def states(self) -> int:
-        """How many states there are: ε, its rate, a motor's speed, eight of the supports."""
-        return 2 + self.drive.free + 8 * (self.supports is not None)
+        """How many states there are: ε, its rate, rotor 1's speed if that is free, those of the
+        parts."""
+        return 2 + self.free + sum(len(part.states) for part in self.all_parts)
 
     @property
     def units(self) -> Float[Array, " n"]:
@@ -184,22 +182,28 @@ class RotorPair(eqx.Module):
     @property
     def smooth(self) -> bool:
         """Whether the equation is smooth between its `switches`."""
-        return getattr(self.contact, "smooth", True)
+        return self.contact.smooth
 
     @property
     def jumps(self) -> bool:
         """Whether the contact force may jump where no other part does."""
-        return isinstance(self.contact, SearchContact) and self.contact.jumps
+        return self.contact.jumps
 
     def rounding(self, depth: Float[Array, ""]) -> Float[Array, ""]:
-        """Relative error of the force at a `depth` (m) that a search found, by rounding alone."""
-        if not isinstance(self.contact, SearchContact):
+        """Relative error of the force at a `depth` (m) by the rounding of the gap alone."""
+        length = self.contact.length_scale
+        if length is None:
             return jnp.zeros_like(depth)
-        return force_rounding(depth, self.law.exponent, self.contact.pair.center_distance / 2)
+        return force_rounding(depth, self.law.exponent, length)
+
+    def at_start(self, first: Float[np.ndarray, "*k 2"]) -> Float[np.ndarray, "*k n"]:
+        """Scaled states with the scaled ε and dε/dt in `first` and all others as a motion begins
+        with."""
+        return np.pad(first, [(0, 0)] * (first.ndim - 1) + [(0, self.states - 2)])
 
     def speed(self, state: Float[Array, "*k n"]) -> Float[Array, "*#k"]:
         """Angular speed of rotor 1 (rad/s) in a scaled state."""
-        if not self.drive.free:
+        if not self.free:
             return self.drive.speed
         return self.drive.speed + self.angle_scale / self.mesh_period * state[..., 2]
 
@@ -209,21 +213,42 @@ class RotorPair(eqx.Module):
         creep = STALLED / 2 * self.drive.speed
         return self.drive.speed / jnp.maximum(self.speed(state), creep)
 
+    @property
+    def _units(self) -> Units:
+        return Units(self.angle_scale, self.mesh_period)
+
+    def own_states(self, state: Float[Array, "*k n"]) -> list[Float[Array | np.ndarray, "*k _"]]:
+        """Own states (SI) of each of `all_parts` in a scaled state."""
+        found, place = [], 2 + self.free
+        for part in self.all_parts:
+            count = len(part.states)
+            # Of no states nothing is traced.
+            own = np.zeros((*state.shape[:-1], 0), state.dtype)
+            if count:
+                own = part.scales(self._units) * state[..., place : place + count]
+                start = part.start(self._units)
+                own = own if start is None else start + own
+            found.append(own)
+            place += count
+        return found
+
     def motion(self, tau: Float[Array, "*k"], state: Float[Array, "*k n"]) -> Motion:
         """Position and velocity from rotation in mesh periods and scaled state, in the precision
         of the pair whatever theirs is."""
+        return self._moving(tau, state)[0]
+
+    def _moving(self, tau, state):
+        """`motion`, and the parts with their own states (SI)."""
         tau, state = (jnp.asarray(x, self.angle_scale.dtype) for x in (tau, state))
         relative = self.angle_scale * state[..., 0]
         rate = self.angle_scale * state[..., 1] / self.mesh_period
         motion = Motion(2 * jnp.pi / self.lobes * tau, relative, rate, self.speed(state))
-        if self.supports is None:
-            return motion
-        unit = self.supports.unit
-        shift, drift = (
-            state[..., -8 + 4 * i : state.shape[-1] - 4 + 4 * i].reshape(*tau.shape, 2, 2)
-            for i in (0, 1)
-        )
-        return motion._replace(shift=unit * shift, drift=unit / self.mesh_period * drift)
+        acting = list(zip(self.all_parts, self.own_states(state), strict=True))
+        for part, own in acting:
+            if part.displaces:
+                shift, drift = part.axes(own)
+                motion = motion._replace(shift=shift, drift=drift)
+        return motion, acting
 
     def physical(
         self, tau: Float[Array, "*k"], state: Float[Array, "*k n"]
@@ -237,7 +262,7 @@ class RotorPair(eqx.Module):
         """Flank contact at rotor 1's angle `phi` (rad), ε and dε/dt, at the drive's speed and
         with both axes in their places."""
         motion = Motion(phi, relative, rate, self.drive.speed)
-        if self.supports is not None:
+        if any(part.displaces for part in self.all_parts):
             rest = jnp.zeros((2, 2), self.angle_scale.dtype)
             motion = motion._replace(shift=rest, drift=rest)
         return self._force(motion)
@@ -253,7 +278,7 @@ class RotorPair(eqx.Module):
         can touch when ε < 0 and only the coast flank when ε > 0, so one search is
         enough; the force is exactly zero on both sides of ε = 0.
         """
-        if self.both:
+        if self.two_sided:
             sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)
             flanks = jax.vmap(self._flank_force, (0, None))(sides, motion)
             drive, coast = flanks.drive
@@ -277,27 +302,27 @@ class RotorPair(eqx.Module):
         """Force of the flanks of one side (1 drive, -1 coast), as that of the drive flank."""
         touch = self._touch(side, motion)
         force = self.law(touch.depth, touch.closing)
+        _, lever1, lever2, _ = touch.approach
         forward, sliding = side * force, touch.sliding
-        torque1, torque2 = -touch.lever1 * forward, touch.lever2 * forward
-        normal = tangent = push = None
+        torque1, torque2 = -lever1 * forward, lever2 * forward
+        push = None
+        if sliding is not None and sliding.normal is not None:
+            push = force * sliding.normal
+        drag = None
         if sliding is not None:
-            normal, tangent = sliding.normal, sliding.tangent
-        if normal is not None:
-            push = force * normal
-        if self.friction is not None:
-            assert sliding is not None
-            drag = self.friction(sliding.speed) * force
+            drag = _sum(part.drag(force, sliding.speed) for part in self.all_parts if part.rubs)
+        if sliding is not None and drag is not None:
             torque1 -= side * drag * sliding.point.support1
             torque2 += side * drag * sliding.point.support2
-            if push is not None and tangent is not None:
-                push += drag * tangent
+            if push is not None and sliding.tangent is not None:
+                push += drag * sliding.tangent
         return FlankForce(
             drive=force,
             coast=jnp.zeros_like(force),
             depth=touch.depth,
             closing=touch.closing,
-            lever1=touch.lever1,
-            lever2=touch.lever2,
+            lever1=lever1,
+            lever2=lever2,
             torque1=torque1,
             torque2=torque2,
             push=push,
@@ -313,122 +338,129 @@ class RotorPair(eqx.Module):
         """
         contact, line, relative = self.contact, None, motion.relative
         if motion.shift is not None:
-            assert isinstance(contact, SearchContact)
             x, y = motion.shift[1] - motion.shift[0]
-            line = jnp.stack([contact.pair.center_distance + x, y])
+            line = jnp.stack([contact.center_distance + x, y])
             relative = relative + 2 * jnp.arctan2(y, line[0])
             contact = contact.at_distance(jnp.hypot(*line))
         roll, turned = -side * (motion.phi + motion.relative / 2), side * relative
-        found = sliding = None
-        if isinstance(contact, SearchContact):
-            found = contact.pair(roll, turned)
-            gap, lever1, lever2 = found.gap, found.lever1, found.lever2
-        else:
-            gap, lever1, lever2 = contact(roll, turned)
+        approach = contact.approach(roll, turned)
+        gap, lever1, lever2, _ = approach
         other = motion.speed + motion.rate
         closing = side * (lever1 * motion.speed - lever2 * other)
-        if self.friction is not None or line is not None:
-            assert isinstance(contact, SearchContact)
-            assert found is not None
-            point = contact_point(contact.pair, roll, turned, found)
+        sliding = None
+        if line is not None or any(part.rubs for part in self.all_parts):
+            point = contact.point(roll, turned, approach)
             speed = side * (motion.speed * point.support1 - other * point.support2)
             sliding = _Sliding(point, speed)
             if line is not None:
                 assert motion.drift is not None
-                distance = contact.pair.center_distance
+                distance = contact.center_distance
                 cos, sin = line / distance
                 along, across = point.radial, side * (lever1 + lever2) / distance
                 normal = jnp.stack([cos * along - sin * across, sin * along + cos * across])
                 tangent = side * jnp.stack([-normal[1], normal[0]])
-                approach = motion.drift[0] - motion.drift[1]
-                closing += jnp.dot(approach, normal)
-                speed += jnp.dot(approach, tangent)
+                approaching = motion.drift[0] - motion.drift[1]
+                closing += jnp.dot(approaching, normal)
+                speed += jnp.dot(approaching, tangent)
                 sliding = _Sliding(point, speed, normal, tangent)
-        depth = -gap - self.clearance
-        return _Touch(depth, closing, lever1, lever2, roll, found, sliding)
+        return _Touch(-gap - self.clearance, closing, roll, approach, sliding)
 
     def switches(
         self, tau: Float[Array, ""], state: Float[Array, " n"]
     ) -> tuple[Bool[Array, " s"], Bool[Array, " s"]]:
-        """Which of its smooth pieces the equation is on, at rotation `tau` (mesh periods) and
-        scaled `state`: side and pieces of the flanks, of the contact law, of every part. And which
-        of these are of account: not the pieces of a flank that does not touch."""
-        motion = self.motion(tau, state)
+        """On which of its smooth pieces the equation is, at rotation `tau` (mesh periods) and
+        scaled `state`: side and pieces of the flanks, of the contact law, of every part. And a
+        mask of the flags that matter (flanks out of contact are excluded)."""
+        motion, acting = self._moving(tau, state)
 
         def of_flank(side):
             touch = self._touch(side, motion)
-            flags = [self.law.switches(touch.depth, touch.closing)]
-            if touch.found is not None:
-                assert isinstance(self.contact, SearchContact)
-                flags.append(self.contact.pair.switches(touch.roll, touch.found))
-            if self.friction is not None:
-                assert touch.sliding is not None
-                flags.append(self.friction.switches(touch.sliding.speed))
+            flags = [
+                self.law.switches(touch.depth, touch.closing),
+                self.contact.switches(touch.roll, touch.approach),
+            ]
+            if touch.sliding is not None:
+                speed = touch.sliding.speed
+                flags += [part.drag_switches(speed) for part in self.all_parts if part.rubs]
             found = jnp.concatenate(flags)
             return found, jnp.full_like(found, touch.depth > 0)
 
         drives = motion.relative < 0
-        if self.both:
+        if self.two_sided:
             sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)
             flags, counts = (x.ravel() for x in jax.vmap(of_flank)(sides))
         else:
             flags, counts = of_flank(jnp.where(drives, 1.0, -1.0))
             flags, counts = jnp.append(flags, drives), jnp.append(counts, True)
-        parts = [self.load.switches(motion.phi)]
-        if self.gear is not None:
-            parts.append(self.gear.switches(motion.relative))
-        flags = jnp.concatenate([flags, *parts])
+        flags = jnp.concatenate([flags, *(part.switches(motion, own) for part, own in acting)])
         return flags, jnp.pad(counts, (0, flags.size - counts.size), constant_values=True)
 
     def derivative(
         self, tau: Float[Array, ""], state: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], FlankForce]:
         """d(state)/dτ and the contact it comes from."""
-        motion = self.motion(tau, state)
+        motion, acting = self._moving(tau, state)
         contact = self._force(motion)
-        torque = contact.torque2 - self.load.torque2(motion.phi)
-        holding = None if self.gear is None else self.gear(motion.relative, motion.rate)
-        if holding is not None:
-            torque = torque - holding
-        acceleration = torque / self.inertia
+        loads = self._loads(motion, acting, contact)
         unit = self.mesh_period**2 / self.angle_scale
+        acceleration = loads.torque2 / self.inertia
         slopes = [state[1:2]]
-        if isinstance(self.drive, MotorDrive):
-            torque = self.drive.torque_at(motion.speed) + contact.torque1
-            torque = torque - self.load.torque1(motion.phi)
-            if holding is not None:
-                torque = torque + holding
-            driven = torque / (self.inertia + self.drive.inertia)
-            slopes += [(unit * jnp.stack([acceleration - driven, driven]))]
-        else:
+        if loads.torque1 is None:
             slopes += [jnp.stack([acceleration * unit])]
-        if self.supports is not None:
-            assert contact.push is not None
-            assert motion.shift is not None
-            assert motion.drift is not None
-            force = self.supports.force(motion.shift, motion.drift)
-            force += jnp.stack([-contact.push, contact.push])
-            unit = self.mesh_period**2 / (self.supports.mass * self.supports.unit)
-            slopes += [state[-4:], unit * force.ravel()]
+        else:
+            added = _sum(part.added_inertia for part in self.all_parts)
+            inertia = self.inertia if added is None else self.inertia + added
+            driven = loads.torque1 / inertia
+            slopes += [unit * jnp.stack([acceleration - driven, driven])]
+        for part, own in acting:
+            if part.states:
+                per_period = self.mesh_period / part.scales(self._units)
+                slopes += [per_period * part.rates(motion, own, loads)]
         slope = jnp.concatenate(slopes)
-        if self.drive.free:
+        if self.free:
             slope = self.lapse(state) * slope
         # A pair that has lost its mesh stands still rather than run to infinity; the
         # caller reports it.
-        return jnp.where(lax.stop_gradient(self.lost(state)), 0.0, slope), contact
+        return jnp.where(lax.stop_gradient(self._lost(state, acting)), 0.0, slope), contact
+
+    def _loads(self, motion: Motion, acting, contact: FlankForce) -> Loads:
+        """All that acts on the rotors, `acting` parts with their own states."""
+        torque1 = axes = None
+        if self.free:
+            torques = (part.torque_on_1(motion, own) for part, own in acting)
+            torque1 = _sum([contact.torque1, *torques])
+        torques = (part.torque_on_2(motion, own) for part, own in acting)
+        torque2 = _sum([contact.torque2, *torques])
+        assert torque2 is not None
+        if contact.push is not None:
+            forces = (part.force_on_axes(motion, own) for part, own in acting)
+            axes = _sum([*forces, jnp.stack([-contact.push, contact.push])])
+        return Loads(torque1, torque2, axes)
 
     def lost(self, state: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether a scaled state is no longer one of a running mesh: lobes have passed through
-        each other, an axis has left its place, or the motor has stalled."""
+        each other, a part says so (an axis has left its place), or the motor has stalled."""
+        return self._lost(state, zip(self.all_parts, self.own_states(state), strict=True))
+
+    def _lost(self, state, acting) -> Bool[Array, ""]:
+        """`lost`, with the parts and their own states at hand."""
         lost = ~(jnp.abs(self.angle_scale * state[0]) < self.angle_limit)
-        if self.supports is not None:
-            assert isinstance(self.contact, SearchContact)
-            farthest = _DISPLACED * self.contact.pair.center_distance
-            lost |= jnp.any(jnp.abs(self.supports.unit * state[-8:-4]) > farthest)
-        return lost | self.stalled(state) if self.drive.free else lost
+        for part, own in acting:
+            gone = part.lost(own)
+            lost = lost if gone is None else lost | gone
+        return lost | self.stalled(state) if self.free else lost
 
     def stalled(self, state: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether a motor has come to a halt, all but."""
-        if not self.drive.free:
+        if not self.free:
             return jnp.zeros((), bool)
         return self.speed(state) < STALLED * self.drive.speed
+
+
+def _sum(terms: Iterable[Array | None]) -> Array | None:
+    """Sum of those that are not None, None if there are none."""
+    total = None
+    for term in terms:
+        if term is not None:
+            total = term if total is None else total + term
+    return total

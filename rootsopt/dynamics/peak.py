@@ -60,7 +60,7 @@ def motion(
 
 def _slope(pair: RotorPair, states: Float[Array, "*k n"]) -> Float[Array, "*k"]:
     """dε/dτ (scaled) at scaled states."""
-    return states[..., 1] * pair.lapse(states) if pair.drive.free else states[..., 1]
+    return states[..., 1] * pair.lapse(states) if pair.free else states[..., 1]
 
 
 def _state(
@@ -71,7 +71,7 @@ def _state(
 ) -> Float[Array, " n"]:
     """The scaled state with this ε and dε/dτ."""
     state = jnp.concatenate([jnp.stack([swing, slope]), others])
-    return state.at[1].divide(pair.lapse(state)) if pair.drive.free else state
+    return state.at[1].divide(pair.lapse(state)) if pair.free else state
 
 
 class Steps(NamedTuple):

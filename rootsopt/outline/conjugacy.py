@@ -67,7 +67,7 @@ def conjugacy(profile: Profile) -> Conjugacy:
 
 @Program
 def _gaps(profile, roll):
-    pair = FlankPair.of(profile, 2 * profile.pitch_radius, both=True)
+    pair = FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True)
     sides = jnp.stack([roll, -roll])
     contact = lax.map(lambda x: pair(x, jnp.zeros_like(x)), sides.ravel())
     gap = jnp.where(contact.found, contact.gap, jnp.inf).reshape(sides.shape)

@@ -141,8 +141,7 @@ def find_fitted(
     scale, period = float(pair.angle_scale), float(pair.mesh_period)
     relative, rate = _axes(config, pair)
     grid = np.stack(np.meshgrid(relative / scale, rate * period / scale), axis=-1).reshape(-1, 2)
-    # Everything else begins at rest, or at the drive's speed.
-    grid = np.pad(grid, ((0, 0), (0, pair.states - 2)))
+    grid = pair.at_start(grid)
     starts = np.concatenate([grid, *(np.atleast_2d(state) for state in known)])
     ends, failures = _settled(evaluator, pair, starts)
     found = _Sorter(evaluator, design, series)

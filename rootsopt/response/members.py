@@ -94,7 +94,7 @@ def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float
     sampler = qmc.Sobol(2, rng=np.random.default_rng(seed))
     power = int(np.ceil(np.log2(members)))
     play = (2 * sampler.random_base2(power)[:members] - 1) * np.array([1.0, fastest])
-    return np.pad(play, ((0, 0), (0, pair.states - 2)))
+    return pair.at_start(play)
 
 
 def prepare_members(pair: RotorPair, how: Integrator) -> None:

@@ -1,5 +1,6 @@
 """What may act on a rotor pair. A scene holds the parts it needs and no others."""
 
+from rootsopt.dynamics.parts.base import Context, Loads, Motion, Own, Part, Units
 from rootsopt.dynamics.parts.drive import Drive, MotorDrive, PrescribedDrive
 from rootsopt.dynamics.parts.friction import Friction
 from rootsopt.dynamics.parts.gear import TimingGear
@@ -8,12 +9,18 @@ from rootsopt.dynamics.parts.supports import Supports
 
 __all__ = [
     "ConstantLoad",
+    "Context",
     "Drive",
     "Friction",
     "GasLoad",
     "Load",
+    "Loads",
+    "Motion",
     "MotorDrive",
+    "Own",
+    "Part",
     "PrescribedDrive",
     "Supports",
     "TimingGear",
+    "Units",
 ]

@@ -1,30 +1,24 @@
 """What turns rotor 1."""
 
-import abc
-
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from rootsopt.dynamics.parts.base import Part
 
-class Drive(eqx.Module):
-    """Turns rotor 1, at the angular speed `speed` (rad/s) or about it."""
+
+class Drive(Part):
+    """Turns rotor 1, at the angular speed `speed` (rad/s) or about it.
+
+    Unless a part of the scene is `free`, rotor 1 turns at just that speed, whatever the torque.
+    """
 
     speed: eqx.AbstractVar[Float[Array, ""]]
-
-    @property
-    @abc.abstractmethod
-    def free(self) -> bool:
-        """Whether the speed of rotor 1 is a state of the motion."""
 
 
 class PrescribedDrive(Drive):
     """Rotor 1 turns at the constant angular speed `speed` (rad/s) whatever the torque."""
 
     speed: Float[Array, ""]
-
-    @property
-    def free(self) -> bool:
-        return False
 
 
 class MotorDrive(Drive):
@@ -42,6 +36,14 @@ class MotorDrive(Drive):
     @property
     def free(self) -> bool:
         return True
+
+    @property
+    def added_inertia(self) -> Float[Array, ""]:
+        return self.inertia
+
+    def torque_on_1(self, motion, own):
+        del own
+        return self.torque_at(motion.speed)
 
     def torque_at(self, speed: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Torque (N·m) at the angular `speed` (rad/s) of rotor 1."""

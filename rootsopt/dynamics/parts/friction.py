@@ -1,13 +1,13 @@
 """Coulomb friction between the flanks."""
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rootsopt.contact.impact import smooth_step
+from rootsopt.dynamics.parts.base import Part
 
 
-class Friction(eqx.Module):
+class Friction(Part):
     """Coefficient of friction over the sliding speed, as multibody programs have it.
 
     It rises from -`static` to `static` between -`stiction_speed` and `stiction_speed` (m/s) and
@@ -27,7 +27,14 @@ class Friction(eqx.Module):
         fall = smooth_step((jnp.abs(sliding) - self.stiction_speed) / span)
         return rise * (self.static - (self.static - self.kinetic) * fall)
 
-    def switches(self, sliding: Float[Array, ""]) -> Bool[Array, "4"]:
+    @property
+    def rubs(self) -> bool:
+        return True
+
+    def drag(self, force: Float[Array, ""], sliding: Float[Array, ""]) -> Float[Array, ""]:
+        return self(sliding) * force
+
+    def drag_switches(self, sliding: Float[Array, ""]) -> Bool[Array, "4"]:
         """On which of its smooth pieces the coefficient is."""
         speeds = jnp.stack([self.stiction_speed, self.friction_speed])
         return sliding > jnp.concatenate([speeds, -speeds])

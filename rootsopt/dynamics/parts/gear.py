@@ -1,13 +1,13 @@
 """The timing gear between the rotors."""
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rootsopt.contact.impact import balanced_ramp, balanced_step
+from rootsopt.dynamics.parts.base import Motion, Part
 
 
-class TimingGear(eqx.Module):
+class TimingGear(Part):
     """Timing gear between the rotors: backlash, stiffness, damping.
 
     The torque vanishes for |ε| ≤ `half_backlash` (rad); beyond, it is `stiffness`
@@ -15,7 +15,7 @@ class TimingGear(eqx.Module):
     backlash are rounded over the first `rounding` (rad) of the excess. There the torque keeps its
     integral over ε: a motion that crosses it loses the same energy to the spring, and the same
     momentum to the damper, as at a sharp edge. `offset`
-    (rad): ε at the middle of the backlash, where the gear was mounted out of phase; None is none.
+    (rad): ε at the middle of the backlash, where the gear was mounted out of phase; None: in phase.
     """
 
     stiffness: Float[Array, ""]
@@ -36,9 +36,31 @@ class TimingGear(eqx.Module):
         spring = self.stiffness * jnp.sign(relative) * balanced_ramp(excess, self.rounding)
         return spring + self.damping * engaged * rate
 
-    def switches(self, relative: Float[Array, ""]) -> Bool[Array, "2"]:
+    def torque_on_1(self, motion: Motion, own) -> Float[Array, ""]:
+        del own
+        return self(motion.relative, motion.rate)
+
+    def torque_on_2(self, motion: Motion, own) -> Float[Array, ""]:
+        del own
+        return -self(motion.relative, motion.rate)
+
+    @property
+    def play(self) -> Float[Array, ""]:
+        return self.half_backlash
+
+    @property
+    def edges(self) -> tuple[Float[Array, ""], ...]:
+        middle = 0.0 if self.offset is None else self.offset
+        return middle + self.half_backlash, middle - self.half_backlash
+
+    @property
+    def holding_stiffness(self) -> Float[Array, ""]:
+        return self.stiffness
+
+    def switches(self, motion: Motion, own) -> Bool[Array, "2"]:
         """On which of its smooth pieces the gear is: engaged, beyond the rounding."""
-        excess = jnp.abs(self._from_middle(relative)) - self.half_backlash
+        del own
+        excess = jnp.abs(self._from_middle(motion.relative)) - self.half_backlash
         return excess > jnp.stack([jnp.zeros_like(self.rounding), self.rounding])
 
     def _from_middle(self, relative):

@@ -7,30 +7,40 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rootsopt.contact.impact import smooth_step
+from rootsopt.dynamics.parts.base import Part
 from rootsopt.profiles.base import Profile
 
 _BRIEF = 0.01
 """Roll angle (rad) in which a stretch of the flank takes at least to pass the seal on."""
 
 
-class Load(eqx.Module):
+class Load(Part):
     """Torques against the rotors at rotor 1's angle φ1; `torque` (N·m) is the mean of that
     against rotor 2."""
 
     torque: eqx.AbstractVar[Float[Array, ""]]
 
     @abc.abstractmethod
-    def torque1(self, phi: Float[Array, ""]) -> Float[Array, ""] | float:
-        """Torque (N·m) against rotor 1 at φ1 = `phi` (rad)."""
+    def torque1(self, phi: Float[Array, ""]) -> Float[Array, ""] | None:
+        """Torque (N·m) against rotor 1 at φ1 = `phi` (rad); None: no torque at any angle."""
 
     @abc.abstractmethod
     def torque2(self, phi: Float[Array, ""]) -> Float[Array, ""]:
         """Torque (N·m) against rotor 2 at φ1 = `phi` (rad)."""
 
-    def switches(self, phi: Float[Array, ""]) -> Bool[Array, " s"]:
-        """On which of its smooth pieces the load is at φ1 = `phi` (rad)."""
-        del phi
-        return jnp.zeros(0, bool)
+    @property
+    @abc.abstractmethod
+    def total(self) -> Float[Array, ""]:
+        """Mean torque (N·m) against both rotors together."""
+
+    def torque_on_1(self, motion, own):
+        del own
+        torque = self.torque1(motion.phi)
+        return None if torque is None else -torque
+
+    def torque_on_2(self, motion, own):
+        del own
+        return -self.torque2(motion.phi)
 
 
 class ConstantLoad(Load):
@@ -40,10 +50,14 @@ class ConstantLoad(Load):
 
     def torque1(self, phi):
         del phi
-        return 0.0
+        return None
 
     def torque2(self, phi):
         del phi
+        return self.torque
+
+    @property
+    def total(self):
         return self.torque
 
 
@@ -77,6 +91,10 @@ class GasLoad(Load):
     def torque2(self, phi):
         return self._torque(phi, -1.0)
 
+    @property
+    def total(self):
+        return 2 * self.torque
+
     def _roll(self, phi):
         """Roll angle at which the pair touches: a tip of rotor 1 at 0, one of rotor 2 at π/N."""
         pitch = 2 * jnp.pi / self.profile.lobes
@@ -108,8 +126,9 @@ class GasLoad(Load):
             squares = jnp.where(brief, spread, squares)
         return self.pressure_length / 2 * squares
 
-    def switches(self, phi):
-        half = self.profile.half_pitch
+    def switches(self, motion, own) -> Bool[Array, " s"]:
+        del own
+        phi, half = motion.phi, self.profile.half_pitch
         roll = self._roll(phi)
         addendum = half - jnp.abs(roll - half)
         ends = [segment.stop for segment in self.profile.segments()[:-1]]

@@ -16,7 +16,6 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rootsopt.dynamics.pair import FlankForce
-from rootsopt.profiles.base import Profile
 
 LONGEST = 4e-6
 """Longest step (mesh periods) that is looked into: all that are made around a change are
@@ -42,14 +41,18 @@ def saltation(
     step: Float[Array, ""],
     slopes: Float[Array, "stages rows"],
     period: Float[Array, ""],
-    profile: Profile,
+    length: Float[Array, ""] | None,
 ) -> Float[Array, " rows-4"]:
     """Zero, with the derivative that a jump inside a step adds to y after it.
 
     `step`: its length (mesh periods); `slopes`: the slope of y with the `marks` behind, at the
     stages of the step, its begin first and its end last; `period`: the time (s) by which y is
-    counted. Exact but for the length of the step.
+    counted; `length` (m): the size of levers. Exact but for the length of the step.
+
+    Raises ValueError where the contact that jumps does not say the size of its levers.
     """
+    if length is None:
+        raise ValueError("A contact that `jumps` must have a `length_scale`, but it is None.")
     first, last = slopes[0], slopes[-1]
     depth = first[-4] - last[-4]
     frozen = lax.stop_gradient(slopes)
@@ -57,7 +60,7 @@ def saltation(
     closing = lax.stop_gradient(period) * (frozen[0, -3] - frozen[-1, -3])
     jump = jnp.max(jnp.abs(frozen[0, -2:] - frozen[-1, -2:]))
     most = _FASTER * jnp.abs(step) + _ROUNDINGS * float(jnp.finfo(step.dtype).eps)
-    most = most * lax.stop_gradient(profile.pitch_radius)
+    most = most * lax.stop_gradient(length)
     apart = jnp.abs(frozen[:, None, -2:] - frozen[jnp.array([0, -1]), -2:])
     between = jnp.max(jnp.min(jnp.max(apart, axis=-1), axis=-1))
     jumps = (jnp.abs(step) < LONGEST) & (jump > most) & (between < _ALIKE * jump) & (closing != 0)

@@ -1,0 +1,100 @@
+"""What every contact must do (`rootsopt.contact.Contact`)."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conformance.kinks import along, unmarked
+
+from rootsopt.contact.nodes import pair_gap
+from rootsopt.errors import InputError
+
+
+@eqx.filter_jit
+def _look(contact, rolls, relatives):
+    """Gap and levers, and the derivatives of the gap with respect to φ1 and φ2, at many poses."""
+
+    def at(roll, relative):
+        # x = -(φ1 + φ2) / 2, ε = φ2 - φ1.
+        gap, slopes = jax.value_and_grad(
+            lambda turns: contact(roll - (turns[0] + turns[1]) / 2, relative + turns[1] - turns[0])[
+                0
+            ]
+        )(jnp.zeros(2))
+        return gap, *contact(roll, relative), slopes
+
+    return jax.lax.map(lambda pose: at(*pose), (jnp.asarray(rolls), jnp.asarray(relatives)))
+
+
+def check_contact(contact, profile, outline, deepest, gap_error, lever_error=1e-12):
+    """Check a contact of `profile`, whose closed `outline` (n, 2) (m) has been made otherwise.
+
+    `deepest` (rad) < 0: ε down to which it is used; `gap_error` (m): what it promises against the
+    polygon; `lever_error` (m): how closely its levers are derivatives of its gap.
+    """
+    rng = np.random.default_rng(9)
+    half, lobes = float(profile.half_pitch), profile.lobes
+    rolls = rng.uniform(0.02, 2 * half - 0.02, 80)
+    relatives = deepest * rng.uniform(0.05, 1, 80)
+    _, gap, lever1, lever2, slopes = (np.asarray(x) for x in _look(contact, rolls, relatives))
+    deep = gap < -1e-7
+    assert np.mean(deep) > 0.4
+    distance = 2 * float(profile.pitch_radius)
+    expected = [
+        pair_gap(outline, lobes, distance, -x - e / 2, -x + e / 2)
+        for x, e in zip(rolls[deep][:25], relatives[deep][:25], strict=True)
+    ]
+    np.testing.assert_allclose(gap[deep][:25], expected, rtol=0, atol=gap_error)
+    # Virtual work: d gap = -lever1 dφ1 + lever2 dφ2.
+    np.testing.assert_allclose(-lever1[deep], slopes[deep, 0], rtol=0, atol=lever_error)
+    np.testing.assert_allclose(lever2[deep], slopes[deep, 1], rtol=0, atol=lever_error)
+    # A mesh further on it is the same, and with the rotors exchanged.
+    again = [np.asarray(x) for x in _look(contact, rolls + 4 * half, relatives)[1:4]]
+    other = [np.asarray(x) for x in _look(contact, 2 * half - rolls, relatives)[1:4]]
+    for found in (again, [other[0], other[2], other[1]]):
+        for one, first in zip(found, (gap, lever1, lever2), strict=True):
+            np.testing.assert_allclose(one[deep], first[deep], rtol=0, atol=1e-9)
+    wild = _look(contact, rng.uniform(-50, 50, 80), rng.uniform(-0.3, 0.3, 80))
+    assert all(np.all(np.isfinite(x)) for x in wild)
+    assert contact.length_scale is not None or not contact.jumps
+    if contact.smooth:
+        _check_kinks(contact, half, deepest)
+    _check_place(contact, rolls[deep][0], relatives[deep][0])
+
+
+def _check_kinks(contact, half, deepest):
+    """Kinks of the levers, second derivatives of the gap, are marked where flanks touch."""
+
+    def function(pose):
+        found = contact.approach(*pose)
+        flags = contact.switches(pose[0], found)
+        return jnp.stack([found.lever1, found.lever2]), jnp.append(flags, found.gap < 0)
+
+    lines = [((0.0, share * deepest), (2 * half, 0.9 * share * deepest)) for share in (0.3, 0.9)]
+    for values, slopes, flags in along(function, lines):
+        touches = flags[:, -1]
+        missed, _ = unmarked(values, slopes, flags)
+        missed = missed[touches[missed] & touches[missed + 1]]
+        assert missed.size == 0, f"kinks of the levers that no switch marks: {missed}"
+
+
+def _check_place(contact, roll, relative):
+    """What a contact says of the point of contact belongs to its gap, or it says nothing."""
+
+    def known(roll, relative):
+        found = contact.approach(roll, relative)
+        point = contact.point(roll, relative, found)
+        there = lambda distance: contact.at_distance(distance)(roll, relative)[0]  # noqa: E731
+        by_distance = jax.grad(there)(contact.center_distance)
+        gap = contact.center_distance * point.radial - point.support1 - point.support2
+        return found.gap - gap, by_distance - point.radial
+
+    try:
+        errors = jax.jit(known)(jnp.asarray(roll), jnp.asarray(relative))
+    except InputError:
+        assert not contact.two_sided
+        with pytest.raises(InputError, match="does not give"):
+            contact.at_distance(jnp.ones(()))
+        return
+    np.testing.assert_allclose(errors, 0.0, atol=1e-9)

@@ -1,0 +1,188 @@
+"""What every part of a scene must do (`rootsopt.dynamics.parts.Part`)."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from conformance.kinks import along, unmarked
+
+from rootsopt.dynamics.parts import Loads, Motion, Units
+
+UNITS = Units(jnp.asarray(1.5e-3), jnp.asarray(6.7e-3))
+SPEED = 314.0
+"""Speed (rad/s) about which rotor 1 turns."""
+
+
+def nothing(part, motion, own):
+    """No energy, no power."""
+    del part, motion, own
+    return jnp.zeros(())
+
+
+def draw(part, rng, reach, axes):
+    """A motion and own states, `reach` times the units of each, and what acts beside the part."""
+    angle, rate = float(UNITS.angle), float(UNITS.angle / UNITS.time)
+    own = jnp.zeros(0)
+    if part.states:
+        own = np.asarray(part.scales(UNITS)) * reach * rng.normal(size=len(part.states))
+        start = part.start(UNITS)
+        own = jnp.asarray(own if start is None else own + np.asarray(start))
+    turns, apart, rate_apart, faster = rng.uniform(0, 2), *(reach * rng.normal(size=3))
+    numbers = turns, angle * apart, rate * rate_apart, SPEED + rate * faster
+    motion = Motion(*(jnp.asarray(x) for x in numbers))
+    if part.displaces or axes:
+        shift, drift = 1e-5 * rng.normal(size=(2, 2, 2)) * np.array([1, 100]).reshape(2, 1, 1)
+        if part.displaces:
+            shift, drift = part.axes(own)
+        motion = motion._replace(shift=jnp.asarray(shift), drift=jnp.asarray(drift))
+    forces = None if motion.shift is None else jnp.asarray(100 * rng.normal(size=(2, 2)))
+    torques = 5 * rng.normal(size=2)
+    return motion, own, Loads(jnp.asarray(torques[0]), jnp.asarray(torques[1]), forces)
+
+
+def actions(part, motion, own, loads):
+    """All that the part does: torques, forces, rates of its own states, as one vector."""
+    found = [part.torque_on_1(motion, own), part.torque_on_2(motion, own)]
+    if motion.shift is not None:
+        found.append(part.force_on_axes(motion, own))
+    if part.states:
+        found.append(part.rates(motion, own, loads))
+    return jnp.concatenate([jnp.zeros(1), *(jnp.ravel(x) for x in found if x is not None)])
+
+
+def check_part(part, energy=nothing, supply=nothing, losses=nothing, reach=2.0, axes=False):
+    """Check a part by itself.
+
+    `energy(part, motion, own)` (J) that it stores, power (W) that it takes in from outside
+    (`supply`) and dissipates (`losses`); `reach`: of the states, in their units, such that its
+    kinks lie within; `axes`: whether it acts on axes that move.
+    """
+    rng = np.random.default_rng(11)
+    check_states(part)
+    cases = [draw(part, rng, reach, axes) for _ in range(20)]
+    _check_power(part, cases, energy, supply, losses)
+    _check_kinks(part, rng, reach, axes)
+    if part.rubs:
+        _check_drag(part)
+    if part.play is not None:
+        edges = [float(edge) for edge in part.edges]
+        assert np.isclose(np.ptp(edges), 2 * float(part.play), rtol=1e-9)
+        motion, own, _ = draw(part, rng, 0.0, axes)
+        for place in np.linspace(min(edges), max(edges), 5):
+            held = part.torque_on_2(motion._replace(relative=jnp.asarray(place)), own)
+            assert abs(float(held)) < 1e-9, "torque inside its play"
+    quickest = part.quickest(jnp.asarray(2e-3))
+    assert quickest is None or float(quickest) > 0
+
+
+def check_states(part):
+    """Names, sizes and starts of its own states belong together, and its numbers are arrays."""
+    count = len(part.states)
+    assert len(set(part.states)) == count
+    if count:
+        scales = np.asarray(part.scales(UNITS))
+        assert scales.shape == (count,)
+        assert np.all(np.isfinite(scales) & (scales > 0))
+        start = part.start(UNITS)
+        assert start is None or (start.shape == (count,) and np.all(np.isfinite(start)))
+    leaves = jax.tree.leaves(part)
+    assert all(eqx.is_inexact_array(leaf) for leaf in leaves), "a number that is no array"
+
+
+def _check_power(part, cases, energy, supply, losses):
+    """Power in, less power to the rotors, is stored or dissipated; nothing is made of nothing."""
+
+    @jax.jit
+    def powers(motion, own, loads):
+        given = jnp.zeros(())
+        for torque, speed in (
+            (part.torque_on_1(motion, own), motion.speed),
+            (part.torque_on_2(motion, own), motion.speed + motion.rate),
+        ):
+            given = given if torque is None else given + torque * speed
+        if motion.shift is not None:
+            forces = part.force_on_axes(motion, own)
+            given = given if forces is None else given + jnp.sum(forces * motion.drift)
+        still = jax.tree.map(jnp.zeros_like, motion)
+        moving = still._replace(phi=motion.speed, relative=motion.rate, shift=motion.drift)
+        change = part.rates(motion, own, loads) if part.states else jnp.zeros(0)
+        _, stored = jax.jvp(lambda m, o: energy(part, m, o), (motion, own), (moving, change))
+        return supply(part, motion, own), given, stored, losses(part, motion, own)
+
+    for case in cases:
+        taken, given, stored, lost = (float(x) for x in powers(*case))
+        scale = abs(taken) + abs(given) + abs(stored) + 1e-12
+        assert lost >= 0
+        assert abs(taken - given - stored - lost) < 1e-9 * scale, "power from or to nowhere"
+
+
+def _check_kinks(part, rng, reach, axes):
+    """Along lines through its states every kink of what it does is marked."""
+    lines = [[draw(part, rng, 2 * reach, axes) for _ in range(2)] for _ in range(6)]
+
+    def function(point):
+        motion, own, loads = point
+        return actions(part, motion, own, loads), part.switches(motion, own)
+
+    for values, slopes, flags in along(function, lines):
+        missed, _ = unmarked(values, slopes, flags)
+        assert missed.size == 0, f"kinks that no switch marks: {missed}"
+
+
+def _check_drag(part):
+    """Drag opposes the sliding and has its kinks marked."""
+    speeds = np.random.default_rng(2).normal(size=50) * np.geomspace(1e-3, 10, 50)
+    drag = jax.jit(jax.vmap(lambda v: part.drag(jnp.asarray(100.0), v)))(jnp.asarray(speeds))
+    assert np.all(np.asarray(drag) * speeds >= 0)
+    lines = [(-far, far) for far in (0.01, 0.3, 10.0)]
+    normal = jnp.asarray(100.0)
+    found = along(lambda v: (part.drag(normal, v)[None], part.drag_switches(v)), lines)
+    for values, slopes, flags in found:
+        assert unmarked(values, slopes, flags)[0].size == 0, "kinks that no switch marks"
+
+
+def equations(jaxpr):
+    """Equations of a traced program, with those of its inner ones."""
+    total = len(jaxpr.eqns)
+    for equation in jaxpr.eqns:
+        for value in jax.tree.leaves(equation.params, is_leaf=lambda v: hasattr(v, "jaxpr")):
+            inner = getattr(value, "jaxpr", value)
+            total += equations(inner) if hasattr(inner, "eqns") else 0
+    return total
+
+
+def size(pair):
+    """States, equations and numbers of a pair's right-hand side."""
+    numbers, static = eqx.partition(pair, eqx.is_array)
+    program = jax.make_jaxpr(lambda tau, y, n: eqx.combine(n, static).derivative(tau, y)[0])(
+        jnp.zeros(()), jnp.zeros(pair.states), numbers
+    )
+    return pair.states, equations(program.jaxpr), len(program.jaxpr.invars)
+
+
+def check_in_pair(pair, part, reach=2.0):
+    """Check a part in a `pair` without it: it adds its own states and numbers, and the motion has a
+    derivative with respect to each of them."""
+    with_part = dataclasses.replace(pair, parts=(*pair.parts, part))
+    added = len(part.states) + (part.free and not pair.free)
+    before, after = size(pair), size(with_part)
+    assert after[0] == before[0] + added
+    assert after[1] > before[1]
+    assert after[2] == before[2] + len(jax.tree.leaves(part))
+    assert len(with_part.state_names) == with_part.states
+    rng = np.random.default_rng(4)
+    states = jnp.asarray(reach * rng.normal(size=(12, with_part.states)))
+
+    @jax.jit
+    def slopes(part):
+        def motion(part):
+            held = dataclasses.replace(pair, parts=(*pair.parts, part))
+            return jax.lax.map(lambda y: held.derivative(jnp.asarray(0.3), y)[0], states)
+
+        return jax.jacfwd(motion)(part)
+
+    for leaf in jax.tree.leaves(slopes(part)):
+        assert np.all(np.isfinite(leaf))
+        assert np.any(np.asarray(leaf) != 0), "a number that nothing depends on"
