@@ -12,16 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rootsopt import auto
-from rootsopt.response.batch import STATUSES, respond_many
 from rootsopt.config import load
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.map import MapContact
 from rootsopt.contact.nodes import pair_gap
 from rootsopt.contact.size import RELATIVES, ROLLS, size_map
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluator
 from rootsopt.model import Scene, design_vector
 from rootsopt.profiles import CIC, EE
+from rootsopt.response.batch import STATUSES, respond_many
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
 
 R = 0.033
@@ -210,7 +210,7 @@ def test_a_smaller_error_needs_no_smaller_map():
 @pytest.fixture(scope="module")
 def default():
     """Evaluator and evaluation of the shipped scene."""
-    evaluator = Evaluator(load("configs/cic.yaml"))
+    evaluator = Evaluator.of(load("configs/cic.yaml"))
     return evaluator, evaluator(series=False)
 
 
@@ -221,7 +221,7 @@ def test_single_precision(default):
     precision is the difference of lengths ten thousand times as large.
     """
     overrides = ["solver.precision=float32", "solver.fidelity=map"]
-    evaluator = Evaluator(load("configs/cic.yaml", overrides))
+    evaluator = Evaluator.of(load("configs/cic.yaml", overrides))
     single, double = evaluator(series=False), default[1]
     pair = evaluator.model.pair(design_vector(evaluator.config))
     leaves = jax.tree.leaves(eqx.filter(pair, eqx.is_inexact_array))
@@ -292,9 +292,9 @@ def test_auto_meets_the_request(wanted):
     record = choice.record()
     assert record["fidelity"] in ("linear", "map", "search")
     assert record["estimated_error"] <= wanted
-    found = Evaluator(choice.config)(series=False)
+    found = Evaluator.of(choice.config)(series=False)
     sharp = ["solver.fidelity=search", "solver.method=dopri8", "solver.rtol=1e-10"]
-    truth = Evaluator(load("configs/cic.yaml", sharp))(series=False)
+    truth = Evaluator.of(load("configs/cic.yaml", sharp))(series=False)
     error = auto.difference(found, truth)
     assert error is not None
     assert error <= wanted

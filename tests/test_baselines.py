@@ -17,9 +17,9 @@ from experiments._common.engines.scipy_nodes import (
 )
 from rootsopt.config import load
 from rootsopt.contact import FlankPair
-from rootsopt.response.evaluation import RESPONSES, Evaluator
 from rootsopt.model import Scene
 from rootsopt.profiles import CIC
+from rootsopt.response.evaluation import RESPONSES, Evaluator
 
 pytest.importorskip("numba")
 
@@ -43,7 +43,7 @@ every_design = pytest.mark.parametrize("design", DESIGNS, ids=str)
 @functools.cache
 def reference():
     """rootsopt's response and gradient in the shipped scene, as arrays (3,) and (3, 3)."""
-    found = Evaluator(CONFIG)(series=False)
+    found = Evaluator.of(CONFIG)(series=False)
     gradient = [list(found.gradient[key].values()) for key in RESPONSES]
     return np.array([found.response[key] for key in RESPONSES]), np.array(gradient)
 

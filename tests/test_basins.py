@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.response.attractors import AttractorEvaluator, _Sorter, find
 from rootsopt.cli import main
 from rootsopt.config import load
 from rootsopt.dynamics.flow import Integrator, strobe
+from rootsopt.programs import Program
+from rootsopt.response.attractors import AttractorEvaluator, _Sorter, find
 from rootsopt.response.evaluation import Evaluator, evaluate
 from rootsopt.response.evaluators import evaluator_for
-from rootsopt.programs import Program
 from rootsopt.status import Status
 
 COEXIST = (
@@ -33,7 +33,7 @@ def config_of(*overrides):
 @pytest.fixture(scope="module")
 def coexisting():
     """Evaluator and basins of a scene with a quiet and noisy motions."""
-    evaluator = Evaluator(config_of(*COEXIST))
+    evaluator = Evaluator.of(config_of(*COEXIST))
     return evaluator, find(evaluator, series=True)
 
 
@@ -86,7 +86,7 @@ def test_initial_states_lead_where_a_long_simulation_ends(coexisting):
 def test_a_known_motion_is_not_lost_on_a_coarse_grid(coexisting):
     """One initial state finds one motion; a state on another motion brings that in."""
     _, basins = coexisting
-    small = Evaluator(config_of(*COEXIST, "attractors.relatives=1", "attractors.rates=1"))
+    small = Evaluator.of(config_of(*COEXIST, "attractors.relatives=1", "attractors.rates=1"))
     alone = find(small)
     assert len(alone.attractors) < len(basins.attractors)
     others = [one.evaluation.state for one in basins.attractors]
@@ -134,7 +134,7 @@ def test_the_reference_decides_which_is_worst(coexisting):
 
 
 def test_a_scene_without_coexistence_has_one_motion():
-    basins = find(Evaluator(config_of()))
+    basins = find(Evaluator.of(config_of()))
     assert [one.share for one in basins.attractors] == [1.0]
     assert basins.attractors[0].reached
 
@@ -196,7 +196,7 @@ def test_a_cycle_is_that_of_the_pair_last_evaluated(coexisting, monkeypatch):
 
 def test_lost_motions_are_counted():
     """Without a timing gear all motions are lost, and no motion is reported."""
-    basins = find(Evaluator(config_of("scene.timing_gear=null")))
+    basins = find(Evaluator.of(config_of("scene.timing_gear=null")))
     assert basins.attractors == ()
     assert basins.lost == {"passed_through": 1.0}
     assert np.all(basins.leads_to == -1)

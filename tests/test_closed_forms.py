@@ -15,7 +15,6 @@ import pytest
 
 from rootsopt import ensemble, evaluate, files, members, orbits, speeds
 from rootsopt.arclength import Steps
-from rootsopt.response.batch import on_all_cores
 from rootsopt.config import load
 from rootsopt.config.families import Parameter, parameters
 from rootsopt.contact.gap import Contact
@@ -30,13 +29,14 @@ from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import FlankForce, RotorPair
 from rootsopt.dynamics.parts import ConstantLoad, MotorDrive, PrescribedDrive, TimingGear
 from rootsopt.dynamics.verdict import TOO_DEEP
-from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
-from rootsopt.response.members import Members
 from rootsopt.model import Scene
 from rootsopt.optimize import noise
 from rootsopt.optimize.problem import Problem, sobol
 from rootsopt.optimize.search import Search, Trial, _history
 from rootsopt.profiles import CIC
+from rootsopt.response.batch import on_all_cores
+from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
+from rootsopt.response.members import Members
 from rootsopt.response.speeds import Part, SpeedsEvaluator, at_speed
 from rootsopt.status import Status
 
@@ -477,7 +477,7 @@ def test_error_of_a_map_is_what_its_spline_leaves():
 def test_stated_error_of_a_map_is_relative_to_the_static_depth(monkeypatch):
     """`map_error` is that of the penetration over the depth which carries the load: F = K δ^e."""
     config = load("configs/cic.yaml", ["solver.fidelity=map", "solver.map_error=2e-3"])
-    evaluator = Evaluator(config)
+    evaluator = Evaluator.of(config)
     depth = 1e-3 * (4.775 / 33e-3 / 2e5) ** (1 / 2.2)
     asked = []
 

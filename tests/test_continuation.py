@@ -31,8 +31,8 @@ from rootsopt.continuation import (
     with_value,
 )
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluator
 from rootsopt.orbits import Orbits, _longest_gap
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
 
 # Curves with a closed form
@@ -159,7 +159,7 @@ def config_at(speed):
 def branch():
     """Orbits over speed, from a stable one at 4000 rpm on."""
     config = config_at(4000.0)
-    found = Evaluator(config)(start=np.array(START), series=False)
+    found = Evaluator.of(config)(start=np.array(START), series=False)
     assert found.status is Status.PERIODIC
     assert found.steady_state["period"] == 1
     return follow(config, "speed_rpm", found.state, 1, RANGE)
@@ -169,7 +169,7 @@ def test_points_agree_with_orbits_closed_for_themselves(branch):
     """Mean, peak and RMS of stable points are those an `Evaluator` finds, started nearby."""
     stable = [point for point in branch.points if point.stable]
     for point in stable[:: len(stable) // 3]:
-        alone = Evaluator(config_at(point.value))(start=0.999 * point.state, series=False)
+        alone = Evaluator.of(config_at(point.value))(start=0.999 * point.state, series=False)
         assert alone.status is Status.PERIODIC
         found = [alone.response[f"{name}_force_N"] for name in ("mean", "peak", "rms")]
         np.testing.assert_allclose([point.mean, point.peak, point.rms], found, rtol=1e-6)
@@ -239,7 +239,7 @@ def test_units_of_the_state_are_those_of_each_config(branch):
     end = other.points[-1]
     assert (end.value, other.ends) == (0.19, (End.START, End.RANGE_END))
     there = with_value(config, "backlash_mm", 0.19)
-    alone = Evaluator(there)(start=end.state, series=False)
+    alone = Evaluator.of(there)(start=end.state, series=False)
     np.testing.assert_allclose(alone.state, end.state, rtol=1e-6)
     assert alone.response["peak_force_N"] == pytest.approx(end.peak, rel=1e-6)
 

@@ -68,7 +68,7 @@ def rows(gradient):
 @pytest.fixture(scope="module")
 def orbit():
     """The closed orbit of a design inside the box."""
-    return Evaluator(config_of())(jnp.array(INSIDE), series=False)
+    return Evaluator.of(config_of())(jnp.array(INSIDE), series=False)
 
 
 def test_periodic_averages_are_those_of_the_orbit(orbit):

@@ -18,7 +18,6 @@ from rootsopt import profile, simulate
 from rootsopt.config import load
 from rootsopt.contact.nodes import place_pair, signed_distance
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Series
 from rootsopt.export import chosen, solid, svg
 from rootsopt.export.animation import rolling_contacts, simulation_gif
 from rootsopt.export.drawing import Drawing
@@ -28,6 +27,7 @@ from rootsopt.families import profile_of
 from rootsopt.model import Scene, check_geometry, design_keys, design_vector
 from rootsopt.optimize.problem import Space
 from rootsopt.profiles import CIC, EE, geometry, outline
+from rootsopt.response.evaluation import Series
 
 ROOT = Path(__file__).parents[1]
 R = 0.033

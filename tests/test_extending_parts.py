@@ -20,7 +20,7 @@ from rootsopt.config import load
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.parts import Context
 from rootsopt.dynamics.steady import close_orbit, settle, settled_within
-from rootsopt.model import Model
+from rootsopt.model import Scene
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending_parts.md"
 BLOCK = re.compile(r"^```python (\S+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -64,7 +64,7 @@ def test_scripts_of_the_page_run(page, monkeypatch, capsys):
 @pytest.fixture(scope="module")
 def model():
     """The paper's pair with a part and a law that the package does not know."""
-    return Model.of(load("configs/cic.yaml", ["solver.fidelity=search"]))
+    return Scene.from_config(load("configs/cic.yaml", ["solver.fidelity=search"]))
 
 
 @pytest.fixture(scope="module")

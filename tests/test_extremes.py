@@ -20,9 +20,9 @@ from rootsopt.dynamics.peak import Steps, locate_peak
 from rootsopt.dynamics.steady import Orbit
 from rootsopt.dynamics.verdict import is_consistent, is_idle, judged
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluator
 from rootsopt.model import Scene, check_geometry, design_vector
 from rootsopt.profiles import geometry
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
 
 
@@ -331,7 +331,7 @@ BOUNDARIES = {
 def test_boundary_scenes_end_as_they_must(name):
     """A finite result or a named status, in a bounded number of steps."""
     changes, expected = BOUNDARIES[name]
-    evaluation = Evaluator(config_of(**changes))(series=False)
+    evaluation = Evaluator.of(config_of(**changes))(series=False)
     assert evaluation.status is expected
     record = json.loads(json.dumps(evaluation.record(), allow_nan=False))
     assert bool(record["gradient"]) == (expected is Status.PERIODIC)
@@ -346,14 +346,14 @@ def test_a_pair_with_a_motor_that_floats_is_idle():
     scene = {"scene__drive": "torque", "scene__motor": "{slope_N_m_s_per_rad: 0.1}"}
     scene |= {"scene__timing_gear": "null", "scene__load__torque_N_m": 0}
     contact = {"solver__fidelity": "linear", "contact__clearance_mm": 0.01}
-    evaluation = Evaluator(config_of(**scene, **contact))(series=False)
+    evaluation = Evaluator.of(config_of(**scene, **contact))(series=False)
     assert evaluation.status is Status.IDLE
 
 
 def test_a_force_lost_in_rounding_is_no_result(monkeypatch):
     """Beyond the limit of `force_rounding` the numbers come with a status and no gradient."""
     monkeypatch.setattr("rootsopt.response.evaluation.UNRESOLVED", 1e-14)
-    evaluation = Evaluator(config_of())(series=False)
+    evaluation = Evaluator.of(config_of())(series=False)
     assert evaluation.status is Status.UNRESOLVED
     assert not evaluation.usable
     assert evaluation.gradient == {}
@@ -379,7 +379,7 @@ def test_motion_of_many_swings_agrees_with_scipy():
         "profile__tip_arc_angle_deg": 20.9,
     }
     config = config_of(**changes)
-    evaluation = Evaluator(config)(series=False)
+    evaluation = Evaluator.of(config)(series=False)
     assert evaluation.status is Status.PERIODIC
     pair = pair_of(Scene.from_config(config), design_vector(config))
 

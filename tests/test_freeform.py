@@ -12,7 +12,6 @@ from test_optimize import SCENE
 from rootsopt.config import parse
 from rootsopt.contact.nodes import pair_gap
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluator
 from rootsopt.families import check, free_form_of, keys_of, profile_of, with_design
 from rootsopt.model import Scene, design_vector
 from rootsopt.optimize.problem import Problem, sobol
@@ -20,6 +19,7 @@ from rootsopt.optimize.search import Search
 from rootsopt.profiles import CIC, EE, FreeForm, geometry, project
 from rootsopt.profiles.departure import departure, distances
 from rootsopt.resemblance import likenesses
+from rootsopt.response.evaluation import Evaluator
 
 R = 0.033
 DEG = np.pi / 180
@@ -227,7 +227,7 @@ def test_profile_command_projects(tmp_path, capsys):
 def test_gradient_of_the_force_agrees_with_central_differences():
     """Reverse mode, along a direction in all coefficients. With a step of 1e-4 differences of
     second order are good to some 1e-6 of the greatest slope."""
-    evaluator = Evaluator(free("solver.rtol=1e-10", "solver.fidelity=search"))
+    evaluator = Evaluator.of(free("solver.rtol=1e-10", "solver.fidelity=search"))
     design = np.asarray(design_vector(evaluator.config))
     direction = np.random.default_rng(2).normal(size=len(design))
     here = evaluator(jnp.asarray(design), series=False)

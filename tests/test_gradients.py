@@ -12,9 +12,9 @@ from rootsopt.config import DESIGN_KEYS, load
 from rootsopt.contact.closest import FlankPair
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.steady import close_orbit, reverse_sensitivity, settle, settled_within
-from rootsopt.response.evaluation import Evaluator
 from rootsopt.model import design_vector
 from rootsopt.profiles.ee import EE
+from rootsopt.response.evaluation import Evaluator
 
 SHARP = ("solver.method=dopri8", "solver.rtol=1e-12")
 SCENES = {
@@ -70,7 +70,7 @@ def settled(model, design, how):
 
 def orbits_of(config):
     """Function (factors, state or None) → closed orbit, from rest if there is no state."""
-    evaluator, design = Evaluator(config), design_vector(config)
+    evaluator, design = Evaluator.of(config), design_vector(config)
     transient = settled(evaluator.model, design, evaluator.transient)
     assert int(transient.period) > 0
 

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.response.attractors import Attractor, AttractorEvaluator, Basins, _averaged
 from rootsopt.config import load
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluation, Evaluator, idle_hint, unsettled
 from rootsopt.model import Scene
 from rootsopt.optimize import __main__ as optimize
 from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import geometry
+from rootsopt.response.attractors import Attractor, AttractorEvaluator, Basins, _averaged
+from rootsopt.response.evaluation import Evaluation, Evaluator, idle_hint, unsettled
 from rootsopt.response.speeds import Part, SpeedsEvaluation, overall
 from rootsopt.status import Status
 
@@ -60,7 +60,7 @@ def problem_of(config, baseline):
 @pytest.fixture(scope="module")
 def held():
     """A pair that its timing gear holds apart."""
-    return Evaluator(config_of("contact.clearance_mm=0.3"))()
+    return Evaluator.of(config_of("contact.clearance_mm=0.3"))()
 
 
 def test_a_pair_held_by_its_gear_is_idle(held):
@@ -77,8 +77,8 @@ def test_a_pair_held_by_its_gear_is_idle(held):
 def test_advice_names_the_clearance_at_which_flanks_touch(held):
     """Just above it the pair is idle, just below it there is a force."""
     touching = float(re.search(r"clearance_mm below ([0-9.]+)\.", held.message)[1])
-    above = Evaluator(config_of(f"contact.clearance_mm={touching + 2e-4}"))(series=False)
-    below = Evaluator(config_of(f"contact.clearance_mm={touching - 2e-4}"))(series=False)
+    above = Evaluator.of(config_of(f"contact.clearance_mm={touching + 2e-4}"))(series=False)
+    below = Evaluator.of(config_of(f"contact.clearance_mm={touching - 2e-4}"))(series=False)
     assert (above.status, below.status) == (Status.IDLE, Status.PERIODIC)
     assert 0 < below.response["mean_force_N"] < 5
 

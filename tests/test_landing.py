@@ -15,8 +15,8 @@ from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.steady import Orbit, agreement, disagreement
 from rootsopt.dynamics.switches import halved, has_room
 from rootsopt.dynamics.verdict import is_certain
-from rootsopt.response.evaluation import Evaluator
 from rootsopt.model import Scene, design_vector
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
 
 LIVELY = (
@@ -36,7 +36,7 @@ twice as long, and some passed over one."""
 @pytest.fixture(scope="module")
 def lively():
     """The lively scene at three tolerances."""
-    evaluator = Evaluator(load("configs/cic.yaml", LIVELY), survey=True)
+    evaluator = Evaluator.of(load("configs/cic.yaml", LIVELY), survey=True)
     evaluator.prepared = True
     found = {}
     for rtol in (1e-8, 1e-9, 1e-10):
@@ -195,7 +195,7 @@ def test_a_touch_between_two_stages_is_met(rtol):
 @pytest.mark.parametrize("rtol", [1e-4, 1e-6])
 def test_an_orbit_that_a_loose_tolerance_does_not_close_is_integrated_more_finely(lively, rtol):
     """It is the orbit of the usual tolerance, and the statistics say at which it was found."""
-    evaluator = Evaluator(load("configs/cic.yaml", [*LIVELY, f"solver.rtol={rtol}"]))
+    evaluator = Evaluator.of(load("configs/cic.yaml", [*LIVELY, f"solver.rtol={rtol}"]))
     found = evaluator(series=False)
     assert found.status is Status.PERIODIC
     assert found.statistics["orbit_rtol"] == pytest.approx(1e-8)
@@ -217,7 +217,7 @@ def test_two_changes_at_one_instant():
         "profile.involute_length_mm=5.77",
         "profile.tip_arc_angle_deg=1.68",
     ]
-    evaluator = Evaluator(load("configs/cic.yaml", scene), survey=True)
+    evaluator = Evaluator.of(load("configs/cic.yaml", scene), survey=True)
     design, step, way = np.array([35.23, 5.77, 1.68]), 5e-5, np.array([1.0, -0.7, 0.8])
     found = evaluator(series=False)
     assert found.status is Status.PERIODIC

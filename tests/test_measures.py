@@ -15,8 +15,8 @@ from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import close_orbit, no_tangents, spectral_radius
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluator, floquet, objective_weights
 from rootsopt.optimize.problem import Problem
+from rootsopt.response.evaluation import Evaluator, floquet, objective_weights
 
 LIVELY = (
     "scene.speed_rpm=4000",
@@ -26,7 +26,7 @@ LIVELY = (
 
 
 def evaluated(*overrides):
-    return Evaluator(load("configs/cic.yaml", list(overrides)))()
+    return Evaluator.of(load("configs/cic.yaml", list(overrides)))()
 
 
 @pytest.mark.parametrize("scene", [(), LIVELY])
@@ -71,7 +71,7 @@ def test_p_norm_tends_to_the_peak_as_stated():
 def test_what_is_not_asked_for_is_not_computed():
     """No lines, no norm: no quadrature for them in the program."""
     plain, more = (
-        Evaluator(load("configs/cic.yaml", over)) for over in ([], ["response.lines=[1]"])
+        Evaluator.of(load("configs/cic.yaml", over)) for over in ([], ["response.lines=[1]"])
     )
     assert plain.measures.count == 2
     assert more.measures.count == 4
@@ -98,7 +98,7 @@ def test_objective_takes_the_lines_and_the_norm_as_weighted():
     assert weights["line_2_force_N"] == pytest.approx(2 / 5)
     assert weights["peak_norm_force_N"] == pytest.approx(0.5 / 5)
     assert "peak_force_N" not in weights
-    evaluator = Evaluator(config)
+    evaluator = Evaluator.of(config)
     baseline = evaluator(series=False)
     problem = Problem.of(config, evaluator.model, baseline)
     assert problem.objective(baseline) == pytest.approx(1)
@@ -116,7 +116,7 @@ def test_objective_takes_the_lines_and_the_norm_as_weighted():
 def test_a_line_the_baseline_has_not_got_is_refused():
     config = load("configs/cic.yaml", ["objective.line_weights={0.5: 1, 1: 1}"])
     # Of the same kind as in the test before: nothing is compiled for it.
-    evaluator = Evaluator(
+    evaluator = Evaluator.of(
         load("configs/cic.yaml", ["response.lines=[0.5, 1]", "objective.peak_norm=8"])
     )
     with pytest.raises(InputError, match=r"line_weights.*0\.5.*repeats every 1 mesh periods"):
@@ -157,7 +157,7 @@ class Lagging(RotorPair):
 @pytest.mark.long
 def test_an_orbit_of_three_states():
     """Closed to 1e-9, with the derivative that differences of orbits give."""
-    model = Evaluator(load("configs/cic.yaml", [])).model
+    model = Evaluator.of(load("configs/cic.yaml", [])).model
     how = Integrator("dopri8", jnp.asarray(1e-11), 4096)
 
     @eqx.filter_jit

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from rootsopt.config import DESIGN_KEYS, load
-from rootsopt.response.ensemble import ERRORS, SIGNIFICANT, EnsembleEvaluator
-from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.optimize import noise
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Trial
+from rootsopt.response.ensemble import ERRORS, SIGNIFICANT, EnsembleEvaluator
+from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.status import Status
 
 INSIDE = (30.0, 4.0, 3.0)
@@ -38,7 +38,7 @@ def trial(point, objective, error=0.02):
 @pytest.fixture(scope="module")
 def problem():
     settings = load("configs/cic.yaml", ["objective.motion=ensemble"])
-    return Problem.of(settings, Evaluator(settings).model, made_up(1.0))
+    return Problem.of(settings, Evaluator.of(settings).model, made_up(1.0))
 
 
 def test_a_lucky_trial_is_no_candidate_on_its_own(problem):

@@ -18,11 +18,11 @@ import pytest
 
 from rootsopt.config import parse
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluation
 from rootsopt.model import Scene
 from rootsopt.optimize.problem import Problem, sobol
 from rootsopt.optimize.search import Search, until_stopped
 from rootsopt.profiles import geometry
+from rootsopt.response.evaluation import Evaluation
 from rootsopt.status import Status
 
 SCENE = """

@@ -15,8 +15,8 @@ import pytest
 from rootsopt import auto, simulate
 from rootsopt.config import load
 from rootsopt.dynamics.flow import METHODS, Integrator, strobe
-from rootsopt.response.evaluation import Evaluator, _series
 from rootsopt.model import Scene, design_vector
+from rootsopt.response.evaluation import Evaluator, _series
 from rootsopt.status import Status
 
 CIC = "configs/cic.yaml"
@@ -91,7 +91,7 @@ def test_a_whole_command_in_single_precision(tmp_path):
     arguments = [CIC, "-o", str(tmp_path), "--set", "solver.precision=float32", "--export", "gif"]
     assert simulate.main(arguments) == 0
     found = json.loads((tmp_path / "result.json").read_text())
-    truth = Evaluator(load(CIC))(series=False)
+    truth = Evaluator.of(load(CIC))(series=False)
     assert found["response"] == pytest.approx(truth.response, rel=TIGHT["float32"])
     forces = np.loadtxt(tmp_path / "response_design.csv", delimiter=",", skiprows=1)[:, 6]
     assert np.mean(forces) == pytest.approx(truth.response["mean_force_N"], rel=2e-3)
@@ -108,7 +108,7 @@ def truths():
 
     def truth(contact):
         if contact not in found:
-            found[contact] = Evaluator(config_of("float64", contact))(series=False)
+            found[contact] = Evaluator.of(config_of("float64", contact))(series=False)
         return found[contact]
 
     return truth
@@ -123,7 +123,7 @@ def test_grid(contact, method, precision, gradient, truths):
     """Each agrees with tsit5 in double precision."""
     config = config_of(precision, contact, method, f"solver.gradient={gradient}")
     config, _ = auto.resolve(config)
-    found = Evaluator(config)()
+    found = Evaluator.of(config)()
     assert found.status is Status.PERIODIC
     truth = truths(config.solver.fidelity)
     tight = 1e-3 if contact == "auto" else TIGHT[precision]

@@ -13,8 +13,8 @@ from scipy.integrate import solve_ivp
 from rootsopt.config import load
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluator
 from rootsopt.model import Scene, design_vector
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
 
 MOTOR = ["scene.drive=torque", "scene.motor={slope_N_m_s_per_rad: 0.1}"]
@@ -243,7 +243,7 @@ def test_an_absent_part_costs_nothing(part):
 def test_orbit_and_gradient_of_all_parts():
     """Eleven states: the orbit closes, and its gradient is that of differences."""
     config = load("configs/cic.yaml", [*ALL, WITHIN, "solver.rtol=1e-10"])
-    evaluator = Evaluator(config)
+    evaluator = Evaluator.of(config)
     found = evaluator(series=True)
     assert found.status is Status.PERIODIC
     assert found.steady_state["residual"] < 1e-9
@@ -289,6 +289,6 @@ def test_parts_that_do_not_go_together_are_refused(overrides, words):
 
 def test_a_motor_too_weak_for_its_load_is_said_to_stall():
     weak = "scene.motor={slope_N_m_s_per_rad: 0.001, torque_N_m: 0.5}"
-    found = Evaluator(load("configs/cic.yaml", ["scene.drive=torque", weak]))(series=False)
+    found = Evaluator.of(load("configs/cic.yaml", ["scene.drive=torque", weak]))(series=False)
     assert found.status is Status.STALLED
     assert not found.usable

@@ -29,7 +29,7 @@ SCENES = {
 def forces(name, *changes):
     path, own = SCENES[name]
     config = load(f"configs/{path}.yaml", [*own, *changes])
-    found = Evaluator(config)(series=False)
+    found = Evaluator.of(config)(series=False)
     assert found.status is Status.PERIODIC
     return np.array([found.response[key] for key in FORCES]), config.contact.rounding_mm
 

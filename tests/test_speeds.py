@@ -12,10 +12,10 @@ from rootsopt import auto, evaluate, speeds
 from rootsopt.cli import main
 from rootsopt.config import load, parse
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.evaluators import evaluator_for
 from rootsopt.model import design_vector
 from rootsopt.optimize.problem import Problem
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.speeds import Part, SpeedsAttractorEvaluator, SpeedsEvaluator
 from rootsopt.status import Status
 
@@ -56,7 +56,7 @@ def singles(baseline, problem):
     design = problem.design(POINT)
     found = {}
     for speed in (2000.0, 4000.0):
-        evaluator = Evaluator(config_of(TIGHT, f"scene.speed_rpm={speed}"))
+        evaluator = Evaluator.of(config_of(TIGHT, f"scene.speed_rpm={speed}"))
         found[speed] = evaluator(series=False), evaluator(design, series=False)
     # A speed is a number of the model: no other program, over several or at one.
     assert programs() == before
@@ -324,7 +324,7 @@ def test_auto_agrees_at_every_speed():
 def test_linearised_pair_has_the_closed_form_stiffness():
     """In half the mesh the involutes carry, e F/δ · (r cos α)²; in the other half the gear."""
     config = config_of("scene.timing_gear.backlash_mm=0.4", "contact.smoothing_mm=0")
-    pair = Evaluator(config).pair(design_vector(config))
+    pair = Evaluator.of(config).pair(design_vector(config))
     total, flank, torque, force = (np.asarray(x) for x in equilibria(pair, np.array([0.25, 0.75])))
     lever = 33.0e-3 * np.cos(np.radians(36.43))
     normal = 4.775 / lever

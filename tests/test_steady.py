@@ -88,14 +88,14 @@ def pair_of(evaluator, design):
 @pytest.fixture(scope="module")
 def sharp():
     """Evaluator at the reference settings; its program serves every test that needs it."""
-    return Evaluator(config_of(*SHARP))
+    return Evaluator.of(config_of(*SHARP))
 
 
 @pytest.fixture(scope="module")
 def orbits(sharp):
     """Sharp evaluations of both designs, and of a scene whose orbit forgets slowly."""
     found = {name: (sharp, sharp(jnp.array(design))) for name, design in DESIGNS.items()}
-    slow = Evaluator(config_of(*SHARP, *gear(damping=0.02, load=2.0)))
+    slow = Evaluator.of(config_of(*SHARP, *gear(damping=0.02, load=2.0)))
     return found | {"slow": (slow, slow())}
 
 
@@ -239,7 +239,7 @@ def test_forward_and_reverse_gradients_agree(settled):
     options = *size, "response.lines=[1, 3]", "objective.peak_norm=12"
     for design in DESIGNS.values():
         forward, reverse = (
-            Evaluator(config_of(*options, f"solver.gradient={mode}"))(jnp.array(design)).gradient
+            Evaluator.of(config_of(*options, f"solver.gradient={mode}"))(jnp.array(design)).gradient
             for mode in ("forward", "reverse")
         )
         assert {"line_1_force_N", "line_3_force_N", "peak_norm_force_N"} < set(forward)
@@ -320,7 +320,7 @@ def test_repeated_steps_tell_of_their_error(sharp, orbits):
     """
     state, one = jnp.asarray(orbits["shorter involute"][1].state), jnp.asarray(1.0)
     design, how = jnp.array(DESIGNS["shorter involute"]), integrator(1e-8)
-    linear = Evaluator(config_of("solver.fidelity=linear"))
+    linear = Evaluator.of(config_of("solver.fidelity=linear"))
 
     def strains(model):
         pair = pair_of(model, design)
@@ -343,7 +343,7 @@ def test_repeated_steps_tell_of_their_error(sharp, orbits):
 def test_peak_on_a_corner_has_its_gradient():
     """Where the contact moves from the involute to the tip arc the force has a corner, and here
     its peak: the derivative is neither of the two beside it."""
-    evaluator = Evaluator(load("configs/cic.yaml"))
+    evaluator = Evaluator.of(load("configs/cic.yaml"))
     design, step = jnp.array([35.0, 5.602843, 3.5]), 1e-3
 
     def peak(at):
@@ -361,7 +361,9 @@ def test_gradient_at_the_default_tolerance(design):
     """It is that at 1e-11: steps end where the equation is not smooth. (If they do not, the
     gradients are 1e-3 to 6e-3 off.)"""
     usual, tight = (
-        gradients(Evaluator(load("configs/cic.yaml"), rtol=rtol)(jnp.array(design), series=False))
+        gradients(
+            Evaluator.of(load("configs/cic.yaml"), rtol=rtol)(jnp.array(design), series=False)
+        )
         for rtol in (None, 1e-11)
     )
     error = np.max(np.abs(usual - tight), axis=1) / np.max(np.abs(tight), axis=1)
@@ -494,7 +496,7 @@ def test_no_number_without_its_status(settled, name):
 
 def test_status_does_not_depend_on_the_series():
     """Asking for no series does not turn a motion that is too deep into a usable one."""
-    assert Evaluator(SCENES["soft"])(series=False).status is Status.TOO_DEEP
+    assert Evaluator.of(SCENES["soft"])(series=False).status is Status.TOO_DEEP
 
 
 def test_chaos_has_a_positive_exponent_and_no_gradient(settled):
@@ -506,7 +508,7 @@ def test_chaos_has_a_positive_exponent_and_no_gradient(settled):
     assert evaluation.gradient == {}
     assert not evaluation.usable
     # Two motions 1e-9 apart part company at about that rate, from 1e-9 to 1e-2.
-    evaluator = Evaluator(SCENES["chaotic"])
+    evaluator = Evaluator.of(SCENES["chaotic"])
     pair = pair_of(evaluator.model, jnp.array(list(evaluation.design.values())))
     scale, rate = float(pair.angle_scale), float(pair.angle_scale) / float(pair.mesh_period)
     start = jnp.array([evaluation.series.relative[0] / scale, evaluation.series.rate[0] / rate])
@@ -540,7 +542,7 @@ def test_the_least_period_is_named(settled, name, period):
 def test_period_doubled_orbit_agrees_with_plain_motion(settled):
     """The closed period-2 orbit is where a long tight integration from rest ends up."""
     evaluation = settled["doubled"]
-    evaluator = Evaluator(SCENES["doubled"])
+    evaluator = Evaluator.of(SCENES["doubled"])
     pair = pair_of(evaluator.model, jnp.array(list(evaluation.design.values())))
     states = run_strobe(pair, jnp.zeros((1, 2)), 200, integrator(1e-10))[0][-2:]
     nearest = np.min(np.max(np.abs(states - evaluation.state), axis=1))

@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 
 from experiments._common.scenes import FORCES
 from rootsopt.config import Config
-from rootsopt.evaluate import Evaluation, Evaluator
-from rootsopt.model import Model, design_vector
+from rootsopt.model import Scene, design_vector
 from rootsopt.profiles import Profile
+from rootsopt.response.evaluation import Evaluation, Evaluator
 
-pair_of_model = eqx.filter_jit(Model.pair)
+pair_of_model = eqx.filter_jit(Scene.pair)
 """The rotor pair of a model and a design, compiled."""
 
 
@@ -25,7 +25,7 @@ def evaluator_of(config: Config, give_up_early: bool = False, prepared: bool = F
     `give_up_early`: give up motions that settle late. `prepared`: do not prepare it for the motion
     of the config's design, such as by fitting a contact map.
     """
-    evaluator = Evaluator(config, survey=give_up_early)
+    evaluator = Evaluator.of(config, survey=give_up_early)
     evaluator.prepared = evaluator.prepared or prepared
     return evaluator
 
@@ -52,14 +52,16 @@ def at(evaluator: Evaluator, rtol: float, transient: float | None = None) -> Eva
 def profile_of(config: Config, design: ArrayLike | None = None) -> Profile:
     """Profile of a design (d,) in config units; by default that of the config."""
     chosen = design_vector(config) if design is None else jnp.asarray(design)
-    return Model.of(config).profile(chosen)
+    return Scene.from_config(config).profile(chosen)
 
 
-def stacked(configs: Sequence[Config], precision: str) -> Model:
+def stacked(configs: Sequence[Config], precision: str) -> Scene:
     """Models of scenes with one kind of pair, at one precision, their numbers stacked along a
     leading axis (n,)."""
     models = [
-        jax.tree.map(np.asarray, dataclasses.replace(Model.of(config), precision=precision))
+        jax.tree.map(
+            np.asarray, dataclasses.replace(Scene.from_config(config), precision=precision)
+        )
         for config in configs
     ]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *models)

@@ -88,8 +88,8 @@ def part_single(job: Job) -> dict[str, Any]:
     import jax.numpy as jnp
 
     from experiments._common.simulation import at
-    from rootsopt.batch import respond
     from rootsopt.model import integrators
+    from rootsopt.response.batch import respond
 
     truth, slope = job.known["forces"][0], job.known["slopes"][0]
     repeats = 2 if job.quick else 9
@@ -175,8 +175,8 @@ class _Batch:
         """Simulate all designs with one setting."""
         import jax.numpy as jnp
 
-        from rootsopt.batch import respond_many
-        from rootsopt.model import Model, integrators
+        from rootsopt.model import Scene, integrators
+        from rootsopt.response.batch import respond_many
 
         config = load(CIC, CONTACTS[contact])
         transient, orbit = integrators(config)
@@ -184,7 +184,7 @@ class _Batch:
             dataclasses.replace(transient, rtol=jnp.asarray(coarse)),
             dataclasses.replace(orbit, rtol=jnp.asarray(rtol)),
         )
-        model = Model.of(config, self.job.known["deepest"][contact])
+        model = Scene.from_config(config, self.job.known["deepest"][contact])
         return ready(respond_many(model, self.designs, self.states, *how, gradient=gradient))
 
     def errors(self, out: Any) -> tuple[int, float, list[float]]:

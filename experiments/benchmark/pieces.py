@@ -43,10 +43,10 @@ def part_table(job: Job) -> dict[str, Any]:
     import jax.numpy as jnp
 
     from rootsopt.contact.map import MapContact
-    from rootsopt.model import Model
+    from rootsopt.model import Scene
 
     config = load(CIC)
-    model = Model.of(config, job.known["deepest"].get("map 384x16"))
+    model = Scene.from_config(config, job.known["deepest"].get("map 384x16"))
     rolls, relatives = (64, 12) if job.quick else model.map_size
     size = f"{rolls}x{relatives}"
 
@@ -128,12 +128,12 @@ def part_revolutions(job: Job) -> dict[str, Any]:
     import jax.numpy as jnp
 
     from rootsopt.dynamics.flow import strobe
-    from rootsopt.model import Model, integrators
+    from rootsopt.model import Scene, integrators
 
     contact = "linear" if job.quick else "search"
     config = load(CIC, CONTACTS[contact])
-    model = Model.of(config, job.known["deepest"].get(contact))
-    pair = eqx.filter_jit(Model.pair)(model, jnp.asarray(BASELINE))
+    model = Scene.from_config(config, job.known["deepest"].get(contact))
+    pair = eqx.filter_jit(Scene.pair)(model, jnp.asarray(BASELINE))
     how = integrators(config)[0]
     compiled = eqx.filter_jit(strobe)
     rows = []
@@ -163,11 +163,11 @@ def part_reverse(job: Job) -> dict[str, Any]:
     import jax.numpy as jnp
 
     from rootsopt.dynamics.flow import Integrator, flow
-    from rootsopt.model import Model
+    from rootsopt.model import Scene
 
     contact = "linear" if job.quick else "search"
     config = load(CIC, CONTACTS[contact])
-    model = Model.of(config, job.known["deepest"].get(contact))
+    model = Scene.from_config(config, job.known["deepest"].get(contact))
     count = 3 if job.quick else 200
     periods = count * MESH_PERIODS
     how = Integrator(config.solver.method, jnp.asarray(1e-6), 200 * periods)

@@ -19,13 +19,13 @@ from experiments._common.driver import NoResultError
 from experiments._common.scenes import shipped
 from rootsopt.config import Config
 from rootsopt.dynamics.flow import flow
-from rootsopt.ensemble import ERRORS, EnsembleEvaluator
-from rootsopt.members import run_members
-from rootsopt.model import Model
+from rootsopt.model import Scene
 from rootsopt.optimize.noise import standard_error
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Optimization, Search
 from rootsopt.programs import Program
+from rootsopt.response.ensemble import ERRORS, EnsembleEvaluator
+from rootsopt.response.members import run_members
 
 SCENE = (
     "scene.load.torque_N_m=1",
@@ -83,7 +83,7 @@ SIZES = {
 }
 
 
-def resized(config: Config, model: Model, **changes) -> EnsembleEvaluator:
+def resized(config: Config, model: Scene, **changes) -> EnsembleEvaluator:
     """Make an evaluator without gradients for an ensemble of another size."""
     ensemble = config.ensemble.model_copy(update=changes)
     evaluator = EnsembleEvaluator(config.model_copy(update={"ensemble": ensemble}), survey=True)
@@ -92,7 +92,7 @@ def resized(config: Config, model: Model, **changes) -> EnsembleEvaluator:
     return evaluator
 
 
-def line(config: Config, model: Model, designs: np.ndarray, size: Size) -> list[dict]:
+def line(config: Config, model: Scene, designs: np.ndarray, size: Size) -> list[dict]:
     """Average along a line of designs (n, d): the motion from rest, and an ensemble."""
     evaluator = resized(config, model, members=size.members, periods=size.window)
     settle = config.ensemble.settle_periods
@@ -110,11 +110,11 @@ def line(config: Config, model: Model, designs: np.ndarray, size: Size) -> list[
     return rows
 
 
-_pair = Program(Model.pair)
+_pair = Program(Scene.pair)
 
 
 @Program
-def _pathwise(model: Model, design, periods, how):
+def _pathwise(model: Scene, design, periods, how):
     """Differentiate the mean force with respect to the design, along the motion from rest.
 
     Returns (periods, d): the mean is taken from the start to the end of each mesh period.
@@ -144,7 +144,7 @@ def pathwise(evaluator: EnsembleEvaluator, design, size: Size) -> list[dict]:
     ]
 
 
-def errors_by_members(config: Config, model: Model, design, size: Size) -> list[dict]:
+def errors_by_members(config: Config, model: Scene, design, size: Size) -> list[dict]:
     """Compare the stated standard error of the mean force with the scatter of independent groups.
 
     The groups are taken from one large ensemble; the scatter has a standard error of its own.
@@ -172,7 +172,7 @@ def errors_by_members(config: Config, model: Model, design, size: Size) -> list[
     return rows
 
 
-def gradients(config: Config, model: Model, design, size: Size) -> list[dict]:
+def gradients(config: Config, model: Scene, design, size: Size) -> list[dict]:
     """Estimate the slope of the mean force over the pressure angle, with its standard error, from
     more members or from more designs."""
     rows = []

@@ -15,14 +15,14 @@ from scipy.integrate import solve_ivp
 from experiments._common.simulation import evaluator_of as make_evaluator
 from experiments._common.simulation import pair_of_model, stacked
 from experiments.extremes.scenes import Kind
-from rootsopt.batch import STATUSES, respond
 from rootsopt.config import Config
 from rootsopt.contact.impact import force_rounding
 from rootsopt.dynamics.flow import Integrator, flow, strobe
 from rootsopt.dynamics.steady import close_orbit, no_tangents
-from rootsopt.evaluate import Evaluator
-from rootsopt.model import Model, design_vector
+from rootsopt.model import Scene, design_vector
 from rootsopt.programs import Program
+from rootsopt.response.batch import STATUSES, respond
+from rootsopt.response.evaluation import Evaluator
 
 HORIZON = 24
 """Longest transient (mesh periods) of most scenes."""
@@ -75,7 +75,7 @@ def _law_values(laws, depths, rates):
 
 
 @eqx.filter_jit
-def _equation_values(models: Model, designs, poses):
+def _equation_values(models: Scene, designs, poses):
     def one(at):
         model, design, poses = at
 
@@ -97,7 +97,7 @@ def _equation_values(models: Model, designs, poses):
 
 def law(cases: list[Case]) -> dict[str, Any]:
     """Count the values of the law that are not finite, or negative, among all scenes."""
-    laws = [jax.tree.map(np.asarray, Model.of(case.config).law) for case in cases]
+    laws = [jax.tree.map(np.asarray, Scene.from_config(case.config).law) for case in cases]
     laws = jax.tree.map(lambda *leaves: np.stack(leaves), *laws)
     found: dict[str, Any] = {}
     for dtype in (np.float32, np.float64):
@@ -147,7 +147,7 @@ def equation(cases: list[Case], seed: int) -> dict[str, Any]:
 
 
 @Program
-def _simulate(model: Model, design, tolerances, method: str):
+def _simulate(model: Scene, design, tolerances, method: str):
     pair = model.pair(design)
     transient, orbit = (Integrator(method, tolerances[k], STEPS) for k in range(2))
     out = respond(model, design, jnp.zeros(pair.states), transient, orbit, HORIZON)
@@ -159,7 +159,7 @@ def _simulate(model: Model, design, tolerances, method: str):
 
 
 def _arguments(case: Case) -> tuple[Any, ...]:
-    model = jax.tree.map(np.asarray, Model.of(case.config))
+    model = jax.tree.map(np.asarray, Scene.from_config(case.config))
     solver = case.config.solver
     tolerances = np.array([solver.transient_rtol, solver.rtol])
     return model, np.asarray(design_vector(case.config)), tolerances, case.kind.method
@@ -201,7 +201,7 @@ def simulate(case: Case) -> None:
 
 
 @Program
-def _sharp(model: Model, design, state, period):
+def _sharp(model: Scene, design, state, period):
     method, rtol, steps = SHARP
     pair = model.pair(design)
     how = Integrator(method, jnp.asarray(rtol), steps)
@@ -210,7 +210,7 @@ def _sharp(model: Model, design, state, period):
 
 
 @Program
-def _patient(model: Model, design, state, period):
+def _patient(model: Scene, design, state, period):
     """Integrate without Newton's method; return the last round and the state it starts from."""
     method, rtol, steps = SHARP
     pair = model.pair(design)
@@ -229,7 +229,7 @@ def _rates(pair, tau, state):
 
 def refine(case: Case) -> None:
     """Measure how far a periodic result is from the orbit that the sharp settings find nearby."""
-    model = dataclasses.replace(Model.of(case.config), precision="float64")
+    model = dataclasses.replace(Scene.from_config(case.config), precision="float64")
     design = np.asarray(design_vector(case.config))
     period = np.asarray(case.row["period"])
     orbit = jax.device_get(_sharp(model, design, case.state, period))
@@ -269,7 +269,7 @@ def by_scipy(case: Case) -> None:
 
     Measures how far the end is from the start, and the mean force.
     """
-    model = dataclasses.replace(Model.of(case.config), precision="float64")
+    model = dataclasses.replace(Scene.from_config(case.config), precision="float64")
     pair = pair_of_model(model, design_vector(case.config))
     period = case.row["period"]
     done = solve_ivp(

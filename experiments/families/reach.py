@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from experiments._common.simulation import profile_of
 from rootsopt.config import Config
 from rootsopt.config.families import family_of
-from rootsopt.model import MM, Model, design_keys
+from rootsopt.model import MM, Scene, design_keys
 from rootsopt.optimize.problem import Problem, Space, sobol
 from rootsopt.profiles import geometry
 
@@ -76,7 +76,7 @@ def in_housing(config: Config, bore_radius_mm: float, area_efficiency: float) ->
 
 def problem_of(config: Config) -> Problem:
     """Make the geometric side of a design problem: constraints, without a baseline."""
-    return Problem(config, cast(Any, None), Space.of(config, Model.of(config), 0.0))
+    return Problem(config, cast(Any, None), Space.of(config, Scene.from_config(config), 0.0))
 
 
 def reach(config: Config, sample: int = SAMPLE) -> Reach | None:

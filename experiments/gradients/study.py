@@ -22,8 +22,8 @@ from experiments._common.simulation import evaluator_of, orbit_at
 from rootsopt.config import Config, load
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.steady import agreement, close_orbit, no_tangents
-from rootsopt.evaluate import Evaluation, Evaluator
-from rootsopt.model import Model
+from rootsopt.model import Scene
+from rootsopt.response.evaluation import Evaluation, Evaluator
 
 Row = dict[str, Any]
 TOLERANCES = (1e-8, 1e-9, 1e-10)
@@ -98,7 +98,7 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
 
 
 @eqx.filter_jit
-def forces(model: Model, design, state, period, how: Integrator):
+def forces(model: Scene, design, state, period, how: Integrator):
     """Close an orbit; return (mean, peak) force, the residual and whether it was integrated."""
     pair = model.pair(design)
     orbit = close_orbit(pair, no_tangents(pair), state, period, how, check=False)

@@ -23,9 +23,9 @@ from rootsopt.config import Config
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import close_orbit
-from rootsopt.evaluate import Evaluation, Evaluator
-from rootsopt.model import MM, Model, design_vector
+from rootsopt.model import MM, Scene, design_vector
 from rootsopt.programs import Program
+from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.status import Status
 
 
@@ -165,7 +165,7 @@ def _slopes(evaluator: Evaluator, one: Evaluation, values) -> NDArray[np.float64
     return np.stack([by_mean / mean, by_peak / peak]) * values
 
 
-def pair_of(model: Model, design, values: Float[Array, " p"]) -> RotorPair:
+def pair_of(model: Scene, design, values: Float[Array, " p"]) -> RotorPair:
     """Make the rotor pair with these values of the quantities (config units)."""
     length, torque, stiffness, damping_ratio, backlash, clearance = values
     half = backlash * MM / (2 * model.pitch_radius)
@@ -182,7 +182,7 @@ def pair_of(model: Model, design, values: Float[Array, " p"]) -> RotorPair:
 
 
 @Program
-def _orbit(model: Model, design, values: Float[Array, " p"], state, period, how: Integrator):
+def _orbit(model: Scene, design, values: Float[Array, " p"], state, period, how: Integrator):
     """Close the orbit, with derivatives with respect to the values."""
 
     def arrays(values):

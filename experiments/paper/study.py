@@ -30,8 +30,8 @@ from experiments.paper.scene import (
     values_of,
 )
 from rootsopt import basins
-from rootsopt.evaluate import CHAOS_WINDOW, lyapunov_program, unsettled
 from rootsopt.model import design_vector
+from rootsopt.response.evaluation import CHAOS_WINDOW, lyapunov_program, unsettled
 
 WINDOWS = ((0.0, 0.1), (0.0, 0.2), (0.05, 0.2), (0.1, 0.2), (0.1, 0.8))
 """Start and end (s) of the windows that mean and maximum may have been taken over."""

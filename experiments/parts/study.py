@@ -19,7 +19,7 @@ from experiments._common.scenes import CIC, shipped
 from experiments._common.simulation import evaluator_of, pair_of_model
 from experiments._common.timing import ready, times_of
 from rootsopt.config import Config, load
-from rootsopt.model import Model, design_vector
+from rootsopt.model import Scene, design_vector
 
 Row = dict[str, Any]
 # A light load at high speed, which flanks alone can hold. Slower, lobes pass through each other.
@@ -54,7 +54,7 @@ def equations(jaxpr) -> int:
 
 def right_hand_side(config: Config, calls: int) -> dict[str, float]:
     """Measure states, equations, and time (µs) of a right-hand side along a slowly moving state."""
-    pair = pair_of_model(Model.of(config), design_vector(config))
+    pair = pair_of_model(Scene.from_config(config), design_vector(config))
     numbers, static = eqx.partition(pair, eqx.is_array)
     state = jnp.full(pair.states, 0.05)
 

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from experiments._common.engines import FD_STEPS
 from experiments._common.scenes import shipped
 from experiments._common.simulation import stacked
-from rootsopt.batch import STATUSES, Batch, on_all_cores, respond
 from rootsopt.config import Config
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.errors import InputError
-from rootsopt.model import MM, Model, check_geometry, design_vector
+from rootsopt.model import MM, Scene, check_geometry, design_vector
 from rootsopt.programs import Program
+from rootsopt.response.batch import STATUSES, Batch, on_all_cores, respond
 
 Say = Callable[[str], None]
 DEFAULT = 0.0
@@ -106,7 +106,7 @@ def scenes(kind: str, count: int, seed: int) -> list[Config]:
 
 
 @Program
-def _respond(models: Model, designs, states, tolerances, periods, gradient: bool) -> Batch:
+def _respond(models: Scene, designs, states, tolerances, periods, gradient: bool) -> Batch:
     def one(at):
         model, design, state = at
         transient, orbit = (Integrator("tsit5", tolerances[k], 4096) for k in range(2))
@@ -116,7 +116,7 @@ def _respond(models: Model, designs, states, tolerances, periods, gradient: bool
 
 
 def responses(
-    models: Model, designs, states, tolerances: tuple[float, float], periods: int, slopes=True
+    models: Scene, designs, states, tolerances: tuple[float, float], periods: int, slopes=True
 ) -> Batch:
     """Simulate n scenes, each with its own design and scaled state to start from."""
     leaves, structure = jax.tree.flatten(models)
@@ -130,7 +130,7 @@ def responses(
     return jax.tree.map(np.asarray, on_all_cores(work, designs, states, *leaves))
 
 
-def rounded(models: Model, width: float) -> Model:
+def rounded(models: Scene, width: float) -> Scene:
     """Round all corners of the models over `width` (mm), or leave them as they are by default."""
     if width == DEFAULT:
         return models
@@ -150,7 +150,7 @@ def bias(found: Batch, truth: Batch) -> NDArray[np.float64]:
     return np.where(same, off, np.nan)
 
 
-def gradient_errors(models: Model, designs, found: Batch) -> NDArray[np.float64]:
+def gradient_errors(models: Scene, designs, found: Batch) -> NDArray[np.float64]:
     """Compare the gradients of mean, peak and RMS with central differences.
 
     Returns errors (n, 3), relative to the greatest entry of each.

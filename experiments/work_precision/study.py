@@ -24,7 +24,7 @@ from experiments._common.driver import NoResultError
 from experiments._common.scenes import shipped
 from experiments._common.simulation import at, evaluator_of
 from experiments._common.timing import median_time
-from rootsopt.evaluate import Evaluation, Evaluator
+from rootsopt.response.evaluation import Evaluation, Evaluator
 
 Row = dict[str, Any]
 Say = Callable[[str], None]

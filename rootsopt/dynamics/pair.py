@@ -156,19 +156,6 @@ class RotorPair(eqx.Module):
         return 2 + self.free + sum(len(part.states) for part in self.all_parts)
 
     @property
-    def units(self) -> Float[Array, " n"]:
-        """Units of the scaled states: rad and rad/s of ε, rad/s of a motor's speed beside
-        `drive.speed`, m and m/s of displaced axes."""
-        angle, period = self.angle_scale, self.mesh_period
-        parts = [jnp.stack([angle, angle / period])]
-        if self.drive.free:
-            parts.append((angle / period)[None])
-        if self.supports is not None:
-            unit = jnp.repeat(self.supports.unit[None], 4)
-            parts += [unit, unit / period]
-        return jnp.concatenate(parts)
-
-    @property
     def mesh_period(self) -> Float[Array, ""]:
         """Duration of one lobe pitch (s) at the drive's speed."""
         return 2 * jnp.pi / (self.lobes * self.drive.speed)
@@ -249,6 +236,18 @@ class RotorPair(eqx.Module):
                 shift, drift = part.axes(own)
                 motion = motion._replace(shift=shift, drift=drift)
         return motion, acting
+
+    def in_si(self, state: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return a scaled state in the units of `state_names`."""
+        angle, period = self.angle_scale, self.mesh_period
+        first = [angle * state[:1], angle / period * state[1 : 2 + self.free]]
+        return jnp.concatenate([*first, *self.own_states(state)])
+
+    def scaled(self, state: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return the scaled state of one in the units of `state_names`."""
+        nothing = jnp.zeros(self.states, self.angle_scale.dtype)
+        start = self.in_si(nothing)
+        return ((state - start) / (self.in_si(nothing + 1) - start)).astype(start.dtype)
 
     def physical(
         self, tau: Float[Array, "*k"], state: Float[Array, "*k n"]

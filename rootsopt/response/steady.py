@@ -102,26 +102,14 @@ def _response_jvp(primals, tangents):
     vector = jnp.concatenate(flat) if flat else jnp.zeros(0, design.dtype)
     # What nobody differentiates with respect to has no derivative to give.
     unknown = jnp.nan * sum((jnp.sum(tangent) for tangent in without), start=jnp.sum(vector))
-    rows = iter(_split(slopes @ vector, response))
+    values = slopes @ vector + (unknown if without else 0.0)
+    mean, peak, rms, lines, norm, state = _split(values, response)
+    multipliers = jnp.full_like(response.multipliers, 1.0) * unknown
+    constant: Any = None
     change = Response(
-        mean=next(rows) + _only(without, unknown),
-        peak=next(rows) + _only(without, unknown),
-        rms=next(rows) + _only(without, unknown),
-        lines=next(rows),
-        peak_norm=None if response.peak_norm is None else next(rows),
-        period=None,
-        multipliers=jnp.broadcast_to(unknown, response.multipliers.shape).astype(
-            response.multipliers.dtype
-        ),
-        residual=None,
-        status=None,
-        state=next(rows),
+        mean, peak, rms, lines, norm, constant, multipliers, constant, constant, state
     )
     return response, change
-
-
-def _only(without, unknown):
-    return unknown if without else 0.0
 
 
 def _moved(scene: Any, design: Any) -> tuple[list[tuple[int, Array]], list[Array]]:
@@ -151,13 +139,11 @@ def _leaves(tree: Any) -> list[tuple[Any, Any]]:
 
 
 def _split(values, response: Response):
-    """The entries of `values` that belong to each differentiated field of a `response`."""
+    """The entries of `values` that belong to each differentiated field of a `response`: mean, peak,
+    RMS, lines, p-norm, state."""
     lines, states = response.lines.shape[0], response.state.shape[0]
-    yield from values[:3]
-    yield values[3 : 3 + lines]
-    if response.peak_norm is not None:
-        yield values[3 + lines]
-    yield values[-states:] if states else values[:0]
+    norm = None if response.peak_norm is None else values[3 + lines]
+    return *values[:3], values[3 : 3 + lines], norm, values[-states:]
 
 
 def _solved(scene: Scene, design, start, along: tuple[int, ...]) -> tuple[Response, Array]:
@@ -181,20 +167,27 @@ def _solve(scene: Scene, design, start, numbers: tuple[int, ...]) -> tuple[Respo
         return moved.pair_and_shape(parameters)
 
     pair, tangents, _ = along(build, chosen, _basis(chosen))
-    units = pair.units
-    state = jnp.zeros(pair.states) if start is None else jnp.asarray(start) / units
-    found = steady_motion(
-        pair, tangents, state.astype(units.dtype), scene.pitch_radius, scene.solver
-    )
-    moved_units = jax.vmap(lambda t: _units_along(pair, t))(
-        eqx.filter(tangents, eqx.is_inexact_array)
-    )
-    return _named(scene.solver.measures, pair, found, moved_units)
+    rest = jnp.zeros(pair.states, pair.angle_scale.dtype)
+    state = rest if start is None else pair.scaled(jnp.asarray(start))
+    found = steady_motion(pair, tangents, state, scene.pitch_radius, scene.solver)
+    return _named(scene.solver.measures, pair, tangents, found)
 
 
-def _units_along(pair: RotorPair, tangent: RotorPair):
+def _state(pair: RotorPair, tangents: RotorPair, found: Steady):
+    """State (n,) in SI units of the orbit, or of the end of a motion without one; and derivatives
+    (n, m) of the orbit's."""
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
-    return jax.jvp(lambda p: eqx.combine(p, static).units, (dynamic,), (tangent,))[1]
+
+    def in_si(dynamic, state):
+        return eqx.combine(dynamic, static).in_si(state)
+
+    def along(tangent, moved):
+        return jax.jvp(in_si, (dynamic, found.orbit.state), (tangent, moved))[1]
+
+    closed = among(found.status, (*CLOSED, Status.IDLE))
+    state = jnp.where(closed, found.orbit.state, found.settled.state)
+    directions = eqx.filter(tangents, eqx.is_inexact_array)
+    return pair.in_si(state), jax.vmap(along)(directions, found.orbit.moved.T).T
 
 
 def _basis(leaves: list[Array]) -> list[Array]:
@@ -208,7 +201,7 @@ def _basis(leaves: list[Array]) -> list[Array]:
     return rows
 
 
-def _named(measures: Measures, pair: RotorPair, found: Steady, moved_units):
+def _named(measures: Measures, pair: RotorPair, tangents: RotorPair, found: Steady):
     """The response of a motion, and the derivatives of its differentiated fields."""
     orbit, period = found.orbit, found.period
     closed = among(found.status, CLOSED)
@@ -217,9 +210,7 @@ def _named(measures: Measures, pair: RotorPair, found: Steady, moved_units):
     rms = jnp.sqrt(jnp.maximum(square, 0.0))
     by_rms = by_square / (2 * jnp.maximum(rms, 1e-150))
     sizes, slopes = measures.amplitudes(others, by_others, period)
-    settled = jnp.where(closed | (found.status == Status.IDLE.code), orbit.state, jnp.nan)
-    state = jnp.where(jnp.isnan(settled), found.settled.state, settled)
-    by_state = orbit.moved * pair.units[:, None] + orbit.state[:, None] * moved_units.T
+    state, by_state = _state(pair, tangents, found)
     rows = [by_mean, by_peak, by_rms, *slopes]
     norm = None
     if measures.norm is not None:
@@ -238,7 +229,7 @@ def _named(measures: Measures, pair: RotorPair, found: Steady, moved_units):
         multipliers=eigenvalues(monodromy),
         residual=jnp.where(closed, orbit.residual, jnp.nan),
         status=found.status,
-        state=state * pair.units,
+        state=state,
     )
     wide = jnp.result_type(float)
     response, rows = jax.tree.map(

@@ -18,7 +18,7 @@ from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.nodes import pair_gap
 from rootsopt.errors import InputError
 from rootsopt.families import check, design_of, profile_of, with_design
-from rootsopt.model import Model
+from rootsopt.model import Scene
 from rootsopt.optimize.problem import Space, sobol
 from rootsopt.profiles import geometry
 from rootsopt.profiles.validity import margins
@@ -238,7 +238,7 @@ def designs_are_points_of_the_unit_box_and_back(family):
     if not row.parameters:
         return
     config = parse(text_of(family))
-    space = Space.of(config, Model.of(config), 0.3)
+    space = Space.of(config, Scene.from_config(config), 0.3)
     size = len(space.lower)
     there, back = jax.jit(jax.vmap(space.design)), jax.jit(jax.vmap(space.point))
     points = np.vstack([np.zeros(size), np.ones(size), sobol(16, 2, size)])

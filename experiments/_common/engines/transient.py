@@ -12,14 +12,14 @@ from jax import lax
 
 from rootsopt.dynamics.flow import Integrator, flow
 from rootsopt.dynamics.steady import SAMPLES
-from rootsopt.model import Model
+from rootsopt.model import Scene
 
 _FEW = 64
 """Samples of a mesh period whose peak is not needed."""
 
 
 @eqx.filter_jit
-def averaged(model: Model, design: Any, settle: Any, how: Integrator) -> tuple[Any, Any]:
+def averaged(model: Scene, design: Any, settle: Any, how: Integrator) -> tuple[Any, Any]:
     """Average the mesh period after `settle` others from rest.
 
     Returns (mean, peak) in N, and their derivatives (2, d) per config unit.
