@@ -114,7 +114,7 @@ class Part(eqx.Module):
         raise NotImplementedError(f"`{type(self).__name__}` has states, but no `rates`")
 
     def axes(
-        self, own: Float[Array, "*k m"]
+        self, own: Float[Array, "*k m"] | Float[np.ndarray, "*k m"]
     ) -> tuple[Float[Array, "*k 2 2"], Float[Array, "*k 2 2"]]:
         """Displacements (m) of the axes and their velocities (m/s), of a part that `displaces`."""
         raise NotImplementedError(f"`{type(self).__name__}` displaces the axes, but has no `axes`")
