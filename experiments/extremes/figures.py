@@ -27,6 +27,7 @@ COLOURS = {
     "idle": "#999999",
     "passed_through": "#F0E442",
     "too_deep": ORANGE,
+    "inaccurate": "#882255",
     "unresolved": PURPLE,
     "stalled": GREEN,
     "solver_failed": VERMILION,

@@ -50,6 +50,9 @@ SCENES: dict[str, dict[str, Any]] = {
 SEARCH = {"screening": 24, "starts": 4, "iterations": 40, "learning_rate": 0.06}
 SEARCH_FREE = {"screening": 0, "starts": 1, "iterations": 100, "learning_rate": 0.005}
 QUICK = ("cic", "arc")
+"""Families of a reduced run, with linear contact."""
+COARSE = {"fidelity": "map", "map_rolls": 192, "map_relatives": 12}
+"""Contact of the free form there: with `linear`, its motion does not settle."""
 
 
 def curvature(profile: Profile) -> dict[str, float]:
@@ -199,7 +202,7 @@ def free_form(path: str, best: dict[str, Any], quick: bool) -> dict[str, Any]:
         config,
         profile=profile.model_dump(),
         optimizer=settings,
-        solver={"gradient": "reverse"},
+        solver={"gradient": "reverse"} | (COARSE if quick else {}),
     )
     config, count = optimised(config, base.response)
     made = profile_of(config)

@@ -41,7 +41,7 @@ def main() -> int:
         "freeform",
         __doc__,
         body,
-        quick="a few steps, linear contact",
+        quick="a few steps, coarse contact map",
         published=FIGURES,
         add_options=add_options,
         cache=True,

@@ -20,6 +20,8 @@ from rootsopt.profiles.departure import departure, flank_points
 from rootsopt.resemblance import likenesses
 
 CONFIG = "configs/free.yaml"
+COARSE = ("solver.fidelity=map", "solver.map_rolls=192", "solver.map_relatives=12")
+"""Contact of a reduced run. With `linear`, the motion of a free form does not settle."""
 MM, UM = 1e-3, 1e-6
 
 
@@ -60,10 +62,8 @@ def run(quick: bool, config: str = CONFIG) -> Results:
 
     Raises `NoResultError` where the search finds nothing better.
     """
-    fast = ["solver.fidelity=linear"] if quick else []
-    few = ["optimizer.iterations=4"] if quick else []
-    settings = load(config, fast + few)
-    paper = evaluate(load(CIC, fast))
+    settings = load(config, [*COARSE, "optimizer.iterations=4"] if quick else [])
+    paper = evaluate(load(CIC, list(COARSE) if quick else []))
     result = Search(settings).run()
     if result.optimized is None:
         raise NoResultError("the search found nothing better; raise optimizer.iterations")
