@@ -1,31 +1,71 @@
-"""Roots rotors designed by gradient; see the README."""
+"""Roots rotors designed by gradient of their dynamic contact force; see the README.
+
+Names are imported when first asked for: importing the package loads no solver and changes no
+setting.
+"""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rootsopt.config import Config as Config
+    from rootsopt.config import load as load_config  # noqa: F401
     from rootsopt.config.families import Family as Family
     from rootsopt.config.families import Parameter as Parameter
     from rootsopt.config.families import register_family as register_family
+    from rootsopt.contact.gap import Contact as Contact
+    from rootsopt.contact.law import ContactLaw as ContactLaw
+    from rootsopt.dynamics.parts.base import Part as Part
+    from rootsopt.errors import InputError as InputError
+    from rootsopt.model import Scene as Scene
+    from rootsopt.optimize.design import optimize_design as optimize_design
+    from rootsopt.optimize.search import Optimization as Optimization
     from rootsopt.profiles.base import Profile as Profile
     from rootsopt.profiles.base import Segment as Segment
+    from rootsopt.response.evaluation import Evaluation as Evaluation
+    from rootsopt.response.evaluation import evaluate as evaluate
+    from rootsopt.response.scenes import sweep_scenes as sweep_scenes
+    from rootsopt.response.steady import Response as Response
+    from rootsopt.response.steady import steady_response as steady_response
+    from rootsopt.response.terms import Term as Term
+    from rootsopt.response.terms import register_term as register_term
+    from rootsopt.status import Status as Status
 
 __version__ = "0.1.0"
 
 _PUBLIC = {
-    "Family": "rootsopt.config.families",
-    "Parameter": "rootsopt.config.families",
-    "Profile": "rootsopt.profiles.base",
-    "Segment": "rootsopt.profiles.base",
-    "register_family": "rootsopt.config.families",
+    "Config": "rootsopt.config:Config",
+    "Contact": "rootsopt.contact.gap:Contact",
+    "ContactLaw": "rootsopt.contact.law:ContactLaw",
+    "Evaluation": "rootsopt.response.evaluation:Evaluation",
+    "Family": "rootsopt.config.families:Family",
+    "InputError": "rootsopt.errors:InputError",
+    "Optimization": "rootsopt.optimize.search:Optimization",
+    "Parameter": "rootsopt.config.families:Parameter",
+    "Part": "rootsopt.dynamics.parts.base:Part",
+    "Profile": "rootsopt.profiles.base:Profile",
+    "Response": "rootsopt.response.steady:Response",
+    "Scene": "rootsopt.model:Scene",
+    "Segment": "rootsopt.profiles.base:Segment",
+    "Status": "rootsopt.status:Status",
+    "Term": "rootsopt.response.terms:Term",
+    "evaluate": "rootsopt.response.evaluation:evaluate",
+    "load_config": "rootsopt.config:load",
+    "optimize_design": "rootsopt.optimize.design:optimize_design",
+    "register_family": "rootsopt.config.families:register_family",
+    "register_term": "rootsopt.response.terms:register_term",
+    "steady_response": "rootsopt.response.steady:steady_response",
+    "sweep_scenes": "rootsopt.response.scenes:sweep_scenes",
 }
-"""Public names and where they are; each is imported when first asked for."""
+"""Public names and where they are."""
+__all__ = ["__version__", *_PUBLIC]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module 'rootsopt' has no attribute {name!r}")
-    return getattr(import_module(_PUBLIC[name]), name)
+    module, _, attribute = _PUBLIC[name].partition(":")
+    return getattr(import_module(module), attribute)
 
 
 def __dir__() -> list[str]:

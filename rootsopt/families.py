@@ -41,17 +41,13 @@ def profile_of(
 
 
 def keys_of(config: ProfileConfig) -> tuple[str, ...]:
-    """Names of the design parameters of a config: its keys, those of a list numbered from 1."""
-    names: list[str] = []
-    for key, value in config.parameters.items():
-        numbers = range(1, 1 + len(value)) if isinstance(value, tuple) else ()
-        names += [f"{key}_{number}" for number in numbers] or [key]
-    return tuple(names)
+    """Names of the design parameters of a config."""
+    return config.design_keys
 
 
 def design_of(config: ProfileConfig) -> Float[Array, " d"]:
     """The design parameters of a config, in its units."""
-    return jnp.asarray(np.hstack([*config.parameters.values(), ()]), float)
+    return jnp.asarray(config.design)
 
 
 def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:

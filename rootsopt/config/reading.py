@@ -1,8 +1,12 @@
 """The whole config, read from YAML."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
 from rootsopt.config.document import MOST_BYTES, read_document
@@ -60,6 +64,32 @@ class Config(Section):
     ensemble: EnsembleConfig = Field(default_factory=lambda: EnsembleConfig.model_validate({}))
     sweep: SweepConfig = Field(default_factory=lambda: SweepConfig.model_validate({}))
     optimizer: OptimizerConfig = Field(default_factory=lambda: OptimizerConfig.model_validate({}))
+
+    @property
+    def design(self) -> NDArray[np.float64]:
+        """The design parameters as an array (d,), in the units of `design_keys`."""
+        return self.profile.design
+
+    @property
+    def design_keys(self) -> tuple[str, ...]:
+        """Names of the design parameters; those of a list are numbered from 1."""
+        return self.profile.design_keys
+
+    def replaced(self, values: Mapping[str, Any]) -> "Config":
+        """Return the config with other `values` of dotted keys, checked like a file.
+
+        Raises `InputError` for an unknown key or a value that is not allowed."""
+        data = self.model_dump(mode="json", exclude_none=True)
+        for key, value in values.items():
+            *path, last = key.split(".")
+            target = data
+            for part in path:
+                target = target.setdefault(part, {})
+            target[last] = value
+        try:
+            return Config.model_validate(data)
+        except ValidationError as error:
+            raise InputError(sentence(f"{explain(error, Config)}")) from None
 
     @property
     def needs_search(self) -> tuple[str, ...]:

@@ -2,6 +2,8 @@
 
 from typing import Annotated, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
 from rootsopt.config import catalogue as _catalogue  # noqa: F401  (fills the table)
@@ -41,6 +43,20 @@ class ProfileConfig(Section):
     def parameters(self) -> dict[str, float | tuple[float, ...]]:
         """The design parameters of the config's family by key, in the units of the keys."""
         return {key: getattr(self, key) for key in family_of(self.family).keys}
+
+    @property
+    def design(self) -> NDArray[np.float64]:
+        """The design parameters as an array (d,), in the units of `design_keys`."""
+        return np.hstack([*self.parameters.values(), ()]).astype(float)
+
+    @property
+    def design_keys(self) -> tuple[str, ...]:
+        """Names of the design parameters; those of a list are numbered from 1."""
+        names: list[str] = []
+        for key, value in self.parameters.items():
+            numbers = range(1, 1 + len(value)) if isinstance(value, tuple) else ()
+            names += [f"{key}_{number}" for number in numbers] or [key]
+        return tuple(names)
 
     @property
     def from_file(self) -> bool:

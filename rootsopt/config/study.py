@@ -76,6 +76,11 @@ class ObjectiveConfig(Section):
         default_factory=dict,
         description="weights of spectral lines, {order: weight}, order in mesh frequencies",
     )
+    terms: dict[str, Weight] = Field(
+        default_factory=dict,
+        description="weights of further terms by their names, as {outer_radius_mm: 0.2}; those of "
+        "the package and those registered from outside",
+    )
     motion: Literal["reached", "worst", "weighted", "ensemble"] = Field(
         "reached",
         description="motion that counts: the one reached from rest, the worst of those that "
@@ -113,10 +118,17 @@ class ObjectiveConfig(Section):
                 f"{shown(self.line_weights)}"
             )
         lines = sum(self.line_weights.values())
-        if self.mean_weight + self.peak_weight + self.rms_weight + lines < _LEAST_WEIGHT:
+        terms = sum(self.terms.values())
+        if self.mean_weight + self.peak_weight + self.rms_weight + lines + terms < _LEAST_WEIGHT:
             raise ValueError(
-                "`objective.mean_weight`, `objective.peak_weight`, `objective.rms_weight` and "
-                f"`objective.line_weights` must not all be 0 (together at least {_LEAST_WEIGHT:g})"
+                "`objective.mean_weight`, `objective.peak_weight`, `objective.rms_weight`, "
+                "`objective.line_weights` and `objective.terms` must not all be 0 (together at "
+                f"least {_LEAST_WEIGHT:g})"
+            )
+        if self.motion == "ensemble" and terms > 0:
+            raise ValueError(
+                "`objective.terms` belong to a periodic motion; remove them or set "
+                "`objective.motion` to reached, worst or weighted"
             )
         if self.motion == "ensemble" and (lines > 0 or self.peak_norm is not None):
             raise ValueError(

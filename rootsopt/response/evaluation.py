@@ -24,6 +24,7 @@ from rootsopt.dynamics.window import Window, lyapunov
 from rootsopt.model import MM, Scene, design_keys, design_vector
 from rootsopt.profiles import Geometry
 from rootsopt.programs import Program
+from rootsopt.response.terms import terms_of, values_of
 from rootsopt.status import Status
 
 if TYPE_CHECKING:
@@ -126,6 +127,7 @@ class Evaluator:
     @classmethod
     def of(cls, config: Config, rtol: float | None = None, survey: bool = False) -> "Evaluator":
         """Return the evaluator of a `config`; `rtol` overrides its orbit tolerance."""
+        terms_of([*config.objective.terms])
         found = cls(config, Scene.from_config(config))
         if rtol is not None:
             found = found.at_tolerance(rtol)
@@ -282,6 +284,7 @@ class Evaluator:
         } | self._map_statistics()
         steady: dict[str, Any] = {"kind": "transient"}
         response: dict[str, float] = {}
+        gradient = self._gradient(design, found) if status is Status.PERIODIC else {}
         hint, motion, state = "", None, None
         if status in _CLOSED:
             named = self.scene.solver.measures.named(orbit.response[:, None], period)
@@ -290,6 +293,9 @@ class Evaluator:
             statistics |= _orbit_statistics(found)
             motion = _orbit_series(pair, orbit, period) if series else None
             state = np.asarray(orbit.state, np.float64)
+            terms, slopes = self._terms(design, response, gradient)
+            response |= terms
+            gradient |= slopes if gradient else {}
         elif status is Status.IDLE:
             steady = {"kind": "idle"}
             names = self.scene.solver.measures.named(np.zeros((len(orbit.response), 1)), 1)
@@ -314,7 +320,7 @@ class Evaluator:
             design=dict(zip(self.keys, map(float, design), strict=True)),
             geometry=geometry_record(self.scene, shape),
             response=response,
-            gradient=self._gradient(design, found) if status is Status.PERIODIC else {},
+            gradient=gradient,
             steady_state=steady,
             status=status,
             message=status.value + hint,
@@ -322,6 +328,23 @@ class Evaluator:
             series=motion,
             state=state,
         )
+
+    def _terms(self, design, response, gradient):
+        """Values of the further terms that the objective names, and their gradients (NaN where
+        those of the forces are not known)."""
+        names = [name for name in self.config.objective.terms if name not in response]
+        if not names:
+            return {}, {}
+        forces = np.array([response[name] for name in RESPONSES])
+        slopes = np.full((3, len(self.keys)), np.nan)
+        if gradient:
+            slopes = np.array([list(gradient[name].values()) for name in RESPONSES])
+        found = values_of(self.scene, terms_of(names), design, forces, slopes)
+        values, rows = map(np.asarray, found)
+        named = zip(names, rows, strict=True)
+        return dict(zip(names, map(float, values), strict=True)), {
+            name: dict(zip(self.keys, map(float, row), strict=True)) for name, row in named
+        }
 
     def _map_statistics(self) -> dict[str, int | float]:
         """Size and error of the contact map, if there is one."""
@@ -443,6 +466,8 @@ def objective_weights(config: Config) -> dict[str, float]:
         "rms_force_N": wanted.rms_weight,
         **{line_name(order): weight for order, weight in wanted.line_weights.items()},
     }
+    for name, weight in wanted.terms.items():
+        shares[name] = shares.get(name, 0.0) + weight
     total = sum(shares.values())
     return {name: share / total for name, share in shares.items() if share}
 

@@ -1,0 +1,27 @@
+"""The main job as a function."""
+
+from collections.abc import Callable
+
+from rootsopt.config import Config
+from rootsopt.model import check_geometry
+from rootsopt.optimize.search import Optimization, Search
+from rootsopt.response.choice import resolve
+
+
+def optimize_design(
+    config: Config, progress: Callable[[int, int, float], None] | None = None
+) -> Optimization:
+    """Search the design with the least objective of a `config`, and compare it with the baseline.
+
+    `progress` is called with (evaluations done, evaluations expected, best objective). The result
+    has `baseline` and `optimized` as `Evaluation` (`None` where no better design held up),
+    `improvement`, `constraints`, `history` and a `status`.
+
+    Raises `InputError` for a config that cannot be optimised, RuntimeError where JAX is not set to
+    the precision it asks for.
+
+    >>> found = rootsopt.optimize_design(rootsopt.load_config("configs/cic.yaml"))
+    >>> found.optimized.design, found.improvement["mean_force_N"]
+    """
+    check_geometry(config)
+    return Search(resolve(config)[0], progress).run()
