@@ -490,7 +490,7 @@ def _reverse(scene: Scene, design, orbit: Orbit, period, how: Integrator, measur
 
 @Program
 def _contact_series(pair: RotorPair, tau, states):
-    lapse = pair.lapse(states) if pair.drive.free else jnp.ones_like(tau)
+    lapse = pair.lapse(states) if pair.free else jnp.ones_like(tau)
     contact = jax.vmap(pair.contact_at)(tau, states)
     return pair.mesh_period, lapse, pair.physical(tau, states)[1:], contact
 
@@ -500,7 +500,7 @@ def _series(pair: RotorPair, tau, states) -> Series:
     turn = np.mod(tau, pair.lobes)
     period, lapse, (relative, rate), contact = _contact_series(pair, turn, states)
     time = period * tau
-    if pair.drive.free:
+    if pair.free:
         from scipy.integrate import cumulative_simpson  # Half a second, for motors alone.
 
         time = period * cumulative_simpson(lapse, x=tau, initial=0.0)

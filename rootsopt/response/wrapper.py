@@ -1,7 +1,7 @@
 """What every evaluator can do, and the base of those that wrap another one."""
 
 import dataclasses
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, TypeVar
 
 from numpy.typing import ArrayLike, NDArray
 
@@ -65,6 +65,9 @@ class Evaluates(Protocol):
         ...
 
 
+_Own = TypeVar("_Own", bound="Wrapper")
+
+
 @dataclasses.dataclass(frozen=True)
 class Wrapper:
     """An evaluator of what the evaluations of another one, `single`, come to.
@@ -88,7 +91,7 @@ class Wrapper:
         """Evaluate `design` (config units; default: the config's own)."""
         return self.fit(design, start, series)[1]
 
-    def fit(self, design=None, start=None, series=True) -> tuple[Self, Evaluation]:
+    def fit(self: _Own, design=None, start=None, series=True) -> tuple[_Own, Evaluation]:
         """Evaluate a design; also return an evaluator fitted to its motion."""
         raise NotImplementedError
 
@@ -96,31 +99,31 @@ class Wrapper:
         """Return the rotor pair of `design` (config units)."""
         return self.single.pair(design)
 
-    def prepare(self, design=None, series=True) -> Self:
+    def prepare(self: _Own, design=None, series=True) -> _Own:
         """Compile in the background what a design takes; return an evaluator sized for it."""
         return self._around(self.single.prepare(design, series))
 
-    def at_speed(self, speed_rpm: float) -> Self:
+    def at_speed(self: _Own, speed_rpm: float) -> _Own:
         """Return another evaluator, at this speed."""
         return self._around(self.single.at_speed(speed_rpm))
 
-    def at_tolerance(self, rtol: float) -> Self:
+    def at_tolerance(self: _Own, rtol: float) -> _Own:
         """Return another evaluator, with this orbit tolerance."""
         return self._around(self.single.at_tolerance(rtol))
 
-    def surveying(self) -> Self:
+    def surveying(self: _Own) -> _Own:
         """Return another evaluator, for a search over many designs."""
         return self._around(self.single.surveying())
 
-    def relative_to(self, baseline: Evaluation) -> Self:
+    def relative_to(self: _Own, baseline: Evaluation) -> _Own:
         """Return another evaluator, whose motions are compared relative to a `baseline`."""
         return self._around(self.single.relative_to(baseline))
 
-    def without_gradient(self) -> Self:
+    def without_gradient(self: _Own) -> _Own:
         """Return another evaluator without the gradient where that takes most of the time."""
         return self._around(self.single.without_gradient())
 
-    def _around(self, single: Evaluates) -> Self:
+    def _around(self: _Own, single: Evaluates) -> _Own:
         return dataclasses.replace(self, single=single)
 
 
