@@ -1,0 +1,208 @@
+"""The configs whose results are kept: a shipped config, overrides and a name each.
+
+Chosen so that every profile family, scene part, contact, method, measure, motion and status occurs
+at least once. What is not itself the subject of a case is as in the shipped config, but for the
+tolerance: at the shipped one, rounding alone chooses other steps, and forces differ by up to 1e-7.
+"""
+
+from typing import NamedTuple
+
+
+class Case(NamedTuple):
+    """A config to be evaluated. nudged: whether it is also evaluated at speeds that differ by
+    rounding when it is written, which a long case can do without."""
+
+    name: str
+    config: str
+    overrides: list[str]
+    nudged: bool = True
+
+
+_TIGHT = "solver.rtol=1e-11"
+
+
+def _tight(case: Case) -> Case:
+    """The case at a tight tolerance, unless its tolerance is its subject."""
+    loose = case.name.startswith(_AS_SHIPPED) or any("rtol" in one for one in case.overrides)
+    return case if loose else case._replace(overrides=[_TIGHT, *case.overrides])
+
+
+_AS_SHIPPED = ("as shipped", "single precision", "unresolved", "inaccurate", "ensemble", "nodes")
+"""Beginnings of the names of cases at the tolerance of the config."""
+
+
+def _sections(**values: str) -> list[str]:
+    """Overrides of a scene by short names."""
+    return [f"{_KEYS[key]}={value}" for key, value in values.items()]
+
+
+_KEYS = {
+    "speed": "scene.speed_rpm",
+    "load": "scene.load.torque_N_m",
+    "backlash": "scene.timing_gear.backlash_mm",
+    "damping": "scene.timing_gear.damping_ratio",
+    "gear": "scene.timing_gear.stiffness_N_m_per_rad",
+    "clearance": "contact.clearance_mm",
+    "stiffness": "contact.stiffness_N_per_mm_e",
+    "rtol": "solver.rtol",
+    "precision": "solver.precision",
+    "contact": "solver.fidelity",
+    "method": "solver.method",
+    "gradient": "solver.gradient",
+}
+
+
+def _profile(family: str, lobes: int, keys: str = "") -> str:
+    inside = f"family: {family}, lobes: {lobes}, pitch_radius_mm: 33.0"
+    return f"profile={{{inside}{', ' if keys else ''}{keys}}}"
+
+
+_FAMILIES = {
+    "cic, 2 lobes": ("cic", 2, "pressure_angle_deg: 40, involute_length_mm: 8, "
+                     "tip_arc_angle_deg: 4"),
+    "cic, 4 lobes": ("cic", 4, "pressure_angle_deg: 33, involute_length_mm: 6, "
+                     "tip_arc_angle_deg: 2"),
+    "ee, 2 lobes": ("ee", 2, ""),
+    "ee, 4 lobes": ("ee", 4, ""),
+    "arc, 2 lobes": ("arc", 2, "arc_center_mm: 26.4"),
+    "arc, 3 lobes": ("arc", 3, "arc_center_mm: 29.7"),
+    "arcs_epicycloid": ("arcs_epicycloid", 3, "arc_center_mm: 27, tip_arc_angle_deg: 8, "
+                        "edge_radius_mm: 1"),
+    "arc_involute, 3 lobes": ("arc_involute", 3, "pressure_angle_deg: 36, involute_length_mm: 6"),
+    "arc_involute, 4 lobes": ("arc_involute", 4, "pressure_angle_deg: 33, involute_length_mm: 5"),
+    "four_arcs": ("four_arcs", 3, "arc_center_mm: 30, tip_arc_radius_mm: 13, "
+                  "tip_arc_turn_deg: 40"),
+    "five_arcs": ("five_arcs", 3, "outer_radius_mm: 45, tip_arc_angle_deg: 3, "
+                  "tip_arc_radius_mm: 13, tip_arc_turn_deg: 60"),
+    "circle_epicycloid": ("circle_epicycloid", 3, "rolling_radius_mm: 7, tip_arc_turn_deg: 30"),
+    "hypo_epicycloid, 3 lobes": ("hypo_epicycloid", 3, "tip_arc_angle_deg: 4"),
+    "hypo_epicycloid, 4 lobes": ("hypo_epicycloid", 4, "tip_arc_angle_deg: 3"),
+    "extended_cycloid": ("extended_cycloid", 3, "trochoid_ratio: 1.3"),
+    "ellipse": ("ellipse", 3, "ellipse_center_mm: 27, ellipse_height_mm: 18"),
+    "outline of a cic": ("outline", 3, "outline_file: HERE/cic.csv"),
+    "outline of an ee, measured": ("outline", 2, "outline_file: HERE/ee.csv, "
+                                   "outline_smoothing_mm: 2.0e-3"),
+}  # fmt: skip
+_GEAR = "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.5, backlash_mm: 0.1}"
+_BARE = [
+    "scene.timing_gear=null",
+    *_sections(speed="6000", load="0.1"),
+    "profile.involute_length_mm=6",
+]
+"""A light load at high speed, which flanks alone can hold."""
+_PARTS = {
+    "no gear": [],
+    "gear": [_GEAR],
+    "gear with phase error": [_GEAR, "scene.phase_error_mrad=0.4"],
+    "motor": ["scene.drive=torque", "scene.motor={slope_N_m_s_per_rad: 0.1}"],
+    "motor with inertia": [
+        _GEAR,
+        "scene.load.torque_N_m=4.775",
+        "scene.drive=torque",
+        "scene.motor={slope_N_m_s_per_rad: 0.1, torque_N_m: 6, inertia_kg_m2: 2.0e-3}",
+    ],
+    "gas load": ["scene.load={pressure_difference_Pa: 1000}"],
+    "gas load and gear": [_GEAR, "scene.load={pressure_difference_Pa: 5.0e4}"],
+    "friction": ["contact.friction={}"],
+    "centre distance error": [_GEAR, "scene.center_distance_error_mm=0.02"],
+    "supports": [_GEAR, "scene.supports={stiffness_N_per_mm: 2.0e5, damping_N_s_per_mm: 5}"],
+}
+_SHAKY = [
+    *_sections(speed="1700", load="3", backlash="0.25", damping="0.3", gear="9000"),
+    "profile.pressure_angle_deg=30.7",
+    "profile.involute_length_mm=4",
+    "profile.tip_arc_angle_deg=1.5",
+]
+"""A stable orbit of two mesh periods, which magnifies what is changed."""
+_TWO = ["scene.timing_gear.backlash_mm=0.2", "scene.timing_gear.damping_ratio=0.2"]
+"""Play in which motions coexist at 6000 rpm."""
+_GRID = ["attractors.relatives=5", "attractors.rates=4"]
+_FEW = ["ensemble.members=4", "ensemble.settle_periods=24", "ensemble.periods=8"]
+_MEASURED = ["response.lines=[1, 2, 3.5]", "objective.peak_norm=16"]
+
+_EVERY = [
+    Case("as shipped, cic", "cic", []),
+    Case("as shipped, ee", "ee", []),
+    Case("as shipped, pump", "pump", []),
+    Case("as shipped, measures", "cic", _MEASURED),
+    Case("cic", "cic", []),
+    Case("dopri8", "cic", _sections(method="dopri8")),
+    Case("ee", "ee", []),
+    Case("paper cic", "paper_cic", []),
+    Case("paper ee", "paper_ee", []),
+    Case("free form", "free", []),
+    Case("free form, forward", "free", _sections(gradient="forward")),
+    Case("pump", "pump", []),
+    Case("bore and short rotor", "cic", ["rotor.bore_mm=20", "rotor.length_mm=40"]),
+    Case("clearance", "cic", _sections(clearance="0.01")),
+    Case("corners as they stand", "cic", ["contact.smoothing_mm=0"]),
+    Case("wide rounding", "cic", ["contact.smoothing_mm=0.003"]),
+    Case("slow", "cic", _sections(speed="700")),
+    Case("fast", "cic", _sections(speed="12000")),
+    Case("no play", "cic", _sections(backlash="0")),
+    Case("one mesh period, lively", "cic", _sections(speed="4500", damping="0.2",
+                                                     backlash="0.05")),
+    Case("two mesh periods, shaky", "cic", _SHAKY),
+    Case("two mesh periods, shaky, at 1e-9", "cic", [*_SHAKY, *_sections(rtol="1e-9")]),
+    Case("two mesh periods", "cic", _sections(backlash="0.2", damping="0.2", speed="4000")),
+    Case("three mesh periods", "cic", _sections(damping="0.05", load="2", speed="6000")),
+    Case("noisy", "cic", _sections(damping="0.05", speed="6000")),
+    Case("four mesh periods", "cic", _sections(backlash="0.2415")),
+    Case("six mesh periods", "cic", [*_TWO, *_sections(speed="6000")]),
+    Case("held apart", "cic", _sections(clearance="0.3")),
+    Case("no load", "cic", _sections(load="0")),
+    Case("too deep", "cic", _sections(backlash="2", load="300", stiffness="200")),
+    Case("slow and stiff", "cic", _sections(speed="1", stiffness="1e9")),
+    Case("not settled", "cic", [*_sections(backlash="0.2", damping="0.05", load="2",
+                                           speed="4000"), "solver.max_mesh_periods=16"]),
+    Case("several speeds", "cic", ["objective.speeds_rpm=[4000, 2000]",
+                                   "objective.speed_weights=[3, 1]"]),
+    Case("several speeds, worst", "cic", ["objective.speeds_rpm=[2000, 3000, 5000]",
+                                          "objective.over_speeds=worst"]),
+    Case("chaotic", "cic", _sections(damping="0", speed="6000")),
+    Case("measures", "cic", _MEASURED),
+    Case("linear", "cic", _sections(contact="linear")),
+    Case("linear, doubled load", "cic", _sections(contact="linear", load="9.55")),
+    Case("passed through, linear", "cic", ["scene.timing_gear=null",
+                                           *_sections(load="30", contact="linear")]),
+    Case("linear of ee", "ee", _sections(contact="linear")),
+    Case("passed through", "cic", ["scene.timing_gear=null", *_sections(load="30")]),
+    *(Case(f"bare, {name}", "cic", [*_BARE, *more]) for name, more in _PARTS.items()),
+    Case("stalled", "cic", ["scene.drive=torque",
+                            "scene.motor={slope_N_m_s_per_rad: 0.001, torque_N_m: 0.5}"]),
+    Case("single precision", "cic", _sections(precision="float32")),
+    Case("unresolved", "cic", _sections(precision="float32", load="1e-4")),
+    Case("inaccurate, no room for a check", "cic",
+         [*_sections(damping="0.05", load="2", speed="6000"), "solver.max_steps_per_period=320"]),
+    *(Case(name, "cic", [_profile(*rest)]) for name, rest in _FAMILIES.items()),
+    Case("worst motion", "cic", [*_TWO, *_GRID, *_sections(speed="6000"),
+                                 "objective.motion=worst"]),
+    Case("weighted motions", "cic", [*_TWO, *_GRID, *_sections(speed="6000"),
+                                     "objective.motion=weighted"]),
+    Case("worst motion at several speeds", "cic", [*_TWO, *_GRID, "objective.motion=worst",
+                                                   "objective.speeds_rpm=[3000, 6000]"]),
+    Case("ensemble of a periodic motion", "cic", [*_FEW, "objective.motion=ensemble",
+                                                  "ensemble.designs=12"]),
+    Case("ensemble of a chaotic motion", "cic", [*_FEW, "objective.motion=ensemble",
+                                                 "ensemble.designs=12",
+                                                 *_sections(damping="0.1", backlash="0.4",
+                                                            load="1")], nudged=False),
+    Case("map", "cic", _sections(contact="map")),
+    Case("map of ee", "ee", _sections(contact="map")),
+    Case("single precision, map", "cic", _sections(precision="float32", contact="map")),
+    Case("nodes", "cic", _sections(contact="nodes")),
+    Case("reverse", "cic", [*_MEASURED, *_sections(gradient="reverse"),
+                            "objective.line_weights={1: 0.3, 2: 0.7}"]),
+    *(
+        Case(f"linear, {name}", "cic", _sections(contact="linear", method=name))
+        for name in ("dopri5", "kvaerno3", "kvaerno5")
+    ),
+    Case("as shipped, auto", "cic", _sections(contact="auto")),
+    Case("kvaerno5", "cic", _sections(method="kvaerno5")),
+    Case("map of given size", "cic", [*_sections(contact="map"), "solver.map_rolls=96",
+                                      "solver.map_relatives=24"]),
+]  # fmt: skip
+"""Those that share compiled programs stand beside each other."""
+CASES = [_tight(case) for case in _EVERY]
+SHORT = ("linear", "linear, doubled load", "passed through, linear", "linear of ee")
+"""Names of cases that are compiled in seconds."""

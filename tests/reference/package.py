@@ -1,0 +1,57 @@
+"""The one place that calls rootsopt: load a config, evaluate it, take its record."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+CALL = "evaluator_for(resolve(load(config, overrides))[0])(series=False).record()"
+"""What is called for each case, as the reference file says it."""
+KEPT = ("design", "geometry", "response", "gradient", "steady_state", "status")
+"""Entries of a record that are kept."""
+PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "optimistix", "lineax", "numpy", "scipy")
+
+
+def start() -> None:
+    """Choose double precision and the cache of compiled programs, as a command does.
+
+    Programs are not optimised, unless XLA_FLAGS says otherwise: most of the time is the compiler's.
+    """
+    os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+    from rootsopt.cli import use_cache, use_float64
+
+    use_float64()
+    use_cache()
+
+
+def evaluate(config: str, overrides: list[str], nudge: float = 0.0) -> dict[str, Any]:
+    """Record of the config's own design, as plain data.
+
+    config: name of a shipped config. overrides: HERE in them is this folder. nudge: relative change
+    of the speed, to see how far a result depends on rounding. Raises `rootsopt.errors.InputError`
+    for a config that is refused.
+    """
+    from rootsopt import auto
+    from rootsopt.config import load
+    from rootsopt.evaluators import evaluator_for
+
+    path = ROOT / "configs" / f"{config}.yaml"
+    overrides = [one.replace("HERE/", f"{HERE}/") for one in overrides]
+    found = load(path, overrides)
+    if nudge:
+        speed = found.scene.speed_rpm * (1 + nudge)
+        found = load(path, [*overrides, f"scene.speed_rpm={speed!r}"])
+    record = evaluator_for(auto.resolve(found)[0])(series=False).record()
+    return {key: record[key] for key in KEPT if key in record}
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that numbers depend on."""
+    import platform
+    from importlib import metadata
+
+    import rootsopt
+
+    own = {"python": platform.python_version(), "rootsopt": rootsopt.__version__}
+    return own | {name: metadata.version(name) for name in PACKAGES}
