@@ -1,7 +1,7 @@
 """What every evaluator can do, and the base of those that wrap another one."""
 
 import dataclasses
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from numpy.typing import ArrayLike, NDArray
 
@@ -11,6 +11,7 @@ from rootsopt.model import Scene
 from rootsopt.response.evaluation import Evaluation
 
 
+@runtime_checkable
 class Evaluates(Protocol):
     """Evaluates designs of one config, and changes nothing of itself (see `Evaluator`)."""
 

@@ -32,9 +32,9 @@ def evaluate(config: str, overrides: list[str], nudge: float = 0.0) -> dict[str,
     of the speed, to see how far a result depends on rounding. Raises `rootsopt.errors.InputError`
     for a config that is refused.
     """
-    from rootsopt import auto
     from rootsopt.config import load
-    from rootsopt.evaluators import evaluator_for
+    from rootsopt.response.choice import resolve
+    from rootsopt.response.evaluators import evaluator_for
 
     path = ROOT / "configs" / f"{config}.yaml"
     overrides = [one.replace("HERE/", f"{HERE}/") for one in overrides]
@@ -42,7 +42,7 @@ def evaluate(config: str, overrides: list[str], nudge: float = 0.0) -> dict[str,
     if nudge:
         speed = found.scene.speed_rpm * (1 + nudge)
         found = load(path, [*overrides, f"scene.speed_rpm={speed!r}"])
-    record = evaluator_for(auto.resolve(found)[0])(series=False).record()
+    record = evaluator_for(resolve(found)[0])(series=False).record()
     return {key: record[key] for key in KEPT if key in record}
 
 
