@@ -1,4 +1,4 @@
-"""Objective terms: the table, the package's own and one from outside, as docs/extending.md has it."""
+"""Objective terms: the table, the package's own, and the one of docs/extending.md."""
 
 import re
 from pathlib import Path
@@ -99,5 +99,3 @@ def test_table_keeps_names_apart():
         register_term("area_mm2", Nothing())
     with pytest.raises(ValueError, match="must be a word"):
         register_term("two words", Nothing())
-    with pytest.raises(ValueError, match="must be a Term, but is a float"):
-        register_term("other", 1.0)  # pyright: ignore[reportArgumentType]
