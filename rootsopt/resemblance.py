@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from rootsopt.config.families import family_of
+from rootsopt.design.space import sobol
 from rootsopt.families import MM, classical, profile_of
-from rootsopt.optimize.problem import sobol
 from rootsopt.profiles import Profile
 from rootsopt.profiles.departure import departure
 from rootsopt.profiles.validity import PURE, margins

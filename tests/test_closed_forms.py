@@ -23,6 +23,7 @@ from rootsopt.contact.map import MARGIN
 from rootsopt.contact.nodes import signed_distance
 from rootsopt.contact.search import SearchContact
 from rootsopt.contact.size import MapSize, _smallest
+from rootsopt.design.space import sobol
 from rootsopt.dynamics import peak, steady
 from rootsopt.dynamics.flow import Flow, Integrator
 from rootsopt.dynamics.measures import Measures
@@ -31,7 +32,7 @@ from rootsopt.dynamics.parts import ConstantLoad, MotorDrive, PrescribedDrive, T
 from rootsopt.dynamics.verdict import TOO_DEEP
 from rootsopt.model import Scene
 from rootsopt.optimize import noise
-from rootsopt.optimize.problem import Problem, sobol
+from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, Trial, _history
 from rootsopt.profiles import CIC
 from rootsopt.response.batch import on_all_cores

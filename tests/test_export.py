@@ -17,6 +17,7 @@ from PIL import Image
 from rootsopt import profile, simulate
 from rootsopt.config import load
 from rootsopt.contact.nodes import place_pair, signed_distance
+from rootsopt.design.space import Space
 from rootsopt.errors import InputError
 from rootsopt.export import chosen, solid, svg
 from rootsopt.export.animation import rolling_contacts, simulation_gif
@@ -25,7 +26,6 @@ from rootsopt.export.dxf import dxf_bytes
 from rootsopt.export.pieces import Arc, Spline, outline_pieces, polyline
 from rootsopt.families import profile_of
 from rootsopt.model import Scene, check_geometry, design_keys, design_vector
-from rootsopt.optimize.problem import Space
 from rootsopt.profiles import CIC, EE, geometry, outline
 from rootsopt.response.evaluation import Series
 

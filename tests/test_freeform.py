@@ -11,10 +11,11 @@ from test_optimize import SCENE
 
 from rootsopt.config import parse
 from rootsopt.contact.nodes import pair_gap
+from rootsopt.design.space import sobol
 from rootsopt.errors import InputError
 from rootsopt.families import check, free_form_of, keys_of, profile_of, with_design
 from rootsopt.model import Scene, design_vector
-from rootsopt.optimize.problem import Problem, sobol
+from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import CIC, EE, FreeForm, geometry, project
 from rootsopt.profiles.departure import departure, distances

@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 
 from rootsopt.config import parse
+from rootsopt.design.space import sobol
 from rootsopt.errors import InputError
 from rootsopt.model import Scene
-from rootsopt.optimize.problem import Problem, sobol
+from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, until_stopped
 from rootsopt.profiles import geometry
 from rootsopt.response.evaluation import Evaluation

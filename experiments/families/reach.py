@@ -9,8 +9,9 @@ from scipy.optimize import minimize
 from experiments._common.simulation import profile_of
 from rootsopt.config import Config
 from rootsopt.config.families import family_of
+from rootsopt.design.space import Space, sobol
 from rootsopt.model import MM, Scene, design_keys
-from rootsopt.optimize.problem import Problem, Space, sobol
+from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import geometry
 
 BAND_MM = 1e-3

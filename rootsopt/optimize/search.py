@@ -22,9 +22,10 @@ import optax
 from numpy.typing import NDArray
 
 from rootsopt.config import FAMILY_KEYS, Config
+from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
 from rootsopt.model import design_vector
-from rootsopt.optimize.problem import Problem, Space, sobol
+from rootsopt.optimize.problem import Problem
 from rootsopt.programs import Program
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.evaluators import evaluator_for

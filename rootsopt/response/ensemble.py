@@ -24,12 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config import EnsembleConfig
+from rootsopt.design.space import Space
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.verdict import TOO_DEEP
 from rootsopt.dynamics.window import PERIODS
 from rootsopt.model import Scene, design_vector
-from rootsopt.optimize.problem import Space
 from rootsopt.profiles import Geometry
 from rootsopt.programs import Program
 from rootsopt.response.evaluation import (

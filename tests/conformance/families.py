@@ -16,10 +16,10 @@ from rootsopt.config import describe_families, describe_keys, parse
 from rootsopt.config.families import families, family_of
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.nodes import pair_gap
+from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
 from rootsopt.families import check, design_of, profile_of, with_design
 from rootsopt.model import Scene
-from rootsopt.optimize.problem import Space, sobol
 from rootsopt.profiles import geometry
 from rootsopt.profiles.validity import margins
 

@@ -1,0 +1,1 @@
+"""The design space: bounds, the unit box, constraints."""

@@ -1,0 +1,188 @@
+"""The unit box of the design parameters, and the constraints in it.
+
+Design parameters map linearly from their bounds onto the sides of the box, but for those whose
+range depends on the others: these are a share of it. Constraints depend on geometry alone and are
+cheap; where no limits of the parameters say whether a profile is sound, the margins of
+`rootsopt.profiles.validity` are constraints like the others.
+"""
+
+import importlib
+import threading
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from rootsopt.config import Config
+from rootsopt.config.families import Family, family_of
+from rootsopt.design.bounds import bounds_of
+from rootsopt.families import DEG, MM
+from rootsopt.model import Scene
+from rootsopt.profiles import Geometry, geometry
+from rootsopt.profiles.validity import Margins, margins
+from rootsopt.programs import Program
+
+_SOUND = (
+    # name, margin, unit, limit, scale, factor
+    ("order of the joints", "turning", "deg", 0.0, 0.1, DEG),
+    ("convex addendum", "convexity", "mm", 0.0, MM, MM),
+    ("reach of the normals", "reach", "mm", 0.0, MM, MM),
+    ("levers from the tip on", "fall", "mm", 0.0, MM, MM),
+    ("roll angle per normal", "rolling", "", 0.0, 0.1, 1.0),
+    ("roll angle from the tip on", "order", "deg", 0.0, 0.1, DEG),
+    ("star shape", "star", "mm", 0.0, MM, MM),
+    ("root above the axis", "root", "mm", 0.0, MM, MM),
+)
+"""What makes a profile sound, beside its undercut margin."""
+
+
+class Constraint(eqx.Module):
+    """value ≥ limit, or ≤ where it is a `ceiling`, scaled by `scale` to order one.
+
+    `quantity`: a field of `Geometry`, or one of `Margins` where `margin`; `factor` turns SI into
+    the reported `unit`.
+    """
+
+    name: str = eqx.field(static=True)
+    quantity: str = eqx.field(static=True)
+    unit: str = eqx.field(static=True)
+    limit: Float[Array, ""]
+    scale: float = eqx.field(static=True)
+    factor: float = eqx.field(static=True)
+    margin: bool = eqx.field(static=True, default=False)
+    ceiling: bool = eqx.field(static=True, default=False)
+
+    @property
+    def sign(self) -> float:
+        """+1 for a floor, -1 for a ceiling."""
+        return -1.0 if self.ceiling else 1.0
+
+    def slack(self, shape: Geometry, found: Margins | None = None) -> Float[Array, ""]:
+        """Scaled distance to the limit, ≥ 0 where satisfied."""
+        value = getattr(found if self.margin else shape, self.quantity)
+        return self.sign * (value - self.limit) / self.scale
+
+
+class Space(eqx.Module):
+    """The unit box of d design parameters and the constraints in it."""
+
+    scene: Scene
+    lower: Float[Array, " d"]
+    upper: Float[Array, " d"]
+    constraints: tuple[Constraint, ...]
+
+    @classmethod
+    def of(cls, config: Config, scene: Scene, area_efficiency: float) -> "Space":
+        """Bounds and floors of a config whose baseline has this `area_efficiency`; raises
+        `InputError` where they leave no design."""
+        limits, family = config.constraints, family_of(config.profile.family)
+        rows = bounds_of(config)
+        floor = limits.area_efficiency_min
+        if floor == "baseline":
+            floor = area_efficiency
+        margin = limits.undercut_margin_min_mm * MM
+        sound = not family.by_limits
+        # Looked at in more places where that decides whether the profile is sound.
+        undercut = "undercut" if sound else "undercut_margin"
+        constraints = (
+            _constraint("area efficiency", "area_efficiency", "", floor, 0.01, 1.0),
+            _constraint("undercut margin", undercut, "mm", margin, MM, MM, sound),
+            _constraint("seal width", "seal_width", "mm", limits.seal_width_min_mm * MM, MM, MM),
+        )
+        if scene.bore_radius is not None:
+            room = scene.bore_radius
+            constraints += (_constraint("root radius", "root_radius", "mm", room, MM, MM),)
+        radii = ((True, limits.outer_radius_max_mm), (False, limits.outer_radius_min_mm))
+        for ceiling, radius in radii:
+            if radius is not None:
+                row = "outer radius", "outer_radius", "mm", radius * MM, MM, MM
+                constraints += (_constraint(*row, ceiling=ceiling),)
+        if sound:
+            rows_of = [row for row in _SOUND if row[1] not in family.inherent]
+            constraints += tuple(_constraint(*row, margin=True) for row in rows_of)
+        lower, upper = np.array(rows, dtype=float).T
+        return cls(scene, jnp.asarray(lower), jnp.asarray(upper), constraints)
+
+    @property
+    def family(self) -> Family:
+        """The profile family whose designs these are."""
+        return family_of(self.scene.family)
+
+    def design(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
+        """Design in config units at `point` of the unit box."""
+        limits = zip(self.lower, self.upper, point, strict=True)
+        values = [low + (high - low) * share for low, high, share in limits]
+        for place, least, most in self._within(values):
+            values[place] = least + (most - least) * point[place]
+        return jnp.stack(values)
+
+    def point(self, design: Float[Array, " d"]) -> Float[Array, " d"]:
+        """The nearest point of the unit box to a design."""
+        values = jnp.clip(design, self.lower, self.upper)
+        limits = zip(self.lower, self.upper, values, strict=True)
+        shares = [(value - low) / (high - low) for low, high, value in limits]
+        for place, least, most in self._within(values):
+            shares[place] = (values[place] - least) / (most - least)
+        return jnp.clip(jnp.stack(shares), 0.0, 1.0)
+
+    def ranges(self, values) -> dict[str, tuple[Float[Array, ""], Float[Array, ""]]]:
+        """(low, high) by key of parameters whose range depends on the other `values` (d,)."""
+        radius = self.scene.pitch_radius / MM
+        named = dict(zip(self.family.keys, self.family.split(values), strict=True))
+        return dict(self.family.dependent(self.scene.lobes, radius, **named))
+
+    def _within(self, values):
+        """Place in the design, least and greatest value of these parameters within bounds."""
+        for key, (least, most) in self.ranges(values).items():
+            place = self.family.keys.index(key)
+            most = jnp.minimum(most, self.upper[place])
+            least = jnp.minimum(jnp.maximum(self.lower[place], least), 0.999 * most)
+            yield place, least, most
+
+    def slacks(self, point: Float[Array, " d"]) -> Float[Array, " m"]:
+        """Scaled slack of every constraint."""
+        return self.slacks_of(self.design(point))
+
+    def slacks_of(self, design: Float[Array, " d"]) -> Float[Array, " m"]:
+        """Scaled slack of every constraint at a design in config units."""
+        profile = self.scene.profile(design)
+        shape = geometry(profile)
+        found = margins(profile) if any(c.margin for c in self.constraints) else None
+        return jnp.stack([c.slack(shape, found) for c in self.constraints])
+
+    def prepare(self) -> None:
+        """Compile in the background what a search in this space takes."""
+        # Half a second to import, and only needed here.
+        threading.Thread(target=importlib.import_module, args=("scipy.stats.qmc",)).start()
+        slacks_and_slopes.prepare(self, jax.ShapeDtypeStruct(self.lower.shape, self.lower.dtype))
+
+
+@Program
+def slacks_and_slopes(space: Space, point):
+    """Design, its Jacobian, slacks of the constraints, and theirs."""
+
+    def both(point):
+        values = space.design(point), space.slacks(point)
+        return values, values
+
+    (design_slope, slack_slope), (design, slack) = jax.jacfwd(both, has_aux=True)(point)
+    return design, design_slope, slack, slack_slope
+
+
+def _constraint(
+    name, quantity, unit, limit, scale, factor, margin=False, ceiling=False
+) -> Constraint:
+    limit = jnp.asarray(float(limit))
+    return Constraint(name, quantity, unit, limit, scale, factor, margin, ceiling)
+
+
+def sobol(count: int, seed: int, dimension: int = 3) -> NDArray[np.float64]:
+    """`count` points (n, `dimension`) of a scrambled Sobol sequence in the unit box."""
+    from scipy.stats import qmc
+
+    sampler = qmc.Sobol(dimension, rng=np.random.default_rng(seed))
+    power = max(0, int(np.ceil(np.log2(max(count, 1)))))
+    return sampler.random_base2(power)[:count]

@@ -1,0 +1,1 @@
+"""The motion of a rotor pair: equation, integration, orbits and their derivatives."""
