@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 
 from rootsopt.config import load
 from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.linear import spectral_radius
+from rootsopt.dynamics.orbit import Shots, close_orbit
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import close_orbit, no_tangents, spectral_radius
+from rootsopt.dynamics.window import no_tangents
 from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
 from rootsopt.response.evaluation import Evaluator, floquet, objective_weights
@@ -73,14 +75,14 @@ def test_what_is_not_asked_for_is_not_computed():
     plain, more = (
         Evaluator.of(load("configs/cic.yaml", over)) for over in ([], ["response.lines=[1]"])
     )
-    assert plain.measures.count == 2
-    assert more.measures.count == 4
+    assert plain.scene.solver.measures.count == 2
+    assert more.scene.solver.measures.count == 4
 
     def size(evaluator):
-        pair = evaluator.model.pair(jnp.array([36.43, 9.0, 4.0]))
-        one = jnp.asarray(1)
+        pair = evaluator.scene.pair(jnp.array([36.43, 9.0, 4.0]))
+        one, shots = jnp.asarray(1), Shots(how, evaluator.scene.solver.measures)
         jaxpr = jax.make_jaxpr(
-            lambda y: close_orbit(pair, no_tangents(pair), y, one, how, evaluator.measures).response
+            lambda y: close_orbit(pair, no_tangents(pair), y, one, shots).response
         )(jnp.zeros(2))
         return len(str(jaxpr))
 
@@ -100,7 +102,7 @@ def test_objective_takes_the_lines_and_the_norm_as_weighted():
     assert "peak_force_N" not in weights
     evaluator = Evaluator.of(config)
     baseline = evaluator(series=False)
-    problem = Problem.of(config, evaluator.model, baseline)
+    problem = Problem.of(config, evaluator.scene, baseline)
     assert problem.objective(baseline) == pytest.approx(1)
     point = problem.point(list(baseline.design.values())) * 0.99
     here = evaluator(problem.design(point), series=False)
@@ -120,7 +122,7 @@ def test_a_line_the_baseline_has_not_got_is_refused():
         load("configs/cic.yaml", ["response.lines=[0.5, 1]", "objective.peak_norm=8"])
     )
     with pytest.raises(InputError, match=r"line_weights.*0\.5.*repeats every 1 mesh periods"):
-        Problem.of(config, evaluator.model, evaluator(series=False))
+        Problem.of(config, evaluator.scene, evaluator(series=False))
 
 
 @given(st.integers(1, 5), st.integers(0, 2**32 - 1))
@@ -157,7 +159,7 @@ class Lagging(RotorPair):
 @pytest.mark.long
 def test_an_orbit_of_three_states():
     """Closed to 1e-9, with the derivative that differences of orbits give."""
-    model = Evaluator.of(load("configs/cic.yaml", [])).model
+    model = Evaluator.of(load("configs/cic.yaml", [])).scene
     how = Integrator("dopri8", jnp.asarray(1e-11), 4096)
 
     @eqx.filter_jit
@@ -171,7 +173,9 @@ def test_an_orbit_of_three_states():
         (dynamic, static), tangents = arrays(load), jax.jacfwd(lambda x: arrays(x)[0])(load)
         tangents = jax.tree.map(lambda x: x[None], tangents)
         start = jnp.array([-0.6, -0.4, 0.3])
-        return close_orbit(eqx.combine(dynamic, static), tangents, start, jnp.asarray(1), how)
+        return close_orbit(
+            eqx.combine(dynamic, static), tangents, start, jnp.asarray(1), Shots(how)
+        )
 
     here = orbit(jnp.asarray(4.775))
     assert float(here.residual) < 1e-9

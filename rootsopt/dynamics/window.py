@@ -26,6 +26,9 @@ _KEPT = 105
 _SAMPLES = 630
 """Uniform samples of a mesh period among which its peak is looked for; a multiple of `_KEPT`."""
 
+_Arrays = Array | np.ndarray
+"""Arrays of JAX, or of NumPy where a window has left the device."""
+
 
 class Window(NamedTuple):
     """A motion over p mesh periods, of which the first `done` are known.
@@ -80,19 +83,20 @@ class Window(NamedTuple):
         )
 
     @property
-    def exponent(self) -> Float[Array, ""]:
+    def exponent(self) -> Float[_Arrays, ""]:
         """Largest Lyapunov exponent per mesh period."""
-        return _numpy_of(self.growth).mean(self.growth)
+        xp = _numpy_of(self.growth)
+        return xp.asarray(xp.mean(self.growth))
 
     @property
-    def error(self) -> Float[Array, ""]:
+    def error(self) -> Float[_Arrays, ""]:
         """Standard error of `exponent`, from the means of batches."""
         xp = _numpy_of(self.growth)
         batches = xp.mean(self.growth.reshape(_BATCHES, -1), axis=1)
-        return xp.std(batches, ddof=1) / _BATCHES**0.5
+        return xp.asarray(xp.std(batches, ddof=1) / _BATCHES**0.5)
 
     @property
-    def forces(self) -> Float[Array, " 3"]:
+    def forces(self) -> Float[_Arrays, " 3"]:
         """Mean (N), mean square (N²) and peak (N) of the contact force over the window."""
         xp = _numpy_of(self.response)
         mean, square, peak = self.response.T
