@@ -182,19 +182,19 @@ class Scene(eqx.Module):
         moved = any(part.displaces for part in self.extra)
         return moved or any(part is not None for part in odd)
 
-    def with_parts(self, *parts: Part) -> "Model":
-        """This model with further parts, which follow the others in the state of a motion.
+    def with_parts(self, *parts: Part) -> "Scene":
+        """This scene with further parts, which follow the others in the state of a motion.
 
         Numbers that are their fields become arrays; responses are differentiable with respect to
         them."""
         return dataclasses.replace(self, extra=(*self.extra, *_as_arrays(parts)))
 
-    def with_law(self, law: ContactLaw) -> "Model":
-        """This model with another contact law, whose numbers become arrays."""
+    def with_law(self, law: ContactLaw) -> "Scene":
+        """This scene with another contact law, whose numbers become arrays."""
         return dataclasses.replace(self, law=_as_arrays(law))
 
     def contact(self, profile: Profile) -> Contact:
-        """Gap and levers of `profile` at this model's fidelity."""
+        """Gap and levers of `profile` at this scene's fidelity."""
         if self.fidelity == "map":
             return MapContact.of(profile, self.deepest, *self.map_size)
         if self.fidelity == "linear":

@@ -539,7 +539,7 @@ def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) 
     cannot be simulated, `RuntimeError` where JAX is not set to the precision it asks for.
 
     >>> config = rootsopt.load_config("configs/cic.yaml")
-    >>> rootsopt.response.evaluation(config).response["mean_force_N"]
+    >>> rootsopt.evaluate(config).response["mean_force_N"]
     """
     return Evaluator.of(config)(None if design is None else jnp.asarray(design, float))
 

@@ -1,7 +1,7 @@
 """What every evaluator can do, and the base of those that wrap another one."""
 
 import dataclasses
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from numpy.typing import ArrayLike, NDArray
 
@@ -10,7 +10,12 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.model import Scene
 from rootsopt.response.evaluation import Evaluation
 
+W = TypeVar("W", bound="Wrapper")
+"""The kind of a wrapper, which stays the same. (Not `Self`: types of single methods are checked at
+run time.)"""
 
+
+@runtime_checkable
 class Evaluates(Protocol):
     """Evaluates designs of one config, and changes nothing of itself (see `Evaluator`)."""
 
@@ -88,7 +93,7 @@ class Wrapper:
         """Evaluate `design` (config units; default: the config's own)."""
         return self.fit(design, start, series)[1]
 
-    def fit(self, design=None, start=None, series=True) -> tuple[Self, Evaluation]:
+    def fit(self: W, design=None, start=None, series=True) -> tuple[W, Evaluation]:
         """Evaluate a design; also return an evaluator fitted to its motion."""
         raise NotImplementedError
 
@@ -96,31 +101,31 @@ class Wrapper:
         """Return the rotor pair of `design` (config units)."""
         return self.single.pair(design)
 
-    def prepare(self, design=None, series=True) -> Self:
+    def prepare(self: W, design=None, series=True) -> W:
         """Compile in the background what a design takes; return an evaluator sized for it."""
         return self._around(self.single.prepare(design, series))
 
-    def at_speed(self, speed_rpm: float) -> Self:
+    def at_speed(self: W, speed_rpm: float) -> W:
         """Return another evaluator, at this speed."""
         return self._around(self.single.at_speed(speed_rpm))
 
-    def at_tolerance(self, rtol: float) -> Self:
+    def at_tolerance(self: W, rtol: float) -> W:
         """Return another evaluator, with this orbit tolerance."""
         return self._around(self.single.at_tolerance(rtol))
 
-    def surveying(self) -> Self:
+    def surveying(self: W) -> W:
         """Return another evaluator, for a search over many designs."""
         return self._around(self.single.surveying())
 
-    def relative_to(self, baseline: Evaluation) -> Self:
+    def relative_to(self: W, baseline: Evaluation) -> W:
         """Return another evaluator, whose motions are compared relative to a `baseline`."""
         return self._around(self.single.relative_to(baseline))
 
-    def without_gradient(self) -> Self:
+    def without_gradient(self: W) -> W:
         """Return another evaluator without the gradient where that takes most of the time."""
         return self._around(self.single.without_gradient())
 
-    def _around(self, single: Evaluates) -> Self:
+    def _around(self: W, single: Evaluates) -> W:
         return dataclasses.replace(self, single=single)
 
 
