@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments._common.engines import FD_STEPS, Scene, motion_of, rotor_of
+from experiments._common import engines
+from experiments._common.engines import FD_STEPS, motion_of, rotor_of
 from experiments._common.engines.scipy_nodes import (
     NODES_1E3,
     NodeContact,
@@ -34,7 +35,7 @@ from experiments._common.engines.numba_pair import (
 CONFIG = load(
     "configs/cic.yaml", ["solver.fidelity=search", "solver.method=dopri8", "solver.rtol=1e-12"]
 )
-SCENE = Scene.of(CONFIG)
+SCENE = engines.Scene.of(CONFIG)
 BASELINE = (36.43, 9.0, 4.0)
 DESIGNS = [BASELINE, (33.0, 6.0, 3.0), (40.0, 8.0, 6.0), (37.0, 8.5, 0.5)]
 every_design = pytest.mark.parametrize("design", DESIGNS, ids=str)
@@ -189,6 +190,6 @@ def test_scene_without_gear_and_other_families():
     config = CONFIG.model_copy(
         update={"scene": CONFIG.scene.model_copy(update={"timing_gear": None})}
     )
-    assert Scene.of(config).gear_stiffness == 0
+    assert engines.Scene.of(config).gear_stiffness == 0
     with pytest.raises(ValueError, match="family"):
-        Scene.of(load("configs/ee.yaml"))
+        engines.Scene.of(load("configs/ee.yaml"))

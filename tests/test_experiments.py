@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments._common.engines import Scene
+from experiments._common import engines
 from experiments._common.engines.scipy_nodes import ScipyNodes
 from experiments._common.scenes import FORCES
 from experiments.gradients import study as gradients
@@ -215,9 +215,9 @@ def test_paper(tmp_path, programs):
 def test_paper_by_scipy():
     """Another tool finds the paper's forces in the shipped scene of the CIC pair."""
     config = load("configs/paper_cic.yaml")
-    found = ScipyNodes(Scene.of(config), nodes=400, rtol=1e-5, settle=10, window=2).simulate(
-        [36.43, 9.0, 4.0]
-    )
+    found = ScipyNodes(
+        engines.Scene.of(config), nodes=400, rtol=1e-5, settle=10, window=2
+    ).simulate([36.43, 9.0, 4.0])
     assert found.mean == pytest.approx(102.4, rel=1e-3)
     assert found.peak == pytest.approx(1973.3, rel=1e-3)
 

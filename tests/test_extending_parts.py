@@ -18,8 +18,9 @@ from conformance.parts import check_in_pair, check_part
 
 from rootsopt.config import load
 from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.orbit import Shots, close_orbit
 from rootsopt.dynamics.parts import Context
-from rootsopt.dynamics.steady import close_orbit, settle, settled_within
+from rootsopt.dynamics.settle import settle, settled_within
 from rootsopt.model import Scene
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending_parts.md"
@@ -176,7 +177,7 @@ def closed(scene, design, factors, state, period, how):
         return eqx.filter(pair(factors), eqx.is_inexact_array)
 
     tangents = jax.vmap(lambda unit: jax.jvp(arrays, (factors,), (unit,))[1])(jnp.eye(4))
-    return close_orbit(pair(factors), tangents, state, period, how)
+    return close_orbit(pair(factors), tangents, state, period, Shots(how))
 
 
 @eqx.filter_jit

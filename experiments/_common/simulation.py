@@ -19,15 +19,12 @@ pair_of_model = eqx.filter_jit(Scene.pair)
 """The rotor pair of a model and a design, compiled."""
 
 
-def evaluator_of(config: Config, give_up_early: bool = False, prepared: bool = False) -> Evaluator:
+def evaluator_of(config: Config, give_up_early: bool = False) -> Evaluator:
     """Make the evaluator of a config.
 
-    `give_up_early`: give up motions that settle late. `prepared`: do not prepare it for the motion
-    of the config's design, such as by fitting a contact map.
+    `give_up_early`: give up motions that settle late.
     """
-    evaluator = Evaluator.of(config, survey=give_up_early)
-    evaluator.prepared = evaluator.prepared or prepared
-    return evaluator
+    return Evaluator.of(config, survey=give_up_early)
 
 
 def evaluate(config: Config) -> Evaluation:
@@ -35,18 +32,12 @@ def evaluate(config: Config) -> Evaluation:
     return evaluator_of(config)(series=False)
 
 
-def orbit_at(evaluator: Evaluator, rtol: float) -> Evaluator:
-    """Set the tolerance of the orbit alone; nothing is compiled anew."""
-    evaluator.orbit = dataclasses.replace(evaluator.orbit, rtol=jnp.asarray(rtol))
-    return evaluator
-
-
 def at(evaluator: Evaluator, rtol: float, transient: float | None = None) -> Evaluator:
-    """Set the tolerances of orbit and transient (default: the same); nothing is compiled anew."""
-    coarse = rtol if transient is None else transient
-    orbit_at(evaluator, rtol)
-    evaluator.transient = dataclasses.replace(evaluator.transient, rtol=jnp.asarray(coarse))
-    return evaluator
+    """Return another evaluator, with these tolerances of orbit and transient (default: the same);
+    nothing is compiled anew."""
+    coarse = jnp.asarray(rtol if transient is None else transient)
+    scene = eqx.tree_at(lambda scene: scene.solver.transient.rtol, evaluator.scene, coarse)
+    return dataclasses.replace(evaluator, scene=scene).at_tolerance(rtol)
 
 
 def profile_of(config: Config, design: ArrayLike | None = None) -> Profile:

@@ -14,9 +14,9 @@ import numpy as np
 
 from experiments._common.scenes import CIC, shipped
 from experiments._common.simulation import evaluate
-from rootsopt import auto
 from rootsopt.config import Config, load
 from rootsopt.errors import InputError
+from rootsopt.response.choice import choose, difference
 from rootsopt.status import Status
 
 Row = dict[str, Any]
@@ -61,10 +61,10 @@ def measure(config: Config, overrides: list[str], family: str, wanted: float) ->
     if truth.status is not Status.PERIODIC:
         return row
     began = time.perf_counter()
-    choice = auto.choose(config)
+    choice = choose(config)
     row["seconds_to_choose"] = time.perf_counter() - began
     found = evaluate(choice.config)
-    error = auto.difference(found, truth)
+    error = difference(found, truth)
     return row | {
         "fidelity": choice.config.solver.fidelity,
         "rtol": choice.config.solver.rtol,

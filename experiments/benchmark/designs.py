@@ -48,7 +48,7 @@ def part_reference(job: Job) -> dict[str, Any]:
     choice = ("solver.method=tsit5",) if job.quick else ("solver.method=dopri8",)
     tool = evaluator_of(load(CIC, [*CONTACTS[job.contacts[-1]], *choice]))
     loose = at(tool, 1e-10, 1e-8)(series=False)
-    at(tool, REFERENCE_RTOL, 1e-8)
+    tool = at(tool, REFERENCE_RTOL, 1e-8)
     designs = sample_designs(2 if job.quick else CHECKED)
     found = [tool(design, series=False) for design in designs]
     if not all(one.usable for one in found):
@@ -87,30 +87,30 @@ def part_single(job: Job) -> dict[str, Any]:
     import equinox as eqx
     import jax.numpy as jnp
 
-    from experiments._common.simulation import at
+    from experiments._common.simulation import at, evaluator_of
     from rootsopt.model import integrators
-    from rootsopt.response.batch import respond
+    from rootsopt.response.batch import coarse, respond
 
     truth, slope = job.known["forces"][0], job.known["slopes"][0]
     repeats = 2 if job.quick else 9
     tried, tools, compiling = [], {}, {}
     for contact in job.contacts:
-        tools[contact] = tool = evaluator_of(load(CIC, CONTACTS[contact]))
-        call = functools.partial(tool, series=False)
-        compiling[contact], _, _ = first_and_warm(call, 1)
-        for rtol, coarse in TOLERANCES[1:2] if job.quick else TOLERANCES:
-            at(tool, rtol, coarse)
-            tool(series=False)
-            seconds, found = median_time(call, 3)
+        tool = evaluator_of(load(CIC, CONTACTS[contact]))
+        compiling[contact], _, _ = first_and_warm(functools.partial(tool, series=False), 1)
+        for rtol, transient in TOLERANCES[1:2] if job.quick else TOLERANCES:
+            # Fits the map to the motion.
+            tool, _ = at(tool, rtol, transient).fit(series=False)
+            seconds, found = median_time(functools.partial(tool, series=False), 3)
             off = value_error(forces_of(found.response), truth) if found.usable else math.nan
             by = gradient_error(slopes_of(found.gradient), slope)
-            tried.append([contact, rtol, coarse, seconds, off, by, found.status.label])
+            tried.append([contact, rtol, transient, seconds, off, by, found.status.label])
+        tools[contact] = tool
     good = [one for one in tried if one[4] <= ACCURACY] or tried
     fine = [one for one in good if one[5] <= GRADIENT_ACCURACY] or good
     value_only, choice = (min(x, key=lambda one: one[3])[:3] for x in (good, fine))
 
-    def evaluated(name: str, contact: str, rtol: float, coarse: float) -> Row:
-        tool = at(tools[contact], rtol, coarse)
+    def evaluated(name: str, contact: str, rtol: float, transient: float) -> Row:
+        tool = at(tools[contact], rtol, transient)
         seconds, found = median_time(lambda: tool(series=False), repeats)
         return row(
             f"rootsopt, {name}",
@@ -119,7 +119,7 @@ def part_single(job: Job) -> dict[str, Any]:
             compile_s=compiling[contact],
             value_error=value_error(forces_of(found.response), truth),
             gradient_error=gradient_error(slopes_of(found.gradient), slope),
-            settings=f"{contact}, rtol {rtol:g}, transient {coarse:g}",
+            settings=f"{contact}, rtol {rtol:g}, transient {transient:g}",
             note="Evaluator: checks settlement, closes the orbit, reports stability",
         )
 
@@ -130,13 +130,14 @@ def part_single(job: Job) -> dict[str, Any]:
     design, state = jnp.asarray(BASELINE), jnp.zeros(2)
     compiled = eqx.filter_jit(respond)
     for gradient in () if job.quick else (False, True):
-        contact, rtol, coarse = choice if gradient else value_only
+        contact, rtol, transient = choice if gradient else value_only
         tool = tools[contact]
-        how = [
+        settling, closing = (
             dataclasses.replace(one, rtol=jnp.asarray(value))
-            for one, value in zip(integrators(tool.config), (coarse, rtol), strict=True)
-        ]
-        call = functools.partial(compiled, tool.model, design, state, *how, gradient=gradient)
+            for one, value in zip(integrators(tool.config), (transient, rtol), strict=True)
+        )
+        solver = coarse(tool.scene, settling, closing)
+        call = functools.partial(compiled, tool.scene, design, state, solver, gradient=gradient)
         extra, seconds, out = first_and_warm(lambda call=call: ready(call()), repeats)
         off = gradient_error(out.gradient[:2], slope) if gradient else None
         rows.append(
@@ -147,12 +148,12 @@ def part_single(job: Job) -> dict[str, Any]:
                 compile_s=extra,
                 value_error=value_error(np.asarray(out.response)[[0, 1]], truth),
                 gradient_error=off,
-                settings=f"{contact}, rtol {rtol:g}, transient {coarse:g}",
+                settings=f"{contact}, rtol {rtol:g}, transient {transient:g}",
                 note="batch.respond: settlement checked, orbit closed, no second attempts",
             )
         )
     # A little deeper, for designs that dip deeper than the baseline.
-    deepest = {name: 1.1 * float(tool.model.deepest) for name, tool in tools.items()}
+    deepest = {name: 1.1 * float(tool.scene.deepest) for name, tool in tools.items()}
     return {"rows": rows, "tried": tried, "choice": choice, "deepest": deepest}
 
 
@@ -171,21 +172,22 @@ class _Batch:
         )
         self.tried: list[list[Any]] = []
 
-    def run(self, contact: str, rtol: float, coarse: float, gradient: bool) -> Any:
+    def run(self, contact: str, rtol: float, transient_rtol: float, gradient: bool) -> Any:
         """Simulate all designs with one setting."""
         import jax.numpy as jnp
 
         from rootsopt.model import Scene, integrators
-        from rootsopt.response.batch import respond_many
+        from rootsopt.response.batch import coarse, respond_many
 
         config = load(CIC, CONTACTS[contact])
         transient, orbit = integrators(config)
         how = (
-            dataclasses.replace(transient, rtol=jnp.asarray(coarse)),
+            dataclasses.replace(transient, rtol=jnp.asarray(transient_rtol)),
             dataclasses.replace(orbit, rtol=jnp.asarray(rtol)),
         )
-        model = Scene.from_config(config, self.job.known["deepest"][contact])
-        return ready(respond_many(model, self.designs, self.states, *how, gradient=gradient))
+        scene = Scene.from_config(config, self.job.known["deepest"][contact])
+        solver = coarse(scene, *how)
+        return ready(respond_many(scene, self.designs, self.states, solver, gradient))
 
     def errors(self, out: Any) -> tuple[int, float, list[float]]:
         """Count usable designs, and compare the checked ones with the truth.

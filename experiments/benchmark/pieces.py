@@ -90,9 +90,9 @@ def part_orbit(job: Job) -> dict[str, Any]:
         forgets = f"multiplier {truth.steady_state['floquet_multiplier']:.2g}"
         tried: list[Row] = []
         for rtol in ORBIT_TOLERANCES:
-            at(tool, rtol, rtol)
-            neighbour = tool(design * 1.002, series=False).state
-            evaluate = functools.partial(tool, design, neighbour, series=False)
+            here = at(tool, rtol, rtol)
+            neighbour = here(design * 1.002, series=False).state
+            evaluate = functools.partial(here, design, neighbour, series=False)
             seconds, found = median_time(evaluate, repeats)
             off = value_error(forces_of(found.response), forces)
             by = gradient_error(slopes_of(found.gradient), slopes)
@@ -102,9 +102,9 @@ def part_orbit(job: Job) -> dict[str, Any]:
         rows.append(min(best or tried[-1:], key=lambda one: one["run_s"]))
         tried = []
         for rtol in ORBIT_TOLERANCES:
-            how = dataclasses.replace(tool.orbit, rtol=jnp.asarray(rtol))
+            how = dataclasses.replace(tool.scene.solver.orbit, rtol=jnp.asarray(rtol))
             for settle in ORBIT_SETTLES[: 4 if job.quick else None]:
-                call = functools.partial(averaged, tool.model, design, jnp.asarray(settle), how)
+                call = functools.partial(averaged, tool.scene, design, jnp.asarray(settle), how)
                 found = ready(call())
                 off = value_error(found[0], forces)
                 if off <= wanted or settle == ORBIT_SETTLES[-1]:

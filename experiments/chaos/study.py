@@ -25,6 +25,7 @@ from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Optimization, Search
 from rootsopt.programs import Program
 from rootsopt.response.ensemble import ERRORS, EnsembleEvaluator
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.members import run_members
 
 SCENE = (
@@ -86,10 +87,8 @@ SIZES = {
 def resized(config: Config, model: Scene, **changes) -> EnsembleEvaluator:
     """Make an evaluator without gradients for an ensemble of another size."""
     ensemble = config.ensemble.model_copy(update=changes)
-    evaluator = EnsembleEvaluator(config.model_copy(update={"ensemble": ensemble}), survey=True)
-    evaluator.model, evaluator.fitted, evaluator.prepared = model, True, True
-    evaluator.differentiate = False
-    return evaluator
+    single = Evaluator(config.model_copy(update={"ensemble": ensemble}), model, fitted=True)
+    return EnsembleEvaluator(single.surveying(), differentiate=False)
 
 
 def line(config: Config, model: Scene, designs: np.ndarray, size: Size) -> list[dict]:
@@ -100,7 +99,7 @@ def line(config: Config, model: Scene, designs: np.ndarray, size: Size) -> list[
     rows = []
     for share, design in zip(np.linspace(0, 1, len(designs)), designs, strict=True):
         evaluation = evaluator(jnp.asarray(design), series=False)
-        pair = _pair(evaluator.model, jnp.asarray(design))
+        pair = _pair(evaluator.scene, jnp.asarray(design))
         (single,) = run_members([pair], rest, settle, size.window, evaluator.how)
         row = {"share": share, **evaluation.design, "single_mean_force_N": single.means[0, 0]}
         for name in ("mean_force_N", "peak_force_N"):
@@ -136,7 +135,7 @@ def _pathwise(model: Scene, design, periods, how):
 def pathwise(evaluator: EnsembleEvaluator, design, size: Size) -> list[dict]:
     """Measure how the single motion's derivative grows with the window."""
     slopes = np.asarray(
-        _pathwise(evaluator.model, jnp.asarray(design), size.pathwise, evaluator.how)
+        _pathwise(evaluator.scene, jnp.asarray(design), size.pathwise, evaluator.how)
     )
     return [
         {"window_mesh_periods": n, "mean_force_by_pressure_angle_N_per_deg": slope}
@@ -152,7 +151,7 @@ def errors_by_members(config: Config, model: Scene, design, size: Size) -> list[
     evaluator = resized(config, model, members=size.large)
     design = jnp.asarray(design)
     start = evaluator(design, series=False)
-    pair = _pair(evaluator.model, design)
+    pair = _pair(evaluator.scene, design)
     (large,) = run_members([pair], start.state, 0, config.ensemble.periods, evaluator.how)  # pyright: ignore[reportArgumentType]
     means = np.asarray(large.means)[:, 0]
     rows = []
@@ -178,7 +177,7 @@ def gradients(config: Config, model: Scene, design, size: Size) -> list[dict]:
     rows = []
     for designs, members in size.slopes:
         evaluator = resized(config, model, members=members, designs=designs)
-        evaluator.differentiate = True
+        evaluator = dataclasses.replace(evaluator, differentiate=True)
         found = evaluator(jnp.asarray(design), series=False)
         errors = found.steady_state["gradient_standard_error"]
         row, column = "mean_force_N", "pressure_angle_deg"
@@ -266,7 +265,7 @@ def run(quick: bool, say: Callable[[str], None] = lambda text: None) -> Results:
     problem = result.problem
     if problem is None or not result.baseline.usable:
         raise NoResultError(f"baseline {result.baseline.status.label}")
-    model = search.exact.model
+    model = search.exact.scene
     designs = designs_between(problem, result, size.line)
     evaluator = resized(config, model)
     return Results(

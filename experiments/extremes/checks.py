@@ -18,11 +18,13 @@ from experiments.extremes.scenes import Kind
 from rootsopt.config import Config
 from rootsopt.contact.impact import force_rounding
 from rootsopt.dynamics.flow import Integrator, flow, strobe
-from rootsopt.dynamics.steady import close_orbit, no_tangents
+from rootsopt.dynamics.orbit import Shots, close_orbit
+from rootsopt.dynamics.window import no_tangents
 from rootsopt.model import Scene, design_vector
 from rootsopt.programs import Program
-from rootsopt.response.batch import STATUSES, respond
+from rootsopt.response.batch import coarse, respond
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.status import Status
 
 HORIZON = 24
 """Longest transient (mesh periods) of most scenes."""
@@ -150,7 +152,8 @@ def equation(cases: list[Case], seed: int) -> dict[str, Any]:
 def _simulate(model: Scene, design, tolerances, method: str):
     pair = model.pair(design)
     transient, orbit = (Integrator(method, tolerances[k], STEPS) for k in range(2))
-    out = respond(model, design, jnp.zeros(pair.states), transient, orbit, HORIZON)
+    solver = coarse(model, transient, orbit, HORIZON)
+    out = respond(model, design, jnp.zeros(pair.states), solver)
     assert pair.pace is not None
     swings = pair.mesh_period / (2 * jnp.pi * pair.pace.swing)
     # Share of the static penetration that is lost in rounding.
@@ -176,7 +179,7 @@ def simulate(case: Case) -> None:
     began = time.perf_counter()
     found = _simulate(*arguments)
     out, swings, rounding, force = jax.device_get(found)
-    status = STATUSES[int(out.status)]
+    status = Status.of(int(out.status))
     numbers = np.concatenate([np.ravel(out.response), np.ravel(out.gradient)])
     mean, peak, rms = map(float, out.response)
     case.state = np.asarray(out.state, np.float64)
@@ -205,7 +208,7 @@ def _sharp(model: Scene, design, state, period):
     method, rtol, steps = SHARP
     pair = model.pair(design)
     how = Integrator(method, jnp.asarray(rtol), steps)
-    orbit = close_orbit(pair, no_tangents(pair), state, period, how)
+    orbit = close_orbit(pair, no_tangents(pair), state, period, Shots(how))
     return orbit._replace(flow=orbit.flow._replace(grid=jnp.zeros(0)))
 
 

@@ -24,7 +24,7 @@ def body(run: Run) -> int:
     if options.show:
         data = json.loads(options.show.read_text())
     else:
-        families = options.families.split(",") if options.families else study.CLASSICAL
+        families = options.families.split(",") if options.families else None
         configs = options.configs or study.REFERENCES
         data = study.run(run.quick, configs, families, options.jobs, run.say)
         run.json("families.json", data)

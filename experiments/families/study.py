@@ -26,7 +26,7 @@ from experiments._common.scenes import FORCES
 from experiments._common.simulation import evaluate, objective, profile_of
 from experiments.families.reach import Reach, changed, in_housing, of_family, problem_of, reach
 from rootsopt.config import Config, load, parse
-from rootsopt.families import CLASSICAL, MM, free_form_of, with_design
+from rootsopt.families import MM, classical, free_form_of, with_design
 from rootsopt.model import check_geometry, design_vector, outline_mm
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import Profile
@@ -220,16 +220,17 @@ def free_form(path: str, best: dict[str, Any], quick: bool) -> dict[str, Any]:
 def run(
     quick: bool,
     paths: Sequence[str] = REFERENCES,
-    families: Sequence[str] = CLASSICAL,
+    families: Sequence[str] | None = None,
     jobs: int = 2,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
     """Study all families in all housings, `jobs` at a time in processes of their own.
 
-    Returns the records of the references, and a row for each design; the free forms come last. A
-    reduced run takes the last housing and the families `QUICK`.
+    `families`: by default the classical ones. Returns the records of the references, and a row for
+    each design; the free forms come last. A reduced run takes the last housing and the families
+    `QUICK`.
     """
-    paths, families = (paths[-1:], QUICK) if quick else (paths, families)
+    paths, families = (paths[-1:], QUICK) if quick else (paths, families or classical())
     references = {Path(path).stem: reference_of(path, quick)[1].record() for path in paths}
     tasks = list(itertools.product(paths, families))
     context = multiprocessing.get_context("spawn")

@@ -18,10 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments._common.scenes import CIC, FORCES
-from experiments._common.simulation import evaluator_of, orbit_at
+from experiments._common.simulation import evaluator_of
 from rootsopt.config import Config, load
 from rootsopt.dynamics.flow import Integrator
-from rootsopt.dynamics.steady import agreement, close_orbit, no_tangents
+from rootsopt.dynamics.orbit import Shots, agreement, close_orbit
+from rootsopt.dynamics.window import no_tangents
 from rootsopt.model import Scene
 from rootsopt.response.evaluation import Evaluation, Evaluator
 
@@ -101,7 +102,7 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
 def forces(model: Scene, design, state, period, how: Integrator):
     """Close an orbit; return (mean, peak) force, the residual and whether it was integrated."""
     pair = model.pair(design)
-    orbit = close_orbit(pair, no_tangents(pair), state, period, how, check=False)
+    orbit = close_orbit(pair, no_tangents(pair), state, period, Shots(how, check=False))
     return jnp.stack([orbit.response[0], orbit.response[2]]), orbit.residual, orbit.flow.solved
 
 
@@ -110,7 +111,7 @@ def differences(evaluator: Evaluator, found: Evaluation, step: float = STEP) -> 
 
     Returns (2, d), NaN where an orbit does not close.
     """
-    how = Integrator("dopri8", jnp.asarray(1e-12), evaluator.orbit.max_steps)
+    how = Integrator("dopri8", jnp.asarray(1e-12), evaluator.scene.solver.orbit.max_steps)
     design = np.array(list(found.design.values()))
     period = jnp.asarray(found.steady_state["period"])
     columns = []
@@ -121,7 +122,7 @@ def differences(evaluator: Evaluator, found: Evaluation, step: float = STEP) -> 
             moved[k] += sign * step * value
             state = jnp.asarray(found.state)
             force, residual, solved = forces(
-                evaluator.model, jnp.asarray(moved), state, period, how
+                evaluator.scene, jnp.asarray(moved), state, period, how
             )
             closed = bool(solved) and float(residual) < 1e-10
             sides.append(np.asarray(force) if closed else np.full(2, np.nan))
@@ -131,9 +132,9 @@ def differences(evaluator: Evaluator, found: Evaluation, step: float = STEP) -> 
 
 def evaluated(config: Config) -> Iterator[tuple[float, Evaluation]]:
     """Evaluate the design at every tolerance, each from rest, the loosest first."""
-    evaluator = evaluator_of(config, give_up_early=True, prepared=True)
+    evaluator = evaluator_of(config, give_up_early=True)
     for rtol in TOLERANCES:
-        yield rtol, orbit_at(evaluator, rtol)(series=False)
+        yield rtol, evaluator.at_tolerance(rtol)(series=False)
 
 
 def errors(found: Evaluation, truth: np.ndarray) -> list[float]:

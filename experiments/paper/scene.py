@@ -21,8 +21,8 @@ from experiments._common.scenes import FORCES, shipped
 from experiments._common.simulation import evaluator_of
 from rootsopt.config import Config
 from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.orbit import Shots, close_orbit
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import close_orbit
 from rootsopt.model import MM, Scene, design_vector
 from rootsopt.programs import Program
 from rootsopt.response.evaluation import Evaluation, Evaluator
@@ -153,12 +153,12 @@ class Pairs:
 def _slopes(evaluator: Evaluator, one: Evaluation, values) -> NDArray[np.float64]:
     """Differentiate log mean and log peak force with respect to the log quantities, (2, p)."""
     orbit = _orbit(
-        evaluator.model,
+        evaluator.scene,
         design_vector(evaluator.config),
         jnp.asarray(values),
         jnp.asarray(one.state),
         jnp.asarray(one.steady_state["period"]),
-        evaluator.orbit,
+        evaluator.scene.solver.orbit,
     )
     mean, _, peak = np.asarray(orbit.response)
     by_mean, _, by_peak = np.asarray(orbit.sensitivity)
@@ -190,7 +190,7 @@ def _orbit(model: Scene, design, values: Float[Array, " p"], state, period, how:
 
     push = functools.partial(jax.jvp, arrays, (values,))
     tangents = jax.vmap(lambda direction: push((direction,))[1])(jnp.eye(values.shape[0]))
-    return close_orbit(pair_of(model, design, values), tangents, state, period, how)
+    return close_orbit(pair_of(model, design, values), tangents, state, period, Shots(how))
 
 
 def polished(

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -29,9 +30,11 @@ from experiments.paper.scene import (
     polished,
     values_of,
 )
-from rootsopt import basins
+from rootsopt.dynamics.window import PERIODS
 from rootsopt.model import design_vector
-from rootsopt.response.evaluation import CHAOS_WINDOW, lyapunov_program, unsettled
+from rootsopt.response import attractors
+from rootsopt.response.evaluation import lyapunov_program, unsettled, unsettled_status
+from rootsopt.status import Status
 
 WINDOWS = ((0.0, 0.1), (0.0, 0.2), (0.05, 0.2), (0.1, 0.2), (0.1, 0.8))
 """Start and end (s) of the windows that mean and maximum may have been taken over."""
@@ -85,7 +88,7 @@ def motions(values: ArrayLike) -> list[Row]:
     """Find the motions that coexist with these values; a row for each."""
     rows = []
     for family in FAMILIES:
-        found = basins.find(evaluator_of(config_of(family, values, *GRID)))
+        found = attractors.find(evaluator_of(config_of(family, values, *GRID)))
         rows += [{"pair": family} | row for row in found.summary()]
         rows += [{"pair": family, "status": k, "share": v} for k, v in found.lost.items()]
     return rows
@@ -100,8 +103,10 @@ def definitions(values: ArrayLike) -> list[Row]:
     for family in FAMILIES:
         evaluator = evaluator_of(config_of(family, values))
         pair = evaluator.pair(design_vector(evaluator.config))
-        window = lyapunov_program(pair, np.zeros(2), CHAOS_WINDOW, evaluator.transient)
-        *_, series = unsettled(pair, window, True)
+        how = evaluator.scene.solver.transient
+        window = jax.device_get(lyapunov_program(pair, np.zeros(2), PERIODS, how))
+        status = Status.of(int(unsettled_status(pair, window)))
+        *_, series = unsettled(pair, status, window, series=True)
         assert series is not None
         runs.append(series)
     rows = []

@@ -79,7 +79,7 @@ def evaluation(config: Config, repeats: int) -> dict[str, float | str]:
     """Time the first evaluation (s) and later ones (ms), value and gradient."""
     evaluator = evaluator_of(config)
     began = time.perf_counter()
-    found = evaluator(series=False)
+    evaluator, found = evaluator.fit(series=False)
     first = time.perf_counter() - began
     times = times_of(lambda: evaluator(series=False), repeats)
     return {

@@ -27,7 +27,8 @@ from rootsopt.dynamics.flow import Integrator
 from rootsopt.errors import InputError
 from rootsopt.model import MM, Scene, check_geometry, design_vector
 from rootsopt.programs import Program
-from rootsopt.response.batch import STATUSES, Batch, on_all_cores, respond
+from rootsopt.response.batch import Batch, coarse, on_all_cores, respond
+from rootsopt.status import Status
 
 Say = Callable[[str], None]
 DEFAULT = 0.0
@@ -110,7 +111,8 @@ def _respond(models: Scene, designs, states, tolerances, periods, gradient: bool
     def one(at):
         model, design, state = at
         transient, orbit = (Integrator("tsit5", tolerances[k], 4096) for k in range(2))
-        return respond(model, design, state, transient, orbit, periods, gradient=gradient)
+        solver = dataclasses.replace(coarse(model, transient, orbit), max_periods=periods)
+        return respond(model, design, state, solver, gradient)
 
     return jax.lax.map(one, (models, designs, states))
 
@@ -124,7 +126,7 @@ def responses(
     def work(designs, states, *leaves):
         models = jax.tree.unflatten(structure, leaves)
         return _respond(
-            models, designs, states, jnp.asarray(tolerances), jnp.asarray(periods), slopes
+            models, designs, states, jnp.asarray(tolerances), jnp.asarray(float(periods)), slopes
         )
 
     return jax.tree.map(np.asarray, on_all_cores(work, designs, states, *leaves))
@@ -249,7 +251,7 @@ def rows_of(measured: Measured) -> list[dict[str, Any]]:
                     "gear_damping_ratio": gear.damping_ratio,
                     "backlash_mm": gear.backlash_mm,
                     "smoothing_mm": width,
-                    "status": STATUSES[orbit.status[k]].label,
+                    "status": Status.of(int(orbit.status[k])).label,
                     "period": orbit.period[k],
                     "mean_force_N": mean,
                     "peak_force_N": peak,

@@ -206,9 +206,9 @@ def measure(curve: Curve, truth: Evaluation, repeats: int) -> list[dict[str, Any
     rows = []
     tool = curve.evaluator()
     for rtol in curve.tolerances:
-        run = at(tool, rtol, curve.transient)
-        call = functools.partial(run, series=False)
-        found = call()  # fits the map to the motion
+        # Fits the map to the motion.
+        tool, found = at(tool, rtol, curve.transient).fit(series=False)
+        call = functools.partial(tool, series=False)
         seconds, found = median_time(call, repeats if found.usable else 1, PATIENCE)
         status = verdict(found, truth)
         off = errors(found, truth) if status == "periodic" else dict.fromkeys(FORCES, math.nan)

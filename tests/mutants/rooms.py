@@ -4,12 +4,8 @@ from pathlib import Path
 
 _OF = {
     "arclength": "closed_forms continuation",
-    "batch": "closed_forms accuracy",
     "continuation": "continuation",
-    "ensemble": "closed_forms ensemble",
-    "members": "closed_forms ensemble",
     "orbits": "closed_forms continuation",
-    "speeds": "closed_forms speeds",
     "contact/closest": "closed_forms contact accuracy conjugacy families gradients",
     "contact/gap": "conformance",
     "contact/impact": "impact contact extremes",
@@ -22,15 +18,20 @@ _OF = {
     "contact/segments": "fidelities",
     "contact/size": "closed_forms accuracy",
     "dynamics/flow": "closed_forms dynamics steady measures gradients scene extremes",
+    "dynamics/landing": "landing",
+    "dynamics/linear": "steady measures",
     "dynamics/measures": "measures extremes",
+    "dynamics/orbit": "closed_forms measures steady gradients extremes",
     "dynamics/pace": "extremes dynamics",
     "dynamics/pair": "closed_forms drive dynamics scene steady",
     "dynamics/peak": "closed_forms extremes steady gradients",
     "dynamics/saltation": "gradients steady",
+    "dynamics/settle": "dynamics steady gradients",
     "dynamics/steady": "closed_forms measures steady gradients extremes",
     "dynamics/switches": "closed_forms steady gradients continuation",
     "dynamics/tangent": "closed_forms steady gradients measures",
     "dynamics/verdict": "closed_forms extremes steady accuracy",
+    "dynamics/window": "closed_forms idle steady",
     "dynamics/parts/base": "conformance extending_parts",
     "dynamics/parts/drive": "drive scene",
     "dynamics/parts/friction": "friction scene",
@@ -58,6 +59,11 @@ _OF = {
     "profiles/outline": "outline",
     "profiles/trochoid": "families conjugacy",
     "profiles/validity": "families",
+    "response/batch": "closed_forms accuracy",
+    "response/ensemble": "closed_forms ensemble",
+    "response/members": "closed_forms ensemble",
+    "response/speeds": "closed_forms speeds",
+    "response/steady": "steady gradients",
 }
 """Modules, and the words in `tests/test_WORD.py`."""
 
@@ -78,9 +84,10 @@ def modules(root: Path) -> list[str]:
 
 def _numerical(root: Path):
     package = root / "rootsopt"
-    names = "arclength", "batch", "continuation", "ensemble", "members", "orbits", "speeds"
-    for name in names:
+    for name in ("arclength", "continuation", "orbits", "config/families"):
         yield package / f"{name}.py"
+    for name in ("batch", "ensemble", "members", "speeds", "steady"):
+        yield package / "response" / f"{name}.py"
     for folder in ("contact", "dynamics", "optimize", "profiles"):
         for path in (package / folder).rglob("*.py"):
             if path.name not in ("__init__.py", "__main__.py"):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from rootsopt.dynamics.flow import Integrator, flow
-from rootsopt.dynamics.steady import SAMPLES
+from rootsopt.dynamics.orbit import SAMPLES
 from rootsopt.model import Scene
 
 _FEW = 64
