@@ -315,7 +315,7 @@ def window_status(pair: RotorPair, window: Window) -> Int[Array, ""]:
         (~finite, Status.NON_FINITE),
         (~window.solved, Status.SOLVER_FAILED),
         (jnp.max(window.response[:, 2]) <= least, Status.IDLE),
-        (window.exponent > 3 * window.error, Status.CHAOTIC),
+        (jnp.asarray(window.exponent > 3 * window.error), Status.CHAOTIC),
         default=Status.NOT_SETTLED.code,
     )
 
