@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rootsopt import auto
 from rootsopt.config import load
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.map import MapContact
@@ -20,7 +19,8 @@ from rootsopt.contact.size import RELATIVES, ROLLS, size_map
 from rootsopt.errors import InputError
 from rootsopt.model import Scene, design_vector
 from rootsopt.profiles import CIC, EE
-from rootsopt.response.batch import STATUSES, respond_many
+from rootsopt.response import choice
+from rootsopt.response.batch import coarse, respond_many
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
 
@@ -223,7 +223,7 @@ def test_single_precision(default):
     overrides = ["solver.precision=float32", "solver.fidelity=map"]
     evaluator = Evaluator.of(load("configs/cic.yaml", overrides))
     single, double = evaluator(series=False), default[1]
-    pair = evaluator.model.pair(design_vector(evaluator.config))
+    pair = evaluator.scene.pair(design_vector(evaluator.config))
     leaves = jax.tree.leaves(eqx.filter(pair, eqx.is_inexact_array))
     assert {leaf.dtype for leaf in leaves} == {np.dtype("float32")}
     assert single.status is Status.PERIODIC
@@ -242,23 +242,23 @@ def test_batch_is_the_designs_one_by_one(default):
     time to settle here) is marked, and spoils no other."""
     evaluator, _ = default
     designs = DESIGNS
-    batch = respond_many(
-        evaluator.model, designs, jnp.zeros((3, 2)), evaluator.transient, evaluator.orbit
-    )
-    assert [STATUSES[i] for i in batch.status] == [Status.PERIODIC] * 3
+    given = evaluator.scene.solver
+    solver = coarse(evaluator.scene, given.transient, given.orbit)
+    batch = respond_many(evaluator.scene, designs, jnp.zeros((3, 2)), solver)
+    assert [Status.of(code) for code in batch.status] == [Status.PERIODIC] * 3
     for row, design in enumerate(designs):
         single = evaluator(design, series=False)
         np.testing.assert_allclose(batch.response[row], list(single.response.values()), rtol=1e-5)
         for line, values in zip(batch.gradient[row], single.gradient.values(), strict=True):
             expected = np.array(list(values.values()))
             np.testing.assert_allclose(line, expected, atol=0.01 * np.max(np.abs(expected)))
-    lost = dataclasses.replace(evaluator.model, load_torque=jnp.asarray(3000.0))
-    failed = respond_many(lost, designs, jnp.zeros((3, 2)), evaluator.transient, evaluator.orbit)
+    lost = dataclasses.replace(evaluator.scene, load_torque=jnp.asarray(3000.0))
+    failed = respond_many(lost, designs, jnp.zeros((3, 2)), solver)
     assert not np.any(failed.usable)
     assert np.all(np.isnan(failed.response))
-    apart = dataclasses.replace(evaluator.model, clearance=jnp.asarray(3e-4))
-    idle = respond_many(apart, designs, jnp.zeros((3, 2)), evaluator.transient, evaluator.orbit)
-    assert [STATUSES[i] for i in idle.status] == [Status.IDLE] * 3
+    apart = dataclasses.replace(evaluator.scene, clearance=jnp.asarray(3e-4))
+    idle = respond_many(apart, designs, jnp.zeros((3, 2)), solver)
+    assert [Status.of(code) for code in idle.status] == [Status.IDLE] * 3
 
 
 @pytest.mark.long
@@ -266,18 +266,16 @@ def test_batch_at_a_coarse_tolerance(default):
     """Kinks are looked for again where the orbit has moved away from the first look: else gradients
     would be some 1e-2 off at this tolerance."""
     evaluator, _ = default
-    coarse, fine = (
-        respond_many(
-            evaluator.model,
-            DESIGNS,
-            jnp.zeros((3, 2)),
-            *(dataclasses.replace(evaluator.orbit, rtol=jnp.asarray(x)) for x in rtols),
-        )
-        for rtols in ((1e-5, 1e-6), (1e-7, 1e-10))
-    )
-    np.testing.assert_allclose(coarse.response, fine.response, rtol=1e-6)
+    scene = evaluator.scene
+
+    def batch(*rtols):
+        both = (dataclasses.replace(scene.solver.orbit, rtol=jnp.asarray(x)) for x in rtols)
+        return respond_many(scene, DESIGNS, jnp.zeros((3, 2)), coarse(scene, *both))
+
+    loose, fine = batch(1e-5, 1e-6), batch(1e-7, 1e-10)
+    np.testing.assert_allclose(loose.response, fine.response, rtol=1e-6)
     largest = np.max(np.abs(fine.gradient), axis=2, keepdims=True)
-    assert np.max(np.abs(coarse.gradient - fine.gradient) / largest) < 1e-3
+    assert np.max(np.abs(loose.gradient - fine.gradient) / largest) < 1e-3
 
 
 # The choice
@@ -288,14 +286,14 @@ def test_auto_meets_the_request(wanted):
     """The chosen settings agree with search at 1e-10 within the request."""
     overrides = [f"solver.accuracy={wanted}", "solver.fidelity=auto"]
     config = load("configs/cic.yaml", overrides)
-    choice = auto.choose(config)
-    record = choice.record()
+    chosen = choice.choose(config)
+    record = chosen.record()
     assert record["fidelity"] in ("linear", "map", "search")
     assert record["estimated_error"] <= wanted
-    found = Evaluator.of(choice.config)(series=False)
+    found = Evaluator.of(chosen.config)(series=False)
     sharp = ["solver.fidelity=search", "solver.method=dopri8", "solver.rtol=1e-10"]
     truth = Evaluator.of(load("configs/cic.yaml", sharp))(series=False)
-    error = auto.difference(found, truth)
+    error = choice.difference(found, truth)
     assert error is not None
     assert error <= wanted
     assert error <= 2 * record["estimated_error"] + 1e-7
@@ -304,7 +302,7 @@ def test_auto_meets_the_request(wanted):
 def test_auto_must_be_resolved_before_use():
     """A pair of a config with `auto` says what to call."""
     config = load("configs/cic.yaml", ["solver.fidelity=auto"])
-    with pytest.raises(InputError, match=r"auto\.choose"):
+    with pytest.raises(InputError, match=r"choice\.choose"):
         Scene.from_config(config).pair(design_vector(config))
 
 
@@ -318,13 +316,17 @@ def test_auto_looks_more_closely_at_what_does_not_settle(monkeypatch, settles):
     class Stub:
         config: object
 
+        @classmethod
+        def of(cls, config):
+            return cls(config)
+
         def __call__(self, series):
             asked.append(self.config.solver.rtol)
             fine = settles and asked[-1] < 1e-8
             found = outcome if fine else dataclasses.replace(outcome, status=Status.NOT_SETTLED)
             return dataclasses.replace(found, statistics={"transient_mesh_periods": 4})
 
-    outcome = auto.Evaluation(
+    outcome = choice.Evaluation(
         design={},
         geometry={},
         response={"mean_force_N": 1.0, "peak_force_N": 2.0},
@@ -335,9 +337,11 @@ def test_auto_looks_more_closely_at_what_does_not_settle(monkeypatch, settles):
         statistics={},
         series=None,
     )
-    monkeypatch.setattr(auto, "Evaluator", Stub)
-    choice = auto.choose(load("configs/cic.yaml", ["solver.fidelity=auto", "solver.accuracy=1e-3"]))
+    monkeypatch.setattr(choice, "Evaluator", Stub)
+    chosen = choice.choose(
+        load("configs/cic.yaml", ["solver.fidelity=auto", "solver.accuracy=1e-3"])
+    )
     assert asked[:2] == pytest.approx([1e-7, 1e-9])
-    assert choice.config.solver.rtol == pytest.approx(1e-9)
-    assert choice.config.solver.fidelity == "search"
-    assert (choice.error is None) == (not settles)
+    assert chosen.config.solver.rtol == pytest.approx(1e-9)
+    assert chosen.config.solver.fidelity == "search"
+    assert (chosen.error is None) == (not settles)

@@ -105,11 +105,10 @@ def test_worst_and_weighted(coexisting):
     shares = np.array([one.share for one in basins.attractors])
     responses = [one.evaluation.response for one in basins.attractors]
     settings = *COEXIST, "objective.mean_weight=0", "objective.peak_weight=1"
-    worst = AttractorEvaluator(config_of(*settings, "objective.motion=worst"))()
+    worst = AttractorEvaluator(Evaluator.of(config_of(*settings, "objective.motion=worst")))()
     assert worst.response["peak_force_N"] == max(r["peak_force_N"] for r in responses)
-    mean = AttractorEvaluator(
-        config_of(*settings, "objective.mean_weight=1", "objective.motion=weighted")
-    )()
+    weighted = config_of(*settings, "objective.mean_weight=1", "objective.motion=weighted")
+    mean = AttractorEvaluator(Evaluator.of(weighted))()
     for name in FORCES:
         expected = shares @ [r[name] for r in responses]
         assert mean.response[name] == pytest.approx(expected, rel=1e-9)
@@ -126,9 +125,11 @@ def test_the_reference_decides_which_is_worst(coexisting):
     greatest peak."""
     _, basins = coexisting
     responses = [one.evaluation.response for one in basins.attractors]
-    evaluator = AttractorEvaluator(config_of(*COEXIST, "objective.motion=worst"))
-    evaluator.reference = {"mean_force_N": 1e-3, "peak_force_N": 1e6}
-    found = evaluator(series=False)
+    base = dataclasses.replace(
+        basins.rest, response={"mean_force_N": 1e-3, "peak_force_N": 1e6, "rms_force_N": 1.0}
+    )
+    single = Evaluator.of(config_of(*COEXIST, "objective.motion=worst"))
+    found = AttractorEvaluator(single).relative_to(base)(series=False)
     assert found.response["mean_force_N"] == max(r["mean_force_N"] for r in responses)
     assert found.response["peak_force_N"] < max(r["peak_force_N"] for r in responses)
 
@@ -187,7 +188,7 @@ def test_a_cycle_is_that_of_the_pair_last_evaluated(coexisting, monkeypatch):
         return np.tile(state, (8, 1))
 
     monkeypatch.setattr("rootsopt.response.attractors._cycle", cycle)
-    sorter = _Sorter(Refitting(evaluator.config), jnp.array([36.43, 9.0, 4.0]), False)
+    sorter = _Sorter(Refitting.of(evaluator.config), jnp.array([36.43, 9.0, 4.0]), False)
     for one in found.attractors:
         sorter.add(one.evaluation, one.cycle[0])
     assert used == built

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt import ensemble, evaluate, files, members, orbits, speeds
+from rootsopt import files, orbits
 from rootsopt.arclength import Steps
 from rootsopt.config import load
 from rootsopt.config.families import Parameter, parameters
@@ -24,9 +24,10 @@ from rootsopt.contact.nodes import signed_distance
 from rootsopt.contact.search import SearchContact
 from rootsopt.contact.size import MapSize, _smallest
 from rootsopt.design.space import sobol
-from rootsopt.dynamics import peak, steady
+from rootsopt.dynamics import peak, window
 from rootsopt.dynamics.flow import Flow, Integrator
 from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.orbit import Shots, close_orbit
 from rootsopt.dynamics.pair import FlankForce, RotorPair
 from rootsopt.dynamics.parts import ConstantLoad, MotorDrive, PrescribedDrive, TimingGear
 from rootsopt.dynamics.verdict import TOO_DEEP
@@ -35,10 +36,11 @@ from rootsopt.optimize import noise
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, Trial, _history
 from rootsopt.profiles import CIC
+from rootsopt.response import ensemble, evaluation, members, speeds
 from rootsopt.response.batch import on_all_cores
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.response.members import Members
-from rootsopt.response.speeds import Part, SpeedsEvaluator, at_speed
+from rootsopt.response.speeds import Part, SpeedsEvaluator
 from rootsopt.status import Status
 
 LOBES, SPEED, INERTIA, STIFFNESS, DAMPING, LOAD = 3, 300.0, 2e-3, 2e3, 1.5, 0.4
@@ -246,17 +248,19 @@ def test_lyapunov_exponent_and_its_standard_error(monkeypatch):
     periods = 4096
     growth = 0.3 + 0.5 * np.random.default_rng(3).normal(size=periods)
 
-    def flow(pair, state, *rest):
-        return told_flow(pair, state, np.ones(periods), growth)
+    def flow(pair, state, one, how, samples, still, measures):
+        out = told_flow(pair, state, np.ones(periods), growth)
+        return out._replace(states=jnp.tile(state, (samples, 1)))
 
-    monkeypatch.setattr(steady, "flow", flow)
+    monkeypatch.setattr(window, "flow", flow)
     how = Integrator("tsit5", jnp.asarray(1e-6), 64)
-    found = steady.lyapunov(oscillator(), jnp.zeros(2), periods, how)
+    found = window.lyapunov(oscillator(), jnp.zeros(2), periods, how)
     assert float(found.exponent) == pytest.approx(np.mean(growth), rel=1e-9)
     batches = [np.mean(growth[k : k + 256]) for k in range(0, periods, 256)]
     assert float(found.error) == pytest.approx(np.std(batches, ddof=1) / np.sqrt(16), rel=1e-9)
     assert float(found.error) == pytest.approx(np.std(growth) / np.sqrt(periods), rel=0.4)
-    assert float(found.state[0]) == periods
+    assert float(found.end[0]) == int(found.done) == periods
+    np.testing.assert_array_equal(found.states[:, 0, 0], np.arange(periods))
 
 
 def test_slopes_and_errors_per_config_unit():
@@ -291,9 +295,9 @@ def test_series_has_drive_and_coast_where_they_belong(monkeypatch):
     )  # fmt: skip
     physical = 0.2 * one, 0.3 * one
     monkeypatch.setattr(
-        evaluate, "_contact_series", lambda *args: (0.02, np.ones(count), physical, contact)
+        evaluation, "_contact_series", lambda *args: (0.02, np.ones(count), physical, contact)
     )
-    columns = files.response_columns(evaluate._series(oscillator(), tau, states))
+    columns = files.response_columns(evaluation._series(oscillator(), tau, states))
     expected = {
         "time_s": 0.02 * tau,
         "rotation_deg": 120 * tau,  # three lobes
@@ -486,11 +490,13 @@ def test_stated_error_of_a_map_is_relative_to_the_static_depth(monkeypatch):
         asked.append(error)
         return MapSize(256, 24, 0.7 * error, True)
 
-    monkeypatch.setattr(evaluate, "size_map", size_map)
-    evaluator._size(jnp.array([36.43, 8.0, 4.0]))
+    monkeypatch.setattr(evaluation, "size_map", size_map)
+    sized = evaluator._sized(jnp.array([36.43, 8.0, 4.0]))
     assert asked == pytest.approx([2e-3 * depth])
-    assert evaluator.map_error == pytest.approx(1.4e-3)
-    assert evaluator.model.map_size == (256, 24)
+    assert sized.map_error == pytest.approx(1.4e-3)
+    assert sized.scene.map_size == (256, 24)
+    # The evaluator that was asked stays as it was.
+    assert np.isnan(evaluator.map_error)
 
 
 def test_ranges_of_parameters_that_a_config_leaves_open():
@@ -537,15 +543,14 @@ def test_every_speed_simulated_counts_in_the_status(monkeypatch, failing):
     """The scene's own 3000 rpm has no share in the objective, but a result that fails there is
     none."""
     config = load("configs/cic.yaml", ["objective.speeds_rpm=[4000, 2000]"])
-    evaluator = object.__new__(SpeedsEvaluator)
-    evaluator.config, evaluator.model = config, at_speed(Scene.from_config(config), 3000.0)
+    evaluator = SpeedsEvaluator(Evaluator.of(config))
 
     def single(self, design, start, series):
-        here = float(self.model.speed) * 60 / (2 * np.pi)
+        here = float(self.scene.speed) * 60 / (2 * np.pi)
         lost = abs(here - failing) < 1e-6
-        return evaluation_of(here, Status.PASSED_THROUGH if lost else Status.PERIODIC)
+        return self, evaluation_of(here, Status.PASSED_THROUGH if lost else Status.PERIODIC)
 
-    monkeypatch.setattr(Evaluator, "__call__", single)
+    monkeypatch.setattr(Evaluator, "fit", single)
     found = evaluator()
     assert [part.share for part in found.parts] == [0.5, 0.0, 0.5]
     assert found.status is Status.PASSED_THROUGH
@@ -659,11 +664,11 @@ def test_an_ensemble_takes_no_infeasible_candidate():
     np.testing.assert_array_equal(point, [0.2, 0.3])
 
 
+@dataclasses.dataclass(frozen=True)
 class Told(Evaluator):
     """An evaluator for which a quadratic bowl about 0.6 has no steady state beyond 0.3 at first."""
 
-    def __init__(self):
-        self.asked = []
+    asked: list = dataclasses.field(default_factory=list)
 
     def __call__(self, design=None, start=None, series=True):
         self.asked.append((tuple(design), start))
@@ -682,8 +687,8 @@ def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state():
     search._lock, search._done, search._best = threading.Lock(), 0, float("nan")
     progress = []
     search.progress = lambda *numbers: progress.append(numbers)
-    evaluator = Told()
-    trials = search._descend(evaluator, 4, np.array([0.2, 0.3]))
+    search.fast = evaluator = Told.of(load("configs/cic.yaml"))
+    trials = search._descend(4, np.array([0.2, 0.3]))
     points = np.array([trial.point for trial in trials])
     assert len(trials) == 7
     # Steps of gradient descent at a rate that falls along a cosine to a twentieth.
@@ -764,10 +769,8 @@ def test_multiplier_is_that_of_the_whole_orbit():
 
     @jax.jit
     def close(length):
-        still = steady.no_tangents(pair)
-        return steady.close_orbit(
-            pair, still, jnp.array([rest + 0.01, 0.0]), length, how, samples=840
-        )
+        still, shots = window.no_tangents(pair), Shots(how, samples=840)
+        return close_orbit(pair, still, jnp.array([rest + 0.01, 0.0]), length, shots)
 
     for length in (1, 2, 3):
         orbit = close(jnp.asarray(length))

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from rootsopt.config import load
 from rootsopt.dynamics.flow import Integrator, flow, strobe
-from rootsopt.dynamics.steady import settle
+from rootsopt.dynamics.settle import settle
 from rootsopt.model import Scene, design_vector, outline_mm
 
 R, LOBES = 0.033, 3

@@ -23,7 +23,7 @@ from rootsopt.response.ensemble import (
     neighbours,
 )
 from rootsopt.response.evaluation import RESPONSES, Evaluator
-from rootsopt.response.evaluators import evaluator_for, without_gradient
+from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.members import Members
 from rootsopt.status import Status
 
@@ -39,9 +39,9 @@ def config_of(*overrides):
 
 def averaged(*overrides, gradient=False, survey=True, design=None):
     """Evaluation by an ensemble, without the Lyapunov exponent unless asked for."""
-    evaluator = EnsembleEvaluator(config_of(*overrides), survey=survey)
+    evaluator = EnsembleEvaluator(Evaluator.of(config_of(*overrides), survey=survey))
     if not gradient:
-        evaluator = without_gradient(evaluator)
+        evaluator = evaluator.without_gradient()
     return evaluator(None if design is None else jnp.array(design), series=False)
 
 
@@ -230,7 +230,7 @@ def test_same_seed_same_numbers():
 def test_start_is_continued():
     """From the last states of a neighbour the members go on; other shapes are refused."""
     settings = config_of(*CHAOTIC, "ensemble.members=4", "ensemble.periods=4")
-    evaluator = without_gradient(EnsembleEvaluator(settings, survey=True))
+    evaluator = EnsembleEvaluator(Evaluator.of(settings, survey=True)).without_gradient()
     first = evaluator(series=False)
     on = evaluator(start=first.state, series=False)
     assert on.status is Status.AVERAGED
@@ -325,12 +325,14 @@ def test_a_neighbour_that_fails_leaves_no_gradient(monkeypatch):
 
 def test_evaluator_of_a_motion():
     """`objective.motion` chooses; only an ensemble has a gradient to leave out."""
-    assert type(evaluator_for(config_of())) is Evaluator
-    evaluator = evaluator_for(config_of("objective.motion=ensemble"), survey=True)
+    plain = evaluator_for(config_of())
+    assert type(plain) is Evaluator
+    assert plain.without_gradient() is plain
+    evaluator = evaluator_for(config_of("objective.motion=ensemble")).surveying()
     assert isinstance(evaluator, EnsembleEvaluator)
-    assert evaluator.survey
+    assert evaluator.single.survey
     assert evaluator.differentiate
-    assert not without_gradient(evaluator).differentiate
+    assert not evaluator.without_gradient().differentiate
     other = evaluator.independent(2)
     assert other.settings.seed == 2
     assert other.settings.members == 4 * evaluator.settings.members

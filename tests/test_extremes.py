@@ -14,15 +14,16 @@ from rootsopt.config import load
 from rootsopt.contact.impact import ImpactLaw, force_rounding
 from rootsopt.dynamics.flow import Flow, Integrator, first_step
 from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pace import Pace
 from rootsopt.dynamics.parts import TimingGear
 from rootsopt.dynamics.peak import Steps, locate_peak
-from rootsopt.dynamics.steady import Orbit
+from rootsopt.dynamics.steady import _Attempts
 from rootsopt.dynamics.verdict import is_consistent, is_idle, judged
 from rootsopt.errors import InputError
 from rootsopt.model import Scene, check_geometry, design_vector
 from rootsopt.profiles import geometry
-from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.evaluation import Evaluator, _motion
 from rootsopt.status import Status
 
 
@@ -232,6 +233,7 @@ def orbit_of(
         multiplier=jnp.max(jnp.abs(jnp.array(multipliers))),
         response=flow.response,
         sensitivity=jnp.zeros((3, 0)),
+        moved=jnp.zeros((2, 0)),
         newton_steps=jnp.zeros((), int),
         drift=jnp.zeros(()),
         defect=jnp.zeros(()),
@@ -352,7 +354,14 @@ def test_a_pair_with_a_motor_that_floats_is_idle():
 
 def test_a_force_lost_in_rounding_is_no_result(monkeypatch):
     """Beyond the limit of `force_rounding` the numbers come with a status and no gradient."""
-    monkeypatch.setattr("rootsopt.response.evaluation.UNRESOLVED", 1e-14)
+
+    def stricter(pair, tangents, state, radius, solver):
+        found = _motion(pair, tangents, state, radius, solver)
+        return _Attempts(pair, tangents, solver, radius).final(found)
+
+    # The program has the usual limit; what it finds is judged by another one.
+    monkeypatch.setattr("rootsopt.dynamics.steady.UNRESOLVED", 1e-14)
+    monkeypatch.setattr("rootsopt.response.evaluation._motion", stricter)
     evaluation = Evaluator.of(config_of())(series=False)
     assert evaluation.status is Status.UNRESOLVED
     assert not evaluation.usable

@@ -11,7 +11,8 @@ import pytest
 from rootsopt.config import DESIGN_KEYS, load
 from rootsopt.contact.closest import FlankPair
 from rootsopt.dynamics.measures import Measures
-from rootsopt.dynamics.steady import close_orbit, reverse_sensitivity, settle, settled_within
+from rootsopt.dynamics.orbit import Shots, close_orbit, reverse_sensitivity
+from rootsopt.dynamics.settle import settle, settled_within
 from rootsopt.model import design_vector
 from rootsopt.profiles.ee import EE
 from rootsopt.response.evaluation import Evaluator
@@ -58,7 +59,7 @@ def closed(model, design, factors, state, period, how):
     pair = moved(model, design, factors)
     units = jnp.eye(factors.shape[0])
     tangents = jax.vmap(lambda unit: jax.jvp(arrays, (factors,), (unit,))[1])(units)
-    return close_orbit(pair, tangents, state, period, how, MEASURES)
+    return close_orbit(pair, tangents, state, period, Shots(how, MEASURES))
 
 
 @eqx.filter_jit
@@ -71,13 +72,13 @@ def settled(model, design, how):
 def orbits_of(config):
     """Function (factors, state or None) → closed orbit, from rest if there is no state."""
     evaluator, design = Evaluator.of(config), design_vector(config)
-    transient = settled(evaluator.model, design, evaluator.transient)
+    transient = settled(evaluator.scene, design, evaluator.scene.solver.transient)
     assert int(transient.period) > 0
 
     def orbit(factors, state=None):
         state = transient.state if state is None else state
-        how = evaluator.orbit
-        found = closed(evaluator.model, design, factors, state, transient.period, how)
+        how = evaluator.scene.solver.orbit
+        found = closed(evaluator.scene, design, factors, state, transient.period, how)
         assert float(found.residual) <= 1e-9
         assert float(found.multiplier) < 1
         return found
@@ -154,9 +155,9 @@ def test_many_kinks_in_a_thousandth_of_a_mesh():
     sharp = orbit(ones)
     config_design = design_vector(evaluator.config)
     for rtol, within in ((1e-7, 3e-2), (1e-9, 1e-4)):
-        how = dataclasses.replace(evaluator.orbit, rtol=jnp.asarray(rtol))
+        how = dataclasses.replace(evaluator.scene.solver.orbit, rtol=jnp.asarray(rtol))
         start = np.asarray(sharp.state), np.asarray(period)
-        found = closed(evaluator.model, config_design, ones, *start, how)
+        found = closed(evaluator.scene, config_design, ones, *start, how)
         assert float(found.multiplier) == pytest.approx(float(sharp.multiplier), rel=within)
         size = np.max(np.abs(sharp.sensitivity[:3]), axis=1, keepdims=True)
         off = np.abs(found.sensitivity[:3] - sharp.sensitivity[:3]) / size
@@ -168,7 +169,7 @@ def test_jump_in_both_modes():
     config = load("configs/ee.yaml", [*SHARP, "profile.lobes=4"])
     orbit, evaluator, period = orbits_of(config)
     here = orbit(jnp.ones(3))
-    model, design, how = evaluator.model, design_vector(config), evaluator.orbit
+    model, design, how = evaluator.scene, design_vector(config), evaluator.scene.solver.orbit
 
     @jax.jit
     def reverse(flow, state):

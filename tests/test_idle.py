@@ -4,15 +4,17 @@ import dataclasses
 import json
 import math
 import re
-from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rootsopt.config import load
+from rootsopt.dynamics.steady import window_status
+from rootsopt.dynamics.window import Window
 from rootsopt.errors import InputError
-from rootsopt.model import Scene
+from rootsopt.model import Scene, design_vector
 from rootsopt.optimize import __main__ as optimize
 from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import geometry
@@ -95,22 +97,34 @@ def test_optimize_says_why_there_is_nothing_to_optimise(tmp_path, capsys):
 # Verdict and advice
 
 
-def window(peak, exponent=0.5):
-    flows = SimpleNamespace(
-        mean=peak, mean_square=peak**2, peak=peak, solved=np.ones(4, bool), depth=-np.ones(4)
+def window(peak, exponent):
+    """A window of 16 mesh periods with these peaks (N) and this exponent, known to some 0.01."""
+    growth = exponent + 0.04 * (-1.0) ** np.arange(16) * np.arange(16) / 16
+    empty = Window.empty(jnp.zeros(2), 16)
+    return empty._replace(
+        growth=jnp.asarray(growth - np.mean(growth) + exponent),
+        response=jnp.asarray(np.column_stack([peak, peak**2, peak])),
+        depth=jnp.asarray(-1.0),
+        done=jnp.asarray(16),
     )
-    state = np.zeros(2)
-    return SimpleNamespace(exponent=exponent, error=0.01, flows=flows, state=state)
 
 
 @pytest.mark.parametrize("exponent", [0.5, 0.0])
 def test_a_motion_without_contact_that_does_not_repeat_is_idle(exponent):
     """Whether the gear's play makes it chaotic or not."""
-    pair = SimpleNamespace(lost=lambda state: False, force_scale=100.0)
-    status, steady, response, _ = unsettled(pair, window(np.zeros(4), exponent), False)
+    evaluator = Evaluator.of(config_of())
+    pair = evaluator.pair(design_vector(evaluator.config))
+    still = window(np.zeros(16), exponent)
+    assert 1e-3 < float(still.error) < 0.05
+    status = Status.of(int(window_status(pair, still)))
+    steady, response, _ = unsettled(pair, status, jax.device_get(still), False)
     assert (status, steady["kind"], response) == (Status.IDLE, "idle", NONE)
-    touched = unsettled(pair, window(np.array([0.0, 0.0, 1.0, 0.0]), exponent), False)
-    assert touched[0] is (Status.CHAOTIC if exponent else Status.NOT_SETTLED)
+    touching = window(np.eye(16)[2], exponent)
+    status = Status.of(int(window_status(pair, touching)))
+    assert status is (Status.CHAOTIC if exponent else Status.NOT_SETTLED)
+    steady, response, _ = unsettled(pair, status, jax.device_get(touching), False)
+    assert steady["kind"] == ("chaotic" if exponent else "transient")
+    assert response["peak_force_N"] == 1
 
 
 def test_advice_depends_on_what_holds_the_flanks_apart():
@@ -218,7 +232,7 @@ def basins_of(*evaluations, lost=None):
         Attractor(e, share, k == 0, np.zeros((1, 2))) for k, e in enumerate(evaluations)
     )
     axis, none = np.zeros(1), np.zeros((1, 1), int)
-    return Basins(axis, axis, none, motions, lost or {}, 1.0, 1.0)
+    return Basins(axis, axis, none, motions, evaluations[0], lost or {}, 1.0, 1.0)
 
 
 def test_a_motion_without_contact_beside_others_counts_as_zero(monkeypatch):
@@ -231,9 +245,12 @@ def test_a_motion_without_contact_beside_others_counts_as_zero(monkeypatch):
     averaged = _averaged(noisy, list(basins_of(noisy, quiet).attractors))
     assert averaged.response == pytest.approx({k: v / 2 for k, v in FORCES.items()})
     assert averaged.gradient["mean_force_N"]["tip_arc_angle_deg"] == 0.5
-    monkeypatch.setattr("rootsopt.response.attractors.find", lambda *rest: basins_of(quiet, noisy))
+    monkeypatch.setattr(
+        "rootsopt.response.attractors.find_fitted",
+        lambda single, *rest: (single, basins_of(quiet, noisy)),
+    )
     for motion, share in (("worst", 1.0), ("weighted", 0.5)):
-        found = AttractorEvaluator(config_of(f"objective.motion={motion}"))()
+        found = AttractorEvaluator(Evaluator.of(config_of(f"objective.motion={motion}")))()
         assert found.status is Status.PERIODIC
         assert found.response["peak_force_N"] == pytest.approx(share * 200)
         assert found.state.shape == (2, 2)

@@ -38,7 +38,7 @@ def trial(point, objective, error=0.02):
 @pytest.fixture(scope="module")
 def problem():
     settings = load("configs/cic.yaml", ["objective.motion=ensemble"])
-    return Problem.of(settings, Evaluator.of(settings).model, made_up(1.0))
+    return Problem.of(settings, Evaluator.of(settings).scene, made_up(1.0))
 
 
 def test_a_lucky_trial_is_no_candidate_on_its_own(problem):
@@ -53,11 +53,13 @@ def test_a_lucky_trial_is_no_candidate_on_its_own(problem):
     assert noise.candidates(problem, [trial([0.5, 0.5, 0.5], 1.2)]) == []
 
 
+@dataclasses.dataclass(frozen=True)
 class Judge(EnsembleEvaluator):
     """An evaluator that knows the truth about every design: 1 for the baseline's."""
 
-    def __init__(self, truth, error, config):
-        self.truth, self.error, self.config, self.asked = truth, error, config, []
+    truth: float = 1.0
+    error: float = 0.02
+    asked: list[int] = dataclasses.field(default_factory=list)
 
     def independent(self, number):
         self.asked.append(number)
@@ -72,7 +74,7 @@ class Judge(EnsembleEvaluator):
 def test_only_a_significant_difference_holds_up(problem, truth, accepted):
     """0.9 is beyond three combined standard errors of 0.02·√(1 + 1), 0.93 is not; whatever the
     search promised."""
-    judge = Judge(truth, 0.02, problem.config)
+    judge = Judge(Evaluator.of(problem.config), truth=truth)
     verdict = noise.verify(problem, judge, [trial([0.5, 0.5, 0.5], 0.4)])
     assert judge.asked == [1, 2]
     assert (verdict.optimized is not None) == accepted
@@ -89,7 +91,7 @@ def test_only_a_significant_difference_holds_up(problem, truth, accepted):
 
 def test_nothing_promised(problem):
     """No trial below the baseline: no verdict, and a message that says what to raise."""
-    judge = Judge(1.0, 0.02, problem.config)
+    judge = Judge(Evaluator.of(problem.config), truth=1.0)
     verdict = noise.verify(problem, judge, [trial([0.5, 0.5, 0.5], 1.4)])
     assert verdict.optimized is None
     assert "ensemble.members" in noise.message(verdict.record)
@@ -106,7 +108,7 @@ class Particular(Judge):
 
 def test_a_candidate_without_an_average_is_passed_over(problem):
     """The next one is judged, though the first promised more; if there is no other, none."""
-    judge = Particular(0.8, 0.02, problem.config)
+    judge = Particular(Evaluator.of(problem.config), truth=0.8)
     lost, good = trial([0.9, 0.5, 0.5], 0.3), trial([0.1, 0.5, 0.5], 0.7)
     verdict = noise.verify(problem, judge, [lost, good])
     assert verdict.optimized is not None

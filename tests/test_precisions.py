@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt import auto, simulate
+from rootsopt import simulate
 from rootsopt.config import load
 from rootsopt.dynamics.flow import METHODS, Integrator, strobe
 from rootsopt.model import Scene, design_vector
+from rootsopt.response import choice
 from rootsopt.response.evaluation import Evaluator, _series
 from rootsopt.status import Status
 
@@ -122,7 +123,7 @@ def truths():
 def test_grid(contact, method, precision, gradient, truths):
     """Each agrees with tsit5 in double precision."""
     config = config_of(precision, contact, method, f"solver.gradient={gradient}")
-    config, _ = auto.resolve(config)
+    config, _ = choice.resolve(config)
     found = Evaluator.of(config)()
     assert found.status is Status.PERIODIC
     truth = truths(config.solver.fidelity)

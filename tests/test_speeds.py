@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from experiments.speed.study import equilibria
-from rootsopt import auto, evaluate, speeds
 from rootsopt.cli import main
 from rootsopt.config import load, parse
 from rootsopt.errors import InputError
 from rootsopt.model import design_vector
 from rootsopt.optimize.problem import Problem
-from rootsopt.response.evaluation import Evaluator
+from rootsopt.response import choice, speeds
+from rootsopt.response.attractors import AttractorEvaluator
+from rootsopt.response.evaluation import Evaluator, _build, _motion
 from rootsopt.response.evaluators import evaluator_for
-from rootsopt.response.speeds import Part, SpeedsAttractorEvaluator, SpeedsEvaluator
+from rootsopt.response.speeds import Part, SpeedsEvaluator
 from rootsopt.status import Status
 
 CIC = "configs/cic.yaml"
@@ -33,20 +34,20 @@ def config_of(*overrides):
 
 def programs():
     """How many programs the evaluators have been compiled to."""
-    return sum(len(one._made) for one in (evaluate._build, evaluate._settle, evaluate._close))
+    return sum(len(one._made) for one in (_build, _motion))
 
 
 @pytest.fixture(scope="module")
 def baseline():
     """Evaluator over two speeds, 3000 rpm beside them, and its evaluation of the own design."""
-    evaluator = SpeedsEvaluator(config_of(SPEEDS, WEIGHTS, TIGHT))
+    evaluator = SpeedsEvaluator(Evaluator.of(config_of(SPEEDS, WEIGHTS, TIGHT)))
     return evaluator, evaluator(series=False)
 
 
 @pytest.fixture(scope="module")
 def problem(baseline):
     evaluator, evaluation = baseline
-    return Problem.of(evaluator.config, evaluator.model, evaluation)
+    return Problem.of(evaluator.config, evaluator.scene, evaluation)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +88,7 @@ def test_parts_are_the_evaluations_at_one_speed(baseline, singles):
     assert found.response == found.parts[1].evaluation.response
     assert found.gradient == found.parts[1].evaluation.gradient != {}
     # The evaluator is left at the scene's speed.
-    assert float(evaluator.model.speed) == pytest.approx(100 * np.pi)
+    assert float(evaluator.scene.speed) == pytest.approx(100 * np.pi)
     rows = found.record()["speeds"]
     assert [row["speed_rpm"] for row in rows] == [2000, 3000, 4000]
     assert {row["status"] for row in rows} == {"periodic"}
@@ -100,7 +101,7 @@ def test_objective_is_the_weighted_mean_or_the_worst(baseline, problem, singles,
     assert values[0] != pytest.approx(values[1], rel=1e-3)
     # Begun from the baseline's orbit, not at rest: the same to the tolerance of the orbit.
     assert problem.objective(moved) == pytest.approx(np.dot([0.25, 0.75], values), rel=1e-7)
-    worst = Problem.of(config_of(SPEEDS, WORST), baseline[0].model, baseline[1])
+    worst = Problem.of(config_of(SPEEDS, WORST), baseline[0].scene, baseline[1])
     assert worst.objective(moved) == pytest.approx(max(values), rel=1e-7)
     for one in (problem, worst):
         assert one.objective(baseline[1]) == pytest.approx(1, abs=1e-14)
@@ -118,7 +119,7 @@ def test_slope_agrees_with_central_differences(baseline, problem, moved):
         evaluator(problem.design(POINT + sign * step * direction), moved.state, series=False)
         for sign in (1, -1)
     ]
-    worst = Problem.of(config_of(SPEEDS, WORST), evaluator.model, base)
+    worst = Problem.of(config_of(SPEEDS, WORST), evaluator.scene, base)
     slopes = []
     for one in (problem, worst):
         upper, lower = map(one.objective, ends)
@@ -131,13 +132,13 @@ def test_each_speed_begins_on_its_own_orbit(baseline, moved, monkeypatch):
     """The state of an evaluation starts each speed where that speed's motion was."""
     evaluator, found = baseline
     seen = []
-    single = Evaluator.__call__
+    single = Evaluator.fit
 
     def spy(self, design, start, series):
         seen.append(start)
         return single(self, design, start, series)
 
-    monkeypatch.setattr(Evaluator, "__call__", spy)
+    monkeypatch.setattr(Evaluator, "fit", spy)
     again = evaluator(start=found.state, series=False)
     for start, part in zip(seen, found.parts, strict=True):
         np.testing.assert_array_equal(start, part.evaluation.state)
@@ -163,7 +164,7 @@ def test_without_speeds_all_is_as_before(baseline):
     assert "speeds" not in found.record()
     head = baseline[1].parts[1].evaluation
     assert found.response == head.response
-    problem = Problem.of(evaluator.config, evaluator.model, found)
+    problem = Problem.of(evaluator.config, evaluator.scene, found)
     weights = {key: 0.5 / found.response[key] for key in ("mean_force_N", "peak_force_N")}
     assert problem.objective(head) == sum(w * head.response[k] for k, w in weights.items())
     assert problem.by_speed(found) == []
@@ -177,7 +178,7 @@ def test_a_speed_without_steady_state_is_a_status():
         "scene.speed_rpm=3900",
         "solver.max_mesh_periods=64",
     )
-    evaluator = evaluator_for(config_of(*scene, "objective.speeds_rpm=[2700, 3900]"), survey=True)
+    evaluator = evaluator_for(config_of(*scene, "objective.speeds_rpm=[2700, 3900]")).surveying()
     found = evaluator(series=False)
     assert [part.evaluation.status for part in found.parts] == [
         Status.NOT_SETTLED,
@@ -188,7 +189,7 @@ def test_a_speed_without_steady_state_is_a_status():
     assert found.gradient == {}
     assert found.state is None
     assert [row["status"] for row in found.record()["speeds"]] == ["not_settled", "periodic"]
-    problem = Problem.of(config_of(), evaluator.model, found.parts[1].evaluation)
+    problem = Problem.of(config_of(), evaluator.scene, found.parts[1].evaluation)
     assert np.isnan(problem.objective(found))
 
 
@@ -196,14 +197,14 @@ def test_motions_that_coexist_at_every_speed():
     """`objective.motion: worst` over speeds: the attractors at each, relative to its baseline."""
     small = "attractors.relatives=1", "attractors.rates=1", "objective.motion=worst"
     evaluator = evaluator_for(config_of(SPEEDS, *small))
-    assert type(evaluator) is SpeedsAttractorEvaluator
+    assert type(evaluator) is SpeedsEvaluator
+    assert type(evaluator.single) is AttractorEvaluator
     found = evaluator(series=False)
     assert found.status is Status.PERIODIC
     for part in found.parts:
         assert len(part.evaluation.steady_state["attractors"]) == 1
-    evaluator.relate(found)
-    again = evaluator(start=found.state, series=False)
-    assert evaluator.reference == found.parts[2].evaluation.response
+    last, again = evaluator.relative_to(found).fit(start=found.state, series=False)
+    assert last.single.single.reference == found.parts[2].evaluation.response
     assert again.response["peak_force_N"] == pytest.approx(found.response["peak_force_N"], rel=1e-7)
 
 
@@ -311,7 +312,7 @@ def test_auto_agrees_at_every_speed():
     """`solver.fidelity: auto` judges a candidate by the worst of all speeds simulated."""
 
     def first(*overrides):
-        (tried, *_) = auto.choose(
+        (tried, *_) = choice.choose(
             config_of("solver.fidelity=auto", "solver.accuracy=0.1", *overrides)
         ).tried
         return tried["error"]

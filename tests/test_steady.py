@@ -11,8 +11,9 @@ import pytest
 
 from rootsopt.config import DESIGN_KEYS, load
 from rootsopt.dynamics.flow import Integrator, flow, strobe
+from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.dynamics.peak import BESIDE, one_sided
-from rootsopt.dynamics.steady import no_tangents, spectral_radius
+from rootsopt.dynamics.window import no_tangents
 from rootsopt.response.evaluation import RESPONSES, Evaluator, evaluate
 from rootsopt.status import Status
 
@@ -105,7 +106,7 @@ every_orbit = pytest.mark.parametrize("name", [*DESIGNS, "slow"])
 def pair_and_state(orbits, name):
     evaluator, evaluation = orbits[name]
     design = jnp.array(list(evaluation.design.values()))
-    return pair_of(evaluator.model, design), jnp.asarray(evaluation.state)
+    return pair_of(evaluator.scene, design), jnp.asarray(evaluation.state)
 
 
 @every_orbit
@@ -267,12 +268,12 @@ def test_both_modes_differentiate_the_same_motion(sharp, orbits, monkeypatch):
     how, one = integrator(1e-8), jnp.asarray(1.0)
     rng = np.random.default_rng(5)
     along_state, along_design = (jnp.asarray(rng.normal(size=(4, n))) for n in (2, 3))
-    grid = jax.jit(lambda: flow(sharp.model.pair(design), state, one, how, 64).grid)()
+    grid = jax.jit(lambda: flow(sharp.scene.pair(design), state, one, how, 64).grid)()
 
     @jax.jit
     def forward():
-        moving = jax.vmap(lambda t: jax.jvp(sharp.model.pair, (design,), (t,))[1])(along_design)
-        pair = sharp.model.pair(design)
+        moving = jax.vmap(lambda t: jax.jvp(sharp.scene.pair, (design,), (t,))[1])(along_design)
+        pair = sharp.scene.pair(design)
         out = flow(pair, state, one, how, 64, moving, grid)
         moved = out.slope[:, :2] @ along_state.T + out.slope[:, 2:]
         return jnp.concatenate([out.end, out.response]), moved
@@ -281,7 +282,7 @@ def test_both_modes_differentiate_the_same_motion(sharp, orbits, monkeypatch):
     def reverse(weight):
         def run(state, design):
             adjoint = diffrax.RecursiveCheckpointAdjoint()
-            out = flow(sharp.model.pair(design), state, one, how, 64, grid=grid, adjoint=adjoint)
+            out = flow(sharp.scene.pair(design), state, one, how, 64, grid=grid, adjoint=adjoint)
             return jnp.concatenate([out.end, out.response])
 
         value, pull = jax.vjp(run, state, design)
@@ -307,7 +308,7 @@ def test_recorded_steps_give_the_same_motion(sharp, orbits):
     flow are its slope down to small steps, which adaptive steps would drown in noise."""
     evaluation = orbits["shorter involute"][1]
     state = jnp.asarray(evaluation.state)
-    pair = pair_of(sharp.model, jnp.array(DESIGNS["shorter involute"]))
+    pair = pair_of(sharp.scene, jnp.array(DESIGNS["shorter involute"]))
     how, one = integrator(1e-8), jnp.asarray(1.0)
     still = no_tangents(pair)
     once = eqx.filter_jit(lambda y: flow(pair, y, one, how, 64, still))(state)
@@ -342,10 +343,10 @@ def test_repeated_steps_tell_of_their_error(sharp, orbits):
         repeated = again(state, once.grid), again(state, half), again(moved, once.grid)
         return [float(each.strain) for each in (once, *repeated)]
 
-    none, own, halved, foreign = strains(sharp.model)
+    none, own, halved, foreign = strains(sharp.scene)
     assert none == 0 < own < 2
     assert min(halved, foreign) > 10
-    assert strains(linear.model) == [0, 0, 0, 0]
+    assert strains(linear.scene) == [0, 0, 0, 0]
 
 
 def test_peak_on_a_corner_has_its_gradient():
@@ -517,7 +518,7 @@ def test_chaos_has_a_positive_exponent_and_no_gradient(settled):
     assert not evaluation.usable
     # Two motions 1e-9 apart part company at about that rate, from 1e-9 to 1e-2.
     evaluator = Evaluator.of(SCENES["chaotic"])
-    pair = pair_of(evaluator.model, jnp.array(list(evaluation.design.values())))
+    pair = pair_of(evaluator.scene, jnp.array(list(evaluation.design.values())))
     scale, rate = float(pair.angle_scale), float(pair.angle_scale) / float(pair.mesh_period)
     start = jnp.array([evaluation.series.relative[0] / scale, evaluation.series.rate[0] / rate])
     starts = start + 1e-9 * jnp.array([[0.0, 0.0], [1.0, 0.0]])
@@ -551,7 +552,7 @@ def test_period_doubled_orbit_agrees_with_plain_motion(settled):
     """The closed period-2 orbit is where a long tight integration from rest ends up."""
     evaluation = settled["doubled"]
     evaluator = Evaluator.of(SCENES["doubled"])
-    pair = pair_of(evaluator.model, jnp.array(list(evaluation.design.values())))
+    pair = pair_of(evaluator.scene, jnp.array(list(evaluation.design.values())))
     states = run_strobe(pair, jnp.zeros((1, 2)), 200, integrator(1e-10))[0][-2:]
     nearest = np.min(np.max(np.abs(states - evaluation.state), axis=1))
     assert nearest < 1e-3
