@@ -91,7 +91,7 @@ def test_prepared_programs_are_ready_when_called(traced):
     program = Program(scaled)
     shape = jax.ShapeDtypeStruct((3,), float)
     kind = Factor(jax.ShapeDtypeStruct((), float), 2), shape, "a"
-    assert program.outline(*kind).total["sum"].shape == ()
+    assert program.result_shape(*kind).total["sum"].shape == ()
     traced.clear()
     program.prepare(*kind)
     program.prepare(*kind)
