@@ -126,7 +126,7 @@ def test_kept_programs_are_found_without_tracing(tmp_path, traced):
     again = ask(Program(scaled))
     assert traced == ["a"]
     assert first.total["sum"] == again.total["sum"]
-    assert Program(scaled).outline(Factor(jnp.ones(()), 2), np.ones(3), "a").name == "a"
+    assert Program(scaled).result_shape(Factor(jnp.ones(()), 2), np.ones(3), "a").name == "a"
     assert traced == ["a"]
     ask(Program(scaled), power=3)
     assert len(traced) == 2
