@@ -91,7 +91,7 @@ def test_prepared_programs_are_ready_when_called(traced):
     program = Program(scaled)
     shape = jax.ShapeDtypeStruct((3,), float)
     kind = Factor(jax.ShapeDtypeStruct((), float), 2), shape, "a"
-    assert program.outline(*kind).total["sum"].shape == ()
+    assert program.result_shape(*kind).total["sum"].shape == ()
     traced.clear()
     program.prepare(*kind)
     program.prepare(*kind)
@@ -126,7 +126,7 @@ def test_kept_programs_are_found_without_tracing(tmp_path, traced):
     again = ask(Program(scaled))
     assert traced == ["a"]
     assert first.total["sum"] == again.total["sum"]
-    assert Program(scaled).outline(Factor(jnp.ones(()), 2), np.ones(3), "a").name == "a"
+    assert Program(scaled).result_shape(Factor(jnp.ones(()), 2), np.ones(3), "a").name == "a"
     assert traced == ["a"]
     ask(Program(scaled), power=3)
     assert len(traced) == 2
