@@ -94,7 +94,8 @@ class Scene(eqx.Module):
     @classmethod
     def from_config(cls, config: Config, deepest: float | None = None) -> "Scene":
         """Return the scene of a config; `deepest` (rad < 0) is the relative rotation that the
-        contact map must reach, estimated from the scene when not given.
+        contact map must reach, estimated from the scene when not given. (The map has a middling
+        size where the config leaves that open; `evaluate` chooses it by `solver.map_error`.)
 
         Raises RuntimeError where the config asks for a precision JAX is not set to."""
         contact, scene, solver = config.contact, config.scene, config.solver

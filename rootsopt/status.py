@@ -16,7 +16,7 @@ class Status(enum.Enum):
     GEOMETRY_ONLY = "The profile is valid; nothing was simulated."
     OFF_MAP = (
         "The motion left the contact map, which says nothing of the flanks there. Set "
-        "solver.fidelity to search, or build the scene anew with a greater reach."
+        "solver.fidelity to search, or make the scene with a lower `deepest`."
     )
     CHAOTIC = (
         "The motion is chaotic: mean and peak are averages over a finite window and have no "

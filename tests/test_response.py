@@ -1,7 +1,9 @@
 """`steady_response`: a pure function that JAX transforms, differentiable in design and scene."""
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -29,6 +31,7 @@ QUANTITIES = {
     "backlash": lambda s: s.gear.half_backlash,
     "gear damping": lambda s: s.gear_damping_ratio,
 }
+ROOT = Path(__file__).parents[1]
 DESIGN = np.array([36.43, 9.0, 4.0])
 
 
@@ -165,6 +168,19 @@ def test_second_derivatives_are_refused(scene):
         jax.hessian(lambda design: steady_response(scene, design).mean)(DESIGN)
 
 
+@pytest.mark.long
+def test_motion_that_leaves_the_contact_map(scene, known):
+    """Its forces are not those of the pair: no number, and a status that says why."""
+    config, _ = scene_of("solver.fidelity=map")
+    wide, narrow = (Scene.from_config(config, deepest) for deepest in (-3e-3, -1e-3))
+    found = steady_response(wide, DESIGN)
+    assert Status.of(found.status) is Status.PERIODIC
+    assert float(found.mean) == pytest.approx(float(known[0].mean), rel=1e-3)
+    found = steady_response(narrow, DESIGN)
+    assert Status.of(found.status) is Status.OFF_MAP
+    assert np.isnan(found.mean)
+
+
 @pytest.mark.parametrize(
     ("design", "message"),
     [([1.0, 2.0], "must have 3 entries.*but has 2"), ([[1.0]], r"array \(d,\), but has shape")],
@@ -198,6 +214,15 @@ def test_precision_is_asked_for_in_words():
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert 'jax.config.update("jax_enable_x64", True)' in found.stdout
+
+
+@pytest.mark.long
+def test_example_of_the_readme_runs():
+    """As it stands, in a process of its own."""
+    (text,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.M | re.S)
+    found = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, cwd=ROOT)
+    assert (found.returncode, found.stderr) == (0, "")
+    assert float(found.stdout.split()[0]) > 0
 
 
 def test_sweep_of_any_keys():

@@ -170,7 +170,16 @@ def _solve(scene: Scene, design, start, numbers: tuple[int, ...]) -> tuple[Respo
     rest = jnp.zeros(pair.states, pair.angle_scale.dtype)
     state = rest if start is None else pair.scaled(jnp.asarray(start))
     found = steady_motion(pair, tangents, state, scene.pitch_radius, scene.solver)
+    if scene.fidelity == "map":
+        found = _on_map(scene, pair, found)
     return _named(scene.solver.measures, pair, tangents, found)
+
+
+def _on_map(scene: Scene, pair: RotorPair, found: Steady) -> Steady:
+    """The motion, whose status says so where it has left the contact map."""
+    reached = pair.angle_scale * jnp.max(jnp.abs(found.orbit.flow.states[:, 0]))
+    left = among(found.status, CLOSED) & (reached > -scene.deepest)
+    return found._replace(status=jnp.where(left, Status.OFF_MAP.code, found.status))
 
 
 def _state(pair: RotorPair, tangents: RotorPair, found: Steady):
