@@ -83,7 +83,7 @@ def test_involute_never_exceeds_its_longest(problem):
     """u ≤ u_max at every point of the unit box."""
     for point in np.random.default_rng(1).uniform(size=(30, 3)):
         design = problem.space.design(jnp.asarray(point))
-        longest = problem.space.model.profile(design).longest_involute
+        longest = problem.space.scene.profile(design).longest_involute
         assert float(design[1]) <= float(longest) * 1e3 * (1 + 1e-12)
 
 

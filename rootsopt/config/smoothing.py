@@ -26,7 +26,7 @@ def following_mm(
     `gear_stiffness` (N·m/rad) if there is one.
 
     `contact`: stiffness (N/mm^e), exponent and depth of full damping (mm) of the flanks. Chosen so
-    that rounding changes no force by 1e-4 of itself (experiments/smoothing.py).
+    that rounding changes no force by 1e-4 of itself (`python -m experiments.smoothing`).
     """
     torque = max(load_torque, _LEAST_LOAD)
     stiffness, exponent, full = contact

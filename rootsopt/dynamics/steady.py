@@ -342,6 +342,7 @@ def steady_motion(
 
     `radius`: pitch radius (m), beside which penetrations are judged.
     """
+    radius = jnp.asarray(radius, pair.angle_scale.dtype)
     attempts = _Attempts(pair, tangents, solver, radius)
     search = lax.while_loop(
         lambda now: ~now.over, lambda now: attempts.step(now), attempts.start(state)

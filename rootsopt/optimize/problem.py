@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 
 from rootsopt.config import Config
 from rootsopt.config.units import unit_of
-from rootsopt.design.space import Space
+from rootsopt.design.space import Space, slacks_and_slopes
 from rootsopt.dynamics.measures import line_name
 from rootsopt.errors import InputError
 from rootsopt.model import Scene
