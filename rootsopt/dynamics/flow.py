@@ -127,7 +127,7 @@ class Flow(NamedTuple):
     and along the directions that were asked for (d more), or no columns at all.
     """
 
-    end: Float[Array, "n"]
+    end: Float[Array, " n"]
     mean: Float[Array, ""]
     mean_square: Float[Array, ""]
     peak: Float[Array, ""]
@@ -224,7 +224,7 @@ class StepGrid(diffrax.AbstractAdaptiveStepSizeController):
         )
 
 
-def strobe(pair: RotorPair, state: Float[Array, "n"], periods: int, how: Integrator) -> Strobe:
+def strobe(pair: RotorPair, state: Float[Array, " n"], periods: int, how: Integrator) -> Strobe:
     """Integrate the bare states over `periods` mesh periods, from φ1 = 0.
 
     Steps land on the period ends: interpolated states would carry an error far above
@@ -262,7 +262,7 @@ def strobe(pair: RotorPair, state: Float[Array, "n"], periods: int, how: Integra
 
 def flow(
     pair: RotorPair,
-    state: Float[Array, "n"],
+    state: Float[Array, " n"],
     periods: Float[Array, ""],
     how: Integrator,
     samples: int,
