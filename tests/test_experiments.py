@@ -192,6 +192,7 @@ def test_parts(tmp_path, programs):
     assert is_picture(tmp_path / "parts.png")
 
 
+@pytest.mark.long
 def test_paper(tmp_path, programs):
     """The shipped values give the paper's four forces (its section 4), both motions periodic; here
     with linear contact, which is some 3 % off."""

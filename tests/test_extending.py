@@ -92,6 +92,7 @@ def test_family_is_known_to_a_command_by_its_file(blunt_cycloid, tmp_path):
     assert "crossing_angle_deg" in done.stderr
 
 
+@pytest.mark.long
 def test_family_is_optimised(blunt_cycloid, tmp_path):
     """Better than the baseline, within the bounds of its parameters."""
     budget = ("screening=2", "starts=1", "iterations=3")

@@ -63,7 +63,7 @@ def steady_response(
     A pure function: it works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and `jacrev` with respect
     to the design and to every physical quantity of the scene. Derivatives of forces and `state` are
     those of the orbit by the implicit function theorem, and NaN where the status is not periodic.
-    Those of the multipliers are NaN: nobody computes them. The residual is a constant.
+    Multipliers and residual are constants to JAX: their derivatives are not computed, and are 0.
 
     Raises ValueError for a design of another size; RuntimeError where JAX is not set to the
     precision of the scene.
@@ -104,11 +104,8 @@ def _response_jvp(primals, tangents):
     unknown = jnp.nan * sum((jnp.sum(tangent) for tangent in without), start=jnp.sum(vector))
     values = slopes @ vector + (unknown if without else 0.0)
     mean, peak, rms, lines, norm, state = _split(values, response)
-    multipliers = jnp.full_like(response.multipliers, 1.0) * unknown
     constant: Any = None
-    change = Response(
-        mean, peak, rms, lines, norm, constant, multipliers, constant, constant, state
-    )
+    change = Response(mean, peak, rms, lines, norm, constant, constant, constant, constant, state)
     return response, change
 
 
