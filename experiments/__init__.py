@@ -2,5 +2,6 @@
 
 import os
 
-# Equinox reads this once, when it is first imported; `rootsopt.cli` says why its checks are off.
+# Equinox reads this once, when it is first imported;
+# `rootsopt.commands.cli` says why they are off.
 os.environ.setdefault("EQX_ON_ERROR", "off")

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from rootsopt.contact.law import ContactLaw as ContactLaw
     from rootsopt.dynamics.parts.base import Part as Part
     from rootsopt.errors import InputError as InputError
-    from rootsopt.model import Scene as Scene
     from rootsopt.optimize.design import optimize_design as optimize_design
     from rootsopt.optimize.search import Optimization as Optimization
     from rootsopt.profiles.base import Profile as Profile
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from rootsopt.response.steady import steady_response as steady_response
     from rootsopt.response.terms import Term as Term
     from rootsopt.response.terms import register_term as register_term
+    from rootsopt.scene import Scene as Scene
     from rootsopt.status import Status as Status
 
 __version__ = "0.1.0"
@@ -45,7 +45,7 @@ _PUBLIC = {
     "Part": "rootsopt.dynamics.parts.base:Part",
     "Profile": "rootsopt.profiles.base:Profile",
     "Response": "rootsopt.response.steady:Response",
-    "Scene": "rootsopt.model:Scene",
+    "Scene": "rootsopt.scene:Scene",
     "Segment": "rootsopt.profiles.base:Segment",
     "Status": "rootsopt.status:Status",
     "Term": "rootsopt.response.terms:Term",

@@ -1,55 +1,6 @@
-"""`rootsopt COMMAND ...` and `python -m rootsopt`: all commands by their names."""
+"""`python -m rootsopt COMMAND ...`: all commands by their names."""
 
-import sys
-from collections.abc import Sequence
-
-from rootsopt import door
-
-COMMANDS = {
-    "optimize": "optimise a design and compare it with the baseline",
-    "simulate": "simulate one design in one scene",
-    "sweep": "one design at many speeds",
-    "attractors": "the motions that coexist in one scene",
-    "profile": "geometry of one design",
-}
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The console command `rootsopt`; returns the exit code."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    command = arguments[0] if arguments and arguments[0] in COMMANDS else ""
-    return door.through(command, lambda: _called(arguments), own=argv is None)
-
-
-def _called(arguments: list[str]) -> int:
-    usage = "usage: rootsopt COMMAND CONFIG [options]\n\n" + "\n".join(
-        f"  {name:<10} {what}" for name, what in COMMANDS.items()
-    )
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(usage)
-        return door.OK if arguments else door.BAD_INPUT
-    name, *rest = arguments
-    if name == "--version":
-        from rootsopt import __version__
-
-        print(f"rootsopt {__version__}")
-        return door.OK
-    if name not in COMMANDS:
-        import difflib
-
-        near = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f"; did you mean `{near[0]}`?" if near else f"; valid: {', '.join(COMMANDS)}"
-        print(f"rootsopt: `{name}` is not a command{hint}", file=sys.stderr)
-        return door.BAD_INPUT
-    import importlib
-
-    return importlib.import_module(f"rootsopt.{name}").main(rest)
-
-
-def console() -> None:
-    """Entry point of the installed command: ends the process."""
-    door.leave(main())
-
+from rootsopt.commands.console import console
 
 if __name__ == "__main__":
     console()

@@ -32,8 +32,9 @@ os.environ["ROOTSOPT_CACHE"] = os.path.join(os.environ["ROOTSOPT_TEST_CACHE"], "
 # The key that they are signed with belongs there too, and not to the user's own.
 os.environ["XDG_STATE_HOME"] = os.path.join(os.environ["ROOTSOPT_TEST_CACHE"], "state")
 
-from rootsopt import programs  # noqa: E402
-from rootsopt.cli import use_cache, use_float64  # noqa: E402
+from rootsopt.commands.cli import use_cache  # noqa: E402
+from rootsopt.runtime import programs  # noqa: E402
+from rootsopt.runtime.environment import use_float64  # noqa: E402
 
 use_float64()
 use_cache()

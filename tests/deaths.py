@@ -16,9 +16,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from rootsopt import disk, lock
 from rootsopt.errors import InputError
-from rootsopt.runs import RunFolder
+from rootsopt.output import disk, lock
+from rootsopt.output.runs import RunFolder
 
 WRITING = ("open", "write", "fsync", "mkdir", "rename", "replace", "ftruncate", "pwrite")
 """Operations that a full disk makes fail."""

@@ -15,12 +15,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rootsopt import environment
-from rootsopt.cli import use_cache, use_float64
-from rootsopt.door import BAD_INPUT, NO_RESULT
-from rootsopt.door import OK as OK
+from rootsopt.commands.cli import use_cache
+from rootsopt.commands.door import BAD_INPUT, NO_RESULT
+from rootsopt.commands.door import OK as OK
 from rootsopt.errors import InputError
-from rootsopt.files import ResultFolder, row_columns, versions
+from rootsopt.output.files import ResultFolder, row_columns, versions
+from rootsopt.runtime import environment
+from rootsopt.runtime.environment import use_float64
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

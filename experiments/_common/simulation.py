@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 
 from experiments._common.scenes import FORCES
 from rootsopt.config import Config
-from rootsopt.model import Scene, design_vector
 from rootsopt.profiles import Profile
 from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.scene import Scene, design_vector
 
 pair_of_model = eqx.filter_jit(Scene.pair)
 """The rotor pair of a model and a design, compiled."""

@@ -5,9 +5,9 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from rootsopt.plot import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION
-from rootsopt.plot import GREY as GREY
-from rootsopt.plot import figure as sheet
+from rootsopt.figures.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION
+from rootsopt.figures.style import GREY as GREY
+from rootsopt.figures.style import figure as sheet
 
 __all__ = [
     "BLACK",

@@ -88,8 +88,8 @@ def part_single(job: Job) -> dict[str, Any]:
     import jax.numpy as jnp
 
     from experiments._common.simulation import at, evaluator_of
-    from rootsopt.model import integrators
     from rootsopt.response.batch import coarse, respond
+    from rootsopt.scene import integrators
 
     truth, slope = job.known["forces"][0], job.known["slopes"][0]
     repeats = 2 if job.quick else 9
@@ -176,8 +176,8 @@ class _Batch:
         """Simulate all designs with one setting."""
         import jax.numpy as jnp
 
-        from rootsopt.model import Scene, integrators
         from rootsopt.response.batch import coarse, respond_many
+        from rootsopt.scene import Scene, integrators
 
         config = load(CIC, CONTACTS[contact])
         transient, orbit = integrators(config)
@@ -227,7 +227,7 @@ class _Batch:
 
     def timed(self, setting: tuple[str, float, float], gradient: bool) -> Row:
         """Time the batch with a setting; the first call is that of compilation."""
-        from rootsopt.timing import CompileClock
+        from rootsopt.runtime.timing import CompileClock
 
         job, (contact, rtol, coarse) = self.job, setting
         call = functools.partial(self.run, *setting, gradient)

@@ -43,7 +43,7 @@ def part_table(job: Job) -> dict[str, Any]:
     import jax.numpy as jnp
 
     from rootsopt.contact.map import MapContact
-    from rootsopt.model import Scene
+    from rootsopt.scene import Scene
 
     config = load(CIC)
     model = Scene.from_config(config, job.known["deepest"].get("map 384x16"))
@@ -128,7 +128,7 @@ def part_revolutions(job: Job) -> dict[str, Any]:
     import jax.numpy as jnp
 
     from rootsopt.dynamics.flow import strobe
-    from rootsopt.model import Scene, integrators
+    from rootsopt.scene import Scene, integrators
 
     contact = "linear" if job.quick else "search"
     config = load(CIC, CONTACTS[contact])
@@ -163,7 +163,7 @@ def part_reverse(job: Job) -> dict[str, Any]:
     import jax.numpy as jnp
 
     from rootsopt.dynamics.flow import Integrator, flow
-    from rootsopt.model import Scene
+    from rootsopt.scene import Scene
 
     contact = "linear" if job.quick else "search"
     config = load(CIC, CONTACTS[contact])

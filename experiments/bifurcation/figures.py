@@ -9,7 +9,7 @@ from matplotlib.ticker import FuncFormatter
 
 from experiments._common.style import BLUE, GREEN, ORANGE, VERMILION, grid_below, sheet
 from experiments.bifurcation.study import Diagram, beside, ranges
-from rootsopt.continuation import Bifurcation, Kind
+from rootsopt.continuation.branch import Bifurcation, Kind
 from rootsopt.status import Status
 
 NAMES = {

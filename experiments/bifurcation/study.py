@@ -15,9 +15,9 @@ import numpy as np
 
 from experiments._common.scenes import shipped
 from experiments._common.simulation import evaluator_of
-from rootsopt import continuation
 from rootsopt.config import Config
-from rootsopt.continuation import Branch, End, Kind, Steps
+from rootsopt.continuation import branch as continuation
+from rootsopt.continuation.branch import Branch, End, Kind, Steps
 from rootsopt.errors import InputError
 
 Row = dict[str, Any]

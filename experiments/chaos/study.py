@@ -19,14 +19,14 @@ from experiments._common.driver import NoResultError
 from experiments._common.scenes import shipped
 from rootsopt.config import Config
 from rootsopt.dynamics.flow import flow
-from rootsopt.model import Scene
 from rootsopt.optimize.noise import standard_error
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Optimization, Search
-from rootsopt.programs import Program
 from rootsopt.response.ensemble import ERRORS, EnsembleEvaluator
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.members import run_members
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene
 
 SCENE = (
     "scene.load.torque_N_m=1",

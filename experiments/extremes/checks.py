@@ -20,10 +20,10 @@ from rootsopt.contact.impact import force_rounding
 from rootsopt.dynamics.flow import Integrator, flow, strobe
 from rootsopt.dynamics.orbit import Shots, close_orbit
 from rootsopt.dynamics.window import no_tangents
-from rootsopt.model import Scene, design_vector
-from rootsopt.programs import Program
 from rootsopt.response.batch import coarse, respond
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 
 HORIZON = 24

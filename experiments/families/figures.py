@@ -8,7 +8,7 @@ from matplotlib.lines import Line2D
 
 from experiments._common.style import BLUE, GREY, VERMILION, grid_below, sheet
 from experiments.families.tables import Row, by_study, is_missing, title
-from rootsopt.plot import plot_flank
+from rootsopt.figures.profiles import plot_flank
 
 _COLUMNS = 4
 

@@ -13,11 +13,11 @@ from experiments._common.driver import NoResultError
 from experiments._common.scenes import CIC
 from experiments._common.simulation import evaluate, objective, profile_of
 from rootsopt.config import Config, load
-from rootsopt.families import with_design
+from rootsopt.design.resemblance import likenesses
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import Profile
 from rootsopt.profiles.departure import departure, flank_points
-from rootsopt.resemblance import likenesses
+from rootsopt.scene.families import with_design
 
 CONFIG = "configs/free.yaml"
 COARSE = ("solver.fidelity=map", "solver.map_rolls=192", "solver.map_relatives=12")

@@ -23,8 +23,8 @@ from rootsopt.config import Config, load
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.orbit import Shots, agreement, close_orbit
 from rootsopt.dynamics.window import no_tangents
-from rootsopt.model import Scene
 from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.scene import Scene
 
 Row = dict[str, Any]
 TOLERANCES = (1e-8, 1e-9, 1e-10)

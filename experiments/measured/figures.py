@@ -5,8 +5,8 @@ from matplotlib.figure import Figure
 
 from experiments._common.style import BLUE, GREY, grid_below, sheet
 from experiments.measured.study import Results, complex_points, off_um
-from rootsopt.outline.conjugacy import gaps_um
-from rootsopt.plot import plot_conjugacy
+from rootsopt.figures.profiles import plot_conjugacy
+from rootsopt.measured.conjugacy import gaps_um
 
 
 def deviations(results: Results) -> Figure:

@@ -15,11 +15,11 @@ from experiments._common.scenes import CIC
 from experiments._common.simulation import evaluate, profile_of
 from rootsopt.config import Config, load
 from rootsopt.contact.nodes import signed_distance
-from rootsopt.files import ResultFolder
-from rootsopt.model import check_geometry, design_keys
-from rootsopt.outline.conjugacy import Conjugacy, conjugacy
-from rootsopt.outline.source import outline_of
+from rootsopt.measured.conjugacy import Conjugacy, conjugacy
+from rootsopt.measured.source import outline_of
+from rootsopt.output.files import ResultFolder
 from rootsopt.profiles import Profile, outline
+from rootsopt.scene import check_geometry, design_keys
 
 FORM, LOBES, NOISE = 20e-3, 3e-3, 1e-3
 """Form error of the addenda, difference among the lobes, RMS noise (mm)."""

@@ -7,7 +7,7 @@ from matplotlib.ticker import NullFormatter
 from experiments._common.style import BLUE, COLORS, grid_below, sheet
 from experiments.paper.scene import FAMILIES, PAPER, QUANTITIES, Response, config_of
 from experiments.paper.study import Found, Row
-from rootsopt.plot import plot_force, plot_spectrum
+from rootsopt.figures.force import plot_force, plot_spectrum
 
 LOWEST, HIGHEST = 0.1, 300.0
 """Misfits (%) shown. Greater ones, and motions that are not periodic, stand at the upper edge."""

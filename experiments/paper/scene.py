@@ -23,9 +23,10 @@ from rootsopt.config import Config
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.orbit import Shots, close_orbit
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.model import MM, Scene, design_vector
-from rootsopt.programs import Program
 from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene, design_vector
+from rootsopt.scene.families import MM
 from rootsopt.status import Status
 
 

@@ -31,9 +31,9 @@ from experiments.paper.scene import (
     values_of,
 )
 from rootsopt.dynamics.window import PERIODS
-from rootsopt.model import design_vector
 from rootsopt.response import attractors
 from rootsopt.response.evaluation import lyapunov_program, unsettled, unsettled_status
+from rootsopt.scene import design_vector
 from rootsopt.status import Status
 
 WINDOWS = ((0.0, 0.1), (0.0, 0.2), (0.05, 0.2), (0.1, 0.2), (0.1, 0.8))

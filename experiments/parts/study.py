@@ -19,7 +19,7 @@ from experiments._common.scenes import CIC, shipped
 from experiments._common.simulation import evaluator_of, pair_of_model
 from experiments._common.timing import ready, times_of
 from rootsopt.config import Config, load
-from rootsopt.model import Scene, design_vector
+from rootsopt.scene import Scene, design_vector
 
 Row = dict[str, Any]
 # A light load at high speed, which flanks alone can hold. Slower, lobes pass through each other.

@@ -15,7 +15,7 @@ from experiments._common.style import (
     sheet,
 )
 from experiments.speed.study import OPTIMISED, Results
-from rootsopt.plot_speeds import LABELS, legend_entries, plot_speeds
+from rootsopt.figures.speeds import LABELS, legend_entries, plot_speeds
 
 TITLES = {"shipped": "shipped scene", "light": "gear damping ratio 0.1"}
 

@@ -21,12 +21,12 @@ from experiments._common.scenes import shipped
 from experiments._common.simulation import evaluator_of
 from rootsopt.config import Config
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.model import design_vector
+from rootsopt.figures.speeds import LABELS
 from rootsopt.optimize.search import Search
-from rootsopt.plot_speeds import LABELS
-from rootsopt.programs import Program
 from rootsopt.response.evaluation import Evaluation, objective_weights
 from rootsopt.response.speeds import Part, sweep
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import design_vector
 
 Row = dict[str, Any]
 SCENES = {"shipped": (), "light": ("scene.timing_gear.damping_ratio=0.1",)}

@@ -1,7 +1,7 @@
 """Configuration: YAML in, typed settings out.
 
 The only place that knows file formats. Keys carry their units; conversion to SI happens
-in `rootsopt.model`. Anything wrong with a file, a key or a value raises `InputError`
+in `rootsopt.scene`. Anything wrong with a file, a key or a value raises `InputError`
 with one message that names the key, the value and what is allowed.
 """
 

@@ -26,6 +26,7 @@ from rootsopt.config.scene import (
 )
 from rootsopt.config.section import Section, bare
 from rootsopt.config.smoothing import following_mm
+from rootsopt.config.sources import regular_file
 from rootsopt.config.study import (
     AttractorsConfig,
     ConstraintsConfig,
@@ -38,7 +39,6 @@ from rootsopt.config.study import (
 )
 from rootsopt.config.units import hint
 from rootsopt.config.words import named, placed, sentence, shown
-from rootsopt.disk import regular_file
 from rootsopt.errors import InputError
 
 _MOST_PARTS = 8

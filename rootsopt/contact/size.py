@@ -16,7 +16,7 @@ from jaxtyping import Array
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.map import MARGIN, continued_gap, first_roll
 from rootsopt.profiles.base import Profile
-from rootsopt.programs import Program
+from rootsopt.runtime.programs import Program
 
 ROLLS = (96, 128, 192, 256, 384, 512, 768, 1024, 1536)
 RELATIVES = (16, 24, 32, 48)

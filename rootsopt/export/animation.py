@@ -16,10 +16,10 @@ from PIL import Image
 from rootsopt.contact.nodes import place_pair
 from rootsopt.export.drawing import Drawing
 from rootsopt.export.pieces import polyline
-from rootsopt.plot import BLUE, GREY, ORANGE, SKY, VERMILION, figure
+from rootsopt.figures.style import BLUE, GREY, ORANGE, SKY, VERMILION, figure
 from rootsopt.profiles import Profile
-from rootsopt.programs import Program
 from rootsopt.response.evaluation import Series
+from rootsopt.runtime.programs import Program
 
 _MM = 1e3
 _FRAMES = 40  # per mesh period

@@ -8,7 +8,7 @@ from rootsopt.errors import InputError
 
 if TYPE_CHECKING:
     from rootsopt.config import Config
-    from rootsopt.files import ResultFolder
+    from rootsopt.output.files import ResultFolder
     from rootsopt.response.evaluation import Evaluation, Series
 
 FORMATS = {
@@ -71,7 +71,7 @@ def write(
     import numpy as np
 
     from rootsopt.export.drawing import Drawing
-    from rootsopt.model import Scene
+    from rootsopt.scene import Scene
 
     values = jnp.asarray(np.array(list(design.values()), dtype=float))
     profile = Scene.from_config(config).profile(values)

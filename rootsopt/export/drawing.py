@@ -5,7 +5,7 @@ import dataclasses
 from rootsopt.config import Config
 from rootsopt.export.pieces import Piece, outline_pieces
 from rootsopt.profiles import Geometry, Profile, geometry
-from rootsopt.programs import Program
+from rootsopt.runtime.programs import Program
 
 _MM = 1e3
 _shape = Program(geometry)

@@ -19,7 +19,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from rootsopt.errors import InputError
 from rootsopt.profiles import Profile
-from rootsopt.programs import Program
+from rootsopt.runtime.programs import Program
 
 TOLERANCE = 1e-7
 """Largest deviation of a spline from the true flank, in pitch radii. As the perimeter times it

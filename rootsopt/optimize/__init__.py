@@ -5,6 +5,6 @@ from collections.abc import Sequence
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `rootsopt optimize`; returns the exit code."""
-    from rootsopt.optimize.__main__ import main as command
+    from rootsopt.commands.optimize import main as command
 
     return command(argv)

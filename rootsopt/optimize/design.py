@@ -3,9 +3,9 @@
 from collections.abc import Callable
 
 from rootsopt.config import Config
-from rootsopt.model import check_geometry
 from rootsopt.optimize.search import Optimization, Search
 from rootsopt.response.choice import resolve
+from rootsopt.scene import check_geometry
 
 
 def optimize_design(

@@ -17,10 +17,10 @@ from rootsopt.config.units import unit_of
 from rootsopt.design.space import Space, slacks_and_slopes
 from rootsopt.dynamics.measures import line_name
 from rootsopt.errors import InputError
-from rootsopt.model import Scene
-from rootsopt.programs import Program
 from rootsopt.response.evaluation import Evaluation, objective_weights
 from rootsopt.response.speeds import counted, parts_of
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene
 
 _NO_LINE = 1e-9
 """Amplitude of a spectral line, relative to the mean force, that counts as none."""

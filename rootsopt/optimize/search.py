@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
-from rootsopt.model import design_vector
 from rootsopt.optimize.problem import Problem
-from rootsopt.programs import Program
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.wrapper import Evaluates
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import design_vector
 from rootsopt.status import Status
 
 T = TypeVar("T")

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from rootsopt.profiles.base import Profile
-from rootsopt.programs import Program
+from rootsopt.runtime.programs import Program
 
 _NODES = 400
 """Nodes of a flank, so that its chords stay within some 1e-7 r of it."""

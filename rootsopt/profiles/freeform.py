@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.profiles.base import Profile, Quadrature, Segment
-from rootsopt.programs import Program
+from rootsopt.runtime.programs import Program
 
 _DEGREE = 2
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rootsopt.profiles.base import Profile, Quadrature
 from rootsopt.profiles.outline import Outline
-from rootsopt.programs import Program
+from rootsopt.runtime.programs import Program
 
 _GRADING = 4.0
 """Nodes that crowd are even ones by the hyperbolic tangent of a scale this long to either side. Of

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rootsopt.profiles.base import Profile
-from rootsopt.programs import Program
+from rootsopt.runtime.programs import Program
 
 PURE = ("turning", "rolling", "order")
 """Margins that are no lengths."""

@@ -20,11 +20,11 @@ from rootsopt.dynamics.flow import Integrator, strobe
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import BLOCK, Transient, settle, settled_within
 from rootsopt.dynamics.steady import transient_status
-from rootsopt.model import design_vector
-from rootsopt.programs import Program
-from rootsopt.response.batch import on_all_cores
 from rootsopt.response.evaluation import Evaluation, Evaluator, objective_weights
 from rootsopt.response.wrapper import Wrapper
+from rootsopt.runtime.programs import Program
+from rootsopt.runtime.threads import on_all_cores
+from rootsopt.scene import design_vector
 from rootsopt.status import Status
 
 _LONGEST = 8

@@ -7,21 +7,18 @@ inaccurate, and can be given to an `Evaluator`.
 """
 
 import dataclasses
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.steady import Solver, steady_motion
-from rootsopt.model import Scene
-from rootsopt.programs import Program
+from rootsopt.runtime.programs import Program
+from rootsopt.runtime.threads import on_all_cores
+from rootsopt.scene import Scene
 from rootsopt.status import Status
 
 SAMPLES = 840
@@ -132,22 +129,6 @@ def respond_many(
     return on_all_cores(
         lambda designs, states: _in_turn(scene, designs, states, solver, gradient), designs, states
     )
-
-
-def on_all_cores(work: Callable[..., Any], *arrays: Any) -> Any:
-    """`work(*arrays)` with the leading axis (n,) of all arrays, and of its result, divided among
-    threads, one for each core.
-
-    The parts have one size, so that they share a compiled program.
-    """
-    count = arrays[0].shape[0]
-    workers = max(1, min(os.cpu_count() or 1, count))
-    size = -(-count // workers)
-    # The last entry fills the last part up.
-    index = np.minimum(np.arange(workers * size), count - 1).reshape(workers, size)
-    with ThreadPoolExecutor(workers) as pool:
-        parts = list(pool.map(lambda rows: work(*(x[rows] for x in arrays)), index))
-    return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *parts)
 
 
 @Program

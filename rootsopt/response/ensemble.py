@@ -29,9 +29,7 @@ from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.verdict import TOO_DEEP
 from rootsopt.dynamics.window import PERIODS
-from rootsopt.model import Scene, design_vector
 from rootsopt.profiles import Geometry
-from rootsopt.programs import Program
 from rootsopt.response.evaluation import (
     RESPONSES,
     Evaluation,
@@ -50,6 +48,8 @@ from rootsopt.response.members import (
     run_members,
 )
 from rootsopt.response.wrapper import Wrapper
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 
 _RTOL = 1e-6

@@ -21,10 +21,11 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import BLOCK
 from rootsopt.dynamics.steady import Steady, steady_motion, window_status
 from rootsopt.dynamics.window import Window, lyapunov
-from rootsopt.model import MM, Scene, design_keys, design_vector
 from rootsopt.profiles import Geometry
-from rootsopt.programs import Program
 from rootsopt.response.terms import terms_of, values_of
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene, design_keys, design_vector
+from rootsopt.scene.families import MM
 from rootsopt.status import Status
 
 if TYPE_CHECKING:

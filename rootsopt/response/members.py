@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rootsopt.dynamics.flow import Integrator, flow, strobe
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.programs import Program
+from rootsopt.runtime.programs import Program
 from rootsopt.status import Status
 
 _SAMPLES = 63

@@ -10,10 +10,10 @@ import numpy as np
 import xarray
 
 from rootsopt.config import Config
-from rootsopt.model import check_geometry
 from rootsopt.response.choice import resolve
 from rootsopt.response.evaluation import RESPONSES, Evaluation
 from rootsopt.response.evaluators import evaluator_for
+from rootsopt.scene import check_geometry
 
 _LONG = {
     "mean_force_N": "mean contact force",

@@ -20,8 +20,9 @@ from rootsopt.dynamics.linear import eigenvalues
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import CLOSED, Steady, among, steady_motion
-from rootsopt.model import Scene, along, check_precision
-from rootsopt.programs import Program
+from rootsopt.runtime.precision import check_precision
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene, along
 from rootsopt.status import Status
 
 

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rootsopt.errors import InputError
-from rootsopt.families import MM
-from rootsopt.model import Scene
 from rootsopt.profiles import Geometry, Profile, geometry
-from rootsopt.programs import Program
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene
+from rootsopt.scene.families import MM
 
 
 class Forces(NamedTuple):

@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.model import Scene
 from rootsopt.response.evaluation import Evaluation
+from rootsopt.scene import Scene
 
 W = TypeVar("W", bound="Wrapper")
 """The kind of a wrapper, which stays the same. (Not `Self`: types of single methods are checked at

@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conformance.kinks import along, unmarked
 
 from rootsopt.contact.nodes import pair_gap
 from rootsopt.errors import InputError
+from tests.conformance.kinks import along, unmarked
 
 
 @eqx.filter_jit

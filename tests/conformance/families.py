@@ -18,10 +18,10 @@ from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.nodes import pair_gap
 from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
-from rootsopt.families import check, design_of, profile_of, with_design
-from rootsopt.model import Scene
 from rootsopt.profiles import geometry
 from rootsopt.profiles.validity import margins
+from rootsopt.scene import Scene
+from rootsopt.scene.families import check, design_of, profile_of, with_design
 
 R = 0.033
 LOBES = 3

@@ -3,7 +3,8 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from conformance.kinks import along, unmarked
+
+from tests.conformance.kinks import along, unmarked
 
 
 def check_law(law, depth, rate, sharp=0.0):

@@ -6,9 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from conformance.kinks import along, unmarked
 
 from rootsopt.dynamics.parts import Loads, Motion, Units
+from tests.conformance.kinks import along, unmarked
 
 UNITS = Units(jnp.asarray(1.5e-3), jnp.asarray(6.7e-3))
 SPEED = 314.0

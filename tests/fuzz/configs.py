@@ -45,7 +45,7 @@ class _LateError(BaseException):
 
 def run(report: Report, seed: int) -> None:
     """Try random configs of every class in turn until the report is full."""
-    from rootsopt.cli import use_float64
+    from rootsopt.runtime.environment import use_float64
 
     use_float64()
     number = 0
@@ -100,9 +100,9 @@ def wrong_geometry(config: Config) -> str | None:
     import jax
     import numpy as np
 
-    from rootsopt.model import Scene, check_geometry, design_vector
     from rootsopt.profiles import geometry
-    from rootsopt.programs import Program
+    from rootsopt.runtime.programs import Program
+    from rootsopt.scene import Scene, check_geometry, design_vector
 
     global _measured
     if _measured is None:

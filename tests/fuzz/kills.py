@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from rootsopt.runs import RESULT, RunFolder
+from rootsopt.output.runs import RESULT, RunFolder
 from tests.deaths import digest, faulty, scratch
 from tests.fuzz.report import Report
 

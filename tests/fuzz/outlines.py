@@ -138,7 +138,7 @@ def good() -> dict[str, bytes]:
     from rootsopt.config import load
     from rootsopt.export.drawing import Drawing
     from rootsopt.export.dxf import dxf_bytes
-    from rootsopt.model import Scene, design_vector
+    from rootsopt.scene import Scene, design_vector
 
     config = load(Path(__file__).parents[2] / "configs" / "cic.yaml")
     profile = Scene.from_config(config).profile(design_vector(config))
@@ -383,9 +383,9 @@ def fault_of(error: BaseException) -> str | None:
 
 def tried(path: Path, smoothing: float, roll: bool = True) -> str | None:
     """Read, fit and roll the outline in a file, as `rootsopt profile` does; what went wrong."""
-    from rootsopt.outline.conjugacy import conjugacy
-    from rootsopt.outline.fit import imported
-    from rootsopt.outline.reading import read
+    from rootsopt.measured.conjugacy import conjugacy
+    from rootsopt.measured.fit import imported
+    from rootsopt.measured.reading import read
 
     try:
         found, _ = imported(read(path), 3, _R, smoothing)
@@ -398,7 +398,7 @@ def tried(path: Path, smoothing: float, roll: bool = True) -> str | None:
 
 def _work(jobs) -> None:
     """A worker: tries the files whose paths come, with stderr into a file, and answers."""
-    from rootsopt.cli import use_float64
+    from rootsopt.runtime.environment import use_float64
 
     use_float64()
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, resource.RLIM_INFINITY))
@@ -483,7 +483,7 @@ def commanded(path: Path, smoothing: float) -> str | None:
 
 def run(report: Report, seed: int) -> None:
     """Try damaged files until `report` is over; failed ones are kept in a folder it names."""
-    from rootsopt.cli import use_float64
+    from rootsopt.runtime.environment import use_float64
 
     use_float64()
     kept = Path(tempfile.gettempdir()) / "rootsopt-outlines"

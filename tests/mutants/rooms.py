@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
+_TESTS = Path(__file__).parents[1]
 _OF = {
-    "arclength": "closed_forms continuation",
-    "continuation": "continuation",
-    "orbits": "closed_forms continuation",
+    "continuation/arclength": "closed_forms continuation",
+    "continuation/branch": "continuation",
+    "continuation/orbits": "closed_forms continuation",
     "contact/closest": "closed_forms contact accuracy conjugacy families gradients",
     "contact/gap": "conformance",
     "contact/impact": "impact contact extremes",
@@ -39,7 +40,7 @@ _OF = {
     "dynamics/parts/load": "load scene dynamics",
     "dynamics/parts/supports": "scene",
     "config/families": "extending families config",
-    "optimize/bounds": "closed_forms families optimize freeform",
+    "design/bounds": "closed_forms families optimize freeform",
     "optimize/noise": "closed_forms noise ensemble",
     "optimize/problem": "closed_forms optimize speeds families freeform",
     "optimize/search": "closed_forms optimize speeds",
@@ -65,10 +66,13 @@ _OF = {
     "response/speeds": "closed_forms speeds",
     "response/steady": "steady gradients",
 }
-"""Modules, and the words in `tests/test_WORD.py`."""
+"""Modules, and the WORDs in their tests' names `test_WORD.py`."""
 
+_FILES = {
+    path.stem: path.relative_to(_TESTS.parent).as_posix() for path in _TESTS.rglob("test_*.py")
+}
 ROOMS = {
-    f"rootsopt/{module}.py": tuple(f"tests/test_{word}.py" for word in words.split())
+    f"rootsopt/{module}.py": tuple(_FILES[f"test_{word}"] for word in words.split())
     for module, words in _OF.items()
 }
 
@@ -84,11 +88,10 @@ def modules(root: Path) -> list[str]:
 
 def _numerical(root: Path):
     package = root / "rootsopt"
-    for name in ("arclength", "continuation", "orbits", "config/families"):
-        yield package / f"{name}.py"
+    yield package / "config" / "families.py"
     for name in ("batch", "ensemble", "members", "speeds", "steady"):
         yield package / "response" / f"{name}.py"
-    for folder in ("contact", "dynamics", "optimize", "profiles"):
+    for folder in ("contact", "continuation", "dynamics", "optimize", "profiles"):
         for path in (package / folder).rglob("*.py"):
             if path.name not in ("__init__.py", "__main__.py"):
                 yield path

@@ -13,7 +13,7 @@ from pathlib import Path
 
 _LEFT_OUT = (".git", ".venv", "results", "dist", "build", "__pycache__", ".hypothesis",
              ".pytest_cache", ".ruff_cache")  # fmt: skip
-_OWN_CACHE = "tests/test_programs.py"
+_OWN_CACHE = "tests/runtime/test_programs.py"
 """Tests of the package's own cache, which is not used beside that of JAX."""
 _WORDS = {"caught": "caught by", "timeout": "no end", "survived": "SURVIVED", "void": "VOID"}
 

@@ -19,7 +19,8 @@ def start() -> None:
     Programs are not optimised, unless XLA_FLAGS says otherwise: most of the time is the compiler's.
     """
     os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
-    from rootsopt.cli import use_cache, use_float64
+    from rootsopt.commands.cli import use_cache
+    from rootsopt.runtime.environment import use_float64
 
     use_float64()
     use_cache()

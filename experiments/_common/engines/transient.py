@@ -12,7 +12,7 @@ from jax import lax
 
 from rootsopt.dynamics.flow import Integrator, flow
 from rootsopt.dynamics.orbit import SAMPLES
-from rootsopt.model import Scene
+from rootsopt.scene import Scene
 
 _FEW = 64
 """Samples of a mesh period whose peak is not needed."""

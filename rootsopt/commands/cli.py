@@ -1,0 +1,197 @@
+"""What the commands share: arguments, result folder, float64, exit codes.
+
+Exit 0: success. 2: bad input, one message on stderr. 3: the run ended without a usable
+result; the status says why.
+"""
+
+import argparse
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
+
+from rootsopt.commands import door
+from rootsopt.commands.door import BAD_INPUT, NO_RESULT
+from rootsopt.commands.door import OK as OK
+from rootsopt.config import Config, describe_families, describe_keys, load, sources
+from rootsopt.config.families import import_named
+from rootsopt.errors import InputError
+from rootsopt.runtime import environment
+from rootsopt.runtime.environment import use_float64
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from rootsopt.output.runs import RunFolder
+
+# Equinox's checks of traced values call back to Python, and a program that does so cannot
+# be kept between processes. Every integration here returns a status instead. Read once,
+# when equinox is first imported.
+os.environ.setdefault("EQX_ON_ERROR", "off")
+
+
+class Outcome(NamedTuple):
+    """What a command came to: its exit `code`, and `show`, which prints it."""
+
+    code: int
+    show: "Callable[[Console], None]"
+
+
+Body = Callable[[Config, argparse.Namespace, "RunFolder"], Outcome]
+"""What a command does: check, compute, write into the folder it is given."""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """One line, as for other bad input."""
+        self.exit(BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def parser(command: str, purpose: str) -> argparse.ArgumentParser:
+    """The arguments every command takes."""
+    result = _Parser(
+        prog=f"rootsopt {command}",
+        description=purpose,
+        epilog=f"profile families (profile.family):\n{describe_families()}\n\n"
+        f"config keys (for --set and the file), units in the name:\n{describe_keys()}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    result.add_argument("config", type=Path, help="YAML file, for example configs/cic.yaml")
+    result.add_argument(
+        "-o",
+        "--output",
+        metavar="DIR",
+        help=f"result folder (default: results/CONFIG-{command}); appears whole when the run has "
+        "ended, and an earlier run in it is moved to DIR.1, DIR.2 ...",
+    )
+    result.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="replace an earlier run in the result folder instead of moving it",
+    )
+    result.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="overrides",
+        help="override a config key, as in --set scene.speed_rpm=1500; repeatable",
+    )
+    _add_import(result)
+    result.add_argument("--no-figures", action="store_true", help="write no figures")
+    result.add_argument(
+        "--no-cache",
+        action="store_true",
+        help="compile anew, and keep no compiled programs in the user's cache folder "
+        "(ROOTSOPT_CACHE=DIR names another folder, ROOTSOPT_CACHE=off is as this option)",
+    )
+    return result
+
+
+def _add_import(arguments: argparse.ArgumentParser) -> None:
+    arguments.add_argument(
+        "--import",
+        action="append",
+        default=[],
+        metavar="FILE_OR_MODULE",
+        dest="imports",
+        help="Python file, or module, to run first: it may register profile families; repeatable",
+    )
+
+
+def _import_extensions(command: str, argv: Sequence[str] | None) -> None:
+    """Import what `--import` names, before config keys are described and read."""
+    early = _Parser(prog=f"rootsopt {command}", add_help=False, allow_abbrev=False)
+    _add_import(early)
+    names = early.parse_known_args(argv)[0].imports
+    if names:
+        use_float64()
+    for name in names:
+        import_named(name)
+
+
+def run(
+    command: str,
+    purpose: str,
+    body: Body,
+    argv: Sequence[str] | None,
+    add_options: Callable[[argparse.ArgumentParser], None] = lambda _: None,
+) -> int:
+    """Parse, load, choose float64, run `body` in a folder of its own, put that in place, print;
+    turn `InputError` into exit 2. `add_options` adds the command's own arguments."""
+    environment.own_process()
+    try:
+        _import_extensions(command, argv)
+        arguments = parser(command, purpose)
+        add_options(arguments)
+        options = arguments.parse_args(argv)
+        for name in options.imports:  # Those that only the whole parser knows: an abbreviation.
+            import_named(name)
+        if options.output is None:
+            options.output = os.path.join("results", f"{options.config.stem}-{command}")
+        config = load(options.config, options.overrides)
+        use_float64()
+        if not options.no_cache:
+            use_cache()
+        with environment.explained():
+            return _in_folder(command, body, config, options)
+    except InputError as error:
+        message = " ".join(str(error).split())
+        print(f"rootsopt {command}: {message}", file=sys.stderr)
+        return BAD_INPUT
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename is not None else ""
+        print(f"rootsopt {command}: {where}{sources.reason(error)}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print(f"rootsopt {command}: stopped by the user", file=sys.stderr)
+        return NO_RESULT
+
+
+def _in_folder(command: str, body: Body, config: Config, options: argparse.Namespace) -> int:
+    from rootsopt.output.runs import RunFolder
+
+    with (
+        RunFolder(options.output, command, options.overwrite) as folder,
+        door.leaving(folder.abandon),
+    ):
+        outcome = body(config, options, folder)
+        notes = folder.put_in_place()
+        # The console takes half of the time to import, and stdout may fail: files come first.
+        from rich.console import Console
+
+        out = Console()
+        outcome.show(out)
+        for note in notes:
+            out.print(note, soft_wrap=True, markup=False, highlight=False)
+        out.print(f"results in {folder.path}", soft_wrap=True, markup=False, highlight=False)
+    return outcome.code
+
+
+@contextlib.contextmanager
+def waiting(console: "Console", what: str) -> Iterator[None]:
+    """Say `what` goes on, on a terminal; nothing in a pipe."""
+    if not console.is_terminal:
+        yield
+        return
+    with console.status(what):
+        yield
+
+
+def use_cache() -> None:
+    """Keep compiled programs between processes, in the user's cache folder.
+
+    A folder that cannot be used is no error: the programs are then compiled anew. One line on
+    stderr says so where others could change what is kept there.
+    """
+    import platformdirs
+
+    from rootsopt.runtime import programs
+
+    choice = os.environ.get("ROOTSOPT_CACHE", "")
+    if choice.lower() not in ("off", "0", "no"):
+        folder = choice or platformdirs.user_cache_dir("rootsopt", appauthor=False)
+        if refused := programs.keep_in(Path(folder)):
+            environment.say(f"compiled programs are not kept between runs: {refused}")

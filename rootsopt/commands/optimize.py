@@ -1,0 +1,258 @@
+"""`rootsopt optimize CONFIG`: an optimised design against the baseline."""
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from rootsopt.commands import door
+
+if TYPE_CHECKING:
+    import argparse
+
+    from rootsopt.commands.cli import Outcome
+    from rootsopt.config import Config
+    from rootsopt.output.runs import RunFolder
+
+PURPOSE = "Optimise the design parameters for low contact force and compare with the baseline."
+
+
+_PATIENCE = 5.0
+"""Time (s) after an interrupt for simulating the best design so far again from rest."""
+
+
+def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
+    """Check, search, write, print."""
+    began = time.perf_counter()
+    from rich.console import Console
+
+    from rootsopt import export
+    from rootsopt.commands import cli
+    from rootsopt.output import tables
+    from rootsopt.runtime.timing import CompileClock
+    from rootsopt.scene import check_geometry
+
+    formats = export.chosen(options.export)
+    check_geometry(config)
+    clock = CompileClock()
+    promise = "keeping the best design so far and writing the files"
+    with (
+        clock,
+        door.patience(promise) as stop,
+        _progress(Console(stderr=True)) as progress,
+    ):
+        config, choice, result = _searched(config, progress, stop)
+    if result is None:
+        return _nothing_known(config, folder)
+    ran = time.perf_counter() - began
+    alike = {} if result.interrupted else _alike(config, result)
+    _write(folder, config, options, result, choice | alike, clock.seconds, ran)
+    if result.optimized is not None:
+        export.write_simulated(folder, config, formats, result.optimized)
+    total = time.perf_counter() - began
+
+    def show(out: Console) -> None:
+        baseline = result.baseline.record().get("speeds")
+        if result.optimized is None:
+            out.print(tables.evaluation_table(result.baseline))
+            if baseline:
+                out.print(tables.speeds_table(baseline))
+        else:
+            numbers = result.constraints, result.improvement
+            out.print(tables.comparison_table(result.baseline, result.optimized, *numbers))
+            if baseline:
+                optimized = result.optimized.record()["speeds"]
+                out.print(tables.speeds_table(baseline, optimized, result.objective_by_speed))
+            if alike:
+                out.print(tables.likeness_table(alike["resembles"]))
+        if result.interrupted or result.optimized is None:
+            out.print(_message(result))
+        out.print(
+            f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
+            f"reports {total - ran:.1f} s",
+            soft_wrap=True,
+        )
+
+    found = result.optimized is not None and not result.interrupted
+    return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
+
+
+def _searched(config: "Config", progress, stop: threading.Event):
+    """Config without `auto`, what was chosen there, and the search's outcome: None if it was
+    stopped before the baseline was simulated."""
+    from rootsopt.optimize.search import Search, until_stopped
+    from rootsopt.response.choice import resolve
+
+    state: dict[str, Any] = {"config": config, "choice": {}}
+
+    def work():
+        state["config"], state["choice"] = resolve(config)
+        state["search"] = Search(state["config"], progress, stop)
+        return state["search"].run()
+
+    result = until_stopped(work, stop, _PATIENCE)
+    if result is None and "search" in state:
+        result = state["search"].so_far()
+    return state["config"], state["choice"], result
+
+
+def _nothing_known(config: "Config", folder: "RunFolder") -> "Outcome":
+    """Write what there is of a run that was stopped before the baseline was simulated."""
+    from rootsopt.commands import cli
+    from rootsopt.output import files
+    from rootsopt.status import Status
+
+    status = Status.INTERRUPTED
+    message = "The run was stopped before the baseline had been simulated: there is no result."
+    files.write_config(folder, config)
+    data = {"baseline": None, "optimized": None, "status": status.label, "message": message}
+    folder.write_json("result.json", data | {"versions": files.versions()})
+    folder.overwrite = False  # An earlier result is worth more than this.
+    text = f"{status.label}: {message}"
+    return cli.Outcome(cli.NO_RESULT, lambda out: out.print(text, soft_wrap=True))
+
+
+def _alike(config: "Config", result) -> dict:
+    """What a free form that was found resembles, for report and result file."""
+    from rootsopt.config.families import family_of
+
+    if family_of(config.profile.family).classical or result.optimized is None:
+        return {}
+    import jax.numpy as jnp
+
+    from rootsopt.design.resemblance import likenesses
+    from rootsopt.scene import Scene
+
+    design = list(result.optimized.design.values())
+    found = likenesses(Scene.from_config(config).profile(jnp.asarray(design)))
+    return {"resembles": [one.record() for one in found]}
+
+
+def _message(result) -> str:
+    """What to say of a search that was interrupted or has found nothing."""
+    return f"{result.status.label}: {_advice(result)}"
+
+
+def _advice(result) -> str:
+    from rootsopt.optimize import noise
+
+    if result.interrupted:
+        return _interrupted(result)
+    if not result.baseline.usable:
+        return f"baseline: {result.baseline.message}"
+    if result.optimized is not None:
+        return result.optimized.message
+    if message := noise.message(result.verification):
+        return message
+    if result.verification.get("rejected"):
+        return (
+            "No better design held up when simulated again from rest at the tight tolerance. "
+            "Raise optimizer.iterations or optimizer.screening, or tighten solver.rtol."
+        )
+    return result.status.value
+
+
+def _interrupted(result) -> str:
+    """How far an interrupted search got."""
+    count = len(result.history)
+    begin = f"The search was stopped after {count} design{'s' if count != 1 else ''}"
+    if not result.baseline.usable:
+        return f"{begin}, and the baseline is of no use: {result.baseline.message}"
+    if result.optimized is None:
+        return f"{begin}; none of them is known to be feasible and better than the baseline."
+    if result.verification["holds_up"]:
+        return f"{begin}. The best of them, simulated again from rest, is reported."
+    return (
+        f"{begin}. The best of them is reported as the search found it: it was not simulated again "
+        "from rest at the config's tolerance."
+    )
+
+
+def _write(folder, config, options, result, choice, compiled, ran) -> None:
+    from rootsopt.output import files
+    from rootsopt.scene import outline_mm
+    from rootsopt.scene.families import with_design
+
+    records = {"baseline": result.baseline, "optimized": result.optimized}
+    files.write_config(folder, config)
+    if result.optimized is not None:
+        profile = with_design(config.profile, list(result.optimized.design.values()))
+        best = config.model_copy(update={"profile": profile})
+        folder.write_text("optimized.yaml", best.to_yaml())
+    data: dict = {name: e.record() if e is not None else None for name, e in records.items()}
+    for name, evaluation in records.items():
+        if evaluation is None:
+            continue
+        design = list(evaluation.design.values())
+        folder.write_csv(f"profile_{name}.csv", files.profile_columns(outline_mm(config, design)))
+        if evaluation.series is not None:
+            folder.write_csv(f"response_{name}.csv", files.response_columns(evaluation.series))
+    rows = result.history
+    if rows:
+        folder.write_csv("history.csv", {key: [row[key] for row in rows] for key in rows[0]})
+    data |= choice
+    data["improvement"] = result.improvement
+    data["constraints"] = result.constraints
+    if config.objective.speeds_rpm and result.optimized is not None:
+        data["objective_by_speed"] = result.objective_by_speed
+    data["verification"] = result.verification
+    data["status"], data["message"] = result.status.label, _advice(result)
+    data["statistics"] = {
+        "evaluations": len(rows),
+        "compile_seconds": compiled,
+        "run_seconds": ran - compiled,
+    }
+    data["versions"] = files.versions()
+    folder.write_json("result.json", data)
+    if not options.no_figures:
+        from rootsopt.figures import runs
+
+        if result.optimized is not None:
+            runs.optimization_figures(folder, result.baseline, result.optimized, rows, config)
+        else:
+            runs.simulation_figures(folder, result.baseline, config)
+        if config.objective.speeds_rpm:
+            from rootsopt.figures.speeds import speed_figure
+
+            names = {"baseline": result.baseline, "optimised": result.optimized}
+            designs = {name: one.parts for name, one in names.items() if one is not None}
+            speed_figure(folder, designs, "Contact force over the speeds of the objective")
+
+
+@contextlib.contextmanager
+def _progress(console) -> Iterator:
+    """A progress bar with the current best objective on a terminal, nothing in a pipe."""
+    if not console.is_terminal:
+        yield None
+        return
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total} designs"),
+        TextColumn("best objective {task.fields[best]}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("baseline, compiling", total=None, best="-")
+
+        def update(done: int, expected: int, best: float) -> None:
+            bar.update(
+                task, description="optimising", completed=done, total=expected, best=f"{best:.4f}"
+            )
+
+        yield update
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return door.through("optimize", lambda: _run(argv), own=argv is None)
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    from rootsopt import export
+    from rootsopt.commands import cli
+
+    return cli.run("optimize", PURPOSE, body, argv, lambda p: export.add_option(p, "none"))

@@ -1,0 +1,117 @@
+"""`rootsopt profile CONFIG`: geometry only."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from rootsopt.commands import door
+
+if TYPE_CHECKING:
+    import argparse
+
+    from rich.console import Console
+
+    from rootsopt.commands.cli import Outcome
+    from rootsopt.config import Config
+    from rootsopt.output.runs import RunFolder
+
+PURPOSE = "Geometry of one design: radii, area, inertia, margins; drawings, solids, animation."
+EXPORT = "dxf,svg"
+"""What is written if nothing is said: a drawing takes less than a second, a solid ten."""
+
+
+def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
+    """Check, measure, write, print."""
+    from rootsopt import export
+    from rootsopt.commands import cli
+    from rootsopt.measured import report as outline_report
+    from rootsopt.output import files, tables
+    from rootsopt.profiles import geometry
+    from rootsopt.response.evaluation import geometry_record
+    from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, outline_mm
+    from rootsopt.scene.families import margins_of
+    from rootsopt.status import Status
+
+    formats = export.chosen(options.export)
+    check_geometry(config)
+    coefficients = _coefficients(options.project)
+    model, design = Scene.from_config(config), design_vector(config)
+    shape = geometry(model.profile(design))
+    record = {
+        "design": dict(zip(design_keys(config), map(float, design), strict=True)),
+        "geometry": geometry_record(model, shape),
+        "response": {},
+        "gradient": {},
+        "steady_state": {},
+        "status": Status.GEOMETRY_ONLY.label,
+        "message": Status.GEOMETRY_ONLY.value,
+        "statistics": {},
+    }
+    if margins := margins_of(config.profile):
+        record["margins"] = margins
+    record |= outline_report.record(config)
+    files.write_config(folder, config)
+    folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
+    folder.write_json("result.json", record | {"versions": files.versions()})
+    export.write(folder, config, formats, record["design"])
+    if not options.no_figures:
+        from rootsopt.figures import runs
+
+        runs.profile_figures(folder, config, record)
+    projected = None if coefficients is None else _projected(folder, config, coefficients)
+
+    def show(out: "Console") -> None:
+        out.print(tables.geometry_table(record))
+        outline_report.say(config, out)
+        if projected is not None:
+            out.print(projected, soft_wrap=True)
+
+    return cli.Outcome(cli.OK, show)
+
+
+def _coefficients(given: str | None) -> int | None:
+    """The number of coefficients that `--project` asks for. Raises `InputError`."""
+    from rootsopt.errors import InputError
+
+    if given is None:
+        return None
+    if not (given.isdecimal() and 3 <= int(given) <= 64):
+        raise InputError(
+            f"`--project` must be a number of coefficients from 3 to 64, but is {given}; "
+            "12 come within some micrometres of most profiles"
+        )
+    return int(given)
+
+
+def _projected(folder: "RunFolder", config: "Config", count: int) -> str:
+    """Write the config with its profile as a free form; what there is to say of that."""
+    from rootsopt.scene.families import free_form_of
+
+    profile, away = free_form_of(config.profile, count)
+    folder.write_text("free_form.yaml", config.model_copy(update={"profile": profile}).to_yaml())
+    return (
+        f"as a free form of {count} coefficients, at most {away * 1e6:.3g} µm away from this "
+        f"outline: {folder.path / 'free_form.yaml'}"
+    )
+
+
+def _options(parser: "argparse.ArgumentParser") -> None:
+    from rootsopt import export
+
+    export.add_option(parser, EXPORT)
+    parser.add_argument(
+        "--project",
+        metavar="N",
+        help="write free_form.yaml, the same config with the profile as a free form of N "
+        "coefficients, to begin an optimisation with",
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return door.through("profile", lambda: _run(argv), own=argv is None)
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    from rootsopt.commands import cli
+
+    return cli.run("profile", PURPOSE, body, argv, _options)

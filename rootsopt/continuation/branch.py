@@ -1,0 +1,258 @@
+"""Periodic orbits followed over a parameter, through folds, with their stability.
+
+A branch begins at an orbit found before (`Evaluation.state` and its period) and is followed
+by pseudo-arclength (`arclength`), as a curve of the equations in `orbits`.
+Unstable orbits, which no simulation shows, are followed like stable ones, and flagged.
+"""
+
+import dataclasses
+import enum
+import itertools
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rootsopt.config import Config
+from rootsopt.continuation.arclength import (
+    End,
+    Path,
+    Spot,
+    Steps,
+    StoppedError,
+    corrected,
+    follow_curve,
+)
+from rootsopt.continuation.orbits import (
+    LONGEST,
+    PLACES,
+    BranchPoint,
+    Orbits,
+    parameters,
+    place_of,
+    value_of,
+    with_value,
+)
+from rootsopt.dynamics.verdict import RESIDUAL
+from rootsopt.errors import InputError
+
+_HALVED = 0.004
+"""Distance (as `Steps` counts) from the state half an orbit later, where a branch that ends for
+no other reason is about to meet one of half the period."""
+_SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
+"""Distances from a bifurcation (as `Steps` counts) at which its doubled orbit is sought."""
+
+
+class Kind(enum.Enum):
+    """What happens to an orbit at a bifurcation."""
+
+    FOLD = "Two orbits meet and vanish; a multiplier passes through +1."
+    PERIOD_DOUBLING = "An orbit of twice the period is born; a multiplier passes through -1."
+    NEIMARK_SACKER = "Quasi-periodic motion is born; two multipliers leave the unit circle."
+    CORNER = "A touch of the flanks or of the gear begins or ends; multipliers jump."
+
+
+@dataclasses.dataclass(frozen=True)
+class Bifurcation:
+    """Where a branch changes: the orbit there, what it is, and the index of the branch's last
+    point before it."""
+
+    kind: Kind
+    point: BranchPoint
+    after: int
+
+    @property
+    def value(self) -> float:
+        """The parameter there (config's unit)."""
+        return self.point.value
+
+
+@dataclasses.dataclass(frozen=True)
+class Branch:
+    """Orbits of one period along `parameter`, in order; why they begin and end where they do.
+
+    `config` is the one it was started with, `limits` (in the config's unit) those it was
+    followed within.
+    """
+
+    config: Config
+    parameter: str
+    period: int
+    points: tuple[BranchPoint, ...]
+    bifurcations: tuple[Bifurcation, ...]
+    ends: tuple[End, End]
+    limits: Steps
+
+    def at(self, value: float) -> list[BranchPoint]:
+        """All orbits of the branch at a value of the parameter, closed there; none where it
+        does not come by."""
+        orbits = Orbits(self.config, self.parameter, self.period, self.limits)
+        found = []
+        for old, new in zip(self.points[:-1], self.points[1:], strict=True):
+            ends = sorted((old.value, new.value))
+            if not ends[0] <= value < ends[1]:
+                continue
+            share = (value - old.value) / (new.value - old.value)
+            places = [orbits.place(point.state, point.value) for point in (old, new)]
+            guess = places[0] + share * (places[1] - places[0])
+            try:
+                found.append(orbits.closed(guess))
+            except StoppedError:
+                continue
+        if self.points[-1].value == value:
+            found.append(self.points[-1])
+        return found
+
+
+def follow(
+    config: Config,
+    parameter: str,
+    state: ArrayLike,
+    period: int,
+    limits: Steps,
+    ways: tuple[int, ...] = (-1, 1),
+) -> Branch:
+    """Follow the orbit of `period` mesh periods near the scaled `state` over a parameter.
+
+    `limits`: range of the parameter in the config's unit, the config's own value within, and
+    steps, of which one of length 1 spans the range, or changes the scaled state by `SPAN`.
+    `ways`: first along falling (-1) and then rising (1) values, or one of these.
+
+    Raises `InputError` for an unknown parameter, a value outside the limits, single precision,
+    or where there is no orbit to start from.
+    """
+    value = value_of(config, parameter)
+    if not limits.low <= value <= limits.high:
+        raise InputError(
+            f"`{place_of(parameter)}` must lie in the range to follow, {limits.low:g} to "
+            f"{limits.high:g}, but is {value:g}"
+        )
+    if not 1 <= period <= LONGEST or not set(ways) <= {-1, 1} or not ways:
+        raise InputError(
+            f"Arguments `period` and `ways` must be 1 to {LONGEST} and among -1 and 1, but are "
+            f"{period} and {ways}"
+        )
+    for bound in (limits.low, limits.high):
+        with_value(config, parameter, bound)
+    orbits = Orbits(config, parameter, period, limits)
+    place = orbits.place(state, value)
+    fixed = np.eye(len(place))[-1]
+    try:
+        start = corrected(orbits, place, fixed, fixed)
+    except StoppedError as stop:
+        raise InputError(
+            f"no orbit of {period} mesh periods is near the state at `{place_of(parameter)}` = "
+            f"{value:g}: {stop.end.value} Start from the state of a periodic Evaluation"
+        ) from None
+    branches = []
+    for way in ways:
+        first = start._replace(tangent=way * np.sign(start.tangent[-1] or 1) * start.tangent)
+        branches.append(_branch(orbits, follow_curve(orbits, first, orbits.steps, _TESTS)))
+        if branches[-1].ends[1] is End.CLOSED:
+            break
+    return branches[0] if len(branches) == 1 else _joined(*branches)
+
+
+def follow_doubled(
+    branch: Branch, bifurcation: Bifurcation, limits: Steps | None = None
+) -> Branch | None:
+    """The branch of twice the period born at a period doubling of `branch`, from there on.
+
+    It begins a little away from the bifurcation, displaced along the eigenvector of the
+    multiplier -1. None where no orbit is found that is not the simple one, or where it is longer
+    than 8 mesh periods. Raises `ValueError` for another kind of bifurcation.
+    """
+    if bifurcation.kind is not Kind.PERIOD_DOUBLING:
+        raise ValueError(
+            "Argument `bifurcation` must be a period doubling, but is "
+            f"{bifurcation.kind.name.lower()}"
+        )
+    if 2 * branch.period > LONGEST:
+        return None
+    limits = limits or branch.limits
+    simple = Orbits(branch.config, branch.parameter, branch.period, limits)
+    orbits = Orbits(branch.config, branch.parameter, 2 * branch.period, limits)
+    place = simple.place(bifurcation.point.state, bifurcation.value)
+    fixed = np.eye(len(place))[-1]
+    try:
+        monodromy = corrected(simple, place, fixed, fixed).look.data.monodromy
+        multipliers, vectors = np.linalg.eig(monodromy)
+        flipped = np.real(vectors[:, np.argmin(np.abs(multipliers + 1))])
+        across = np.append(flipped / np.linalg.norm(flipped), 0.0)
+    except StoppedError:
+        return None
+    # Both ways lead to the one orbit, a mesh period apart: near a grazing touch one may fail.
+    for size, way in itertools.product(_SIZES, (1, -1)):
+        aside = way * across
+        try:
+            start = corrected(orbits, place + size * aside, aside, aside)
+        except StoppedError:
+            continue
+        if start.look.data.half_way > 0.2 * size:
+            return _branch(orbits, follow_curve(orbits, start, orbits.steps, _TESTS))
+    return None
+
+
+def _branch(orbits: Orbits, path: Path) -> Branch:
+    """The branch of a path."""
+    end = path.end
+    if end is End.STEP_TOO_SMALL and orbits.period % 2 == 0:
+        half_way = path.spots[-1].look.data.half_way
+        end = End.HALVED if half_way < _HALVED else end
+    bifurcations = []
+    for after, name, spot in path.crossings:
+        kind, point = Kind[name], orbits.point(spot)
+        # Two real multipliers whose product is one make a neutral saddle.
+        real = np.all(np.abs(point.multipliers.imag) < 1e-9)
+        if kind is not Kind.NEIMARK_SACKER or not real:
+            bifurcations.append(Bifurcation(kind, point, after))
+    return Branch(
+        config=orbits.config,
+        parameter=orbits.parameter,
+        period=orbits.period,
+        points=tuple(map(orbits.point, path.spots)),
+        bifurcations=tuple(bifurcations),
+        ends=(End.START, end),
+        limits=orbits.limits,
+    )
+
+
+def _joined(falling: Branch, rising: Branch) -> Branch:
+    """One branch of two that begin at the same point, the first reversed."""
+    count = len(falling.points) - 1
+    points = tuple(
+        dataclasses.replace(point, slope=-point.slope) for point in falling.points[:0:-1]
+    )
+    turned = [
+        dataclasses.replace(one, after=count - 1 - one.after) for one in falling.bifurcations[::-1]
+    ]
+    moved = [dataclasses.replace(one, after=count + one.after) for one in rising.bifurcations]
+    return dataclasses.replace(
+        rising,
+        points=points + rising.points,
+        bifurcations=(*turned, *moved),
+        ends=(falling.ends[1], rising.ends[1]),
+    )
+
+
+def _fold(spot: Spot) -> float:
+    return float(spot.tangent[-1])
+
+
+def _doubling(spot: Spot) -> float:
+    monodromy = spot.look.data.monodromy
+    return float(np.linalg.det(monodromy + np.eye(len(monodromy))))
+
+
+def _torus(spot: Spot) -> float:
+    multipliers = np.linalg.eigvals(spot.look.data.monodromy)
+    first, second = np.triu_indices(len(multipliers), 1)
+    return float(np.prod(multipliers[first] * multipliers[second] - 1).real)
+
+
+_TESTS = {"FOLD": _fold, "PERIOD_DOUBLING": _doubling, "NEIMARK_SACKER": _torus}
+
+
+__all__ = [
+    "PLACES", "RESIDUAL", "Bifurcation", "Branch", "BranchPoint", "End", "Kind", "Steps",
+    "follow", "follow_doubled", "parameters", "value_of", "with_value",
+]  # fmt: skip

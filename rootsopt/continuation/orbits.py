@@ -1,0 +1,395 @@
+"""Periodic orbits as the zeros of equations in a state and a parameter.
+
+The unknowns are the state at φ1 = 0, in units that stay those of the first config, and the
+parameter; the equations say that the state comes back after k mesh periods, and their derivatives
+come with the motion, from its linearised steps. `rootsopt.continuation.branch` follows the curves.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike, NDArray
+
+from rootsopt.config import Config, parse
+from rootsopt.continuation.arclength import End, Look, Spot, Steps, StoppedError, corrected
+from rootsopt.dynamics.flow import Flow, Integrator, flow
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.steady import SAMPLES
+from rootsopt.dynamics.switches import with_switches
+from rootsopt.dynamics.verdict import RESIDUAL, TOO_DEEP
+from rootsopt.errors import InputError
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import (
+    Scene,
+    check_geometry,
+    design_keys,
+    design_vector,
+    families,
+    integrators,
+)
+from rootsopt.scene.families import MM
+
+PLACES = {
+    "speed_rpm": "scene.speed_rpm",
+    "torque_N_m": "scene.load.torque_N_m",
+    "pressure_difference_Pa": "scene.load.pressure_difference_Pa",
+    "backlash_mm": "scene.timing_gear.backlash_mm",
+    "damping_ratio": "scene.timing_gear.damping_ratio",
+}
+"""Parameters that can be followed, in the config's units, and where they stand there, beside the
+design parameters, which are in `profile`."""
+_GEAR = ("backlash_mm", "damping_ratio")
+SPAN = 20.0
+"""Change of the scaled state that counts as much as the whole range of the parameter."""
+_LOOKS = 504
+"""Uniform times at which contact is looked for."""
+LONGEST = 8
+"""Longest orbit (mesh periods)."""
+_STEP = 1 / 256
+"""Steps (mesh periods) are not much longer than this."""
+_SAME = 1e-5
+"""Distance (as `Steps` counts) from the state half an orbit later within which an orbit is one of
+half the period (states between steps are interpolated)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BranchPoint:
+    """One periodic orbit.
+
+    `value` of the parameter (config's unit); `state` (n,) at φ1 = 0, scaled as the config with
+    that value scales it, so that an `Evaluator` can start there; `period` (mesh periods);
+    `mean`, `peak`, `rms` of the contact force (N); `multipliers` (n,): Floquet multipliers;
+    `residual`: greatest entry of Φ(z) - z, relative to that of z where this exceeds one;
+    `slope`: change of the parameter along the branch, as a share of its range and of arclength;
+    `gap_time`: longest time (mesh periods) in which neither flanks nor gear touch;
+    `depth`: greatest penetration (m); `reach`: greatest |ε| (rad); `looks`: integrations it
+    took.
+    """
+
+    value: float
+    state: NDArray[np.float64]
+    period: int
+    mean: float
+    peak: float
+    rms: float
+    multipliers: NDArray[np.complex128]
+    residual: float
+    slope: float
+    gap_time: float
+    depth: float
+    reach: float
+    looks: int
+
+    @property
+    def stable(self) -> bool:
+        """Whether all multipliers lie inside the unit circle."""
+        return bool(np.max(np.abs(self.multipliers)) < 1)
+
+
+def parameters(config: Config) -> tuple[str, ...]:
+    """Names of the parameters that can be followed for `config`."""
+    gear = _GEAR if config.scene.timing_gear is not None else ()
+    gas = config.scene.load.pressure_difference_Pa is not None
+    load = "pressure_difference_Pa" if gas else "torque_N_m"
+    return ("speed_rpm", load, *gear, *design_keys(config))
+
+
+def value_of(config: Config, parameter: str) -> float:
+    """Value of a parameter, in the config's unit. Raises `InputError` for an unknown one."""
+    _check(config, parameter)
+    keys = design_keys(config)
+    if parameter in keys:
+        return float(design_vector(config)[keys.index(parameter)])
+    found: Any = config
+    for key in PLACES[parameter].split("."):
+        found = getattr(found, key)
+    return float(found)
+
+
+def place_of(parameter: str) -> str:
+    """Where a parameter stands in a config."""
+    return PLACES.get(parameter, f"profile.{parameter}")
+
+
+def with_value(config: Config, parameter: str, value: float) -> Config:
+    """`config` with another value of a parameter. Raises `InputError` for an unknown
+    parameter, and for a value that is out of bounds."""
+    _check(config, parameter)
+    if parameter in design_keys(config):
+        return parse(_with_design(config, parameter, value).to_yaml())
+    return parse(config.to_yaml(), [f"{PLACES[parameter]}={float(value)!r}"])
+
+
+def _with_design(config: Config, parameter: str, value: float) -> Config:
+    """`config` with another value of a design parameter, of which nothing is checked."""
+    design = np.asarray(design_vector(config)).copy()
+    design[design_keys(config).index(parameter)] = value
+    profile = families.with_design(config.profile, design)
+    return config.model_copy(update={"profile": profile})
+
+
+def _check(config: Config, parameter: str) -> None:
+    valid = parameters(config)
+    if parameter in valid:
+        return
+    why = "this config has no timing gear" if parameter in _GEAR else "valid here"
+    raise InputError(
+        f"Argument `parameter` must be one that can be followed, but is {parameter!r}; {why}: "
+        f"{', '.join(valid)}"
+    )
+
+
+class _Shot(NamedTuple):
+    """k mesh periods from a state: `out`, its steps `grid` with ends where the equation is not
+    smooth, whether the mesh was lost, whether there is contact at uniform
+    times, and the `scale` (rad) of the config."""
+
+    out: Flow
+    grid: Float[Array, " steps"]
+    lost: Bool[Array, ""]
+    touching: Bool[Array, " looks"]
+    scale: Float[Array, ""]
+
+
+class _Seen(NamedTuple):
+    """What is known of an orbit at a look, beside residual and Jacobian."""
+
+    monodromy: NDArray[np.float64]
+    state: NDArray[np.float64]
+    statistics: NDArray[np.float64]
+    half_way: float
+    residual: float
+    depth: float
+    reach: float
+    gap_time: float
+
+
+class Orbits:
+    """Orbits of k mesh periods as a curve: places are (state / `SPAN`, share of the range)."""
+
+    def __init__(self, config: Config, parameter: str, period: int, limits: Steps):
+        if config.solver.precision != "float64":
+            raise InputError(
+                "`solver.precision` must be float64 to follow a branch, but is "
+                f"{config.solver.precision}"
+            )
+        self.config, self.parameter, self.period, self.limits = config, parameter, period, limits
+        self.names = parameters(config)
+        self.values = np.array([value_of(config, name) for name in self.names])
+        self.index = self.names.index(parameter)
+        self.model = Scene.from_config(config)
+        self.how = integrators(config)[1]
+        self.width = limits.high - limits.low
+        self.steps = dataclasses.replace(limits, low=0.0, high=1.0)
+        # Built once for its units: they stay those of the config while the parameter changes.
+        self.unit = float(_unit(self.model, self.names, self.values))
+
+    def value(self, place: NDArray[np.float64]) -> float:
+        """The parameter at a place, in the config's unit; exact at both ends of the range."""
+        share = place[-1]
+        return float(self.limits.high if share == 1 else self.limits.low + share * self.width)
+
+    def place(self, state: ArrayLike, value: float) -> NDArray[np.float64]:
+        """Place of an orbit, from its state scaled as the config with that `value` scales it."""
+        scale = float(_unit(self.model, self.names, self._values(value)))
+        share = (value - self.limits.low) / self.width
+        return np.append(np.asarray(state) * (scale / self.unit / SPAN), share)
+
+    def _values(self, value: float) -> NDArray[np.float64]:
+        values = self.values.copy()
+        values[self.index] = value
+        return values
+
+    def closed(self, guess: NDArray[np.float64]) -> BranchPoint:
+        """The orbit near `guess` at its value of the parameter. Raises `StoppedError`."""
+        fixed = np.eye(len(guess))[-1]
+        return self.point(corrected(self, guess, fixed, fixed))
+
+    def __call__(self, place: NDArray[np.float64], memory: Any, careful: bool) -> Look:
+        self._check_design(self.value(place))
+        shot = self._shot(place, memory, refine=memory is None)
+        if careful and memory is None:
+            # Once more, on steps short enough to see the touches that those chosen step over.
+            shot = self._shot(place, shot.grid, refine=True)
+        out: Flow = shot.out
+        reach = self.unit * float(np.max(np.abs(out.states[:, 0])))
+        count = len(place) - 1
+        if not out.solved:
+            raise StoppedError(End.SOLVER_FAILED)
+        if not (np.all(np.isfinite(out.end)) and np.all(np.isfinite(out.slope[:count]))):
+            raise StoppedError(End.NON_FINITE)
+        if shot.lost:
+            raise StoppedError(End.LOST_MESH)
+        if out.depth > TOO_DEEP * float(self.model.pitch_radius):
+            raise StoppedError(End.TOO_DEEP)
+        if self.model.fidelity == "map" and reach > -float(self.model.deepest):
+            raise StoppedError(End.OFF_THE_MAP)
+        state = SPAN * place[:-1]
+        miss = np.asarray(out.end) - state
+        monodromy = np.asarray(out.slope)[:count, :count]
+        by_share = out.slope[:count, count] * self.width / SPAN
+        seen = _Seen(
+            monodromy=monodromy,
+            state=state * (self.unit / shot.scale),
+            statistics=np.array([out.mean, out.peak, np.sqrt(out.mean_square)]),
+            half_way=float(np.max(np.abs(out.states[len(out.states) // 2] - state))) / SPAN,
+            residual=float(np.max(np.abs(miss)) / max(1.0, np.max(np.abs(state)))),
+            depth=float(out.depth),
+            reach=reach,
+            gap_time=_longest_gap(np.asarray(shot.touching)) * self.period,
+        )
+        if self.period % 2 == 0 and seen.half_way < _SAME and seen.residual < RESIDUAL["float64"]:
+            raise StoppedError(End.HALVED)
+        jacobian = np.column_stack([monodromy - np.eye(count), by_share])
+        return Look(miss / SPAN, jacobian, shot.grid, seen)
+
+    def _shot(self, place: NDArray[np.float64], grid: Any, refine: bool) -> "_Shot":
+        return jax.device_get(
+            _shoot(
+                self.model,
+                self.names,
+                self._values(self.value(place)),
+                np.eye(len(self.names))[self.index],
+                np.asarray(self.unit),
+                SPAN * place[:-1],
+                np.asarray(float(self.period)),
+                self.how,
+                np.full(self.how.max_steps, np.inf) if grid is None else grid,
+                np.asarray(grid is not None),
+                np.asarray(refine),
+            )
+        )
+
+    def _check_design(self, value: float) -> None:
+        """Raise `StoppedError` where no profile can be made."""
+        if self.parameter in design_keys(self.config):
+            try:
+                check_geometry(_with_design(self.config, self.parameter, value))
+            except InputError:
+                raise StoppedError(End.NO_GEOMETRY) from None
+
+    def point(self, spot: Spot) -> BranchPoint:
+        """The orbit at a spot."""
+        seen: _Seen = spot.look.data
+        mean, peak, rms = map(float, seen.statistics)
+        return BranchPoint(
+            value=self.value(spot.place),
+            state=seen.state,
+            period=self.period,
+            mean=mean,
+            peak=peak,
+            rms=rms,
+            multipliers=np.linalg.eigvals(seen.monodromy).astype(complex),
+            residual=seen.residual,
+            slope=float(spot.tangent[-1]),
+            gap_time=seen.gap_time,
+            depth=seen.depth,
+            reach=seen.reach,
+            looks=spot.looks,
+        )
+
+
+def _longest_gap(touching: NDArray[np.bool_]) -> float:
+    """Longest run of False around a cycle, as a share of it."""
+    if not touching.any():
+        return 1.0
+    ends = np.flatnonzero(touching)
+    gaps = np.diff(ends, append=ends[0] + len(touching)) - 1
+    return float(np.max(gaps)) / len(touching)
+
+
+def _build(
+    model: Scene, names: tuple[str, ...], values: Float[Array, " p"]
+) -> tuple[RotorPair, Float[Array, ""]]:
+    """The pair with these values of the parameters (config's units), and its angle scale."""
+    at = dict(zip(names, values, strict=True))
+    gear = model.gear
+    if gear is not None:
+        half = at["backlash_mm"] * MM / (2 * model.pitch_radius)
+        gear = eqx.tree_at(lambda g: g.half_backlash, gear, half)
+    tuned = dataclasses.replace(
+        model,
+        speed=at["speed_rpm"] * (2 * jnp.pi / 60),
+        load_torque=at.get("torque_N_m", model.load_torque),
+        pressure=at.get("pressure_difference_Pa"),
+        gear=gear,
+        gear_damping_ratio=at.get("damping_ratio", model.gear_damping_ratio),
+    )
+    design = [value for name, value in at.items() if name not in PLACES]
+    pair = tuned.pair(jnp.stack(design) if design else jnp.zeros(0))
+    return pair, pair.angle_scale
+
+
+@Program
+def _unit(model, names, values):
+    return _build(model, names, values)[1]
+
+
+@Program
+def _shoot(
+    model: Scene,
+    names: tuple[str, ...],
+    values: Float[Array, " p"],
+    direction: Float[Array, " p"],
+    unit: Float[Array, ""],
+    state: Float[Array, " n"],
+    period: Float[Array, ""],
+    how: Integrator,
+    grid: Float[Array, " steps"],
+    repeat: Bool[Array, ""],
+    refine: Bool[Array, ""],
+) -> _Shot:
+    """Motion from a state in the fixed `unit` (rad), linearised in it and along `direction`.
+
+    On the steps of `grid` while `repeat`. With `refine` the grid returned has ends added where
+    the equation is not smooth.
+    """
+
+    def build(values):
+        pair, scale = _build(model, names, values)
+        return eqx.tree_at(lambda p: p.angle_scale, pair, unit), scale
+
+    def arrays(values):
+        return eqx.filter(build(values)[0], eqx.is_inexact_array)
+
+    pair, scale = build(values)
+    _, tangent = jax.jvp(arrays, (values,), (direction,))
+    tangents = jax.tree.map(lambda x: x[None], tangent)
+    out = flow(pair, state, period, how, SAMPLES, tangents, grid, repeat)
+    tolerance = how.tolerance(state.dtype)
+    finer = lax.cond(
+        refine,
+        lambda: _without_long(with_switches(pair, out, period, tolerance), period),
+        lambda: grid,
+    )
+    stride = SAMPLES // _LOOKS
+    times = period * jnp.arange(_LOOKS) / _LOOKS
+
+    def touches(tau, state):
+        held = pair.gear is not None and jnp.any(pair.gear.switches(pair.motion(tau, state), None))
+        return (pair.contact_at(tau, state).total > 0) | held
+
+    touching = jax.vmap(touches)(times, out.states[::stride])
+    farthest = jnp.maximum(jnp.max(jnp.abs(out.states[:, 0])), jnp.abs(out.end[0]))
+    lost = (unit * farthest >= pair.angle_limit) | pair.lost(out.end)
+    return _Shot(out, finer, lost, touching, scale)
+
+
+def _without_long(grid: Float[Array, " steps"], period: Float[Array, ""]) -> Float[Array, " steps"]:
+    """`grid` with ends added in steps much longer than `_STEP`.
+
+    In free flight the error control takes steps so long that a short touch goes unseen, or not:
+    then the flow would jump from one state to the next.
+    """
+    ends = _STEP * jnp.arange(1, LONGEST / _STEP)
+    after = jnp.searchsorted(grid, ends)
+    before = jnp.where(after > 0, grid[after - 1], 0.0)
+    clear = jnp.minimum(ends - before, grid[after] - ends) > _STEP / 4
+    ends = jnp.where(clear & (ends < period), ends, jnp.inf)
+    return jnp.sort(jnp.concatenate([grid, ends]))[: grid.shape[0]]

@@ -1,0 +1,199 @@
+"""Which of the named families a profile resembles, and how far it departs from that."""
+
+import functools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+
+from rootsopt.config.families import family_of
+from rootsopt.design.space import sobol
+from rootsopt.profiles import Profile
+from rootsopt.profiles.departure import departure
+from rootsopt.profiles.validity import PURE, margins
+from rootsopt.runtime.programs import Program
+from rootsopt.scene.families import MM, classical, profile_of
+
+_NODES = 96
+"""Nodes on either side of the pitch circle, in the search."""
+_SAMPLE = 128
+"""Members of a family that are tried; the best of them begin a search."""
+_STARTS = 3
+_PROGRAMS, _LONGEST, _SHORTEST = 80, 0.2, 1e-9
+"""Linear programs of a search, at most, and the longest and shortest of their steps, as a share of
+where the parameters usually lie."""
+_UNSOUND_WEIGHT = 10.0
+"""Of a negative margin against distance."""
+_UNSOUND = 1e-6
+"""Negative margin, relative to its scale, with which a member of a family is none."""
+
+
+class Likeness(NamedTuple):
+    """The member of a `family` that is nearest to a profile: its `design` in config units, and the
+    greatest distance (m) of the outlines."""
+
+    family: str
+    design: dict[str, float]
+    departure: float
+
+    def record(self) -> dict[str, Any]:
+        """The record of the result file."""
+        return {
+            "family": self.family,
+            "design": self.design,
+            "departure_um": self.departure * 1e6,
+        }
+
+
+def likenesses(profile: Profile) -> list[Likeness]:
+    """The nearest member of every classical family to `profile`, nearest first.
+
+    Nearest is where the greatest distance of the outlines is least, looked for from the best of a
+    Sobol sample: a nearer member may be left unfound. Families without a sound one are left out.
+    """
+    found = []
+    for family in classical():
+        likeness = _nearest(profile, family)
+        if likeness is not None:
+            found.append(likeness)
+    return sorted(found, key=lambda one: one.departure)
+
+
+def _nearest(profile: Profile, family: str) -> Likeness | None:
+    lobes, radius = profile.lobes, profile.pitch_radius
+    parameters, keys = family_of(family).parameters, family_of(family).keys
+    look = _Look(profile, family)
+    if not keys:
+        starts = [np.zeros(0)]
+    else:
+        size = float(radius) / MM, lobes
+        low, high = np.array([parameter.usually(*size) for parameter in parameters]).T
+        sample = low + (high - low) * sobol(_SAMPLE, 0, len(keys))
+        faults = np.array([look(one).fault for one in sample])
+        starts = [_fitted(look, sample[k], high - low) for k in np.argsort(faults)[:_STARTS]]
+    sound = [one for one in starts if look(one).sound]
+    if not sound:
+        return None
+    design = min(sound, key=lambda one: look(one).away)
+    member = profile_of(family, lobes, radius, jnp.asarray(design))
+    named = dict(zip(keys, map(float, design), strict=True))
+    return Likeness(family, named, departure(profile, member))
+
+
+class _Seen(NamedTuple):
+    """Distances (n,) of a member's outline, in pitch radii, its margins (m,) relative to their
+    scales, and the derivatives of both by the design."""
+
+    distance: NDArray[np.float64]
+    margin: NDArray[np.float64]
+    distance_slope: NDArray[np.float64]
+    margin_slope: NDArray[np.float64]
+
+    @property
+    def finite(self) -> bool:
+        return all(np.all(np.isfinite(part)) for part in self)
+
+    @property
+    def sound(self) -> bool:
+        return self.finite and bool(np.min(self.margin) >= -_UNSOUND)
+
+    @property
+    def fault(self) -> float:
+        """What a search is to make small: the greatest distance, and negative margins."""
+        if not self.finite:
+            return math.inf
+        lacking = max(0.0, -float(np.min(self.margin)))
+        return float(np.max(np.abs(self.distance))) + _UNSOUND_WEIGHT * lacking
+
+    @property
+    def away(self) -> float:
+        """Greatest distance; of what is not sound, beyond every other."""
+        return float(np.max(np.abs(self.distance))) if self.sound else math.inf
+
+
+class _Look:
+    """Members of a `family` as seen from a `profile`."""
+
+    def __init__(self, profile: Profile, family: str):
+        self.family, self.lobes, self.radius = family, profile.lobes, profile.pitch_radius
+        self.target = _target(profile)
+
+    @functools.lru_cache(maxsize=1024)  # noqa: B019
+    def _at(self, design: tuple[float, ...]) -> _Seen:
+        design_array = np.asarray(design, dtype=np.float64)
+        found = _compared(self.family, self.lobes, self.radius, self.target, design_array)
+        return _Seen(*map(np.asarray, found))
+
+    def __call__(self, design) -> _Seen:
+        return self._at(tuple(map(float, design)))
+
+
+def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
+    """The design near `start` with the least greatest distance, by a sequence of linear programs:
+    each finds the step, at most `size` of the `width`, that the derivatives promise most of."""
+    design, size = start, _LONGEST
+    for _ in range(_PROGRAMS):
+        seen = look(design)
+        if not seen.finite or size < _SHORTEST:
+            break
+        new = design + width * _promising(seen, width, size)
+        if look(new).fault < seen.fault:
+            design, size = new, min(2 * size, _LONGEST)
+        else:
+            size /= 4
+    return design
+
+
+def _promising(seen: _Seen, width, size: float) -> NDArray[np.float64]:
+    """The step, in `width`, with the least fault to first order: minimise the bound t on all
+    distances plus the weighted bound u on negative margins."""
+    count, distances, soundness = len(width), len(seen.distance), len(seen.margin)
+    by_step = np.concatenate([seen.distance_slope, -seen.distance_slope, -seen.margin_slope])
+    one, none = np.ones((2 * distances, 1)), np.zeros((2 * distances, 1))
+    bounds = np.block([[-one, none], [np.zeros((soundness, 1)), -np.ones((soundness, 1))]])
+    found = linprog(
+        np.concatenate([np.zeros(count), [1.0, _UNSOUND_WEIGHT]]),
+        A_ub=np.hstack([by_step * width, bounds]),
+        b_ub=np.concatenate([-seen.distance, seen.distance, seen.margin]),
+        bounds=[(-size, size)] * count + [(0, None)] * 2,
+    )
+    return np.zeros(count) if found.x is None else found.x[:count]
+
+
+@Program
+def _target(profile: Profile):
+    """Normal angles (n,), and of addendum and dedendum points (m) and outward normals there,
+    (2, n, 2) each."""
+    nu = profile.pitch_normal * jnp.linspace(0.0, 1.0, _NODES)
+    points = [side(nu) for side in (profile.addendum, profile.dedendum)]
+    places = jnp.stack([profile.position(point) for point in points])
+    angles = jnp.stack([point.beta + jnp.pi / 2 - point.psi for point in points])
+    return nu, places, jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
+
+
+@Program
+def _compared(family: str, lobes: int, radius: Float[Array, ""], target, design):
+    """Distances along the normals of the `target` at equal normal angles of the addendum, which
+    are distances of the outlines but for what is of second order; margins; slopes of both."""
+    nu, places, normals = target
+
+    def both(design):
+        profile = profile_of(family, lobes, radius, design)
+        sides = [profile.position(side(nu)) for side in (profile.addendum, profile.dedendum)]
+        away = jnp.sum((jnp.stack(sides) - places) * normals, axis=-1).ravel() / radius
+        found = margins(profile)._asdict()
+        scaled = [
+            value / (1.0 if name in PURE else radius)
+            for name, value in found.items()
+            if name not in family_of(family).inherent
+        ]
+        values = away, jnp.stack(scaled)
+        return values, values
+
+    slopes, values = jax.jacfwd(both, has_aux=True)(design)
+    return *values, *slopes

@@ -1,0 +1,1 @@
+"""Figures of profiles, forces, searches, speeds and basins."""

@@ -1,0 +1,131 @@
+"""Contact force over time and frequency. Each function draws on the axes it is given."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.markers import CARETDOWN
+from numpy.typing import ArrayLike, NDArray
+
+from rootsopt.figures.style import (
+    BLUE,
+    COLORS,
+    VERMILION,
+)
+from rootsopt.response.evaluation import Series
+
+_MOST_TURNS = 4  # revolutions of a force panel
+_LINES = 400  # spectral lines drawn one by one
+_NOTHING = 1e-300  # stands for 0 on a logarithmic axis
+
+
+def plot_force(
+    axes: Sequence[Axes] | NDArray,
+    series: Mapping[str, Series],
+    responses: Mapping[str, Mapping[str, float]],
+) -> Sequence[Axes] | NDArray:
+    """Contact force over time, one panel per design, all on one scale.
+
+    Mean and peak are the given responses (`mean_force_N`, `peak_force_N`), which are finer
+    than the samples. Every panel is as long as the shortest window, a few revolutions at
+    most, and has the largest force in it; time counts from its start.
+    """
+    turns = min(_MOST_TURNS, *(np.ptp(run.rotation) / (2 * np.pi) for run in series.values()))
+    for ax, (name, run) in zip(axes, series.items(), strict=True):
+        shown = _around_peak(run, turns)
+        force = run.force[shown]
+        step = (run.time[1] - run.time[0]) * 1e3
+        time = step * np.arange(len(force))
+        _flank_force(ax, time, run.drive_force[shown], BLUE, "drive flank")
+        _flank_force(ax, time, run.coast_force[shown], VERMILION, "coast flank")
+        mean, peak = responses[name]["mean_force_N"], responses[name]["peak_force_N"]
+        label = f"mean {number(mean)} N"
+        ax.axhline(mean, color="black", linestyle="--", linewidth=1.1, label=label)
+        first = time[np.argmax(force >= 0.999 * np.max(force))]
+        label = f"peak {number(peak)} N"
+        ax.plot(first, peak, color="black", marker=CARETDOWN, ls="", markersize=9, label=label)
+        ax.set(title=name, ylabel="contact force (N)", xlim=(0, len(force) * step))
+        ax.grid(color="0.92", linewidth=0.6)
+        ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
+    top = max(max(responses[k]["peak_force_N"], np.max(series[k].force)) for k in series)
+    for ax in axes:
+        ax.set_ylim(0, 1.12 * top if top > 0 else 1)
+    axes[-1].set_xlabel("time (ms)")
+    return axes
+
+
+def _flank_force(ax, time, force, color, label):
+    if not np.any(force > 0):
+        label += " (no contact)"
+    ax.fill_between(time, force, color=color, alpha=0.15, linewidth=0)
+    ax.plot(time, force, color=color, linewidth=1.2, label=label)
+
+
+def number(value: float) -> str:
+    """Four significant digits, final zeros kept."""
+    return f"{value:#.4g}".rstrip(".")
+
+
+def _around_peak(run: Series, turns: float) -> slice:
+    """So many revolutions with the largest force in the middle, as far as there are samples."""
+    count = len(run.time)
+    shown = min(count, round(count * turns * 2 * np.pi / np.ptp(run.rotation)))
+    start = 0 if shown == count else int(np.argmax(run.force)) - shown // 2
+    start = min(max(start, 0), count - shown)
+    return slice(start, start + shown)
+
+
+def amplitude_spectrum(
+    signal: ArrayLike, step: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Frequencies (1/unit of `step`) above 0 and one-sided amplitudes of a signal (n,).
+
+    The samples must be uniform and cover whole periods, without the end point: then a
+    cosine of amplitude a gives one line of height a and no window function is needed.
+    """
+    signal = np.asarray(signal)
+    amplitude = 2 * np.abs(np.fft.rfft(signal)) / len(signal)
+    if len(signal) % 2 == 0:
+        amplitude[-1] /= 2
+    frequency = np.fft.rfftfreq(len(signal), step)
+    return np.asarray(frequency[1:], dtype=np.float64), np.asarray(amplitude[1:], dtype=np.float64)
+
+
+def plot_spectrum(
+    axes: Sequence[Axes] | NDArray,
+    series: Mapping[str, Series],
+    mesh_frequency_Hz: float,
+    harmonics: int = 40,
+) -> Sequence[Axes] | NDArray:
+    """Amplitude spectrum of the contact force, one panel per design, all on one scale.
+
+    Up to `harmonics` times the mesh frequency; the mean (0 Hz) is left out.
+    """
+    limit = (harmonics + 0.5) * mesh_frequency_Hz
+    top = 0.0
+    for ax, (name, run), color in zip(axes, series.items(), COLORS, strict=False):
+        frequency, amplitude = amplitude_spectrum(run.force, run.time[1] - run.time[0])
+        shown = frequency <= limit
+        frequency, amplitude = frequency[shown] / 1e3, np.maximum(amplitude[shown], _NOTHING)
+        top = max(top, float(np.max(amplitude, initial=0)))
+        if len(frequency) <= _LINES:
+            ax.vlines(frequency, _NOTHING, amplitude, color=color, linewidth=2)
+        else:
+            ax.plot(frequency, amplitude, color=color, linewidth=0.7)
+        ax.set(title=name, ylabel="force amplitude (N)", xlim=(0, limit / 1e3))
+        ax.grid(color="0.92", linewidth=0.6)
+        ax.set_axisbelow(True)
+    for ax in axes:
+        ax.set_yscale("log")
+        ax.set_ylim(*((1e-4 * top, 2 * top) if top > 0 else (1e-4, 1)))
+    per_mesh = mesh_frequency_Hz / 1e3
+    orders = axes[0].secondary_xaxis(
+        "top",
+        functions=(
+            lambda f: np.asarray(f) / per_mesh,
+            lambda order: np.asarray(order) * per_mesh,
+        ),
+    )
+    orders.set_xlabel(f"multiple of the mesh frequency, {mesh_frequency_Hz:.4g} Hz")
+    axes[-1].set_xlabel("frequency (kHz)")
+    return axes

@@ -1,0 +1,142 @@
+"""History of an optimisation: objective and design over the evaluations."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from rootsopt.config import DESIGN_KEYS
+from rootsopt.config.families import is_list
+from rootsopt.figures.force import number
+from rootsopt.figures.style import (
+    COLORS,
+    GREY,
+)
+
+_MARKERS = "os^Dvp"
+
+
+def plot_history(
+    axes: Sequence[Axes] | NDArray,
+    history: Sequence[Mapping[str, Any]],
+    keys: Sequence[str] = DESIGN_KEYS,
+) -> Sequence[Axes] | NDArray:
+    """Objective with best so far, then the design parameters, over the evaluations.
+
+    `axes` holds a panel more than there are `keys`, those of the family in the config; a list of
+    parameters shares a panel, which shows the local searches only. A row without `start`, or with
+    a negative one, belongs to the screening. Unusable designs (objective not finite) stand as
+    crosses at the top.
+    """
+    keys = ("objective", *keys)
+    for ax, key in zip(axes, keys, strict=True):
+        for rows, style in _starts(history):
+            if is_list(key):
+                _traces(ax, rows, key)
+            else:
+                _trace(ax, rows, key, style)
+        ax.set_ylabel("objective / baseline" if key == "objective" else _label(key))
+        ax.grid(color="0.92", linewidth=0.6)
+    axes[0].axhline(1, color="black", linewidth=0.8, linestyle=":", label="baseline")
+    _best(axes, keys, history)
+    _outside(axes[0], history)
+    axes[0].legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
+    axes[-1].set_xlabel("evaluation")
+    return axes
+
+
+def _label(key: str) -> str:
+    """Name of a design parameter with its unit."""
+    units = {"_deg": " (°)", "_mm": " (mm)"}
+    unit = next((end for end in units if key.endswith(end)), "")
+    return key.removesuffix(unit).replace("_", " ") + units.get(unit, "")
+
+
+def _traces(ax, rows, key):
+    """The entries of a list of parameters over the evaluations of a local search."""
+    rows = [row for row in rows if _start(row) >= 0]
+    if not rows:
+        return
+    names = [name for name in rows[0] if name.startswith(key)]
+    x = _values(rows, "evaluation")
+    for k, name in enumerate(names):
+        shade = colormaps["cividis"](k / max(len(names) - 1, 1))
+        label = {0: "first, at the tip", len(names) - 1: "last, at the pitch circle"}.get(k)
+        ax.plot(x, _values(rows, name), color=shade, linewidth=1.2, label=label)
+    if not ax.get_legend():
+        ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
+
+
+def _starts(history) -> Iterator[tuple[list[Mapping[str, Any]], dict[str, Any]]]:
+    """Rows and line style of the screening and of each start."""
+    groups: dict[Any, list] = {}
+    for row in history:
+        groups.setdefault(_start(row), []).append(row)
+    for i, (start, rows) in enumerate(sorted(groups.items())):
+        if start < 0:
+            style = {"color": GREY, "marker": ".", "linestyle": "", "label": "screening"}
+        else:
+            color = COLORS[start % len(COLORS)]
+            marker = _MARKERS[(start // len(COLORS) + start) % len(_MARKERS)]
+            style = {"color": color, "marker": marker, "linestyle": "-", "linewidth": 1}
+            style["label"] = f"start {start}" if i < 10 else None
+        yield rows, style
+
+
+def _start(row) -> int:
+    start = row.get("start")
+    return int(start) if isinstance(start, int | np.integer) else -1
+
+
+def _trace(ax, rows, key, style):
+    """Values over evaluations; hollow where a constraint is not met."""
+    x, y = _values(rows, "evaluation"), _values(rows, key)
+    met = np.asarray([bool(row.get("feasible", True)) for row in rows])
+    ax.plot(x, y, **(style | {"marker": "", "label": None}), alpha=0.6)
+    dots = style | {"linestyle": "", "markersize": 5}
+    ax.plot(x[met], y[met], **dots)
+    ax.plot(x[~met], y[~met], **(dots | {"label": None}), markerfacecolor="white")
+
+
+def _values(rows, key) -> NDArray[np.float64]:
+    values = (row.get(key) for row in rows)
+    return np.asarray([np.nan if value is None else value for value in values], dtype=float)
+
+
+def _best(axes, keys, history):
+    """Best objective so far as a line, and a star on the best design in every panel."""
+    x, best = [row["evaluation"] for row in history], _values(history, "best_objective")
+    axes[0].step(x, best, where="post", color="black", linewidth=1.8, label="best so far")
+    if not np.isfinite(best).any():
+        return
+    last = best[np.isfinite(best)][-1]
+    winner = [row for row in history if row["objective"] == last][:1]
+    star = {"color": "black", "markerfacecolor": "#F0E442", "markersize": 14, "zorder": 5}
+    for ax, key in zip(axes, keys, strict=True):
+        if is_list(key):
+            continue
+        x, y = [row["evaluation"] for row in winner], _values(winner, key)
+        ax.plot(x, y, "*", label=f"best, {number(last)}", **star)
+
+
+def _outside(ax, history):
+    """Limits that a few bad designs cannot stretch, and marks for what lies outside them."""
+    values = _values(history, "objective")
+    x = _values(history, "evaluation")
+    known = values[np.isfinite(values)]
+    known = np.append(known, 1.0)
+    high = known[known <= max(1.5, 2 * np.median(known))].max()
+    low = known.min()
+    margin = 0.12 * max(high - low, 0.02)
+    ax.set_ylim(low - margin, high + 1.5 * margin)
+    marks = ((values > high, "^", "above the axis"), (~np.isfinite(values), "x", "unusable design"))
+    for mask, marker, label in marks:
+        if np.any(mask):
+            top = np.full(np.count_nonzero(mask), 0.96)
+            over = {"transform": ax.get_xaxis_transform(), "linestyle": "", "color": "black"}
+            ax.plot(x[mask], top, marker=marker, markersize=6, label=label, **over)
+    if not all(bool(row.get("feasible", True)) for row in history):
+        ax.plot([], [], "o", color=GREY, markerfacecolor="white", label="constraint not met")

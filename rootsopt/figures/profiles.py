@@ -1,0 +1,93 @@
+"""Rotor profiles, meshing and conjugacy. Each function draws on the axes it is given."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from rootsopt.contact.nodes import place_pair
+from rootsopt.figures.style import COLORS, DASHES, GREY, ORANGE, SKY, VERMILION
+
+
+def plot_profiles(
+    ax: Axes, outlines: Mapping[str, NDArray[np.float64]], pitch_radius_mm: float
+) -> Axes:
+    """Closed outlines (n, 2) in mm, overlaid, with the pitch circle."""
+    _overlay(ax, outlines, pitch_radius_mm)
+    reach = 1.06 * max(np.max(np.hypot(*points.T)) for points in outlines.values())
+    ax.plot(0, 0, "+", color="black", markersize=9)
+    ax.set(xlim=(-reach, reach), ylim=(-reach, reach), title="Rotor")
+    return ax
+
+
+def plot_flank(
+    ax: Axes, outlines: Mapping[str, NDArray[np.float64]], lobes: int, pitch_radius_mm: float
+) -> Axes:
+    """One flank from tip (+x axis) to root, enlarged: all there is, the rest is symmetry."""
+    _overlay(ax, outlines, pitch_radius_mm)
+    flanks = []
+    for points in outlines.values():
+        angle = np.arctan2(points[:, 1], points[:, 0])
+        flanks.append(points[(angle >= 0) & (angle <= np.pi / lobes + 1e-9)])
+    low, high = np.min(np.vstack(flanks), axis=0), np.max(np.vstack(flanks), axis=0)
+    margin = 0.06 * np.max(high - low)
+    ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
+    ax.set_title("One flank, tip to root, enlarged")
+    return ax
+
+
+def _overlay(ax, outlines, pitch_radius_mm):
+    for (name, points), color, dashes in zip(outlines.items(), COLORS, DASHES * 2, strict=False):
+        ax.plot(*points.T, color=color, linestyle=dashes, linewidth=1.6, label=name)
+    _circle(ax, (0, 0), pitch_radius_mm, f"pitch circle, {pitch_radius_mm:g} mm")
+    ax.set_aspect("equal")
+    ax.set(xlabel="x (mm)", ylabel="y (mm)")
+    ax.grid(color="0.92", linewidth=0.6)
+    ax.set_axisbelow(True)
+
+
+def _circle(ax, center, radius, label=None):
+    turn = np.linspace(0, 2 * np.pi, 361)
+    x, y = center[0] + radius * np.cos(turn), center[1] + radius * np.sin(turn)
+    ax.plot(x, y, "--", color=GREY, linewidth=0.9, label=label)
+
+
+def plot_meshing(
+    axes: Sequence[Axes] | NDArray,
+    outline_mm: NDArray[np.float64],
+    lobes: int,
+    pitch_radius_mm: float,
+    angles_deg: Sequence[float] | NDArray[np.float64],
+) -> Sequence[Axes] | NDArray:
+    """The meshing pair at several angles of rotor 1, one panel each."""
+    center = 2 * pitch_radius_mm
+    for ax, angle in zip(axes, angles_deg, strict=True):
+        turn = np.radians(angle)
+        pair = place_pair(np.asarray(outline_mm), lobes, center, turn, turn)
+        names = "rotor 1 ↺", "rotor 2 ↻"
+        for points, color, x, name in zip(pair, (SKY, ORANGE), (0, center), names, strict=True):
+            ax.fill(*points.T, facecolor=color, alpha=0.75, edgecolor="black", linewidth=0.8)
+            _circle(ax, (x, 0), pitch_radius_mm)
+            ax.plot(x, 0, "o", color="black", markersize=4)
+            ax.annotate(name, (x, 0), (0, 7), textcoords="offset points", ha="center")
+        ax.axhline(0, color="black", linewidth=0.6, linestyle="-.")
+        ax.set_aspect("equal")
+        ax.set_title(f"rotor 1 at {angle:g}°")
+    return axes
+
+
+def plot_conjugacy(ax: Axes, gaps: Mapping[str, tuple[NDArray, NDArray]]) -> Axes:
+    """Gap (µm) that pairs leave in perfect rolling, over rotor 1's angle (deg) from where its tip
+    passes the line of centres."""
+    for (name, (angle, gap)), color, dashes in zip(gaps.items(), COLORS, DASHES * 2, strict=False):
+        ax.plot(angle, gap, color=color, linestyle=dashes, linewidth=1.6, label=name)
+    ax.axhline(0, color="black", linewidth=0.8)
+    low, high = ax.get_ylim()
+    if low < 0:
+        ax.axhspan(low, 0, color=VERMILION, alpha=0.08, linewidth=0, label="overlap")
+    ax.set(ylim=(low, high), xlabel="angle of rotor 1 from tip on the line of centres (°)")
+    ax.set(ylabel="gap at ε = 0 (µm)", title="Gap in rolling")
+    ax.grid(color="0.92", linewidth=0.6)
+    ax.set_axisbelow(True)
+    return ax

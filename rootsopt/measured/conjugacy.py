@@ -1,0 +1,79 @@
+"""How far the flanks of a profile are from conjugate: the gap that rolling leaves."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Float64
+from numpy.typing import NDArray
+
+from rootsopt.contact.closest import FlankPair
+from rootsopt.errors import InputError
+from rootsopt.profiles import Profile
+from rootsopt.runtime.programs import Program
+
+_MICRON = 1e-6
+_POSES = 361
+
+
+@dataclasses.dataclass(frozen=True)
+class Conjugacy:
+    """Gap of a pair rolling at ε = 0 and the nominal centre distance.
+
+    `roll` (rad): angle of rotor 1 from where its tip passes the line of centres, over a quarter of
+    a lobe pitch (the rest is alike, rotors or flanks having changed places); `gap` (m) of the drive
+    or the coast flanks, whichever is less: negative where they overlap, NaN where no points of the
+    flanks face each other.
+    """
+
+    roll: Float64[np.ndarray, " n"]
+    gap: Float64[np.ndarray, " n"]
+
+    @property
+    def least(self) -> float:
+        return float(np.nanmin(self.gap))
+
+    @property
+    def most(self) -> float:
+        return float(np.nanmax(self.gap))
+
+    def record(self) -> dict[str, float]:
+        """For the result file. `interference_um`: greatest overlap; `backlash_um`: twice the least
+        gap, the normal play of the lobe between both of its neighbours."""
+        return {
+            "mesh_gap_min_um": self.least / _MICRON,
+            "mesh_gap_min_at_deg": float(np.degrees(self.roll[np.nanargmin(self.gap)])),
+            "mesh_gap_max_um": self.most / _MICRON,
+            "mesh_gap_max_at_deg": float(np.degrees(self.roll[np.nanargmax(self.gap)])),
+            "interference_um": max(0.0, -self.least) / _MICRON,
+            "backlash_um": max(0.0, 2 * self.least) / _MICRON,
+        }
+
+
+def conjugacy(profile: Profile) -> Conjugacy:
+    """The gap of `profile` through a mesh. Raises `InputError` where the flanks never face each
+    other."""
+    roll = float(profile.half_pitch) * (np.arange(_POSES) + 0.5) / _POSES
+    gap, found = map(np.asarray, _gaps(profile, jnp.asarray(roll)))
+    found = found & np.isfinite(gap)
+    if not np.any(found):
+        raise InputError(
+            "`profile.pitch_radius_mm` must be half the centre distance at which the rotors mesh, "
+            "but their flanks do not face each other there; check it and the outline's units"
+        )
+    return Conjugacy(roll, np.where(found, gap, np.nan))
+
+
+@Program
+def _gaps(profile, roll):
+    pair = FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True)
+    sides = jnp.stack([roll, -roll])
+    contact = lax.map(lambda x: pair(x, jnp.zeros_like(x)), sides.ravel())
+    gap = jnp.where(contact.found, contact.gap, jnp.inf).reshape(sides.shape)
+    return jnp.min(gap, axis=0), jnp.any(contact.found.reshape(sides.shape), axis=0)
+
+
+def gaps_um(found: Conjugacy) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Roll angle (deg) and gap (µm), to be drawn."""
+    return np.degrees(found.roll), found.gap / _MICRON

@@ -1,0 +1,233 @@
+"""Smooth curves through the points of a flank, in pieces where its curvature jumps.
+
+Points are complex numbers x + iy (mm). The parameter is the length of the polygon plus a share of
+its turning, so that it stays regular where a radius of curvature vanishes (EE at the pitch
+circle); through measured points, whose turning is noise, it is the length alone.
+"""
+
+import dataclasses
+import itertools
+
+import numpy as np
+from jaxtyping import Bool, Complex128, Float64
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline, make_interp_spline, make_splprep, splprep
+
+from rootsopt.errors import InputError
+from rootsopt.measured.guard import guarded
+
+_TURNING = 0.3
+"""Length that a turn of 1 rad counts as much as, in pitch radii."""
+_JUMP, _ABOVE = 0.02, 20.0
+"""A jump of curvature is one of at least so much of it, and so many times its usual change from
+point to point around there."""
+_BESIDE, _AROUND = 3, 12
+"""Points on either side that a joint shows at, and among which its surroundings are."""
+_WINDING = 7.0
+"""Sum of the angles (rad) between the steps along a flank past which its points are scattered."""
+_SHORTEST = 4
+"""Intervals of a piece, at least."""
+_MOST_KNOTS, _NO_ROOM = 500, 1
+"""Number of knots above which a smoothing spline follows the noise, and FITPACK's word for it."""
+_KEY = "`profile.outline_file`"
+_UNEVEN = "remove points that are much closer together than others"
+_CUSP, _SPARED = 2e-2, 2
+"""Speed at the end of a piece, relative to its mean, below which it is a cusp, and knots next to it
+that are spared, as is what lies before the curve has that speed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """A curve z(t) in `pieces` that follow each other, each from the `ends` to the next."""
+
+    ends: Float64[np.ndarray, " k"]
+    pieces: tuple[BSpline, ...]
+
+    def derivatives(self, t: NDArray[np.float64], place: int) -> NDArray[np.complex128]:
+        """z, z′, z″, z‴ (4, n) on a piece."""
+        return np.stack([self.pieces[place](t, order) for order in range(4)])
+
+    def __call__(self, t: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """z, z′, z″, z‴ (4, n) at any t."""
+        place = np.clip(np.searchsorted(self.ends, t, side="right") - 1, 0, len(self.pieces) - 1)
+        found = np.empty((4, len(t)), complex)
+        for k in map(int, np.unique(place)):
+            found[:, place == k] = self.derivatives(t[place == k], k)
+        return found
+
+    def between(self, start: float, stop: float) -> list[tuple[int, float, float]]:
+        """The pieces that meet (start, stop), with the part of each inside."""
+        parts = []
+        for k, (low, high) in enumerate(zip(self.ends[:-1], self.ends[1:], strict=True)):
+            low, high = max(low, start), min(high, stop)
+            if high - low > 1e-9 * (stop - start):
+                parts.append((k, low, high))
+        return parts
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """A curve at some places, travelled from the tip towards the root: point `z` (mm), unit
+    tangent, `speed` |z′|, `turning` (rad per parameter)."""
+
+    z: NDArray[np.complex128]
+    tangent: NDArray[np.complex128]
+    speed: NDArray[np.float64]
+    turning: NDArray[np.float64]
+
+    @property
+    def normal(self) -> NDArray[np.complex128]:
+        """Outward unit normal."""
+        return -1j * self.tangent
+
+
+def stretch(
+    curve: Curve, place: int, low: float, high: float, count: int
+) -> tuple[NDArray[np.float64], Frame]:
+    """`count` places from `low` to `high` on a piece, and the curve there.
+
+    At a cusp, where z′ vanishes, the last intervals of the points say little of it; there is no
+    place between them, and tangent and turning are continued from before.
+    """
+    ends = np.array([low, high])
+    speed = np.abs(curve.derivatives(np.linspace(low, high, count), place)[1])
+    cusp = speed[[0, -1]] < _CUSP * np.mean(speed)
+    knots = np.unique(curve.pieces[place].t)
+    cusp &= len(knots) > 2 * _SPARED
+    if np.any(cusp):
+        fast = np.linspace(low, high, count)[speed > _CUSP * np.mean(speed)]
+        spared = [max(knots[_SPARED], fast[0]), min(knots[-1 - _SPARED], fast[-1])]
+        ends = np.where(cusp, spared, ends)
+    t = np.linspace(ends[0], ends[1], count - int(np.sum(cusp)))
+    t = np.concatenate([[low][: int(cusp[0])], t, [high][: int(cusp[1])]])
+    z, first, second, _ = curve.derivatives(t, place)
+    speed = np.abs(first)
+    safe = np.where(speed > 0, speed, 1.0)
+    tangent, turning = first / safe, np.imag(np.conj(first) * second) / safe**2
+    for end, inside in ((0, 1), (-1, -2)):
+        if cusp[end]:
+            turning[end] = turning[inside]
+            tangent[end] = tangent[inside] * np.exp(1j * turning[end] * (t[end] - t[inside]))
+            speed[end] = 0.0
+    return t, Frame(z, tangent, speed, turning)
+
+
+def through(
+    points: Complex128[np.ndarray, " n"],
+    joints: Bool[np.ndarray, " n"],
+    pitch_radius: float,
+    smoothing: float,
+) -> Curve:
+    """The curve through `points`, or at an RMS distance `smoothing` (mm) from them.
+
+    Without smoothing it is a quintic spline between `joints` and between places where the
+    points' own curvature jumps. Raises `InputError` for too few points.
+    """
+    if len(points) < 8:
+        raise InputError(
+            f"`profile.outline_file` must have at least 8 points on a flank, but has {len(points)}"
+        )
+    turned = np.sum(np.abs(np.angle(np.diff(points)[1:] / np.diff(points)[:-1])))
+    if smoothing == 0 and turned > _WINDING:
+        raise InputError(
+            "`profile.outline_smoothing_mm` must be the scatter (RMS) of the points, but is 0: "
+            f"from point to point a flank turns by {turned:.3g} rad in all, a smooth one by 4; "
+            "set it"
+        )
+    if smoothing > 0:
+        return _smoothed(points, smoothing)
+    last = len(points) - 1
+    ends = [0]
+    for joint in np.flatnonzero(joints | _jumps(points)):
+        if joint - ends[-1] >= _SHORTEST and last - joint >= _SHORTEST:
+            ends.append(int(joint))
+    ends.append(last)
+    pieces, places = [], [0.0]
+    for start, stop in itertools.pairwise(ends):
+        part = points[start : stop + 1]
+        t = places[-1] + _parameter(part, _TURNING * pitch_radius)
+        degree = min(5, (stop - start) // 2 * 2 - 1)
+        with guarded(_KEY, "no curve goes through its points", _UNEVEN):
+            pieces.append(make_interp_spline(t, part, k=degree))
+        places.append(t[-1])
+    return Curve(np.array(places), tuple(pieces))
+
+
+def _smoothed(points: NDArray[np.complex128], smoothing: float) -> Curve:
+    """The smoothest spline at an RMS distance `smoothing` from the points."""
+    t = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points)))])
+    sides = [np.real(points), np.imag(points)]
+    squares = len(points) * smoothing**2
+    with guarded(_KEY, "its points cannot be smoothed", "check `profile.outline_smoothing_mm`"):
+        # FITPACK's own takes a hundredth of the time to find out that there are too many knots.
+        *_, flag, _ = splprep(
+            sides, u=t, k=5, s=squares, nest=_MOST_KNOTS, full_output=True, quiet=True
+        )
+    if flag == _NO_ROOM:
+        raise InputError(
+            "`profile.outline_smoothing_mm` must be the scatter (RMS) of the points, but with "
+            f"{smoothing:g} a flank needs more than {_MOST_KNOTS} knots to follow them; raise it"
+        )
+    with guarded(_KEY, "its points cannot be smoothed", "check `profile.outline_smoothing_mm`"):
+        spline, _ = make_splprep(sides, u=t, k=5, s=squares)  # type: ignore[arg-type]
+    controls = np.asarray(spline.c)
+    controls = controls[0] + 1j * controls[1] if controls.shape[0] == 2 else controls @ [1, 1j]
+    return Curve(t[[0, -1]], (BSpline(spline.t, controls, spline.k),))
+
+
+def _parameter(points: NDArray[np.complex128], weight: float) -> NDArray[np.float64]:
+    """Parameters of the points of a smooth piece, from 0, a turn of 1 rad being of `weight`."""
+    bend, lengths = _curvature(points)
+    # Beyond an end, where the next piece turns otherwise, as before it.
+    first, last = 2 * bend[0] - bend[1], 2 * bend[-1] - bend[-2]
+    bend = np.concatenate([[first], bend, [last]])
+    mean = weight * (bend[1:] + bend[:-1]) / 2
+    return np.concatenate([[0.0], np.cumsum(lengths * np.hypot(1.0, mean))])
+
+
+def _curvature(points: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Curvature of a polygon at its inner corners, and the lengths of its sides."""
+    steps = np.diff(points)
+    lengths = np.abs(steps)
+    return 2 * np.angle(steps[1:] / steps[:-1]) / (lengths[1:] + lengths[:-1]), lengths
+
+
+def _jumps(points: NDArray[np.complex128]) -> NDArray[np.bool_]:
+    """Where curvature jumps, at a point or near it."""
+    found = np.zeros(len(points), bool)
+    if len(points) < 2 * _AROUND:
+        return found
+    # Entry i is that of point i + 1.
+    curvature, _ = _curvature(points)
+    before, after = (
+        2 * curvature[1:-3] - curvature[:-4],
+        2 * curvature[3:-1] - curvature[4:],
+    )
+    # Entry i is that of point i + 3.
+    jump = np.abs(before - after)
+    size = np.abs(curvature[1:-3]) + np.abs(curvature[3:-1])
+    # At a cusp between convex and concave, curvature grows without bound on both sides.
+    bend = np.abs(curvature)
+    grows = (bend[3:-5] > bend[1:-7]) & (bend[2:-6] > bend[:-8])
+    grows &= (bend[5:-3] > bend[7:-1]) & (bend[6:-2] > bend[8:])
+    grows &= curvature[3:-5] * curvature[5:-3] < 0
+    growth = np.where(grows, np.minimum(bend[3:-5], bend[5:-3]), 0.0)
+    cusps = [
+        m + 5
+        for m in np.flatnonzero(jump[2:-2] > 0.9 * size[2:-2])
+        if 0 < growth[m] == np.max(growth[max(m - _BESIDE, 0) : m + _BESIDE + 1])
+    ]
+    found[cusps] = True
+    for i in np.flatnonzero(jump > _JUMP * size):
+        if any(abs(cusp - i - 3) <= _BESIDE for cusp in cusps):
+            continue
+        near = jump[max(i - _BESIDE, 0) : i + _BESIDE + 1]
+        around = np.concatenate(
+            [
+                jump[max(i - _AROUND, 0) : max(i - _BESIDE, 0)],
+                jump[i + _BESIDE + 1 : i + _AROUND + 1],
+            ]
+        )
+        usual = np.median(around) if len(around) else np.inf
+        found[i + 3] = jump[i] == np.max(near) and jump[i] > _ABOVE * usual
+    return found

@@ -1,0 +1,227 @@
+"""Outlines from DXF drawings, text or binary: entities out of the file, points on them."""
+
+import io
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from rootsopt.errors import InputError
+from rootsopt.measured.entities import Entity, chain
+from rootsopt.measured.guard import each, guarded, short, silenced
+from rootsopt.measured.joining import joined
+from rootsopt.measured.loop import Loop
+
+with silenced():  # It announces itself in the log.
+    from ezdxf import recover
+    from ezdxf.document import Drawing
+    from ezdxf.lldxf import types
+    from ezdxf.lldxf.tagger import binary_tags_loader
+
+_SPACING = 1 / 400
+"""Distance between points on arcs and splines, relative to the drawing's size."""
+_LAYER = "OUTLINE"
+_KINDS = ("LINE", "ARC", "SPLINE", "ELLIPSE", "LWPOLYLINE", "POLYLINE")
+_CURVES = ("LINE", "ARC", "SPLINE", "ELLIPSE")
+_PARTS = ("VERTEX", "INSERT")
+_ENTITIES = 100_000
+"""Number of entities (vertices of a POLYLINE counted) above which a drawing is refused."""
+_POINTS = 500_000
+"""Number of points on all entities above which a drawing is refused."""
+_DEEPEST = 8
+"""Depth of blocks in blocks above which a drawing is refused."""
+_LARGEST = 1e9
+"""Size of a number in an entity (drawing units) above which it is damaged."""
+_BINARY = b"AutoCAD Binary DXF\r\n\x1a\x00"
+_NOT = "is not a DXF file that can be read"
+_AGAIN = "export it again (DXF R2000 or newer) or save the outline as CSV"
+_INCH, _SURVEY_FOOT = 25.4, 1200 / 3937 * 1e3
+_METRE = 1e3
+_UNITS = {
+    0: 1.0,
+    1: _INCH,
+    2: 12 * _INCH,
+    3: 63360 * _INCH,
+    4: 1.0,
+    5: 10.0,
+    6: _METRE,
+    7: 1e3 * _METRE,
+    8: 1e-6 * _INCH,
+    9: 1e-3 * _INCH,
+    10: 36 * _INCH,
+    11: 1e-10 * _METRE,
+    12: 1e-9 * _METRE,
+    13: 1e-6 * _METRE,
+    14: 1e-1 * _METRE,
+    15: 1e1 * _METRE,
+    16: 1e2 * _METRE,
+    21: _SURVEY_FOOT,
+    22: _SURVEY_FOOT / 12,
+    23: 3 * _SURVEY_FOOT,
+    24: 5280 * _SURVEY_FOOT,
+}
+"""Length (mm) of each unit that $INSUNITS may name; astronomical ones (17 to 20) are refused."""
+
+
+def from_dxf(data: bytes, name: str) -> Loop:
+    """The closed loop of the largest area in a drawing. Raises `InputError`."""
+    binary = data.startswith(_BINARY)
+    counted = _check_tags(data, binary, name)
+    with guarded(name, _NOT, _AGAIN):
+        if binary:
+            document = Drawing.load(binary_tags_loader(data))
+            auditor = document.audit()
+        else:
+            document, auditor = recover.read(io.BytesIO(data))
+        unit = document.header.get("$INSUNITS", 0)
+        kept = Counter(e.dxftype() for e in document.entitydb.values() if e.is_alive)
+        reasons = [str(fix.message) for fix in auditor.fixes]
+    for kind in _CURVES:
+        if kept[kind] < counted[kind]:
+            # The library has taken them out: what is left may be another outline.
+            reason = next((text for text in reasons if kind in text), "damaged")
+            raise InputError(
+                f"{name}: {counted[kind] - kept[kind]} of {counted[kind]} {kind} make no sense "
+                f"({short(reason, 100)}); mend or remove them in the drawing"
+            )
+    scale = _UNITS.get(unit) if isinstance(unit, int) else None
+    if scale is None:
+        raise InputError(
+            f"{name}: $INSUNITS must be the code of a length unit (4: mm, 1: inch, 0: none), but "
+            f"is {short(unit)}; set the drawing's units"
+        )
+    with silenced():
+        entities = [Entity.of(entity, name) for entity in _chosen(document, name)]
+    parts = [part for entity in entities if (part := entity.segments(scale))]
+    if not parts:
+        raise InputError(
+            f"{name}: must hold an outline of {', '.join(_KINDS)}, but those in it have no extent; "
+            "export it again"
+        )
+    rough = np.concatenate([s.points(s.least) for part in parts for s in part])
+    size = float(np.hypot(np.ptp(rough.real), np.ptp(rough.imag)))
+    if not 0 < size < _LARGEST:
+        raise InputError(
+            f"{name}: must hold an outline, but its entities measure {size:.4g} mm; check the "
+            "drawing and its units ($INSUNITS)"
+        )
+    spacing = _SPACING * size
+    count = sum(s.intervals(spacing) for part in parts for s in part)
+    if count > _POINTS:
+        raise InputError(
+            f"{name}: must hold an outline of at most {_POINTS} points, but its entities need "
+            f"{count}; draw the outline alone on a layer {_LAYER}"
+        )
+    return joined([chain(part, spacing) for part in parts], _LAYER, name)
+
+
+def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
+    """Number of entities of each kind. Raises `InputError` unless the file is whole and the numbers
+    of its entities are sound.
+
+    The library reads "1,5" as 1, and a number that the end of the file cut off as what is left.
+    """
+    tags = binary_tags_loader(data) if binary else recover.bytes_loader(io.BytesIO(data))
+    counted: Counter[str] = Counter()
+    kind, ended = "", False
+    for number, tag in enumerate(each(iter(tags), name, _NOT, _AGAIN), 1):
+        code, value = tag.code, tag.value
+        if code == 0:
+            kind = (value if isinstance(value, str) else value.decode("latin-1")).strip().upper()
+            ended = kind == "EOF"
+            counted[kind] += 1
+            continue
+        if kind not in _KINDS and kind not in _PARTS:
+            continue
+        if code < 1000 and (code in types.POINT_CODES or types.TYPE_TABLE.get(code) is float):
+            try:
+                sound = abs(float(value)) <= _LARGEST and b"_" not in _raw(value)
+            except ValueError:
+                sound = False
+            if not sound:
+                where = f"tag {number}" if binary else f"line {2 * number}"
+                raise InputError(
+                    f"{name}, {where}: a number of {kind} must be finite and at most "
+                    f"{_LARGEST:g}, but is {short(_raw(value).decode('latin-1'))!r}; mend or "
+                    "remove the entity, or export the drawing again"
+                )
+    count = sum(counted[kind] for kind in (*_KINDS, *_PARTS))
+    if count > _ENTITIES:
+        raise InputError(
+            f"{name}: must have at most {_ENTITIES} lines, arcs and vertices, but has {count}; "
+            "export the outline alone"
+        )
+    if not ended:
+        raise InputError(
+            f"{name}: must end with the mark EOF of a whole drawing, but does not; {_AGAIN}"
+        )
+    return counted
+
+
+def _raw(value: Any) -> bytes:
+    return value if isinstance(value, bytes) else str(value).encode()
+
+
+def _chosen(document: Drawing, name: str) -> list[Any]:
+    """Entities that may be the outline: those on its layer, else those drawn directly, else those
+    of blocks."""
+    with guarded(name, _NOT, _AGAIN):
+        everything = list(document.modelspace())
+    direct = [e for e in everything if e.dxftype() in _KINDS]
+    if found := _on_layer(direct, name):
+        return found
+    inserts = [e for e in everything if e.dxftype() == "INSERT"]
+    if not direct and not inserts:
+        raise InputError(
+            f"{name}: must hold an outline of {', '.join(_KINDS)}, but has none of them; draw it "
+            "with these"
+        )
+    blocks = _exploded(inserts, name)
+    found = _on_layer(blocks, name) or direct or blocks
+    if not found:
+        raise InputError(
+            f"{name}: must hold an outline of {', '.join(_KINDS)}, but its blocks have none of "
+            "them; draw it with these"
+        )
+    return found
+
+
+def _on_layer(entities: list[Any], name: str) -> list[Any]:
+    with guarded(name, _NOT, _AGAIN):
+        return [e for e in entities if str(e.dxf.layer).upper() == _LAYER]
+
+
+def _exploded(inserts: list[Any], name: str) -> list[Any]:
+    """The entities of blocks where they are inserted, and of blocks in those."""
+    found: list[Any] = []
+    stack = [(insert, 1) for insert in reversed(inserts)]
+    handled = 0
+
+    def skipped(entity, reason):
+        if entity.dxftype() in _KINDS:
+            raise InputError(
+                f"{name}: {entity.dxftype()} in a block cannot be placed: {short(reason)}; "
+                "dissolve the blocks in the drawing"
+            )
+
+    while stack:
+        insert, depth = stack.pop()
+        with guarded(name, "holds a block that cannot be read", "dissolve the blocks"):
+            repeated = insert.mcount
+            own = []
+            if depth <= _DEEPEST and repeated == 1:
+                own = list(insert.virtual_entities(skipped_entity_callback=skipped))
+            layer = insert.dxf.layer
+            for entity in own:
+                if entity.dxf.layer == "0":  # By the rules of CAD it takes that of the insert.
+                    entity.dxf.layer = layer
+        handled += 1 + len(own)
+        if depth > _DEEPEST or repeated != 1 or handled > _ENTITIES:
+            raise InputError(
+                f"{name}: blocks must be inserted singly, at most {_DEEPEST} in each other, with "
+                f"at most {_ENTITIES} entities in all, but these are not; dissolve the blocks in "
+                "the drawing"
+            )
+        found += [e for e in own if e.dxftype() in _KINDS]
+        stack += [(e, depth + 1) for e in reversed(own) if e.dxftype() == "INSERT"]
+    return found

@@ -1,0 +1,333 @@
+"""Points on the entities of a drawing (mm, as x + iy).
+
+An entity is a chain of segments: corners joined by straight lines, arcs, ellipses, splines. Each
+tells how many intervals it needs before it is sampled, so that no array is made without a bound.
+"""
+
+import abc
+import dataclasses
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from rootsopt.errors import InputError
+from rootsopt.measured.guard import guarded, short
+from rootsopt.measured.loop import Loop
+
+_FEWEST = 24
+"""Intervals of an arc or spline, at least."""
+_MOST = 100_000
+"""Intervals of an arc or spline, at most."""
+_PER_SPAN = 4
+"""Intervals between two knots of a spline, at least."""
+_DEGREES = 25
+"""Degree above which a spline is refused."""
+_FITTED = 5_000
+"""Points of a spline through points, at most."""
+_SAME_KNOT = 1e-9
+"""Difference of knots, relative to their range, below which they are one."""
+_FULL = 1e-9
+"""Sweep (rad) of an ellipse below which it is a full one."""
+_STRAIGHT = 1e-12
+"""Bulge below which a side of a polyline is straight."""
+_FRAME = 16
+"""Flag of a vertex that only guides a polyline which CAD has fitted."""
+_TILT = 1e-6
+"""Tilt (rad) of an entity's plane above which it does not lie in that of the drawing."""
+
+
+class Segment(abc.ABC):
+    """Part of an entity."""
+
+    curved: bool
+    """Whether its ends are joints."""
+    least: int
+    """The fewest intervals that show its extent."""
+
+    @abc.abstractmethod
+    def intervals(self, spacing: float) -> int:
+        """Number of intervals for a distance of points (mm)."""
+
+    @abc.abstractmethod
+    def points(self, count: int) -> NDArray[np.complex128]:
+        """Points from end to end, at least `count` + 1 on a curve."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Corners(Segment):
+    """Points joined by straight lines."""
+
+    corners: NDArray[np.complex128]
+    curved = False
+    least = 1
+
+    def intervals(self, spacing: float) -> int:
+        del spacing
+        return len(self.corners)
+
+    def points(self, count: int) -> NDArray[np.complex128]:
+        del count
+        return self.corners
+
+
+@dataclasses.dataclass(frozen=True)
+class _Ellipse(Segment):
+    """center + major cos t + minor sin t for t from start over sweep; an arc is one, too."""
+
+    center: complex
+    major: complex
+    minor: complex
+    start: float
+    sweep: float
+    curved = True
+    least = _FEWEST
+
+    def intervals(self, spacing: float) -> int:
+        return _bounded(abs(self.major) * abs(self.sweep) / spacing)
+
+    def points(self, count: int) -> NDArray[np.complex128]:
+        t = self.start + self.sweep * np.arange(count + 1) / count
+        return self.center + self.major * np.cos(t) + self.minor * np.sin(t)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Spline(Segment):
+    """A spline in homogeneous coordinates (x, y, weight), evenly divided between its knots."""
+
+    curve: BSpline
+    knots: NDArray[np.float64]
+    curved = True
+    least = 64
+
+    def intervals(self, spacing: float) -> int:
+        length = np.sum(np.abs(np.diff(self.points(self.least))))
+        spans = len(self.knots) - 1
+        return spans * max(_PER_SPAN, math.ceil(_bounded(length / spacing) / spans))
+
+    def points(self, count: int) -> NDArray[np.complex128]:
+        spans = len(self.knots) - 1
+        each = -(-count // spans)
+        shares = np.arange(each) / each
+        inside = self.knots[:-1, None] + np.diff(self.knots)[:, None] * shares
+        x, y, weight = self.curve(np.append(inside.ravel(), self.knots[-1])).T
+        return (x + 1j * y) / weight
+
+
+def _bounded(count: float) -> int:
+    return math.ceil(min(max(_FEWEST, count), _MOST))
+
+
+def chain(parts: list[Segment], spacing: float) -> Loop:
+    """Points of the segments of one entity; the ends of its curves are joints."""
+    points, joints = [], []
+    for segment in parts:
+        own = segment.points(segment.intervals(spacing))
+        marks = np.zeros(len(own), bool)
+        marks[[0, -1]] = segment.curved
+        if points:
+            joints[-1][-1] |= marks[0]
+            own, marks = own[1:], marks[1:]
+        points.append(own)
+        joints.append(marks)
+    return Loop(np.concatenate(points), np.concatenate(joints))
+
+
+@dataclasses.dataclass(frozen=True)
+class Entity:
+    """What a drawing says of an entity: `data` for its maker; `normal` of its plane."""
+
+    kind: str
+    what: str
+    normal: tuple[float, ...]
+    data: tuple[Any, ...]
+
+    @classmethod
+    def of(cls, entity: Any, name: str) -> "Entity":
+        """From the library's object. Raises `InputError`."""
+        kind = entity.dxftype()
+        with guarded(name, f"{kind} cannot be read", "mend or remove it in the drawing"):
+            handle = short(entity.dxf.handle or "unknown", 20)
+            normal = tuple(float(x) for x in entity.dxf.get("extrusion", (0, 0, 1)))
+            data = _KINDS[kind][0](entity)
+        return cls(kind, f"{name}: {kind} (handle {handle})", normal, data)
+
+    def segments(self, scale: float) -> list[Segment]:
+        """Its segments, `scale` mm for a drawing unit; none if it has no extent.
+
+        Raises `InputError` for an entity that makes no sense.
+        """
+        fault, across = _Fault(self.what), abs(self.normal[2])
+        if self.kind not in _SPATIAL and math.hypot(*self.normal[:2]) > _TILT * across:
+            raise fault("lie in the plane of x and y", "is in another")
+        made = _KINDS[self.kind][1](*self.data, _Plane(scale, self.normal[2] < 0), fault)
+        with np.errstate(all="ignore"):
+            whole = all(np.all(np.isfinite(s.points(s.least))) for s in made)
+        if not whole:
+            raise fault("have a finite size", "has none")
+        return made
+
+
+@dataclasses.dataclass(frozen=True)
+class _Plane:
+    """Where an entity lies: `scale` mm for a drawing unit, seen from above or `below`."""
+
+    scale: float
+    below: bool
+
+    def __call__(self, z: Any) -> Any:
+        """A point or vector of the entity's own plane in that of the drawing: x, y stand for -x, y
+        if it is seen from below, as CAD leaves what was mirrored."""
+        return self.scale * (-np.conj(z) if self.below else z)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Fault:
+    """Makes the errors of an entity."""
+
+    what: str
+
+    def __call__(self, must: str, but: str) -> InputError:
+        return InputError(
+            f"{self.what} must {must}, but {but}; mend or remove it in the drawing, or draw the "
+            "outline alone on a layer OUTLINE"
+        )
+
+
+def _plain(points: Iterable[Any]) -> NDArray[np.complex128]:
+    """Points of the library, without their z."""
+    rows = np.array([(p[0], p[1]) for p in points], float).reshape(-1, 2)
+    return rows[:, 0] + 1j * rows[:, 1]
+
+
+def _read_line(entity: Any):
+    return (_plain([entity.dxf.start, entity.dxf.end]),)
+
+
+def _line(ends, plane, fault) -> list[Segment]:
+    del fault
+    return [_Corners(plane.scale * ends)] if ends[0] != ends[1] else []
+
+
+def _read_arc(entity: Any):
+    dxf = entity.dxf
+    numbers = (float(x) for x in (dxf.radius, dxf.start_angle, dxf.end_angle))
+    return _plain([dxf.center])[0], *numbers
+
+
+def _arc(center, radius, first, last, plane, fault) -> list[Segment]:
+    if not radius > 0:
+        raise fault("have a radius above 0", f"has {radius:g}")
+    axis = radius * np.exp(1j * math.radians(first))
+    sweep = math.radians((last - first) % 360 or 360)
+    return [_Ellipse(plane(center), plane(axis), plane(1j * axis), 0.0, sweep)]
+
+
+def _read_ellipse(entity: Any):
+    dxf = entity.dxf
+    center, major = _plain([dxf.center, dxf.major_axis])
+    minor = _plain([entity.minor_axis])[0]
+    return center, major, minor, float(dxf.start_param), float(dxf.end_param)
+
+
+def _ellipse(center, major, minor, first, last, plane, fault) -> list[Segment]:
+    if not min(abs(major), abs(minor)) > 0:
+        raise fault("have axes longer than 0", f"has {abs(major):g} and {abs(minor):g}")
+    first, sweep = first % math.tau, (last - first) % math.tau
+    sweep = sweep if sweep > _FULL else math.tau
+    center, major, minor = (plane.scale * x for x in (center, major, minor))
+    return [_Ellipse(center, major, minor, first, sweep)]
+
+
+def _read_spline(entity: Any):
+    if len(entity.control_points) == 0 and 2 < len(entity.fit_points) <= _FITTED:
+        tool = entity.construction_tool()
+        return _plain(tool.control_points), tool.degree, _floats(tool.knots()), _floats([])
+    controls = _plain(entity.control_points)
+    return controls, int(entity.dxf.degree), _floats(entity.knots), _floats(entity.weights)
+
+
+def _floats(values: Iterable[Any]) -> NDArray[np.float64]:
+    return np.array([float(x) for x in values], float)
+
+
+def _spline(controls, degree, knots, weights, plane, fault) -> list[Segment]:
+    if not 1 <= degree <= _DEGREES:
+        raise fault(f"have a degree from 1 to {_DEGREES}", f"has {degree}")
+    count = len(controls)
+    if count <= degree:
+        raise fault(
+            f"have more than {degree} control points (or 3 to {_FITTED} fit points)", f"has {count}"
+        )
+    if len(knots) == 0:
+        inner = np.arange(1.0, count - degree)
+        knots = np.concatenate([np.zeros(degree + 1), inner, np.full(degree + 1, count - degree)])
+    if len(knots) != count + degree + 1:
+        raise fault(f"have {count + degree + 1} knots", f"has {len(knots)}")
+    if len(weights) not in (0, count) or not np.all(weights > 0):
+        raise fault(f"have {count} weights above 0 or none", "has others")
+    if np.any(np.diff(knots) < 0):
+        raise fault("have knots in rising order", "has not")
+    # Knots that only rounding has parted are one.
+    first = np.append(0, np.cumsum(np.diff(knots) > _SAME_KNOT * np.ptp(knots)))
+    knots = knots[np.unique(first, return_index=True)[1]][first]
+    domain = knots[degree : count + 1]
+    different, repeated = np.unique(domain, return_counts=True)
+    if len(different) < 2 or np.any(repeated[1:-1] > degree):
+        raise fault(f"have at most {degree} equal knots inside", "has more")
+    weights = weights if len(weights) else np.ones(count)
+    points = plane.scale * controls * weights
+    controls = np.stack([points.real, points.imag, weights], axis=1)
+    return [_Spline(BSpline(knots, controls, degree), different)]
+
+
+def _read_polyline(entity: Any):
+    if entity.dxftype() == "LWPOLYLINE":
+        rows = entity.get_points("xyb")
+        return _plain(rows), _floats(row[2] for row in rows), bool(entity.closed), False
+    if not (entity.is_2d_polyline or entity.is_3d_polyline):
+        return _plain([]), _floats([]), False, False  # A mesh.
+    # The frame of a polyline that CAD has fitted is not drawn.
+    vertices = [v for v in entity.vertices if not int(v.dxf.flags) & _FRAME]
+    flat = bool(entity.is_2d_polyline)
+    bulges = _floats(v.dxf.get("bulge", 0.0) if flat else 0.0 for v in vertices)
+    points = _plain(v.dxf.location for v in vertices)
+    return points, bulges, bool(entity.is_closed), bool(entity.is_3d_polyline)
+
+
+def _polyline(corners, bulges, closed, spatial, plane, fault) -> list[Segment]:
+    """Straight runs and arcs; a bulge is the tangent of a quarter of an arc's angle."""
+    del fault
+    corners = plane.scale * corners if spatial else plane(corners)
+    bulges = -bulges if plane.below and not spatial else bulges
+    if closed and len(corners) > 1:
+        corners = np.append(corners, corners[0])
+    made: list[Segment] = []
+    run = 0
+    steps = np.diff(corners)
+    for k in np.flatnonzero((np.abs(bulges[: len(steps)]) > _STRAIGHT) & (steps != 0)):
+        if k > run:
+            made.append(_Corners(corners[run : k + 1]))
+        run = k + 1
+        center = corners[k] + steps[k] / 2 * (1 + 1j * (1 - bulges[k] ** 2) / (2 * bulges[k]))
+        axis, sweep = corners[k] - center, 4 * math.atan(bulges[k])
+        made.append(_Ellipse(center, axis, 1j * axis, 0.0, sweep))
+    if run < len(corners) - 1 and np.any(steps[run:] != 0):
+        made.append(_Corners(corners[run:]))
+    return made
+
+
+_SPATIAL = ("LINE", "SPLINE")
+"""Kinds whose plane does not matter."""
+_KINDS = {
+    "LINE": (_read_line, _line),
+    "ARC": (_read_arc, _arc),
+    "ELLIPSE": (_read_ellipse, _ellipse),
+    "SPLINE": (_read_spline, _spline),
+    "LWPOLYLINE": (_read_polyline, _polyline),
+    "POLYLINE": (_read_polyline, _polyline),
+}
+"""What reads an entity, inside the guard, and what makes segments of it."""

@@ -1,0 +1,352 @@
+"""A profile from the loop of an outline."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from rootsopt.errors import InputError
+from rootsopt.measured.checks import Checks
+from rootsopt.measured.curves import Curve, Frame, stretch, through
+from rootsopt.measured.loop import Loop, signed_area
+from rootsopt.profiles.outline import Outline, Table
+
+_MM = 1e-3
+NODES = 1536
+"""Nodes of either table, so that one compiled program serves all outlines."""
+_PIECES = NODES // 4
+"""Smooth pieces of an addendum or dedendum, at most."""
+_BEYOND = 0.3
+"""Share of a flank by which its points go on beyond tip and root."""
+_SHARES = 400
+"""Places at which flanks are compared."""
+_FOLD = 1e-3
+"""Angle (rad) that the outline may turn back, seen from the axis: noise and rounding."""
+_OFF = 0.02
+"""Deviation of flanks from each other, in pitch radii, past which they are not those of one
+rotor."""
+_LAND = 1e-3, 0.5 * np.pi / 180
+"""A land's normals miss the axis by less than the first (pitch radii) over more than the second."""
+_CORNER = 1e-2
+"""Angle (rad) at a joint from which on it is a corner."""
+_AT = 1e-6
+"""Distance (pitch radii) from the pitch circle within which a joint is on it."""
+_FAR = 1e3
+"""Ratio of an outline's greatest radius to the pitch radius above which units are wrong."""
+_GAUSS = np.polynomial.legendre.leggauss(12)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Flank:
+    """A flank in its own lobe's frame, tip on +x, mirrored if it is a trailing one: its curve, and
+    where (parameter) it passes tip, pitch circle and root; `off`: RMS distance of the points."""
+
+    curve: Curve
+    tip: float
+    pitch: float
+    root: float
+    off: float
+
+    def at(self, share: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """z, z′, z″, z‴ (4, n) at shares 0 to 1 of the parameter from tip to root."""
+        return self.curve(self.tip + (self.root - self.tip) * share)
+
+
+def imported(
+    loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: float
+) -> tuple[Outline, Checks]:
+    """The profile of an outline, and what was found of it.
+
+    It is made of one flank, the leading one of the lobe next to +x (rotors turning
+    counter-clockwise); the others are compared with it. The loop is run through counter-clockwise
+    and turned until a lobe's axis, the phase of its N-th moment ∬ z^N dA, is on +x.
+
+    Raises `InputError` where there is no rotor of so many lobes in the file, or none that can be
+    simulated.
+    """
+    if smoothing_mm > _OFF * pitch_radius_mm:
+        raise InputError(
+            "`profile.outline_smoothing_mm` must be the scatter (RMS) of the points in mm, at most "
+            f"{_OFF:g} of the pitch radius, but is {smoothing_mm:g}; lower it"
+        )
+    # What overflows or divides by zero all the same is found in the outcome.
+    with np.errstate(all="ignore"):
+        outline, checks = _imported(loop, lobes, pitch_radius_mm, smoothing_mm)
+    found = [*jax.tree.leaves(outline), *checks.record().values()]
+    if not all(np.all(np.isfinite(x)) for x in found):
+        raise InputError(
+            "`profile.outline_file` must hold a smooth outline, but the curve through its points "
+            "is not finite; remove points that are much closer together than others"
+        )
+    return outline, checks
+
+
+def _imported(loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: float):
+    points, joints = loop.points, loop.joints
+    backwards = signed_area(points) < 0
+    if backwards:
+        points, joints = points[::-1], joints[::-1]
+    _check_lobes(points, lobes, pitch_radius_mm)
+    turn = np.angle(_moment(points, lobes)) / lobes
+    points = points * np.exp(-1j * turn)
+    how = lobes, pitch_radius_mm, smoothing_mm
+    flanks = [[_flank(points, joints, k, side, *how) for k in range(lobes)] for side in (1, -1)]
+    own = flanks[0][0]
+    apart = np.array([[_distances(flank, own) for flank in group] for group in flanks])
+    mean = apart.mean(axis=1)
+    lobe_off, flank_off = np.max(np.abs(apart - mean[:, None])), np.max(np.abs(mean[1] - mean[0]))
+    worst = max(lobe_off, flank_off)
+    if worst > _OFF * pitch_radius_mm:
+        raise InputError(
+            f"`profile.outline_file` must hold a rotor of {lobes} equal lobes with equal flanks, "
+            f"but they differ by up to {worst:.4g} mm (lobes {lobe_off:.4g}, flanks "
+            f"{flank_off:.4g}); only rotors of symmetrical lobes are known here, with the axis at "
+            "the origin"
+        )
+    outline, star, convexity = _outline(own, lobes, pitch_radius_mm)
+    centroid = _moment(points, 1) / signed_area(points)
+    checks = Checks(
+        points=len(points),
+        turned_deg=float(np.degrees(-turn)),
+        reversed=bool(backwards),
+        axis_offset_um=float(abs(centroid)) / _MM,
+        lobe_deviation_um=float(lobe_off) / _MM,
+        flank_deviation_um=float(flank_off) / _MM,
+        fit_deviation_um=own.off / _MM,
+        star_margin_mm=star,
+        convexity_margin_mm=convexity,
+    )
+    return outline, checks
+
+
+def _check_lobes(points, lobes, radius):
+    away = InputError(
+        "`profile.outline_file` must hold an outline around the rotor's axis, the origin, but "
+        "it does not go round it once; move it there"
+    )
+    least, most = np.min(np.abs(points)), np.max(np.abs(points))
+    if not radius / _FAR < most < radius * _FAR:
+        raise InputError(
+            f"`profile.pitch_radius_mm` = {radius:g} must fit the outline, but the outline's "
+            f"greatest radius is {most:.5g} mm; mend the key or the file's units"
+        )
+    if not least > most / _FAR**2:
+        raise away
+    around = np.angle(np.roll(points, -1) / points)
+    if round(np.sum(around) / (2 * np.pi)) != 1:
+        raise away
+    # Noise may turn back and go on: what counts is how far behind the farthest it comes.
+    angle = np.cumsum(around)
+    back = np.max(np.maximum.accumulate(angle) - angle)
+    if back > _FOLD:
+        raise InputError(
+            "`profile.outline_file` must hold an outline that does not fold back, seen from the "
+            f"axis, but it does, by {np.degrees(back):.3g} deg; only such rotors are known here"
+        )
+    inside = np.abs(points) < radius
+    crossings = int(np.sum(inside != np.roll(inside, 1)))
+    if crossings != 2 * lobes:
+        raise InputError(
+            f"`profile.lobes` = {lobes} and `profile.pitch_radius_mm` = {radius:g} must fit the "
+            f"outline: it crosses the pitch circle {crossings} times, and {lobes} lobes do so "
+            f"{2 * lobes} times (its radii: {np.min(np.abs(points)):.5g} to "
+            f"{np.max(np.abs(points)):.5g} mm); mend the key that is wrong, or the file's units"
+        )
+
+
+def _moment(points, order):
+    """∬ z^order dA of a polygon, exact: by Green's theorem ∮ z̄ z^order dz / 2i."""
+    start, step = points, np.roll(points, -1) - points
+    nodes, weights = np.polynomial.legendre.leggauss(order // 2 + 2)
+    z = start[:, None] + step[:, None] * (1 + nodes) / 2
+    return np.sum(np.conj(z) * z**order * step[:, None] * weights / 2) / 2j
+
+
+def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
+    """The leading (`side` 1) or trailing flank of a lobe, smoothed with those beside it."""
+    local = points * np.exp(-2j * np.pi * lobe / lobes)
+    if side < 0:
+        local, joints = np.conj(local)[::-1], joints[::-1]
+    half = np.pi / lobes
+    # Opposite the flank, the loop can be opened.
+    angle = np.angle(local * np.exp(-0.5j * half))
+    start = np.argmin(angle)
+    local, joints, angle = (np.roll(x, -start) for x in (local, joints, angle + half / 2))
+    kept = np.flatnonzero((angle > -_BEYOND * half) & (angle < (1 + _BEYOND) * half))
+    part = slice(kept[0], kept[-1] + 1) if len(kept) else slice(0)
+    local, joints, angle = local[part], joints[part], angle[part]
+    curve = through(local, joints, radius, smoothing)
+    low, high = curve.ends[[0, -1]]
+    scan = np.linspace(low, high, 4 * len(local))
+    z = curve(scan)[0]
+
+    lacking = InputError(
+        "`profile.outline_file` must have points all along every flank, but the one at "
+        f"{np.degrees(2 * np.pi * lobe / lobes):.4g} deg lacks its tip, root or pitch "
+        "crossing; add points"
+    )
+
+    def root(values, function):
+        i = np.flatnonzero((values[:-1] < 0) != (values[1:] < 0))
+        if len(i) == 0:
+            raise lacking
+        i = i[len(i) // 2]
+        if not function(scan[i]) * function(scan[i + 1]) <= 0:
+            raise lacking
+        found = brentq(function, scan[i], scan[i + 1], xtol=1e-13)
+        return float(found)  # type: ignore[arg-type]
+
+    def point(t):
+        return curve(np.array([t]))[0][0]
+
+    tip = root(z.imag, lambda t: point(t).imag)
+    turned = z * np.exp(-1j * half)
+    end = root(turned.imag, lambda t: (point(t) * np.exp(-1j * half)).imag)
+    inside = (scan > tip) & (scan < end)
+    pitch = root(
+        np.where(inside, np.abs(z) - radius, np.where(scan <= tip, 1.0, -1.0)),
+        lambda t: abs(point(t)) - radius,
+    )
+    # At a cusp on the pitch circle (EE) the radius hardly tells where it is.
+    near = curve.ends[np.abs(np.abs(curve(curve.ends)[0]) - radius) < _AT * radius]
+    pitch = next((float(t) for t in near if tip < t < end), pitch)
+    if not tip < pitch < end:
+        raise lacking
+    off = 0.0
+    if smoothing > 0:
+        t = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(local)))])
+        off = float(np.sqrt(np.mean(np.abs(curve(t)[0] - local) ** 2)))
+    return _Flank(curve, tip, pitch, end, off)
+
+
+def _distances(flank: _Flank, own: _Flank) -> NDArray[np.float64]:
+    """Normal distance (mm, positive outside) of a flank from another at places along it."""
+    share = np.linspace(0.0, 1.0, _SHARES)
+    place = flank.at(share)[0]
+    for _ in range(4):
+        z, slope = own.at(share)[:2]
+        # The foot of the perpendicular; the curve has no speed at a cusp.
+        speed = np.maximum(np.abs(slope), 1e-3 * np.mean(np.abs(slope)))
+        step = np.real((place - z) * np.conj(slope)) / speed**2 / (own.root - own.tip)
+        share = np.clip(share + np.clip(step, -0.01, 0.01), 0.0, 1.0)
+    z, slope = own.at(share)[:2]
+    normal = -1j * slope / np.maximum(np.abs(slope), 1e-300)
+    return np.real((place - z) * np.conj(normal))
+
+
+def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray[np.float64], Frame]]:
+    """`NODES` places from `start` to `stop`, each joint twice, in their pieces."""
+    parts = flank.curve.between(start, stop)
+    if len(parts) > _PIECES:
+        raise InputError(
+            f"`profile.outline_file` must have flanks of at most {_PIECES} smooth pieces, but one "
+            f"has {len(parts)}; if the points are measured, set `profile.outline_smoothing_mm` to "
+            "their scatter, else draw the flank with longer arcs or one spline"
+        )
+    lengths = np.array([high - low for _, low, high in parts])
+    counts = 2 + np.floor((NODES - 2 * len(parts)) * lengths / lengths.sum()).astype(int)
+    counts[np.argmax(counts)] += NODES - counts.sum()
+    found = []
+    for (place, low, high), count in zip(parts, counts, strict=True):
+        found.append(stretch(flank.curve, place, low, high, int(count)))
+    return found
+
+
+def _outline(flank: _Flank, lobes: int, radius: float) -> tuple[Outline, float, float]:
+    """The profile of a flank, its star margin and that of convexity (mm)."""
+    upper = _stretch(flank, flank.tip, flank.pitch)
+    lower = _stretch(flank, flank.pitch, flank.root)
+    t, z, direction, speed, turning = (
+        np.concatenate(rows) for rows in zip(*(_row(part) for part in upper + lower), strict=True)
+    )
+    direction = _agreed(t, np.unwrap(direction))
+    normal = np.exp(1j * direction)
+    height, lever = np.real(z * np.conj(normal)), -np.imag(z * np.conj(normal))
+    nu = direction[:NODES]
+    curvature_radius = speed[:NODES] / np.where(turning > 0, turning, 1.0)[:NODES]
+    folds = ~(turning[:NODES] > 0) | np.append(np.diff(nu) < 0, not nu[-1] > max(0.0, nu[0]))
+    if np.any(folds):
+        place = z[np.argmax(folds)]
+        raise InputError(
+            "`profile.outline_file` must have a convex addendum, but its curvature is not positive "
+            f"at radius {abs(place):.5g} mm ({np.degrees(np.angle(place)):.3g} deg from the tip); "
+            "if the points are measured, raise `profile.outline_smoothing_mm` to their scatter"
+        )
+    scale = nu[-1] / (flank.root - flank.pitch)
+    f, g, h, q = turning[NODES:], speed[NODES:], height[NODES:], lever[NODES:]
+    crown = _table(
+        nu,
+        np.stack([height[:NODES], lever[:NODES]], axis=1) * _MM,
+        np.stack([-lever[:NODES], height[:NODES] - curvature_radius], axis=1) * _MM,
+    )
+    valley = _table(
+        (flank.root - t[NODES:][::-1]) * scale,
+        np.stack([direction[NODES:] - np.pi / lobes, q * _MM, h * _MM], axis=1)[::-1],
+        np.stack([f, (h * f - g) * _MM, -q * f * _MM], axis=1)[::-1] / -scale,
+    )
+    star = float(np.min(height))
+    if star < -_FOLD * radius:
+        raise InputError(
+            "`profile.outline_file` must hold an outline that does not fold back, seen from the "
+            f"axis, but a tangent passes it on the other side by {-star:.4g} mm; if the points are "
+            "measured, raise `profile.outline_smoothing_mm` to their scatter"
+        )
+    area, moment = _integrals(flank, lobes)
+    outline = Outline(
+        lobes=lobes,
+        pitch_radius=jnp.asarray(radius * _MM),
+        crown=crown,
+        valley=valley,
+        area=jnp.asarray(area * _MM**2),
+        polar_area_moment=jnp.asarray(moment * _MM**4),
+        outer_radius=jnp.asarray(np.max(np.abs(z)) * _MM),
+        root_radius=jnp.asarray(np.min(np.abs(z)) * _MM),
+        seal_width=jnp.asarray(_land(nu, lever[:NODES], curvature_radius, radius) * _MM),
+    )
+    return outline, star, float(np.min(curvature_radius))
+
+
+def _row(part: tuple[NDArray[np.float64], Frame]) -> tuple[NDArray, ...]:
+    t, found = part
+    return t, found.z, np.angle(found.normal), found.speed, found.turning
+
+
+def _agreed(t: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Directions of the normal, on both sides of a joint their mean if they all but agree; else
+    it is a corner."""
+    joint = np.flatnonzero((np.diff(t) == 0) & (np.abs(np.diff(direction)) < _CORNER))
+    agreed = direction.copy()
+    agreed[joint] = agreed[joint + 1] = (direction[joint] + direction[joint + 1]) / 2
+    return agreed
+
+
+def _table(node: NDArray, value: NDArray, slope: NDArray) -> Table:
+    return Table(*(jnp.asarray(np.ascontiguousarray(x)) for x in (node, value, slope)))
+
+
+def _land(nu, lever, curvature_radius, radius) -> float:
+    """Arc length (mm) of the whole tip land, 0 if there is none."""
+    miss, turn = _LAND
+    beyond = np.flatnonzero(np.abs(lever) > miss * radius)
+    end = beyond[0] if len(beyond) else len(nu) - 1
+    if nu[end] - nu[0] < turn:
+        return 0.0
+    return float(2 * np.trapezoid(curvature_radius[:end], nu[:end]))
+
+
+def _integrals(flank: _Flank, lobes: int) -> tuple[float, float]:
+    """Area (mm²) and polar moment of area (mm⁴) of the rotor made of a flank."""
+    nodes, weights = _GAUSS
+    area = moment = 0.0
+    for place, low, high in flank.curve.between(flank.tip, flank.root):
+        knots = np.unique(np.clip(flank.curve.pieces[place].t, low, high))
+        width = np.diff(knots)[:, None]
+        t = (knots[:-1, None] + width * (1 + nodes) / 2).ravel()
+        z, slope = flank.curve.derivatives(t, place)[:2]
+        element = np.imag(np.conj(z) * slope) * (width * weights / 2).ravel()
+        area += float(np.sum(element)) / 2
+        moment += float(np.sum(np.abs(z) ** 2 * element)) / 4
+    return 2 * lobes * area, 2 * lobes * moment

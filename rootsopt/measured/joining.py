@@ -1,0 +1,206 @@
+"""Joining a drawing's entities to closed loops."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from rootsopt.errors import InputError
+from rootsopt.measured.loop import Loop, place, signed_area
+
+TOGETHER = 1e-3
+"""Ends of entities closer than this (mm) are one point."""
+_CROWDED = 50
+"""Neighbours within `TOGETHER` (mean of all ends) above which a drawing is refused."""
+
+
+def joined(chains: list[Loop], layer: str, name: str) -> Loop:
+    """The closed loop of the largest area that `chains` make, each in either direction.
+
+    A chain that stands twice counts once. Chains that lead to a dead end, such as center lines,
+    belong to no loop. Raises `InputError` if there is no closed loop, if chains that are not closed
+    would enclose more than the largest loop does, or if more than two ends meet in a point of what
+    may be the outline.
+    """
+    remedy = f"join them in the drawing, on a layer {layer}"
+    ends = np.array([chain.points[[0, -1]] for chain in chains]).reshape(-1, 2)
+    vertex = _clusters(ends.ravel(), name).reshape(-1, 2)
+    lengths = np.array([np.sum(np.abs(np.diff(chain.points))) for chain in chains])
+    alone = (vertex[:, 0] == vertex[:, 1]) & (lengths > 2 * TOGETHER)
+    alone &= np.array([len(chain.points) > 2 for chain in chains], bool)
+    loops = [Loop(c.points[:-1], _closing(c.joints)) for c in _where(chains, alone)]
+    links = np.flatnonzero(vertex[:, 0] != vertex[:, 1])
+    links = links[_first_of_each(_where(chains, links), vertex[links], name)]
+    inner = links[_in_loops(vertex[links])]
+    clear, tangled = [], []
+    for group in _groups(vertex[inner]):
+        members = inner[group]
+        branches = np.flatnonzero(np.bincount(vertex[members].ravel()) > 2)
+        (tangled if len(branches) else clear).append((members, branches))
+    for members, _ in clear:
+        points, joints = _walked(chains, members, vertex)
+        loops.append(Loop(points[:-1], _closing(joints)))
+    best = max(loops, key=lambda loop: abs(signed_area(loop.points)), default=None)
+    size = _extent(best.points) if best else 0.0
+    for members, branches in tangled:
+        if _extent(np.concatenate([c.points for c in _where(chains, members)])) >= size:
+            at = ends.ravel()[np.flatnonzero(vertex.ravel() == branches[0])[0]]
+            meeting = np.count_nonzero(vertex[members] == branches[0])
+            raise InputError(
+                f"{name}: an outline must go on in one way from point to point, but {meeting} ends "
+                f"meet at {place(complex(at))}; remove the entities that do not belong to it, or "
+                f"draw it on a layer {layer}"
+            )
+    dead = np.setdiff1d(links, inner)
+    if best is None:
+        gap, at = _widest_gap(ends, vertex, links if len(links) else np.arange(len(chains)))
+        raise InputError(
+            f"{name}: the outline must be closed within {TOGETHER:g} mm, but the entities make no "
+            f"closed loop (widest gap {gap:.4g} mm, at {place(at)}); {remedy}"
+        )
+    for group in _groups(vertex[dead]):
+        members = dead[group]
+        if len(members) < 3 or np.max(np.bincount(vertex[members].ravel())) > 2:
+            continue
+        if abs(signed_area(_walked(chains, members, vertex)[0])) > abs(signed_area(best.points)):
+            gap, at = _widest_gap(ends, vertex, members)
+            raise InputError(
+                f"{name}: the outline must be closed within {TOGETHER:g} mm, but {len(members)} "
+                f"entities that enclose more than any closed loop have a gap of {gap:.4g} mm at "
+                f"{place(complex(at))}; {remedy}"
+            )
+    return best
+
+
+def _where(chains: list[Loop], which: NDArray) -> list[Loop]:
+    which = np.flatnonzero(which) if which.dtype == bool else which
+    return [chains[k] for k in which]
+
+
+def _closing(joints: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Joints of a chain whose last point is its first."""
+    joints = joints.copy()
+    joints[0] |= joints[-1]
+    return joints[:-1]
+
+
+def _extent(points: NDArray[np.complex128]) -> float:
+    return float(np.hypot(np.ptp(points.real), np.ptp(points.imag)))
+
+
+def _clusters(points: NDArray[np.complex128], name: str) -> NDArray[np.intp]:
+    """Number of the cluster of each point: points linked by steps below `TOGETHER`."""
+    unique, which = np.unique(points, return_inverse=True)
+    tree = KDTree(np.stack([unique.real, unique.imag], axis=1))
+    # Counted before they are listed: there may be n² of them.
+    if tree.count_neighbors(tree, TOGETHER) > (1 + _CROWDED) * len(unique):
+        raise InputError(
+            f"{name}: ends of entities must be farther apart than {TOGETHER:g} mm, but many are "
+            "closer; check the drawing's units, or draw longer entities"
+        )
+    pairs = tree.query_pairs(TOGETHER, output_type="ndarray")
+    return _components(pairs, len(unique))[which]
+
+
+def _components(pairs: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.intp)
+
+
+def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> NDArray[np.intp]:
+    """Places of the chains without those that repeat another: same ends, same places between."""
+    if not chains:
+        return np.zeros(0, np.intp)
+    quarters = np.array(
+        [
+            _quarters(chain.points, a > b)
+            for chain, (a, b) in zip(chains, vertex.tolist(), strict=True)
+        ]
+    )
+    between = _clusters(quarters.ravel(), name).reshape(len(chains), -1)
+    rows = np.concatenate([np.sort(vertex, axis=1), between], axis=1)
+    return np.sort(np.unique(rows, axis=0, return_index=True)[1])
+
+
+def _quarters(points: NDArray[np.complex128], backwards: bool) -> NDArray[np.complex128]:
+    """Points at a quarter, half and three quarters of the length."""
+    points = points[::-1] if backwards else points
+    if len(points) == 2:
+        return points[0] + (points[1] - points[0]) * np.array([0.25, 0.5, 0.75])
+    way = np.append(0.0, np.cumsum(np.abs(np.diff(points))))
+    return np.interp(way[-1] * np.array([0.25, 0.5, 0.75]), way, points)
+
+
+def _in_loops(vertex: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Places of the links that remain once those at dead ends are taken away, again and again."""
+    at: dict[int, set[int]] = {}
+    for link, (a, b) in enumerate(vertex.tolist()):
+        at.setdefault(a, set()).add(link)
+        at.setdefault(b, set()).add(link)
+    ends = [v for v, links in at.items() if len(links) == 1]
+    while ends:
+        links = at[ends.pop()]
+        if not links:
+            continue
+        link = links.pop()
+        for v in vertex[link].tolist():
+            at[v].discard(link)
+            if len(at[v]) == 1:
+                ends.append(v)
+    return np.array(sorted(set().union(*at.values())), np.intp)
+
+
+def _groups(vertex: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Places of the links of each connected part, in their order."""
+    if not len(vertex):
+        return []
+    _, which = np.unique(vertex, return_inverse=True)
+    which = which.reshape(-1, 2)
+    part = _components(which, int(np.max(which)) + 1)[which[:, 0]]
+    order = np.argsort(part, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(part[order])) + 1)
+    return sorted(groups, key=lambda group: group[0])
+
+
+def _walked(
+    chains: list[Loop], members: NDArray[np.intp], vertex: NDArray[np.intp]
+) -> tuple[NDArray[np.complex128], NDArray[np.bool_]]:
+    """Points and joints of links that make one loop or one open way, from end to end."""
+    at: dict[int, list[int]] = {}
+    for link in members.tolist():
+        for v in vertex[link].tolist():
+            at.setdefault(v, []).append(link)
+    open_ends = [v for v, links in at.items() if len(links) == 1]
+    link = at[open_ends[0]][0] if open_ends else int(members[0])
+    start = open_ends[0] if open_ends else int(vertex[link, 0])
+    points, joints = [], []
+    for _ in range(len(members)):
+        a, b = vertex[link].tolist()
+        way = slice(None) if a == start else slice(None, None, -1)
+        start = b if a == start else a
+        own, marks = chains[link].points[way], chains[link].joints[way]
+        # The end that two links share stands once, as a joint if it is one of either.
+        if joints:
+            joints[-1][-1] |= marks[0]
+            own, marks = own[1:], marks[1:]
+        points.append(own)
+        joints.append(marks.copy())
+        link = next((k for k in at[start] if k != link), -1)
+    return np.concatenate(points), np.concatenate(joints)
+
+
+def _widest_gap(
+    ends: NDArray[np.complex128], vertex: NDArray[np.intp], links: NDArray[np.intp]
+) -> tuple[float, complex]:
+    """The widest of the ways from each dead end to the nearest other, and where."""
+    places = ends[links].ravel()
+    numbers = vertex[links].ravel()
+    single = np.flatnonzero(np.bincount(numbers)[numbers] == 1)
+    places = places[single]
+    if len(places) < 2:
+        return 0.0, complex(ends[0, 0])
+    tree = KDTree(np.stack([places.real, places.imag], axis=1))
+    away = tree.query(tree.data, k=2)[0][:, 1]
+    widest = int(np.argmax(away))
+    return float(away[widest]), complex(places[widest])

@@ -1,0 +1,127 @@
+"""Outlines from files: CSV and DXF in, one closed loop of points out (mm, as x + iy)."""
+
+import os
+import stat
+from pathlib import Path
+
+import numpy as np
+
+from rootsopt.errors import InputError
+from rootsopt.measured.guard import short
+from rootsopt.measured.loop import Loop, signed_area
+from rootsopt.measured.table import from_csv
+
+__all__ = ["Loop", "read", "signed_area"]
+
+_WIDEST = 5.0
+"""The way from the last point to the first, relative to the longest step between others, with which
+a loop that does not repeat its first point counts as closed."""
+_BYTES = 50_000_000
+"""Size of a file (bytes) above which it is refused unread."""
+_POINTS = 500_000
+"""Number of points above which an outline is refused: each takes some 20 µs to read and fit."""
+_SIZES = 0.1, 1e5
+"""Sizes of an outline (mm) below and above which its units must be wrong."""
+_SAME = 1e-9
+"""Points closer than this, relative to the outline's size, are one."""
+_NOT_FILES = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (lambda mode: stat.S_ISCHR(mode) or stat.S_ISBLK(mode), "a device"),
+)
+
+
+def read(path: Path) -> Loop:
+    """The outline in a CSV or DXF file.
+
+    CSV: x and y in mm (columns `x_mm` and `y_mm` if the header names them, else the first two),
+    with or without a header, split by commas, semicolons, tabs or blanks. DXF, text or binary: the
+    closed loop of the largest area out of LINE, ARC, ELLIPSE, SPLINE, LWPOLYLINE and POLYLINE on
+    the layer OUTLINE, or on all layers if there is none of that name, in the units the file states
+    (mm if none). The ends of a LINE and the corners of a polyline are taken as points of a curve.
+
+    Raises `InputError` for a file that cannot be read or holds no closed outline.
+    """
+    name, kind = short(path.name), path.suffix.lower()
+    if kind not in (".csv", ".txt", ".dxf"):
+        raise InputError(
+            f"`profile.outline_file` must be a .csv, .txt or .dxf file, but is {name!r}; save "
+            "the outline in one of these formats"
+        )
+    data = _bytes(path, name)
+    if kind == ".dxf":
+        from rootsopt.measured.dxf import from_dxf  # A quarter of a second, for drawings alone.
+
+        return _closed(from_dxf(data, name), name)
+    return _closed(from_csv(data, name), name)
+
+
+def _bytes(path: Path, name: str) -> bytes:
+    """The file's content. Nothing but a regular file of limited size is opened."""
+    try:
+        found = path.stat()
+        kind = next((what for test, what in _NOT_FILES if test(found.st_mode)), None)
+        if kind is not None:
+            raise InputError(
+                f"`profile.outline_file` must be a file, but {name!r} is {kind}; give the path of "
+                "a .csv, .txt or .dxf file"
+            )
+        # A pipe that took the file's place meanwhile must not be waited for.
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+        with open(os.open(path, flags), "rb") as file:
+            data = file.read(_BYTES + 1) or b""
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(
+            "`profile.outline_file` must be a file that can be read, but is "
+            f"{short(str(path), 120)!r}: {short(reason.lower())}; a path in a config is relative "
+            "to the config's folder, one given with --set to the current folder"
+        ) from None
+    if len(data) > _BYTES:
+        raise InputError(
+            f"{name}: must have at most {_BYTES / 1e6:g} MB, but is larger; export the outline "
+            "alone, with fewer points"
+        )
+    if not data.strip():
+        raise InputError(f"{name}: must hold an outline, but is empty; export it again")
+    return data
+
+
+def _closed(loop: Loop, name: str) -> Loop:
+    """The loop without repeated points. Raises `InputError` unless it is closed and of a size."""
+    points = loop.points
+    if len(points) > _POINTS:
+        raise InputError(
+            f"{name}: must have at most {_POINTS} points, but has {len(points)}; thin them out"
+        )
+    if len(points) < 4:
+        raise InputError(
+            f"{name}: must hold the points of an outline, but has {len(points)}; add the rest"
+        )
+    low, high = _SIZES
+    # The greatest coordinate first, since the difference of large ones may overflow.
+    x, y = np.real(points), np.imag(points)
+    reach = float(max(np.max(np.abs(x)), np.max(np.abs(y))))
+    size = float(max(np.ptp(x), np.ptp(y))) if reach <= high else reach
+    if not low <= size <= high:
+        raise InputError(
+            f"{name}: must hold an outline of {low:g} to {high:g} mm, but "
+            + ("all its points are in one place" if size == 0 else f"it measures {size:.4g} mm")
+            + "; check its units (CSV: mm; DXF: $INSUNITS)"
+        )
+    steps = np.abs(np.diff(points))
+    gap = abs(points[-1] - points[0])
+    if gap > _WIDEST * np.max(steps):
+        raise InputError(
+            f"{name}: the outline must be closed, but its last point is {gap:.4g} mm from its "
+            f"first (longest step between others: {np.max(steps):.4g} mm); add what is missing"
+        )
+    # Of points in one place the last is kept, and is a joint if any of them is one.
+    kept = np.flatnonzero(np.append(steps, gap) > _SAME * reach)
+    owner = np.searchsorted(kept, np.flatnonzero(loop.joints)) % len(kept)
+    joints = np.zeros(len(kept), bool)
+    joints[owner] = True
+    return Loop(points[kept], joints)

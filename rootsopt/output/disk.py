@@ -1,0 +1,150 @@
+"""The file operations everything that is written goes through.
+
+Thin on purpose: a test makes each of these calls fail, or ends the process there, one after the
+other. Standard library only.
+"""
+
+import ctypes
+import errno
+import functools
+import os
+import shutil
+import stat
+from pathlib import Path
+
+_AT_FDCWD = -100
+_RENAME_EXCHANGE = 2
+_UNSUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
+
+
+def create(path: Path, data: bytes) -> None:
+    """Write a new file with the user's usual permissions, through to the disk; on failure none is
+    left."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+    file = os.open(path, flags, 0o666)
+    try:
+        try:
+            view = memoryview(data)
+            while view:
+                view = view[os.write(file, view) :]
+            os.fsync(file)
+        finally:
+            os.close(file)
+    except BaseException:
+        discard(path)
+        raise
+
+
+def make_folder(path: Path) -> None:
+    """Make one new folder."""
+    os.mkdir(path)
+
+
+def make_folders(folder: Path, made: list[Path]) -> None:
+    """Make a folder and its parents, noting the new ones in `made` as they appear."""
+    missing = []
+    while not folder.is_dir():
+        missing.append(folder)
+        if folder.parent == folder:
+            break
+        folder = folder.parent
+    for new in reversed(missing):
+        try:
+            make_folder(new)
+        except FileExistsError:
+            if not new.is_dir():  # not merely another process that was faster
+                raise
+        else:
+            made.append(new)
+
+
+def sync_folder(path: Path) -> None:
+    """Put the names in a folder through to the disk, where the file system can do that."""
+    try:
+        folder = os.open(path, os.O_RDONLY)
+    except PermissionError:  # where folders cannot be opened
+        return
+    try:
+        os.fsync(folder)
+    except OSError as error:
+        if error.errno not in _UNSUPPORTED:
+            raise
+    finally:
+        os.close(folder)
+
+
+def move(source: Path, target: Path) -> None:
+    """Rename in one step; an empty folder at `target` is replaced."""
+    os.rename(source, target)
+
+
+def replace(source: Path, target: Path) -> None:
+    """Rename in one step; a file at `target` is replaced."""
+    os.replace(source, target)
+
+
+def exchange(first: Path, second: Path) -> bool:
+    """Let two folders change places in one step; False where the system cannot do that."""
+    call = _renameat2()
+    if call is None:
+        return False
+    error = _exchanged(call, os.fsencode(first), os.fsencode(second))
+    if error in _UNSUPPORTED:
+        return False
+    if error:
+        raise OSError(error, os.strerror(error), str(first))
+    return True
+
+
+def can_exchange(folder: Path) -> bool:
+    """Whether folders on the file system of `folder` can change places."""
+    pair = [folder / name for name in (".first", ".second")]
+    for one in pair:
+        os.mkdir(one)
+    try:
+        return exchange(*pair)
+    finally:
+        for one in pair:
+            discard(one)
+
+
+def _exchanged(call, first: bytes, second: bytes) -> int:
+    """The error number of an exchange, 0 for none."""
+    done = call(_AT_FDCWD, first, _AT_FDCWD, second, _RENAME_EXCHANGE)
+    return ctypes.get_errno() if done else 0
+
+
+@functools.cache
+def _renameat2():
+    """The C library's function, or None."""
+    try:
+        call = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError, TypeError):
+        return None
+    path = ctypes.c_char_p
+    call.argtypes = ctypes.c_int, path, ctypes.c_int, path, ctypes.c_uint
+    return call
+
+
+def adopt_mode(path: Path, model: Path) -> None:
+    """Give a folder the permissions of another, as far as that is allowed."""
+    try:
+        os.chmod(path, stat.S_IMODE(os.stat(model).st_mode))
+    except OSError:
+        return
+
+
+def discard(path: Path) -> None:
+    """Remove a file or an empty folder, if there is one and it can be removed."""
+    try:
+        if path.is_dir() and not path.is_symlink():
+            os.rmdir(path)
+        else:
+            os.unlink(path)
+    except OSError:
+        return
+
+
+def discard_tree(path: Path) -> None:
+    """Remove a folder with all it holds, as far as possible."""
+    shutil.rmtree(path, ignore_errors=True)

@@ -1,0 +1,225 @@
+"""Result files: written whole or not at all, into a folder checked before the work begins.
+
+Every file goes to a temporary name in its own folder and then takes the final name in one
+step, so a reader (or a killed run) sees the old file or the new one, never half of it. Commands
+write whole folders that way (`rootsopt.output.runs`).
+"""
+
+import csv
+import enum
+import importlib.metadata
+import io
+import json
+import math
+import os
+import platform
+import secrets
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import rootsopt
+from rootsopt.config import sources
+from rootsopt.errors import InputError
+from rootsopt.output import disk
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from rootsopt.config import Config
+    from rootsopt.response.evaluation import Series
+
+DPI = 150
+"""Resolution of the figures written."""
+_LIBRARIES = ("jax", "jaxlib", "diffrax", "optax", "equinox", "numpy")
+
+
+class ResultFolder:
+    """A folder that takes result files.
+
+    Made with its parents where it does not exist. Raises `InputError` if it cannot be made
+    or written into, and then leaves nothing behind.
+    """
+
+    def __init__(self, path: str | os.PathLike):
+        if not str(path):
+            raise InputError("the output folder must have a name, but is empty; give a path")
+        self.path = Path(path)
+        made: list[Path] = []
+        try:
+            disk.make_folders(self.path, made)
+            probe = self.path / _temporary("probe")
+            disk.create(probe, b"probe")
+            disk.discard(probe)
+        except (OSError, ValueError) as error:
+            for folder in reversed(made):
+                disk.discard(folder)
+            raise InputError(
+                f"{str(path)!r}: cannot be used as output folder: {sources.reason(error)}; choose "
+                "another folder or make this one writable"
+            ) from None
+
+    @property
+    def place(self) -> Path:
+        """Where files are."""
+        return self.path
+
+    def write_bytes(self, name: str, data: bytes) -> Path:
+        """Write `data` as `name`, which may lie in a subfolder (`figures/force.png`)."""
+        target = self.path / name
+        temporary = target.with_name(_temporary(target.name))
+        try:
+            disk.make_folders(target.parent, [])
+            disk.create(temporary, data)
+            try:
+                disk.replace(temporary, target)
+            except BaseException:
+                disk.discard(temporary)
+                raise
+        except OSError as error:
+            raise InputError(
+                f"{str(target)!r}: cannot be written: {sources.reason(error)}; free the place or "
+                "choose another output folder"
+            ) from None
+        return target
+
+    def write_text(self, name: str, text: str) -> Path:
+        """Write `text` as UTF-8."""
+        try:
+            data = text.encode("utf-8")
+        except UnicodeEncodeError as error:
+            wrong = text[max(0, error.start - 20) : error.end + 20]
+            raise InputError(
+                f"{name}: {wrong!a} cannot be written as UTF-8; rename the file it names"
+            ) from None
+        return self.write_bytes(name, data)
+
+    def write_json(self, name: str, data: Any) -> Path:
+        """Write `data` as strict JSON: numbers that are not finite become null."""
+        text = json.dumps(_plain(data), indent=2, allow_nan=False, ensure_ascii=False)
+        return self.write_text(name, text + "\n")
+
+    def write_csv(self, name: str, columns: Mapping[str, ArrayLike]) -> Path:
+        """Write equally long columns under a header line, floats with 10 digits.
+
+        Text, truth values (`true`, `false`) and None (empty) may stand among numbers.
+        Raises `ValueError` for columns that differ in length or are not one-dimensional.
+        """
+        return self.write_text(name, _csv(columns))
+
+    def write_figure(self, name: str, figure: "Figure") -> Path:
+        """Write a matplotlib figure as PNG."""
+        image = io.BytesIO()
+        figure.savefig(image, format="png", dpi=DPI)
+        return self.write_bytes(name, image.getvalue())
+
+
+def _temporary(name: str) -> str:
+    return f".{name[:100]}.{os.getpid()}-{secrets.token_hex(4)}.tmp"
+
+
+def _plain(data: Any) -> Any:
+    """`data` in JSON's own types."""
+    if isinstance(data, Mapping):
+        return {str(key): _plain(value) for key, value in data.items()}
+    if isinstance(data, (list, tuple)):
+        return [_plain(value) for value in data]
+    if isinstance(data, enum.Enum):
+        return data.name.lower()
+    if isinstance(data, os.PathLike):
+        return os.fspath(data)
+    if hasattr(data, "tolist"):  # arrays and array scalars, NumPy or JAX
+        return _plain(data.tolist())
+    if isinstance(data, float) and not math.isfinite(data):
+        return None
+    return data
+
+
+def _csv(columns: Mapping[str, ArrayLike]) -> str:
+    arrays = {name: np.asarray(values) for name, values in columns.items()}
+    shapes = {name: array.shape for name, array in arrays.items()}
+    if any(len(shape) != 1 for shape in shapes.values()) or len(set(shapes.values())) > 1:
+        raise ValueError(f"Argument `columns` must hold 1-D arrays of one length, but has {shapes}")
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(arrays)
+    writer.writerows(zip(*(_cells(array) for array in arrays.values()), strict=True))
+    return text.getvalue()
+
+
+def _cells(array: NDArray) -> list[str]:
+    if array.dtype.kind == "f":
+        return [f"{value:.10g}" for value in (array + 0.0).tolist()]  # no "-0"
+    return [_cell(value) for value in array.tolist()]
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool | np.bool_):
+        return "true" if value else "false"
+    if isinstance(value, float | np.floating):
+        return f"{value + 0.0:.10g}"
+    return str(value)
+
+
+def write_config(folder: ResultFolder, config: "Config") -> None:
+    """Write config.yaml, and beside it a copy of the file that an outline is in, which it names:
+    the folder stays whole wherever it is moved."""
+    profile = config.profile
+    if profile.outline_file is not None:
+        source = sources.regular_file(profile.outline_file, "an outline")
+        copy = f"outline{source.suffix.lower()}"
+        try:
+            data = source.read_bytes()
+        except OSError as error:
+            raise InputError(f"{str(source)!r}: cannot be read: {sources.reason(error)}") from None
+        folder.write_bytes(copy, data)
+        profile = profile.model_copy(update={"outline_file": copy})
+        config = config.model_copy(update={"profile": profile})
+    folder.write_text("config.yaml", config.to_yaml())
+
+
+def profile_columns(outline_mm: ArrayLike) -> dict[str, NDArray[np.float64]]:
+    """Columns of `profile_*.csv` from a closed outline (n, 2) in mm."""
+    outline = np.asarray(outline_mm)
+    return {"x_mm": outline[:, 0], "y_mm": outline[:, 1]}
+
+
+def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
+    """Columns of `response_*.csv`: motion and forces over the reported window."""
+    return {
+        "time_s": series.time,
+        "rotation_deg": np.degrees(series.rotation),
+        "relative_rotation_rad": series.relative,
+        "relative_speed_rad_s": series.rate,
+        "drive_flank_force_N": series.drive_force,
+        "coast_flank_force_N": series.coast_force,
+        "contact_force_N": series.force,
+    }
+
+
+def row_columns(
+    rows: Sequence[Mapping[str, Any]], keys: Iterable[str] | None = None
+) -> dict[str, NDArray]:
+    """Columns from dict rows such as the optimisation history; an absent entry is None.
+
+    `keys` orders the columns (default: as first met), and gives the header where there
+    are no rows.
+    """
+    if keys is None:
+        keys = dict.fromkeys(key for row in rows for key in row)
+    columns = {}
+    for key in keys:
+        columns[key] = np.empty(len(rows), dtype=object)
+        columns[key][:] = [row.get(key) for row in rows]
+    return columns
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, this package and the libraries that decide its numbers."""
+    found = {"python": platform.python_version(), "rootsopt": rootsopt.__version__}
+    return found | {name: importlib.metadata.version(name) for name in _LIBRARIES}

@@ -1,0 +1,356 @@
+"""The result folder of one run of a command: written aside, put in place whole.
+
+A run writes into a folder of its own beside the target, `.NAME.PROCESS-XXXXXXXX.rootsopt`. When all
+is written, that folder takes the target's name in one step. So the target is the run before or this
+one, never a mixture. A lock file beside it, `.NAME.rootsopt`, keeps a second process out. Both
+vanish with the run; what a killed run leaves, the next one removes.
+
+What is in the target already:
+
+- nothing: the new run takes its place;
+- an earlier run: it is moved aside to `NAME.1`, `NAME.2` …, or with `overwrite` replaced, unless
+  there are files in it that are not its own;
+- anything else: refused.
+
+Where the file system can exchange two folders (Linux), the target exists at any time. Elsewhere the
+older run is moved away first; if the process is killed just then, the next run puts the finished
+folder in place.
+"""
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+import re
+import secrets
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+from rootsopt.config import sources
+from rootsopt.errors import InputError
+from rootsopt.output import disk
+from rootsopt.output.files import ResultFolder
+from rootsopt.output.lock import Lock, TakenError
+
+RESULT = "result.json"
+"""The file that is written last and lists all others."""
+_CONFIG = "config.yaml"
+_SUFFIX = ".rootsopt"
+_STAGE = re.compile(r"(\..+)\.\d+-[0-9a-f]{8}" + re.escape(_SUFFIX))
+_LONGEST = 150
+"""Bytes of a folder's name up to which temporary names contain it."""
+_PATIENCE = 10.0
+"""Time (s) that a write in progress has left when the process is stopped."""
+_State = Literal["absent", "empty", "ours", "more", "foreign"]
+
+
+class RunFolder(ResultFolder):
+    """A `ResultFolder` that appears whole, with `put_in_place`, or not at all.
+
+    `path`: where it will be. Use it as a context: what is not in place at the end is removed.
+    Raises `InputError` where the folder cannot be used: another process writes into it, it holds
+    files of others, it is no folder, or its parent cannot be written into.
+    """
+
+    def __init__(self, path: str | os.PathLike, command: str = "", overwrite: bool = False):
+        name = os.fspath(path)
+        if not name:
+            raise InputError(
+                "`--output` must name a folder, but is empty; give a path, or leave it out"
+            )
+        self.path = Path(path)
+        self.command, self.overwrite = command, overwrite
+        self.placed = False
+        self._written: set[str] = set()
+        self._result: Mapping[str, Any] | None = None
+        self._made: list[Path] = []
+        self._lock: Lock | None = None
+        self._busy = threading.RLock()
+        try:
+            self.target = Path(os.path.realpath(self.path))
+            self._refuse_places()
+            disk.make_folders(self.target.parent, self._made)
+            self._base = self.target.parent / _base(self.target.name)
+            self.stage = self._temporary()
+            self._claim()
+            disk.make_folder(self.stage)
+        except InputError:
+            self.close()
+            raise
+        except (OSError, ValueError) as error:
+            self.close()
+            raise self._unusable(sources.reason(error)) from None
+        except BaseException:
+            self.close()
+            raise
+
+    def _unusable(self, why: str) -> InputError:
+        return InputError(
+            f"{str(self.path)!r}: cannot be used as output folder: {why}; choose another folder "
+            "or make its parent folder writable"
+        )
+
+    def _refuse_places(self) -> None:
+        """Raise `InputError` where nothing can be put in place of the target."""
+        target = self.target
+        if os.path.lexists(target) and not target.is_dir():
+            raise InputError(f"{str(self.path)!r}: is not a folder; choose another output folder")
+        here = Path.cwd()
+        what = None
+        if target == here or target in here.parents:
+            what = "the current folder or one around it"
+        elif os.path.ismount(target) or str(target) in _mount_points():
+            what = "a mount point"
+        if what is not None:
+            inside = self.path / (self.command or "run")
+            raise InputError(
+                f"{str(self.path)!r}: is {what}, which a finished run cannot take the place of; "
+                f"name a folder inside, as {str(inside)!r}"
+            )
+
+    def _claim(self) -> None:
+        """Take the lock, remove what killed runs have left, look at what is there."""
+        try:
+            self._lock = Lock(self._base.with_name(self._base.name + _SUFFIX))
+        except TakenError as taken:
+            who = f"process {taken.process}" if taken.process else "another process"
+            raise InputError(
+                f"{str(self.path)!r}: {who} is writing into this folder; wait for it, stop it, or "
+                "choose another folder with --output"
+            ) from None
+        if self._lock.held:
+            self._clear()
+        if self._state() == "foreign":
+            some = sorted(os.listdir(self.target))
+            shown = ", ".join(some[:3]) + (", …" if len(some) > 3 else "")
+            raise InputError(
+                f"{str(self.path)!r}: holds files that are not of an earlier run ({shown}); choose "
+                "another folder, or empty this one (--overwrite replaces earlier runs only)"
+            )
+
+    def _clear(self) -> None:
+        """Finish what a killed run had nearly put in place; remove the rest of killed runs in the
+        parent folder."""
+        for name in sorted(os.listdir(self.target.parent)):
+            found = _STAGE.fullmatch(name)
+            if found is None:
+                continue
+            left = self.target.parent / name
+            if found[1] == self._base.name:
+                if _complete(left) and not os.path.lexists(self.target):
+                    disk.move(left, self.target)
+                else:
+                    disk.discard_tree(left)
+                continue
+            with contextlib.suppress(InputError, OSError):  # of a run that goes on
+                other = Lock(self.target.parent / (found[1] + _SUFFIX))
+                if other.held and not _complete(left):
+                    disk.discard_tree(left)
+                other.release()
+
+    def _state(self) -> _State:
+        """What the target is: `ours`, an earlier run and nothing else; `more`, one with other files
+        beside its own."""
+        if not os.path.lexists(self.target):
+            return "absent"
+        if not self.target.is_dir():
+            return "foreign"
+        if not os.listdir(self.target):
+            return "empty"
+        if not all((self.target / name).is_file() for name in (RESULT, _CONFIG)):
+            return "foreign"
+        return "ours" if _files_in(self.target) <= _listed(self.target / RESULT) else "more"
+
+    def _temporary(self) -> Path:
+        unique = f".{os.getpid()}-{secrets.token_hex(4)}{_SUFFIX}"
+        return self._base.with_name(self._base.name + unique)
+
+    @property
+    def place(self) -> Path:
+        """Where files are for now."""
+        return self.stage
+
+    def write_bytes(self, name: str, data: bytes) -> Path:
+        """Write `data` as `name`, which may lie in a subfolder (`figures/force.png`); return where
+        it will be."""
+        with self._busy, self._failing(name):
+            file = self.stage / name
+            disk.make_folders(file.parent, [])
+            if name in self._written:
+                disk.discard(file)
+            disk.create(file, data)
+            self._written.add(name)
+        return self.path / name
+
+    def write_json(self, name: str, data: Any) -> Path:
+        """As `ResultFolder.write_json`; `result.json` is written last, with a list of all files."""
+        if name != RESULT:
+            return super().write_json(name, data)
+        self._result = data
+        return self.path / name
+
+    def put_in_place(self) -> list[str]:
+        """Give the folder its place; return what the user should know of that, a sentence each.
+
+        Raises `InputError` if that fails, and then the target is as it was."""
+        with self._busy:
+            files = sorted(self._written | {RESULT})
+            run = {"run": {"command": self.command, "files": files}}
+            super().write_json(RESULT, {**(self._result or {}), **run})
+            with self._failing():
+                for folder in {(self.stage / name).parent for name in files} | {self.stage}:
+                    disk.sync_folder(folder)
+                notes = self._take_place()
+            self.placed = True
+            with contextlib.suppress(OSError):
+                disk.sync_folder(self.target.parent)
+        return notes
+
+    def _take_place(self) -> list[str]:
+        state = self._state()
+        if state in ("absent", "empty"):
+            if state == "empty":
+                disk.adopt_mode(self.stage, self.target)
+            disk.move(self.stage, self.target)
+            return []
+        if state == "foreign":  # It was not when the run began, and a long run is not thrown away.
+            self.target = self.path = self._free()
+            disk.move(self.stage, self.target)
+            return [f"the folder asked for holds other files by now; this run is in {self.path}"]
+        disk.adopt_mode(self.stage, self.target)
+        if self.overwrite and state == "ours":
+            self._replace()
+            return []
+        aside = self._free()
+        self._push_aside(aside)
+        shown = self.path.with_name(aside.name)
+        note = f"the earlier run is now in {shown}"
+        if self.overwrite:
+            note += ", as there are files in it that are not its own"
+        return [note]
+
+    def _replace(self) -> None:
+        """Take the place of the run in the target, which vanishes."""
+        if disk.exchange(self.stage, self.target):
+            older = self.stage
+        else:
+            older = self._temporary()
+            self._swap_by(older)
+        disk.discard_tree(older)
+
+    def _push_aside(self, aside: Path) -> None:
+        """Take the place of the run in the target, which moves to `aside`."""
+        if not disk.can_exchange(self.stage):
+            self._swap_by(aside)
+            return
+        # Complete under that name, so that nothing is lost if the process ends in between.
+        disk.move(self.stage, aside)
+        try:
+            if not disk.exchange(aside, self.target):
+                raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        except BaseException:
+            disk.move(aside, self.stage)
+            raise
+
+    def _swap_by(self, older: Path) -> None:
+        """In two steps: the target to `older`, this run to the target."""
+        disk.move(self.target, older)
+        try:
+            disk.move(self.stage, self.target)
+        except BaseException:
+            disk.move(older, self.target)
+            raise
+
+    def _free(self) -> Path:
+        """The first of `NAME.1`, `NAME.2` … that does not exist."""
+        number = 1
+        while os.path.lexists(found := self.target.with_name(f"{self.target.name}.{number}")):
+            number += 1
+        return found
+
+    @contextlib.contextmanager
+    def _failing(self, name: str = ""):
+        try:
+            yield
+        except OSError as error:
+            raise InputError(
+                f"{str(self.path / name)!r}: cannot be written: {sources.reason(error)}; free the "
+                "place or choose another output folder"
+            ) from None
+
+    def close(self) -> None:
+        """Remove what is not in place, and give the lock back; a second time does nothing."""
+        with self._busy:
+            if not self.placed and hasattr(self, "stage"):
+                disk.discard_tree(self.stage)
+            if self._lock is not None:
+                self._lock.release()
+            if not self.placed:
+                for folder in reversed(self._made):
+                    disk.discard(folder)
+
+    def abandon(self) -> str:
+        """As `close`, from another thread and for good: the run can write nothing any more. Return
+        what has become of the folder."""
+        if self._busy.acquire(timeout=_PATIENCE):
+            self.close()
+        return f"{self.path} is {'complete' if self.placed else 'as it was'}"
+
+    def __enter__(self) -> "RunFolder":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def _base(name: str) -> str:
+    """What the temporary names of a folder begin with."""
+    if len(os.fsencode(name)) > _LONGEST:
+        name = hashlib.sha256(os.fsencode(name)).hexdigest()
+    return f".{name}"
+
+
+def _files_in(folder: Path) -> set[str]:
+    """All files below a folder, by their names relative to it; empty folders too."""
+    found: set[str] = set()
+    for place, folders, files in os.walk(folder):
+        inside = Path(place).relative_to(folder)
+        names = files if files or folders else [""]
+        names += [name for name in folders if os.path.islink(os.path.join(place, name))]
+        found |= {(inside / name).as_posix() for name in names}
+    return found
+
+
+def _listed(result: Path) -> set[str]:
+    """The files of a run by its result file; none where it does not say."""
+    try:
+        names = json.loads(result.read_bytes())["run"]["files"]
+        return {name for name in names if isinstance(name, str)}
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return set()
+
+
+def _complete(stage: Path) -> bool:
+    """Whether a run that was killed had written all its files."""
+    listed = _listed(stage / RESULT)
+    return bool(listed) and _files_in(stage) == listed
+
+
+def _mount_points() -> set[str]:
+    """Folders that something is mounted on, also from the same file system (Linux)."""
+    try:
+        lines = Path("/proc/self/mountinfo").read_bytes().splitlines()
+        places = [line.split()[4] for line in lines]
+    except (OSError, IndexError):
+        return set()
+    octal = re.compile(rb"\\([0-7]{3})")
+    return {os.fsdecode(octal.sub(lambda m: bytes([int(m[1], 8)]), place)) for place in places}

@@ -1,0 +1,1 @@
+"""Process and programs: precision, environment, threads, compiled programs and their cache."""

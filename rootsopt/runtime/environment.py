@@ -1,0 +1,300 @@
+"""What environment variables and the machine may do to a command.
+
+A command owns its process: it computes in double precision with JAX's own defaults, whatever the
+environment says. Variables that only choose a device, a cache or a log are respected; those that
+change numbers, or stop a run on purpose, are set aside and named on stderr. What cannot work is an
+`InputError` before anything is computed: XLA ends the whole process at a flag it does not know.
+"""
+
+import contextlib
+import os
+import re
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+
+from rootsopt.errors import InputError
+
+_RESPECTED = (
+    "JAX_PLATFORMS",
+    "JAX_COMPILATION_CACHE_",
+    "JAX_PERSISTENT_CACHE_",
+    "JAX_ENABLE_COMPILATION_CACHE",
+    "JAX_RAISE_PERSISTENT_CACHE_ERRORS",
+    "JAX_LOG",
+    "JAX_EXPLAIN_CACHE_MISSES",
+    "JAX_DEBUG_LOG_MODULES",
+    "JAX_TRACEBACK_FILTERING",
+    "JAX_DUMP_IR_",
+    "JAX_CUDA_VISIBLE_DEVICES",
+    "JAX_ROCM_VISIBLE_DEVICES",
+    "JAX_ONEAPI_VISIBLE_DEVICES",
+    "JAX_PJRT_CLIENT_CREATE_OPTIONS",
+)
+"""Beginnings of variables that choose a device, a cache or a log."""
+
+_REQUIRED = {
+    "jax_enable_x64": True,
+    "jax_numpy_dtype_promotion": "standard",
+    "jax_numpy_rank_promotion": "allow",
+    "jax_default_matmul_precision": None,
+    "jax_disable_jit": False,
+    "jax_debug_nans": False,
+    "jax_debug_infs": False,
+    "jax_debug_key_reuse": False,
+    "jax_enable_checks": False,
+    "jax_check_tracer_leaks": False,
+    "jax_no_tracing": False,
+    "jax_no_execution": False,
+}
+"""Settings of JAX that every result relies on; NaN occurs on purpose inside of the programs."""
+
+_XLA_FLAGS = "XLA_FLAGS"
+_CHECKED = "ROOTSOPT_XLA_FLAGS_CHECKED"
+"""Holds the XLA_FLAGS that were tried, for the processes started from this one."""
+
+# XLA compiles a loop on a CPU to one function if its buffers are small; else it calls one for
+# every operation of every turn, which here costs several times the arithmetic itself.
+_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
+
+_UNSOUND = re.compile(r"--?(xla_cpu_enable_fast_math)(?:=(?:true|1|t|yes|y))?(?=\s|$)", re.I)
+"""Flags with which NaN and infinity are no longer told from numbers."""
+
+_TRIAL = """
+import sys
+try:
+    from jaxlib import xla_client
+    make, devices = xla_client.make_cpu_client, xla_client.DeviceList
+    options = xla_client.CompileOptions()
+except (ImportError, AttributeError, TypeError):
+    sys.exit(0)
+client = make()
+text = '''module { func.func public @main(%arg0: tensor<f64>) -> tensor<f64> {
+  %0 = stablehlo.sine %arg0 : tensor<f64>
+  return %0 : tensor<f64> } }'''
+try:
+    client.compile_and_load(text, devices(tuple(client.local_devices()[:1])), options)
+except (AttributeError, TypeError):
+    pass
+"""
+"""Compiles one operation, with no more of JAX than that needs."""
+_TRIAL_SECONDS = 60.0
+_LOG_PREFIX = re.compile(r"^[IWEF]\d{4} \S+\s+\d+ \S+\] ")
+
+_NARROWEST = 40
+"""Columns below which a table would lose its numbers; COLUMNS is then not believed."""
+
+_noticed: set[str] = set()
+
+
+def say(text: str) -> None:
+    """One line on stderr, once in a process."""
+    if text in _noticed:
+        return
+    _noticed.add(text)
+    with contextlib.suppress(OSError, ValueError):
+        print(f"rootsopt: {' '.join(text.split())}", file=sys.stderr)
+
+
+def shortened(value: str, longest: int = 80) -> str:
+    """A value for a message, with control characters escaped, and no longer than `longest`."""
+    text = repr(value)
+    return text if len(text) <= longest else f"{text[: longest - 4]}...{text[-1]}"
+
+
+def own_process() -> None:
+    """Set aside what the environment says against a command; to be called before anything else.
+
+    Warnings never become errors, tables are wide enough to be read, figures need no display,
+    checks of equinox are off. The variables of JAX are dealt with by `use_float64`.
+    """
+    if any(option.lower().startswith("e") for option in sys.warnoptions):
+        for entry in [entry for entry in warnings.filters if entry[0] == "error"]:
+            warnings.filters.remove(entry)  # type: ignore[attr-defined]
+        warnings.simplefilter("default", append=True)
+    columns = os.environ.get("COLUMNS", "")
+    if not (columns.isdecimal() and int(columns) >= _NARROWEST):
+        os.environ.pop("COLUMNS", None)
+    if "matplotlib" not in sys.modules:
+        os.environ["MPLBACKEND"] = "agg"
+    if "equinox" not in sys.modules:
+        chosen = os.environ.get("EQX_ON_ERROR", "off")
+        os.environ["EQX_ON_ERROR"] = "off"
+        if chosen != "off":
+            _set_aside([f"EQX_ON_ERROR={shortened(chosen)}"])
+        for name in [name for name in os.environ if name.startswith(("EQX_GETKEY", "JAXTYPING_"))]:
+            del os.environ[name]
+
+
+def use_float64() -> None:
+    """Import JAX and start its device in double precision, with all other settings as they must be.
+
+    Raises `InputError` where the environment lets JAX not start.
+    """
+    aside = {} if "jax" in sys.modules else _without_settings()
+    flags = os.environ.get(_XLA_FLAGS, "").strip()
+    if flags:
+        _check_flags(flags)
+    else:
+        os.environ.pop(_XLA_FLAGS, None)
+    use_compiled_loops()
+    try:
+        import jax
+    except Exception as error:  # also what JAX finds wrong with variables that are respected
+        chosen = {name: value for name, value in os.environ.items() if name.startswith("JAX_")}
+        said = ", ".join(f"{name}={shortened(value)}" for name, value in sorted(chosen.items()))
+        advice = f"correct or unset {said}" if said else "mend its installation"
+        raise InputError(f"JAX cannot be imported here: {_reason(error)}; {advice}") from error
+    changed = _require(jax.config)
+    known = jax.config.values
+    named = []
+    for name, value in aside.items():
+        if name.lower() not in known:
+            os.environ[name] = value  # none of JAX's
+        elif not _agrees(known[name.lower()], value):
+            named.append(f"{name}={shortened(value)}")
+    _set_aside(named + [f"{name} = {value!r}" for name, value in changed])
+    _start_device(jax)
+
+
+def use_compiled_loops() -> None:
+    """Have every loop compiled to a single function on CPUs; call it before JAX has
+    computed anything. What XLA_FLAGS says already stands."""
+    flags = os.environ.get(_XLA_FLAGS, "")
+    if "xla_backend_extra_options" not in flags:
+        checked = flags.strip() in ("", os.environ.get(_CHECKED))
+        flags = f"{flags} --xla_backend_extra_options={_LOOPS}=1000000000".strip()
+        os.environ[_XLA_FLAGS] = flags
+        if checked:
+            os.environ[_CHECKED] = flags
+
+
+@contextlib.contextmanager
+def explained() -> Iterator[None]:
+    """Turn a lack of memory, of XLA's too, into `InputError`."""
+    try:
+        yield
+    except MemoryError:
+        raise InputError(_NO_MEMORY) from None
+    except Exception as error:
+        if type(error).__name__ in _XLA_ERRORS and _EXHAUSTED in str(error):
+            raise InputError(_NO_MEMORY) from error
+        raise
+
+
+_NO_MEMORY = (
+    "there is not enough memory for this run; free some, allow the process more, or ask for less "
+    "(fewer points, speeds or starts)"
+)
+_XLA_ERRORS = "XlaRuntimeError", "JaxRuntimeError"
+_EXHAUSTED = "RESOURCE_EXHAUSTED"
+
+
+def _set_aside(named: list[str]) -> None:
+    if named:
+        say(
+            f"set aside: {', '.join(named)}; commands compute with JAX's own defaults in double "
+            "precision (unset it and this line is gone)"
+        )
+
+
+def _without_settings() -> dict[str, str]:
+    """Remove the variables of JAX that are not respected from the environment; what they were."""
+    names = [
+        name for name in os.environ if name.startswith("JAX_") and not name.startswith(_RESPECTED)
+    ]
+    return {name: os.environ.pop(name) for name in names}
+
+
+def _agrees(setting: object, value: str) -> bool:
+    """Whether a variable says what is in force anyway."""
+    words = {"1": "true", "t": "true", "yes": "true", "y": "true", "on": "true"}
+    words |= {"0": "false", "f": "false", "no": "false", "n": "false", "off": "false", "": "false"}
+    said, force = value.strip().lower(), str(getattr(setting, "value", setting)).lower()
+    return said == force or (isinstance(setting, bool) and words.get(said, said) == force)
+
+
+def _require(config) -> list[tuple[str, object]]:
+    """Put what is required in force; names and values of what stood against it."""
+    changed = []
+    for name, needed in _REQUIRED.items():
+        if name not in config.values:  # gone in this version of JAX
+            continue
+        found = config.values[name]
+        if getattr(found, "value", found) != needed:
+            config.update(name, needed)
+            if name != "jax_enable_x64":  # its default
+                changed.append((name, found))
+    return changed
+
+
+def _start_device(jax) -> None:
+    """Start the platform that JAX_PLATFORMS names, or the CPU. Raises `InputError`."""
+    chosen = os.environ.get("JAX_PLATFORMS")
+    before = jax.config.values.get("jax_platforms")
+    jax.config.update("jax_platforms", "cpu" if chosen is None else chosen)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            backend = jax.default_backend()
+        if backend != "cpu":
+            (jax.numpy.ones(1, float) + 1).block_until_ready()
+    except Exception as error:
+        jax.config.update("jax_platforms", before)
+        if chosen is None:
+            raise InputError(f"JAX cannot start on the CPU: {_reason(error)}") from error
+        reason = "JAX finds no such device" if not str(error) else _reason(error)
+        raise InputError(
+            f"environment variable JAX_PLATFORMS must name what JAX can compute on here, but is "
+            f"{shortened(chosen)}: {reason}; unset it to compute on the CPU"
+        ) from error
+
+
+def _reason(error: BaseException) -> str:
+    """The message of another library in one short line, without its advice in brackets."""
+    text = re.sub(r"\s*\((?:set|you may need)\b[^)]*\)", "", str(error))
+    text = " ".join(text.split()).rstrip(".")
+    return text if len(text) <= 300 else f"{text[:297]}..."
+
+
+def _check_flags(flags: str) -> None:
+    """Try XLA_FLAGS in a process of its own. Raises `InputError`."""
+    if os.environ.get(_CHECKED) == flags:
+        return
+    advice = "correct the flag or unset XLA_FLAGS"
+    shown = f"environment variable XLA_FLAGS is {shortened(flags, 120)}"
+    if not flags.startswith("-"):
+        raise InputError(f"{shown}, but must be flags that begin with --; {advice}")
+    if unsound := _UNSOUND.search(flags):
+        raise InputError(
+            f"{shown}: with {unsound[1]} NaN and infinity are no longer told from numbers, and "
+            f"results may be wrong without notice; {advice}"
+        )
+    if not sys.executable:
+        return
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _TRIAL],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=_TRIAL_SECONDS,
+            env=os.environ | {"TF_CPP_MIN_LOG_LEVEL": "1"},
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise InputError(f"{shown}: XLA does not start with it; {advice}") from None
+    except OSError:
+        return  # There are no processes to be had; the flags may be good.
+    if done.returncode:
+        raise InputError(f"{shown}: {_complaint(done.stderr.decode(errors='replace'))}; {advice}")
+    os.environ[_CHECKED] = flags
+
+
+def _complaint(log: str) -> str:
+    """What XLA has against its flags, from what it wrote before it ended the process."""
+    lines = [line for line in log.splitlines() if line.strip()]
+    marked = [line for line in lines if re.match(r"^[EF]\d{4} ", line)]
+    options = [line for line in lines if line.startswith("xla: ")]
+    line = (marked or options or lines[-1:] or ["XLA does not start with it"])[0]
+    return _reason(ValueError(_LOG_PREFIX.sub("", line)))

@@ -1,0 +1,13 @@
+"""Check of the precision JAX computes in, which a command or script chooses, never the library."""
+
+import jax
+
+
+def check_precision(precision: str) -> None:
+    """Raise RuntimeError unless JAX is set to this `precision` (float64 or float32)."""
+    if precision == "float64" and not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(
+            "JAX computes in single precision here: call "
+            'jax.config.update("jax_enable_x64", True) before anything else, or set '
+            "solver.precision to float32"
+        )

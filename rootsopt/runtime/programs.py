@@ -1,0 +1,330 @@
+"""Compiled programs: made ahead and side by side, and kept between processes.
+
+Tracing and compiling take longer than all else here. JAX's own cache keeps what has been
+compiled, but every process still traces and lowers a function to find it there; a `Program`
+finds it by name, source and kinds of arguments alone.
+"""
+
+import contextlib
+import functools
+import hashlib
+import os
+import pickle
+import platform
+import sys
+import threading
+import zlib
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.core import Tracer
+from jax.experimental import serialize_executable
+
+from rootsopt.config.families import outside_modules
+from rootsopt.runtime.store import Store, UnsafeFolderError
+
+_PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "optax", "numpy")
+_SETTINGS = (
+    "jax_enable_x64",
+    "jax_numpy_dtype_promotion",
+    "jax_numpy_rank_promotion",
+    "jax_default_matmul_precision",
+    "jax_random_seed_offset",
+    "jax_default_prng_impl",
+    "jax_enable_custom_prng",
+    "jax_threefry_partitionable",
+    "jax_softmax_custom_jvp",
+    "jax_use_direct_linearize",
+    "jax_disable_most_optimizations",
+    "jax_optimization_level",
+    "jax_exec_time_optimization_effort",
+    "eager_constant_folding",
+)
+"""Settings of JAX that change what is traced or compiled."""
+_VARIABLES = ("XLA_FLAGS", "EQX_ON_ERROR")
+OPTIONS: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
+"""Options of the compiler on CPUs: the older way of making code from fused operations takes two
+thirds of the time, and what it makes is as fast."""
+_PACKAGE = Path(__file__).parents[1]
+_store: Store | None = None
+# Tracing is Python's work: in turn, the first asked for comes first to the compiler, which works
+# side by side.
+_tracing = threading.RLock()
+
+
+def keep_in(folder: Path | None) -> str | None:
+    """Keep programs in `folder` from now on; None keeps none.
+
+    Nothing is kept where that cannot be done. Where it must not be done, as others could put
+    programs of theirs in place of these, the reason is returned.
+    """
+    global _store
+    _store = None
+    if folder is None:
+        return None
+    try:
+        _store = Store(folder)
+    except UnsafeFolderError as error:
+        return str(error)
+    except OSError:
+        return None
+    return None
+
+
+class _Kind(NamedTuple):
+    """What a program is compiled for: structure of the arguments, (shape, dtype) of arrays and
+    None for other leaves, and those with their types."""
+
+    tree: Any
+    shapes: tuple[tuple[tuple[int, ...], str] | None, ...]
+    others: tuple[tuple[type, Any], ...]
+
+
+class _Made(NamedTuple):
+    """A compiled program, called with the arrays alone, and its result with shapes for arrays."""
+
+    call: Callable[..., Any]
+    result_shape: Any
+
+
+class Program:
+    """A function of trees of arrays and other things, compiled once for each kind of arguments.
+
+    As with `equinox.filter_jit` arrays are traced, and all else is static and must be hashable.
+    """
+
+    def __init__(self, function: Callable[..., Any]):
+        functools.update_wrapper(self, function)
+        self.function = function
+        self._made: dict[_Kind, Future[_Made]] = {}
+        self._lock = threading.Lock()
+
+    def __call__(self, *args: Any) -> Any:
+        """The function's result; compiled before unless that has happened."""
+        leaves, kind = _split(args)
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
+            return self.function(*args)
+        future, new = self._future(kind)
+        if new:
+            self._make(future, kind)
+        made = future.result()
+        results = iter(made.call(*leaves))
+        return jax.tree.map(lambda x: next(results) if _is_array(x) else x, made.result_shape)
+
+    def prepare(self, *args: Any) -> None:
+        """Compile for arguments like these, of which arrays may be `jax.ShapeDtypeStruct`, in
+        the background. If that fails, so does the call that needs it."""
+        _, kind = _split(args)
+        future, new = self._future(kind)
+        if new:
+            threading.Thread(target=self._make, args=(future, kind)).start()
+
+    def result_shape(self, *args: Any) -> Any:
+        """The result with `jax.ShapeDtypeStruct` for arrays, known before it is compiled."""
+        _, kind = _split(args)
+        place = self._place(kind)
+        kept = place is not None and place.kept
+        if kept:
+            self.prepare(*args)
+        future = self._made.get(kind)
+        if future is not None and (kept or future.done()):
+            return future.result().result_shape
+        return jax.tree.map(_outline, eqx.filter_eval_shape(self.function, *args))
+
+    def _future(self, kind: _Kind) -> tuple[Future[_Made], bool]:
+        """The program of a kind to come, and whether it is now the caller's task to make it."""
+        with self._lock:
+            new = kind not in self._made
+            return self._made.setdefault(kind, Future()), new
+
+    def _make(self, future: Future[_Made], kind: _Kind) -> None:
+        try:
+            place = self._place(kind)
+            future.set_result(_loaded(place) or self._compiled(kind, place))
+        except BaseException as error:
+            with self._lock:
+                del self._made[kind]
+            future.set_exception(error)
+
+    def _compiled(self, kind: _Kind, place: "_Place | None") -> _Made:
+        outlines = []
+
+        def flat(*arrays):
+            out = self.function(*_joined(kind, iter(arrays)))
+            outlines.append(jax.tree.map(_outline, out))
+            return [x for x in jax.tree.leaves(out) if _is_array(x)]
+
+        flat.__name__ = flat.__qualname__ = self.function.__name__
+        structs = [jax.ShapeDtypeStruct(s[0], np.dtype(s[1])) for s in kind.shapes if s]
+        with _tracing:
+            lowered = jax.jit(flat).lower(*structs)
+        made = _Made(_finished(lowered), outlines[-1])
+        if place is not None:
+            # Not being able to keep a program is no reason not to use it.
+            with contextlib.suppress(Exception):
+                _save(place, made, len(structs))
+        return made
+
+    def _place(self, kind: _Kind) -> "_Place | None":
+        """Where a program of this kind is kept, if it is."""
+        if _store is None or jax.default_backend() != "cpu":
+            return None
+        if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
+            return None  # What comes out of JAX's own cache cannot be kept a second time.
+        outside = outside_modules()
+        sources = _sources({self.function.__module__, *_modules(kind), *outside})
+        if sources is None:
+            return None
+        name = f"{self.function.__module__}.{self.function.__qualname__}"
+        words = [name, *map(repr, kind), *sources, *_machine(), *_versions(), *_settings()]
+        if any(" at 0x" in word for word in words):
+            return None  # Known by its address, which is another one next time.
+        purpose = hashlib.sha256("\0".join(words).encode()).hexdigest()
+        return _Place(_store, f"{self.function.__name__}-{purpose[:32]}", purpose)
+
+
+class _Place(NamedTuple):
+    """An entry of a store: its name, and all that the program depends on, as a digest."""
+
+    store: Store
+    name: str
+    purpose: str
+
+    @property
+    def kept(self) -> bool:
+        return self.name in self.store
+
+
+def _is_array(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct)
+
+
+def _outline(leaf: Any) -> Any:
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) if _is_array(leaf) else leaf
+
+
+def _split(args: tuple) -> tuple[list, _Kind]:
+    """The arrays among the leaves of `args`, and what kind of arguments these are."""
+    leaves, tree = jax.tree.flatten(args)
+    shapes = tuple(
+        (x.shape, str(jax.dtypes.canonicalize_dtype(x.dtype))) if _is_array(x) else None
+        for x in leaves
+    )
+    others = tuple((type(x), x) for x in leaves if not _is_array(x))
+    return [x for x in leaves if _is_array(x)], _Kind(tree, shapes, others)
+
+
+def _finished(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
+    """The program compiled with those of `OPTIONS` that XLA_FLAGS says nothing of, or without them
+    where this compiler has none such."""
+    said = os.environ.get("XLA_FLAGS", "")
+    options = {name: value for name, value in OPTIONS.items() if name not in said}
+    if options and jax.default_backend() == "cpu":
+        with contextlib.suppress(jax.errors.JaxRuntimeError):
+            return lowered.compile(compiler_options=options)
+    return lowered.compile()
+
+
+def _joined(kind: _Kind, arrays: Iterator) -> tuple:
+    """The reverse of `_split`."""
+    others = iter(kind.others)
+    leaves = [next(arrays) if shape else next(others)[1] for shape in kind.shapes]
+    return jax.tree.unflatten(kind.tree, leaves)
+
+
+def _save(place: _Place, made: _Made, number: int) -> None:
+    # A program that calls out (LAPACK, Python) relies on addresses set up when it is lowered.
+    if "custom-call" in made.call.as_text():  # pyright: ignore[reportFunctionMemberAccess]
+        return
+    payload, _, _ = serialize_executable.serialize(made.call)  # pyright: ignore[reportArgumentType]
+    data = zlib.compress(pickle.dumps((payload, number, made.result_shape)), 1)
+    place.store.write(place.name, place.purpose, data)
+
+
+def _loaded(place: _Place | None) -> _Made | None:
+    """A kept program, or None if there is none that works."""
+    if place is None:
+        return None
+    try:
+        data = place.store.read(place.name, place.purpose)
+        if data is None:
+            return None
+        payload, number, result_shape = pickle.loads(zlib.decompress(data))
+        results = sum(map(_is_array, jax.tree.leaves(result_shape)))
+        takes = jax.tree.structure(((0,) * number, {}))
+        call = serialize_executable.deserialize_and_load(
+            payload, takes, jax.tree.structure([0] * results)
+        )
+    except Exception:
+        return None
+    return _Made(call, result_shape)
+
+
+def _modules(kind: _Kind) -> set[str]:
+    """Modules that define the types in the arguments."""
+    found = {of.__module__ for of, _ in kind.others}
+    trees = [kind.tree]
+    while trees:
+        tree = trees.pop()
+        if (data := tree.node_data()) is not None:
+            found.add(data[0].__module__)
+        trees.extend(tree.children())
+    return found
+
+
+def _sources(modules: set[str]) -> list[str] | None:
+    """Digests of this package's sources, and of the files of modules that are neither in it nor
+    in a package whose version is known; None where there is such a module without a file."""
+    digests = [_package_digest()]
+    for name in sorted(modules):
+        top = name.partition(".")[0]
+        if top in (_PACKAGE.name, *_PACKAGES) or top in sys.stdlib_module_names:
+            continue
+        file = getattr(sys.modules.get(name), "__file__", None)
+        try:
+            digests.append(hashlib.sha256(Path(file or "").read_bytes()).hexdigest())
+        except OSError:
+            return None
+    return digests if digests[0] else None
+
+
+@functools.cache
+def _package_digest() -> str:
+    """Digest of every source file of this package; empty where there are none to be read."""
+    digest, files = hashlib.sha256(), sorted(_PACKAGE.rglob("*.py"))
+    for file in files:
+        data = file.read_bytes()
+        digest.update(f"{file.relative_to(_PACKAGE).as_posix()} {len(data)}\n".encode())
+        digest.update(data)
+    return digest.hexdigest() if files else ""
+
+
+@functools.cache
+def _machine() -> list[str]:
+    """What the processor can do."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text("utf-8", errors="replace").splitlines()
+        processor = next(line for line in lines if line.startswith(("flags", "Features")))
+    except (OSError, StopIteration):
+        processor = platform.processor()
+    return [platform.system(), platform.machine(), processor]
+
+
+@functools.cache
+def _versions() -> list[str]:
+    """What traces and compiles."""
+    packages = [f"{name} {metadata.version(name)}" for name in _PACKAGES]
+    return [platform.python_implementation(), platform.python_version(), *packages]
+
+
+def _settings() -> list[str]:
+    """Settings that change what is traced or compiled, as they are now."""
+    variables = [f"{name}={os.environ.get(name, '')}" for name in _VARIABLES]
+    variables.append(f"{sorted(OPTIONS.items())}")
+    return variables + [f"{name}={getattr(jax.config, name, None)}" for name in _SETTINGS]

@@ -1,0 +1,303 @@
+"""The scene: everything but the design, from which a rotor pair is built.
+
+A design is a vector of the config's design parameters in the config's own units, so gradients
+come out per config unit. A family without parameters (EE) has an empty design.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rootsopt.config import Config
+from rootsopt.contact.gap import Contact
+from rootsopt.contact.law import ContactLaw
+from rootsopt.contact.linear import LinearContact
+from rootsopt.contact.map import MapContact
+from rootsopt.contact.search import SearchContact
+from rootsopt.contact.segments import NodeContact
+from rootsopt.dynamics.pace import Pace
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.parts import (
+    ConstantLoad,
+    Context,
+    Drive,
+    Friction,
+    GasLoad,
+    Load,
+    MotorDrive,
+    Part,
+    PrescribedDrive,
+    Supports,
+    TimingGear,
+)
+from rootsopt.dynamics.steady import Solver
+from rootsopt.errors import InputError
+from rootsopt.profiles import Geometry, Outline, Profile, geometry
+from rootsopt.runtime.precision import check_precision
+from rootsopt.scene import families, reading
+
+
+class Scene(eqx.Module):
+    """Everything but the design, in SI units: builds a rotor pair from a design.
+
+    Physical quantities are leaves that one may differentiate with respect to, choices are static,
+    so that one compiled program serves every scene of the same kind. `solver`: how its steady
+    motion is found.
+    """
+
+    family: str = eqx.field(static=True)
+    lobes: int = eqx.field(static=True)
+    fidelity: str = eqx.field(static=True)
+    precision: str = eqx.field(static=True)
+    map_size: tuple[int, int] = eqx.field(static=True)
+    nodes: int = eqx.field(static=True)
+    straight: bool = eqx.field(static=True)
+    design_size: int = eqx.field(static=True)
+    pitch_radius: Float[Array, ""]
+    length: Float[Array, ""]
+    density: Float[Array, ""]
+    law: ContactLaw
+    clearance: Float[Array, ""]
+    speed: Float[Array, ""]
+    load_torque: Float[Array, ""]
+    gear: TimingGear | None
+    gear_damping_ratio: Float[Array, ""]
+    deepest: Float[Array, ""]
+    solver: Solver
+    bore_radius: Float[Array, ""] | None = None
+    pressure: Float[Array, ""] | None = None
+    motor: MotorDrive | None = None
+    friction: Friction | None = None
+    supports: Supports | None = None
+    center_distance_error: Float[Array, ""] | None = None
+    outline: Outline | None = None
+    extra: tuple[Part, ...] = ()
+
+    @classmethod
+    def from_config(cls, config: Config, deepest: float | None = None) -> "Scene":
+        """Return the scene of a config; `deepest` (rad < 0) is the relative rotation that the
+        contact map must reach, estimated from the scene when not given. (The map has a middling
+        size where the config leaves that open; `evaluate` chooses it by `solver.map_error`.)
+
+        Raises RuntimeError where the config asks for a precision JAX is not set to."""
+        check_precision(config.solver.precision)
+        if deepest is None:
+            deepest = reading.expected_rotation(config)
+        return cls(
+            family=config.profile.family,
+            lobes=config.profile.lobes,
+            fidelity=config.solver.fidelity,
+            precision=config.solver.precision,
+            map_size=reading.map_size(config),
+            nodes=config.solver.nodes,
+            straight=config.rotor.helix_deg == 0,
+            design_size=len(reading.design_keys(config)),
+            deepest=jnp.asarray(deepest),
+            solver=reading.solver_of(config),
+            outline=families.outline(config.profile),
+            law=reading.law_of(config),
+            gear=reading.gear_of(config),
+            **reading.quantities(config),
+            **reading.parts_of(config),
+        )
+
+    def profile(self, design: Float[Array, " d"]) -> Profile:
+        """The profile of a design given in config units."""
+        if self.outline is not None:
+            return self.outline
+        return families.profile_of(self.family, self.lobes, self.pitch_radius, design)
+
+    @property
+    def static_depth(self) -> float:
+        """Penetration (m) that carries the load at the pitch radius."""
+        force = jnp.maximum(self.load_torque, 1e-3) / self.pitch_radius
+        return float(self.law.depth_at(force))
+
+    def inertia(self, shape: Geometry) -> Float[Array, ""]:
+        """Polar moment of inertia of one rotor about its axis (kg·m²)."""
+        moment = shape.polar_area_moment
+        if self.bore_radius is not None:
+            moment = moment - jnp.pi / 2 * self.bore_radius**4
+        return self.density * self.length * moment
+
+    def mass(self, shape: Geometry) -> Float[Array, ""]:
+        """Mass of one rotor (kg)."""
+        area = shape.area
+        if self.bore_radius is not None:
+            area = area - jnp.pi * self.bore_radius**2
+        return self.density * self.length * area
+
+    @property
+    def both(self) -> bool:
+        """Whether drive and coast flanks may touch at once: the axes may be elsewhere than at the
+        nominal centre distance, or the flanks are not conjugate."""
+        odd = self.supports, self.center_distance_error, self.outline
+        moved = any(part.displaces for part in self.extra)
+        return moved or any(part is not None for part in odd)
+
+    def with_parts(self, *parts: Part) -> "Scene":
+        """This scene with further parts, which follow the others in the state of a motion.
+
+        Numbers that are their fields become arrays; responses are differentiable with respect to
+        them."""
+        return dataclasses.replace(self, extra=(*self.extra, *_as_arrays(parts)))
+
+    def with_law(self, law: ContactLaw) -> "Scene":
+        """This scene with another contact law, whose numbers become arrays."""
+        return dataclasses.replace(self, law=_as_arrays(law))
+
+    def contact(self, profile: Profile) -> Contact:
+        """Gap and levers of `profile` at this scene's fidelity."""
+        if self.fidelity == "map":
+            return MapContact.of(profile, self.deepest, *self.map_size)
+        if self.fidelity == "linear":
+            return LinearContact.of(profile)
+        if self.fidelity == "nodes":
+            return NodeContact.of(profile, self.nodes)
+        if self.fidelity == "auto":
+            raise InputError(
+                "`solver.fidelity` must be chosen before a pair is built, but is auto; call "
+                "rootsopt.response.choice.choose first"
+            )
+        if not self.both:
+            return SearchContact.of(profile)
+        error = self.center_distance_error
+        distance = 2 * profile.pitch_radius + (0.0 if error is None else error)
+        return SearchContact.of(profile, distance, two_sided=True)
+
+    def _drive(self, load: Load) -> Drive:
+        """The drive; a motor without a torque of its own is given what the load takes."""
+        motor = self.motor
+        if motor is None:
+            return PrescribedDrive(self.speed)
+        torque = jnp.where(jnp.isnan(motor.torque), load.total, motor.torque)
+        return eqx.tree_at(lambda m: (m.speed, m.torque), motor, (self.speed, torque))
+
+    def _load(self, profile: Profile, shape: Geometry) -> Load:
+        if self.pressure is None:
+            return ConstantLoad(self.load_torque)
+        across = self.pressure * self.length
+        # ρ1² + ρ2² = 2 (r² + s²), and the area is π times the mean of r² + s².
+        mean = across * (shape.outer_radius**2 - shape.area / jnp.pi) / 2
+        return GasLoad(
+            pressure_length=across, profile=profile, outer_radius=shape.outer_radius, torque=mean
+        )
+
+    def pair(self, design: Float[Array, " d"]) -> RotorPair:
+        """The rotor pair of a design in config units, differentiable in it."""
+        return self.pair_and_shape(design)[0]
+
+    def pair_and_tangents(
+        self, design: Float[Array, " d"], directions: Float[Array, "n d"] | tuple[()] | None = None
+    ) -> tuple[RotorPair, RotorPair, Geometry]:
+        """The rotor pair, its derivatives along the `directions` of the design (by default those of
+        its parameters; () for none) stacked along a leading axis in the pair's own structure, and
+        the rotor's geometry."""
+        if directions is None:
+            directions = jnp.eye(design.shape[0])
+        return along(lambda design: self.pair_and_shape(design), design, directions)
+
+    def pair_and_shape(self, design: Float[Array, " d"]) -> tuple[RotorPair, Geometry]:
+        """The rotor pair and the geometry of one rotor.
+
+        Raises `InputError` for twisted rotors: along their length every phase of the mesh is met
+        at once, which the pair of this package knows nothing of."""
+        if not self.straight:
+            raise InputError(
+                "`rotor.helix_deg` must be 0 for a simulation, which is of straight rotors; set "
+                "it to 0 to simulate straight rotors of the same section, or draw the twisted "
+                "ones with `rootsopt profile`"
+            )
+        profile = self.profile(design)
+        shape = geometry(profile)
+        inertia = self.inertia(shape)
+        contact = self.contact(profile)
+        gear = self.gear
+        if gear is not None:
+            # I_r = I1 I2 / (I1 + I2) of two equal rotors.
+            damping = 2 * self.gear_damping_ratio * jnp.sqrt(gear.stiffness * inertia / 2)
+            gear = eqx.tree_at(lambda g: g.damping, gear, damping)
+        force = jnp.maximum(self.load_torque, 1e-3) / self.pitch_radius
+        angle = self.law.depth_at(force) / self.pitch_radius
+        for part in (gear, *self.extra):
+            if part is not None and part.play is not None:
+                angle = angle + part.play
+        # Units, no quantities: nothing depends on them.
+        force, angle = jax.lax.stop_gradient((force, angle))
+        load = self._load(profile, shape)
+        context = Context(
+            inertia=inertia,
+            mass=self.mass(shape),
+            pitch_radius=self.pitch_radius,
+            angle=angle,
+            load_torque=load.torque,
+            speed=self.speed,
+        )
+        supports = None if self.supports is None else self.supports.prepare(context)
+        extra = tuple(part.prepare(context) for part in self.extra)
+        pair = RotorPair(
+            lobes=self.lobes,
+            contact=contact,
+            law=self.law,
+            clearance=self.clearance,
+            inertia=inertia,
+            drive=self._drive(load),
+            load=load,
+            gear=gear,
+            angle_scale=angle,
+            force_scale=force,
+            friction=self.friction,
+            supports=supports,
+            two_sided=self.both,
+            parts=extra,
+        )
+        pace = Pace.of(self.law, pair.all_parts, inertia, force, self.pitch_radius, self.clearance)
+        pair = dataclasses.replace(pair, pace=pace)
+        if self.precision == "float32":
+            # Built in double precision; single only where it is integrated.
+            pair = jax.tree.map(_single, pair)
+        return pair, shape
+
+
+def along(
+    build: Callable[[Any], tuple[RotorPair, Geometry]], primal: Any, directions: Any
+) -> tuple[RotorPair, RotorPair, Geometry]:
+    """The rotor pair and geometry that `build(primal)` gives, and the pair's derivatives along the
+    `directions` of the primal (stacked along a leading axis; there may be none), stacked likewise
+    in the pair's own structure."""
+
+    def parted(primal):
+        pair, shape = build(primal)
+        dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
+        return dynamic, (_Static(static), shape)
+
+    leaves = jax.tree.leaves(directions)
+    if not leaves or leaves[0].shape[0] == 0:
+        dynamic, (static, shape) = parted(primal)
+        tangents = jax.tree.map(lambda x: jnp.zeros((0, *x.shape), x.dtype), dynamic)
+    else:
+        push = functools.partial(jax.jvp, parted, (primal,), has_aux=True)
+        each = jax.vmap(lambda t: push((t,)), out_axes=(None, 0, None))
+        dynamic, tangents, (static, shape) = each(directions)
+    return eqx.combine(dynamic, static.value), tangents, shape
+
+
+class _Static(eqx.Module):
+    """Carries what is not an array through a transformation."""
+
+    value: Any = eqx.field(static=True)
+
+
+def _single(leaf):
+    return leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf
+
+
+def _as_arrays(tree):
+    """`tree` with arrays in place of numbers."""
+    return jax.tree.map(lambda x: jnp.asarray(x, float) if isinstance(x, int | float) else x, tree)

@@ -1,0 +1,45 @@
+"""What a config's geometry must fulfil, and its outline."""
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rootsopt.config import Config
+from rootsopt.errors import InputError
+from rootsopt.profiles import geometry, outline
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import families
+from rootsopt.scene.build import Scene
+from rootsopt.scene.families import MM
+from rootsopt.scene.reading import design_vector
+
+
+def check_geometry(config: Config) -> None:
+    """Raise `InputError` unless the config's profile can be made and meshes, and leaves room for
+    the bore."""
+    families.check(config.profile)
+    bore = config.rotor.bore_mm
+    if bore is None:
+        return
+    root = float(_shape(Scene.from_config(config), design_vector(config)).root_radius) / MM
+    if bore >= 2 * root:
+        raise InputError(
+            f"`rotor.bore_mm` must be less than {2 * root:.6g} (the root circle), but is "
+            f"{bore:g}; make it smaller"
+        )
+
+
+@Program
+def _shape(scene: Scene, design):
+    """Geometry of a design in config units."""
+    return geometry(scene.profile(design))
+
+
+def outline_mm(config: Config, design: ArrayLike | None = None) -> NDArray[np.float64]:
+    """Closed counter-clockwise outline (n, 2) in mm of a design, by default the config's."""
+    design = design_vector(config) if design is None else jnp.asarray(design)
+    profile = _profile(Scene.from_config(config), design)
+    return np.asarray(outline(profile, points=240)) / MM
+
+
+_profile = Program(Scene.profile)

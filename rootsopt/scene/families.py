@@ -1,0 +1,160 @@
+"""Profile families by the names and units of the config: how they are made, and what is wrong."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from rootsopt.config import ProfileConfig
+from rootsopt.config.families import families, family_of
+from rootsopt.config.words import shown
+from rootsopt.errors import InputError
+from rootsopt.measured.conjugacy import conjugacy
+from rootsopt.profiles import Outline, Profile, project
+from rootsopt.profiles.departure import departure
+from rootsopt.profiles.validity import PURE, margins
+from rootsopt.runtime.programs import Program
+
+MM = 1e-3
+DEG = math.pi / 180
+_ROUNDING = 1e-9
+"""Margin relative to its scale that counts as 0."""
+
+
+def classical() -> tuple[str, ...]:
+    """Names of the registered families that are made from a few parameters."""
+    return tuple(name for name, family in families().items() if family.classical)
+
+
+def profile_of(
+    family: str, lobes: int, pitch_radius: Float[Array, ""], design: Float[Array, " d"]
+) -> Profile:
+    """The profile of a `family` with a `design` in config units, `pitch_radius` in m."""
+    found = family_of(family)
+    values = {
+        parameter.argument: value * parameter.unit
+        for parameter, value in zip(found.parameters, found.split(design), strict=True)
+    }
+    return found.make(lobes, pitch_radius, **values)
+
+
+def keys_of(config: ProfileConfig) -> tuple[str, ...]:
+    """Names of the design parameters of a config."""
+    return config.design_keys
+
+
+def design_of(config: ProfileConfig) -> Float[Array, " d"]:
+    """The design parameters of a config, in its units."""
+    return jnp.asarray(config.design)
+
+
+def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:
+    """A config's profile with another `design` (d,) in its units, as many as it has."""
+    given = [float(value) for value in np.asarray(design)]
+    family = family_of(config.family)
+    values = zip(family.parameters, family.split(given), strict=True)
+    return config.model_copy(
+        update={one.key: tuple(v) if one.count is not None else v for one, v in values}
+    )
+
+
+def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, float]:
+    """A config's profile as a free form of `count` coefficients, and how far (m) that departs from
+    it at most. Raises `InputError` for an outline from a file."""
+    if config.from_file:
+        raise InputError(
+            "`profile.family` must be that of a design to be projected onto a free form, but is "
+            f"{config.family}: its dedendum need not be the mate of its addendum, as that of a "
+            "free form is; name the family the rotor was made to"
+        )
+    radius = jnp.asarray(config.pitch_radius_mm * MM)
+    profile = profile_of(config.family, config.lobes, radius, design_of(config))
+    found = project(profile, count)
+    # Decimals enough for a hundredth of a micrometre.
+    result = ProfileConfig.model_validate(
+        {
+            "family": "free_form",
+            "lobes": config.lobes,
+            "pitch_radius_mm": config.pitch_radius_mm,
+            "tip_arc_angle_deg": round(float(found.tip_arc_angle) / DEG, 9),
+            "coefficients": tuple(round(float(c), 6) for c in found.coefficients),
+        }
+    )
+    written = profile_of("free_form", config.lobes, radius, design_of(result))
+    return result, departure(profile, written)
+
+
+def outline(config: ProfileConfig) -> Outline | None:
+    """The profile of a config that has it in a file."""
+    if not config.from_file:
+        return None
+    from rootsopt.measured.source import outline_of  # Half a second, for outlines alone.
+
+    return outline_of(config)[0]
+
+
+def check(config: ProfileConfig) -> None:
+    """Raise `InputError` unless the profile can be made and meshes."""
+    if (given := outline(config)) is not None:
+        conjugacy(given)
+        return
+    family = family_of(config.family)
+    family.check(config)
+    if family.by_limits:
+        return
+    radius = jnp.asarray(config.pitch_radius_mm * MM)
+    found = _margins(config.family, config.lobes, radius, design_of(config))
+    for name, value in found._asdict().items():
+        if name in family.inherent:
+            continue
+        scale = 1.0 if name in PURE else config.pitch_radius_mm * MM
+        if not float(value) >= -_ROUNDING * scale:
+            given = ", ".join(
+                f"`profile.{key}` = {_written(value)}" for key, value in config.parameters.items()
+            )
+            raise InputError(
+                f"the profile of family {config.family} must be sound, but with {given} "
+                f"{_FAULTS[name]}; {family.remedy}"
+            )
+
+
+def margins_of(config: ProfileConfig) -> dict[str, float]:
+    """The margins of a config's profile by name and unit, for the result file; none for an outline
+    from a file."""
+    if config.from_file:
+        return {}
+    radius = jnp.asarray(config.pitch_radius_mm * MM)
+    found = _margins(config.family, config.lobes, radius, design_of(config))._asdict()
+    units = {"turning": ("_deg", DEG), "order": ("_deg", DEG), "rolling": ("", 1.0)}
+    record = {}
+    for name, value in found.items():
+        suffix, unit = units.get(name, ("_mm", MM))
+        record[name + suffix] = float(value) / unit
+    return record
+
+
+@Program
+def _margins(family, lobes, pitch_radius, design):
+    """Margins of the profile of a design in config units."""
+    return margins(profile_of(family, lobes, pitch_radius, design))
+
+
+def _written(value: float | tuple[float, ...]) -> str:
+    if isinstance(value, tuple):
+        return shown([float(f"{number:.6g}") for number in value])
+    return f"{value:g}"
+
+
+_FAULTS = {
+    "turning": "a part of it would end before it begins, or miss the pitch crossing",
+    "convexity": "the addendum is not convex",
+    "reach": "some normals of the addendum miss the pitch circle: it would touch nothing there",
+    "fall": "the tip is no tip: the outline rises again behind it",
+    "rolling": "two points of a flank would mesh at once",
+    "order": "a flank would touch before the tip of its lobe has come to the line of centres",
+    "undercut": "the dedendum is undercut",
+    "star": "the outline folds back, seen from the axis",
+    "root": "the root lies beyond the axis",
+}

@@ -1,0 +1,164 @@
+"""From config to the pieces of a scene: units, law, parts, solver."""
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rootsopt.config import Config
+from rootsopt.contact.impact import ImpactLaw
+from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.parts import Friction, MotorDrive, Supports, TimingGear
+from rootsopt.dynamics.steady import Solver
+from rootsopt.scene import families
+from rootsopt.scene.families import MM
+
+_ORBIT_STEPS = 4
+"""Steps allowed for a whole orbit, in units of those allowed for a mesh period."""
+_ROLLS, _RELATIVES = 384, 16
+"""Size of a contact map that the config leaves open."""
+
+
+def design_vector(config: Config) -> Float[Array, " d"]:
+    """The config's design parameters in config units: (3,) for CIC, (0,) for EE."""
+    return families.design_of(config.profile)
+
+
+def design_keys(config: Config) -> tuple[str, ...]:
+    """Names of the entries of `design_vector`."""
+    return families.keys_of(config.profile)
+
+
+def quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
+    """Physical quantities of a config in SI units, by their names in `Scene`."""
+    rotor, scene, gear = config.rotor, config.scene, config.scene.timing_gear
+    return {
+        "pitch_radius": jnp.asarray(config.profile.pitch_radius_mm * MM),
+        "length": jnp.asarray(rotor.length_mm * MM),
+        "density": jnp.asarray(rotor.density_kg_m3),
+        "clearance": jnp.asarray(config.contact.clearance_mm * MM),
+        "speed": jnp.asarray(scene.speed_rpm * 2 * math.pi / 60),
+        "load_torque": jnp.asarray(config.load_torque),
+        "gear_damping_ratio": jnp.asarray(0.0 if gear is None else gear.damping_ratio),
+        "bore_radius": _optional(rotor.bore_mm, MM / 2),
+        "pressure": _optional(scene.load.pressure_difference_Pa),
+        "center_distance_error": _optional(scene.center_distance_error_mm, MM),
+    }
+
+
+def law_of(config: Config) -> ImpactLaw:
+    """The contact law of a config."""
+    contact = config.contact
+    return ImpactLaw(
+        stiffness=jnp.asarray(contact.stiffness_N_per_mm_e / MM**contact.exponent),
+        exponent=jnp.asarray(contact.exponent),
+        damping=jnp.asarray(contact.max_damping_N_s_per_mm / MM),
+        full_damping_depth=jnp.asarray(contact.full_damping_depth_mm * MM),
+        smoothing=jnp.asarray(contact.rounding_mm * MM),
+    )
+
+
+def gear_of(config: Config) -> TimingGear | None:
+    """The timing gear of a config; its damping depends on the rotors' inertia and is set later."""
+    gear, radius = config.scene.timing_gear, config.profile.pitch_radius_mm * MM
+    if gear is None:
+        return None
+    return TimingGear(
+        stiffness=jnp.asarray(gear.stiffness_N_m_per_rad),
+        damping=jnp.asarray(0.0),
+        half_backlash=jnp.asarray(gear.backlash_mm * MM / (2 * radius)),
+        rounding=jnp.asarray(config.contact.rounding_mm * MM / radius),
+        offset=_optional(config.scene.phase_error_mrad, 1e-3),
+    )
+
+
+def parts_of(config: Config) -> dict[str, Any]:
+    """Other parts of a config by their names in `Scene`; what depends on the design is NaN."""
+    scene, friction = config.scene, config.contact.friction
+    parts: dict[str, Any] = {}
+    missing = jnp.asarray(float("nan"))
+    if scene.motor is not None:
+        torque = scene.motor.torque_N_m
+        parts["motor"] = MotorDrive(
+            speed=missing,
+            torque=missing if torque is None else jnp.asarray(torque),
+            slope=jnp.asarray(scene.motor.slope_N_m_s_per_rad),
+            inertia=jnp.asarray(scene.motor.inertia_kg_m2),
+        )
+    if friction is not None:
+        parts["friction"] = Friction(
+            static=jnp.asarray(friction.static),
+            kinetic=jnp.asarray(friction.kinetic),
+            stiction_speed=jnp.asarray(friction.stiction_speed_mm_s * MM),
+            friction_speed=jnp.asarray(friction.friction_speed_mm_s * MM),
+        )
+    if scene.supports is not None:
+        parts["supports"] = Supports(
+            stiffness=jnp.asarray(scene.supports.stiffness_N_per_mm / MM),
+            damping=jnp.asarray(scene.supports.damping_N_s_per_mm / MM),
+            mass=missing,
+            radius=missing,
+        )
+    return parts
+
+
+def map_size(config: Config) -> tuple[int, int]:
+    """Roll angles and relative rotations of the contact map."""
+    solver = config.solver
+    return solver.map_rolls or _ROLLS, solver.map_relatives or _RELATIVES
+
+
+def expected_rotation(config: Config) -> float:
+    """Relative rotation (rad, negative) a scene is expected to reach: the backlash and
+    clearance taken up, plus an impact ten times the static contact force."""
+    contact, scene = config.contact, config.scene
+    radius = config.profile.pitch_radius_mm
+    play = contact.clearance_mm
+    if scene.timing_gear is not None:
+        play += scene.timing_gear.backlash_mm / 2
+    force = 20 * max(config.load_torque, 0.01) / (radius * MM)
+    depth = (force / contact.stiffness_N_per_mm_e) ** (1 / contact.exponent)
+    return -min((1.3 * play + 1.5 * depth) / radius, math.pi / (8 * config.profile.lobes))
+
+
+def integrators(config: Config) -> tuple[Integrator, Integrator]:
+    """(transient, orbit) integrators of a config.
+
+    An orbit has several mesh periods, and many short steps about its kinks."""
+    solver = config.solver
+    steps = solver.max_steps_per_period
+    return (
+        Integrator(solver.method, jnp.asarray(solver.transient_rtol), steps),
+        Integrator(solver.method, jnp.asarray(solver.rtol), _ORBIT_STEPS * steps),
+    )
+
+
+def solver_of(config: Config) -> Solver:
+    """How a config asks for its steady motion to be found."""
+    settings = config.solver
+    transient, orbit = integrators(config)
+    return Solver(
+        transient=transient,
+        orbit=orbit,
+        measures=measures(config),
+        max_periods=jnp.asarray(float(settings.max_mesh_periods)),
+        examine=jnp.asarray(1.0),
+        max_orbit=settings.max_orbit_periods,
+        precision=settings.precision,
+    )
+
+
+def measures(config: Config) -> Measures:
+    """What of the force a config asks for, in its report or its objective."""
+    objective = config.objective
+    weighted = [order for order, weight in objective.line_weights.items() if weight]
+    orders = dict.fromkeys([*config.response.lines, *weighted])
+    norm = objective.peak_norm
+    return Measures(np.array([*orders], float), None if norm is None else jnp.asarray(norm))
+
+
+def _optional(value: float | None, unit: float = 1.0) -> Float[Array, ""] | None:
+    return None if value is None else jnp.asarray(value * unit)

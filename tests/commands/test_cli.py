@@ -1,0 +1,217 @@
+"""The commands from outside: files, exit codes, messages."""
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from rootsopt import profiles
+from rootsopt.commands import profile
+from rootsopt.config import load
+from rootsopt.measured.reading import read, signed_area
+from rootsopt.runtime import programs
+from rootsopt.scene import Scene, design_vector
+
+ROOT = Path(__file__).parents[2]
+CIC = str(ROOT / "configs" / "cic.yaml")
+EE = str(ROOT / "configs" / "ee.yaml")
+SMALL = [
+    "--set", "optimizer.screening=2",
+    "--set", "optimizer.starts=1",
+    "--set", "optimizer.iterations=2",
+    "--set", "solver.map_rolls=96",
+    "--set", "solver.map_relatives=16",
+]  # fmt: skip
+
+
+def command(module, *arguments, **environment):
+    return subprocess.run(
+        [sys.executable, "-m", f"rootsopt.{module}", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+        env=os.environ | {"COLUMNS": "100"} | environment,
+    )
+
+
+def columns(path):
+    with path.open() as file:
+        rows = list(csv.reader(file))
+    return rows[0], np.array(rows[1:], dtype=float)
+
+
+def profile_in(folder):
+    """The profile of the optimised config in a result folder."""
+    config = load(folder / "optimized.yaml")
+    return Scene.from_config(config).profile(design_vector(config))
+
+
+def test_optimize_writes_the_contract(tmp_path):
+    """Every file of the contract, the table, compile and run time, exit 0, quiet stderr."""
+    done = command("optimize", CIC, "-o", tmp_path, *SMALL, "--export", "dxf")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    for word in ("baseline", "optimised", "pressure angle", "mean force", "periodic", "compile"):
+        assert word in done.stdout
+    result = json.loads((tmp_path / "result.json").read_text())
+    for record in (result["baseline"], result["optimized"]):
+        assert record["status"] == "periodic"
+        assert set(record["design"]) == set(record["gradient"]["mean_force_N"])
+        for key in ("outer_radius_mm", "root_radius_mm", "area_mm2", "area_efficiency"):
+            assert record["geometry"][key] > 0
+        assert record["steady_state"]["kind"] == "periodic"
+        assert record["steady_state"]["floquet_multiplier"] < 1
+    assert {"improvement", "constraints", "versions"} <= set(result)
+    assert result["baseline"]["design"]["pressure_angle_deg"] == 36.43
+    assert result["optimized"]["geometry"]["area_efficiency"] >= (
+        result["baseline"]["geometry"]["area_efficiency"] - 1e-6
+    )
+    for name in ("baseline", "optimized"):
+        header, outline = columns(tmp_path / f"profile_{name}.csv")
+        assert header == ["x_mm", "y_mm"]
+        np.testing.assert_array_equal(outline[0], outline[-1])
+        x, y = outline.T
+        area = np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]) / 2
+        assert area == pytest.approx(result[name]["geometry"]["area_mm2"], rel=1e-4)
+        header, response = columns(tmp_path / f"response_{name}.csv")
+        assert header[0] == "time_s"
+        assert header[-1] == "contact_force_N"
+        force = response[:, -1]
+        assert force.mean() == pytest.approx(result[name]["response"]["mean_force_N"], rel=1e-3)
+        assert force.max() <= result[name]["response"]["peak_force_N"] * (1 + 1e-6)
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["optimizer"]["screening"] == 2
+    assert result["status"] == "periodic"
+    assert result["run"]["command"] == "optimize"
+    figures = {path.name for path in (tmp_path / "figures").iterdir()}
+    names = ("profiles", "meshing", "force", "spectrum", "history")
+    assert figures == {f"{name}.png" for name in names}
+    assert (tmp_path / "history.csv").read_text().count("\n") >= 4
+    # The optimised design, as a config and as a drawing, both read back.
+    best, drawn = result["optimized"]["geometry"], profiles.geometry(profile_in(tmp_path))
+    assert float(drawn.area) * 1e6 == pytest.approx(best["area_mm2"], rel=1e-9)
+    loop = read(tmp_path / "rotor.dxf").points
+    assert abs(signed_area(loop)) == pytest.approx(best["area_mm2"], rel=1e-3)
+
+
+def test_simulate_ee_and_profile(tmp_path):
+    """One record at top level; `profile` simulates nothing; EE has an empty design."""
+    done = command("simulate", EE, "-o", tmp_path / "ee", "--no-figures")
+    assert done.returncode == 0, done.stdout + done.stderr
+    record = json.loads((tmp_path / "ee" / "result.json").read_text())
+    assert record["design"] == {}
+    assert record["gradient"] == {}
+    assert record["response"]["peak_force_N"] > record["response"]["mean_force_N"] > 0
+    done = command("profile", EE, "-o", tmp_path / "p", "--set", "profile.lobes=2")
+    assert done.returncode == 0, done.stderr
+    record = json.loads((tmp_path / "p" / "result.json").read_text())
+    assert record["geometry"]["area_efficiency"] == pytest.approx(0.5, abs=1e-12)
+    assert record["response"] == {}
+    assert record["margins"]["root_mm"] == pytest.approx(record["geometry"]["root_radius_mm"])
+    # Of the turn of an epicycloid's normal 1 / (1 + N) is the roll angle's.
+    assert record["margins"]["rolling"] == pytest.approx(1 / 3, abs=1e-9)
+
+
+def test_no_usable_result_exits_3(tmp_path):
+    """Lobes passing through each other, with hardly a gear: status, exit 3, no numbers."""
+    text = yaml.safe_load(Path(CIC).read_text())
+    text["scene"]["timing_gear"]["stiffness_N_m_per_rad"] = 1.0
+    text["scene"]["load"]["torque_N_m"] = 40.0
+    config = tmp_path / "loose.yaml"
+    config.write_text(yaml.safe_dump(text))
+    for module in ("simulate", "optimize"):
+        done = command(module, config, "-o", tmp_path / module, "--no-figures")
+        assert done.returncode == 3, done.stderr
+        assert "passed_through" in done.stdout
+        result = json.loads((tmp_path / module / "result.json").read_text())
+        record = result if module == "simulate" else result["baseline"]
+        assert record["status"] == "passed_through"
+        assert record["response"] == {}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["missing.yaml"], ["missing.yaml", "no such file"]),
+        ([CIC, "--set", "profile.presure_angle_deg=30"], ["profile.pressure_angle_deg"]),
+        ([CIC, "--set", "profile.lobes=9"], ["profile.lobes", "6", "9"]),
+        ([CIC, "--set", "scene.speed_rpm=fast"], ["scene.speed_rpm", "number", "fast"]),
+        ([CIC, "--set", "profile.involute_length_mm=20"], ["involute_length_mm", "20"]),
+        ([CIC, "--set", "scene.speed_rpm"], ["dotted.key=value"]),
+    ],
+)
+def test_bad_input_exits_2_with_one_message(arguments, words, tmp_path):
+    """Exit 2, one line on stderr that names key and remedy, nothing written."""
+    out = tmp_path / "out"
+    done = command("simulate", *arguments, "-o", out)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.strip().count("\n") == 0
+    assert "Traceback" not in done.stderr
+    for word in words:
+        assert word in done.stderr
+    assert not out.exists()
+
+
+def test_unwritable_output_exits_2(tmp_path):
+    """An output path below a regular file is refused before anything is computed."""
+    blocker = tmp_path / "file"
+    blocker.write_text("")
+    done = command("profile", CIC, "-o", blocker / "out")
+    assert done.returncode == 2
+    assert str(blocker) in done.stderr
+    assert blocker.read_text() == ""
+
+
+def test_console_command_and_help():
+    """`rootsopt COMMAND`; unknown commands get the nearest; help lists keys with units."""
+    run = [
+        sys.executable,
+        "-c",
+        "import sys; from rootsopt.commands.console import main; sys.exit(main())",
+    ]
+    done = subprocess.run([*run, "optimise"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "optimize" in done.stderr
+    done = subprocess.run([*run, "simulate", "-h"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert "scene.timing_gear.backlash_mm" in done.stdout
+    assert "contact.stiffness_N_per_mm_e" in done.stdout
+
+
+def test_compiled_programs_are_kept_between_processes(tmp_path):
+    """A second run finds every program in the cache and gives the same numbers. The first one
+    shares the session's cache; the second has a copy of it, which nobody else writes to."""
+    answers = []
+    for run, cache in (("first", os.environ["ROOTSOPT_CACHE"]), ("second", tmp_path / "cache")):
+        if run == "second":
+            unfinished = shutil.ignore_patterns(".*")
+            shutil.copytree(os.environ["ROOTSOPT_CACHE"], cache, ignore=unfinished)
+            kept = {path.name: path.stat().st_ino for path in cache.iterdir()}
+        arguments = EE, "--no-figures", "-o", tmp_path / run
+        done = command("simulate", *arguments, ROOTSOPT_CACHE=str(cache))
+        assert done.returncode == 0, done.stderr
+        assert done.stderr == ""
+        answers.append(json.loads((tmp_path / run / "result.json").read_text())["response"])
+    assert {"steady_motion", "pair_and_tangents"} <= {name.split("-")[0] for name in kept}
+    assert kept == {path.name: path.stat().st_ino for path in cache.iterdir()}
+    assert answers[0] == answers[1]
+
+
+def test_no_programs_are_kept_if_told_so(tmp_path, monkeypatch, capsys):
+    """With --no-cache; without it they are."""
+    monkeypatch.setattr(programs, "_store", None)
+    monkeypatch.setenv("ROOTSOPT_CACHE", str(tmp_path / "cache"))
+    arguments = EE, "-o", str(tmp_path / "p"), "--no-figures", "--export", "none"
+    for more in (["--no-cache"], []):
+        assert not (tmp_path / "cache").exists()
+        assert profile.main([*arguments, *more]) == 0
+        assert capsys.readouterr().err == ""
+    assert (tmp_path / "cache").is_dir()

@@ -1,0 +1,301 @@
+"""The edges of a command's process: signals, closed and full streams, odd files as config."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from rootsopt.commands import door
+from rootsopt.commands.console import COMMANDS, main
+from rootsopt.config import load
+from rootsopt.errors import InputError
+
+ROOT = Path(__file__).parents[2]
+CIC = str(ROOT / "configs" / "cic.yaml")
+
+
+def python(code, *arguments, **options):
+    """A process that runs `code`, its streams as pipes."""
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
+    # Whoever started the tests in the background has Ctrl-C ignored, in its children too.
+    options |= {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
+    return subprocess.Popen([sys.executable, "-c", code, *arguments], cwd=ROOT, **options)
+
+
+WORK = """
+import os, sys, time
+from rootsopt.commands import door
+def work():
+    print("x" * int(sys.argv[2]), flush=True)
+    print("said", file=sys.stderr, flush=True)
+    return int(sys.argv[1])
+sys.exit(door.through("test", work, own=True))
+"""
+
+
+# What is left in a buffer is written at the very end of the process.
+BUFFERED = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
+
+
+def shell(redirection, code, size=10):
+    """Exit code and stderr of work that prints, with a shell's redirection."""
+    command = f'"$0" -c "$1" {code} {size} {redirection}'
+    done = subprocess.run(
+        ["bash", "-c", f"{command}; exit ${{PIPESTATUS[0]}}", sys.executable, WORK],
+        cwd=ROOT, capture_output=True, text=True, check=False, env=BUFFERED,
+    )  # fmt: skip
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize("size", [10, 200_000])
+@pytest.mark.parametrize("code", [0, 3])
+@pytest.mark.parametrize("redirection", ["| true", ">&-", "2>&-", ">&- 2>&- <&-", "1</dev/null"])
+def test_the_exit_code_is_the_runs_own(redirection, code, size):
+    """Whoever reads, or has stopped to."""
+    found, told = shell(redirection, code, size)
+    assert found == code
+    assert told in ("said\n", "")
+
+
+@pytest.mark.parametrize("code", [0, 3])
+def test_output_that_cannot_be_written_is_told(code):
+    found, told = shell(">/dev/full", code)
+    assert found == 2
+    assert told.splitlines() == [
+        "said",
+        "rootsopt test: standard output cannot be written: no space left on device; redirect it "
+        "elsewhere",
+    ]
+    assert shell("2>/dev/full", code) == (code, "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [(["--help"], 0), (["--version"], 0), (["profile", "--help"], 0), ([], 2)],
+)
+def test_help_into_a_closed_pipe(arguments, code):
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(
+        [sys.executable, "-m", "rootsopt", *arguments],
+        cwd=ROOT, stdout=writing, stderr=subprocess.PIPE, text=True, check=False, env=BUFFERED,
+    )  # fmt: skip
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (code, "")
+
+
+@pytest.mark.parametrize("daemon", [True, False])
+def test_threads_that_go_on_do_not_keep_the_process(daemon):
+    """Nor are they waited for, as a compilation that nobody needs any more."""
+    code = (
+        "import threading, time; from rootsopt.commands import door;"
+        f"go = lambda: threading.Thread(target=time.sleep, args=(60,), daemon={daemon}).start();"
+        "door.leave(door.through('test', lambda: go() or print('said') or 3, own=True))"
+    )
+    began = time.monotonic()
+    process = python(code, env=BUFFERED)
+    assert process.communicate() == ("said\n", "")
+    assert process.returncode == 3
+    assert time.monotonic() - began < 30
+
+
+def test_letters_that_the_terminal_lacks():
+    code = (
+        "import sys; from rootsopt.commands import door;"
+        "sys.exit(door.through('test', lambda: print('µm \\udcff') or 0, own=True))"
+    )
+    environment = os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    process = python(code, env=environment)
+    assert process.communicate() == ("?m ?\n", "")
+    assert process.returncode == 0
+
+
+# ------------------------------------------------------------------------- signals
+
+
+WAITING = """
+import sys, time
+from pathlib import Path
+from rootsopt.commands import door
+from rootsopt.output.runs import RunFolder
+def work():
+    with RunFolder(sys.argv[1]) as folder, door.leaving(folder.abandon):
+        folder.write_text("config.yaml", "new")
+        {wait}
+        folder.write_json("result.json", {{}})
+        folder.put_in_place()
+    return 3
+door.leave(door.through("test", work, own=True))
+"""
+AT_ONCE = "print('here', flush=True); time.sleep(60)"
+# Unlike a sleep of the C library, this does not end at a signal.
+COMPILED = """print('here', flush=True)
+        import hashlib; hashlib.pbkdf2_hmac("sha256", b"a", b"b", 10**9)"""
+PATIENT = """
+        with door.patience("finishing") as stop:
+            print('here', flush=True)
+            while not stop.is_set() or "{twice}": time.sleep(0.01)"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("wait", [AT_ONCE, COMPILED])
+def test_a_signal_stops_a_run_at_once(tmp_path, wait, number):
+    """In compiled code too, which Python cannot interrupt; nothing is left."""
+    process = python(WAITING.format(wait=wait), str(tmp_path / "run"))
+    assert process.stdout.readline() == "here\n"
+    assert len(os.listdir(tmp_path)) == 2
+    began = time.monotonic()
+    process.send_signal(number)
+    _, told = process.communicate()
+    assert time.monotonic() - began < 20
+    assert process.returncode == 3
+    name = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}[number]
+    assert told == f"rootsopt test: stopped by {name}; {tmp_path / 'run'} is as it was\n"
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_patient_run_ends_by_itself(tmp_path):
+    wait = PATIENT.format(twice="")
+    process = python(WAITING.format(wait=wait), str(tmp_path / "run"))
+    assert process.stdout.readline() == "here\n"
+    process.send_signal(signal.SIGTERM)
+    _, told = process.communicate()
+    assert process.returncode == 3
+    assert told == "rootsopt test: SIGTERM: finishing (once more to stop at once)\n"
+    assert sorted(os.listdir(tmp_path / "run")) == ["config.yaml", "result.json"]
+
+
+def test_a_second_signal_stops_a_patient_run(tmp_path):
+    wait = PATIENT.format(twice="yes")
+    process = python(WAITING.format(wait=wait), str(tmp_path / "run"))
+    assert process.stdout.readline() == "here\n"
+    process.send_signal(signal.SIGINT)
+    assert "once more" in process.stderr.readline()
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate()
+    assert process.returncode == 3
+    assert "stopped by Ctrl-C" in told
+    assert os.listdir(tmp_path) == []
+
+
+def test_signals_that_are_ignored_stay_so():
+    """As those of a job in the background of a script."""
+    code = (
+        "import os, signal, sys, time; from rootsopt.commands import door;"
+        "signal.signal(signal.SIGINT, signal.SIG_IGN);"
+        "kill = lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(1));"
+        "sys.exit(door.through('test', lambda: kill() and 0, own=True))"
+    )
+    process = python(code)
+    assert process.communicate() == ("", "")
+    assert process.returncode == 0
+
+
+@pytest.mark.parametrize("module", ["argparse", "yaml", "pydantic", "jax"])
+@pytest.mark.parametrize("command", ["rootsopt", "rootsopt.simulate", "rootsopt.optimize"])
+def test_an_interrupt_during_imports(tmp_path, command, module):
+    """A module of that name stands in for the real one, and takes for ever."""
+    text = "print('here', flush=True)\nimport time\ntime.sleep(60)\n"
+    (tmp_path / f"{module}.py").write_text(text)
+    arguments = ["simulate", CIC] if command == "rootsopt" else [CIC]
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
+    process = subprocess.Popen(
+        [sys.executable, "-m", command, *arguments, "-o", str(tmp_path / "run")],
+        cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    assert process.stdout.readline() == "here\n"
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate()
+    assert process.returncode == 3
+    assert told.count("\n") == 1
+    assert "stopped by Ctrl-C" in told
+
+
+def test_called_from_python_nothing_global_changes(tmp_path, capsys, monkeypatch):
+    """Neither signals nor streams, nor file descriptors."""
+    monkeypatch.chdir(ROOT)
+    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    streams, threads = (sys.stdout, sys.stderr), threading.active_count()
+    assert main(["profile", "missing.yaml"]) == 2
+    assert main(["nonsense"]) == 2
+    assert before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    assert (sys.stdout, sys.stderr) == streams
+    assert threading.active_count() == threads
+    monkeypatch.setattr(sys, "argv", ["rootsopt", "--version"])
+    assert main() == 0
+    assert before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    assert (sys.stdout, sys.stderr) == streams
+
+
+def test_doors_load_little():
+    """What is imported before signals are answered."""
+    code = "import sys, rootsopt.simulate, rootsopt.__main__, rootsopt.optimize.__main__;"
+    code += "print([n for n in ('numpy', 'yaml', 'pydantic', 'jax', 'rich') if n in sys.modules])"
+    process = python(code)
+    assert process.communicate()[0] == "[]\n"
+
+
+# ------------------------------------------------------------------- odd arguments
+
+
+def _odd(folder):
+    os.mkfifo(folder / "fifo")
+    (folder / "folder").mkdir()
+    server = socket.socket(socket.AF_UNIX)
+    server.bind(str(folder / "socket"))
+    server.close()
+    (folder / "link").symlink_to("fifo")
+    return [folder / name for name in ("fifo", "folder", "socket", "link")] + ["/dev/zero"]
+
+
+def test_a_config_that_is_no_file_is_refused(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for path in _odd(tmp_path):
+        with pytest.raises(InputError, match="regular file"):
+            load(path)
+        for command in COMMANDS:
+            assert main([command, str(path)]) == 2
+            told = capsys.readouterr().err
+            assert told.startswith(f"rootsopt {command}: '{path}': is a ")
+            assert told.count("\n") == 1
+    assert main(["profile", ""]) == 2
+    assert not (tmp_path / "results").exists()
+
+
+def test_an_empty_output_is_refused(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for command in COMMANDS:
+        for arguments in (["-o", ""], ["--output="]):
+            assert main([command, CIC, *arguments]) == 2
+            told = capsys.readouterr().err
+            assert "`--output` must name a folder" in told
+            assert told.count("\n") == 1
+    assert os.listdir(tmp_path) == []
+
+
+def test_wrong_arguments_take_one_line(capsys):
+    for arguments in ([], [CIC, "--nonsense"], [CIC, "-o"], [CIC, "two"]):
+        with pytest.raises(SystemExit) as caught:
+            main(["profile", *arguments])
+        assert caught.value.code == 2
+        assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_full_disks_elsewhere_take_one_line(capsys, monkeypatch):
+    """Any failure of the system that nobody has foreseen."""
+
+    def full(*_):
+        raise OSError(28, "No space left on device", "/tmp/elsewhere")
+
+    monkeypatch.setattr("rootsopt.commands.cli.load", full)
+    assert main(["profile", CIC]) == 2
+    expected = "rootsopt profile: /tmp/elsewhere: no space left on device\n"
+    assert capsys.readouterr().err == expected
+    assert door.OK == 0

@@ -1,0 +1,404 @@
+"""What the reader of YAML takes, refuses and bounds; the fuzzing campaign, reduced."""
+
+import os
+import random
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rootsopt.config import load, parse
+from rootsopt.config.document import MOST_BYTES, read_document
+from rootsopt.config.words import named, sentence, shown
+from rootsopt.errors import InputError
+from tests.config.test_config import MINIMAL
+from tests.fuzz import configs
+from tests.fuzz.report import Report
+
+LONGEST = 500
+
+
+def refusal(text, *overrides):
+    """The message of a config that must be refused soon, in one line of bounded length."""
+    began = time.process_time()
+    with pytest.raises(InputError) as caught:
+        parse(text, overrides)
+    assert time.process_time() - began < 2
+    message = str(caught.value)
+    assert configs.wrong_message(message) is None
+    return message
+
+
+def laughs(levels, left="[", right="]"):
+    """Every level holds the one before nine times."""
+    first = f"a0: &a0 {left}{'x' if left == '[' else 'k: 1'}{right}\n"
+    rows = [f"a{k}: &a{k} {left}{', '.join([f'*a{k - 1}'] * 9)}{right}\n" for k in range(1, levels)]
+    return first + "".join(rows) + f"profile: *a{levels - 1}\n"
+
+
+def merges(levels):
+    """Every level merges the one before nine times."""
+    rows = [f"a{k}: &a{k} {{<<: [{', '.join([f'*a{k - 1}'] * 9)}]}}\n" for k in range(1, levels)]
+    return "a0: &a0 {k: 1}\n" + "".join(rows) + f"profile: *a{levels - 1}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (laughs(10), "more than 5000 values"),
+        (laughs(30), "more than 5000 values"),
+        (merges(10), "more than 5000 values"),
+        ("a: &a [" + "1, " * 60 + "]\nb: [" + "*a, " * 100 + "]", "more than 5000 values"),
+        (
+            "a: &a [[[[[[[[[[[[1]]]]]]]]]]]]\nb: [[[[[[[[[[[[[[[[[[[[[[*a]]]]]]]]]]]]]]]]]]]]]]",
+            "32",
+        ),
+        ("[" * 10_000, "more than 32 levels"),
+        ("- " * 10_000, "more than 32 levels"),
+        ("\n".join(" " * k + "a:" for k in range(200)), "more than 32 levels"),
+        ("[" + "1, " * 6000 + "]", "more than 5000 values"),
+        ("x" * MOST_BYTES + "x", f"at most {MOST_BYTES} bytes"),
+        ("é" * (MOST_BYTES // 2 + 1), f"at most {MOST_BYTES} bytes"),
+        ("a: '" + "x" * 100_000 + "'", "at most 4096"),
+        ("profile: &a [*a]", "*a stands inside"),
+        ("profile: &a {lobes: {x: *a}}", "*a stands inside"),
+        ("profile: &a {<<: *a}", "*a stands inside"),
+        ("a: *" + "x" * 5000, "undefined alias"),
+    ],
+)
+def test_size_of_what_is_read_is_bounded(text, words):
+    """Bombs, loops, depth and length are refused at once, in the file and with --set."""
+    assert words in refusal(text)
+    value = text.partition(": ")[2] if text.startswith(("a: ", "profile: ")) else text
+    refusal(MINIMAL, f"profile={value}")
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        '!!float ""',
+        "!!float x",
+        "!!bool maybe",
+        "!!bool ''",
+        "!!timestamp foo",
+        "!!timestamp 2020-01-01",
+        '!!int "x"',
+        "!!int ''",
+        "!!int 3.5",
+        "!!null x",
+        "!!int [1]",
+        "!!seq x",
+        "!!map [1]",
+        "!!str {a: 1}",
+        "!!binary '?'",
+        "!!binary aGFsbG8=",
+        "!!set {a, b}",
+        "!!omap [a: 1]",
+        "!!python/object:os.system {}",
+        "!!python/name:os.system",
+        "!!merge x",
+        "!own x",
+        "!" + "x" * 5000,
+        '"\\UFFFFFFFF"',
+        '"\\U00110000"',
+        '"\\uD800"',
+        '"\\uDFFF x"',
+        '"\\q"',
+        "a\x00b",
+        "a\ud800b",
+        "a\x07b",
+        "9" * 4000,
+        "0x" + "f" * 4000,
+        "1" * 400,
+        "-" + "9" * 350,
+        "1e999",
+        "._",
+        "-._",
+        "0b_",
+        "1__.__e",
+        "`x",
+        "%x",
+        "[1, 2",
+        "{a: 1, a: 2}",
+        "{1: 1, 1.0: 2}",
+        "{null: 1}",
+        "{true: 1}",
+        "{? [a] : 1}",
+        "{? {a: b} : 1}",
+        "{.nan: 1}",
+        "{1: 2}",
+        "{float: 1}",
+        "{'a[b': 1}",
+        "{'': 1}",
+        "{<<: 3}",
+        "{<<: [1]}",
+        "{<<: }",
+        "{<<: {a: 1}, <<: {b: 1}}",
+        "{<<: *x}",
+        "1\n---\n2",
+        "[" + "{a: 1}, " * 300 + "]",
+        "x" * 4000,
+        "\u202e",
+        "{" + "k" * 1000 + ": 1}",
+        "\t- x",
+    ],
+    ids=lambda value: ascii(value[:24]),
+)
+@pytest.mark.parametrize("key", ["scene.speed_rpm", "profile.family", "scene", "nothing.at.all"])
+def test_odd_value_is_refused_in_one_line(key, value):
+    """Whatever a value is, as an override and in the file, what is said of it is one short line."""
+    refusal(MINIMAL, f"{key}={value}")
+    if "." in key:
+        section, name = key.split(".", 1)
+        refusal(f"{section}: {{{name}: {value}}}\n")
+        refusal(f"{section}:\n  {name}: {value}\n")
+    refusal(value)
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        *("=", "", "=1", ".", "a.", ".a=1", "a.b.c.d=1", "scene.speed_rpm.x=1"),
+        *("scene.speed_rpm.x.y=1", "\ud800=1", "\x1b[31m=1", "profile.lobes\n=1"),
+        *("a." * 5000 + "a=1", "k" * 50_000, "k" * 50_000 + "=1"),
+        *("scene.speed_rpm=" + "[" * 50_000, "scene=" + "x" * 300_000),
+    ],
+    ids=lambda override: ascii(override[:24]),
+)
+def test_odd_override_is_refused_in_one_line(override):
+    """So is whatever stands behind --set."""
+    refusal(MINIMAL, override)
+
+
+@pytest.mark.parametrize("written", ['"\\uD800"', '"x \\uDFFF"', '{"\\uDBFF": 1}'])
+def test_half_a_character_is_refused(written):
+    """No file could hold what is read from it."""
+    with pytest.raises(InputError, match="half of a character"):
+        read_document(written, "text")
+
+
+def test_merge_keys_work():
+    """`<<` takes one section or a list of them; own keys come first, then those merged first."""
+    text = MINIMAL.replace("rotor:\n", "rotor:\n  <<: [*one, *two]\n").replace(
+        "  length_mm: 100.0\n", ""
+    )
+    head = "ensemble: &one {seed: 5}\nattractors: &two {rates: 7}\n"
+    with pytest.raises(InputError, match=r"`rotor.(seed|rates)` is not a known key"):
+        parse(head + text)
+    data = read_document(
+        "{one: &one {a: 1, b: 2}, two: &two {b: 3, c: 4}, x: {<<: [*one, *two], c: 5}, "
+        "y: {a: 6, <<: *one}, z: *one}",
+        "text",
+    )
+    assert data["x"] == {"a": 1, "b": 2, "c": 5}
+    assert data["y"] == {"a": 6, "b": 2}
+    assert data["z"] == data["one"] == {"a": 1, "b": 2}
+
+
+def test_override_changes_one_place_of_what_an_alias_shares():
+    """What an anchor names is copied wherever an alias stands."""
+    text = MINIMAL + "  timing_gear: &g {stiffness_N_m_per_rad: 1.0e4, backlash_mm: 0.1}\n"
+    text = text.replace("    torque_N_m: 1.0\n", "    torque_N_m: 1.0\n  supports: null\n")
+    data = read_document("{a: &a {x: {y: 1}}, b: *a}", "text")
+    data["a"]["x"]["y"] = 2
+    assert data["b"] == {"x": {"y": 1}}
+    assert parse(text, ["scene.timing_gear.backlash_mm=0.2"]).scene.speed_rpm == 3000.0
+
+
+@pytest.mark.parametrize(
+    ("written", "value"),
+    [
+        ("1:30", "1:30"),
+        ("2020-01-01", "2020-01-01"),
+        ("yes", "yes"),
+        ("off", "off"),
+        ("=", "="),
+        ("<<x", "<<x"),
+        ("true", True),
+        ("False", False),
+        ("~", None),
+        ("", None),
+        ("010", 10),
+        ("0x1F", 31),
+        ("0o17", 15),
+        ("-0b11", -3),
+        ("1_000", 1000),
+        ("+5.", 5.0),
+        (".5e3", 500.0),
+        ("-.inf", float("-inf")),
+        ("!!float 3", 3.0),
+        ("!!int '12'", 12),
+        ("!!str 12", "12"),
+        ("1e", "1e"),
+        ("\ufeff[1]", [1]),
+        ("%YAML 1.2\n--- 1", 1),
+    ],
+)
+def test_words_and_numbers_are_told_apart(written, value):
+    """No number is read from a time, a date or an octal, no boolean from a word."""
+    found = read_document(written, "text")
+    assert found == value
+    assert type(found) is type(value)
+
+
+# Files
+
+
+def test_what_is_no_regular_file_is_refused(tmp_path):
+    """A pipe does not make the command wait, and a device does not go on for ever."""
+    pipe, bound = tmp_path / "pipe.yaml", tmp_path / "socket"
+    os.mkfifo(pipe)
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(bound))
+        for path in (pipe, bound, Path("/dev/zero"), Path("/dev/null")):
+            with pytest.raises(InputError, match="regular file") as caught:
+                load(path)
+            assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("a\x00b.yaml", "not a path"),
+        ("x" * 5000, "cannot be read"),
+        ("no/such\n/folder.yaml", "no such file"),
+        ("\udcff.yaml", "no such file"),
+        ("", "folder"),
+    ],
+)
+def test_odd_path_is_refused(name, words):
+    """Paths that no file can have, in one printable line."""
+    with pytest.raises(InputError) as caught:
+        load(name)
+    assert words in str(caught.value)
+    assert configs.wrong_message(str(caught.value)) is None
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (MINIMAL.encode("utf-16"), "UTF-8"),
+        (MINIMAL.encode("utf-16-le"), "not valid YAML"),
+        (b"\xed\xa0\x80", "UTF-8"),
+        (b"\xff", "UTF-8"),
+        (b"\xc3", "UTF-8"),
+        (b"a: \x00", "not valid YAML"),
+        (b"#" * (MOST_BYTES + 1), "bytes"),
+        (b"#" * MOST_BYTES + b"\xff" * 100, "bytes"),
+        (b"#" * 50_000_000, "bytes"),
+    ],
+    ids=range(9),
+)
+def test_bytes_that_are_no_config_are_refused(tmp_path, data, words):
+    """Other encodings, and what is too long to be a config."""
+    path = tmp_path / "x.yaml"
+    path.write_bytes(data)
+    with pytest.raises(InputError) as caught:
+        load(path)
+    assert words in str(caught.value)
+    assert configs.wrong_message(str(caught.value)) is None
+
+
+def test_byte_order_mark_of_utf8_is_taken(tmp_path):
+    """Some editors write one."""
+    path = tmp_path / "x.yaml"
+    path.write_bytes(MINIMAL.encode("utf-8-sig"))
+    assert load(path) == parse(MINIMAL)
+
+
+def test_long_path_is_shown_by_its_end(tmp_path):
+    """The message stays short, and the file's name in it."""
+    folder = tmp_path.joinpath(*["d" * 100] * 5)
+    with pytest.raises(InputError) as caught:
+        load(folder / "scene.yaml")
+    assert "scene.yaml" in str(caught.value)
+    assert len(str(caught.value)) < LONGEST
+
+
+# Words
+
+
+def test_words_are_bounded():
+    """Values, keys, paths and messages are each cut, however large they are, and on one line."""
+    endless = [["x" * 10_000] * 1000] * 1000
+    for value in (endless, {k: endless for k in range(1000)}, "x" * 10**6, 10**3999, "a\nb"):
+        assert len(shown(value)) <= 160
+        assert shown(value).isprintable()
+    assert shown([1, 2.5, "a", None]) == "[1, 2.5, 'a', None]"
+    assert len(named("k" * 1000)) <= 60
+    assert named("a\x1bb") == "a\\x1bb"
+    assert len(sentence("word " * 1000)) <= LONGEST
+    assert sentence("one\n two") == "one two"
+
+
+# Commands and random configs
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "words"),
+    [
+        (laughs(12), [], "more than 5000 values"),
+        ('profile: {lobes: !!float ""}\n', [], "is not a number"),
+        (MINIMAL, ["--set", 'scene.speed_rpm="\\UFFFFFFFF"'], "scene.speed_rpm"),
+        (MINIMAL, ["--set", "profile.pitch_radius_mm=0.033"], "metres? write 33"),
+    ],
+)
+def test_command_refuses_in_one_line(tmp_path, text, options, words):
+    """Exit code 2 and one line on stderr."""
+    path = tmp_path / "x.yaml"
+    path.write_text(text)
+    command = [sys.executable, "-m", "rootsopt.profile", str(path), "-o", str(tmp_path / "o")]
+    done = subprocess.run(
+        [*command, *options], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+    assert words in done.stderr
+    assert len(done.stderr) < LONGEST + 100
+
+
+def test_random_configs(monkeypatch):
+    """A few hundred configs of `python -m tests.fuzz configs`, without geometry."""
+    monkeypatch.setattr(configs, "_GEOMETRIES", 0.0)
+    report = Report("configs", 280, 300)
+    configs.run(report, 0)
+    assert report.failures == []
+    assert report.total >= 280
+    kinds = {kind.rpartition(", ")[0] for kind in report.tried}
+    assert kinds == set(configs.CLASSES)
+    assert sum(n for kind, n in report.tried.items() if kind.endswith("accepted")) > 20
+
+
+def test_campaign_notices(tmp_path, monkeypatch):
+    """A traceback, a long message, one of two lines, one too late, and a config that is not read
+    back are failures of the campaign."""
+
+    def outcome(action):
+        monkeypatch.setattr(configs, "load", action)
+        return configs.tried((b"", ()), tmp_path)[1]
+
+    def failing(error):
+        def action(*_):
+            raise error
+
+        return action
+
+    def late(*_):
+        while True:
+            random.random()
+
+    class Changed:
+        def to_yaml(self):
+            return MINIMAL
+
+    assert outcome(failing(InputError("short"))) is None
+    assert "KeyError" in str(outcome(failing(KeyError("x"))))
+    for text in ("", "x" * 501, "a\nb", "a\x1b"):
+        assert "message is" in str(outcome(failing(InputError(text))))
+    assert "load again" in str(outcome(lambda *_: Changed()))
+    monkeypatch.setattr(configs, "SECONDS", 0.2)
+    assert "longer" in str(outcome(late))

@@ -1,0 +1,277 @@
+"""Every contact, contact law and part of the package in its conformance suite, and what the suites
+find wrong in broken ones."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt.contact import ContactLaw, ImpactLaw
+from rootsopt.contact.linear import LinearContact
+from rootsopt.contact.map import MapContact
+from rootsopt.contact.point import ContactPoint
+from rootsopt.contact.search import SearchContact
+from rootsopt.contact.segments import NodeContact
+from rootsopt.dynamics.parts import (
+    ConstantLoad,
+    Friction,
+    GasLoad,
+    MotorDrive,
+    Part,
+    PrescribedDrive,
+    Supports,
+    TimingGear,
+)
+from rootsopt.errors import InputError
+from rootsopt.profiles import CIC, EE, geometry
+from tests.conformance.contacts import check_contact
+from tests.conformance.laws import check_law
+from tests.conformance.parts import SPEED, check_in_pair, check_part, size
+from tests.dynamics.test_closed_forms import LOBES, SCALE, Far, oscillator
+
+R = 0.033
+PROFILES = {
+    "cic": CIC(3, R, np.radians(36.43), 8.0e-3, np.radians(4.0)),
+    "ee": EE(3, R),
+}
+DEEPEST = -2e-3
+CONTACTS = {
+    # Name: how it is made, error of the gap (m), of levers as derivatives of it (m).
+    "search": (SearchContact.of, 2e-8, 1e-9),
+    "two-sided search": (
+        lambda profile: SearchContact.of(profile, 2 * profile.pitch_radius, two_sided=True),
+        2e-8,
+        1e-9,
+    ),
+    "map": (lambda profile: MapContact.of(profile, jnp.asarray(DEEPEST), 256, 24), 1e-7, 1e-12),
+    "linear": (LinearContact.of, 2e-6, 1e-12),
+    "nodes": (lambda profile: NodeContact.of(profile, 400), 2e-6, 1e-12),
+}
+
+
+@eqx.filter_jit
+def built(make, profile):
+    return make(profile)
+
+
+@pytest.mark.parametrize("family", PROFILES)
+@pytest.mark.parametrize("name", CONTACTS)
+def test_contacts(name, family, graded_outline):
+    make, gap_error, lever_error = CONTACTS[name]
+    profile = PROFILES[family]
+    contact = built(make, profile)
+    check_contact(contact, profile, graded_outline(profile, 1000), DEEPEST, gap_error, lever_error)
+
+
+def law(exponent, smoothing):
+    """A law of any exponent with the same force at 20 µm, which its damping can release."""
+    stiffness = 4e11 * 2e-5 ** (2.2 - exponent)
+    return ImpactLaw(*(jnp.asarray(x) for x in (stiffness, exponent, 250.0, 1e-5, smoothing)))
+
+
+@pytest.mark.parametrize(("exponent", "smoothing"), [(2.2, 1e-6), (1.5, 1e-6), (2.2, 0.0)])
+def test_laws(exponent, smoothing):
+    check_law(law(exponent, smoothing), 2e-5, 0.3, smoothing)
+
+
+def arrays(*numbers):
+    return [jnp.asarray(float(x)) for x in numbers]
+
+
+def held(part, motion, own):
+    """Energy (J) of a gear with sharp edges."""
+    excess = jnp.maximum(jnp.abs(motion.relative - part.offset) - part.half_backlash, 0)
+    return part.stiffness * excess**2 / 2
+
+
+def rubbed(part, motion, own):
+    """Power (W) that the damper of such a gear takes."""
+    engaged = jnp.abs(motion.relative - part.offset) > part.half_backlash
+    return jnp.where(engaged, part.damping * motion.rate**2, 0.0)
+
+
+def driven(part, motion, own):
+    return part.torque_at(motion.speed) * motion.speed
+
+
+def against(part, motion, own):
+    first = part.torque1(motion.phi)
+    first = 0.0 if first is None else first
+    return -first * motion.speed - part.torque2(motion.phi) * (motion.speed + motion.rate)
+
+
+def gas(family):
+    profile = PROFILES[family]
+    return GasLoad(*arrays(4e3), profile, geometry(profile).outer_radius, *arrays(5))
+
+
+PARTS = {
+    "prescribed drive": (lambda: PrescribedDrive(*arrays(SPEED)), {}),
+    "motor": (lambda: MotorDrive(*arrays(SPEED, 5, 0.1, 1e-3)), {"supply": driven}),
+    "load": (lambda: ConstantLoad(*arrays(5)), {"supply": against}),
+    "gas": (lambda: gas("cic"), {"supply": against}),
+    "sharp gear": (
+        lambda: TimingGear(*arrays(2e4, 1.7, 1.5e-3, 0, 4e-4)),
+        {"energy": held, "losses": rubbed},
+    ),
+    "friction": (lambda: Friction(*arrays(0.1, 0.05, 0.1, 1.0)), {}),
+    "supports": (
+        lambda: Supports(*arrays(2e8, 5e3, 3.0, R)),
+        {
+            "energy": lambda part, motion, own: part.stiffness * jnp.sum(motion.shift**2) / 2,
+            "losses": lambda part, motion, own: part.damping * jnp.sum(motion.drift**2),
+        },
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_parts(name):
+    make, powers = PARTS[name]
+    check_part(make(), **powers)
+
+
+class Absent(Part):
+    """A part that leaves everything as it is."""
+
+
+def test_what_a_part_leaves_alone_costs_nothing():
+    """Neither state nor equation nor number: the program is that of the pair without it."""
+    pair = oscillator()
+    assert size(dataclasses.replace(pair, parts=(Absent(), Absent()))) == size(pair)
+
+
+class Unbalance(Part):
+    """Force on the axes that turns with the rotors."""
+
+    pull: jnp.ndarray
+
+    def force_on_axes(self, motion, own):
+        turns = jnp.stack([motion.phi, -motion.phi - motion.relative])
+        return self.pull * jnp.stack([jnp.cos(turns), jnp.sin(turns)], axis=-1)
+
+
+class FarAnywhere(Far):
+    """The same at any distance of the axes."""
+
+    two_sided = True
+    center_distance = jnp.asarray(2 * R)
+
+    def at_distance(self, distance):
+        return self
+
+    def point(self, roll, relative, approach):
+        return ContactPoint(*(jnp.ones_like(roll) for _ in range(3)))
+
+
+def test_a_part_that_acts_on_axes_needs_them_to_move():
+    """In rigid bearings its force adds nothing; on supports each axis begins to move by F / m."""
+    pair = oscillator()
+    pulls = (Unbalance(jnp.asarray(7.0)),)
+    assert size(dataclasses.replace(pair, parts=pulls))[:2] == size(pair)[:2]
+    supports = PARTS["supports"][0]()
+    moving = oscillator(contact=FarAnywhere(), two_sided=True, supports=supports, parts=pulls)
+    slope, _ = jax.jit(lambda y: moving.derivative(jnp.asarray(0.2), y))(jnp.zeros(10))
+    turn = 0.2 * 2 * np.pi / LOBES
+    expected = 7.0 / 3.0 * np.array([np.cos(turn), np.sin(turn), np.cos(turn), -np.sin(turn)])
+    period = float(moving.mesh_period)
+    np.testing.assert_allclose(slope[6:], expected * period**2 / (SCALE * R), rtol=1e-12)
+    assert np.all(np.asarray(slope[2:6]) == 0)
+
+
+def test_parts_that_exclude_each_other_are_refused():
+    supports = PARTS["supports"][0]()
+    with pytest.raises(InputError, match="`two_sided` = False"):
+        oscillator(supports=supports)
+    with pytest.raises(InputError, match="Supports and Supports both"):
+        oscillator(supports=supports, parts=(supports,))
+    with pytest.raises(InputError, match="right for one of them at a time"):
+        oscillator(two_sided=True)
+    rubbing = oscillator(parts=(PARTS["friction"][0](),))
+    with pytest.raises(InputError, match="does not give the point of contact, which friction"):
+        rubbing.derivative(jnp.zeros(()), jnp.zeros(2))
+
+
+class Leaky(Part):
+    """A spring with a stop, wrong in the ways that are switched on."""
+
+    gain: jnp.ndarray
+    silent: bool = eqx.field(static=True, default=False)
+
+    def torque_on_2(self, motion, own):
+        stop = jnp.maximum(motion.relative - 1e-3, 0)
+        return -1e4 * motion.relative - 5e4 * stop + self.gain * motion.rate
+
+    def switches(self, motion, own):
+        return jnp.zeros(0, bool) if self.silent else jnp.stack([motion.relative > 1e-3])
+
+    def torque_on_1(self, motion, own):
+        return -self.torque_on_2(motion, own)
+
+
+def spring(part, motion, own):
+    stop = jnp.maximum(motion.relative - 1e-3, 0)
+    return (1e4 * motion.relative**2 + 5e4 * stop**2) / 2
+
+
+def test_the_suite_finds_a_part_that_makes_energy_or_hides_a_kink():
+    check_part(Leaky(jnp.asarray(0.0)), energy=spring)
+    with pytest.raises(AssertionError, match="from or to nowhere"):
+        check_part(Leaky(jnp.asarray(0.5)), energy=spring)
+    with pytest.raises(AssertionError, match="no switch marks"):
+        check_part(Leaky(jnp.asarray(0.0), silent=True), energy=spring)
+    with pytest.raises(AssertionError, match="nothing depends on"):
+        check_in_pair(oscillator(), Idle(jnp.asarray(1.0)))
+
+
+class Idle(Part):
+    """A number without effect."""
+
+    number: jnp.ndarray
+
+    def torque_on_2(self, motion, own):
+        return 0.0 * self.number + motion.rate
+
+
+class Wrong(ContactLaw):
+    """F = K δ^e (1 + c v), wrong in one way or another."""
+
+    exponent: jnp.ndarray
+    how: str = eqx.field(static=True)
+
+    def __call__(self, depth, rate):
+        force = 1e10 * jnp.where(depth > 0, depth, 1.0) ** self.exponent
+        factor = 1 + 0.5 * rate
+        factor = factor if self.how == "sticks" else jnp.maximum(factor, 0.0)
+        return jnp.where(depth > 0, force * factor, 0.0)
+
+    def depth_at(self, force):
+        return (force / (2e10 if self.how == "inverse" else 1e10)) ** (1 / self.exponent)
+
+    def switches(self, depth, rate):
+        flags = [depth > 0, 1 + 0.5 * rate > 0]
+        return jnp.stack(flags[: 1 if self.how == "hides" else 2])
+
+
+def test_the_suite_finds_a_wrong_law():
+    check_law(Wrong(jnp.asarray(1.5), "right"), 2e-5, 1.0)
+    for how, words in {"sticks": "adhesive", "inverse": "Not equal", "hides": "no switch"}.items():
+        with pytest.raises(AssertionError, match=words):
+            check_law(Wrong(jnp.asarray(1.5), how), 2e-5, 1.0)
+
+
+class Tilted(LinearContact):
+    """Levers that are no derivatives of the gap."""
+
+    def __call__(self, roll, relative):
+        gap, lever1, lever2 = super().__call__(roll, relative)
+        return gap, 1.001 * lever1, lever2
+
+
+def test_the_suite_finds_levers_that_are_not_of_the_gap(graded_outline):
+    profile = PROFILES["cic"]
+    with pytest.raises(AssertionError, match="Not equal"):
+        check_contact(Tilted(profile), profile, graded_outline(profile, 1000), DEEPEST, 2e-6)

@@ -1,0 +1,222 @@
+"""docs/extending.md is executed: its files join the suites that the package's own pieces pass."""
+
+import functools
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt.commands import optimize
+from rootsopt.config import load
+from rootsopt.config.families import (
+    Family,
+    Parameter,
+    families,
+    for_a_time,
+    import_named,
+    outside_modules,
+    parameters,
+    register_family,
+)
+from rootsopt.errors import InputError
+from rootsopt.profiles import Profile
+from rootsopt.scene.families import profile_of
+from tests.conformance import families as suite
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+MOST_LINES = 60
+
+
+def block_of(name):
+    """The code block of the page that begins with a file's name."""
+    blocks = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+    return next(block for block in blocks if block.startswith(f'"""{name}'))
+
+
+@pytest.fixture(scope="module")
+def blunt_cycloid(tmp_path_factory):
+    """The path of the family's file, which has been imported."""
+    path = tmp_path_factory.mktemp("family") / "blunt_cycloid.py"
+    path.write_text(block_of(path.name), encoding="utf-8")
+    with for_a_time():
+        import_named(str(path))
+        yield path
+
+
+def test_family_is_short(blunt_cycloid):
+    assert len(blunt_cycloid.read_text(encoding="utf-8").splitlines()) <= MOST_LINES
+
+
+@pytest.mark.parametrize("holds", suite.CHECKS, ids=lambda one: one.__name__)
+def test_family_conforms(blunt_cycloid, holds):
+    """A stranger's family passes what the package's own pass."""
+    holds(blunt_cycloid.stem)
+
+
+def test_family_without_crossing_angle_is_another(blunt_cycloid):
+    """With α = 0 it is the hypocycloid with an epicycloid and a land."""
+    shapes = [
+        suite.measure(profile_of(name, 3, jnp.asarray(suite.R), jnp.asarray(design)))
+        for name, design in ((blunt_cycloid.stem, [4.0, 0.0]), ("hypo_epicycloid", [4.0]))
+    ]
+    for key in ("outer_radius", "area", "polar_area_moment", "seal_width"):
+        one, two = (float(getattr(shape, key)) for shape in shapes)
+        assert one == pytest.approx(two, rel=1e-12)
+
+
+DESIGN = (
+    *("--set", "profile.family=blunt_cycloid", "--set", "profile.tip_arc_angle_deg=3"),
+    *("--set", "profile.crossing_angle_deg=20"),
+)
+
+
+def test_family_is_known_to_a_command_by_its_file(blunt_cycloid, tmp_path):
+    """In a process that has heard of it by the option alone, and not without."""
+    call = [sys.executable, "-m", "rootsopt.profile", "configs/ee.yaml", "--no-figures", *DESIGN]
+    call += ["-o", str(tmp_path / "out")]
+    run = functools.partial(subprocess.run, capture_output=True, text=True, cwd=ROOT, check=False)
+    done = run([*call, "--import", str(blunt_cycloid)])
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
+    assert result["design"] == {"tip_arc_angle_deg": 3.0, "crossing_angle_deg": 20.0}
+    assert min(result["margins"].values()) >= 0
+    done = run(call)
+    assert done.returncode == 2
+    assert "crossing_angle_deg" in done.stderr
+
+
+@pytest.mark.long
+def test_family_is_optimised(blunt_cycloid, tmp_path):
+    """Better than the baseline, within the bounds of its parameters."""
+    budget = ("screening=2", "starts=1", "iterations=3")
+    given = [word for setting in budget for word in ("--set", f"optimizer.{setting}")]
+    given += ["--set", "solver.fidelity=linear", "--no-figures", "-o", str(tmp_path / "out")]
+    assert optimize.main(["configs/ee.yaml", *DESIGN, *given]) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
+    assert result["improvement"]["objective"] > 0
+    best = load(tmp_path / "out" / "optimized.yaml").profile
+    assert best.parameters == pytest.approx(result["optimized"]["design"])
+
+
+def test_help_of_a_command_has_the_family(blunt_cycloid):
+    call = [sys.executable, "-m", "rootsopt.profile", "--import", str(blunt_cycloid), "--help"]
+    done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, check=True)
+    assert "parallel curve of an epicycloid" in done.stdout
+    assert "profile.crossing_angle_deg" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("import no_such_module_at_all", "ModuleNotFoundError"),
+        ("1 / 0", "ZeroDivisionError: division by zero (line 1 of"),
+        ("def f(:", "SyntaxError"),
+        (None, "FileNotFoundError"),
+    ],
+)
+def test_file_that_fails_is_one_line(tmp_path, text, words):
+    path = tmp_path / "broken.py"
+    if text is not None:
+        path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=re.escape(words)) as caught:
+        import_named(str(path))
+    assert "--import" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_installed_package_is_found_by_its_entry_point(tmp_path, monkeypatch):
+    """A config that names an unknown family loads the package that offers it."""
+    (tmp_path / "offered.py").write_text(
+        block_of("blunt_cycloid.py").replace("blunt_cycloid", "offered_cycloid"), encoding="utf-8"
+    )
+    folder = tmp_path / "offered-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: offered\nVersion: 1.0\n")
+    (folder / "entry_points.txt").write_text("[rootsopt.families]\noffered_cycloid = offered\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    changes = "{family: Offered-Cycloid, lobes: 3, pitch_radius_mm: 33, tip_arc_angle_deg: 3, "
+    with for_a_time():
+        config = load("configs/ee.yaml", [f"profile={changes} crossing_angle_deg: 20}}"])
+        assert config.profile.family == "offered_cycloid"
+
+
+def made(lobes, pitch_radius, depth):
+    """A maker that is never called."""
+
+
+DEPTH = Parameter("depth_mm", "a depth", 1, 9, usual=(2, 3))
+GOOD = {"name": "mine", "help": "mine", "maker": made, "parameters": (DEPTH,)} | {
+    "example": {"depth_mm": 2.0},
+    "remedy": "dig",
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"name": "Mine!"}, "lower-case"),
+        ({"name": "cic"}, "cic is taken"),
+        ({"name": "five__arcs"}, "five_arcs is taken"),
+        ({"remedy": ""}, "`remedy`"),
+        ({"example": {}}, "`example`"),
+        ({"example": {"depth_mm": 10.0}}, "limits of depth_mm"),
+        ({"inherent": frozenset({"rollin"})}, "rollin"),
+        ({"parameters": (DEPTH, DEPTH)}, "every key once"),
+        ({"maker": lambda lobes, pitch_radius: None}, "lobes, pitch_radius, depth"),
+        ({"parameters": (Parameter("arc_center_mm", "other", 0, 1),)}, "arc, arcs_epicycloid"),
+        ({"parameters": (Parameter("lobes", "other", 0, 1),)}, "reserved"),
+        ({"parameters": (Parameter("depth_mm", "a depth", 9, 1),)}, "increasing"),
+        ({"parameters": (parameters()["coefficients"], DEPTH)}, "list of numbers last"),
+    ],
+)
+def test_incomplete_families_are_refused(change, words):
+    """With what is missing; nothing of them is left in the table."""
+    before = families()
+    with pytest.raises(ValueError, match=re.escape(words)):
+        register_family(Family(**(GOOD | change)))
+    assert families() == before
+
+
+def test_family_may_be_taken_back():
+    """For tests: the config is then as it was."""
+    text = ["profile={family: mine, lobes: 3, pitch_radius_mm: 33, depth_mm: 2}"]
+    with for_a_time():
+        register_family(Family(**GOOD))
+        assert load("configs/ee.yaml", text).optimizer.bounds.depth_mm is None
+        assert __name__ in outside_modules()
+    assert __name__ not in outside_modules()
+    with pytest.raises(InputError, match=r"`profile\.depth_mm` is not a known key"):
+        load("configs/ee.yaml", text)
+    with pytest.raises(InputError, match=r"'mine'; if that is a family of your own.*--import"):
+        load("configs/ee.yaml", ["profile.family=mine"])
+
+
+@pytest.mark.parametrize("family", ["cic", "four_arcs", "free_form", "extended_cycloid"])
+def test_searched_normal_is_that_of_the_closed_form(family):
+    """And so are its derivatives with respect to roll angle and design."""
+    row = families()[family]
+    values = [np.atleast_1d(row.example[key]) for key in row.keys]
+    design = jnp.asarray(np.concatenate(values))
+
+    def at(design, beta, search):
+        profile = profile_of(family, 3, jnp.asarray(suite.R), design)
+        return search(profile, beta)
+
+    stop = float(suite.made(family).half_pitch)
+    beta = jnp.linspace(0.05, 0.999, 101) * stop
+    ways = (design, jnp.ones_like(beta))
+    found, wanted = (
+        jax.jit(lambda d, b, search=search: jax.jvp(lambda *x: at(*x, search), (d, b), ways))(
+            design, beta
+        )
+        for search in (Profile.normal_at, lambda profile, beta: profile.normal_at(beta))
+    )
+    for one, two in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-9)

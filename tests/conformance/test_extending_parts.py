@@ -1,0 +1,218 @@
+"""The page on parts and contact laws of one's own: its files are imported from outside the package,
+pass the conformance suites, and give motions that conserve energy and have right gradients."""
+
+import importlib
+import re
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt.config import load
+from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.orbit import Shots, close_orbit
+from rootsopt.dynamics.parts import Context
+from rootsopt.dynamics.settle import settle, settled_within
+from rootsopt.scene import Scene
+from tests.conformance.laws import check_law
+from tests.conformance.parts import check_in_pair, check_part
+
+PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
+BLOCK = re.compile(r"^```python (\S+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+MODULES = "coupling.py", "law.py"
+LONGEST = 60
+COUPLING = {"stiffness": 8000.0, "damping": 6.0, "buffer": 4000.0, "stop": 7.0e-4}
+LAW = {"stiffness": 2.0e10, "exponent": 1.5, "loss": 0.4}
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """The page's modules by name, and its scripts."""
+    folder, scripts = tmp_path_factory.mktemp("outside"), []
+    found = {}
+    sys.path.insert(0, str(folder))
+    try:
+        for name, text in BLOCK.findall(PAGE.read_text("utf-8")):
+            if name == "run":
+                scripts.append(text)
+            if name not in MODULES:
+                continue
+            assert len(text.splitlines()) <= LONGEST, f"{name} is longer than {LONGEST} lines"
+            (folder / name).write_text(text, "utf-8")
+            stem = name.removesuffix(".py")
+            found[stem] = importlib.import_module(stem)
+        yield SimpleNamespace(**found, scripts=scripts)
+    finally:
+        sys.path.remove(str(folder))
+        for name in found:
+            sys.modules.pop(name, None)
+
+
+def test_scripts_of_the_page_run(page, monkeypatch, capsys):
+    monkeypatch.chdir(PAGE.parents[1])
+    assert len(page.scripts) == 2
+    for script in page.scripts:
+        exec(compile(script, str(PAGE), "exec"), {})
+    said = capsys.readouterr().out
+    assert "twist of the coupling (rad)" in said
+    assert float(said.splitlines()[-1]) > 0
+
+
+@pytest.fixture(scope="module")
+def model():
+    """The paper's pair with a part and a law that the package does not know."""
+    return Scene.from_config(load("configs/cic.yaml", ["solver.fidelity=search"]))
+
+
+@pytest.fixture(scope="module")
+def design(model):
+    return jnp.asarray([36.43, 8.0, 4.0])
+
+
+@eqx.filter_jit
+def built(model, design):
+    return model.pair(design)
+
+
+def stored(part, motion, own):
+    """Energy (J) of the coupling."""
+    excess = jnp.maximum(jnp.abs(own[0]) - part.stop, 0)
+    return (part.stiffness * own[0] ** 2 + part.buffer * excess**2) / 2
+
+
+def transmitted(part, motion, own):
+    """Power (W) that the drive puts in at its own speed."""
+    return part.torque_on_1(motion, own) * part.speed
+
+
+def damped(part, motion, own):
+    return part.damping * (part.speed - motion.speed) ** 2
+
+
+def test_the_coupling_conforms(page, model, design):
+    numbers = (2e-3, 3.0, 0.033, 1.5e-3, 4.8, 314.0)
+    context = Context(*(jnp.asarray(x) for x in numbers))
+    (coupling,) = model.with_parts(page.coupling.FlexibleCoupling(**COUPLING)).extra
+    coupling = coupling.prepare(context)
+    check_part(coupling, energy=stored, supply=transmitted, losses=damped)
+    check_in_pair(built(model, design), coupling)
+
+
+def test_the_law_conforms(page, model):
+    law = model.with_law(page.law.HuntCrossley(**LAW)).law
+    check_law(law, 2e-5, 3.0)
+
+
+@eqx.filter_jit
+def balance(pair, start, how):
+    """Change of the energy (J) over a mesh period, and work done: by drive, by load, by dampers and
+    contact."""
+    (coupling,), gear = pair.parts, pair.gear
+
+    def energy(tau, state):
+        motion, own = pair.motion(tau, state), pair.own_states(state)[-1]
+        other = motion.speed + motion.rate
+        kinetic = pair.inertia * (motion.speed**2 + other**2) / 2
+        return kinetic + stored(coupling, motion, own)
+
+    def slope(tau, y, _):
+        state = y[:-4]
+        change, contact = pair.derivative(tau, state)
+        motion, own = pair.motion(tau, state), pair.own_states(state)[-1]
+        other = motion.speed + motion.rate
+        hold = gear(motion.relative, motion.rate)
+        powers = [
+            transmitted(coupling, motion, own),
+            -pair.load.torque * other,
+            -damped(coupling, motion, own),
+            # What gear and contact take: their springs give it back, or not.
+            contact.torque1 * motion.speed + contact.torque2 * other - hold * motion.rate,
+        ]
+        lapse = pair.lapse(state) * pair.mesh_period
+        return jnp.concatenate([change, lapse * jnp.stack(powers)])
+
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(slope), how.solver(start.dtype), 0.0, 1.0, None, jnp.pad(start, (0, 4)),
+        stepsize_controller=how.controller(start.dtype), max_steps=how.max_steps,
+        adjoint=diffrax.ForwardMode(),
+    )  # fmt: skip
+    end = solution.ys[-1]
+    change = energy(jnp.ones(()), end[:-4]) - energy(jnp.zeros(()), start)
+    return change, end[-4:], end[:-4]
+
+
+def test_energy_balance_with_a_part_of_ones_own(page, model, design):
+    """Kinetic energy and that of the coupling change by the work of all others, to 1e-8."""
+    scene = model.with_parts(page.coupling.FlexibleCoupling(**COUPLING))
+    scene = scene.with_law(page.law.HuntCrossley(**LAW))
+    pair = built(scene, design)
+    assert pair.states == 4
+    start = jnp.asarray([-0.6, 0.3, 0.4, 0.3])
+    change, work, end = balance(pair, start, Integrator("dopri8", jnp.asarray(1e-11), 20000))
+    work = np.asarray(work)
+    assert np.all(np.abs(work) > 1e-4)
+    assert work[2] < 0
+    assert float(change) == pytest.approx(work.sum(), abs=1e-8 * np.abs(work).max())
+    assert abs(end[3]) < 10
+
+
+@eqx.filter_jit
+def closed(scene, design, factors, state, period, how):
+    """Closed orbit with derivatives in factors of the stiffness of coupling and law, of the stop,
+    and of the load."""
+
+    def entries(scene):
+        (coupling,) = scene.extra
+        return coupling.stiffness, scene.law.stiffness, coupling.stop, scene.load_torque
+
+    def pair(factors):
+        values = [x * f for x, f in zip(entries(scene), factors, strict=True)]
+        return eqx.tree_at(entries, scene, values).pair(design)
+
+    def arrays(factors):
+        return eqx.filter(pair(factors), eqx.is_inexact_array)
+
+    tangents = jax.vmap(lambda unit: jax.jvp(arrays, (factors,), (unit,))[1])(jnp.eye(4))
+    return close_orbit(pair(factors), tangents, state, period, Shots(how))
+
+
+@eqx.filter_jit
+def settled(pair, how):
+    start = jnp.zeros(pair.states)
+    return settle(pair, start, how, settled_within(how.rtol), jnp.asarray(400), 4)
+
+
+def test_gradient_with_respect_to_numbers_of_ones_own(page, model, design):
+    """Mean and mean square by stiffness and stop of the coupling, stiffness of the law and load,
+    against central differences of orbits; the orbit crosses the stop, a kink."""
+    scene = model.with_parts(page.coupling.FlexibleCoupling(**COUPLING))
+    scene = scene.with_law(page.law.HuntCrossley(**LAW))
+    transient = settled(built(scene, design), Integrator("tsit5", jnp.asarray(1e-8), 4096))
+    assert int(transient.period) > 0
+    how = Integrator("dopri8", jnp.asarray(1e-12), 4096)
+    ones = jnp.ones(4)
+    here = closed(scene, design, ones, transient.state, transient.period, how)
+    assert float(here.residual) < 1e-9
+    assert float(here.multiplier) < 1
+    pair = built(scene, design)
+    twist = np.asarray(here.flow.states)[:, 3] * float(pair.angle_scale) + float(
+        pair.parts[0].start(None)[0]
+    )
+    assert np.min(twist) < COUPLING["stop"] < np.max(twist)
+    assert 0.1 < np.max(np.abs(here.flow.states)[:, 3]) < 10
+    # Along two directions in which all four count.
+    for way in (np.array([1.0, 0.6, 0.8, 0.3]), np.array([-0.4, 1.0, 0.5, -0.2])):
+        responses = [
+            closed(scene, design, ones + side * way, here.state, transient.period, how).response
+            for side in (2e-5, -2e-5)
+        ]
+        slope = np.asarray(responses[0] - responses[1])[:2] / 4e-5
+        assert np.asarray(here.sensitivity)[:2] @ way == pytest.approx(slope, rel=1e-6)
+    sizes = np.abs(np.asarray(here.sensitivity)[0])
+    assert np.min(sizes) > 1e-3 * np.max(sizes)

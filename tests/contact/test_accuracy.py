@@ -1,0 +1,347 @@
+"""The ladder of fidelities: exactness of its top, stated errors of its rungs, the choice."""
+
+import dataclasses
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rootsopt.config import load
+from rootsopt.contact.closest import FlankPair
+from rootsopt.contact.map import MapContact
+from rootsopt.contact.nodes import pair_gap
+from rootsopt.contact.size import RELATIVES, ROLLS, size_map
+from rootsopt.errors import InputError
+from rootsopt.profiles import CIC, EE
+from rootsopt.response import choice
+from rootsopt.response.batch import coarse, respond_many
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.scene import Scene, design_vector
+from rootsopt.status import Status
+
+R = 0.033
+DEG = np.pi / 180
+PAPER = CIC(3, R, 36.43 * DEG, 9e-3, 4 * DEG)
+SHORT = CIC(3, R, 27.3 * DEG, 0.8e-3, 1.3 * DEG)
+PROFILES = {
+    "paper": PAPER,
+    "short": SHORT,
+    "five lobes": CIC(5, R, 36 * DEG, 3e-3, 1 * DEG),
+    "epicycloid": EE(3, R),
+}
+
+closest = eqx.filter_jit(lambda pair, x, e: jax.vmap(pair)(x, e))
+every_profile = pytest.mark.parametrize("name", PROFILES)
+
+
+def poses(count, half, seed=0):
+    rng = np.random.default_rng(seed)
+    return jnp.asarray(rng.uniform(0, half, count)), jnp.asarray(rng.uniform(-0.02, 0.02, count))
+
+
+# The search
+
+
+@every_profile
+@pytest.mark.parametrize("error_mm", [-0.3, 0.0, 0.3])
+def test_root_is_found_to_twelve_digits(name, error_mm):
+    """Over ±20 mrad and ±0.3 mm of centre distance: T vanishes to 1e-12 of the pitch radius
+    wherever T crosses zero smoothly, and the two normals are parallel by construction."""
+    profile = PROFILES[name]
+    pair = FlankPair.of(profile, jnp.asarray(2 * R + error_mm * 1e-3))
+    x, relative = poses(4000, float(profile.half_pitch))
+    found = closest(pair, x, relative)
+    offset = np.abs(jax.vmap(pair._offset)(found.normal2, x, relative)) / R
+    touching = np.asarray(found.found)
+    assert np.mean(touching) > 0.6
+    assert np.quantile(offset[touching], 0.995) < 1e-12
+    # What T leaves at a kink inside the bracket costs the gap its square over curvature.
+    assert np.max(offset[touching]) < 1e-6
+
+
+gap_of = eqx.filter_jit(lambda pair, roll, relative: pair(roll, relative).gap)
+
+
+@pytest.mark.parametrize(
+    "name", ["paper", pytest.param("short", marks=pytest.mark.long), "epicycloid"]
+)
+@pytest.mark.parametrize("error_mm", [0.0, pytest.param(0.3, marks=pytest.mark.long)])
+def test_gap_is_that_of_nodes_far_out(graded_outline, name, error_mm):
+    """Against node search, which knows no flanks: ±20 mrad, wrong centre distance."""
+    profile, distance = PROFILES[name], 2 * R + error_mm * 1e-3
+    pair = FlankPair.of(profile, jnp.asarray(distance))
+    outline = graded_outline(profile, 6000)
+    rng = np.random.default_rng(1)
+    checked = 0
+    for _ in range(40):
+        mean, relative = rng.uniform(0, 2 * np.pi), rng.uniform(-0.02, 0.02)
+        drive = float(gap_of(pair, jnp.asarray(-mean), jnp.asarray(relative)))
+        coast = float(gap_of(pair, jnp.asarray(mean), jnp.asarray(-relative)))
+        flank = min(drive, coast)
+        # Lands pass at the centre distance's error; only what is deeper is a flank's.
+        if flank > -2e-5:
+            continue
+        phi1, phi2 = mean - relative / 2, mean + relative / 2
+        nodes = pair_gap(outline, 3, distance, phi1, phi2, reach=2e-3)
+        # Nodes, and the parabola through three of them, are poor where the epicycloid's
+        # radius of curvature vanishes; the search is the deeper one there.
+        resolution = 2e-4 * abs(nodes) if name == "epicycloid" else 0.0
+        assert flank == pytest.approx(nodes, rel=0, abs=max(2e-8, resolution))
+        checked += 1
+    assert checked > 5
+
+
+@eqx.filter_jit
+def both_searches(pair, roll, relative):
+    """Newton's method and the nodes at many poses: whether it is certain, and both results."""
+
+    def one(roll, relative):
+        attempts, best = pair._search(roll, relative)
+        return attempts == 1, best, pair._search(roll, relative, attempt=1)[1]
+
+    return jax.vmap(one)(roll, relative)
+
+
+@given(
+    lobes=st.integers(2, 4),
+    above=st.floats(0.1, 20.0),
+    share=st.floats(0.02, 1.0),
+    tip=st.floats(0.0, 0.4),
+    cycloid=st.booleans(),
+    seed=st.integers(0, 10**6),
+)
+def test_newton_finds_what_the_nodes_find(lobes, above, share, tip, cycloid, seed):
+    """Wherever Newton's method calls itself certain, it has the closest approach, and it never
+    calls a touching pair apart. (`above` the pressure angle, in degrees, at which the longest
+    involute undercuts: lobes cut into each other touch everywhere.)"""
+    half = np.pi / (2 * lobes)
+    angle = np.degrees(np.arctan(half)) + above
+    longest = R * np.sin(angle * DEG) * half * (1 - tip)
+    profile = EE(lobes, R) if cycloid else CIC(lobes, R, angle * DEG, share * longest, tip * half)
+    rng = np.random.default_rng(seed)
+    roll = jnp.asarray(rng.uniform(-half, half, 4000))
+    relative = jnp.asarray(-(10 ** rng.uniform(-7, np.log10(5e-3), 4000)))
+    found = both_searches(FlankPair.of(profile), roll, relative)
+    certain, best, of_nodes = jax.tree.map(np.asarray, found)
+    assert np.mean(certain) > 0.5
+    both = certain & best.found & of_nodes.found
+    assert np.max(np.abs(best.gap - of_nodes.gap), where=both, initial=0.0) < 1e-13
+    touching = of_nodes.found & (of_nodes.gap < 0)
+    assert not np.any(touching & certain & ~best.found)
+    assert not np.any(certain & best.found & ~of_nodes.found & (best.gap < 0))
+
+
+@pytest.mark.parametrize("name", ["paper", "short", "epicycloid"])
+def test_second_derivatives_are_those_of_the_gap(name):
+    """Hessian of the gap in pose and centre distance = differences of the first derivative."""
+    profile = PROFILES[name]
+
+    def gap(at):
+        return FlankPair.of(profile, at[2])(at[0], at[1]).gap
+
+    slope, bend = jax.jit(jax.grad(gap)), jax.jit(jax.hessian(gap))
+    for roll in (0.3, 0.4, 0.62, 0.8):
+        at = jnp.array([roll, -3e-4, 2 * R])
+        step = np.array([1e-6, 1e-6, 1e-9])
+        found = np.asarray(bend(at))
+        differences = np.stack(
+            [
+                (slope(at.at[i].add(h)) - slope(at.at[i].add(-h))) / (2 * h)
+                for i, h in enumerate(step)
+            ]
+        )
+        scale = np.array([R, R, 1.0])
+        size = np.max(np.abs(found * R / np.outer(scale, scale)))
+        np.testing.assert_allclose(
+            found * R / np.outer(scale, scale),
+            differences * R / np.outer(scale, scale),
+            atol=1e-5 * size,
+        )
+
+
+# The map
+
+
+@given(
+    angle=st.floats(26.0, 42.0),
+    share=st.floats(0.15, 0.95),
+    tip=st.floats(0.5, 5.0),
+    deepest=st.floats(-2e-3, -1e-4),
+)
+def test_map_keeps_its_stated_error(angle, share, tip, deepest):
+    """A map sized for an error has it, at poses that are none of the probed ones."""
+    longest = R * np.sin(angle * DEG) * (np.pi / 6 - tip * DEG)
+    profile = CIC(3, R, angle * DEG, share * longest, tip * DEG)
+    size = size_map(profile, deepest, 4e-7)
+    assert size.rolls in ROLLS
+    assert size.relatives in RELATIVES
+    assert size.enough == (size.error <= 4e-7)
+    rng = np.random.default_rng(2)
+    x = jnp.asarray(rng.uniform(0.0, float(profile.half_pitch), 3000))
+    relative = jnp.asarray(deepest * rng.uniform(0.0, 1.0, 3000))
+    table = tabulate(profile, jnp.asarray(deepest), size.rolls, size.relatives)
+    made = table_gap(table, x, relative)
+    true = closest(FlankPair.of(profile), x, relative)
+    # Cells next to the beginning of contact are not counted (see `size_map`).
+    inside = np.asarray(true.found) & (np.asarray(true.gap) < -0.05 * R * abs(deepest))
+    assert np.max(np.abs(made - true.gap), where=inside, initial=0.0) < 2 * max(size.error, 4e-7)
+
+
+tabulate = eqx.filter_jit(MapContact.of)
+table_gap = eqx.filter_jit(lambda table, x, e: jax.vmap(lambda a, b: table(a, b)[0])(x, e))
+
+
+def test_a_smaller_error_needs_no_smaller_map():
+    """Sizes grow as the error falls; what cannot be met is said."""
+    sizes = [size_map(PAPER, -4e-4, error) for error in (1e-6, 1e-7, 1e-8, 1e-9, 1e-13)]
+    assert all(a.rolls <= b.rolls for a, b in itertools.pairwise(sizes[:-1]))
+    assert sizes[0].enough
+    assert not sizes[-1].enough
+
+
+# Precision, batches
+
+
+@pytest.fixture(scope="module")
+def default():
+    """Evaluator and evaluation of the shipped scene."""
+    evaluator = Evaluator.of(load("configs/cic.yaml"))
+    return evaluator, evaluator(series=False)
+
+
+def test_single_precision(default):
+    """float32 reaches forces to 1e-4 and the gradient of the mean to 1 %, in float32.
+
+    With the map, which is tabulated in double precision: a gap searched for in single
+    precision is the difference of lengths ten thousand times as large.
+    """
+    overrides = ["solver.precision=float32", "solver.fidelity=map"]
+    evaluator = Evaluator.of(load("configs/cic.yaml", overrides))
+    single, double = evaluator(series=False), default[1]
+    pair = evaluator.scene.pair(design_vector(evaluator.config))
+    leaves = jax.tree.leaves(eqx.filter(pair, eqx.is_inexact_array))
+    assert {leaf.dtype for leaf in leaves} == {np.dtype("float32")}
+    assert single.status is Status.PERIODIC
+    for key, value in double.response.items():
+        assert single.response[key] == pytest.approx(value, rel=1e-4)
+    for key, value in double.gradient["mean_force_N"].items():
+        largest = max(map(abs, double.gradient["mean_force_N"].values()))
+        assert single.gradient["mean_force_N"][key] == pytest.approx(value, abs=0.01 * largest)
+
+
+DESIGNS = jnp.array([[36.43, 9.0, 4.0], [28.0, 3.0, 1.5], [30.0, 4.0, 2.0]])
+
+
+def test_batch_is_the_designs_one_by_one(default):
+    """Responses and gradients of a batch are those of its members; a hopeless one (given no
+    time to settle here) is marked, and spoils no other."""
+    evaluator, _ = default
+    designs = DESIGNS
+    given = evaluator.scene.solver
+    solver = coarse(evaluator.scene, given.transient, given.orbit)
+    batch = respond_many(evaluator.scene, designs, jnp.zeros((3, 2)), solver)
+    assert [Status.of(code) for code in batch.status] == [Status.PERIODIC] * 3
+    for row, design in enumerate(designs):
+        single = evaluator(design, series=False)
+        np.testing.assert_allclose(batch.response[row], list(single.response.values()), rtol=1e-5)
+        for line, values in zip(batch.gradient[row], single.gradient.values(), strict=True):
+            expected = np.array(list(values.values()))
+            np.testing.assert_allclose(line, expected, atol=0.01 * np.max(np.abs(expected)))
+    lost = dataclasses.replace(evaluator.scene, load_torque=jnp.asarray(3000.0))
+    failed = respond_many(lost, designs, jnp.zeros((3, 2)), solver)
+    assert not np.any(failed.usable)
+    assert np.all(np.isnan(failed.response))
+    apart = dataclasses.replace(evaluator.scene, clearance=jnp.asarray(3e-4))
+    idle = respond_many(apart, designs, jnp.zeros((3, 2)), solver)
+    assert [Status.of(code) for code in idle.status] == [Status.IDLE] * 3
+
+
+@pytest.mark.long
+def test_batch_at_a_coarse_tolerance(default):
+    """Kinks are looked for again where the orbit has moved away from the first look: else gradients
+    would be some 1e-2 off at this tolerance."""
+    evaluator, _ = default
+    scene = evaluator.scene
+
+    def batch(*rtols):
+        both = (dataclasses.replace(scene.solver.orbit, rtol=jnp.asarray(x)) for x in rtols)
+        return respond_many(scene, DESIGNS, jnp.zeros((3, 2)), coarse(scene, *both))
+
+    loose, fine = batch(1e-5, 1e-6), batch(1e-7, 1e-10)
+    np.testing.assert_allclose(loose.response, fine.response, rtol=1e-6)
+    largest = np.max(np.abs(fine.gradient), axis=2, keepdims=True)
+    assert np.max(np.abs(loose.gradient - fine.gradient) / largest) < 1e-3
+
+
+# The choice
+
+
+@pytest.mark.parametrize("wanted", [1e-2, 1e-4])
+def test_auto_meets_the_request(wanted):
+    """The chosen settings agree with search at 1e-10 within the request."""
+    overrides = [f"solver.accuracy={wanted}", "solver.fidelity=auto"]
+    config = load("configs/cic.yaml", overrides)
+    chosen = choice.choose(config)
+    record = chosen.record()
+    assert record["fidelity"] in ("linear", "map", "search")
+    assert record["estimated_error"] <= wanted
+    found = Evaluator.of(chosen.config)(series=False)
+    sharp = ["solver.fidelity=search", "solver.method=dopri8", "solver.rtol=1e-10"]
+    truth = Evaluator.of(load("configs/cic.yaml", sharp))(series=False)
+    error = choice.difference(found, truth)
+    assert error is not None
+    assert error <= wanted
+    assert error <= 2 * record["estimated_error"] + 1e-7
+
+
+def test_auto_must_be_resolved_before_use():
+    """A pair of a config with `auto` says what to call."""
+    config = load("configs/cic.yaml", ["solver.fidelity=auto"])
+    with pytest.raises(InputError, match=r"choice\.choose"):
+        Scene.from_config(config).pair(design_vector(config))
+
+
+@pytest.mark.parametrize("settles", [True, False])
+def test_auto_looks_more_closely_at_what_does_not_settle(monkeypatch, settles):
+    """A motion that the reference finds unsettled is taken at a hundredth of its tolerance
+    before it is given up."""
+    asked = []
+
+    @dataclasses.dataclass
+    class Stub:
+        config: object
+
+        @classmethod
+        def of(cls, config):
+            return cls(config)
+
+        def __call__(self, series):
+            asked.append(self.config.solver.rtol)
+            fine = settles and asked[-1] < 1e-8
+            found = outcome if fine else dataclasses.replace(outcome, status=Status.NOT_SETTLED)
+            return dataclasses.replace(found, statistics={"transient_mesh_periods": 4})
+
+    outcome = choice.Evaluation(
+        design={},
+        geometry={},
+        response={"mean_force_N": 1.0, "peak_force_N": 2.0},
+        gradient={},
+        steady_state={},
+        status=Status.PERIODIC,
+        message="",
+        statistics={},
+        series=None,
+    )
+    monkeypatch.setattr(choice, "Evaluator", Stub)
+    chosen = choice.choose(
+        load("configs/cic.yaml", ["solver.fidelity=auto", "solver.accuracy=1e-3"])
+    )
+    assert asked[:2] == pytest.approx([1e-7, 1e-9])
+    assert chosen.config.solver.rtol == pytest.approx(1e-9)
+    assert chosen.config.solver.fidelity == "search"
+    assert (chosen.error is None) == (not settles)

@@ -1,0 +1,449 @@
+"""At the limits of what a config may ask for: a right result or a named status."""
+
+import itertools
+import json
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from rootsopt.config import load
+from rootsopt.contact.impact import ImpactLaw, force_rounding
+from rootsopt.dynamics.flow import Flow, Integrator, first_step
+from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.orbit import Orbit
+from rootsopt.dynamics.pace import Pace
+from rootsopt.dynamics.parts import TimingGear
+from rootsopt.dynamics.peak import Steps, locate_peak
+from rootsopt.dynamics.steady import _Attempts
+from rootsopt.dynamics.verdict import is_consistent, is_idle, judged
+from rootsopt.errors import InputError
+from rootsopt.profiles import geometry
+from rootsopt.response.evaluation import Evaluator, _motion
+from rootsopt.scene import Scene, check_geometry, design_vector
+from rootsopt.status import Status
+
+
+def config_of(**changes):
+    """The shipped CIC scene with changed keys, `__` for a dot."""
+    return load("configs/cic.yaml", [f"{k.replace('__', '.')}={v}" for k, v in changes.items()])
+
+
+pair_of = eqx.filter_jit(Scene.pair)
+
+
+# The contact law at the ends of its ranges
+
+
+def extreme_laws():
+    """Parameters (n, 5; SI units) of laws at every combination of limits (N/mm^e, N s/mm, mm)."""
+    stiffness, exponents = (1e3, 1e6, 1e9), (1.0, 1.5, 2.0, 3.0, 5.0)
+    damping, depths, smoothing = (0.0, 1e-4, 10.0), (1e-5, 1e-2, 1.0), (0.0, 1e-6, 1e-4, 0.1)
+    rows = [
+        (k * 1e3**e, e, c * 1e3, d * 1e-3, h * 1e-3)
+        for k, e, c, d, h in itertools.product(stiffness, exponents, damping, depths, smoothing)
+    ]
+    return np.array(rows)
+
+
+DEPTHS = np.concatenate([[-1e-3, 0.0], np.geomspace(1e-36, 1e-2, 58)])
+RATES = np.concatenate([-np.geomspace(1e-9, 1e3, 9), [0.0], np.geomspace(1e-9, 1e3, 5)])
+
+
+@jax.jit
+def values_and_slopes(rows, depths, rates):
+    def force(row, depth, rate):
+        return ImpactLaw(*row)(depth, rate)
+
+    def at(*x):
+        value, (by_row, by_depth, by_rate) = jax.value_and_grad(force, (0, 1, 2))(*x)
+        return jnp.concatenate([jnp.stack([value, by_depth, by_rate]), by_row])
+
+    def one(row):
+        return jax.vmap(lambda d: jax.vmap(lambda r: at(row, d, r))(rates))(depths)
+
+    return jax.lax.map(one, rows)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_law_and_its_slopes_are_finite_at_every_limit(dtype):
+    """Force and its derivatives in depth, rate and parameters, from 1e-36 m to 10 mm of depth."""
+    rows = extreme_laws()
+    found = values_and_slopes(*(jnp.asarray(x, dtype) for x in (rows, DEPTHS, RATES)))
+    assert found.dtype == dtype
+    wrong = np.argwhere(~np.isfinite(found))
+    assert len(wrong) == 0, [(rows[i], DEPTHS[j], RATES[k], n) for i, j, k, n in wrong[:3]]
+    assert np.all(np.asarray(found[..., 0]) >= 0)
+
+
+def test_single_precision_force_is_that_of_the_law():
+    """Where the law is not rounded: K δ^e + C (3x² - 2x³) dδ/dt in double, to 1e-5 of itself."""
+    rows = extreme_laws()
+    depths, rates = np.geomspace(1e-8, 1e-3, 21), np.array([0.0, 1e-3, 10.0])
+    single = (jnp.asarray(x, jnp.float32) for x in (rows, depths, rates))
+    found = np.asarray(values_and_slopes(*single)[..., 0], float)
+    k, e, c, d, h = rows.T[:, :, None, None]
+    place, rate = depths[None, :, None], rates[None, None, :]
+    x = np.minimum(place / d, 1.0)
+    plain = k * place**e + c * (3 * x**2 - 2 * x**3) * rate
+    plain_enough = np.broadcast_to((place > h) & (plain > 1e-15), plain.shape)
+    assert plain_enough.mean() > 0.4
+    np.testing.assert_allclose(found[plain_enough], plain[plain_enough], rtol=1e-4)
+
+
+# Steps from the scene
+
+
+def pace(play=1e-3, torque=5.0, inertia=2e-3, exponent=1.0, stiffness=1e7):
+    """Pace of a pair of 33 mm pitch radius, a gear of 2e4 N m/rad, and its parts."""
+    law = ImpactLaw(*(jnp.asarray(x) for x in (stiffness, exponent, 0.0, 1e-5, 0.0)))
+    gear = TimingGear(*(jnp.asarray(x) for x in (2e4, 0.0, play / 2, 0.0)))
+    radius = 0.033
+    force = jnp.asarray(torque / radius)
+    return Pace.of(law, (gear,), jnp.asarray(inertia), force, jnp.asarray(radius), jnp.asarray(0.0))
+
+
+def test_pace_in_closed_form():
+    """A linear contact beside the gear is a spring, and the fall through the play s = a t²/2."""
+    found = pace()
+    spring = 1e7 * 0.033**2 + 2e4
+    assert float(found.swing) == pytest.approx(np.sqrt(2e-3 / spring), rel=1e-12)
+    assert float(found.fall) == pytest.approx(np.sqrt(2 * 1e-3 * 2e-3 / 5.0), rel=1e-12)
+
+
+def test_impact_after_a_fall_sets_the_pace():
+    """With e = 2 the work of the load on the play, K δ³/3, goes into a deeper and stiffer
+    contact; without play the static depth counts, and there is no flight."""
+    found, radius, torque = pace(play=5e-3, exponent=2.0, stiffness=1e12), 0.033, 5.0
+    depth = (3 * torque * 5e-3 / 1e12) ** (1 / 3)
+    assert depth > (torque / radius / 1e12) ** 0.5
+    spring = 2 * 1e12 * depth * radius**2 + 2e4
+    assert float(found.swing) == pytest.approx(np.sqrt(2e-3 / spring), rel=1e-12)
+    still = pace(play=0.0, exponent=2.0, stiffness=1e12)
+    spring = 2 * 1e12 * (torque / radius / 1e12) ** 0.5 * radius**2 + 2e4
+    assert float(still.swing) == pytest.approx(np.sqrt(2e-3 / spring), rel=1e-12)
+    assert np.isinf(float(still.fall))
+
+
+@pytest.mark.parametrize(("speed", "stiffness"), [(3000, 2e5), (1, 1e9), (60_000, 1e3)])
+def test_steps_follow_the_scene(speed, stiffness):
+    """The first step is short against a swing and the longest against a flight, but not so short
+    that steps as long as that use up those allowed."""
+    config = config_of(scene__speed_rpm=speed, contact__stiffness_N_per_mm_e=stiffness)
+    pair = pair_of(Scene.from_config(config), design_vector(config))
+    how = Integrator("tsit5", jnp.asarray(1e-8), 4096)
+    swing, fall = (float(t / pair.mesh_period) for t in (pair.pace.swing, pair.pace.fall))
+    first = float(first_step(pair, np.dtype(float)))
+    longest = float(how.controller(np.dtype(float), pair=pair).base.dtmax)
+    assert first == pytest.approx(min(1e-3, swing / 20))
+    assert longest == pytest.approx(min(1 / 32, max(fall / 8, 4 / 4096)))
+    if speed == 1:
+        assert first < 1e-7
+        assert longest == 4 / 4096
+
+
+# The peak
+
+
+def test_motion_inside_a_step_is_a_cubic():
+    """Between the ends of the steps, ε and its rate are those of any cubic motion."""
+    config = config_of(solver__fidelity="linear")
+    pair = pair_of(Scene.from_config(config), design_vector(config))
+    ends = np.array([0.1, 0.4, 0.45, np.inf])
+    begins = np.array([0.0, 0.1, 0.4, 0.45])
+
+    def cubic(t):
+        return np.stack([1 - 2 * t + 3 * t**2 - 5 * t**3, -2 + 6 * t - 15 * t**2], axis=-1)
+
+    with np.errstate(invalid="ignore"):
+        before, after = cubic(begins), cubic(ends)
+    steps = Steps(*map(jnp.asarray, (begins, ends, before, after, 3)))
+    for tau in (0.0, 0.03, 0.1, 0.25, 0.41, 0.45):
+        np.testing.assert_allclose(steps.motion(pair, jnp.asarray(tau)), cubic(tau), rtol=1e-12)
+
+
+@jax.jit
+def peak_of(pair, states, steps):
+    return locate_peak(pair, states, jnp.asarray(1.0), steps)
+
+
+def test_impact_between_the_samples_is_found():
+    """A dip into the flank a hundredth of a period long lies between two of 60 samples; the steps
+    of the solver are short there. The greatest force is where the dip is deepest."""
+    config = config_of(solver__fidelity="linear", contact__max_damping_N_s_per_mm=0)
+    pair = pair_of(Scene.from_config(config), design_vector(config))
+    middle, width = 0.7083, 1e-3
+
+    def motion(tau):
+        bump = -0.5 * np.exp(-(((tau - middle) / width) ** 2))
+        return np.stack([0.05 + bump, -2 * (tau - middle) / width**2 * bump], axis=-1)
+
+    samples = motion(np.arange(60) / 60)
+    assert samples[:, 0].min() > 0  # no sample is in contact with this flank
+    near = middle + width * np.linspace(-4, 4, 41)
+    edges = np.concatenate([np.linspace(0, 0.7, 11), near, np.linspace(0.72, 1, 11)])
+    begins, ends = edges[:-1], edges[1:]
+    steps = Steps(begins, ends, motion(begins), motion(ends), np.array(len(ends)))
+    steps = jax.tree.map(jnp.asarray, steps)
+    time, depth = peak_of(pair, jnp.asarray(samples), steps)
+    assert float(time) == pytest.approx(middle, abs=2e-5)
+    deepest = pair.contact_at(jnp.asarray(middle), jnp.asarray(motion(middle)))
+    assert float(deepest.drive) > 0
+    assert float(depth) == pytest.approx(float(deepest.depth), rel=1e-3)
+
+
+def test_the_greatest_sample_need_not_lie_by_the_greatest_peak():
+    """The deeper of two dips has its bottom half way between two samples, the other on one."""
+    config = config_of(solver__fidelity="linear", contact__max_damping_N_s_per_mm=0)
+    pair = pair_of(Scene.from_config(config), design_vector(config))
+    bottoms, depths, width = np.array([[20 / 60], [42.5 / 60]]), [[0.5], [0.501]], 0.02
+
+    def motion(tau):
+        bumps = depths * np.exp(-(((tau - bottoms) / width) ** 2))
+        rates = 2 * (tau - bottoms) / width**2 * bumps
+        return np.stack([0.05 - bumps.sum(axis=0), rates.sum(axis=0)], axis=-1)
+
+    samples = motion(np.arange(60) / 60)
+    assert np.argmin(samples[:, 0]) == 20
+    edges = np.linspace(0, 1, 8)
+    begins, ends = edges[:-1], edges[1:]
+    steps = Steps(begins, ends, motion(begins), motion(ends), np.array(len(ends)))
+    time, _ = peak_of(pair, jnp.asarray(samples), jax.tree.map(jnp.asarray, steps))
+    assert float(time) == pytest.approx(42.5 / 60, abs=1e-3)
+
+
+# What counts as a result
+
+
+def orbit_of(
+    multipliers=(0.5, 0.1), size=1.0, residual=0.0, peak=1.0, depth=1e-5, mean=1.0, strain=1.0
+):
+    """A closed orbit with a diagonal monodromy matrix and little else."""
+    none = Flow.empty(2, 0, 1, 1, Measures(), np.dtype(float))
+    numbers = {"mean": mean, "peak": peak, "depth": depth, "strain": strain}
+    flow = none._replace(**{k: jnp.asarray(v) for k, v in numbers.items()})
+    return Orbit(
+        state=jnp.array([size, 0.0]),
+        flow=flow,
+        residual=jnp.asarray(residual),
+        monodromy=jnp.diag(jnp.array(multipliers)),
+        multiplier=jnp.max(jnp.abs(jnp.array(multipliers))),
+        response=flow.response,
+        sensitivity=jnp.zeros((3, 0)),
+        moved=jnp.zeros((2, 0)),
+        newton_steps=jnp.zeros((), int),
+        drift=jnp.zeros(()),
+        defect=jnp.zeros(()),
+        disagreement=jnp.zeros(()),
+    )
+
+
+judgement = jax.jit(judged)
+
+
+def accepted(orbit, rtol=1e-8, moved=0.0, residual=1e-9):
+    state = orbit.state + moved
+    return bool(judgement(orbit, state, 1e-3, (1e-8, rtol), residual))
+
+
+def test_an_orbit_that_multiplies_errors_is_none():
+    """Errors of the tolerance grow by 1/(1 - multiplier): too near to 1 nothing is known."""
+    near = orbit_of((1 - 1e-5, 0.1))
+    assert accepted(near, 1e-8)
+    assert not accepted(near, 1e-3)
+    assert accepted(orbit_of(), 1e-3)
+    assert not accepted(orbit_of((1.01, 0.1)))
+
+
+def test_an_orbit_on_steps_no_solver_would_take_is_none():
+    """However well it is closed on them; nor one whose error is not a number."""
+    assert accepted(orbit_of(strain=50.0))
+    assert not accepted(orbit_of(strain=200.0))
+    assert not accepted(orbit_of(strain=np.nan))
+
+
+def test_distances_are_relative_to_large_states():
+    """A residual of 3e-8 is an open orbit of size 1 and a closed one of size 400."""
+    assert not accepted(orbit_of(residual=3e-8))
+    assert accepted(orbit_of(residual=3e-8, size=400.0))
+    assert accepted(orbit_of(), moved=1e-3)
+    assert not accepted(orbit_of(), moved=0.1)
+
+
+def test_rounding_of_the_gap():
+    """The gap is known to a rounding of the pitch radius, and the force is a power of it."""
+    radius, exponent = jnp.asarray(0.033), jnp.asarray(2.0)
+    eps = np.finfo(float).eps
+    found = float(force_rounding(jnp.asarray(1e-9), exponent, radius))
+    assert found == pytest.approx(2 * eps * 0.033 / 1e-9)
+    found = float(force_rounding(jnp.asarray(1e-7, np.float32), exponent, radius))
+    assert found == pytest.approx(2 * np.finfo(np.float32).eps * 0.033 / 1e-7, rel=1e-6)
+    assert float(force_rounding(jnp.asarray(-0.03), exponent, radius)) == 0
+
+
+def test_mean_rms_and_peak_must_not_contradict_each_other():
+    """mean ≤ RMS ≤ peak, but for 1 % and what is below the least force."""
+
+    def consistent(mean, square, peak, least=1e-3):
+        orbit = orbit_of(mean=mean, peak=peak)
+        numbers = jnp.array([mean, square, peak])
+        return bool(is_consistent(orbit._replace(response=numbers), jnp.asarray(least)))
+
+    assert consistent(3.0, 10.0, 4.0)
+    assert consistent(3.0, 9.0, 3.0)
+    assert not consistent(3.0, -1.0, 4.0)
+    assert not consistent(3.0, 10.0, 0.0)
+    assert not consistent(-3.0, 10.0, 4.0)
+    assert consistent(1e-4, -1e-8, 1e-4)
+
+
+def test_idle_is_without_force():
+    """No force at all, and free drift (a multiplier of 1, or none) or a steady orbit."""
+    nothing = {"mean": 0.0, "peak": 0.0}
+    assert bool(is_idle(orbit_of((1.0, 1.0), **nothing)))
+    assert bool(is_idle(orbit_of((np.nan, 1.0), **nothing)))
+    assert not bool(is_idle(orbit_of(**nothing)))
+    assert bool(is_idle(orbit_of(**nothing), 0.0, True))
+    assert not bool(is_idle(orbit_of(), 0.0, True))
+    rounding = {"mean": 1e-50, "peak": 1e-48}
+    assert bool(is_idle(orbit_of((1.0, 1.0), **rounding), 1e-18))
+    assert not bool(is_idle(orbit_of((1.0, 1.0))))
+
+
+# Whole scenes; one compiled program serves them all
+
+BOUNDARIES = {
+    # A million swings in a mesh period: as many steps as are allowed, and no more.
+    "slow and stiff": (
+        {"scene__speed_rpm": 1, "contact__stiffness_N_per_mm_e": 1e9},
+        Status.SOLVER_FAILED,
+    ),
+    "no load": ({"scene__load__torque_N_m": 0}, Status.IDLE),
+    "fast": ({"scene__speed_rpm": 60_000}, Status.PERIODIC),
+    "no play": ({"scene__timing_gear__backlash_mm": 0}, Status.PERIODIC),
+    "hardly any play": ({"scene__timing_gear__backlash_mm": 1e-3}, Status.PERIODIC),
+    "coarse": ({"solver__rtol": 1e-2, "solver__transient_rtol": 1e-2}, Status.PERIODIC),
+}
+
+
+@pytest.mark.parametrize("name", BOUNDARIES)
+def test_boundary_scenes_end_as_they_must(name):
+    """A finite result or a named status, in a bounded number of steps."""
+    changes, expected = BOUNDARIES[name]
+    evaluation = Evaluator.of(config_of(**changes))(series=False)
+    assert evaluation.status is expected
+    record = json.loads(json.dumps(evaluation.record(), allow_nan=False))
+    assert bool(record["gradient"]) == (expected is Status.PERIODIC)
+    assert evaluation.statistics["solver_steps"] <= 5 * 4096
+    if expected is Status.SOLVER_FAILED:
+        assert 1e5 < evaluation.statistics["swings_per_mesh_period"] < 1e7
+
+
+@pytest.mark.long
+def test_a_pair_with_a_motor_that_floats_is_idle():
+    """Newton's equations are singular then, and the state is kept."""
+    scene = {"scene__drive": "torque", "scene__motor": "{slope_N_m_s_per_rad: 0.1}"}
+    scene |= {"scene__timing_gear": "null", "scene__load__torque_N_m": 0}
+    contact = {"solver__fidelity": "linear", "contact__clearance_mm": 0.01}
+    evaluation = Evaluator.of(config_of(**scene, **contact))(series=False)
+    assert evaluation.status is Status.IDLE
+
+
+def test_a_force_lost_in_rounding_is_no_result(monkeypatch):
+    """Beyond the limit of `force_rounding` the numbers come with a status and no gradient."""
+
+    def stricter(pair, tangents, state, radius, solver):
+        found = _motion(pair, tangents, state, radius, solver)
+        return _Attempts(pair, tangents, solver, radius).final(found)
+
+    # The program has the usual limit; what it finds is judged by another one.
+    monkeypatch.setattr("rootsopt.dynamics.steady.UNRESOLVED", 1e-14)
+    monkeypatch.setattr("rootsopt.response.evaluation._motion", stricter)
+    evaluation = Evaluator.of(config_of())(series=False)
+    assert evaluation.status is Status.UNRESOLVED
+    assert not evaluation.usable
+    assert evaluation.gradient == {}
+    assert 1e-14 < evaluation.statistics["force_rounding"] < 1e-11
+
+
+def test_motion_of_many_swings_agrees_with_scipy():
+    """A stiff pair at low speed, hundreds of swings in a mesh period: SciPy comes back to the
+    orbit's state, and finds the same mean and peak force."""
+    changes = {
+        "contact__stiffness_N_per_mm_e": 4.29e7,
+        "contact__max_damping_N_s_per_mm": 0.00424,
+        "contact__full_damping_depth_mm": 1.53e-5,
+        "contact__smoothing_mm": 0.00178,
+        "contact__exponent": 1.45,
+        "scene__speed_rpm": 1000,
+        "scene__load__torque_N_m": 3.31,
+        "scene__timing_gear__backlash_mm": 0,
+        "scene__timing_gear__stiffness_N_m_per_rad": 3.12e4,
+        "rotor__length_mm": 201,
+        "profile__pressure_angle_deg": 42.1,
+        "profile__involute_length_mm": 0.502,
+        "profile__tip_arc_angle_deg": 20.9,
+    }
+    config = config_of(**changes)
+    evaluation = Evaluator.of(config)(series=False)
+    assert evaluation.status is Status.PERIODIC
+    pair = pair_of(Scene.from_config(config), design_vector(config))
+
+    @jax.jit
+    def rates(tau, state):
+        slope, contact = pair.derivative(tau, state)
+        return jnp.append(slope, contact.total)
+
+    start = np.append(evaluation.state, 0.0)
+    scales = np.array([1e-9, 1e-9, 1e-7])
+    done = solve_ivp(
+        lambda tau, y: np.asarray(rates(tau, y[:2])),
+        (0, 1), start, "DOP853", rtol=1e-9, atol=scales, max_step=1 / 32,
+    )  # fmt: skip
+    np.testing.assert_allclose(done.y[:2, -1], evaluation.state, rtol=1e-5, atol=1e-5)
+    mean, peak = (evaluation.response[f"{name}_force_N"] for name in ("mean", "peak"))
+    assert done.y[2, -1] == pytest.approx(mean, rel=1e-5)
+    # At the ends of its steps the force is near its greatest value, but never above it.
+    forces = jax.vmap(rates)(jnp.asarray(done.t), jnp.asarray(done.y[:2].T))[:, 2]
+    assert 0.98 * peak < np.max(forces) < peak * (1 + 1e-5)
+
+
+# Profiles on their limits
+
+
+@jax.jit
+def shape_of(model, design):
+    return geometry(model.profile(design))
+
+
+def refused(config):
+    """Why the profile of a config is refused, or nothing."""
+    try:
+        check_geometry(config)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def test_a_tip_arc_that_misses_the_pitch_circle_is_refused():
+    """With a small pressure angle the involute must be long enough; the message says how long."""
+    keys = {"profile__pressure_angle_deg": 12, "profile__tip_arc_angle_deg": 4}
+    short = config_of(**keys, profile__involute_length_mm=0.2)
+    assert "`profile.involute_length_mm` must be at least 0.2395" in refused(short)
+    assert not refused(config_of(**keys, profile__involute_length_mm=0.24))
+
+
+@pytest.mark.parametrize("angle", [1.0, 10.0, 20.0, 45.0, 89.0])
+@pytest.mark.parametrize("tip", [0.0, 15.0, 29.9])
+def test_profiles_on_their_limits_are_finite_or_refused(angle, tip):
+    """The shortest and the longest involute that are not refused have a finite geometry."""
+    keys = {"profile__pressure_angle_deg": angle, "profile__tip_arc_angle_deg": tip}
+    lengths = np.geomspace(1e-6, 60, 40)
+    configs = [config_of(**keys, profile__involute_length_mm=length) for length in lengths]
+    allowed = [config for config in configs if not refused(config)]
+    for config in allowed[:1] + allowed[-1:]:
+        shape = shape_of(Scene.from_config(config), design_vector(config))
+        assert all(np.isfinite(value) for value in jax.tree.leaves(shape))

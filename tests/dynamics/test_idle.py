@@ -1,0 +1,256 @@
+"""Scenes and designs whose flanks never touch: `idle`, forces of zero, and advice."""
+
+import dataclasses
+import json
+import math
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt.commands import optimize
+from rootsopt.config import load
+from rootsopt.dynamics.steady import window_status
+from rootsopt.dynamics.window import Window
+from rootsopt.errors import InputError
+from rootsopt.optimize.problem import Problem
+from rootsopt.profiles import geometry
+from rootsopt.response.attractors import Attractor, AttractorEvaluator, Basins, _averaged
+from rootsopt.response.evaluation import Evaluation, Evaluator, idle_hint, unsettled
+from rootsopt.response.speeds import Part, SpeedsEvaluation, overall
+from rootsopt.scene import Scene, design_vector
+from rootsopt.status import Status
+
+CIC = "configs/cic.yaml"
+FORCES = {"mean_force_N": 50.0, "peak_force_N": 200.0, "rms_force_N": 80.0}
+NONE = dict.fromkeys(FORCES, 0.0)
+
+
+def config_of(*overrides):
+    return load(CIC, overrides)
+
+
+def made_up(response, status=Status.PERIODIC, state=(0.1, 0.0)) -> Evaluation:
+    """An evaluation of the shipped design with made-up forces."""
+    config = config_of()
+    design = {"pressure_angle_deg": 36.43, "involute_length_mm": 9.0, "tip_arc_angle_deg": 4.0}
+    shape = geometry(Scene.from_config(config).profile(jnp.asarray(list(design.values()))))
+    slopes = {name: dict.fromkeys(design, 1.0) for name in response}
+    return Evaluation(
+        design=design,
+        geometry={"area_efficiency": float(shape.area_efficiency)},
+        response=dict(response),
+        gradient=slopes if status.usable else {},
+        steady_state={"kind": "periodic", "period": 1, "floquet_multiplier": 0.5},
+        status=status,
+        message=status.value,
+        statistics={"seconds": 0.0},
+        series=None,
+        state=None if state is None else np.array(state),
+    )
+
+
+def problem_of(config, baseline):
+    return Problem.of(config, Scene.from_config(config), baseline)
+
+
+# Whole scenes; the program is that of the shipped one
+
+
+@pytest.fixture(scope="module")
+def held():
+    """A pair that its timing gear holds apart."""
+    return Evaluator.of(config_of("contact.clearance_mm=0.3"))()
+
+
+def test_a_pair_held_by_its_gear_is_idle(held):
+    """The orbit is known and stable, the forces are exactly zero, and there is no gradient."""
+    assert held.status is Status.IDLE
+    assert held.steady_state["kind"] == "idle"
+    assert held.steady_state["floquet_multiplier"] < 0.1
+    assert (held.response, held.gradient) == (NONE, {})
+    assert np.all(held.series.force == 0)
+    assert np.max(held.series.depth) < 0
+    json.dumps(held.record(), allow_nan=False)
+
+
+def test_advice_names_the_clearance_at_which_flanks_touch(held):
+    """Just above it the pair is idle, just below it there is a force."""
+    touching = float(re.search(r"clearance_mm below ([0-9.]+)\.", held.message)[1])
+    above = Evaluator.of(config_of(f"contact.clearance_mm={touching + 2e-4}"))(series=False)
+    below = Evaluator.of(config_of(f"contact.clearance_mm={touching - 2e-4}"))(series=False)
+    assert (above.status, below.status) == (Status.IDLE, Status.PERIODIC)
+    assert 0 < below.response["mean_force_N"] < 5
+
+
+def test_optimize_says_why_there_is_nothing_to_optimise(tmp_path, capsys):
+    """Exit 3, with the baseline's status and what to change."""
+    arguments = [CIC, "-o", str(tmp_path / "out"), "--set", "contact.clearance_mm=0.3"]
+    assert optimize.main([*arguments, "--no-figures"]) == 3
+    said = " ".join(capsys.readouterr().out.split())
+    assert "idle: baseline: No flank touches" in said
+    assert "contact.clearance_mm below 0.0" in said
+
+
+# Verdict and advice
+
+
+def window(peak, exponent):
+    """A window of 16 mesh periods with these peaks (N) and this exponent, known to some 0.01."""
+    growth = exponent + 0.04 * (-1.0) ** np.arange(16) * np.arange(16) / 16
+    empty = Window.empty(jnp.zeros(2), 16)
+    return empty._replace(
+        growth=jnp.asarray(growth - np.mean(growth) + exponent),
+        response=jnp.asarray(np.column_stack([peak, peak**2, peak])),
+        depth=jnp.asarray(-1.0),
+        done=jnp.asarray(16),
+    )
+
+
+@pytest.mark.parametrize("exponent", [0.5, 0.0])
+def test_a_motion_without_contact_that_does_not_repeat_is_idle(exponent):
+    """Whether the gear's play makes it chaotic or not."""
+    evaluator = Evaluator.of(config_of())
+    pair = evaluator.pair(design_vector(evaluator.config))
+    still = window(np.zeros(16), exponent)
+    assert 1e-3 < float(still.error) < 0.05
+    status = Status.of(int(window_status(pair, still)))
+    steady, response, _ = unsettled(pair, status, jax.device_get(still), False)
+    assert (status, steady["kind"], response) == (Status.IDLE, "idle", NONE)
+    touching = window(np.eye(16)[2], exponent)
+    status = Status.of(int(window_status(pair, touching)))
+    assert status is (Status.CHAOTIC if exponent else Status.NOT_SETTLED)
+    steady, response, _ = unsettled(pair, status, jax.device_get(touching), False)
+    assert steady["kind"] == ("chaotic" if exponent else "transient")
+    assert response["peak_force_N"] == 1
+
+
+def test_advice_depends_on_what_holds_the_flanks_apart():
+    """Clearance where that is the cause, else the gear's backlash, else nothing to name."""
+    wide, tight = config_of("contact.clearance_mm=0.3"), config_of("contact.clearance_mm=0.01")
+    assert idle_hint(wide, -0.1e-3).endswith("contact.clearance_mm below 0.2.")
+    assert idle_hint(tight, -0.1e-3).endswith("scene.timing_gear.backlash_mm above 0.3.")
+    free = config_of("scene.timing_gear=null", "contact.clearance_mm=0.01")
+    assert idle_hint(free, -0.1e-3).endswith("0.1 mm.")
+    # Nothing was found where the gap is a pitch radius.
+    assert idle_hint(wide, -0.033) == idle_hint(wide, math.nan) == ""
+
+
+# Objectives
+
+
+def test_a_design_that_never_touches_has_no_objective():
+    """Else it would be the perfect optimum of a force that is not there."""
+    problem = problem_of(config_of(), made_up(FORCES))
+    assert problem.objective(made_up(FORCES)) == pytest.approx(1)
+    assert np.isnan(problem.objective(made_up(NONE, Status.IDLE)))
+
+
+LINE = "line_1_force_N"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "response", "words"),
+    [
+        ((), NONE, "mean_force_N is 0"),
+        (("objective.mean_weight=0",), FORCES | {"peak_force_N": 0.0}, "peak_force_N is 0"),
+        (("objective.rms_weight=1",), FORCES | {"rms_force_N": 0.0}, "rms_force_N is 0"),
+        (("objective.line_weights={1: 1}",), FORCES | {LINE: 0.0}, "has no such line"),
+        (
+            ("objective.peak_norm=8",),
+            FORCES | {"peak_norm_force_N": 0.0},
+            "peak_norm_force_N is 0",
+        ),
+    ],
+)
+def test_nothing_is_relative_to_a_force_of_zero(overrides, response, words):
+    """One message for every measure with a weight; measures without one do not count."""
+    config = config_of(*overrides)
+    with pytest.raises(InputError, match=words):
+        problem_of(config, made_up(response))
+
+
+def test_measures_without_weight_may_be_zero():
+    config = config_of("objective.mean_weight=1", "objective.peak_weight=0")
+    problem = problem_of(config, made_up(FORCES | {"peak_force_N": 0.0, LINE: 0.0}))
+    assert problem.objective(made_up(FORCES)) == 1
+
+
+def test_forces_of_any_size_have_a_finite_objective():
+    """Down to the least number, whose inverse overflows."""
+    tiny = {name: 1e-300 * value for name, value in FORCES.items()}
+    problem = problem_of(config_of(), made_up(tiny))
+    assert problem.objective(made_up(tiny)) == pytest.approx(1)
+
+
+# Several speeds
+
+
+def several(*responses, shares=(0.0, 1.0)):
+    """An evaluation at two speeds, idle where the response is zero."""
+    parts = tuple(
+        Part(1000.0 * k, share, made_up(r, Status.PERIODIC if any(r.values()) else Status.IDLE))
+        for k, (share, r) in enumerate(zip(shares, responses, strict=True), 1)
+    )
+    status, message = overall(parts)
+    head = {f.name: getattr(parts[0].evaluation, f.name) for f in dataclasses.fields(Evaluation)}
+    return SpeedsEvaluation(**head | {"status": status, "message": message}, parts=parts)
+
+
+def test_one_idle_speed_is_named():
+    """A speed without contact is not usable, whatever its share; the message says which."""
+    found = several(FORCES, NONE)
+    assert found.status is Status.IDLE
+    assert found.message.startswith("At 2000 rpm: No flank touches")
+    config = config_of("objective.speeds_rpm=[1000, 2000]")
+    problem = problem_of(config, several(FORCES, FORCES, shares=(0.5, 0.5)))
+    assert np.isnan(problem.objective(found))
+
+
+def test_a_speed_without_share_has_nothing_to_be_relative_to():
+    """A line that is 0 at a speed that does not count is no hindrance, and has no objective."""
+    config = config_of("objective.speeds_rpm=[2000]", "objective.line_weights={1: 1}")
+    with_line, without = FORCES | {LINE: 3.0}, FORCES | {LINE: 0.0}
+    baseline = several(without, with_line)
+    problem = problem_of(config, baseline)
+    assert problem.objective(baseline) == pytest.approx(1)
+    alone, counting = problem.by_speed(baseline)
+    assert np.isnan(alone["objective"])
+    assert counting["objective"] == pytest.approx(1)
+    with pytest.raises(InputError, match="no such line at 2000 rpm"):
+        problem_of(config, several(with_line, without))
+
+
+# Motions that coexist
+
+
+def basins_of(*evaluations, lost=None):
+    share = 1 / len(evaluations)
+    motions = tuple(
+        Attractor(e, share, k == 0, np.zeros((1, 2))) for k, e in enumerate(evaluations)
+    )
+    axis, none = np.zeros(1), np.zeros((1, 1), int)
+    return Basins(axis, axis, none, motions, evaluations[0], lost or {}, 1.0, 1.0)
+
+
+def test_a_motion_without_contact_beside_others_counts_as_zero(monkeypatch):
+    """Held by the gear it is a motion like others; a pair that floats is none."""
+    noisy, quiet = made_up(FORCES), made_up(NONE, Status.IDLE)
+    floating = made_up(NONE, Status.IDLE, state=None)
+    assert basins_of(noisy, quiet).status is Status.PERIODIC
+    assert basins_of(quiet).status is Status.IDLE
+    assert basins_of(noisy, floating).status is Status.IDLE
+    averaged = _averaged(noisy, list(basins_of(noisy, quiet).attractors))
+    assert averaged.response == pytest.approx({k: v / 2 for k, v in FORCES.items()})
+    assert averaged.gradient["mean_force_N"]["tip_arc_angle_deg"] == 0.5
+    monkeypatch.setattr(
+        "rootsopt.response.attractors.find_fitted",
+        lambda single, *rest: (single, basins_of(quiet, noisy)),
+    )
+    for motion, share in (("worst", 1.0), ("weighted", 0.5)):
+        found = AttractorEvaluator(Evaluator.of(config_of(f"objective.motion={motion}")))()
+        assert found.status is Status.PERIODIC
+        assert found.response["peak_force_N"] == pytest.approx(share * 200)
+        assert found.state.shape == (2, 2)

@@ -1,0 +1,284 @@
+"""Steps that end where free flight may, and derivatives that are checked before they are told."""
+
+import dataclasses
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt.config import load
+from rootsopt.dynamics.flow import Flow, Integrator
+from rootsopt.dynamics.landing import LandingControl
+from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.orbit import Orbit, agreement, disagreement
+from rootsopt.dynamics.switches import halved, has_room
+from rootsopt.dynamics.verdict import is_certain
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.scene import Scene, design_vector
+from rootsopt.status import Status
+
+LIVELY = (
+    "scene.speed_rpm=1700",
+    "scene.load.torque_N_m=3",
+    "scene.timing_gear.backlash_mm=0.25",
+    "scene.timing_gear.damping_ratio=0.3",
+    "scene.timing_gear.stiffness_N_m_per_rad=9000",
+    "profile.pressure_angle_deg=30.7",
+    "profile.involute_length_mm=4",
+    "profile.tip_arc_angle_deg=1.5",
+)
+"""A stable orbit of two mesh periods with touches of 1/64 mesh period: steps in free flight are
+twice as long, and some passed over one."""
+
+
+@pytest.fixture(scope="module")
+def lively():
+    """The lively scene at three tolerances."""
+    evaluator = Evaluator.of(load("configs/cic.yaml", LIVELY), survey=True)
+    return {rtol: evaluator.at_tolerance(rtol)(series=False) for rtol in (1e-8, 1e-9, 1e-10)}
+
+
+def test_a_tighter_tolerance_does_no_worse(lively):
+    """Steps that passed over a touch left d mean / d tip arc angle 1 % off at 1e-9, and no orbit
+    at 1e-10."""
+    for evaluation in lively.values():
+        assert evaluation.status.label == "periodic"
+        assert evaluation.steady_state["period"] == 2
+        assert evaluation.statistics["transient_mesh_periods"] < 64
+        truth = lively[1e-10].gradient["mean_force_N"]["tip_arc_angle_deg"]
+        slope = evaluation.gradient["mean_force_N"]["tip_arc_angle_deg"]
+        assert slope == pytest.approx(truth, rel=1e-5)
+
+
+def test_the_check_is_about_the_error_of_the_gradient(lively):
+    best = lively[1e-10]
+    for rtol in (1e-8, 1e-9):
+        said = lively[rtol].statistics["gradient_disagreement"]
+        for name in ("mean_force_N", "peak_force_N"):
+            here, truth = (
+                np.array(list(one.gradient[name].values())) for one in (lively[rtol], best)
+            )
+            error = np.max(np.abs(here - truth)) / np.max(np.abs(truth))
+            assert error < 5 * said + 1e-7
+        assert said < 10 * rtol**0.75
+
+
+def control(**over) -> LandingControl:
+    given = {"clearance_mm": 0.0} | over
+    config = load(
+        "configs/cic.yaml",
+        [
+            f"contact.clearance_mm={given['clearance_mm']}",
+            "scene.timing_gear.backlash_mm=0.2",
+            *over.get("more", ()),
+        ],
+    )
+    pair = Scene.from_config(config).pair(design_vector(config))
+    how = Integrator("tsit5", jnp.asarray(1e-8), 4096)
+    found = how.controller(jnp.dtype("float64"), 1.0, pair)
+    assert isinstance(found, LandingControl)
+    return found
+
+
+def test_edges_are_those_of_clearance_and_backlash():
+    config = load("configs/cic.yaml", ["scene.timing_gear.backlash_mm=0.2"])
+    pair = Scene.from_config(config).pair(design_vector(config))
+    edges = np.sort(np.asarray(control().edges)) * float(pair.angle_scale)
+    half = 0.1 / 33
+    assert edges == pytest.approx([-half, 0, 0, half], abs=1e-15)
+    assert np.isinf(control().inside)
+    with_gap = control(clearance_mm=0.03)
+    edges = np.sort(np.asarray(with_gap.edges)) * float(pair.angle_scale)
+    assert edges == pytest.approx([-half, -0.03 / 33, 0.03 / 33, half])
+    assert float(with_gap.inside * pair.angle_scale) == pytest.approx(0.03 / 33)
+    # Displaced axes may bring the flanks together anywhere.
+    assert float(control(more=["scene.center_distance_error_mm=0.01"]).inside) == 0
+
+
+def adapted(landing, before, after, step):
+    """Whether a step of these states without an error is kept, and where the next one ends."""
+    before, after = jnp.asarray(before), jnp.asarray(after)
+    begin = jnp.asarray(0.2)
+    args = begin, begin + step, before, after, None, jnp.zeros(2), 5.0
+    state = jnp.asarray(1.0), jnp.asarray(1.0), jnp.asarray(False)
+    keep, start, stop, *_ = landing.adapt_step_size(*args, state)
+    return bool(keep), float(start - begin), float(stop - begin)
+
+
+def parabola(place, rate, bend, time):
+    return [place + rate * time + bend / 2 * time**2, rate + bend * time]
+
+
+@pytest.mark.parametrize("bend", [-30.0, 0.0, 40.0])
+@pytest.mark.parametrize("place", [0.3, -0.2])
+def test_the_next_step_ends_just_beyond_the_edge(place, bend):
+    """ε = 0 is an edge; steps of 1/32 mesh period would pass it by far."""
+    landing, step = control(), 0.004
+    rate = -12.0 * np.sign(place)
+    before = parabola(place, rate, bend, 0.0)
+    after = parabola(place, rate, bend, step)
+    roots = np.roots([bend / 2, rate, place]) if bend else np.array([-place / rate])
+    meets = min(float(r.real) for r in roots if abs(r.imag) < 1e-12 and r.real > 0)
+    keep, start, stop = adapted(landing, before, after, step)
+    assert keep
+    assert start == pytest.approx(step)
+    assert stop == pytest.approx(min(meets + 1e-4, step + 1 / 32), rel=1e-9)
+
+
+def test_a_step_that_passed_an_edge_far_is_taken_again():
+    keep, start, stop = adapted(control(), [0.05, -10.0], [-0.2, -10.0], 0.025)
+    assert not keep
+    assert start == 0
+    assert stop == pytest.approx(0.005 + 1e-4)
+    # Not one that passed it as it was meant to; the next begins short.
+    keep, start, stop = adapted(control(), [0.05, -10.0], [-0.001, -10.0], 0.0051)
+    assert keep
+    assert start == pytest.approx(0.0051)
+    assert stop - start == pytest.approx(5e-4)
+
+
+def test_a_step_ends_at_a_turn_beside_an_edge():
+    """A parabola that turns 0.01 before the edge may reach it all the same."""
+    landing, step = control(), 0.002
+    bend = 100.0
+    turn = 0.02
+    place, rate = 0.01 + bend / 2 * turn**2, -bend * turn
+    before, after = (parabola(place, rate, bend, t) for t in (0.0, step))
+    keep, _, stop = adapted(landing, before, after, step)
+    assert keep
+    assert stop == pytest.approx(turn)
+    # Far from every edge nothing is in the way.
+    far = [0.3 + place, rate]
+    _, _, stop = adapted(landing, far, parabola(*far, bend, step), step)
+    assert stop > turn
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-8, 1e-11])
+def test_a_touch_between_two_stages_is_met(rtol):
+    """Free fall on to a stiff floor at ε = 0, from a height at which steps are long."""
+    landing = control()
+    control_of = dataclasses.replace(
+        landing, base=diffrax.PIDController(rtol=rtol, atol=rtol, dtmax=1.0)
+    )
+
+    def field(t, y, args):
+        push = jnp.where(y[0] < 0, 4e6 * y[0] ** 2, 0.0)
+        return jnp.stack([y[1], -1.0 + push])
+
+    @eqx.filter_jit
+    def end(control):
+        found = diffrax.diffeqsolve(
+            diffrax.ODETerm(field),
+            diffrax.Tsit5(),
+            t0=0.0,
+            t1=3.0,
+            dt0=1e-3,
+            y0=jnp.asarray([0.5, 0.0]),
+            stepsize_controller=control,
+            throw=False,
+        )
+        return found.ys[0]
+
+    # The floor gives back what it takes, and is left by t = 2.
+    state = np.asarray(end(control_of))
+    energy = state[0] + state[1] ** 2 / 2
+    assert energy == pytest.approx(0.5, abs=max(300 * rtol, 1e-9))
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6])
+def test_an_orbit_that_a_loose_tolerance_does_not_close_is_integrated_more_finely(lively, rtol):
+    """It is the orbit of the usual tolerance, and the statistics say at which it was found."""
+    evaluator = Evaluator.of(load("configs/cic.yaml", [*LIVELY, f"solver.rtol={rtol}"]))
+    found = evaluator(series=False)
+    assert found.status is Status.PERIODIC
+    assert found.statistics["orbit_rtol"] == pytest.approx(1e-8)
+    usual = lively[1e-8]
+    for name, value in usual.response.items():
+        assert found.response[name] == pytest.approx(value, rel=1e-6)
+
+
+def test_two_changes_at_one_instant():
+    """The seal and the contact pass the same joint of the flank 1e-9 mesh periods apart: each was
+    at the end of a step of no length, and the gradient 6e-4 off at any tolerance."""
+    scene = [
+        "scene.speed_rpm=3831.1",
+        "scene.timing_gear.backlash_mm=0.276",
+        "scene.timing_gear.damping_ratio=0.06",
+        "scene.timing_gear.stiffness_N_m_per_rad=44582",
+        "scene.load={pressure_difference_Pa: 2.0e4}",
+        "profile.pressure_angle_deg=35.23",
+        "profile.involute_length_mm=5.77",
+        "profile.tip_arc_angle_deg=1.68",
+    ]
+    evaluator = Evaluator.of(load("configs/cic.yaml", scene), survey=True)
+    design, step, way = np.array([35.23, 5.77, 1.68]), 5e-5, np.array([1.0, -0.7, 0.8])
+    found = evaluator(series=False)
+    assert found.status is Status.PERIODIC
+    assert found.statistics["gradient_disagreement"] < 1e-4
+    ends = [
+        evaluator(jnp.asarray(design + sign * step * way), start=found.state, series=False)
+        for sign in (1, -1)
+    ]
+    slope = np.subtract(*(one.response["mean_force_N"] for one in ends)) / (2 * step)
+    row = np.array(list(found.gradient["mean_force_N"].values()))
+    assert row @ way == pytest.approx(slope, abs=1e-4 * np.max(np.abs(row)))
+
+
+def test_a_check_without_room_is_none():
+    """Where a grid cannot hold all its steps halved, nothing is compared."""
+    grid = jnp.asarray([0.1, 0.1 + 2e-6, 0.5, jnp.inf, jnp.inf])
+    assert bool(has_room(grid))
+    assert not bool(has_room(grid[:4]))
+
+
+def test_halved_steps():
+    grid = jnp.asarray([0.1, 0.4, 0.5, jnp.inf, jnp.inf, jnp.inf, jnp.inf])
+    assert np.asarray(halved(grid))[:6] == pytest.approx([0.05, 0.1, 0.25, 0.4, 0.45, 0.5])
+    # Without room for all the longest are halved.
+    assert np.asarray(halved(grid[:4])) == pytest.approx([0.1, 0.25, 0.4, 0.5])
+    # A step about a change is not divided there.
+    about = jnp.asarray([0.1, 0.1 + 2e-6, 0.3, jnp.inf, jnp.inf])
+    assert np.asarray(halved(about)) == pytest.approx([0.05, 0.1, 0.1 + 2e-6, 0.2, 0.3], abs=1e-5)
+
+
+def test_disagreement_is_that_of_the_orbits_derivatives():
+    """Against the implicit function theorem written out with NumPy."""
+    draw = np.random.default_rng(0)
+    count, designs = 2, 3
+    first = draw.normal(size=(count + 3, count + designs))
+    first[:count, :count] *= 0.3
+    second = first + 1e-4 * draw.normal(size=first.shape)
+
+    def derivatives(slope):
+        inverse = np.linalg.inv(np.eye(count) - slope[:count, :count])
+        moved = inverse @ slope[:count, count:]
+        forces = slope[count : count + 2]
+        return [inverse, moved, *(forces[:, count:] + forces[:, :count] @ moved)]
+
+    both = zip(derivatives(first), derivatives(second), strict=True)
+    truth = max(np.max(np.abs(a - b)) / np.max(np.abs(a)) for a, b in both)
+    found = disagreement(jnp.asarray(first), jnp.asarray(second), count)
+    assert float(found) == pytest.approx(truth)
+    assert float(disagreement(jnp.asarray(first), jnp.asarray(first), count)) == 0
+    # A pair without design parameters is compared by its monodromy matrix.
+    bare = [jnp.asarray(x[:, :count]) for x in (first, second)]
+    assert 0 < float(disagreement(*bare, count)) <= truth
+
+
+def test_what_is_not_certain_has_no_derivatives():
+    flow = Flow.empty(2, 3, 8, 16, Measures(), jnp.float64)
+    orbit = Orbit.empty(jnp.zeros(2), 3, flow)
+    rtol = jnp.asarray(1e-8)
+    assert is_certain(orbit, rtol)
+    for wrong in (
+        {"disagreement": 1.1 * agreement(rtol)},
+        {"disagreement": jnp.asarray(jnp.nan)},
+        {"defect": jnp.asarray(1.1e-5)},
+        {"drift": jnp.asarray(1.1e-5)},
+    ):
+        assert not is_certain(orbit._replace(**wrong), rtol), wrong
+    # Where the monodromy matrix multiplies errors, they may be as much greater.
+    lively = orbit._replace(defect=jnp.asarray(1.1e-5), monodromy=2 * jnp.eye(2))
+    assert is_certain(lively, rtol)

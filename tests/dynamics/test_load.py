@@ -1,0 +1,84 @@
+"""The loads: gas torque against geometry and displaced volume."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt.config import load
+from rootsopt.scene import Scene, design_vector, outline_mm
+from tests.scene.test_scene import pair_of
+
+GAS = ["scene.load={pressure_difference_Pa: 4e4}"]
+LENGTH = 0.1
+
+
+@pytest.mark.parametrize(
+    ("family", "overrides"),
+    [("cic", ["profile.involute_length_mm=7"]), ("ee", []), ("ee", ["profile.lobes=2"])],
+)
+def test_the_mean_gas_torque_is_the_displaced_volume(family, overrides):
+    """Over a revolution both rotors together take Δp times the displaced volume over 2π: twice
+    the housing's bore less the rotor, from the outline's polygon."""
+    pair, config = pair_of([*GAS, *overrides], family)
+    phi = np.linspace(0, 2 * np.pi, 60001)[:-1] + 1e-6
+    both = [np.asarray(jax.jit(jax.vmap(f))(phi)) for f in (pair.load.torque1, pair.load.torque2)]
+    x, y = 1e-3 * outline_mm(config).T
+    area = abs(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) / 2
+    volume = 2 * (np.pi * np.max(np.hypot(x, y)) ** 2 - area) * LENGTH
+    expected = 4e4 * volume / (2 * np.pi)
+    # A polygon of some hundred corners a lobe has its area to 1e-5.
+    assert np.mean(both[0] + both[1]) == pytest.approx(expected, rel=3e-5)
+    means = [np.mean(torque) for torque in both]
+    np.testing.assert_allclose(means, float(pair.load.torque), rtol=1e-6)
+
+
+@pytest.mark.parametrize("family", ["cic", "ee"])
+def test_gas_torque_follows_the_radius_of_contact(family):
+    """A vane from the point of contact to the tip, found on the outline; at the line of centres
+    the tip of one rotor seals and takes no torque."""
+    pair, config = pair_of([*GAS, *(["profile.involute_length_mm=7"] * (family == "cic"))], family)
+    x, y = 1e-3 * outline_mm(config).T
+    points, outer = x + 1j * y, np.max(np.hypot(x, y))
+    radius, lobes = 0.033, 3
+    assert float(pair.load.torque1(0.0)) == pytest.approx(0, abs=1e-12)
+    assert float(pair.load.torque2(jnp.pi / lobes)) == pytest.approx(0, abs=1e-12)
+    for phi in (0.2, 0.5, 0.9, 1.3, 1.9):
+        # In contact the two outlines, placed by hand, come closest at a point of both.
+        first = points * np.exp(1j * phi)
+        second = 2 * radius - np.conjugate(points * np.exp(1j * (phi + np.pi / lobes)))
+        apart = abs(first[:, None] - second[None, :])
+        i, j = np.unravel_index(np.argmin(apart), apart.shape)
+        assert apart[i, j] < 3e-4
+        for number, place in ((1, first[i]), (2, second[j] - 2 * radius)):
+            torque = 4e4 * LENGTH * (outer**2 - abs(place) ** 2) / 2
+            found = getattr(pair.load, f"torque{number}")(phi)
+            assert float(found) == pytest.approx(torque, abs=0.02 * float(pair.load.torque) + 1e-6)
+
+
+@pytest.mark.parametrize("length", [7.0, 8.893, 9.0])
+def test_gas_torque_has_no_jump_and_its_derivative_is_that_of_differences(length):
+    """Also at and past the longest involute, where the whole tip arc meshes at once."""
+    config = load("configs/cic.yaml", [*GAS, f"profile.involute_length_mm={length}"])
+    model, design = Scene.from_config(config), design_vector(config)
+    phi = jnp.linspace(0.001, 1.04, 4001)
+
+    @eqx.filter_jit
+    def torque(model, design):
+        return jax.vmap(model.pair(design).load.torque2)(phi)
+
+    here = np.asarray(torque(model, design))
+    # It rises by its mean in no less than a quarter of a brief stretch, 0.01 rad.
+    assert np.max(abs(np.diff(here))) < np.mean(here) * 1.2 * np.ptp(phi) / 4000 / 0.0025
+    if length == 8.893:
+        return  # The longest to within rounding of its own difference.
+    for index, step in enumerate((1e-5, 1e-5, 1e-5)):
+        unit = jnp.zeros(3).at[index].set(1.0)
+        slope = eqx.filter_jit(lambda m, d, u: jax.jvp(lambda d: torque(m, d), (d,), (u,))[1])
+        found = np.asarray(slope(model, design, unit))
+        ends = [np.asarray(torque(model, design + way * step * unit)) for way in (-1, 1)]
+        expected = (ends[1] - ends[0]) / (2 * step)
+        # Where pieces meet the difference straddles a kink.
+        off = abs(found - expected) > 1e-5 * np.max(abs(expected))
+        assert np.mean(off) < 0.002

@@ -1,0 +1,364 @@
+"""Import of outlines: files in, the profile they hold and what is wrong with it out."""
+
+import importlib.util
+import json
+
+import ezdxf
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from ezdxf import units
+
+from rootsopt.commands import profile, simulate
+from rootsopt.config import load, parse
+from rootsopt.contact.closest import FlankPair
+from rootsopt.contact.nodes import pair_gap
+from rootsopt.errors import InputError
+from rootsopt.measured.conjugacy import conjugacy
+from rootsopt.measured.curves import _jumps
+from rootsopt.measured.fit import imported
+from rootsopt.measured.reading import Loop, read, signed_area
+from rootsopt.measured.source import note, outline_of
+from rootsopt.optimize.search import Search
+from rootsopt.profiles import CIC, EE, geometry, outline
+from rootsopt.scene import Scene, check_geometry, design_vector
+from rootsopt.scene.families import free_form_of
+
+R = 0.033
+CIC3 = CIC(3, R, np.deg2rad(36.43), 8.5e-3, np.deg2rad(4.0))
+PROFILES = {"cic": CIC3, "ee": EE(3, R)}
+every_profile = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES.keys())
+CONFIG = """
+profile: {{family: outline, lobes: 3, pitch_radius_mm: 33.0, outline_file: "{}"}}
+rotor: {{length_mm: 100.0, density_kg_m3: 7800.0}}
+contact: {{stiffness_N_per_mm_e: 2.0e5, exponent: 2.2, max_damping_N_s_per_mm: 0.25,
+  full_damping_depth_mm: 0.01}}
+scene: {{speed_rpm: 3000.0, load: {{torque_N_m: 4.775}},
+  timing_gear: {{stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.5, backlash_mm: 0.1}}}}
+"""
+
+
+def points_of(profile, count=1000):
+    """Points of an outline (mm) to ten digits, as in a CSV file; the first not repeated."""
+    points = np.asarray(outline(profile, count))[:-1] * 1e3
+    return np.array([[float(f"{x:.10g}") for x in row] for row in points]) @ [1, 1j]
+
+
+def profile_of(points, smoothing=0.0):
+    return imported(Loop(points, np.zeros(len(points), bool)), 3, 1e3 * R, smoothing)
+
+
+def closed(points):
+    return np.stack([np.append(x, x[0]) for x in (points.real, points.imag)], axis=1)
+
+
+def bulged(points, by):
+    """Points with the addenda `by` mm too thick."""
+    along = np.roll(points, -1) - np.roll(points, 1)
+    above = np.clip((np.abs(points) - 33) / (np.max(np.abs(points)) - 33), 0, 1)
+    return points - 1j * along / np.abs(along) * by * np.sin(np.pi * above) ** 2
+
+
+def write(path, points, header="x_mm,y_mm", separator=","):
+    points = closed(points)
+    np.savetxt(path, points, fmt="%.10g", delimiter=separator, header=header, comments="")
+    return path
+
+
+@jax.jit
+def approaches(pair, rolls, relatives):
+    return jax.lax.map(lambda pose: pair(*pose), (rolls, relatives))
+
+
+def contact_of(profile):
+    rolls, relatives = jnp.meshgrid(
+        jnp.linspace(1e-3, np.pi / 3 - 1e-3, 121), jnp.array([0.0, -1e-4, -1e-3, -3e-3])
+    )
+    pair = FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True)
+    return approaches(pair, rolls.ravel(), relatives.ravel())
+
+
+@every_profile
+def test_points_of_a_profile_give_its_contact_and_geometry(profile):
+    """Gap within 1 nm, levers within 3e-4 of the pitch radius (where arcs conform, ten digits say
+    no more of where they touch), area and inertia within 1e-9."""
+    found, checks = profile_of(points_of(profile))
+    truth, contact = contact_of(profile), contact_of(found)
+    assert np.array_equal(truth.found, contact.found)
+    assert np.count_nonzero(truth.found) > 400
+    gap, there = np.asarray(contact.gap - truth.gap), np.asarray(truth.found)
+    assert np.max(np.abs(gap[there])) < 1e-9
+    for lever in ("lever1", "lever2"):
+        off = np.asarray(getattr(contact, lever) - getattr(truth, lever))
+        assert np.max(np.abs(off[there])) < 3e-4 * R
+    exact, shape = geometry(profile), geometry(found)
+    for name in ("area", "polar_area_moment", "outer_radius", "root_radius"):
+        assert float(getattr(shape, name)) == pytest.approx(float(getattr(exact, name)), rel=1e-9)
+    assert float(shape.seal_width) == pytest.approx(float(exact.seal_width), rel=1e-3)
+    assert np.isnan(shape.undercut_margin)
+    assert max(checks.lobe_deviation_um, checks.flank_deviation_um) < 1e-3
+    assert note(checks) is None
+    rolled = conjugacy(found)
+    assert max(-rolled.least, rolled.most) < 1e-9
+
+
+@every_profile
+@pytest.mark.parametrize("by", [0.02, -0.02])
+def test_a_wrong_outline_leaves_the_gap_that_its_points_leave(profile, by):
+    """20 µm on the addenda are 20 µm of overlap or gap, as node against segment sees them."""
+    points = bulged(points_of(profile), by)
+    found, _ = profile_of(points)
+    rolled = conjugacy(found)
+    worst = rolled.least if by > 0 else rolled.most
+    assert worst == pytest.approx(-by * 1e-3, rel=1e-3)
+    for i in range(7, 361, 59):
+        seen = pair_gap(closed(points), 3, 2e3 * R, rolled.roll[i], rolled.roll[i]) * 1e-3
+        assert rolled.gap[i] == pytest.approx(seen, abs=1e-9)
+    pair = FlankPair.of(found, 2 * found.pitch_radius, two_sided=True)
+    rolls, relatives = np.array([0.3, 0.6, 0.9]), np.array([-1e-3, -2e-3, -5e-4])
+    for x, e, gap in zip(rolls, relatives, approaches(pair, rolls, relatives).gap, strict=True):
+        seen = pair_gap(closed(points), 3, 2e3 * R, -x - e / 2, -x + e / 2) * 1e-3
+        assert float(gap) == pytest.approx(seen, abs=1e-9)
+
+
+def test_levers_are_the_derivatives_of_the_gap():
+    """Of flanks that are not conjugate, by central differences in φ1 and φ2."""
+    found, _ = profile_of(bulged(points_of(CIC3), 0.02))
+    pair = FlankPair.of(found, 2 * found.pitch_radius, two_sided=True)
+    rolls, h = np.linspace(0.15, 0.9, 7), 1e-6
+    relatives = np.full(7, -1e-3)
+    here = approaches(pair, rolls, relatives)
+
+    def slope(a, b):
+        ahead, behind = (approaches(pair, rolls + k * a, relatives + k * b).gap for k in (1, -1))
+        return np.asarray(ahead - behind) / (2 * h)
+
+    by_roll, by_relative = slope(h, 0.0), slope(0.0, h)
+    assert np.asarray(here.lever1) == pytest.approx(by_relative + by_roll / 2, abs=1e-7)
+    assert np.asarray(here.lever2) == pytest.approx(by_relative - by_roll / 2, abs=1e-7)
+
+
+def test_turned_and_clockwise_outlines_are_put_right():
+    points = points_of(CIC3, 240)
+    _, checks = profile_of(points[::-1] * np.exp(0.3j))
+    assert checks.reversed
+    assert checks.turned_deg == pytest.approx(-np.degrees(0.3), abs=1e-6)
+    found, _ = profile_of(points[::-1] * np.exp(0.3j))
+    assert conjugacy(found).least > -1e-9
+
+
+def test_lobes_and_flanks_that_differ_are_told():
+    points = points_of(CIC3, 240)
+    lobe = np.abs(np.angle(points)) < np.pi / 3
+    worse = np.where(lobe, bulged(points, 0.03), points)
+    _, checks = profile_of(worse)
+    # The mean lobe has a third of it.
+    assert checks.lobe_deviation_um == pytest.approx(20, rel=0.01)
+    leading = np.mod(np.angle(points), 2 * np.pi / 3) < np.pi / 3
+    _, checks = profile_of(np.where(leading, bulged(points, 0.03), points))
+    # The lobe's axis moves over with the flank and takes up part of it.
+    assert 15 < checks.flank_deviation_um < 30
+    assert "trailing flank" in (note(checks) or "")
+
+
+def test_scattered_points_are_smoothed():
+    random = np.random.default_rng(0)
+    points = points_of(CIC3, 240) + random.normal(0, 1e-3, 2892)
+    with pytest.raises(InputError, match=r"outline_smoothing_mm"):
+        profile_of(points)
+    found, checks = profile_of(points, 1e-3)
+    assert checks.fit_deviation_um == pytest.approx(1, rel=0.05)
+    assert max(-conjugacy(found).least, conjugacy(found).most) < 5e-6
+
+
+def test_joints_are_seen():
+    """Land, arc, involute and their mates: eight places a lobe, the pitch circle not among them."""
+    points = points_of(CIC3, 240)
+    found = np.degrees(np.angle(points[np.roll(_jumps(np.roll(points, 77)), -77)]))
+    assert np.sum(np.abs(found) < 59) == 8
+    assert np.min(np.abs(found - 4)) < 1e-6
+
+
+@pytest.mark.parametrize(("header", "separator"), [("", ";"), ("name", "\t"), ("x_mm y_mm", " ")])
+def test_csv_dialects(tmp_path, header, separator):
+    points = points_of(CIC3, 60)
+    loop = read(write(tmp_path / "points.csv", points, header, separator))
+    assert np.array_equal(loop.points, points)
+
+
+def dxf(path, draw, units):
+    """A DXF file of what `draw` adds to its model space."""
+    document = ezdxf.new("R2010", units=units)
+    draw(document.modelspace())
+    document.saveas(path)
+    return read(path)
+
+
+def test_dxf_in_inches_of_polylines_and_lines(tmp_path):
+    """A polyline with arcs (a slot), and lines in any order and direction: scaled, joined, and the
+    largest loop taken."""
+    corners = [(0, 0, 0), (2, 0, 1), (2, 1, 0), (0, 1, 1)]
+
+    def slot(space):
+        space.add_lwpolyline(corners, format="xyb", close=True)
+        space.add_lwpolyline([(0.5, 0.2), (1, 0.2), (1, 0.6)], close=True)
+
+    loop = dxf(tmp_path / "slot.dxf", slot, units.IN)
+    # Chords of the arcs, at least 24 each: 1 - 2e-3 of their segments.
+    assert signed_area(loop.points) / 25.4**2 == pytest.approx(2 + np.pi / 4, rel=2e-3)
+    assert np.max(loop.points.real) / 25.4 == pytest.approx(2.5, abs=1e-4)
+
+    polygon = np.array([3, 3 + 2j, 1 + 2.5j, 2j, 0])
+    ends = list(zip(polygon, np.roll(polygon, -1), strict=True))
+
+    def lines(space):
+        for k in (2, 0, 4, 1, 3):
+            start, stop = ends[k][:: 1 if k % 2 else -1]
+            space.add_line((start.real, start.imag), (stop.real, stop.imag))
+
+    loop = dxf(tmp_path / "lines.dxf", lines, units.CM)
+    assert sorted(np.abs(loop.points)) == pytest.approx(sorted(10 * np.abs(polygon)))
+    assert abs(signed_area(loop.points)) == pytest.approx(100 * abs(signed_area(polygon)))
+
+
+def test_dxf_of_an_ellipse(tmp_path):
+    """Turned, off the origin, without units, which are millimetres then."""
+
+    def ellipse(space):
+        space.add_ellipse((5, 1), major_axis=(4, 3), ratio=0.6)
+
+    loop = dxf(tmp_path / "ellipse.dxf", ellipse, units.M * 0)
+    local = (loop.points - (5 + 1j)) / (0.8 + 0.6j)
+    assert np.hypot(local.real / 5, local.imag / 3) == pytest.approx(np.ones(len(local)))
+    assert abs(signed_area(loop.points)) == pytest.approx(np.pi * 15, rel=1e-3)
+
+
+def test_dxf_faults_are_named(tmp_path):
+    def gap(space):
+        space.add_line((0, 0), (1, 0))
+        space.add_line((1, 0), (1, 1))
+        space.add_line((1, 1), (0, 0.1))
+
+    with pytest.raises(InputError, match=r"closed within .*widest gap 0.1 mm"):
+        dxf(tmp_path / "gap.dxf", gap, units.MM)
+    with pytest.raises(InputError, match="must hold an outline of LINE, ARC"):
+        dxf(tmp_path / "none.dxf", lambda space: space.add_text("rotor"), units.MM)
+    (tmp_path / "no.dxf").write_text("x,y\n1,2\n")
+    with pytest.raises(InputError, match="is not a DXF file"):
+        read(tmp_path / "no.dxf")
+
+
+FAULTS = {
+    "open": (lambda z: z[: len(z) * 3 // 4], "must be closed"),
+    "two lobes": (lambda z: z * np.abs(z), "crosses the pitch circle"),
+    "off the axis": (lambda z: z + 60, "around the rotor's axis"),
+    "folded": (lambda z: z * np.exp(2e-4j * (np.abs(z) - 33) ** 4), "fold back"),
+    "unequal": (lambda z: np.where(np.abs(np.angle(z)) < 1, bulged(z, 1.5), z), "equal lobes"),
+    "hollow": (lambda z: bulged(z, -4.0), "convex addendum|fold back|a flank turns by"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_named(tmp_path, fault):
+    change, message = FAULTS[fault]
+    path = tmp_path / "points.csv"
+    z = change(points_of(CIC3, 240))
+    np.savetxt(path, np.stack([z.real, z.imag], axis=1), fmt="%.10g", delimiter=",")
+    with pytest.raises(InputError, match=message):
+        check_geometry(parse(CONFIG.format(path)))
+
+
+def test_config_keys(tmp_path):
+    path = write(tmp_path / "points.csv", points_of(CIC3, 60))
+    (tmp_path / "scene.yaml").write_text(CONFIG.format("points.csv"))
+    config = load(tmp_path / "scene.yaml")
+    assert config.profile.outline_file == str(path)
+    assert config.solver.fidelity == "search"
+    for change, message in (
+        ("solver.fidelity=map", r"search \(or auto\) with `profile.outline_file`"),
+        ("profile.outline_file=null", r"`profile.outline_file` is required"),
+        ("profile.family=ee", r"`profile.outline_file` does not belong to family ee"),
+    ):
+        with pytest.raises(InputError, match=message):
+            load(tmp_path / "scene.yaml", [change])
+    with pytest.raises(InputError, match=r"must be a file that can be read"):
+        check_geometry(load(tmp_path / "scene.yaml", ["profile.outline_file=none.csv"]))
+    with pytest.raises(InputError, match=r"must be that of a design to be projected"):
+        free_form_of(config.profile, 12)
+    with pytest.raises(InputError, match=r"to be optimised, but is outline"):
+        Search(config)
+
+
+def test_profile_command_reads_its_own_files(tmp_path):
+    """The CSV that was read, and the DXF drawn of it where ezdxf is there; the folder is whole."""
+    path = write(tmp_path / "points.csv", points_of(CIC3, 240))
+    (tmp_path / "scene.yaml").write_text(CONFIG.format(path))
+    drawn = "dxf" if importlib.util.find_spec("ezdxf") else "none"
+    first = tmp_path / "first"
+    arguments = [str(tmp_path / "scene.yaml"), "-o", str(first), "--no-figures", "--export", drawn]
+    assert profile.main(arguments) == 0
+    record = json.loads((first / "result.json").read_text())
+    assert record["outline"]["interference_um"] < 1e-3
+    assert record["geometry"]["undercut_margin_mm"] is None
+    again = load(first / "config.yaml")
+    assert again.profile.outline_file == str(first / "outline.csv")
+    sources = ["profile_design.csv"] + (["rotor.dxf"] if drawn == "dxf" else [])
+    for name in sources:
+        other = again.profile.model_copy(update={"outline_file": str(first / name)})
+        found, _ = outline_of(other)
+        area = float(found.area) * 1e6
+        assert area == pytest.approx(record["geometry"]["area_mm2"], rel=1e-7)
+        assert max(-conjugacy(found).least, conjugacy(found).most) < 5e-8
+
+
+@pytest.mark.long
+def test_pair_has_the_forces_of_the_profile(tmp_path):
+    """Force and torques of a whole pair, drive and coast, over poses and speeds."""
+    path = write(tmp_path / "points.csv", points_of(CIC3))
+    config = parse(CONFIG.format(path))
+    truth = parse(
+        CONFIG.format(path),
+        [
+            "profile.family=cic",
+            "profile.outline_file=null",
+            "profile.pressure_angle_deg=36.43",
+            "profile.involute_length_mm=8.5",
+            "profile.tip_arc_angle_deg=4",
+        ],
+    )
+    poses = np.random.default_rng(1).uniform([0, -2e-3, -5], [2.1, 2e-3, 5], (200, 3))
+    pairs = [Scene.from_config(c).pair(design_vector(c)) for c in (config, truth)]
+    forces = [
+        jax.jit(lambda x, p=p: jax.lax.map(lambda s: p.contact_force(*s), x))(poses) for p in pairs
+    ]
+    largest = float(jnp.max(forces[1].total))
+    assert largest > 100
+    for name in ("drive", "coast", "torque1", "torque2"):
+        one, other = (np.asarray(getattr(f, name)) for f in forces)
+        assert np.max(np.abs(one - other)) < 1e-4 * largest * (R if "torque" in name else 1)
+
+
+@pytest.mark.long
+def test_simulation_of_the_points_is_that_of_the_profile(tmp_path):
+    path = write(tmp_path / "points.csv", points_of(CIC3, 240))
+    (tmp_path / "scene.yaml").write_text(CONFIG.format(path))
+    own = [
+        f"profile.{change}"
+        for change in (
+            "family=cic",
+            "outline_file=null",
+            "pressure_angle_deg=36.43",
+            "involute_length_mm=8.5",
+            "tip_arc_angle_deg=4",
+        )
+    ]
+    responses = []
+    for name, sets in (("points", []), ("truth", own)):
+        arguments = [str(tmp_path / "scene.yaml"), "-o", str(tmp_path / name), "--no-figures"]
+        assert simulate.main([*arguments, *(f"--set={change}" for change in sets)]) == 0
+        record = json.loads((tmp_path / name / "result.json").read_text())
+        assert record["status"] == "periodic"
+        responses.append(record["response"])
+    for key in ("mean_force_N", "peak_force_N"):
+        assert responses[0][key] == pytest.approx(responses[1][key], rel=1e-4)

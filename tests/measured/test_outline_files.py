@@ -1,0 +1,437 @@
+"""Outline files: malformed ones are answered in a line, loose entities joined, CAD's ways known."""
+
+import io
+import os
+import random
+import signal
+
+import ezdxf
+import numpy as np
+import pytest
+from ezdxf import units
+
+from rootsopt.errors import InputError
+from rootsopt.measured import joining
+from rootsopt.measured.conjugacy import conjugacy
+from rootsopt.measured.fit import imported
+from rootsopt.measured.loop import Loop, signed_area
+from rootsopt.measured.reading import read
+from tests.fuzz import outlines
+
+T = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+ROTOR = (40 + 8 * np.cos(3 * T)) * np.exp(1j * T)
+
+
+def drawn(path, draw, version="R2010", units=units.MM, fmt="asc"):
+    """The outline in a drawing of what `draw` adds to the model space."""
+    document = ezdxf.new(version, units=units)
+    draw(document.modelspace())
+    document.saveas(path, fmt=fmt)
+    return read(path)
+
+
+def line(space, start, stop, **attributes):
+    ends = (start.real, start.imag), (stop.real, stop.imag)
+    space.add_line(*ends, dxfattribs=attributes)
+
+
+def lines(space, z, order=None):
+    """Loose lines along a polygon, every other one backwards."""
+    for k in range(len(z)) if order is None else order:
+        line(space, *(z[k], z[(k + 1) % len(z)])[:: 1 if k % 2 else -1])
+
+
+def polyline(z, **how):
+    return lambda space: space.add_lwpolyline([(p.real, p.imag) for p in z], close=True, **how)
+
+
+def fault(path, data):
+    """The one line that a file's content is answered with."""
+    path.write_bytes(data if isinstance(data, bytes) else data.encode())
+    with pytest.raises(InputError) as raised:
+        imported(read(path), 3, 33.0, 0.0)
+    assert outlines.fault_of(raised.value) is None
+    return str(raised.value)
+
+
+def test_fuzzed_files_are_answered(tmp_path, capfd):
+    """The campaign of tests/fuzz, reduced."""
+    wrong = []
+    for number in range(50):
+        chance = random.Random(f"test-{number}")
+        kind, ending, data = outlines.malformed(chance)
+        path = tmp_path / f"case{number}{ending}"
+        path.write_bytes(data)
+        if failure := outlines.tried(path, 0.0, roll=False):
+            wrong.append(f"{number}, {kind}: {failure}")
+    assert not wrong
+    assert capfd.readouterr().err == ""
+
+
+def test_good_files_of_the_campaign_are_read(tmp_path):
+    """Else nothing but the damage done before would be tried."""
+    areas = {}
+    for name, data in outlines.good().items():
+        (tmp_path / name).write_bytes(data)
+        areas[name] = abs(signed_area(read(tmp_path / name).points))
+    for name, area in areas.items():
+        assert area == pytest.approx(3960 if "ee" in name else 3900, rel=0.1), areas
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    {
+        "empty": ("", "is empty"),
+        "blank": (" \n\n", "is empty"),
+        "comments": ("# x\n# y\n", "has none"),
+        "header alone": ("x_mm,y_mm\n", "has 0"),
+        "long field": ("1," + "9" * 10_000_000, "line 1: must have at most 100000 characters"),
+        "quoted field": ('1,"' + "9" * 90_000, "line 1: must hold x and y|larger than field limit"),
+        "long text field": ("x,y\n" + "a" * 90_000 + ",1\n", r"line 2: .*a\.\.\. \(90"),
+        "columns": ("x,y\n" + "1," * 5000, r"has 1; add the rest"),
+        "zero byte": ("1,2\n3,\0\n", "line 2: must be text, but has a zero byte"),
+        "latin 1": (b"x,y\n1,\xe9\n", "must be UTF-8 text, but is not at byte 6"),
+        "nan": ("1,2\nnan,3\n", "line 2: must hold x and y in mm, but is 'nan, 3'"),
+        "underscore": ("1,2\n1_0,3\n", "line 2: must hold"),
+        "ragged": ("1,2\n3\n", "line 2: must hold x and y in mm, but is '3'"),
+        "one place": ("1,2\n" * 9, "all its points are in one place"),
+        "huge": ("1e300,0\n0,1e300\n-1e300,0\n0,-1e300\n", "measures 1e\\+300 mm"),
+        "tiny": ("1e-300,0\n0,1e-300\n-1e-300,0\n0,0\n", "measures 2e-300 mm"),
+    }.values(),
+)
+def test_malformed_tables(tmp_path, data, message):
+    text = fault(tmp_path / "points.csv", data)
+    assert __import__("re").search(message, text), text
+
+
+@pytest.mark.parametrize(
+    ("split", "comma", "header", "encoding"),
+    [
+        (";", True, "x_mm,y_mm", "utf-8"),
+        ("\t", True, "X [mm],Y [mm]", "utf-16"),
+        (",", False, '"x","y"', "utf-8-sig"),
+        (";", False, "Größe,Wert", "utf-8"),
+    ],
+)
+def test_tables_of_spreadsheets(tmp_path, split, comma, header, encoding):
+    data = outlines.table(ROTOR, split, comma, header).decode().replace("\n", "\r\n")
+    (tmp_path / "points.csv").write_bytes(data.encode(encoding))
+    assert read(tmp_path / "points.csv").points == pytest.approx(ROTOR, abs=1e-8)
+
+
+def test_named_columns_are_taken_wherever_they_are(tmp_path):
+    rows = [f"{k};{z.imag:.9g};{z.real:.9g}" for k, z in enumerate(ROTOR)]
+    (tmp_path / "points.csv").write_text("\n".join(["nr;y (mm);x (mm)", *rows]))
+    assert read(tmp_path / "points.csv").points == pytest.approx(ROTOR, abs=1e-6)
+
+
+def test_what_is_no_file_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe.csv")
+    (tmp_path / "folder.csv").mkdir()
+    (tmp_path / "device.csv").symlink_to("/dev/zero")
+    signal.alarm(30)
+    try:
+        for name, what in (("pipe", "a pipe"), ("folder", "a folder"), ("device", "a device")):
+            with pytest.raises(InputError, match=f"must be a file, but '{name}.csv' is {what}"):
+                read(tmp_path / f"{name}.csv")
+    finally:
+        signal.alarm(0)
+    with pytest.raises(InputError, match="can be read"):
+        read(tmp_path / "a\0b.csv")
+    with open(tmp_path / "large.dxf", "wb") as file:
+        file.truncate(10**12)
+    with pytest.raises(InputError, match="at most 50 MB"):
+        read(tmp_path / "large.dxf")
+
+
+ENTITIES = {
+    "arc of no radius": (lambda s: s.add_arc((0, 0), 0, 0, 90), "ARC .* radius above 0, but has 0"),
+    "huge arc": (lambda s: s.add_arc((0, 0), 1e300, 0, 90), "number of ARC must be finite"),
+    "nan arc": (lambda s: s.add_arc((0, 0), np.nan, 0, 90), "number of ARC must be finite"),
+    "nan bulge": (
+        lambda s: s.add_lwpolyline([(0, 0, np.nan), (9, 0, 0), (9, 9, 0)], format="xyb"),
+        "number of LWPOLYLINE must be finite",
+    ),
+    "empty polyline": (lambda s: s.add_lwpolyline([], close=True), "has none of them"),
+    "one corner": (lambda s: s.add_lwpolyline([(1, 1)], close=True), "have no extent"),
+    "line of no length": (lambda s: s.add_line((1, 1), (1, 1)), "have no extent"),
+    "another plane": (
+        lambda s: s.add_arc((0, 0), 9, 0, 90, dxfattribs={"extrusion": (1, 0, 0)}),
+        "lie in the plane of x and y",
+    ),
+    "huge drawing": (
+        lambda s: [s.add_circle((0, 0), 9), s.add_arc((0, 0), 9e8, 0, 360)],
+        "measure 2.*e\\+09 mm",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ENTITIES)
+def test_senseless_entities(tmp_path, name):
+    draw, message = ENTITIES[name]
+    with pytest.raises(InputError, match=message) as raised:
+        drawn(tmp_path / "drawing.dxf", draw)
+    assert outlines.fault_of(raised.value) is None
+
+
+SPLINES = {
+    "equal knots": ({"knots": [1.0] * 8}, "equal knots"),
+    "falling knots": ({"knots": [0, 0, 0, 0, 1, 1, 1, 0.5]}, "rising order"),
+    "few knots": ({"knots": [0, 0, 1, 1]}, "1 of 1 SPLINE make no sense .*knot value count: 4 < 8"),
+    "no weight": ({"weights": [0.0] * 4}, "weights above 0"),
+    "two weights": ({"weights": [1.0, 1.0]}, "make no sense .*weight count: 2 != 4"),
+    "few points": (
+        {"control_points": [(0, 0), (1, 1)]},
+        "make no sense .*control point count: 2 < 4",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SPLINES)
+def test_senseless_splines(tmp_path, name):
+    changes, message = SPLINES[name]
+
+    def draw(space):
+        spline = space.add_spline(degree=3)
+        spline.control_points = [(0, 0), (1, 2), (3, 1), (4, 0)]
+        spline.knots = [0.0] * 4 + [1.0] * 4
+        for key, value in changes.items():
+            setattr(spline, key, value)
+
+    with pytest.raises(InputError, match=message):
+        drawn(tmp_path / "drawing.dxf", draw)
+
+
+def text_of(draw, version="R2010", units=units.MM):
+    document = ezdxf.new(version, units=units)
+    draw(document.modelspace())
+    text = io.StringIO()
+    document.write(text)
+    return text.getvalue()
+
+
+def test_damaged_drawings_are_not_read_as_others(tmp_path, capfd):
+    """A decimal comma, an unknown unit, a file that was cut off; the library would go on."""
+    path, whole = tmp_path / "drawing.dxf", text_of(polyline(ROTOR))
+    assert "a number of LWPOLYLINE must be" in fault(path, whole.replace("48.0", "48,0"))
+    assert "end with the mark EOF" in fault(path, whole[: whole.rindex("ENDSEC")])
+    assert "is not a DXF file" in fault(path, "x,y\n1,2\n")
+    assert "is not a DXF file" in fault(path, b"AutoCAD Binary DXF\r\n\x1a\x00" + b"\xff" * 99)
+    code = "$INSUNITS\n 70\n"
+    for unit in ("99", "-1", "17", "18"):
+        text = whole.replace(f"{code}4", f"{code}{unit}")
+        assert text != whole
+        assert (
+            f"$INSUNITS must be the code of a length unit (4: mm, 1: inch, 0: none), but is {unit}"
+            in fault(path, text)
+        )
+    assert capfd.readouterr().err == ""
+
+
+def test_what_the_library_says_stays_inside(tmp_path, caplog):
+    """It logs what it repairs; without a handler of the program's that would go to stderr."""
+    whole = text_of(polyline(ROTOR))
+    odd = whole.replace(" 90\n60\n", " 90\n60.0\n")
+    assert odd != whole
+    (tmp_path / "drawing.dxf").write_text(odd)
+    assert read(tmp_path / "drawing.dxf").points == pytest.approx(ROTOR)
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    ("code", "length"),
+    [(1, 25.4), (2, 304.8), (8, 2.54e-5), (9, 0.0254), (14, 100.0), (21, 304.8006)],
+)
+def test_units(tmp_path, code, length):
+    loop = drawn(tmp_path / "drawing.dxf", polyline(ROTOR / length), units=code)
+    assert loop.points == pytest.approx(ROTOR, rel=1e-7)
+
+
+@pytest.mark.parametrize("fmt", ["asc", "bin"])
+@pytest.mark.parametrize("version", ["R12", "R2000", "R2018"])
+def test_versions_of_drawings(tmp_path, version, fmt):
+    def draw(space):
+        add = space.add_polyline2d if version == "R12" else space.add_lwpolyline
+        add([(z.real, z.imag) for z in ROTOR], close=True)
+
+    loop = drawn(tmp_path / "drawing.dxf", draw, version, units=0, fmt=fmt)
+    assert loop.points == pytest.approx(ROTOR, abs=1e-9)
+
+
+def test_entities_seen_from_below(tmp_path):
+    """CAD mirrors an arc or a polyline by turning its normal over: x then runs the other way."""
+    below = {"extrusion": (0, 0, -1)}
+
+    def draw(space):
+        space.add_arc((-10, 0), 5, 90, 270, dxfattribs=below)  # Right half of a circle at x = 10.
+        rows = [(-10, 5, 0), (10, 5, -1), (10, -5, 0), (-10, -5, 0)]
+        space.add_lwpolyline(rows, format="xyb", dxfattribs=below)
+
+    loop = drawn(tmp_path / "slot.dxf", draw)
+    assert (np.min(loop.points.real), np.max(loop.points.real)) == pytest.approx(
+        (-15, 15), rel=1e-4
+    )
+    assert abs(signed_area(loop.points)) == pytest.approx(200 + 25 * np.pi, rel=1e-3)
+
+
+def test_blocks(tmp_path):
+    """An outline in a block, turned; entities drawn directly come first."""
+    document = ezdxf.new(units=units.MM)
+    inner, outer = document.blocks.new("ROTOR"), document.blocks.new("SHEET")
+    polyline(ROTOR)(inner)
+    outer.add_blockref("ROTOR", (0, 0), dxfattribs={"rotation": 90})
+    space = document.modelspace()
+    space.add_blockref("SHEET", (5, 0))
+    document.saveas(tmp_path / "block.dxf")
+    assert read(tmp_path / "block.dxf").points == pytest.approx(5 + 1j * ROTOR)
+    polyline(ROTOR / 2)(space)
+    document.saveas(tmp_path / "block.dxf")
+    assert read(tmp_path / "block.dxf").points == pytest.approx(ROTOR / 2)
+    inner.add_blockref("SHEET", (0, 0))
+    document.saveas(tmp_path / "block.dxf")
+    with pytest.raises(InputError, match="blocks must be inserted singly"):
+        read(tmp_path / "block.dxf")
+
+
+def test_many_loose_lines_are_joined_in_order(tmp_path, monkeypatch):
+    """Twenty thousand chains in any order: one query of the tree for all of them, and no more
+    memory or time than that takes."""
+    t = np.linspace(0, 2 * np.pi, 20_000, endpoint=False)
+    z = (40 + 8 * np.cos(3 * t)) * np.exp(1j * t)
+    order = np.random.default_rng(0).permutation(len(z))
+    chains = [
+        Loop(np.array([z[k], z[(k + 1) % len(z)]])[:: 1 if k % 2 else -1], np.zeros(2, bool))
+        for k in order
+    ]
+    trees = []
+    tree = joining.KDTree
+    monkeypatch.setattr(joining, "KDTree", lambda data: trees.append(len(data)) or tree(data))
+    loop = joining.joined(chains, "OUTLINE", "lines.dxf")
+    assert trees == [len(z), 3 * len(z)]
+    assert sorted(loop.points, key=np.angle) == pytest.approx(sorted(z, key=np.angle))
+    assert abs(signed_area(loop.points)) == pytest.approx(abs(signed_area(z)))
+
+
+def test_what_does_not_belong_to_the_outline(tmp_path):
+    """Lines drawn twice, center lines from the axis and from a corner, a bore of arcs: none of them
+    matters."""
+
+    def draw(space):
+        lines(space, ROTOR)
+        lines(space, ROTOR[:7])  # Six again, and a chord.
+        for end in (60, 60j, -60, -60j):
+            line(space, 0j, end)
+        line(space, ROTOR[30], 0j + 90)
+        space.add_arc((0, 0), 5, 0, 180)
+        space.add_arc((0, 0), 5, 180, 360)
+
+    def clean(space):
+        lines(space, ROTOR)
+        for k in range(6):
+            line(space, ROTOR[k + 1], ROTOR[k])
+        for end in (60, 60j, -60, -60j):
+            line(space, 0j, end)
+        line(space, ROTOR[30], 0j + 90)
+        space.add_arc((0, 0), 5, 0, 180)
+        space.add_arc((0, 0), 5, 180, 360)
+
+    loop = drawn(tmp_path / "clean.dxf", clean)
+    assert sorted(loop.points, key=np.angle) == pytest.approx(sorted(ROTOR, key=np.angle))
+    with pytest.raises(InputError, match=r"in one way from point to point, but 3 ends meet at \("):
+        drawn(tmp_path / "chord.dxf", draw)
+
+
+def test_a_gap_is_not_answered_with_the_bore(tmp_path):
+    def draw(space):
+        lines(space, ROTOR, range(59))
+        space.add_arc((0, 0), 5, 0, 180)
+        space.add_arc((0, 0), 5, 180, 360)
+
+    gap = abs(ROTOR[59] - ROTOR[0])
+    with pytest.raises(InputError, match=f"enclose more than any .* a gap of {gap:.4g} mm at"):
+        drawn(tmp_path / "gap.dxf", draw)
+
+
+def test_joints_of_a_clockwise_drawing():
+    """Corners and jumps of curvature keep their places when a loop is turned round.
+
+    The loop is that of a rotor with joints on one flank of every lobe, so that joints in the order
+    they came in would lie on the other."""
+    z = outlines.points("cic", 60)
+    step = len(z) // 3
+    joints = np.zeros(len(z), bool)
+    joints[[k * step + j for k in range(3) for j in (37, 58, 91)]] = True
+    z, joints = np.roll(z, -17), np.roll(joints, -17)
+    found, checks = imported(Loop(z, joints), 3, 33.0, 0.0)
+    turned, others = imported(Loop(z[::-1], joints[::-1]), 3, 33.0, 0.0)
+    assert (checks.reversed, others.reversed) == (False, True)
+    for name in ("crown", "valley"):
+        one, other = getattr(found, name), getattr(turned, name)
+        for part in ("node", "value", "slope"):
+            assert np.asarray(getattr(other, part)) == pytest.approx(
+                np.asarray(getattr(one, part)), abs=1e-12
+            )
+
+
+def test_a_drawing_that_begins_with_a_valley_is_clockwise(tmp_path):
+    """This program's own drawing, entities the other way round: the same rotor, as conjugate."""
+    own = tmp_path / "own.dxf"
+    own.write_bytes(outlines.good()["own.dxf"])
+    document = ezdxf.readfile(own)
+    space = document.modelspace()
+    entities = [e for e in space if e.dxf.layer == "OUTLINE"]
+    loop = read(own)
+    backwards = [e for e in entities if e.dxftype() == "SPLINE"]
+    for entity in backwards:
+        entity.control_points = list(entity.control_points)[::-1]
+        entity.knots = [float(entity.knots[-1]) - k for k in list(entity.knots)[::-1]]
+    first = backwards[len(backwards) // 3]
+    for entity in entities:
+        if entity is not first:
+            space.unlink_entity(entity)
+            space.add_entity(entity)
+    document.saveas(tmp_path / "clockwise.dxf")
+    clockwise = read(tmp_path / "clockwise.dxf")
+    assert signed_area(loop.points) > 0 > signed_area(clockwise.points)
+    assert np.sum(loop.joints) == np.sum(clockwise.joints) == len(entities)
+    one, two = (imported(x, 3, 33.0, 0.0)[0] for x in (loop, clockwise))
+    assert float(two.area) == pytest.approx(float(one.area), rel=1e-9)
+    assert conjugacy(two).least == pytest.approx(conjugacy(one).least, abs=1e-9)
+
+
+@pytest.mark.parametrize("smoothing", [1e-9, 1e-4, 10.0, 1e4])
+def test_smoothing_that_does_not_fit_the_scatter(smoothing, capfd):
+    """Too little would take minutes of fitting for a curve that follows the noise."""
+    random = np.random.default_rng(0)
+    z = outlines.points("cic", 800)
+    z = z + random.normal(0, 1e-3, len(z)) + 1j * random.normal(0, 1e-3, len(z))
+    with pytest.raises(InputError, match=r"outline_smoothing_mm|outline_file") as raised:
+        imported(Loop(z, np.zeros(len(z), bool)), 3, 33.0, smoothing)
+    if smoothing < 1e-3:
+        assert "needs more than 500 knots" in str(raised.value)
+    assert capfd.readouterr().err == ""
+
+
+WRONG = {
+    "collinear": lambda z: z.real + 0j,
+    "two points": lambda z: z[[0, len(z) // 2]],
+    "six points": lambda z: z[:: len(z) // 6],
+    "axis among the points": lambda z: np.where(np.arange(len(z)) == 5, 0, z),
+    "spike": lambda z: np.where(np.arange(len(z)) == 5, 3 * z, z),
+    "twice around": lambda z: np.concatenate([z, z]),
+    "figure of eight": lambda z: np.concatenate(
+        [z.real + 60 + 1j * z.imag, -z.real - 60 - 1j * z.imag]
+    ),
+    "micrometres": lambda z: z * 1e3,
+    "metres": lambda z: z * 1e-3,
+    "in any order": lambda z: np.random.default_rng(0).permutation(z),
+    "two lobes": lambda z: np.abs(z) * np.exp(2j * np.angle(z) / 3),
+    "circle": lambda z: 33.0 * np.exp(2j * np.pi * np.arange(len(z)) / len(z)),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_outlines(tmp_path, name, capfd):
+    z = WRONG[name](outlines.points("cic", 60))
+    fault(tmp_path / "points.csv", outlines.table(z))
+    assert capfd.readouterr().err == ""

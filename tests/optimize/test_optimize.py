@@ -1,0 +1,387 @@
+"""Optimiser: space, constraints, projection, descent directions, and a whole small run."""
+
+import dataclasses
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt.config import parse
+from rootsopt.design.space import sobol
+from rootsopt.errors import InputError
+from rootsopt.optimize.problem import Problem
+from rootsopt.optimize.search import Search, until_stopped
+from rootsopt.profiles import geometry
+from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.scene import Scene
+from rootsopt.status import Status
+
+SCENE = """
+profile: {family: cic, lobes: 3, pitch_radius_mm: 33.0, pressure_angle_deg: 36.43,
+          involute_length_mm: 8.0, tip_arc_angle_deg: 4.0}
+rotor: {length_mm: 100.0, density_kg_m3: 7800.0}
+contact: {stiffness_N_per_mm_e: 2.0e5, exponent: 2.2, max_damping_N_s_per_mm: 0.25,
+          full_damping_depth_mm: 0.01}
+scene:
+  speed_rpm: 3000.0
+  load: {torque_N_m: 4.775}
+  timing_gear: {stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.5, backlash_mm: 0.1}
+constraints: {seal_width_min_mm: 2.0}
+"""
+
+
+def config(*overrides):
+    return parse(SCENE, overrides)
+
+
+def baseline(settings) -> Evaluation:
+    """An evaluation with made-up forces: the space needs only its geometry."""
+    model = Scene.from_config(settings)
+    design = {"pressure_angle_deg": 36.43, "involute_length_mm": 8.0, "tip_arc_angle_deg": 4.0}
+    shape = geometry(model.profile(jnp.asarray(list(design.values()))))
+    return Evaluation(
+        design=design,
+        geometry={"area_efficiency": float(shape.area_efficiency)},
+        response={"mean_force_N": 50.0, "peak_force_N": 200.0, "rms_force_N": 80.0},
+        gradient={},
+        steady_state={},
+        status=Status.PERIODIC,
+        message="",
+        statistics={},
+        series=None,
+    )
+
+
+@pytest.fixture(scope="module")
+def problem():
+    settings = config()
+    return Problem.of(settings, Scene.from_config(settings), baseline(settings))
+
+
+def test_unit_box_and_design_are_inverse(problem):
+    """point(design(x)) = x inside the box, and both ends are reached."""
+    for point in np.random.default_rng(0).uniform(size=(20, 3)):
+        design = problem.space.design(jnp.asarray(point))
+        np.testing.assert_allclose(problem.space.point(design), point, atol=1e-12)
+    low = np.asarray(problem.space.design(jnp.zeros(3)))
+    high = np.asarray(problem.space.design(jnp.ones(3)))
+    assert (low[0], low[2]) == (25.0, 0.5)
+    np.testing.assert_allclose([high[0], high[2]], [45.0, 8.0])
+
+
+def test_involute_never_exceeds_its_longest(problem):
+    """u ≤ u_max at every point of the unit box."""
+    for point in np.random.default_rng(1).uniform(size=(30, 3)):
+        design = problem.space.design(jnp.asarray(point))
+        longest = problem.space.scene.profile(design).longest_involute
+        assert float(design[1]) <= float(longest) * 1e3 * (1 + 1e-12)
+
+
+def test_projection_makes_feasible_and_keeps_feasible_points(problem):
+    """Projected points satisfy the constraints; feasible ones are not moved."""
+    for point in sobol(32, 3):
+        projected = problem.project(point)
+        assert problem.feasible(projected)
+        assert np.all((projected >= 0) & (projected <= 1))
+        np.testing.assert_array_equal(problem.project(projected), projected)
+    inside = next(p for p in sobol(256, 4) if problem.feasible(p))
+    np.testing.assert_array_equal(problem.project(inside), inside)
+
+
+def test_rotor_stays_in_its_housing(problem):
+    """Floor and ceiling of the outer radius bind on their own sides, and are reported as such."""
+    limits = "constraints.outer_radius_min_mm=44.2", "constraints.outer_radius_max_mm=44.5"
+    settings = config(*limits, "constraints.area_efficiency_min=0.4")
+    model, start = Scene.from_config(settings), baseline(settings)
+    start = dataclasses.replace(start, geometry=start.geometry | _radii(44.3))
+    housed = Problem.of(settings, model, start)
+    free = [float(_outer(model, problem.design(p))) * 1e3 for p in sobol(32, 3)]
+    assert min(free) < 44.2
+    assert max(free) > 44.5
+    for point in sobol(32, 3):
+        found = housed.project(point)
+        assert housed.feasible(found)
+        assert 44.2 - 2e-6 < float(_outer(model, housed.design(found))) * 1e3 < 44.5 + 2e-6
+    wide = dataclasses.replace(start, geometry=start.geometry | _radii(44.8))
+    narrow = dataclasses.replace(start, geometry=start.geometry | _radii(44.0))
+    for one, floor, ceiling in ((wide, True, False), (narrow, False, True)):
+        rows = [r for r in housed.constraint_rows(one) if r["name"] == "outer radius"]
+        satisfied = {row["sense"]: row["satisfied"] for row in rows}
+        assert satisfied == {">=": floor, "<=": ceiling}
+        assert not any(row["active"] for row in rows)
+    at_ceiling = dataclasses.replace(start, geometry=start.geometry | _radii(44.5 - 5e-5))
+    rows = [r for r in housed.constraint_rows(at_ceiling) if r["name"] == "outer radius"]
+    assert {row["sense"]: row["active"] for row in rows} == {">=": False, "<=": True}
+    with pytest.raises(InputError, match=r"outer_radius_max_mm` must be greater"):
+        config("constraints.outer_radius_min_mm=44.5", "constraints.outer_radius_max_mm=44.2")
+
+
+@jax.jit
+def _outer(model, design):
+    return geometry(model.profile(design)).outer_radius
+
+
+def _radii(outer):
+    return {"outer_radius_mm": outer, "undercut_margin_mm": 5.0, "seal_width_mm": 5.0}
+
+
+def test_descent_respects_active_constraints(problem):
+    """The stripped slope leads into no active constraint and vanishes at a KKT point."""
+    rng = np.random.default_rng(5)
+    on_edge = [problem.project(p) for p in sobol(64, 6) if not problem.feasible(p)]
+    assert on_edge
+    for point in on_edge[:10]:
+        _, _, slack, jacobian = problem.look(point)
+        active = slack < 1e-4
+        slope = rng.normal(size=3)
+        direction = -problem.descent(point, slope)
+        assert np.all(jacobian[active] @ direction >= -1e-9)
+        # The stripped slope is still one of descent.
+        assert slope @ direction <= 1e-12
+        outward = jacobian[active].sum(axis=0)
+        np.testing.assert_allclose(problem.descent(point, outward), 0, atol=1e-9)
+
+
+def test_contradicting_constraints_are_bad_input():
+    """No feasible design: one message, before anything is searched."""
+    settings = config("constraints.area_efficiency_min=0.9", "optimizer.screening=4")
+    search = Search(settings)
+    search.problem = Problem.of(settings, Scene.from_config(settings), baseline(settings))
+    with pytest.raises(InputError, match=r"constraints\.area_efficiency_min"):
+        search._feasible(np.full(3, 0.5))
+
+
+def test_ee_has_nothing_to_optimise():
+    """A family without design parameters is refused by name."""
+    text = SCENE.replace("family: cic", "family: ee").replace("pressure_angle_deg: 36.43,", "")
+    text = text.replace("involute_length_mm: 8.0, tip_arc_angle_deg: 4.0", "")
+    with pytest.raises(InputError, match=r"profile\.family"):
+        Search(parse(text))
+
+
+def test_search_improves_within_the_constraints():
+    """A small run: better than the baseline, feasible, verified, best-so-far monotone."""
+    settings = config(
+        "optimizer.screening=4",
+        "optimizer.starts=1",
+        "optimizer.iterations=6",
+        "solver.map_rolls=96",
+        "solver.map_relatives=16",
+    )
+    seen = []
+    result = Search(settings, lambda done, expected, best: seen.append((done, best))).run()
+    assert result.optimized is not None
+    assert result.verification["holds_up"]
+    assert result.problem.objective(result.baseline) == pytest.approx(1, abs=1e-12)
+    assert result.problem.objective(result.optimized) < 0.95
+    assert all(row["satisfied"] for row in result.problem.constraint_rows(result.optimized))
+    best = [row["best_objective"] for row in result.history]
+    assert all(b <= a for a, b in itertools.pairwise(best))
+    assert best[-1] == pytest.approx(result.problem.objective(result.optimized), rel=0.01)
+    assert [done for done, _ in seen] == list(range(1, len(result.history) + 1))
+    gains = result.improvement
+    reduction = (
+        1 - result.optimized.response["mean_force_N"] / (result.baseline.response["mean_force_N"])
+    )
+    assert gains["mean_force_N"] == pytest.approx(reduction)
+
+
+SMALL = (
+    "optimizer.screening=4",
+    "optimizer.starts=1",
+    "optimizer.iterations=6",
+    "solver.map_rolls=96",
+    "solver.map_relatives=16",
+)
+
+
+def _stopped(after, patience, hinder=lambda search: None):
+    """Outcome of a search that is stopped after some evaluations, and the search."""
+    stop, seen = threading.Event(), []
+
+    def progress(done, expected, best):
+        seen.append(best)
+        if done == after:
+            stop.set()
+
+    search = Search(config(*SMALL), progress, stop)
+    hinder(search)
+    result = until_stopped(search.run, stop, patience)
+    return result or search.so_far(), search
+
+
+def test_a_stopped_search_keeps_the_best_so_far():
+    """Verified, as there is time for it; no more designs are tried than those under way."""
+    result, search = _stopped(8, patience=600.0)
+    assert result.interrupted
+    assert result.status is Status.INTERRUPTED
+    assert not result.status.usable
+    time.sleep(2)  # Nor does anything go on in the background.
+    assert 8 <= len(result.history) <= len(search._trials) <= 8 + os.cpu_count()
+    assert result.verification["holds_up"]
+    assert result.optimized.series is not None
+    best = min(row["objective"] for row in result.history if row["feasible"])
+    assert search.problem.objective(result.optimized) == pytest.approx(best, rel=0.01)
+    assert best < 1
+
+
+def test_a_stopped_search_without_time_to_verify():
+    """The best trial itself, and it says that nothing was verified."""
+
+    def hinder(search):
+        search.exact = _Slow.of(search.config)
+
+    result, search = _stopped(8, patience=0.0, hinder=hinder)
+    assert result.interrupted
+    assert result.verification["holds_up"] is None
+    trials = [row["objective"] for row in result.history if row["feasible"]]
+    assert search.problem.objective(result.optimized) == min(trials) < 1
+    assert all(row["satisfied"] for row in result.constraints)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Slow(Evaluator):
+    """An evaluator that takes ten minutes for a design, except in a survey."""
+
+    def __call__(self, design=None, start=None, series=True):
+        if not self.survey:
+            time.sleep(600)
+        return super().__call__(design, start, series)
+
+
+def test_a_search_stopped_before_it_found_anything():
+    """During screening's first design; and before the baseline was simulated."""
+    stop = threading.Event()
+    search = Search(config(*SMALL), None, stop)
+    assert search.so_far() is None
+    search._side_by_side = lambda *_: stop.set() or []
+    result = search.run()
+    assert result.interrupted
+    assert result.optimized is None
+    assert result.history == []
+    assert result.baseline.usable
+
+
+def test_designs_that_did_not_hold_up_are_not_reported():
+    result, search = _stopped(8, patience=600.0)
+    design = np.array(list(result.optimized.design.values()))
+    search._refuted = [search.problem.point(design)]
+    assert search.so_far().optimized.design != result.optimized.design
+
+
+@pytest.fixture
+def interruptible():
+    """Ctrl-C raises, also where whoever started the tests has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_stops_a_search_and_a_second_one_the_wait(interruptible):
+    """`KeyboardInterrupt`, as Python raises it where no command line owns the process."""
+    stop = threading.Event()
+
+    def interrupt(seconds):
+        import _thread
+
+        threading.Timer(seconds, _thread.interrupt_main).start()
+
+    interrupt(0.2)
+    assert until_stopped(lambda: stop.wait(60) and "kept", stop, 60.0) == "kept"
+    interrupt(0.2)
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        until_stopped(lambda: time.sleep(5), stop, 60.0)
+    assert time.monotonic() - began < 4
+    assert until_stopped(lambda: time.sleep(5), stop, 0.0) is None
+    with pytest.raises(InputError, match="passed on"):
+        until_stopped(lambda: _refuse(), threading.Event(), 0.0)
+
+
+def _refuse():
+    raise InputError("passed on")
+
+
+INTERRUPTED = """
+import os, signal, sys
+from rootsopt.commands import optimize as command
+from rootsopt.optimize.search import Search
+wanted, number = int(sys.argv.pop(1)), signal.Signals[sys.argv.pop(1)]
+command._PATIENCE = 600.0 if wanted else 0.0
+evaluate, run = Search._evaluate, Search.run
+def counted(self, *arguments, **options):
+    found = evaluate(self, *arguments, **options)
+    if len(self._trials) == wanted:
+        os.kill(os.getpid(), number)
+        self.stop.wait(60)
+    return found
+def begun(self):
+    if wanted == 0:
+        os.kill(os.getpid(), number)
+        import time; time.sleep(60)
+    return run(self)
+Search._evaluate, Search.run = counted, begun
+command.door.leave(command.main())
+"""
+
+
+@pytest.mark.parametrize(("after", "number"), [(0, "SIGINT"), (8, "SIGINT"), (9, "SIGTERM")])
+def test_signals_to_the_command(tmp_path, after, number):
+    """Status, exit code, and a folder that is complete."""
+    path = tmp_path / "scene.yaml"
+    path.write_text(SCENE)
+    overrides = [part for text in SMALL for part in ("--set", text)]
+    arguments = [str(path), "-o", str(tmp_path / "run"), *overrides, "--no-figures"]
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, str(after), number, *arguments],
+        cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    assert done.returncode == 3, done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert "interrupted" in done.stdout
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["status"] == "interrupted"
+    written = {p.name for p in (tmp_path / "run").iterdir()}
+    assert written == set(result["run"]["files"])
+    if after == 0:
+        assert result["baseline"] is None
+        assert result["optimized"] is None
+        assert written == {"config.yaml", "result.json"}
+    else:
+        assert result["optimized"]["status"] == "periodic"
+        assert result["verification"]["holds_up"]
+        assert result["improvement"]["objective"] > 0
+        names = {"history.csv", "optimized.yaml", "profile_optimized.csv", "response_optimized.csv"}
+        assert names <= written
+    assert sorted(os.listdir(tmp_path)) == ["run", "scene.yaml"]
+
+
+def test_objective_slope_agrees_with_finite_differences():
+    """The gradient in the unit box, chain rule included, against central differences."""
+    settings = config("solver.rtol=1e-10")
+    search = Search(settings)
+    base = search.exact(series=False)
+    problem = Problem.of(settings, search.exact.scene, base)
+    # Away from designs whose peak falls on a corner of the force (see test_steady).
+    point = np.array([0.2, 0.3, 0.4])
+
+    def objective(at):
+        return problem.objective(search.exact(problem.design(at), series=False))
+
+    slope = problem.slope(search.exact(problem.design(point), series=False), jnp.asarray(point))
+    step = 1e-4
+    for i, unit in enumerate(np.eye(3)):
+        difference = (objective(point + step * unit) - objective(point - step * unit)) / (2 * step)
+        assert slope[i] == pytest.approx(difference, rel=1e-3, abs=1e-5)

@@ -1,0 +1,380 @@
+"""Result files, tables and figures, from evaluations made by hand."""
+
+import csv
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from rootsopt.config import parse
+from rootsopt.errors import InputError
+from rootsopt.figures import runs
+from rootsopt.figures.force import amplitude_spectrum, plot_force
+from rootsopt.figures.history import plot_history
+from rootsopt.figures.runs import optimization_figures, simulation_figures
+from rootsopt.figures.style import figure
+from rootsopt.output import files, tables
+from rootsopt.response.evaluation import Evaluation, Series
+from rootsopt.status import Status
+
+CONFIG = """
+profile: {family: cic, lobes: 3, pitch_radius_mm: 33.0, pressure_angle_deg: 36.43,
+          involute_length_mm: 8.5, tip_arc_angle_deg: 4.0}
+rotor: {length_mm: 100.0, density_kg_m3: 7800.0}
+contact: {stiffness_N_per_mm_e: 2.0e5, exponent: 2.2, max_damping_N_s_per_mm: 0.25,
+          full_damping_depth_mm: 0.01}
+scene: {speed_rpm: 3000.0, load: {torque_N_m: 1.0}}
+"""
+DESIGN = {"pressure_angle_deg": 36.43, "involute_length_mm": 8.5, "tip_arc_angle_deg": 4.0}
+
+
+def _series(periods=3, samples=64):
+    tau = np.arange(periods * samples) / samples
+    drive = np.maximum(0, 30 * np.cos(2 * np.pi * tau))
+    coast = np.maximum(0, -10 * np.cos(2 * np.pi * tau))
+    turn = 2 * np.pi / 3 * tau
+    return Series(
+        time=tau / 150,
+        rotation=turn,
+        relative=-1e-4 * tau,
+        rate=0 * tau,
+        drive_force=drive,
+        coast_force=coast,
+        depth=0 * tau,
+    )
+
+
+def _evaluation(mean=14.830332, peak=83.824854, **changes):
+    made = Evaluation(
+        design=dict(DESIGN),
+        geometry={"outer_radius_mm": 45.1028545, "polar_inertia_kg_m2": 0.00210070},
+        response={"mean_force_N": mean, "peak_force_N": peak, "rms_force_N": 22.45494},
+        gradient={"mean_force_N": {"pressure_angle_deg": -0.24457, "involute_length_mm": 0.65}},
+        steady_state={"kind": "periodic", "period": 2, "floquet_multiplier": 0.37066967},
+        status=Status.PERIODIC,
+        message=Status.PERIODIC.value,
+        statistics={"solver_steps": 3055, "seconds": 21.16},
+        series=_series(),
+    )
+    return dataclasses.replace(made, **changes)
+
+
+def _failed():
+    return _evaluation(
+        response={},
+        gradient={},
+        steady_state={"kind": "transient"},
+        status=Status.PASSED_THROUGH,
+        message=Status.PASSED_THROUGH.value,
+        series=None,
+    )
+
+
+def _history():
+    rows = []
+    for i in range(12):
+        row = DESIGN | {"evaluation": i, "start": -1 if i < 4 else i // 8, "iteration": i}
+        row |= {"objective": 1.2 - 0.05 * i, "best_objective": min(1.0, 1.2 - 0.05 * i)}
+        row |= {"feasible": i != 6, "status": "periodic"}
+        rows.append(row)
+    rows[5]["objective"] = float("nan")
+    return rows
+
+
+def _read(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# ---------------------------------------------------------------------------- files
+
+
+def test_csv_keeps_ten_digits(tmp_path):
+    series = _series()
+    columns = files.response_columns(series)
+    path = files.ResultFolder(tmp_path).write_csv("response_baseline.csv", columns)
+    assert path == tmp_path / "response_baseline.csv"
+    rows = _read(path)
+    assert list(rows[0]) == [
+        "time_s", "rotation_deg", "relative_rotation_rad", "relative_speed_rad_s",
+        "drive_flank_force_N", "coast_flank_force_N", "contact_force_N",
+    ]  # fmt: skip
+    for name, values in columns.items():
+        np.testing.assert_allclose([float(row[name]) for row in rows], values, rtol=1e-9)
+    assert float(rows[64]["rotation_deg"]) == 120
+    np.testing.assert_allclose(columns["contact_force_N"], series.drive_force + series.coast_force)
+
+
+def test_csv_of_rows_keeps_text_truth_and_gaps(tmp_path):
+    rows = [{"a": 1, "b": True, "c": "x,y"}, {"a": 2, "b": False, "d": float("nan")}]
+    folder = files.ResultFolder(tmp_path)
+    read = _read(folder.write_csv("history.csv", files.row_columns(rows)))
+    assert read[0] == {"a": "1", "b": "true", "c": "x,y", "d": ""}
+    assert read[1] == {"a": "2", "b": "false", "c": "", "d": "nan"}
+    empty = folder.write_csv("history.csv", files.row_columns([], keys=("a", "b")))
+    assert empty.read_text() == "a,b\n"
+
+
+def test_csv_refuses_uneven_columns(tmp_path):
+    with pytest.raises(ValueError, match="one length"):
+        files.ResultFolder(tmp_path).write_csv("x.csv", {"a": [1.0], "b": [1.0, 2.0]})
+    assert os.listdir(tmp_path) == []
+
+
+def test_profile_columns():
+    columns = files.profile_columns(np.array([[45.0, 0.0], [0.0, 30.0]]))
+    assert {name: list(values) for name, values in columns.items()} == {
+        "x_mm": [45.0, 0.0], "y_mm": [0.0, 30.0],
+    }  # fmt: skip
+
+
+def test_json_has_null_for_what_is_not_finite(tmp_path):
+    data = {
+        "a": float("nan"),
+        "b": [np.inf, np.float64(1.5)],
+        "c": np.array([1, 2]),
+        "d": {"e": np.bool_(True), "f": None, "g": Status.CHAOTIC},
+    }
+    path = files.ResultFolder(tmp_path).write_json("result.json", data)
+
+    def refuse(name):
+        raise AssertionError(name)
+
+    assert json.loads(path.read_text(), parse_constant=refuse) == {
+        "a": None, "b": [None, 1.5], "c": [1, 2],
+        "d": {"e": True, "f": None, "g": "chaotic"},
+    }  # fmt: skip
+
+
+def test_files_are_replaced_whole_and_leave_nothing_else(tmp_path):
+    folder = files.ResultFolder(tmp_path)
+    folder.write_text("config.yaml", "old")
+    folder.write_text("config.yaml", "new")
+    folder.write_text("figures/note.txt", "x")
+    assert sorted(os.listdir(tmp_path)) == ["config.yaml", "figures"]
+    assert os.listdir(tmp_path / "figures") == ["note.txt"]
+    assert (tmp_path / "config.yaml").read_text() == "new"
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+def test_a_failing_write_keeps_the_old_file(tmp_path, monkeypatch, step):
+    folder = files.ResultFolder(tmp_path)
+    folder.write_text("result.json", "old")
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files.disk.os, step, fail)
+    with pytest.raises(InputError, match="no space left on device") as caught:
+        folder.write_text("result.json", "new")
+    assert "\n" not in str(caught.value)
+    monkeypatch.undo()
+    assert os.listdir(tmp_path) == ["result.json"]
+    assert (tmp_path / "result.json").read_text() == "old"
+
+
+def test_a_new_folder_is_made_with_its_parents(tmp_path):
+    folder = files.ResultFolder(tmp_path / "a" / "b")
+    assert folder.path.is_dir()
+    assert os.listdir(folder.path) == []
+
+
+@pytest.mark.parametrize("below", ["", "x", "x/y/z"])
+def test_a_path_at_or_below_a_file_is_refused(tmp_path, below):
+    (tmp_path / "file").write_text("keep")
+    with pytest.raises(InputError, match="output folder") as caught:
+        files.ResultFolder(tmp_path / "file" / below)
+    assert str(tmp_path / "file") in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert os.listdir(tmp_path) == ["file"]
+    assert (tmp_path / "file").read_text() == "keep"
+
+
+def test_an_unwritable_folder_is_refused_and_new_parents_removed(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(files.disk, "create", refuse)
+    with pytest.raises(InputError, match="permission denied"):
+        files.ResultFolder(tmp_path / "a" / "b")
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["", "nul\0byte", "x" * 300])
+def test_impossible_names_are_refused(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError):
+        files.ResultFolder(name)
+    assert os.listdir(tmp_path) == []
+
+
+def test_versions():
+    found = files.versions()
+    assert set(found) == {
+        "python", "rootsopt", "jax", "jaxlib", "diffrax", "optax", "equinox", "numpy",
+    }  # fmt: skip
+    assert found["numpy"] == np.__version__
+
+
+def test_importing_files_and_report_does_not_import_matplotlib():
+    code = (
+        "from rootsopt.output import files, tables;"
+        "import sys; sys.exit('matplotlib' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+# --------------------------------------------------------------------------- tables
+
+
+def _render(table):
+    console = Console(width=80, force_terminal=False, color_system=None)
+    with console.capture() as capture:
+        console.print(table)
+    text = capture.get()
+    assert text.isascii()
+    assert "\x1b" not in text
+    assert max(map(len, text.splitlines())) <= 80
+    return text
+
+
+def _row(text, label):
+    (line,) = [line for line in text.splitlines() if line.startswith(f"|   {label} ")]
+    return [cell.strip() for cell in line.strip("|").split("|")][1:]
+
+
+CONSTRAINTS = [
+    {"name": "area_efficiency", "baseline": 0.4344578, "optimized": 0.4344579, "unit": "",
+     "limit": 0.4344578, "sense": ">=", "satisfied": True, "active": True},
+    {"name": "undercut_margin", "baseline": 7.4, "optimized": -0.1, "unit": "mm", "limit": 0.0,
+     "sense": ">=", "satisfied": False, "active": False},
+]  # fmt: skip
+
+
+def test_comparison_table():
+    gains = {"objective": 0.25, "mean_force_N": 0.1, "peak_force_N": 0.5}
+    baseline, better = _evaluation(), _evaluation(13.3472988, 41.912427)
+    text = _render(tables.comparison_table(baseline, better, CONSTRAINTS, gains))
+    assert _row(text, "objective (baseline = 1)") == ["1", "0.75000", "-25.00 %"]
+    assert _row(text, "mean force, N") == ["14.830", "13.347", "-10.00 %"]
+    assert _row(text, "peak force, N") == ["83.825", "41.912", "-50.00 %"]
+    assert _row(text, "pressure angle, deg") == ["36.430", "36.430", "+0.00 %"]
+    assert _row(text, "polar inertia, kg m^2")[0] == "0.0021007"
+    assert _row(text, "by pressure angle, N/deg") == ["-0.24457", "-0.24457", ""]
+    assert _row(text, "area efficiency >= 0.43446") == ["0.43446", "0.43446", "active"]
+    assert _row(text, "undercut margin >= 0 mm") == ["7.4000", "-0.10000", "violated"]
+    assert _row(text, "status") == ["periodic", "periodic", ""]
+    assert text.count(Status.PERIODIC.value) == 1
+
+
+def test_comparison_table_without_a_usable_result():
+    failed = _failed()
+    text = _render(tables.comparison_table(_evaluation(), failed, [], {"objective": float("nan")}))
+    assert _row(text, "objective (baseline = 1)") == ["-", "-", "-"]
+    assert _row(text, "mean force, N") == ["14.830", "-", "-"]
+    assert _row(text, "by pressure angle, N/deg") == ["-0.24457", "-", ""]
+    assert _row(text, "status") == ["periodic", "passed_through", ""]
+    assert "passed through each other" in text
+
+
+def test_evaluation_table():
+    text = _render(tables.evaluation_table(_evaluation()))
+    assert _row(text, "mean force, N") == ["14.830"]
+    assert _row(text, "by involute length, N/mm") == ["0.65000"]
+    assert _row(text, "period, mesh periods") == ["2"]
+    assert _row(text, "status") == ["periodic"]
+    empty = _render(tables.evaluation_table(_failed()))
+    assert empty.count("|   none ") == 2  # response and gradient
+    assert "passed through each other" in empty
+
+
+def test_geometry_table():
+    record = {"design": {}, "geometry": {"outer_radius_mm": 44.0, "area_efficiency": 0.40625}}
+    text = _render(tables.geometry_table(record))
+    assert _row(text, "outer radius, mm") == ["44.000"]
+    assert _row(text, "area efficiency") == ["0.40625"]
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(0.0, "0"), (1973.3, "1973.3"), (-1.23456e-7, "-1.235e-07"), (3, "3"), (None, "-"),
+     (float("nan"), "-"), (123456.7, "123457")],
+)  # fmt: skip
+def test_number(value, shown):
+    assert tables._number(value) == shown
+
+
+# -------------------------------------------------------------------------- figures
+
+
+@pytest.mark.parametrize("count", [96, 97])
+def test_spectrum_of_a_cosine(count):
+    step = 3 / (150 * count)  # three whole periods of 150 Hz
+    time = step * np.arange(count)
+    signal = 5 + 2.5 * np.cos(2 * np.pi * 150 * time + 0.3) + 0.5 * np.sin(2 * np.pi * 300 * time)
+    frequency, amplitude = amplitude_spectrum(signal, step)
+    expected = np.zeros_like(frequency)
+    expected[np.isclose(frequency, 150)] = 2.5
+    expected[np.isclose(frequency, 300)] = 0.5
+    assert np.count_nonzero(expected) == 2
+    assert frequency[0] == pytest.approx(50)
+    np.testing.assert_allclose(amplitude, expected, atol=1e-12)
+
+
+def test_spectrum_at_the_highest_frequency():
+    _, amplitude = amplitude_spectrum(3.0 * (-1.0) ** np.arange(8), 0.1)
+    np.testing.assert_allclose(amplitude, [0, 0, 0, 3], atol=1e-12)
+
+
+def test_force_panels_show_each_peak_on_a_common_time_axis():
+    long = _series(periods=128)
+    late = np.where(np.arange(128 * 64) == 100 * 64, 500.0, long.drive_force)
+    long = dataclasses.replace(long, drive_force=late)
+    _, axes = figure(6, 4, 2, 1, sharex=True)
+    responses = {"a": {"mean_force_N": 10.0, "peak_force_N": 500.0},
+                 "b": {"mean_force_N": 10.0, "peak_force_N": 30.0}}  # fmt: skip
+    plot_force(axes[:, 0], {"a": long, "b": _series()}, responses)
+    drawn = axes[0, 0].lines[0]
+    assert drawn.get_ydata().max() == 500
+    assert axes[0, 0].get_xlim() == pytest.approx((0, 20))
+    assert drawn.get_xdata()[-1] < 20
+
+
+def _png_size(path):
+    data = path.read_bytes()
+    assert data.startswith(b"\x89PNG")
+    return int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
+
+
+def test_optimization_figures(tmp_path):
+    folder = files.ResultFolder(tmp_path)
+    better = _evaluation(design=DESIGN | {"involute_length_mm": 8.0})
+    names = optimization_figures(folder, _evaluation(), better, _history(), parse(CONFIG))
+    assert names == [
+        f"figures/{name}.png" for name in ("profiles", "meshing", "force", "spectrum", "history")
+    ]
+    assert sorted(os.listdir(tmp_path / "figures")) == sorted(n.split("/")[1] for n in names)
+    for name in names:
+        width, height = _png_size(tmp_path / name)
+        assert width >= 1400
+        assert height >= 700
+        assert (tmp_path / name).stat().st_size > 20_000
+
+
+def test_simulation_figures_without_a_series(tmp_path):
+    folder = files.ResultFolder(tmp_path)
+    names = simulation_figures(folder, _failed(), parse(CONFIG))
+    assert names == ["figures/profiles.png", "figures/meshing.png"]
+    assert "pyplot" not in vars(runs)
+
+
+def test_history_of_nothing_but_failures():
+    rows = [row | {"objective": None, "best_objective": float("nan")} for row in _history()]
+    _, axes = figure(6, 6, 4, 1)
+    plot_history(axes[:, 0], rows)
+    assert "unusable design" in axes[0, 0].get_legend_handles_labels()[1]

@@ -1,0 +1,102 @@
+"""Area and polar moment of every family against polygons of its own outline, from positions alone.
+
+Derivatives of both with respect to the design against differences of the polygons.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experiments.geometry import study
+from rootsopt.config import FAMILY_KEYS
+from rootsopt.profiles import geometry
+from rootsopt.scene.families import MM, profile_of
+
+ERROR = 1e-11
+"""Relative; the study in experiments/geometry finds 1e-13."""
+HARD = {
+    # The normals of the arc all but touch the pitch circle, at its end or inside of it.
+    "cic": (5, [[36.43, 6.0, 4.0], [9.90309962, 4.61058857e-06, 0.00440706401]]),
+    "ee": (4, [[]]),
+    "arc": (5, [[30.0], [31.9750552], [32.99]]),
+    "arcs_epicycloid": (5, [[32.2328279, 4.52872269, 1.31231773]]),
+    "arc_involute": (5, [[30.0, 4.0], [9.57156265, 2.03155703e-06], [86.07009, 4.82898416]]),
+    "four_arcs": (5, [[32.7457584, 9.9455844, 26.4908313]]),
+    "five_arcs": (5, [[38.6977037, 3.82052582, 10.6338733, 36.9061107]]),
+    "circle_epicycloid": (5, [[10.5861275, 89.9968733]]),
+    "hypo_epicycloid": (5, [[3.0], [17.9924375]]),
+    # The pressure angle is steep.
+    "extended_cycloid": (5, [[1.0], [0.3835], [0.238601779]]),
+    "ellipse": (5, [[9.46007216, 27.8267607]]),
+    "free_form": (3, [[4.0, 0.8, 0.7, 0.75], [5.04175591, 0.98336944, 0.83837998, -0.4203177]]),
+}
+"""Number of lobes and designs (config units) of each family."""
+
+
+@pytest.mark.parametrize("family", HARD)
+def test_area_and_moment_are_those_of_the_outline(family):
+    lobes, designs = HARD[family]
+    designs = np.array(designs).reshape(len(designs), -1)
+    area, moment, reference = np.asarray(study.compared(family, lobes, designs)).T
+    assert np.max(reference) < ERROR / 10
+    assert np.max(area) < ERROR
+    assert np.max(moment) < ERROR
+
+
+def test_every_family_is_looked_at():
+    assert set(HARD) == {*FAMILY_KEYS} - {"outline"}
+
+
+DRAWN = 8
+
+
+@pytest.mark.parametrize("family", ["cic", "extended_cycloid"])
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_random_designs(family, seed):
+    """Over the whole range that a config allows."""
+    _, found = study.errors(family, 5, DRAWN, np.random.default_rng(seed))
+    assert np.max(found, initial=0.0) < ERROR
+
+
+@pytest.mark.long
+def test_study():
+    """All families and numbers of lobes, many sound designs of each."""
+    rows = study.study(100, 1)
+    assert sum(row["sound"] for row in rows) > 2000
+    assert {row["family"].split()[0] for row in rows if row["sound"]} == set(HARD)
+    for row in rows:
+        if row["sound"]:
+            assert max(row["area_error"], row["polar_moment_error"]) < ERROR, row
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def slopes(family, lobes, design, way, step):
+    """Derivatives of area and moment along a `way` (d,), and differences of those of polygons."""
+    make = functools.partial(profile_of, family, lobes, jnp.asarray(33.0 * MM))
+
+    def integrals(design):
+        shape = geometry(make(design))
+        return jnp.stack([shape.area, shape.polar_area_moment])
+
+    ends = jax.lax.map(lambda x: study.by_polygons(make(design + x * step * way))[0], _STEPS)
+    near, far = (ends[1] - ends[0]) / 2, (ends[3] - ends[2]) / 4
+    return jax.jvp(integrals, (design,), (way,))[1], (4 * near - far) / (3 * step)
+
+
+_STEPS = jnp.array([-1.0, 1.0, -2.0, 2.0])
+
+
+@pytest.mark.parametrize("family", ["cic", "extended_cycloid"])
+def test_slopes_are_those_of_the_outline(family):
+    lobes, designs = HARD[family]
+    for design in map(np.array, designs):
+        ways = np.diag(design)
+        rows = [slopes(family, lobes, design, way, 1e-4) for way in ways]
+        found, expected = (np.array(each) for each in zip(*rows, strict=True))
+        assert np.all(np.abs(found - expected) < 1e-6 * np.max(np.abs(expected), axis=0)), design

@@ -1,0 +1,225 @@
+"""Profile families: the conformance suite, known numbers, limits, refusals."""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from rootsopt.config.families import families
+from rootsopt.errors import InputError
+from rootsopt.profiles import CIC, EE, arc
+from rootsopt.profiles.validity import margins
+from rootsopt.scene.families import check, profile_of
+from tests.conformance import families as suite
+from tests.conformance.families import COUNT, R, config_of, looked_at, made, maker, measure, sampled
+
+DEG = np.pi / 180
+FAMILIES = [name for name, family in families().items() if family.maker is not None]
+_ALIKE = {
+    suite.search_finds_the_closest_approach: (
+        *("arc", "four_arcs", "five_arcs", "arc_involute", "hypo_epicycloid", "ellipse", "ee"),
+    ),
+    suite.slopes_of_geometry_are_those_of_differences: ("arc", "five_arcs", "ellipse", "cic"),
+    suite.what_margins_call_sound_is_one_curve: ("arc_involute", "ee"),
+}
+"""Families that share the code of the rest in a check that compiles long: in long runs only."""
+
+
+def every_check():
+    """All pairs of a family and a check."""
+    pairs = []
+    for family, one in itertools.product(FAMILIES, suite.CHECKS):
+        marks = [pytest.mark.long] if family in _ALIKE.get(one, ()) else []
+        pairs.append(pytest.param(family, one, marks=marks, id=f"{family}-{one.__name__}"))
+    return pairs
+
+
+@pytest.mark.parametrize(("family", "holds"), every_check())
+def test_conforms(family, holds):
+    """Every family that the package registers passes the suite."""
+    holds(family)
+
+
+# Known numbers
+
+
+@pytest.mark.parametrize(
+    ("lobes", "center", "tip_radius", "efficiency"),
+    [(2, 0.8, 1.51318, 0.51382), (3, 0.9, 1.40115, 0.45679)],
+)
+def test_single_arc(lobes, center, tip_radius, efficiency):
+    found = measure(arc(lobes, 1.0, center))
+    assert float(found.outer_radius) == pytest.approx(tip_radius, abs=5e-6)
+    assert float(found.area_efficiency) == pytest.approx(efficiency, abs=5e-6)
+
+
+@pytest.mark.parametrize(
+    ("lobes", "center", "efficiency"),
+    [(2, 0.92882, 0.58116), (3, 0.96693, 0.50355), (4, 0.98111, 0.43971)],
+)
+def test_largest_single_arc_without_undercut(lobes, center, efficiency):
+    def undercut(b):
+        return float(margins(arc(lobes, 1.0, b)).undercut)
+
+    limit = brentq(undercut, 0.8, 0.999, xtol=1e-9)
+    assert limit == pytest.approx(center, abs=5e-6)
+    found = measure(arc(lobes, 1.0, limit))
+    # The efficiency of the source is that at its own rounded centre.
+    assert float(found.area_efficiency) == pytest.approx(efficiency, abs=1e-5)
+
+
+def test_margins_are_the_least_between_the_places_too():
+    """Undercut and star margin of an arc are least inside a segment: in 400 places they are seen
+    up to 1e-5 too great, with the parabola through three of them right to 3e-7."""
+    sampled = []
+    for center in (0.89, 0.9, 0.92):
+        profile, fine, coarse = arc(3, 1.0, center), [], []
+        for segment in profile.segments():
+            share = np.linspace(1e-9, 1 - 1e-9, 1 + 399 * 200)
+            nu = float(segment.start) + float(segment.stop - segment.start) * share
+            point, _, dedendum = profile.speeds(jnp.asarray(nu))
+            sliding = np.sin(point.psi)
+            both = np.stack([dedendum, np.minimum(sliding + point.s, sliding - point.s)])
+            fine.append(np.min(both, axis=1))
+            coarse.append(np.min(both[:, ::200], axis=1))
+        least = np.min(fine, axis=0)
+        sampled.append(np.min(coarse, axis=0) - least)
+        found = margins(profile)
+        np.testing.assert_allclose([found.undercut, found.star], least, rtol=0, atol=3e-7)
+    assert np.all(np.max(sampled, axis=0) > 2e-6)
+
+
+def test_ranges_of_the_arc_and_involute_patent():
+    """US 7,320,579, claim 1, with centre distance L and two lobes: base radius above L / 2√2 and
+    arc above √2 π L / 16, where the involute is the longest at 45°; arc below (27 - 5√2) L / 56,
+    where it has none and the tip lies at 3 L / 4."""
+    distance = 1.0
+    r = distance / 2
+    longest = r * np.sin(np.pi / 4) * np.pi / 4
+    least = profile_of("arc_involute", 2, jnp.asarray(r), jnp.asarray([45.0, longest * 1e3]))
+    assert isinstance(least, CIC)
+    assert float(least.base_radius) == pytest.approx(distance / (2 * np.sqrt(2)), rel=1e-12)
+    assert float(least.arc_radius) == pytest.approx(np.sqrt(2) / 16 * np.pi * distance, rel=1e-12)
+    assert float(least.arc_radius) == pytest.approx(0.27768, abs=5e-6)
+
+    def tip(b):
+        return float(measure(arc(2, r, b)).outer_radius) - 0.75 * distance
+
+    radius = float(arc(2, r, brentq(tip, 0.3, 0.45, xtol=1e-12)).radius[0])
+    assert radius == pytest.approx((27 - 5 * np.sqrt(2)) / 56 * distance, rel=1e-9)
+    assert radius == pytest.approx(0.35587, abs=5e-6)
+
+
+@pytest.mark.parametrize(
+    ("base", "wanted"),
+    [(0.353554, 0.27769), (0.353554, 0.343), (0.39, 0.3075), (0.39, 0.352), (0.424264, 0.35587)],
+)
+def test_patented_rotors_are_sound(base, wanted):
+    """US 7,320,579 with distance L: for base radii from L / 2√2 to 0.3 √2 L some length of the
+    involute gives arcs of the radii claimed, 0.27768 L to 0.35587 L, and rotors that mesh."""
+    r, distance = 33.0, 66.0
+    angle = np.degrees(np.arccos(base * distance / r))
+    longest = r * np.sin(angle * DEG) * np.pi / 4
+
+    def made(length):
+        design = jnp.asarray([angle, length])
+        return profile_of("arc_involute", 2, jnp.asarray(r * 1e-3), design)
+
+    def beyond(length):
+        return float(made(length).arc_radius) / (distance * 1e-3) - wanted
+
+    length = brentq(beyond, longest / 2, longest)
+    keys = {"pressure_angle_deg": angle, "involute_length_mm": length}
+    check(config_of("arc_involute", lobes=2, **keys))
+    assert float(made(length).base_radius) == pytest.approx(base * distance * 1e-3, rel=1e-12)
+    assert min(float(margin) for margin in margins(made(length))) > -1e-9
+
+
+def test_families_that_become_another():
+    """Two arcs of one radius and an ellipse of equal semi-axes are the single arc; a circle of
+    r / 2N, whole arches without a land and a ratio of 1 are EE."""
+    single, ee = maker("arc")(jnp.asarray([29.7])), EE(3, R)
+    radius = float(single.radius[0]) * 1e3
+    nu = np.linspace(0.01, 1.4, COUNT)
+    for family, design, same in (
+        ("four_arcs", [29.7, radius, 40.0], single),
+        ("ellipse", [29.7, radius], single),
+        ("circle_epicycloid", [5.5, 0.01], ee),
+        ("hypo_epicycloid", [0.0], ee),
+        ("extended_cycloid", [1.0], ee),
+    ):
+        other = maker(family)(jnp.asarray(design))
+        one, two = (looked_at(p, jnp.asarray(nu)) for p in (same, other))
+        for key in ("addendum", "dedendum", "lever"):
+            np.testing.assert_allclose(two[key], one[key], rtol=0, atol=1e-10 * R, err_msg=family)
+
+
+@pytest.mark.parametrize("ratio", [0.7, 1.3])
+def test_extended_cycloid_is_the_curve_drawn(ratio):
+    """P(θ), its tangents by differences, against the core's form of it."""
+    profile = maker("extended_cycloid")(jnp.asarray([ratio]))
+
+    def drawn(theta):
+        u = 1 - 6 * theta / np.pi
+        away = 1 + (ratio - 1) * u**3 * (10 - 15 * u + 6 * u**2)
+        return R * np.exp(1j * theta) * (7 / 6 + away / 6 * np.exp(6j * theta))
+
+    theta = np.linspace(0, np.pi / 6, COUNT + 2)[1:-1]
+    normal = (drawn(theta + 1e-6) - drawn(theta - 1e-6)) / 1j
+    nu = jnp.asarray(np.angle(normal))
+    place = np.asarray(looked_at(profile, nu)["addendum"]) @ [1, 1j]
+    np.testing.assert_allclose(place, drawn(theta), rtol=0, atol=1e-9 * R)
+
+
+def test_edge_describes_an_extended_epicycloid():
+    """The mate of an edge lies at its radius from what its centre draws on the partner, and is
+    carried over: the contact moves backwards along it."""
+    profile = made("arcs_epicycloid")
+    nu, found = sampled("arcs_epicycloid")
+    edge = np.flatnonzero((nu > profile.joints[1]) & (nu < profile.joints[2]))[::40]
+    mate = found["dedendum"][edge]
+    center, theta = np.hypot(*profile.center[1]), float(profile.joints[1])
+    # The rotor rolls on the partner's pitch circle; a space of the partner lies at π/3.
+    turn = np.linspace(-0.5, 0.5, 20001)
+    path = 2 * R * np.exp(1j * turn) - center * np.exp(1j * (2 * turn - theta))
+    path = np.conj(path) * np.exp(1j * np.pi / 3)
+    distance = np.abs(path[:, None] - np.asarray(mate) @ [1, 1j])
+    np.testing.assert_allclose(np.min(distance, axis=0), 1e-3, rtol=0, atol=1e-9)
+    assert len(edge) == 5
+    assert np.all(found["rate"][edge] < 0)
+    assert float(margins(profile).rolling) < 0 < float(margins(profile).undercut)
+
+
+def test_five_arcs_have_their_land():
+    """Tangents and the pitch crossing are looked at with those of every family."""
+    shape = measure(made("five_arcs"))
+    assert float(shape.outer_radius) == pytest.approx(0.045, rel=1e-12)
+    assert float(shape.seal_width) == pytest.approx(2 * 3 * DEG * 0.045)
+
+
+# Use by name
+
+
+@pytest.mark.parametrize(
+    ("family", "changes", "fault"),
+    [
+        ("arc", {"arc_center_mm": 32.5}, "undercut"),
+        ("arc", {"arc_center_mm": 34.0}, "miss the pitch circle|mesh at once|undercut"),
+        ("four_arcs", {"tip_arc_turn_deg": 120.0}, "end before|convex"),
+        ("five_arcs", {"outer_radius_mm": 60.0}, "undercut|convex|miss|at once"),
+        ("five_arcs", {"tip_arc_angle_deg": 20.0, "tip_arc_turn_deg": 10.0}, "end before"),
+        ("arcs_epicycloid", {"arc_center_mm": 33.0, "edge_radius_mm": 5.0}, "undercut|miss"),
+        ("arcs_epicycloid", {"edge_radius_mm": 0.05}, "`profile.edge_radius_mm` must be at least"),
+        ("circle_epicycloid", {"tip_arc_turn_deg": 15.0}, "mesh at once"),
+        ("circle_epicycloid", {"rolling_radius_mm": 20.0, "tip_arc_turn_deg": 70.0}, "folds back"),
+        ("hypo_epicycloid", {"tip_arc_angle_deg": 31.0}, "`profile.tip_arc_angle_deg` = 31"),
+        ("extended_cycloid", {"trochoid_ratio": 1.5}, "folds back"),
+        ("ellipse", {"ellipse_height_mm": 1.0}, "miss the pitch crossing"),
+    ],
+)
+def test_unsound_profiles_are_refused(family, changes, fault):
+    config = config_of(family, **changes)
+    with pytest.raises(InputError, match=fault):
+        check(config)

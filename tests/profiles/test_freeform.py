@@ -1,0 +1,329 @@
+"""Free form: its spline, conjugacy, projections, gradients, config, optimisation, likeness."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.interpolate import BSpline
+
+from rootsopt.config import parse
+from rootsopt.contact.nodes import pair_gap
+from rootsopt.design.resemblance import likenesses
+from rootsopt.design.space import sobol
+from rootsopt.errors import InputError
+from rootsopt.optimize.problem import Problem
+from rootsopt.optimize.search import Search
+from rootsopt.profiles import CIC, EE, FreeForm, geometry, project
+from rootsopt.profiles.departure import departure, distances
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.scene import Scene, design_vector
+from rootsopt.scene.families import check, free_form_of, keys_of, profile_of, with_design
+from tests.optimize.test_optimize import SCENE
+
+R = 0.033
+DEG = np.pi / 180
+TIP = 2 * DEG
+SHARES = np.array([0.7, 0.9, 0.95, 0.8, 0.4, 0.1, -0.3])
+CIC_KEYS = "pressure_angle_deg: 36.43,\n          involute_length_mm: 8.0, tip_arc_angle_deg: 4.0"
+measure = jax.jit(geometry)
+
+
+def made(family, *design):
+    """A member of a family, with three lobes."""
+    return profile_of(family, 3, jnp.asarray(R), jnp.asarray(design))
+
+
+def scene(family, inside, *overrides):
+    """The scene of the optimiser's tests with another profile, its contact to first order."""
+    text = SCENE.replace("family: cic", f"family: {family}").replace(CIC_KEYS, inside)
+    return parse(text, ["solver.fidelity=linear", *overrides])
+
+
+def free(*overrides):
+    return scene(
+        "free_form",
+        f"tip_arc_angle_deg: 2.0, coefficients: {SHARES.tolist()}",
+        "solver.gradient=reverse",
+        *overrides,
+    )
+
+
+@pytest.fixture(scope="module")
+def profile():
+    return FreeForm(3, R, TIP, SHARES)
+
+
+def test_shares_and_pressure_angle_are_the_spline(profile):
+    """τ and ψ at given normals, from SciPy's B-spline and its integral; ends of the addendum."""
+    spans = len(SHARES) - 2
+    knots = np.concatenate([[0, 0], np.arange(spans + 1), [spans, spans]])
+    spline = BSpline(knots, SHARES, 2)
+    half = np.pi / 6
+    length = (half - TIP) / (1 - spline.integrate(0, spans) / spans)
+    assert float(profile.pitch_normal) == pytest.approx(TIP + length, rel=1e-14)
+    for share in (0.0, 0.13, 0.5, 0.77, 0.999):
+        nu = jnp.asarray(TIP + share * length)
+        turned = spline.integrate(0, share * spans) / spans * length
+        point = profile.addendum(nu)
+        assert float(point.psi) == pytest.approx(np.pi / 2 - turned, abs=1e-13)
+        assert float(profile.roll_rate(nu)) == pytest.approx(1 - spline(share * spans), abs=1e-12)
+    assert float(profile.roll_angle(profile.pitch_normal)) == pytest.approx(half, rel=1e-14)
+    assert float(profile.contact_distance(profile.pitch_normal)) == pytest.approx(0, abs=1e-17)
+
+
+def test_law_of_gearing_and_inverse(profile):
+    """ds/dβ = -r cos ψ and h′ = -lever by differentiation; ν(β) is the inverse of β(ν), with its
+    derivatives by the coefficients."""
+    nu = jnp.linspace(TIP, float(profile.pitch_normal), 33)[1:-1]
+
+    @jax.jit
+    def looked(profile, nu):
+        one = jnp.ones_like(nu)
+        rise, fall = (
+            jax.jvp(f, (nu,), (one,))[1] for f in (profile.contact_distance, profile.support)
+        )
+        law = -R * jnp.cos(profile.addendum(nu).psi) * profile.roll_rate(nu)
+        return rise - law, fall + profile.lever(nu), profile.normal_at(profile.roll_angle(nu))
+
+    def there_and_back(shares):
+        made = FreeForm(3, R, TIP, shares)
+        return made.normal_at(made.roll_angle(nu))
+
+    gearing, support, back = looked(profile, nu)
+    np.testing.assert_allclose(gearing, 0, atol=1e-15)
+    np.testing.assert_allclose(support, 0, atol=1e-15)
+    np.testing.assert_allclose(back, nu, atol=1e-13)
+    # Whatever the coefficients: nothing changes.
+    slopes = jax.jit(jax.jacfwd(there_and_back))(jnp.asarray(SHARES))
+    np.testing.assert_allclose(slopes, 0, atol=1e-12)
+
+
+def test_pair_touches_and_does_not_overlap(profile, graded_outline):
+    """|gap| < 1 nm through a mesh period, by node search; the area by the polygon."""
+    points = graded_outline(profile, 1500) * 1e3
+    for phi in 0.0123 + 2 * np.pi / 3 * np.arange(7) / 7:
+        assert abs(pair_gap(points, 3, 66.0, phi, phi)) < 1e-6
+    corners = points @ [1, 1j]
+    area = np.sum((np.conj(corners[:-1]) * corners[1:]).imag) / 2
+    assert float(measure(profile).area) * 1e6 == pytest.approx(area, rel=1e-6)
+
+
+def test_ee_is_a_free_form_of_equal_coefficients():
+    """For any number of lobes, with N / (1 + N) throughout."""
+    for lobes in (2, 5):
+        same = FreeForm(lobes, R, 0.0, np.full(5, lobes / (1 + lobes)))
+        nu = jnp.linspace(0.01, 1.05 * float(same.pitch_normal), 20)
+        other = EE(lobes, R)
+        np.testing.assert_allclose(same.support(nu), other.support(nu), rtol=1e-13)
+        np.testing.assert_allclose(same.lever(nu), other.lever(nu), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("other", "within"),
+    [
+        # Distance (µm) with 6, 12 and 24 coefficients. Arcs that are tangent alone bend suddenly.
+        (CIC(3, R, 27.3 * DEG, 0.77e-3, 1.27 * DEG), (5.0, 0.5, 0.1)),
+        (made("arc", 29.7), (2.0, 0.05, 0.01)),
+        (made("four_arcs", 30.0, 13.0, 40.0), (200.0, 50.0, 10.0)),
+        (EE(3, R), (1e-6, 1e-6, 1e-6)),
+    ],
+)
+def test_projections_come_closer_with_more_coefficients(other, within):
+    away = [departure(other, project(other, count)) * 1e6 for count in (6, 12, 24)]
+    assert np.all(np.array(away) < within)
+    if away[0] > 1:
+        assert away[2] < away[1] / 2 < away[0] / 4
+
+
+def test_distance_of_points_from_a_line():
+    """From a corner, an end and the inside of a piece."""
+    line = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0]])
+    points = np.array([[1.0, 0.5], [3.0, -1.0], [-3.0, 4.0], [2.0, 1.0]])
+    np.testing.assert_allclose(distances(points, line), [0.5, np.sqrt(2), 5.0, 0.0], atol=1e-15)
+
+
+def test_derivatives_by_the_coefficients(profile):
+    """Area, tip radius, margin and lever against central differences. The step, 1e-5, leaves an
+    error of its square and of rounding, 1e-16, over it: some 1e-10 of each."""
+    step = 1e-5
+
+    def measured(shares):
+        made = FreeForm(3, R, TIP, shares)
+        shape = geometry(made)
+        near = made.normal_at(jnp.asarray(0.3))
+        scales = R**2, R, R, R, R
+        values = shape.area, shape.outer_radius, shape.undercut_margin, made.lever(near)
+        return jnp.stack([*values, made.support(near)]) / jnp.asarray(scales)
+
+    measured = jax.jit(measured)
+    slopes = jax.jit(jax.jacfwd(measured))(jnp.asarray(SHARES))
+    for k, unit in enumerate(np.eye(len(SHARES))):
+        ends = (measured(jnp.asarray(SHARES + sign * step * unit)) for sign in (1, -1))
+        np.testing.assert_allclose(slopes[:, k], np.subtract(*ends) / (2 * step), atol=1e-8)
+
+
+# In a config
+
+
+def test_keys_design_and_back():
+    """The list is one key in the config, and numbered entries in a design."""
+    config = free()
+    assert keys_of(config.profile)[:3] == ("tip_arc_angle_deg", "coefficients_1", "coefficients_2")
+    design = np.asarray(design_vector(config))
+    np.testing.assert_allclose(design, [2.0, *SHARES])
+    changed = with_design(config.profile, design + 0.01)
+    assert changed.coefficients == pytest.approx(tuple(SHARES + 0.01))
+    assert parse(config.to_yaml()) == config
+    check(config.profile)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("profile.coefficients=[0.5, 0.5]", ("profile.coefficients", "3")),
+        ("profile.coefficients=[0.5, 1.5, 0]", ("profile.coefficients", "at most 1")),
+        ("profile.coefficients=null", ("profile.coefficients", "required")),
+        ("profile.coefficients=0.5", ("profile.coefficients", "list")),
+        ("optimizer.bounds.coefficients=[0, 2]", ("optimizer.bounds.coefficients", "[-1, 1]")),
+        ("optimizer.bounds.coefficient=[0, 1]", ("did you mean", "optimizer.bounds.coefficients")),
+    ],
+)
+def test_what_is_wrong_with_a_config_is_said(override, words):
+    with pytest.raises(InputError) as error:
+        free(override)
+    for word in words:
+        assert word in str(error.value)
+
+
+def test_profile_that_does_not_mesh_is_refused():
+    """A dent, and a pressure angle that falls past 0, are found before anything is simulated."""
+    for shares, word in (([1, 1, 1, 1, 1, 1, -1], "convex"), ([0.8] * 7, "sound")):
+        with pytest.raises(InputError, match=word):
+            check(free(f"profile.coefficients={shares}").profile)
+
+
+def test_profile_command_projects(tmp_path, capsys):
+    """`--project` writes a config of the same pair that is within what it says."""
+    from rootsopt.commands import profile as command
+
+    source = tmp_path / "cic.yaml"
+    source.write_text(SCENE)
+    arguments = [str(source), "-o", str(tmp_path / "out"), "--no-figures", "--export", "svg"]
+    assert command.main([*arguments, "--project", "16"]) == 0
+    assert "free_form.yaml" in capsys.readouterr().out
+    found = parse((tmp_path / "out" / "free_form.yaml").read_text())
+    wanted = parse(SCENE)
+    assert (found.profile, found.scene) == (free_form_of(wanted.profile, 16)[0], wanted.scene)
+    assert free_form_of(wanted.profile, 16)[1] < 4e-6
+    assert command.main([*arguments, "--project", "2"]) == 2
+    assert "--project" in capsys.readouterr().err
+
+
+# Optimised
+
+
+@pytest.mark.long
+def test_gradient_of_the_force_agrees_with_central_differences():
+    """Reverse mode, along a direction in all coefficients. With a step of 1e-4 differences of
+    second order are good to some 1e-6 of the greatest slope."""
+    evaluator = Evaluator.of(free("solver.rtol=1e-10", "solver.fidelity=search"))
+    design = np.asarray(design_vector(evaluator.config))
+    direction = np.random.default_rng(2).normal(size=len(design))
+    here = evaluator(jnp.asarray(design), series=False)
+    assert here.usable
+    step = 1e-4
+    sides = [
+        evaluator(jnp.asarray(design + s * step * direction), here.state, series=False).response
+        for s in (1, -1)
+    ]
+    for name, slope in here.gradient.items():
+        along = np.array(list(slope.values())) @ direction
+        wanted = (sides[0][name] - sides[1][name]) / (2 * step)
+        assert along == pytest.approx(wanted, rel=1e-4)
+
+
+@pytest.mark.long
+def test_free_form_is_improved_by_a_search():
+    """Some steps of descent: better than the baseline within the constraints, and still sound."""
+    settings = free(
+        "optimizer.screening=0",
+        "optimizer.starts=1",
+        "optimizer.iterations=4",
+        "optimizer.learning_rate=0.01",
+    )
+    result = Search(settings).run()
+    assert result.optimized is not None
+    assert result.improvement["objective"] > 0.005
+    assert all(row["satisfied"] for row in result.constraints)
+    names = {row["name"] for row in result.constraints}
+    assert {"convex addendum", "star shape", "undercut margin"} <= names
+    check(with_design(settings.profile, list(result.optimized.design.values())))
+
+
+def test_single_arc_is_improved_by_a_search():
+    """A family of one parameter with margins for constraints: less displacement, less force."""
+    settings = scene(
+        "arc",
+        "arc_center_mm: 30.5",
+        "constraints.seal_width_min_mm=0",
+        "constraints.area_efficiency_min=0.44",
+        "optimizer.screening=4",
+        "optimizer.starts=1",
+        "optimizer.iterations=3",
+    )
+    result = Search(settings).run()
+    assert result.optimized is not None
+    assert result.improvement["objective"] > 0.01
+    assert all(row["satisfied"] for row in result.constraints)
+    assert {row["feasible"] for row in result.history} == {True}
+
+
+@pytest.mark.parametrize(
+    ("family", "inside"),
+    [
+        ("four_arcs", "arc_center_mm: 30.0, tip_arc_radius_mm: 13.0, tip_arc_turn_deg: 40.0"),
+        ("free_form", f"tip_arc_angle_deg: 2.0, coefficients: {SHARES.tolist()}"),
+    ],
+)
+def test_points_of_any_box_become_sound_profiles(family, inside):
+    """Wherever a sample lies in the bounds, it is drawn to where a profile can be made."""
+    settings = scene(
+        family,
+        inside,
+        "constraints.area_efficiency_min=0.42",
+        "constraints.seal_width_min_mm=0",
+    )
+    model, design = Scene.from_config(settings), design_vector(settings)
+    problem = Problem.of(settings, model, _geometry_alone(model, design))
+    start = problem.project(problem.point(design))
+    assert problem.feasible(start)
+    drawn = 0
+    for sample in sobol(12, 1, len(start)):
+        found = problem.toward(sample, start)
+        assert problem.feasible(found)
+        drawn += not problem.feasible(problem.project(sample))
+        check(with_design(settings.profile, problem.design(found)))
+    assert drawn > 0
+
+
+def _geometry_alone(model, design):
+    from tests.optimize.test_optimize import baseline
+
+    shape = measure(model.profile(design))
+    made = baseline(parse(SCENE))
+    return dataclasses.replace(made, geometry={"area_efficiency": float(shape.area_efficiency)})
+
+
+@pytest.mark.long
+def test_likeness_finds_the_family_it_came_from(monkeypatch):
+    """A projected member of a family resembles that family, in its parameters too."""
+    from rootsopt.design import resemblance
+
+    monkeypatch.setattr(resemblance, "classical", lambda: ("ee", "arc"))
+    nearest, other = likenesses(project(made("arc", 29.7), 12))
+    assert (nearest.family, other.family) == ("arc", "ee")
+    assert nearest.design["arc_center_mm"] == pytest.approx(29.7, abs=1e-3)
+    assert nearest.departure < 0.05e-6
+    assert other.departure == pytest.approx(departure(EE(3, R), made("arc", 29.7)), rel=1e-3)

@@ -1,0 +1,244 @@
+"""Motions that coexist: attractors, basins, and objectives over all of them."""
+
+import csv
+import dataclasses
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt.commands.console import main
+from rootsopt.config import load
+from rootsopt.dynamics.flow import Integrator, strobe
+from rootsopt.response.attractors import AttractorEvaluator, _Sorter, find
+from rootsopt.response.evaluation import Evaluator, evaluate
+from rootsopt.response.evaluators import evaluator_for
+from rootsopt.runtime.programs import Program
+from rootsopt.status import Status
+
+COEXIST = (
+    "scene.timing_gear.backlash_mm=0.2",
+    "scene.timing_gear.damping_ratio=0.2",
+    "scene.speed_rpm=6000",
+)
+GRID = "attractors.relatives=12", "attractors.rates=9"
+FORCES = ("mean_force_N", "peak_force_N", "rms_force_N")
+
+
+def config_of(*overrides):
+    return load("configs/cic.yaml", [*GRID, *overrides])
+
+
+@pytest.fixture(scope="module")
+def coexisting():
+    """Evaluator and basins of a scene with a quiet and noisy motions."""
+    evaluator = Evaluator.of(config_of(*COEXIST))
+    return evaluator, find(evaluator, series=True)
+
+
+long_run = Program(lambda pair, state, how: strobe(pair, state, 240, how).states)
+
+
+def test_motions_that_coexist_are_told_apart(coexisting):
+    """At least two stable orbits of different force, whose shares make up all initial states."""
+    _, basins = coexisting
+    assert basins.status is Status.PERIODIC
+    peaks = [one.evaluation.response["peak_force_N"] for one in basins.attractors]
+    assert len(peaks) >= 2
+    assert max(peaks) > 1.5 * min(peaks)
+    shares = [one.share for one in basins.attractors]
+    assert sum(shares) == pytest.approx(1)
+    assert shares == sorted(shares, reverse=True)
+    assert sum(one.reached for one in basins.attractors) == 1
+    counts = np.bincount(basins.leads_to.ravel(), minlength=len(shares))
+    assert counts / basins.leads_to.size == pytest.approx(shares)
+    for one in basins.attractors:
+        assert one.evaluation.steady_state["floquet_multiplier"] < 1
+        assert len(one.cycle) == one.evaluation.steady_state["period"]
+
+
+def test_the_one_reached_is_that_of_the_plain_evaluation(coexisting):
+    evaluator, basins = coexisting
+    (reached,) = (one for one in basins.attractors if one.reached)
+    plain = evaluate(evaluator.config)
+    for name in FORCES:
+        assert reached.evaluation.response[name] == pytest.approx(plain.response[name], rel=1e-9)
+
+
+def test_initial_states_lead_where_a_long_simulation_ends(coexisting):
+    """240 mesh periods at another tolerance with another method, from cells of the grid."""
+    evaluator, basins = coexisting
+    pair = evaluator.pair(jnp.array([36.43, 9.0, 4.0]))
+    how = Integrator("dopri8", jnp.asarray(1e-9), 4096)
+    agree = []
+    for row, column in [(0, 0), (1, 4), (2, 2), (3, 5), (4, 1), (5, 7), (2, 9), (7, 3)]:
+        start = jnp.array([basins.relative[column], basins.rate[row] * basins.mesh_period])
+        ends = np.asarray(long_run(pair, start / basins.angle_scale, how))[-8:]
+        cycle = basins.attractors[basins.leads_to[row, column]].cycle
+        apart = np.max(np.abs(ends[:, None] - cycle[None]), axis=2)
+        # Every point of the end lies on the cycle and every point of the cycle is visited.
+        agree.append(np.max(np.min(apart, axis=1)) < 0.02 and np.max(np.min(apart, axis=0)) < 0.02)
+    # Next to a boundary of the basins the tolerance decides.
+    assert sum(agree) >= 7
+
+
+def test_a_known_motion_is_not_lost_on_a_coarse_grid(coexisting):
+    """One initial state finds one motion; a state on another motion brings that in."""
+    _, basins = coexisting
+    small = Evaluator.of(config_of(*COEXIST, "attractors.relatives=1", "attractors.rates=1"))
+    alone = find(small)
+    assert len(alone.attractors) < len(basins.attractors)
+    others = [one.evaluation.state for one in basins.attractors]
+    together = find(small, known=others)
+    wanted, found = (
+        np.array([one.evaluation.response["peak_force_N"] for one in some.attractors])
+        for some in (basins, together)
+    )
+    assert np.all(np.min(np.abs(wanted[:, None] / found - 1), axis=1) < 1e-5)
+    assert sum(one.share for one in together.attractors) == pytest.approx(1)
+
+
+def test_worst_and_weighted(coexisting):
+    """The worst has the greatest weighted force, the weighted one averages by share."""
+    _, basins = coexisting
+    shares = np.array([one.share for one in basins.attractors])
+    responses = [one.evaluation.response for one in basins.attractors]
+    settings = *COEXIST, "objective.mean_weight=0", "objective.peak_weight=1"
+    worst = AttractorEvaluator(Evaluator.of(config_of(*settings, "objective.motion=worst")))()
+    assert worst.response["peak_force_N"] == max(r["peak_force_N"] for r in responses)
+    weighted = config_of(*settings, "objective.mean_weight=1", "objective.motion=weighted")
+    mean = AttractorEvaluator(Evaluator.of(weighted))()
+    for name in FORCES:
+        expected = shares @ [r[name] for r in responses]
+        assert mean.response[name] == pytest.approx(expected, rel=1e-9)
+        gradients = [one.evaluation.gradient[name] for one in basins.attractors]
+        for key, value in mean.gradient[name].items():
+            assert value == pytest.approx(shares @ [g[key] for g in gradients], rel=1e-6)
+    assert len(mean.steady_state["attractors"]) == len(shares)
+    assert mean.state is not None
+    assert mean.state.shape == (len(shares), 2)
+
+
+def test_the_reference_decides_which_is_worst(coexisting):
+    """Relative to a tiny mean force the motion of the greatest mean is worst, not that of the
+    greatest peak."""
+    _, basins = coexisting
+    responses = [one.evaluation.response for one in basins.attractors]
+    base = dataclasses.replace(
+        basins.rest, response={"mean_force_N": 1e-3, "peak_force_N": 1e6, "rms_force_N": 1.0}
+    )
+    single = Evaluator.of(config_of(*COEXIST, "objective.motion=worst"))
+    found = AttractorEvaluator(single).relative_to(base)(series=False)
+    assert found.response["mean_force_N"] == max(r["mean_force_N"] for r in responses)
+    assert found.response["peak_force_N"] < max(r["peak_force_N"] for r in responses)
+
+
+def test_a_scene_without_coexistence_has_one_motion():
+    basins = find(Evaluator.of(config_of()))
+    assert [one.share for one in basins.attractors] == [1.0]
+    assert basins.attractors[0].reached
+
+
+def test_a_chaotic_basin_is_no_steady_state():
+    """Some initial states lead to chaos: the objective over all motions has no gradient."""
+    scene = (
+        "scene.timing_gear.backlash_mm=0.1",
+        "scene.timing_gear.damping_ratio=0.05",
+        "scene.load.torque_N_m=2",
+        "scene.speed_rpm=6000",
+    )
+    found = evaluator_for(config_of(*scene, "objective.motion=worst"))(series=False)
+    assert found.status is Status.CHAOTIC
+    assert not found.usable
+    assert found.gradient == {}
+    kinds = {row["status"] for row in found.steady_state["attractors"]}
+    assert kinds == {"periodic", "chaotic"}
+
+
+def test_a_motion_that_is_not_told_is_no_steady_state(coexisting):
+    """Whatever is lost stands against `periodic`; a failure is named before it."""
+    _, basins = coexisting
+
+    def status(**lost):
+        return dataclasses.replace(basins, lost=lost).status
+
+    assert status() is Status.PERIODIC
+    assert status(not_settled=0.01) is Status.NOT_SETTLED
+    assert status(not_settled=0.5, solver_failed=0.1) is Status.SOLVER_FAILED
+    assert status(non_finite=0.1) is Status.NON_FINITE
+    first, *others = basins.attractors
+    wild = dataclasses.replace(first.evaluation, status=Status.CHAOTIC)
+    mixed = dataclasses.replace(first, evaluation=wild), *others
+    assert dataclasses.replace(basins, attractors=mixed).status is Status.CHAOTIC
+
+
+def test_a_cycle_is_that_of_the_pair_last_evaluated(coexisting, monkeypatch):
+    """An evaluation may fit the contact map to its motion, and the cycle must be on that map."""
+    evaluator, found = coexisting
+    built, used = [], []
+
+    class Refitting(Evaluator):
+        def pair(self, design):
+            built.append(object())
+            return built[-1]
+
+    def cycle(pair, state, how):
+        used.append(pair)
+        return np.tile(state, (8, 1))
+
+    monkeypatch.setattr("rootsopt.response.attractors._cycle", cycle)
+    sorter = _Sorter(Refitting.of(evaluator.config), jnp.array([36.43, 9.0, 4.0]), False)
+    for one in found.attractors:
+        sorter.add(one.evaluation, one.cycle[0])
+    assert used == built
+    assert len({id(pair) for pair in used}) == len(found.attractors) >= 2
+
+
+def test_lost_motions_are_counted():
+    """Without a timing gear all motions are lost, and no motion is reported."""
+    basins = find(Evaluator.of(config_of("scene.timing_gear=null")))
+    assert basins.attractors == ()
+    assert basins.lost == {"passed_through": 1.0}
+    assert np.all(basins.leads_to == -1)
+    assert basins.status is Status.PASSED_THROUGH
+
+
+def test_command(tmp_path, capsys):
+    """Table, result file, CSV of basins that agrees with it, picture; exit codes."""
+    overrides = [f"--set={key}" for key in (*GRID, *COEXIST)]
+    assert main(["attractors", "configs/cic.yaml", *overrides, "-o", str(tmp_path)]) == 0
+    assert "Motions that coexist" in capsys.readouterr().out
+    record = json.loads((tmp_path / "result.json").read_text())
+    shares = [one["share"] for one in record["attractors"]]
+    assert record["status"] == "periodic"
+    assert len(shares) >= 2
+    with open(tmp_path / "basins.csv", newline="") as file:
+        numbers = [int(row["attractor"]) for row in csv.DictReader(file)]
+    assert len(numbers) == 108
+    assert [numbers.count(k + 1) / 108 for k in range(len(shares))] == pytest.approx(shares)
+    assert (tmp_path / "figures" / "basins.png").read_bytes()[:4] == b"\x89PNG"
+    assert (tmp_path / "response_2.csv").exists()
+    lost = ["attractors", "configs/cic.yaml", "--set=scene.timing_gear=null", *overrides[:2]]
+    assert main([*lost, "-o", str(tmp_path / "lost"), "--no-figures"]) == 3
+
+
+@pytest.mark.long
+def test_optimiser_over_all_motions(tmp_path):
+    """`worst` improves the worst motion of the baseline, and says so of all."""
+    small = (
+        "objective.motion=worst",
+        "optimizer.iterations=3",
+        "optimizer.screening=2",
+        "optimizer.starts=1",
+        "attractors.relatives=8",
+        "attractors.rates=6",
+    )
+    overrides = [f"--set={key}" for key in (*COEXIST, *small)]
+    assert main(["optimize", "configs/cic.yaml", *overrides, "-o", str(tmp_path)]) == 0
+    record = json.loads((tmp_path / "result.json").read_text())
+    assert record["improvement"]["objective"] > 0
+    for name in ("baseline", "optimized"):
+        motions = record[name]["steady_state"]["attractors"]
+        assert len(motions) >= 1
+        assert {row["status"] for row in motions} == {"periodic"}

@@ -1,0 +1,414 @@
+"""Ensembles: averages and their standard errors, gradients estimated from neighbours, commands."""
+
+import csv
+import functools
+import io
+import itertools
+import json
+import re
+import subprocess
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt import optimize
+from rootsopt.commands import simulate
+from rootsopt.config import DESIGN_KEYS, EnsembleConfig, load
+from rootsopt.output import tables
+from rootsopt.response.ensemble import (
+    ERRORS,
+    SIGNIFICANT,
+    EnsembleEvaluator,
+    fitted_slope,
+    neighbours,
+)
+from rootsopt.response.evaluation import RESPONSES, Evaluator
+from rootsopt.response.evaluators import evaluator_for
+from rootsopt.response.members import Members
+from rootsopt.status import Status
+
+PERIODIC = ("ensemble.members=8", "ensemble.settle_periods=24", "ensemble.periods=8")
+GEAR = "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.1, backlash_mm: 0.4}"
+CHAOTIC = (GEAR, "scene.load.torque_N_m=1", "objective.motion=ensemble")
+INSIDE = (30.0, 4.0, 3.0)
+
+
+def config_of(*overrides):
+    return load("configs/cic.yaml", overrides)
+
+
+def averaged(*overrides, gradient=False, survey=True, design=None):
+    """Evaluation by an ensemble, without the Lyapunov exponent unless asked for."""
+    evaluator = EnsembleEvaluator(Evaluator.of(config_of(*overrides), survey=survey))
+    if not gradient:
+        evaluator = evaluator.without_gradient()
+    return evaluator(None if design is None else jnp.array(design), series=False)
+
+
+@functools.cache
+def chaotic(seed=0, members=32, periods=32):
+    """Averages in the chaotic scene."""
+    size = f"ensemble.members={members}", f"ensemble.periods={periods}", f"ensemble.seed={seed}"
+    return averaged(*CHAOTIC, "ensemble.settle_periods=24", *size)
+
+
+def numbers(evaluation):
+    """(responses, their standard errors)."""
+    errors = [evaluation.steady_state[ERRORS[name]] for name in RESPONSES]
+    return np.array([evaluation.response[name] for name in RESPONSES]), np.array(errors)
+
+
+def rows(gradient):
+    return np.array([[gradient[name][key] for key in DESIGN_KEYS] for name in RESPONSES])
+
+
+# Where the motion is periodic
+
+
+@pytest.fixture(scope="module")
+def orbit():
+    """The closed orbit of a design inside the box."""
+    return Evaluator.of(config_of())(jnp.array(INSIDE), series=False)
+
+
+def test_periodic_averages_are_those_of_the_orbit(orbit):
+    """All members end on the one orbit: its mean, RMS and peak, with nearly no standard error."""
+    evaluation = averaged(*PERIODIC, survey=False, design=INSIDE)
+    assert evaluation.status is Status.AVERAGED
+    steady = evaluation.steady_state
+    assert (steady["kind"], steady["period"]) == ("periodic", 1)
+    values, errors = numbers(evaluation)
+    closed = np.array([orbit.response[name] for name in RESPONSES])
+    np.testing.assert_allclose(values, closed, rtol=3e-5)
+    assert np.all(errors < 3e-5 * closed)
+    assert steady["greatest_force_N"] == pytest.approx(closed[1], rel=1e-4)
+    assert abs(steady["mean_force_drift_N"]) < 1e-4 * closed[0]
+    assert evaluation.gradient == {}
+
+
+def test_gradient_is_that_of_the_orbit(orbit):
+    """Estimated from close neighbours it agrees with the implicit function theorem within its
+    own standard error, which is small."""
+    small = "ensemble.spread=0.005", "ensemble.designs=16"
+    evaluation = averaged(*PERIODIC, *small, gradient=True, design=INSIDE)
+    found, truth = rows(evaluation.gradient), rows(orbit.gradient)
+    errors = rows(evaluation.steady_state["gradient_standard_error"])
+    size = np.max(np.abs(truth), axis=1, keepdims=True)
+    assert np.all(errors > 0)
+    assert np.all(errors < 0.05 * size)
+    assert np.all(np.abs(found - truth) < 4 * errors + 1e-3 * size)
+
+
+def test_neighbours_are_in_pairs_inside_the_box():
+    """Opposite about the middle, which is the point except within a spread of a bound."""
+    settings = EnsembleConfig(designs=64, spread=0.1, seed=3)
+    for point in np.array([[0.5, 0.4, 0.6], [0.0, 1.0, 0.5], [0.05, 0.5, 0.97]]):
+        points, steps = neighbours(point, settings)
+        assert points.shape == (64, 3)
+        assert np.all((points >= 0) & (points <= 1))
+        middle = (points[:32] + points[32:]) / 2
+        np.testing.assert_allclose(middle, np.clip(point, 0.1, 0.9) + 0 * steps, atol=1e-12)
+        np.testing.assert_allclose(points[:32] - middle, steps, atol=1e-12)
+        assert np.linalg.matrix_rank(steps) == 3
+    _, steps = neighbours(np.full(3, 0.5), settings.model_copy(update={"designs": 2048}))
+    np.testing.assert_allclose(np.cov(steps.T), 0.01 * np.eye(3), atol=5e-4)
+    _, others = neighbours(
+        np.full(3, 0.5), settings.model_copy(update={"seed": 4, "designs": 2048})
+    )
+    assert not np.any(steps == others)
+
+
+def test_slope_of_a_quadratic_is_exact():
+    """Curvature cancels between opposite neighbours, and leaves no error to state."""
+    rng = np.random.default_rng(0)
+    slope, bend = rng.normal(size=(2, 3)), rng.normal(size=(2, 3, 3))
+    steps = 0.1 * rng.normal(size=(8, 3))
+    both = np.concatenate([steps, -steps])
+    values = 5 + both @ slope.T + np.einsum("ni,rij,nj->nr", both, bend, both)
+    found, covariance = fitted_slope(values, steps)
+    np.testing.assert_allclose(found, slope, atol=1e-12)
+    np.testing.assert_allclose(covariance, 0, atol=1e-20)
+
+
+def test_standard_error_of_the_slope_is_honest():
+    """Over many noisy samples the slope is right on average, and scatters as it says."""
+    rng = np.random.default_rng(1)
+    slope = np.array([[1.0, -2.0, 0.5]])
+    steps = 0.1 * rng.normal(size=(8, 3))
+    both = np.concatenate([steps, -steps])
+    samples = [
+        fitted_slope(both @ slope.T + 0.05 * rng.normal(size=(16, 1)), steps) for _ in range(2000)
+    ]
+    found = np.array([one[0][0] for one in samples])
+    stated = np.mean([np.diag(one[1][0]) for one in samples], axis=0)
+    assert np.all(np.abs(np.mean(found, axis=0) - slope[0]) < 4 * np.sqrt(stated / 2000))
+    np.testing.assert_allclose(np.var(found, axis=0), stated, rtol=0.15)
+
+
+# Where it is chaotic
+
+
+def test_chaos_is_averaged_and_named():
+    """Usable, with the kind of motion and standard errors beside the averages."""
+    evaluation = averaged(
+        *CHAOTIC, "ensemble.members=8", "ensemble.periods=16", survey=False, gradient=False
+    )
+    assert evaluation.status is Status.AVERAGED
+    assert evaluation.usable
+    steady = evaluation.steady_state
+    assert steady["kind"] == "chaotic"
+    exponent = steady["lyapunov_exponent_per_mesh_period"]
+    assert exponent > 3 * steady["lyapunov_standard_error"] > 0
+    values, errors = numbers(evaluation)
+    assert 0 < values[0] < values[2] < values[1] < steady["greatest_force_N"]
+    assert np.all((errors > 1e-3 * values) & (errors < values))
+    json.dumps(evaluation.record(), allow_nan=False)
+
+
+def test_standard_errors_are_honest():
+    """Independent ensembles differ by what their standard errors say."""
+    found = [numbers(chaotic(seed=seed)) for seed in range(4)]
+    apart = []
+    for (first, by_first), (second, by_second) in itertools.combinations(found, 2):
+        apart.append(np.abs(first - second) / np.hypot(by_first, by_second))
+    assert np.max(apart) < 4
+    # Neither are they far too large.
+    assert np.max(apart) > 0.3
+
+
+def test_standard_error_falls_with_the_members():
+    """As the square root of their number."""
+    few = np.mean([numbers(chaotic(seed=s, members=8))[1] for s in range(4)], axis=0)
+    many = np.mean([numbers(chaotic(seed=s))[1] for s in range(4)], axis=0)
+    ratio = few / many
+    assert np.all((ratio > 1.4) & (ratio < 2.8))
+
+
+def test_peak_does_not_grow_with_the_window():
+    """The mean of every period's peak is the same over long and short windows; the greatest of
+    all forces is not."""
+    short, long = chaotic(periods=8), chaotic(periods=96)
+    (a, by_a), (b, by_b) = numbers(short), numbers(long)
+    assert np.all(np.abs(a - b) < 4 * np.hypot(by_a, by_b))
+    assert long.steady_state["greatest_force_N"] > short.steady_state["greatest_force_N"]
+
+
+def test_gradient_of_chaos_has_its_standard_error():
+    """Another seed gives another estimate, which differs by what the standard errors say."""
+    size = "ensemble.members=4", "ensemble.settle_periods=16", "ensemble.periods=16"
+    both = [
+        averaged(*CHAOTIC, *size, "ensemble.spread=0.2", f"ensemble.seed={seed}", gradient=True)
+        for seed in (0, 1)
+    ]
+    first, second = (rows(one.gradient) for one in both)
+    errors = [rows(one.steady_state["gradient_standard_error"]) for one in both]
+    assert not np.array_equal(first, second)
+    # Five degrees of freedom each: 6 of these are as rare as 4 of normal ones.
+    assert np.all(np.abs(first - second) < 6 * np.hypot(*errors))
+    text = render(tables.evaluation_table(both[0]))
+    assert "standard error of the gradient of the peak force" in text.replace("\n", " ")
+    json.dumps(both[0].record(), allow_nan=False)
+
+
+def render(table):
+    from rich.console import Console
+
+    console = Console(width=200, record=True, file=io.StringIO())
+    console.print(table)
+    return console.export_text()
+
+
+def test_same_seed_same_numbers():
+    """The same seed gives the same numbers to the last digit, another one others."""
+    size = "ensemble.members=4", "ensemble.settle_periods=8", "ensemble.periods=8"
+    first, again, other = (averaged(*CHAOTIC, *size, f"ensemble.seed={seed}") for seed in (5, 5, 6))
+    assert first.response == again.response
+    np.testing.assert_array_equal(first.state, again.state)
+    assert first.response != other.response
+
+
+def test_start_is_continued():
+    """From the last states of a neighbour the members go on; other shapes are refused."""
+    settings = config_of(*CHAOTIC, "ensemble.members=4", "ensemble.periods=4")
+    evaluator = EnsembleEvaluator(Evaluator.of(settings, survey=True)).without_gradient()
+    first = evaluator(series=False)
+    on = evaluator(start=first.state, series=False)
+    assert on.status is Status.AVERAGED
+    assert on.response != first.response
+    with pytest.raises(ValueError, match="start"):
+        evaluator(start=np.zeros(2), series=False)
+
+
+def test_no_number_without_its_status():
+    """A member that fails fails the ensemble: no averages, no gradient."""
+    free = "scene.timing_gear=null", "scene.load.torque_N_m=4.775"
+    evaluation = averaged(*free, *PERIODIC, gradient=True)
+    assert evaluation.status is Status.PASSED_THROUGH
+    assert evaluation.message == evaluation.status.value
+    assert (evaluation.response, evaluation.gradient) == ({}, {})
+    assert evaluation.steady_state == {"kind": "transient"}
+    assert evaluation.series is None
+
+
+YES, NO = np.ones(4, bool), np.zeros(4, bool)
+ONE = np.array([True, False, False, False])
+
+
+def sound(level=1.0):
+    """Four members of a motion without fault,."""
+    few = level * np.ones(4)
+    means = np.column_stack([few, few**2, 2 * few + np.arange(4)])
+    return Members(
+        means, 0 * few, 9 * few, 1e-3 * few, -1e-3 * few, np.ones((4, 2)), np.ones((4, 8), bool),
+        NO, NO, YES,
+    )  # fmt: skip
+
+
+def test_one_member_that_fails_is_enough():
+    """The status of an ensemble is that of its worst member."""
+    members = sound()
+    assert members.status is Status.AVERAGED
+    assert members._replace(lost=ONE).status is Status.PASSED_THROUGH
+    assert members._replace(lost=ONE, stalled=ONE).status is Status.STALLED
+    assert members._replace(solved=~ONE).status is Status.SOLVER_FAILED
+    assert members._replace(means=np.full((4, 3), np.nan)).status is Status.NON_FINITE
+
+
+def told(monkeypatch, run, gradient=False):
+    """Evaluation of members that `run(number of the pair)` makes up."""
+    made = lambda pairs, *rest: [run(k) for k in range(len(pairs))]  # noqa: E731
+    monkeypatch.setattr("rootsopt.response.ensemble.run_members", made)
+    return averaged("ensemble.members=4", "ensemble.designs=12", gradient=gradient)
+
+
+def test_responses_stand_where_they_belong(monkeypatch):
+    """Mean, peak and RMS of members that are told, with the standard error of the peaks."""
+    evaluation = told(monkeypatch, lambda number: sound(3.0))
+    response, steady = evaluation.response, evaluation.steady_state
+    assert response == {"mean_force_N": 3, "peak_force_N": 7.5, "rms_force_N": 3}
+    expected = np.std(np.arange(4), ddof=1) / 2
+    assert steady[ERRORS["peak_force_N"]] == pytest.approx(expected)
+    assert steady[ERRORS["mean_force_N"]] == 0
+    assert steady["greatest_force_N"] == 27
+
+
+def test_members_that_never_touch_are_idle(monkeypatch):
+    """Averages of nothing; one member with contact is enough for averages."""
+    evaluation = told(monkeypatch, lambda number: sound(0.0)._replace(means=np.zeros((4, 3))))
+    assert evaluation.status is Status.IDLE
+    assert set(evaluation.response.values()) == {0.0}
+    assert evaluation.gradient == {}
+    assert told(monkeypatch, lambda number: sound(3.0)).status is Status.AVERAGED
+
+
+def test_too_deep_is_no_average(monkeypatch):
+    """One member beyond the validity of the contact law takes the result its usability."""
+    depth = np.array([-1.0, 1.0, 1.0, 1.0]) * 0.0201 * 0.033
+    evaluation = told(monkeypatch, lambda number: sound()._replace(depth=depth), gradient=True)
+    assert evaluation.status is Status.TOO_DEEP
+    assert evaluation.gradient == {}
+    allowed = sound()._replace(depth=0.99 * depth)
+    assert told(monkeypatch, lambda number: allowed).status is Status.AVERAGED
+
+
+def test_a_neighbour_that_fails_leaves_no_gradient(monkeypatch):
+    """Nor averages: they would stand for a neighbourhood that is not there."""
+    failed = sound()._replace(lost=ONE)
+    runs = lambda number: failed if number == 7 else sound()  # noqa: E731
+    evaluation = told(monkeypatch, runs, gradient=True)
+    assert evaluation.status is Status.PASSED_THROUGH
+    assert (evaluation.response, evaluation.gradient, evaluation.state) == ({}, {}, None)
+    whole = told(monkeypatch, lambda number: sound(), gradient=True)
+    assert whole.status is Status.AVERAGED
+    assert rows(whole.gradient) == pytest.approx(0)
+
+
+def test_evaluator_of_a_motion():
+    """`objective.motion` chooses; only an ensemble has a gradient to leave out."""
+    plain = evaluator_for(config_of())
+    assert type(plain) is Evaluator
+    assert plain.without_gradient() is plain
+    evaluator = evaluator_for(config_of("objective.motion=ensemble")).surveying()
+    assert isinstance(evaluator, EnsembleEvaluator)
+    assert evaluator.single.survey
+    assert evaluator.differentiate
+    assert not evaluator.without_gradient().differentiate
+    other = evaluator.independent(2)
+    assert other.settings.seed == 2
+    assert other.settings.members == 4 * evaluator.settings.members
+
+
+# Commands
+
+
+def test_optimize_a_chaotic_scene(tmp_path, capsys):
+    """A small run: significant or not, it says so; the history has its standard errors."""
+    size = "ensemble.members=4", "ensemble.designs=12", "ensemble.spread=0.1"
+    window = "ensemble.settle_periods=8", "ensemble.periods=8"
+    search = "optimizer.screening=2", "optimizer.starts=1", "optimizer.iterations=2"
+    options = itertools.chain.from_iterable(
+        ("--set", key) for key in (*CHAOTIC, *size, *window, *search)
+    )
+    code = optimize.main(["configs/cic.yaml", "-o", str(tmp_path), "--no-figures", *options])
+    result = json.loads((tmp_path / "result.json").read_text())
+    verification, text = result["verification"], capsys.readouterr().out
+    assert result["baseline"]["status"] == "averaged"
+    assert result["baseline"]["gradient"]
+    with open(tmp_path / "history.csv", newline="") as file:
+        history = list(csv.DictReader(file))
+    assert len(history) >= 3
+    assert all(0 < float(row["objective_standard_error"]) < 10 for row in history)
+    assert code == (0 if verification["holds_up"] else 3)
+    if code == 0:
+        gain = 1 - verification["verified_objective"]
+        assert gain > SIGNIFICANT * verification["combined_standard_error"]
+        assert gain == pytest.approx(result["improvement"]["objective"])
+    else:
+        assert "noise" in text
+        assert result["optimized"] is None
+
+
+def test_reached_refuses_chaos_and_names_the_option(tmp_path):
+    """A single chaotic motion is refused, with the way out."""
+    options = itertools.chain.from_iterable(
+        ("--set", key) for key in (*CHAOTIC, "objective.motion=reached")
+    )
+    command = [sys.executable, "-m", "rootsopt.optimize", "configs/cic.yaml", "--no-figures"]
+    command += ["-o", str(tmp_path), *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 3, done.stderr
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["baseline"]["status"] == "chaotic"
+    assert result["baseline"]["gradient"] == {}
+    assert re.search(r"objective\.motion\s+to\s+ensemble", done.stdout)
+
+
+def test_simulate_an_ensemble(tmp_path):
+    """Exit 0, averaged, the series of one member, and figures."""
+    size = "ensemble.members=4", "ensemble.designs=12", "ensemble.periods=16"
+    options = itertools.chain.from_iterable(("--set", key) for key in (*CHAOTIC, *size))
+    assert simulate.main(["configs/cic.yaml", "-o", str(tmp_path), *options]) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["status"] == "averaged"
+    assert set(result["steady_state"]["gradient_standard_error"]) == set(RESPONSES)
+    with open(tmp_path / "response_design.csv", newline="") as file:
+        force = [float(row["contact_force_N"]) for row in csv.DictReader(file)]
+    assert 0 < np.mean(force) < max(force)
+    assert (tmp_path / "figures" / "force.png").exists()
+
+
+@pytest.mark.long
+def test_experiment(tmp_path):
+    """The study runs, and writes its tables and its figure."""
+    command = [sys.executable, "-m", "experiments.chaos", "--quick", "-o", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    data = json.loads((tmp_path / "chaos.json").read_text())
+    assert data["versions"]["rootsopt"]
+    assert data["baseline"]["lyapunov_exponent_per_mesh_period"] > 0
+    assert (tmp_path / "chaos.png").read_bytes()[:4] == b"\x89PNG"
+    for name in ("line", "pathwise", "history", "members"):
+        with open(tmp_path / f"chaos_{name}.csv", newline="") as file:
+            assert len(list(csv.DictReader(file))) >= 2

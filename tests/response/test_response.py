@@ -1,0 +1,266 @@
+"""`steady_response`: a pure function that JAX transforms, differentiable in design and scene."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import rootsopt
+from rootsopt import InputError, Scene, Status, steady_response
+
+TIGHT = "solver.rtol=1e-11", "solver.transient_rtol=1e-8"
+QUANTITIES = {
+    "pitch radius": lambda s: s.pitch_radius,
+    "length": lambda s: s.length,
+    "density": lambda s: s.density,
+    "stiffness": lambda s: s.law.stiffness,
+    "exponent": lambda s: s.law.exponent,
+    "damping": lambda s: s.law.damping,
+    "full damping depth": lambda s: s.law.full_damping_depth,
+    "clearance": lambda s: s.clearance,
+    "speed": lambda s: s.speed,
+    "load": lambda s: s.load_torque,
+    "gear stiffness": lambda s: s.gear.stiffness,
+    "backlash": lambda s: s.gear.half_backlash,
+    "gear damping": lambda s: s.gear_damping_ratio,
+}
+ROOT = Path(__file__).parents[2]
+DESIGN = np.array([36.43, 9.0, 4.0])
+
+
+def scene_of(*overrides: str) -> tuple[rootsopt.Config, Scene]:
+    config = rootsopt.load_config("configs/cic.yaml", [*TIGHT, *overrides])
+    return config, Scene.from_config(config)
+
+
+def forces(response) -> jax.Array:
+    return jnp.stack([response.mean, response.rms, response.peak])
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scene_of()[1]
+
+
+@pytest.fixture(scope="module")
+def known(scene):
+    """Response at the config's design; derivatives of its forces by design and quantities."""
+
+    def found(design, *values):
+        moved = eqx.tree_at(lambda s: [get(s) for get in QUANTITIES.values()], scene, values)
+        return forces(steady_response(moved, design))
+
+    values = [get(scene) for get in QUANTITIES.values()]
+    jacobian = jax.jacrev(found, tuple(range(1 + len(values))))
+    return steady_response(scene, DESIGN), found, values, jacobian(jnp.asarray(DESIGN), *values)
+
+
+def test_response_of_the_shipped_scene(known):
+    response, *_ = known
+    assert Status.of(response.status) is Status.PERIODIC
+    assert (float(response.mean), float(response.peak)) == pytest.approx((76.247, 242.11), rel=1e-5)
+    assert int(response.period) == 1
+    assert response.residual < 1e-9
+    assert np.all(np.abs(np.diff(np.abs(response.multipliers))) >= 0)
+    again = rootsopt.evaluate(scene_of()[0])
+    np.testing.assert_allclose(
+        forces(response)[jnp.array([0, 2, 1])], list(again.response.values()), rtol=1e-11
+    )
+    # In SI units, and on the orbit: begun there, it is found at once.
+    assert abs(float(response.state[0])) < 2e-3
+
+
+def test_derivatives_by_design_and_scene_are_those_of_differences(scene, known):
+    response, _, values, jacobian = known
+
+    def moved(number, step):
+        entries = [jnp.asarray(DESIGN), *values]
+        entries[number] = entries[number] + step
+        inner = eqx.tree_at(lambda s: [get(s) for get in QUANTITIES.values()], scene, entries[1:])
+        return np.asarray(forces(steady_response(inner, entries[0], response.state)))
+
+    def difference(number, step, along=1.0):
+        # Central, extrapolated once: what is left is of the fourth order.
+        coarse, fine = (
+            (moved(number, h * along) - moved(number, -h * along)) / (2 * h)
+            for h in (step, step / 2)
+        )
+        return (4 * fine - coarse) / 3
+
+    for k, (name, value) in enumerate(zip(QUANTITIES, values, strict=True), start=1):
+        # Errors of rounding and closing (1e-13) against the fourth power of the step.
+        step = 3e-4 * abs(float(value)) or 3e-8
+        np.testing.assert_allclose(
+            jacobian[k][:2], difference(k, step)[:2], rtol=3e-6, atol=1e-9, err_msg=name
+        )
+    along = np.array([0.5, 0.2, -0.3])
+    np.testing.assert_allclose(
+        jacobian[0] @ along, difference(0, 1e-3, along), rtol=1e-5, atol=1e-9
+    )
+
+
+def test_forward_and_reverse_agree(known):
+    _, found, values, jacobian = known
+    arguments = jnp.asarray(DESIGN), *values
+    forward = jax.jacfwd(found, tuple(range(len(arguments))))(*arguments)
+    for one, other in zip(forward, jacobian, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-13)
+    along = jnp.array([1.0, 2.0, 3.0]), *values
+    _, change = jax.jvp(found, arguments, along)
+    parts = [
+        slope @ step if slope.ndim > 1 else slope * step
+        for slope, step in zip(jacobian, along, strict=True)
+    ]
+    np.testing.assert_allclose(change, sum(parts), rtol=1e-10)
+
+
+def test_composes_with_jit_and_vmap(scene, known):
+    """`jit(vmap(value_and_grad))` over scenes and designs, one of which passes through: its forces
+    and gradient are NaN, and those of the others are not touched."""
+    response, *_, jacobian = known
+    loads = jnp.array([1.0, 3000.0]) * scene.load_torque
+    scenes = eqx.tree_at(lambda s: s.load_torque, scene, loads)
+    axes = jax.tree.map(lambda x: 0 if jnp.shape(x) == (2,) else None, scenes)
+
+    def mean(design, scene):
+        found = steady_response(scene, design)
+        return found.mean, found
+
+    both = jax.vmap(jax.value_and_grad(mean, has_aux=True), (0, axes))
+    (values, found), slopes = jax.jit(both)(jnp.stack([DESIGN] * 2), scenes)
+    assert [Status.of(code) for code in found.status] == [Status.PERIODIC, Status.PASSED_THROUGH]
+    assert float(values[0]) == pytest.approx(float(response.mean), rel=1e-9)
+    np.testing.assert_allclose(slopes[0], jacobian[0][0], rtol=1e-6)
+    assert np.all(np.isnan(slopes[1]))
+    assert np.isnan(values[1])
+
+
+@pytest.mark.long
+def test_within_an_optimiser(scene):
+    """A function that calls it twice, in an optax loop."""
+    faster = eqx.tree_at(lambda s: s.speed, scene, 1.2 * scene.speed)
+
+    def both(design):
+        return steady_response(scene, design).mean + steady_response(faster, design).mean
+
+    rule = optax.sgd(2e-2)
+    design, state = jnp.asarray(DESIGN), rule.init(jnp.asarray(DESIGN))
+    values = []
+    for _ in range(3):
+        value, slope = jax.value_and_grad(both)(design)
+        update, state = rule.update(slope, state)
+        design = optax.apply_updates(design, update)
+        values.append(float(value))
+    assert values[2] < values[1] < values[0]
+
+
+def test_unknown_derivatives_are_not_numbers(scene):
+    """All of them without an orbit; multipliers are constants and spoil no other derivative."""
+
+    def both(design, *values):
+        moved = eqx.tree_at(lambda s: [get(s) for get in QUANTITIES.values()], scene, values)
+        found = steady_response(moved, design)
+        return jnp.stack([found.mean, jnp.abs(found.multipliers[0])])
+
+    values = {name: get(scene) for name, get in QUANTITIES.items()}
+    slopes = jax.jacrev(both, tuple(range(1 + len(values))))
+    mean, multiplier = slopes(jnp.asarray(DESIGN), *values.values())[0]
+    assert np.all(np.isfinite(mean))
+    assert np.all(multiplier == 0)
+    values["load"] = 3000.0 * values["load"]
+    assert all(np.all(np.isnan(slope)) for slope in slopes(jnp.asarray(DESIGN), *values.values()))
+
+
+def test_second_derivatives_are_refused(scene):
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        jax.hessian(lambda design: steady_response(scene, design).mean)(DESIGN)
+
+
+@pytest.mark.long
+def test_motion_that_leaves_the_contact_map(scene, known):
+    """Its forces are not those of the pair: no number, and a status that says why."""
+    config, _ = scene_of("solver.fidelity=map")
+    wide, narrow = (Scene.from_config(config, deepest) for deepest in (-3e-3, -1e-3))
+    found = steady_response(wide, DESIGN)
+    assert Status.of(found.status) is Status.PERIODIC
+    assert float(found.mean) == pytest.approx(float(known[0].mean), rel=1e-3)
+    found = steady_response(narrow, DESIGN)
+    assert Status.of(found.status) is Status.OFF_MAP
+    assert np.isnan(found.mean)
+
+
+@pytest.mark.parametrize(
+    ("design", "message"),
+    [([1.0, 2.0], "must have 3 entries.*but has 2"), ([[1.0]], r"array \(d,\), but has shape")],
+)
+def test_designs_of_another_size_are_refused(scene, design, message):
+    with pytest.raises(ValueError, match=message):
+        steady_response(scene, design)
+
+
+def test_import_loads_no_solver():
+    code = (
+        "import sys, rootsopt; print([m for m in ('jax', 'numpy', 'pydantic') if m in sys.modules])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (found.stdout.strip(), found.stderr) == ("[]", "")
+
+
+def test_every_public_name_is_there():
+    for name in rootsopt.__all__:
+        assert getattr(rootsopt, name).__doc__ or name == "__version__"
+    with pytest.raises(AttributeError, match="no attribute 'Rotor'"):
+        rootsopt.Rotor  # noqa: B018
+    assert set(rootsopt.__all__) <= set(dir(rootsopt))
+
+
+def test_precision_is_asked_for_in_words():
+    code = (
+        "import rootsopt\n"
+        "try: rootsopt.Scene.from_config(rootsopt.load_config('configs/cic.yaml'))\n"
+        "except RuntimeError as error: print(error)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert 'jax.config.update("jax_enable_x64", True)' in found.stdout
+
+
+@pytest.mark.long
+def test_example_of_the_readme_runs():
+    """As it stands, in a process of its own."""
+    (text,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.M | re.S)
+    found = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, cwd=ROOT)
+    assert (found.returncode, found.stderr) == (0, "")
+    assert float(found.stdout.split()[0]) > 0
+
+
+def test_sweep_of_any_keys():
+    config, _ = scene_of("objective.terms={outer_radius_mm: 0.5}")
+    axes = {"scene.load.torque_N_m": [4.0, 3000.0], "contact.clearance_mm": [0.0, 0.3]}
+    found = rootsopt.sweep_scenes(config, axes)
+    assert found.mean_force_N.dims == tuple(axes)
+    assert found.status.values.tolist() == [["periodic", "idle"], ["passed_through"] * 2]
+    point = {"scene.load.torque_N_m": 4.0, "contact.clearance_mm": 0.0}
+    one = rootsopt.evaluate(config.replaced(point))
+    assert float(found.mean_force_N.sel(point)) == one.response["mean_force_N"]
+    key = point | {"design_key": "involute_length_mm"}
+    slope = one.gradient["outer_radius_mm"]["involute_length_mm"]
+    assert float(found.gradient_outer_radius_mm.sel(key)) == slope
+    assert found.mean_force_N.attrs["units"] == "N"
+    for wrong in ({"scene.sped_rpm": [1.0]}, {"scene.speed_rpm": [-1.0]}):
+        with pytest.raises(InputError, match="speed_rpm"):
+            rootsopt.sweep_scenes(config, wrong)
+
+
+def test_evaluation_as_a_dataset():
+    found = rootsopt.evaluate(scene_of()[0])
+    data = found.to_dataset()
+    assert data.contact_force_N.attrs["units"] == "N"
+    assert float(data.contact_force_N.mean()) == pytest.approx(76.247, rel=1e-3)
+    assert data.attrs["status"] == "periodic"

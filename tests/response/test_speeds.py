@@ -1,0 +1,336 @@
+"""One design at several speeds: evaluator, objective, optimiser, sweep."""
+
+import csv
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from experiments.speed.study import equilibria
+from rootsopt.commands.console import main
+from rootsopt.config import load, parse
+from rootsopt.errors import InputError
+from rootsopt.optimize.problem import Problem
+from rootsopt.response import choice, speeds
+from rootsopt.response.attractors import AttractorEvaluator
+from rootsopt.response.evaluation import Evaluator, _build, _motion
+from rootsopt.response.evaluators import evaluator_for
+from rootsopt.response.speeds import Part, SpeedsEvaluator
+from rootsopt.scene import design_vector
+from rootsopt.status import Status
+
+CIC = "configs/cic.yaml"
+SPEEDS = "objective.speeds_rpm=[4000, 2000]"
+WEIGHTS = "objective.speed_weights=[3, 1]"
+WORST = "objective.over_speeds=worst"
+TIGHT = "solver.rtol=1e-10"
+POINT = np.array([0.2, 0.3, 0.4])
+
+
+def config_of(*overrides):
+    return load(CIC, overrides)
+
+
+def programs():
+    """How many programs the evaluators have been compiled to."""
+    return sum(len(one._made) for one in (_build, _motion))
+
+
+@pytest.fixture(scope="module")
+def baseline():
+    """Evaluator over two speeds, 3000 rpm beside them, and its evaluation of the own design."""
+    evaluator = SpeedsEvaluator(Evaluator.of(config_of(SPEEDS, WEIGHTS, TIGHT)))
+    return evaluator, evaluator(series=False)
+
+
+@pytest.fixture(scope="module")
+def problem(baseline):
+    evaluator, evaluation = baseline
+    return Problem.of(evaluator.config, evaluator.scene, evaluation)
+
+
+@pytest.fixture(scope="module")
+def singles(baseline, problem):
+    """Baseline and another design at 2000 and 4000 rpm, each by an evaluator of one speed."""
+    before = programs()
+    design = problem.design(POINT)
+    found = {}
+    for speed in (2000.0, 4000.0):
+        evaluator = Evaluator.of(config_of(TIGHT, f"scene.speed_rpm={speed}"))
+        found[speed] = evaluator(series=False), evaluator(design, series=False)
+    # A speed is a number of the model: no other program, over several or at one.
+    assert programs() == before
+    return found
+
+
+@pytest.fixture(scope="module")
+def moved(baseline, problem):
+    return baseline[0](problem.design(POINT), start=baseline[1].state, series=False)
+
+
+def relative(one, base):
+    """The config's objective by hand: half the mean force, half the peak."""
+    keys = "mean_force_N", "peak_force_N"
+    return sum(0.5 * one.response[key] / base.response[key] for key in keys)
+
+
+def test_parts_are_the_evaluations_at_one_speed(baseline, singles):
+    """Every speed from rest is what an evaluator of that speed finds; the scene's heads the
+    record, with no share."""
+    evaluator, found = baseline
+    assert [part.speed_rpm for part in found.parts] == [2000, 3000, 4000]
+    assert [part.share for part in found.parts] == [0.25, 0, 0.75]
+    for part in (found.parts[0], found.parts[2]):
+        single, _ = singles[part.speed_rpm]
+        assert part.evaluation.response == single.response
+        assert part.evaluation.gradient == single.gradient
+    assert found.response == found.parts[1].evaluation.response
+    assert found.gradient == found.parts[1].evaluation.gradient != {}
+    # The evaluator is left at the scene's speed.
+    assert float(evaluator.scene.speed) == pytest.approx(100 * np.pi)
+    rows = found.record()["speeds"]
+    assert [row["speed_rpm"] for row in rows] == [2000, 3000, 4000]
+    assert {row["status"] for row in rows} == {"periodic"}
+    assert rows[2]["peak_force_N"] == singles[4000.0][0].response["peak_force_N"]
+
+
+def test_objective_is_the_weighted_mean_or_the_worst(baseline, problem, singles, moved):
+    """Against combinations by hand of evaluations at one speed."""
+    values = [relative(*pair[::-1]) for pair in singles.values()]
+    assert values[0] != pytest.approx(values[1], rel=1e-3)
+    # Begun from the baseline's orbit, not at rest: the same to the tolerance of the orbit.
+    assert problem.objective(moved) == pytest.approx(np.dot([0.25, 0.75], values), rel=1e-7)
+    worst = Problem.of(config_of(SPEEDS, WORST), baseline[0].scene, baseline[1])
+    assert worst.objective(moved) == pytest.approx(max(values), rel=1e-7)
+    for one in (problem, worst):
+        assert one.objective(baseline[1]) == pytest.approx(1, abs=1e-14)
+    found = [row["objective"] for row in problem.by_speed(moved) if row["share"]]
+    assert found == pytest.approx(values, rel=1e-7)
+
+
+def test_slope_agrees_with_central_differences(baseline, problem, moved):
+    """Along one direction of the unit box, for the weighted mean and for the worst speed."""
+    evaluator, base = baseline
+    direction = np.array([0.6, -0.5, 0.4])
+    # Differences of second order: 1e-4 leaves some 1e-6 of curvature and 1e-6 of tolerance.
+    step = 1e-4
+    ends = [
+        evaluator(problem.design(POINT + sign * step * direction), moved.state, series=False)
+        for sign in (1, -1)
+    ]
+    worst = Problem.of(config_of(SPEEDS, WORST), evaluator.scene, base)
+    slopes = []
+    for one in (problem, worst):
+        upper, lower = map(one.objective, ends)
+        slopes.append(float(one.slope(moved, POINT) @ direction))
+        assert slopes[-1] == pytest.approx((upper - lower) / (2 * step), rel=1e-4)
+    assert slopes[0] != pytest.approx(slopes[1], rel=1e-2)
+
+
+def test_each_speed_begins_on_its_own_orbit(baseline, moved, monkeypatch):
+    """The state of an evaluation starts each speed where that speed's motion was."""
+    evaluator, found = baseline
+    seen = []
+    single = Evaluator.fit
+
+    def spy(self, design, start, series):
+        seen.append(start)
+        return single(self, design, start, series)
+
+    monkeypatch.setattr(Evaluator, "fit", spy)
+    again = evaluator(start=found.state, series=False)
+    for start, part in zip(seen, found.parts, strict=True):
+        np.testing.assert_array_equal(start, part.evaluation.state)
+    for new, old in zip(again.parts, found.parts, strict=True):
+        periods = [part.evaluation.statistics["transient_mesh_periods"] for part in (new, old)]
+        assert periods[0] <= periods[1]
+    # Several motions at a speed, and one at another.
+    states = [np.arange(6.0).reshape(3, 2), np.array([7.0, 8.0])]
+    parts = [
+        Part(1.0, 1.0, dataclasses.replace(found.parts[0].evaluation, state=state))
+        for state in states
+    ]
+    both = speeds._states(parts)
+    for number, state in enumerate(states):
+        np.testing.assert_array_equal(speeds._rows(both, number), state)
+
+
+def test_without_speeds_all_is_as_before(baseline):
+    """The plain evaluator, its very record, and the objective of one speed to the last bit."""
+    assert type(evaluator_for(config_of())) is Evaluator
+    evaluator = evaluator_for(config_of(TIGHT))
+    found = evaluator(series=False)
+    assert "speeds" not in found.record()
+    head = baseline[1].parts[1].evaluation
+    assert found.response == head.response
+    problem = Problem.of(evaluator.config, evaluator.scene, found)
+    weights = {key: 0.5 / found.response[key] for key in ("mean_force_N", "peak_force_N")}
+    assert problem.objective(head) == sum(w * head.response[k] for k, w in weights.items())
+    assert problem.by_speed(found) == []
+
+
+def test_a_speed_without_steady_state_is_a_status():
+    """One of two speeds does not settle: its status, with the speed, no gradient, no objective."""
+    scene = (
+        "scene.timing_gear.backlash_mm=0.2",
+        "scene.timing_gear.damping_ratio=0.2",
+        "scene.speed_rpm=3900",
+        "solver.max_mesh_periods=64",
+    )
+    evaluator = evaluator_for(config_of(*scene, "objective.speeds_rpm=[2700, 3900]")).surveying()
+    found = evaluator(series=False)
+    assert [part.evaluation.status for part in found.parts] == [
+        Status.NOT_SETTLED,
+        Status.PERIODIC,
+    ]
+    assert found.status is Status.NOT_SETTLED
+    assert found.message.startswith("At 2700 rpm: ")
+    assert found.gradient == {}
+    assert found.state is None
+    assert [row["status"] for row in found.record()["speeds"]] == ["not_settled", "periodic"]
+    problem = Problem.of(config_of(), evaluator.scene, found.parts[1].evaluation)
+    assert np.isnan(problem.objective(found))
+
+
+def test_motions_that_coexist_at_every_speed():
+    """`objective.motion: worst` over speeds: the attractors at each, relative to its baseline."""
+    small = "attractors.relatives=1", "attractors.rates=1", "objective.motion=worst"
+    evaluator = evaluator_for(config_of(SPEEDS, *small))
+    assert type(evaluator) is SpeedsEvaluator
+    assert type(evaluator.single) is AttractorEvaluator
+    found = evaluator(series=False)
+    assert found.status is Status.PERIODIC
+    for part in found.parts:
+        assert len(part.evaluation.steady_state["attractors"]) == 1
+    last, again = evaluator.relative_to(found).fit(start=found.state, series=False)
+    assert last.single.single.reference == found.parts[2].evaluation.response
+    assert again.response["peak_force_N"] == pytest.approx(found.response["peak_force_N"], rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["objective.speeds_rpm=[2000, 2000]"], ["objective.speeds_rpm", "different"]),
+        ([f"objective.speeds_rpm={list(range(1, 34))}"], ["objective.speeds_rpm", "32"]),
+        (["objective.speeds_rpm=[2000, 0]"], ["objective.speeds_rpm.1", "greater than 0"]),
+        (["objective.speeds_rpm=2000"], ["objective.speeds_rpm", "list"]),
+        ([SPEEDS, "objective.speed_weights=[1]"], ["objective.speed_weights", "2 numbers"]),
+        ([SPEEDS, "objective.speed_weights=[1, 0]"], ["speed_weights.1", "greater than 0"]),
+        ([WEIGHTS], ["objective.speed_weights", "objective.speeds_rpm"]),
+        ([WORST], ["objective.over_speeds", "objective.speeds_rpm"]),
+        ([SPEEDS, WEIGHTS, WORST], ["objective.speed_weights", "worst"]),
+        ([SPEEDS, "objective.motion=ensemble"], ["objective.speeds_rpm", "ensemble"]),
+        ([SPEEDS, "objective.over_speeds=best"], ["objective.over_speeds", "worst"]),
+        (["sweep.speed_rpm={from: 900, to: 300, points: 3}"], ["sweep.speed_rpm", "below"]),
+        (["sweep.speed_rpm={from: 1, to: 2, points: 2.5}"], ["sweep.speed_rpm", "points"]),
+        (["sweep.speed_rpm={from: 1, to: 2}"], ["sweep.speed_rpm", "points"]),
+        (["sweep.speed_rpm={from: 1, to: 2, steps: 3}"], ["sweep.speed_rpm.steps", "points"]),
+    ],
+)
+def test_refusals_name_the_key(overrides, words):
+    with pytest.raises(InputError) as caught:
+        config_of(*overrides)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
+def test_speeds_of_a_config():
+    """What is simulated and what counts; the resolved config says the same again."""
+    config = config_of(SPEEDS, WEIGHTS, "sweep.speed_rpm={from: 300, to: 600, points: 4}")
+    assert speeds.shares(config) == {2000: 0.25, 3000: 0, 4000: 0.75}
+    assert speeds.shares(speeds.alone(config)) == {3000: 1}
+    assert speeds.shares(config_of("objective.speeds_rpm=[3000]")) == {3000: 1}
+    assert parse(config.to_yaml()) == config
+    assert speeds.swept_speeds(config) == pytest.approx([300, 400, 500, 600])
+    assert speeds.swept_speeds(config_of(SPEEDS)) == [2000, 4000]
+    default = speeds.swept_speeds(config_of())
+    assert (default[0], default[-1], len(default)) == (300, 6000, 39)
+
+
+def run(command, folder, *overrides, options=()):
+    arguments = [f"--set={key}" for key in overrides]
+    return main([command, CIC, "-o", str(folder), *arguments, *options])
+
+
+def test_sweep_command(tmp_path, capsys, singles):
+    """CSV and result file hold what single simulations give; pictures; exit codes."""
+    assert run("sweep", tmp_path, TIGHT, SPEEDS) == 0
+    assert "4000.0" in capsys.readouterr().out
+    with open(tmp_path / "sweep.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["status"] == "periodic"
+    for row, record, (speed, (single, _)) in zip(
+        rows, result["speeds"], singles.items(), strict=True
+    ):
+        assert float(row["speed_rpm"]) == record["speed_rpm"] == speed
+        assert (row["kind"], row["period"], row["status"]) == ("periodic", "1", "periodic")
+        for key, value in single.response.items():
+            assert float(row[key]) == pytest.approx(value, rel=1e-9)
+            assert record[key] == pytest.approx(value, rel=1e-12)
+    assert (tmp_path / "figures" / "speeds.png").read_bytes()[:4] == b"\x89PNG"
+    lost = "scene.timing_gear=null", "sweep.speed_rpm={from: 2000, to: 4000, points: 2}"
+    assert run("sweep", tmp_path / "lost", *lost, options=["--no-figures"]) == 3
+    record = json.loads((tmp_path / "lost" / "result.json").read_text())
+    assert record["status"] == "passed_through"
+    assert record["message"].startswith("At 2000 rpm: ")
+    with open(tmp_path / "lost" / "sweep.csv", newline="") as file:
+        assert {row["mean_force_N"] for row in csv.DictReader(file)} == {""}
+    assert run("sweep", tmp_path / "bad", "sweep.speed_rpm=3") == 2
+
+
+def test_optimize_over_speeds(tmp_path, capsys):
+    """A short run end to end: better over the speeds, each speed in table, records, picture."""
+    short = "optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=2"
+    assert run("optimize", tmp_path, SPEEDS, WEIGHTS, *short) == 0
+    assert "Contact force over speed" in capsys.readouterr().out
+    result = json.loads((tmp_path / "result.json").read_text())
+    tables = {name: result[name]["speeds"] for name in ("baseline", "optimized")}
+    by_hand = 0.0
+    for before, after in zip(*tables.values(), strict=True):
+        shares = [0.5 * after[k] / before[k] for k in ("mean_force_N", "peak_force_N")]
+        by_hand += before["share"] * sum(shares)
+    assert by_hand < 1
+    assert result["improvement"]["objective"] == pytest.approx(1 - by_hand, rel=1e-9)
+    assert result["optimized"]["response"]["mean_force_N"] == tables["optimized"][1]["mean_force_N"]
+    assert [row["speed_rpm"] for row in result["objective_by_speed"]] == [2000, 3000, 4000]
+    assert (tmp_path / "figures" / "speeds.png").exists()
+
+
+def test_simulate_stays_at_the_scene(tmp_path, baseline):
+    """`simulate` is of the scene's own speed, whatever the objective."""
+    assert run("simulate", tmp_path, SPEEDS, TIGHT, options=["--no-figures"]) == 0
+    record = json.loads((tmp_path / "result.json").read_text())
+    assert "speeds" not in record
+    assert record["response"]["mean_force_N"] == baseline[1].response["mean_force_N"]
+
+
+def test_auto_agrees_at_every_speed():
+    """`solver.fidelity: auto` judges a candidate by the worst of all speeds simulated."""
+
+    def first(*overrides):
+        (tried, *_) = choice.choose(
+            config_of("solver.fidelity=auto", "solver.accuracy=0.1", *overrides)
+        ).tried
+        return tried["error"]
+
+    each = first("scene.speed_rpm=3000"), first("scene.speed_rpm=6000")
+    assert each[0] != pytest.approx(each[1], rel=0.1)
+    assert first("objective.speeds_rpm=[6000]") == max(each)
+
+
+def test_linearised_pair_has_the_closed_form_stiffness():
+    """In half the mesh the involutes carry, e F/δ · (r cos α)²; in the other half the gear."""
+    config = config_of("scene.timing_gear.backlash_mm=0.4", "contact.smoothing_mm=0")
+    pair = Evaluator.of(config).pair(design_vector(config))
+    total, flank, torque, force = (np.asarray(x) for x in equilibria(pair, np.array([0.25, 0.75])))
+    lever = 33.0e-3 * np.cos(np.radians(36.43))
+    normal = 4.775 / lever
+    depth = 1e-3 * (normal / 2.0e5) ** (1 / 2.2)
+    assert total == pytest.approx([2.0e4, 2.2 * normal / depth * lever**2], rel=1e-6)
+    assert flank == pytest.approx([0, total[1]], rel=1e-9)
+    assert torque == pytest.approx([0, 4.775], abs=1e-9)
+    assert force == pytest.approx([0, normal], rel=1e-6)

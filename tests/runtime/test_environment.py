@@ -1,0 +1,265 @@
+"""Environment variables and machines: what is set aside, what is refused, what works."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import types
+import warnings
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from rootsopt.errors import InputError
+from rootsopt.runtime import environment
+
+ROOT = Path(__file__).parents[2]
+EE = str(ROOT / "configs" / "ee.yaml")
+SET_ASIDE = {
+    "JAX_DEBUG_NANS": "1",
+    "JAX_DEBUG_INFS": "True",
+    "JAX_DISABLE_JIT": "1",
+    "JAX_ENABLE_CHECKS": "1",
+    "JAX_CHECK_TRACER_LEAKS": "1",
+    "JAX_ENABLE_X64": "0",
+    "JAX_NUMPY_RANK_PROMOTION": "raise",
+    "JAX_NUMPY_DTYPE_PROMOTION": "strict",
+    "JAX_DEFAULT_MATMUL_PRECISION": "bfloat16",
+    "JAX_RANDOM_SEED_OFFSET": "7",
+    "JAX_TRANSFER_GUARD": "disallow",
+    "JAX_PLATFORM_NAME": "cuda",
+    "JAX_THREEFRY_PARTITIONABLE": "perhaps",
+    "EQX_ON_ERROR": "breakpoint",
+}
+HARMLESS = {
+    "JAX_SOFTMAX_CUSTOM_JVP": "0",  # in force anyway
+    "JAX_NOT_OF_JAX": "1",
+    "JAX_TRACEBACK_FILTERING": "off",
+    "EQX_GETKEY_SEED": "junk",
+    "JAXTYPING_DISABLE": "junk",
+    "MPLBACKEND": "nonsense",
+    "MPLCONFIGDIR": "/dev/null/below",
+    "HOME": "/dev/null/home",
+    "OMP_NUM_THREADS": "junk",
+    "PYTHONWARNINGS": "error",
+    "TERM": "dumb",
+    "NO_COLOR": "1",
+    "COLUMNS": "1",
+    "LINES": "junk",
+}
+
+
+def command(name, output, **variables):
+    return subprocess.run(
+        [sys.executable, "-m", f"rootsopt.{name}", EE, "-o", str(output), "--no-figures"],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+        env=os.environ | variables,
+    )
+
+
+def test_a_command_computes_the_same_whatever_the_environment_says(tmp_path):
+    """All at once; what would change numbers or stop the run is named in a line on stderr."""
+    answers, tables = [], []
+    for name, variables in {"plain": {}, "odd": SET_ASIDE | HARMLESS}.items():
+        done = command("simulate", tmp_path / name, **variables)
+        assert done.returncode == 0, done.stderr
+        answers.append(json.loads((tmp_path / name / "result.json").read_text()))
+        tables.append(
+            [line for line in done.stdout.splitlines() if re.search("force|radius", line)]
+        )
+        named = set(re.findall(r"\b([A-Z][A-Z0-9_]+)=", done.stderr))
+        assert named == set(variables) & set(SET_ASIDE), done.stderr
+        lines = done.stderr.splitlines()
+        assert all(line.startswith("rootsopt: set aside: ") for line in lines), done.stderr
+    assert answers[0]["response"] == answers[1]["response"]
+    assert answers[0]["geometry"] == answers[1]["geometry"]
+    assert len(tables[0]) >= 4
+    assert tables[0] == tables[1]
+
+
+@pytest.mark.parametrize(
+    ("variables", "words"),
+    [
+        ({"JAX_PLATFORMS": "nonsense"}, ["JAX_PLATFORMS", "nonsense", "unset"]),
+        ({"XLA_FLAGS": "--xla_nonsense=1"}, ["XLA_FLAGS", "--xla_nonsense=1", "unset"]),
+        ({"JAX_LOGGING_LEVEL": "junk"}, ["JAX_LOGGING_LEVEL", "junk", "unset"]),
+    ],
+)
+def test_what_cannot_work_is_refused_in_one_line(tmp_path, variables, words):
+    done = command("profile", tmp_path / "out", **variables)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("rootsopt profile: ")
+    assert all(word in line for word in words)
+    assert done.stdout == ""
+    assert not (tmp_path / "out" / "result.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "word"),
+    [
+        ("--xla_cpu_parallel_codegen_split_count=some", "some"),
+        ("--xla_backend_extra_options=rubbish", "rubbish"),
+        ("--xla_force_host_platform_device_count=0", "process"),
+        ("a/file/of/flags", "begin with --"),
+        ("--xla_cpu_enable_fast_math=true", "xla_cpu_enable_fast_math"),
+        ("--xla_dump_to=x --xla_cpu_enable_fast_math", "xla_cpu_enable_fast_math"),
+        ("--xla_nonsense=" + "x" * 5000, "Unknown flag"),
+    ],
+)
+def test_flags_of_xla_are_tried_in_a_process_of_their_own(monkeypatch, flags, word):
+    monkeypatch.delenv(environment._CHECKED, raising=False)
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    with pytest.raises(InputError, match="XLA_FLAGS") as caught:
+        environment._check_flags(flags)
+    assert word in str(caught.value)
+    assert len(str(caught.value)) < 700
+    assert "\n" not in str(caught.value)
+
+
+def test_flags_that_work_are_tried_once(monkeypatch):
+    """Processes started from this one do not try them again; without flags nothing is tried."""
+    flags = "--xla_cpu_enable_fast_math=false --xla_cpu_multi_thread_eigen=false"
+    monkeypatch.delenv(environment._CHECKED, raising=False)
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    environment._check_flags(flags)
+    environment.use_compiled_loops()
+    assert environment._LOOPS in os.environ["XLA_FLAGS"]
+
+    def tried(*_, **__):
+        raise AssertionError
+
+    monkeypatch.setattr(environment.subprocess, "run", tried)
+    environment._check_flags(os.environ["XLA_FLAGS"])
+    for before in ("", "  "):
+        monkeypatch.setenv("XLA_FLAGS", before)
+        environment.use_float64()
+        assert os.environ["XLA_FLAGS"].startswith("--xla_backend_extra_options")
+        environment.use_float64()
+    with pytest.raises(AssertionError):
+        environment._check_flags("--xla_dump_to=elsewhere")
+
+
+def test_settings_of_a_python_session_are_put_right(monkeypatch, capsys):
+    """Where JAX was imported before, variables come too late; its settings are changed."""
+    monkeypatch.setattr(environment, "_noticed", set())
+    wrong = {"jax_debug_nans": True, "jax_numpy_rank_promotion": "raise", "jax_enable_x64": False}
+    for name, value in wrong.items():
+        jax.config.update(name, value)
+    environment.use_float64()
+    assert jnp.ones(1).dtype == float
+    assert not jax.config.values["jax_debug_nans"]
+    assert jax.config.values["jax_numpy_rank_promotion"] == "allow"
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "jax_debug_nans" in line
+    assert "jax_enable_x64" not in line
+    environment.use_float64()
+    assert capsys.readouterr().err == ""
+
+
+class Machine:
+    """Stands in for JAX on a machine with one platform beside the CPU."""
+
+    def __init__(self, platform):
+        self.platform = platform
+        self.chosen = None
+        self.config = types.SimpleNamespace(values={"jax_platforms": None}, update=self._update)
+        self.numpy = jnp
+
+    def _update(self, name, value):
+        assert name == "jax_platforms"
+        self.chosen = value
+
+    def default_backend(self):
+        if self.chosen not in ("", "cpu", self.platform):
+            raise RuntimeError(f"Unable to initialize backend '{self.chosen}' (set X to Y)")
+        return self.platform if self.chosen != "cpu" else "cpu"
+
+
+@pytest.mark.parametrize(
+    ("variable", "platform", "chosen"),
+    [(None, "cuda", "cpu"), ("cuda", "cuda", "cuda"), ("", "cuda", ""), ("cpu", "tpu", "cpu")],
+)
+def test_a_platform_that_is_there_is_not_refused(monkeypatch, variable, platform, chosen):
+    monkeypatch.delenv("JAX_PLATFORMS", raising=False)
+    if variable is not None:
+        monkeypatch.setenv("JAX_PLATFORMS", variable)
+    machine = Machine(platform)
+    environment._start_device(machine)
+    assert machine.chosen == chosen
+
+
+def test_a_platform_that_is_not_there_is_refused(monkeypatch):
+    for variable in ("cuda", "METAL", "CPU", "cuda,cpu", ",", "x" * 5000):
+        monkeypatch.setenv("JAX_PLATFORMS", variable)
+        with pytest.raises(InputError, match="JAX_PLATFORMS") as caught:
+            environment._start_device(Machine("tpu"))
+        assert "unset" in str(caught.value)
+        assert "set X" not in str(caught.value)
+        assert len(str(caught.value)) < 700
+
+
+def test_a_device_without_double_precision_is_refused(monkeypatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "METAL")
+    machine = Machine("METAL")
+    machine.numpy = types.SimpleNamespace(ones=lambda *_: 1 / 0)
+    with pytest.raises(InputError, match="METAL"):
+        environment._start_device(machine)
+
+
+def test_a_lack_of_memory_is_explained():
+    with pytest.raises(InputError, match="not enough memory"), environment.explained():
+        raise MemoryError
+    with pytest.raises(InputError, match="not enough memory"), environment.explained():
+        jnp.ones(2**46).block_until_ready()
+    with pytest.raises(ZeroDivisionError), environment.explained():
+        _ = 1 / 0
+
+
+@pytest.mark.parametrize(
+    ("columns", "after"), [("0", None), ("-3", None), ("junk", None), ("5", None), ("72", "72")]
+)
+def test_a_table_is_never_too_narrow_to_read(monkeypatch, columns, after):
+    monkeypatch.setenv("COLUMNS", columns)
+    environment.own_process()
+    assert os.environ.get("COLUMNS") == after
+
+
+def test_warnings_never_end_a_command(monkeypatch):
+    monkeypatch.setattr(sys, "warnoptions", ["error::UserWarning"])
+    with warnings.catch_warnings(record=True):
+        warnings.simplefilter("error")
+        environment.own_process()
+        warnings.warn("only that", UserWarning, stacklevel=1)
+    monkeypatch.setattr(sys, "warnoptions", [])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of a caller, as pytest, who wants them
+        environment.own_process()
+        with pytest.raises(UserWarning, match="only"):
+            warnings.warn("only that", UserWarning, stacklevel=1)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "agrees"),
+    [(True, "1", True), (True, "TRUE", True), (False, "0", True), (False, "", True),
+     (False, "yes", False), (True, "0", False), (False, "junk", False), ("allow", "allow", True),
+     ("allow", "raise", False), (0, "0", True), (0, "7", False), (None, "float32", False)],
+)  # fmt: skip
+def test_a_variable_that_agrees_is_not_named(setting, value, agrees):
+    assert environment._agrees(setting, value) is agrees
+
+
+def test_nothing_is_said_where_nobody_can_read_it(monkeypatch):
+    class Full:
+        def write(self, _):
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(environment, "_noticed", set())
+    monkeypatch.setattr(sys, "stderr", Full())
+    environment.say("unread")

@@ -1,0 +1,452 @@
+"""Compiled programs: called, prepared, kept between processes and thrown away."""
+
+import importlib
+import os
+import pickle
+import platform
+import re
+import shutil
+import sys
+import threading
+import time
+import zlib
+from importlib import metadata
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt.commands import cli
+from rootsopt.config.families import for_a_time, import_named
+from rootsopt.runtime import environment, programs, store
+from rootsopt.runtime.programs import Program
+from rootsopt.runtime.timing import CompileClock
+
+
+class Answer(NamedTuple):
+    total: object
+    name: str
+
+
+class Factor(eqx.Module):
+    value: object
+    power: int = eqx.field(static=True)
+
+
+TRACED = []
+
+
+def scaled(factor, numbers, name):
+    """A function of a module, arrays and something static."""
+    TRACED.append(name)
+    return Answer({"sum": jnp.sum(factor.value * numbers**factor.power)}, name)
+
+
+def solved(matrix):
+    """Needs LAPACK, which is set up when a program is lowered."""
+    return jnp.linalg.solve(matrix, matrix[0])
+
+
+@pytest.fixture(autouse=True)
+def traced(monkeypatch, tmp_path):
+    """The traces of `scaled`, from none on; no programs are kept, and the key is the test's own."""
+    monkeypatch.setattr(programs, "_store", None)
+    monkeypatch.setattr(store, "key_folder", lambda: tmp_path / "state")
+    TRACED.clear()
+    return TRACED
+
+
+def ask(program, power=2, size=3, name="a"):
+    answer = program(Factor(jnp.asarray(2.0), power), np.arange(size, dtype=float), name)
+    assert isinstance(answer, Answer)
+    assert answer.name == name
+    assert float(answer.total["sum"]) == 2 * sum(k**power for k in range(size))
+    return answer
+
+
+def test_a_program_is_traced_once_for_each_kind_of_arguments(traced):
+    program = Program(scaled)
+    ask(program)
+    ask(program)
+    assert len(traced) == 1
+    for other in ({"power": 3}, {"size": 4}, {"name": "b"}):
+        ask(program, **other)
+    assert len(traced) == 4
+
+
+def test_a_program_inside_another_is_a_plain_function(traced):
+    program = Program(scaled)
+    factors = Factor(jnp.arange(3.0), 2)
+    answer = jax.vmap(lambda value: program(Factor(value, 2), jnp.ones(2), "a").total["sum"])(
+        factors.value
+    )
+    np.testing.assert_array_equal(answer, [0, 2, 4])
+    assert traced == ["a"]
+
+
+def test_prepared_programs_are_ready_when_called(traced):
+    program = Program(scaled)
+    shape = jax.ShapeDtypeStruct((3,), float)
+    kind = Factor(jax.ShapeDtypeStruct((), float), 2), shape, "a"
+    assert program.result_shape(*kind).total["sum"].shape == ()
+    traced.clear()
+    program.prepare(*kind)
+    program.prepare(*kind)
+    ask(program)
+    assert len(traced) == 1
+
+
+def test_a_failure_is_raised_by_the_call_and_not_remembered():
+    fails = [True]
+
+    def moody(x):
+        if fails[0]:
+            raise ValueError("no")
+        return x + 1
+
+    program = Program(moody)
+    program.prepare(jnp.ones(2))
+    for thread in threading.enumerate():
+        if thread is not threading.current_thread() and "_make" in thread.name:
+            thread.join()
+    with pytest.raises(ValueError, match="no"):
+        program(jnp.ones(2))
+    fails[0] = False
+    np.testing.assert_array_equal(program(jnp.ones(2)), [2, 2])
+
+
+def test_kept_programs_are_found_without_tracing(tmp_path, traced):
+    """Another process is stood in for by another `Program` of the same function."""
+    programs.keep_in(tmp_path / "new" / "folder")
+    first = ask(Program(scaled))
+    assert len(list((tmp_path / "new" / "folder").iterdir())) == 1
+    again = ask(Program(scaled))
+    assert traced == ["a"]
+    assert first.total["sum"] == again.total["sum"]
+    assert Program(scaled).result_shape(Factor(jnp.ones(()), 2), np.ones(3), "a").name == "a"
+    assert traced == ["a"]
+    ask(Program(scaled), power=3)
+    assert len(traced) == 2
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """The folder that programs are kept in from now on."""
+    programs.keep_in(tmp_path / "cache")
+    return tmp_path / "cache"
+
+
+def test_a_damaged_or_unwritable_cache_is_no_error(folder, traced):
+    ask(Program(scaled))
+    (file,) = folder.iterdir()
+    file.write_bytes(file.read_bytes()[:100])
+    ask(Program(scaled))
+    assert len(traced) == 2
+    ask(Program(scaled))
+    assert len(traced) == 2
+    assert programs.keep_in(file / "below a file") is None
+    ask(Program(scaled))
+    assert len(traced) == 3
+
+
+class Bomb:
+    """Notes that it was unpickled."""
+
+    went_off = False
+
+    def __reduce__(self):
+        return setattr, (Bomb, "went_off", True)
+
+
+@pytest.mark.parametrize("signed", ["not", "with another key", "for another program"])
+def test_what_is_not_ours_is_never_unpickled(folder, traced, monkeypatch, tmp_path, signed):
+    """What others put into the folder is compiled anew."""
+    ask(Program(scaled))
+    (file,) = folder.iterdir()
+    bomb = zlib.compress(pickle.dumps(Bomb()))
+    if signed == "not":
+        file.write_bytes(bomb)
+    else:
+        name, purpose = file.stem, "for another program"
+        if signed == "with another key":
+            monkeypatch.setattr(store, "key_folder", lambda: tmp_path / "of others")
+        store.Store(folder).write(name, purpose, bomb)
+    ask(Program(scaled))
+    assert len(traced) == 2
+    assert not Bomb.went_off
+    ask(Program(scaled))
+    assert len(traced) == 2
+    pickle.loads(zlib.decompress(bomb))
+    assert Bomb.went_off
+    Bomb.went_off = False
+
+
+def test_an_exchanged_program_is_compiled_anew(folder, traced):
+    """Whole and signed, but of another program: its answer would be another one."""
+    ask(Program(scaled), power=2)
+    (second,) = folder.iterdir()
+    ask(Program(scaled), power=3)
+    (third,) = set(folder.iterdir()) - {second}
+    third.write_bytes(second.read_bytes())
+    ask(Program(scaled), power=3)
+    assert len(traced) == 3
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
+def test_a_cache_others_may_write_to_is_said_once_and_not_used(folder, traced, monkeypatch, capsys):
+    ask(Program(scaled))
+    folder.chmod(0o777)
+    monkeypatch.setenv("ROOTSOPT_CACHE", str(folder))
+    monkeypatch.setattr(environment, "_noticed", set())
+    for _ in range(2):
+        cli.use_cache()
+        ask(Program(scaled))
+    assert len(traced) == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert str(folder) in line
+    assert "chmod" in line
+
+
+def test_a_cache_that_cannot_be_used_is_not_spoken_of(traced, monkeypatch, capsys, tmp_path):
+    """A file in the folder's place, a full path, or a cache that is switched off."""
+    (tmp_path / "file").touch()
+    for choice in (tmp_path / "file", tmp_path / "file" / "below", "off", "OFF", "0", "no"):
+        monkeypatch.setenv("ROOTSOPT_CACHE", str(choice))
+        cli.use_cache()
+        ask(Program(scaled))
+    assert len(traced) == 6
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert capsys.readouterr().err == ""
+
+
+def test_the_cache_may_be_named_from_the_current_folder(traced, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ROOTSOPT_CACHE", "cache")
+    cli.use_cache()
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    ask(Program(scaled))
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+
+
+def test_programs_that_call_out_are_not_kept(folder):
+    """Loaded without being lowered they would call what has not been set up."""
+    np.testing.assert_allclose(Program(solved)(jnp.eye(2) * 2), [1, 0])
+    assert not list(folder.iterdir())
+
+
+def test_the_oldest_programs_give_way(folder, monkeypatch):
+    ask(Program(scaled))
+    (oldest,) = folder.iterdir()
+    os.utime(oldest, (1e9, 1e9))
+    monkeypatch.setattr(store, "MOST_BYTES", 2.5 * oldest.stat().st_size)
+    for power in (3, 4):
+        ask(Program(scaled), power=power)
+    kept = list(folder.iterdir())
+    assert len(kept) == 2
+    assert oldest not in kept
+
+
+def place():
+    """Name and purpose of a program in the store; its arguments have no precision of their own."""
+    _, kind = programs._split((Factor(jnp.asarray(2, "int8"), 2), np.ones(3, "int8"), "a"))
+    return Program(scaled)._place(kind)[1:]
+
+
+def changed_file(monkeypatch, tmp_path):
+    (tmp_path / "room").mkdir()
+    for file in sorted(programs._PACKAGE.glob("s*.py")):
+        shutil.copy(file, tmp_path / "room")
+    monkeypatch.setattr(programs, "_PACKAGE", tmp_path / "room")
+    programs._package_digest.cache_clear()
+    before = place()
+    with (tmp_path / "room" / "sweep.py").open("a") as file:
+        file.write("#")
+    programs._package_digest.cache_clear()
+    return before
+
+
+def renamed_file(monkeypatch, tmp_path):
+    (tmp_path / "room" / "inner").mkdir(parents=True)
+    (tmp_path / "room" / "inner" / "a.py").touch()
+    monkeypatch.setattr(programs, "_PACKAGE", tmp_path / "room")
+    programs._package_digest.cache_clear()
+    before = place()
+    (tmp_path / "room" / "inner" / "a.py").rename(tmp_path / "room" / "inner" / "b.py")
+    programs._package_digest.cache_clear()
+    return before
+
+
+def merged_files(monkeypatch, tmp_path):
+    """Two files that read as one."""
+    (tmp_path / "room").mkdir()
+    first, second = tmp_path / "room" / "a.py", tmp_path / "room" / "b.py"
+    first.write_text("x\n")
+    second.write_text("y\n")
+    monkeypatch.setattr(programs, "_PACKAGE", tmp_path / "room")
+    programs._package_digest.cache_clear()
+    before = place()
+    first.write_text("x\nb.py\ny\n")
+    second.unlink()
+    programs._package_digest.cache_clear()
+    return before
+
+
+def flags(monkeypatch, _):
+    before = place()
+    monkeypatch.setenv("XLA_FLAGS", f"{os.environ['XLA_FLAGS']} --xla_cpu_enable_fast_math=true")
+    return before
+
+
+def checks(monkeypatch, _):
+    before = place()
+    monkeypatch.setenv("EQX_ON_ERROR", "nan")
+    return before
+
+
+def version(package):
+    def change(monkeypatch, _):
+        before, found = place(), metadata.version
+        programs._versions.cache_clear()
+        other = {package: "0"}
+        monkeypatch.setattr(metadata, "version", lambda name: other.get(name) or found(name))
+        return before
+
+    return change
+
+
+def machine(monkeypatch, _):
+    before = place()
+    programs._machine.cache_clear()
+    monkeypatch.setattr(platform, "machine", lambda: "abacus")
+    return before
+
+
+def processor(monkeypatch, _):
+    """Without an instruction: a program that has it would end the process."""
+    before, found = place(), Path.read_text
+    programs._machine.cache_clear()
+
+    def other(path, *args, **kwargs):
+        text = found(path, *args, **kwargs)
+        return re.sub(r"(?m)^(flags|Features)(.*) \w+$", r"\1\2", text)
+
+    monkeypatch.setattr(Path, "read_text", other)
+    monkeypatch.setattr(platform, "processor", lambda: "other")
+    return before
+
+
+def setting(name, value):
+    def change(monkeypatch, _):
+        before = place()
+        found = jax.config.values[name]
+        jax.config.update(name, value)
+        UNDO.append(lambda: jax.config.update(name, found))
+        return before
+
+    return change
+
+
+UNDO = []
+CHANGES = {
+    "a source": changed_file,
+    "a source's name": renamed_file,
+    "where one source ends": merged_files,
+    "flags of XLA": flags,
+    "checks of equinox": checks,
+    "precision": setting("jax_enable_x64", False),
+    "matrix products": setting("jax_default_matmul_precision", "bfloat16"),
+    "promotion": setting("jax_numpy_dtype_promotion", "strict"),
+    "seeds": setting("jax_random_seed_offset", 1),
+    "machine": machine,
+    "processor": processor,
+    **{package: version(package) for package in programs._PACKAGES},
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_a_program_is_another_after_a_change(what, folder, monkeypatch, tmp_path):
+    """Of anything that its result depends on; back again it is found."""
+    caches = programs._package_digest, programs._machine, programs._versions
+    first = place()
+    assert place() == first
+    try:
+        with monkeypatch.context() as patch:
+            before = CHANGES[what](patch, tmp_path)
+            after = place()
+            assert before[0] != after[0]
+            assert before[1] != after[1]
+    finally:
+        while UNDO:
+            UNDO.pop()()
+        for cache in caches:
+            cache.cache_clear()
+    assert place() == first
+
+
+def test_a_program_of_sources_elsewhere_follows_them(folder, monkeypatch, tmp_path):
+    """A user's own function or part of a scene that was changed is not the one that was kept."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    answers = []
+    for step in (1, 2):
+        (tmp_path / "own_room.py").write_text(
+            "import equinox as eqx\n"
+            "class Part(eqx.Module):\n"
+            "    size: float\n"
+            f"    def grown(self, x): return x + self.size * {step}\n"
+            f"def function(x): return x + {step}\n"
+        )
+        monkeypatch.delitem(sys.modules, "own_room", raising=False)
+        importlib.invalidate_caches()
+        own = importlib.import_module("own_room")
+        answers.append(
+            (float(Program(own.function)(jnp.ones(()))), float(Program(grown)(own.Part(2.0), 1.0)))
+        )
+    assert answers == [(2.0, 3.0), (3.0, 5.0)]
+    assert len(list(folder.iterdir())) == 4
+    del own.__file__
+    assert float(Program(own.function)(jnp.ones(2))[0]) == 3.0
+    assert len(list(folder.iterdir())) == 4
+
+
+def test_programs_follow_the_files_of_families_from_outside(folder, monkeypatch, tmp_path):
+    """And what these import from their folder: a name in a config says nothing of either."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "own_helper.py").write_text("SIZE = 1\n")
+    (tmp_path / "own_family.py").write_text(
+        "import own_helper\n"
+        "from rootsopt import Family, register_family\n"
+        "def make(lobes, pitch_radius): return own_helper.SIZE\n"
+        "register_family(Family(name='of_a_helper', help='none', maker=make))\n"
+    )
+    before = place()
+    with for_a_time():
+        import_named("own_family")
+        found = [place()]
+        for name in ("own_helper", "own_family"):
+            (tmp_path / f"{name}.py").write_text("# changed\n")
+            found.append(place())
+        assert len({before, *found}) == 4
+    assert place() == before
+    for name in ("own_helper", "own_family"):
+        del sys.modules[name]
+
+
+def grown(part, x):
+    return part.grown(x) + 0.0 * jnp.ones(())
+
+
+def test_time_spent_compiling_side_by_side_counts_once():
+    began = time.perf_counter()
+    with CompileClock() as clock:
+        program = Program(scaled)
+        for power in range(2, 8):
+            program.prepare(Factor(jnp.asarray(2.0), power), np.ones(3), "a")
+        for power in range(2, 8):
+            program(Factor(jnp.asarray(2.0), power), np.ones(3), "a")
+    assert 0 < clock.seconds <= time.perf_counter() - began

@@ -1,0 +1,375 @@
+"""Signed files of compiled programs: who may have a hand in them, damage, eviction, processes."""
+
+import os
+import stat
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from rootsopt.runtime import store
+from rootsopt.runtime.store import Store, UnsafeFolderError
+
+ROOT = Path(__file__).parents[2]
+DATA = b"program" * 1000
+posix = pytest.mark.skipif(os.name != "posix", reason="owners and permissions of POSIX")
+
+
+@pytest.fixture(autouse=True)
+def key_folder(tmp_path, monkeypatch):
+    """A state folder of the test's own, which holds the key."""
+    folder = tmp_path / "state"
+    monkeypatch.setattr(store, "key_folder", lambda: folder)
+    return folder
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """A store with one entry, and the file that holds it."""
+    made = Store(tmp_path / "cache")
+    made.write("a", "for a", DATA)
+    (file,) = (tmp_path / "cache").iterdir()
+    return made, file
+
+
+def test_what_was_written_is_read(kept, tmp_path):
+    made, file = kept
+    assert "a" in made
+    assert "b" not in made
+    assert made.read("a", "for a") == DATA
+    assert Store(tmp_path / "cache").read("a", "for a") == DATA
+    made.write("a", "for a", b"other")
+    assert made.read("a", "for a") == b"other"
+    assert [path.name for path in file.parent.iterdir()] == ["a.program"]
+
+
+def flipped(data, place):
+    return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
+
+
+DAMAGE = {
+    "empty": lambda data: b"",
+    "one byte short": lambda data: data[:-1],
+    "one byte long": lambda data: data + b"\0",
+    "half": lambda data: data[: len(data) // 2],
+    "no signature": lambda data: DATA,
+    "header": lambda data: flipped(data, 0),
+    "signature": lambda data: flipped(data, len(store._HEADER)),
+    "first byte": lambda data: flipped(data, len(store._HEADER) + 32),
+    "last byte": lambda data: flipped(data, len(data) - 1),
+}
+
+
+@pytest.mark.parametrize("how", DAMAGE)
+def test_a_damaged_entry_is_none(kept, how):
+    made, file = kept
+    file.write_bytes(DAMAGE[how](file.read_bytes()))
+    assert made.read("a", "for a") is None
+    made.write("a", "for a", DATA)
+    assert made.read("a", "for a") == DATA
+
+
+def test_an_exchanged_entry_is_none(kept):
+    """Under another name, or made for something else, it is not what was asked for."""
+    made, file = kept
+    made.write("b", "for b", DATA)
+    other = file.with_name("b.program")
+    assert made.read("b", "for a") is None
+    other.write_bytes(file.read_bytes())
+    assert made.read("b", "for b") is None
+    assert made.read("b", "for a") is None
+
+
+@posix
+def test_only_plain_files_of_the_users_own_are_read(kept, monkeypatch, tmp_path):
+    """Links, pipes and folders in an entry's place neither count nor hold up, nor do files that
+    others could write to."""
+    made, file = kept
+    whole = file.read_bytes()
+    for mode in (0o620, 0o602, 0o666):
+        file.chmod(mode)
+        assert made.read("a", "for a") is None
+    file.chmod(0o644)
+    assert made.read("a", "for a") == DATA
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "geteuid", lambda: os.getuid() + 1)
+        assert made.read("a", "for a") is None
+        patch.setattr(store, "MOST_BYTES", len(whole) - 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "MOST_BYTES", len(whole) - 1)
+        assert made.read("a", "for a") is None
+    file.unlink()
+    (tmp_path / "elsewhere").write_bytes(whole)
+    file.symlink_to(tmp_path / "elsewhere")
+    assert made.read("a", "for a") is None
+    assert "a" not in made
+    file.unlink()
+    os.mkfifo(file)
+    assert made.read("a", "for a") is None
+    file.unlink()
+    file.mkdir()
+    assert made.read("a", "for a") is None
+    with pytest.raises(OSError, match="directory"):
+        made.write("a", "for a", DATA)
+    assert [path.name for path in file.parent.iterdir()] == ["a.program"]
+
+
+def refusal(folder):
+    with pytest.raises(UnsafeFolderError) as caught:
+        Store(folder)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert "choose" in message or "cannot be kept" in message
+    return message
+
+
+@posix
+@pytest.mark.parametrize("mode", [0o770, 0o707, 0o777, 0o1777, 0o720])
+def test_a_folder_others_may_write_to_is_refused(tmp_path, mode):
+    folder = tmp_path / "cache"
+    folder.mkdir()
+    folder.chmod(mode)
+    assert "chmod go-w" in refusal(folder)
+    (tmp_path / "link").symlink_to(folder)
+    assert str(folder) in refusal(tmp_path / "link")
+
+
+@posix
+def test_a_folder_others_may_exchange_is_refused(tmp_path):
+    """They may, if they can write to a folder above it; the sticky bit takes that from them."""
+    above = tmp_path / "above"
+    above.mkdir()
+    folder = above / "between" / "cache"
+    for mode in (0o777, 0o775):
+        above.chmod(mode)
+        assert f"{str(above)!r}" in refusal(folder)
+    above.chmod(0o1777)
+    Store(folder).write("a", "for a", DATA)
+    assert (
+        stat.S_IMODE(folder.stat().st_mode) == stat.S_IMODE(folder.parent.stat().st_mode) == 0o700
+    )
+    assert stat.S_IMODE((folder / "a.program").stat().st_mode) == 0o600
+
+
+@posix
+def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "cache").mkdir()
+    monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
+    assert "belongs to another user" in refusal(tmp_path / "cache")
+
+
+@posix
+@pytest.mark.skipif(os.name == "posix" and os.geteuid() != 0, reason="only root gives files away")
+def test_a_folder_in_one_of_another_user_is_refused(tmp_path):
+    """Its owner can exchange what is in it."""
+    above = tmp_path / "above"
+    (above / "cache").mkdir(parents=True)
+    os.chown(above, 12345, 12345)
+    assert "12345" in refusal(above / "cache")
+    os.chown(tmp_path / "above" / "cache", 12345, 12345)
+    assert "belongs to another user" in refusal(above / "cache")
+
+
+def test_a_folder_that_cannot_be_used_is_an_os_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(OSError, match=r"directory|exists"):
+            Store(path)
+    (tmp_path / "circle").symlink_to(tmp_path / "circle")
+    with pytest.raises(OSError, match="circle"):
+        Store(tmp_path / "circle")
+
+
+def test_the_key_is_secret_and_lies_elsewhere(kept, key_folder, tmp_path):
+    """With another key, entries are none, and are replaced."""
+    (key,) = key_folder.iterdir()
+    assert len(key.read_bytes()) == 32
+    if os.name == "posix":
+        assert stat.S_IMODE(key.stat().st_mode) == 0o600
+        assert stat.S_IMODE(key_folder.stat().st_mode) == 0o700
+    first = key.read_bytes()
+    Store(tmp_path / "cache")
+    assert key.read_bytes() == first
+    key.unlink()
+    other = Store(tmp_path / "cache")
+    assert key.read_bytes() != first
+    assert other.read("a", "for a") is None
+    other.write("a", "for a", DATA)
+    assert other.read("a", "for a") == DATA
+
+
+UNFIT = {
+    "empty": lambda key: key.write_bytes(b""),
+    "short": lambda key: key.write_bytes(key.read_bytes()[:31]),
+    "long": lambda key: key.write_bytes(key.read_bytes() + b"0"),
+    "readable by others": lambda key: key.chmod(0o604),
+    "readable by the group": lambda key: key.chmod(0o640),
+    "a link": lambda key: (key.rename(key.parent / "moved"), key.symlink_to(key.parent / "moved")),
+}
+
+
+@posix
+@pytest.mark.parametrize("how", UNFIT)
+def test_an_unfit_key_is_replaced(kept, key_folder, tmp_path, how):
+    key = key_folder / "programs.key"
+    first = key.read_bytes()
+    UNFIT[how](key)
+    other = Store(tmp_path / "cache")
+    assert other.read("a", "for a") is None
+    assert len(key.read_bytes()) == 32
+    assert key.read_bytes() != first
+    assert stat.S_ISREG(key.lstat().st_mode)
+    assert stat.S_IMODE(key.lstat().st_mode) == 0o600
+
+
+@posix
+def test_without_a_key_nothing_is_kept(tmp_path, key_folder, monkeypatch):
+    """Nor where others may write beside it, or the state folder cannot be made."""
+    key_folder.mkdir()
+    key_folder.chmod(0o777)
+    assert "key" in refusal(tmp_path / "cache")
+    key_folder.chmod(0o700)
+    (key_folder / "programs.key").mkdir()
+    assert str(key_folder) in refusal(tmp_path / "cache")
+    (key_folder / "programs.key").rmdir()
+    for folder in (tmp_path / "cache" / "x" / "y", Path("relative")):
+        (tmp_path / "cache").mkdir(exist_ok=True)
+        (tmp_path / "cache" / "x").touch()
+        monkeypatch.setattr(store, "key_folder", lambda folder=folder: folder)
+        assert str(folder) in refusal(tmp_path / "cache")
+
+
+def at_once(number, work):
+    """Run `work(k)` in so many threads that start together; the results."""
+    gate, results = threading.Barrier(number), [None] * number
+
+    def one(k):
+        gate.wait()
+        results[k] = work(k)
+
+    threads = [threading.Thread(target=one, args=(k,)) for k in range(number)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return results
+
+
+def test_those_who_make_the_key_at_once_share_it(key_folder, monkeypatch):
+    for attempt in range(20):
+        monkeypatch.setattr(store, "key_folder", lambda k=attempt: key_folder / str(k))
+        assert len(set(at_once(8, lambda _: store._key()))) == 1
+        assert [path.name for path in (key_folder / str(attempt)).iterdir()] == ["programs.key"]
+
+
+def test_an_entry_written_by_many_is_whole(tmp_path):
+    made = Store(tmp_path / "cache")
+
+    def both(k):
+        own = Store(tmp_path / "cache")
+        seen = set()
+        for _ in range(20):
+            own.write("a", "for a", bytes([k]) * 10_000)
+            seen.add(own.read("a", "for a"))
+        return seen
+
+    seen = set().union(*at_once(6, both))
+    assert None not in seen
+    assert all(len(data) == 10_000 and len(set(data)) == 1 for data in seen)
+    assert made.read("a", "for a") in seen
+    assert [path.name for path in (tmp_path / "cache").iterdir()] == ["a.program"]
+
+
+def make_older(folder):
+    for path in folder.iterdir():
+        os.utime(path, (time.time() - 10,) * 2)
+
+
+@posix
+def test_unfinished_files_of_dead_processes_are_removed(tmp_path, key_folder):
+    """Those of living ones stay, and so does what is not ours."""
+    Store(tmp_path / "cache")
+    script = f"""
+import os, sys
+from pathlib import Path
+from rootsopt.runtime import store
+folder = store.Folder(Path({str(tmp_path / "cache")!r}))
+with folder.unfinished("a.program", b"half"):
+    print("written", flush=True)
+    sys.stdin.read()
+"""
+    process = subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT,
+    )  # fmt: skip
+    assert process.stdout.readline() == b"written\n"
+    (key_folder / ".programs.key.0123").write_bytes(b"left over")
+    make_older(key_folder)
+    (tmp_path / "cache" / ".program").write_text("the user's")
+    (tmp_path / "cache" / ".a.txt").write_text("the user's")
+    make_older(tmp_path / "cache")
+    Store(tmp_path / "cache")
+    assert len(list((tmp_path / "cache").iterdir())) == 3
+    process.kill()
+    process.wait()
+    process.stdin.close()
+    process.stdout.close()
+    Store(tmp_path / "cache")
+    assert {path.name for path in (tmp_path / "cache").iterdir()} == {".program", ".a.txt"}
+    assert [path.name for path in key_folder.iterdir()] == ["programs.key"]
+
+
+def test_the_entries_unused_for_longest_give_way(kept, monkeypatch, tmp_path):
+    """Being read counts as use; what else lies in the folder, older and larger, is left alone."""
+    made, file = kept
+    size = file.stat().st_size
+    other = file.with_name("of the user")
+    other.write_bytes(bytes(10 * size))
+    os.utime(other, (0, 0))
+    folder = file.with_name("folder.program")
+    folder.mkdir()
+    now = time.time()
+    for age, name in enumerate("bcd", start=1):
+        made.write(name, "x", DATA)
+        os.utime(file.with_name(f"{name}.program"), (now - 100 * age, now - 100 * age))
+    os.utime(file, (now - 1000, now - 1000))
+    assert made.read("a", "for a") == DATA
+    monkeypatch.setattr(store, "MOST_BYTES", 3.5 * size)
+    made.write("e", "x", DATA)
+    names = {path.name for path in file.parent.iterdir()}
+    assert names == {"a.program", "b.program", "e.program", other.name, folder.name}
+
+
+def test_entries_may_disappear_while_others_are_counted(kept, monkeypatch):
+    made, _ = kept
+    monkeypatch.setattr(
+        store.Folder, "names", lambda self: [*os.listdir(self.path), "gone.program", ".x.program.y"]
+    )
+    made.write("b", "for b", DATA)
+    assert made.read("a", "for a") == DATA
+    assert made.read("b", "for b") == DATA
+
+
+def test_a_system_without_owners_and_open_folders(tmp_path, monkeypatch):
+    """As Windows: no user numbers, no descriptors of folders, no locks, no links of that kind."""
+    monkeypatch.setattr(store, "_HAS_OWNERS", False)
+    monkeypatch.setattr(store, "_IN_FOLDER", False)
+    monkeypatch.setattr(store, "fcntl", None)
+
+    def none(*_, **__):
+        raise OSError("not supported")
+
+    monkeypatch.setattr(os, "link", none)
+    made = Store(tmp_path / "cache")
+    made.write("a", "for a", DATA)
+    assert Store(tmp_path / "cache").read("a", "for a") == DATA
+    (file,) = (tmp_path / "cache").iterdir()
+    file.write_bytes(file.read_bytes()[:-1])
+    assert made.read("a", "for a") is None
+    file.with_name(".a.program.0123").write_bytes(b"left over")
+    make_older(file.parent)
+    Store(tmp_path / "cache")
+    assert [path.name for path in file.parent.iterdir()] == ["a.program"]

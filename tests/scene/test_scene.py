@@ -1,0 +1,294 @@
+"""A scene as the sum of its parts: forces and motion against Newton's laws written anew
+(`planar`), energy, and what an absent part costs."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from rootsopt.config import load
+from rootsopt.dynamics.flow import Integrator
+from rootsopt.errors import InputError
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.scene import Scene, design_vector
+from rootsopt.status import Status
+from tests.planar import Planar
+
+MOTOR = ["scene.drive=torque", "scene.motor={slope_N_m_s_per_rad: 0.1}"]
+PARTS = {
+    "motor": ["scene.drive=torque", "scene.motor={slope_N_m_s_per_rad: 0.1, torque_N_m: 5}"],
+    "gas": ["scene.load={pressure_difference_Pa: 5e4}"],
+    "friction": ["contact.friction={}"],
+    "phase error": ["scene.phase_error_mrad=0.4"],
+    "centre distance error": ["scene.center_distance_error_mm=0.02"],
+    "supports": ["scene.supports={stiffness_N_per_mm: 2e5, damping_N_s_per_mm: 5}"],
+}
+ALL = [override for part in PARTS.values() for override in part]
+SHARE = 0.35
+WITHIN = "profile.involute_length_mm=8.5"
+"""Past the longest involute two points of a flank mesh at once, which `planar` has no order for."""
+
+
+@eqx.filter_jit
+def build(model, design):
+    return model.pair_and_shape(design)
+
+
+def pair_of(overrides, family="cic"):
+    config = load(f"configs/{family}.yaml", list(overrides))
+    return build(Scene.from_config(config), design_vector(config))[0], config
+
+
+def planar_of(pair, config):
+    """The same scene in plain coordinates."""
+    mass = None if pair.supports is None else float(pair.supports.mass)
+    gas = None
+    if config.scene.load.pressure_difference_Pa is not None:
+        torques = jax.jit(lambda phi: jnp.stack([pair.load.torque1(phi), pair.load.torque2(phi)]))
+        gas = lambda phi: np.asarray(torques(phi))  # noqa: E731
+    return Planar(config, float(pair.inertia), mass, gas)
+
+
+def plain(pair, tau, state):
+    """The state of `planar` for rotation `tau` and a scaled state."""
+    motion = pair.motion(jnp.asarray(tau), jnp.asarray(state))
+    positions = [[motion.phi, motion.phi + motion.relative], jnp.ravel(motion.shift)]
+    rates = [[motion.speed, motion.speed + motion.rate], jnp.ravel(motion.drift)]
+    return np.concatenate([np.asarray(x, float) for x in positions + rates])
+
+
+@eqx.filter_jit
+def contacts(pair, tau, states):
+    return jax.lax.map(lambda at: pair.contact_at(*at), (tau, states))
+
+
+@pytest.mark.parametrize("family", ["cic", "ee"])
+def test_forces_of_all_parts_are_newtons(family):
+    """Torques on both rotors, force on the axes and contact force at random states with displaced
+    axes, wider and closer than nominal: flanks, tips and roots that touch."""
+    # Rounding of the geometry is some 1e-17 m of a depth of 1e-6 m.
+    for error in (0.02, -0.02):
+        more = [f"scene.center_distance_error_mm={error}", *([WITHIN] * (family == "cic"))]
+        pair, config = pair_of([*ALL, *more], family)
+        reference = planar_of(pair, config)
+        rng = np.random.default_rng(3)
+        tau, states = rng.uniform(0, 1, 60), rng.normal(0, 0.7, (60, pair.states))
+        states[:, -8:] *= 0.3
+        # The axis of a lobe on the line of centres, where one side hands over to the other.
+        tau[:6] = np.array([0.0, 0.5, 1.0]).repeat(2) + 3e-3 * np.array([-1, 1] * 3)
+        found = contacts(pair, jnp.asarray(tau), jnp.asarray(states))
+        got = np.column_stack([found.torque1, found.torque2, found.push, found.total])
+        expected = []
+        for k in range(len(tau)):
+            torques, pushes, total, _ = reference.forces(plain(pair, tau[k], states[k]))
+            expected.append([*torques, pushes[1].real, pushes[1].imag, total])
+            assert pushes[0] == -pushes[1]
+        expected = np.array(expected)
+        scale = np.max(abs(expected), axis=0)
+        np.testing.assert_array_less(0, scale)
+        assert 5 < np.sum(expected[:, 4] > 0) < 55
+        np.testing.assert_allclose(got / scale, expected / scale, rtol=0, atol=1e-9)
+
+
+def test_motion_of_all_parts_is_scipys():
+    """Through an impact, a third of a mesh period of rotation, with every part on: all states
+    against DOP853."""
+    pair, config = pair_of([*ALL, WITHIN])
+    reference = planar_of(pair, config)
+    start = np.array([-0.6, 0.0, 0.0, 0.1, 0.0, -0.1, 0.05, 0.0, 0.0, 0.0, 0.0])
+    how = Integrator("dopri8", jnp.asarray(1e-11), 20000)
+
+    @jax.jit
+    def run(start):
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda tau, y, _: pair.derivative(tau, y)[0]), how.solver(start.dtype),
+            0.0, SHARE, None, start, stepsize_controller=how.controller(start.dtype),
+            max_steps=how.max_steps, adjoint=diffrax.ForwardMode(),
+        ).ys[-1]  # fmt: skip
+
+    period = float(pair.mesh_period)
+
+    # With the angle as what runs on: an event in time would be found by interpolation.
+    scale = 1e-5 * np.array([1, 1, 1, 1, 1, 1, *np.full(6, 1 / period)])
+    solution = solve_ivp(
+        lambda phi, y: reference(0, y) / y[6], (0, SHARE * 2 * np.pi / 3), plain(pair, 0.0, start),
+        "DOP853", rtol=1e-13, atol=1e-13 * scale, max_step=0.06,
+    )  # fmt: skip
+    end = solution.y[:, -1]
+    got = plain(pair, SHARE, run(jnp.asarray(start)))
+    moved = np.max(abs(end - plain(pair, SHARE, start)) / scale)
+    assert moved > 1  # Otherwise closeness would be that of a pair at rest.
+    np.testing.assert_allclose((got - end)[1:] / scale[1:] / moved, 0, atol=1e-8)
+
+
+def test_energy_balance_with_all_parts():
+    """Over a mesh period: the change of kinetic and elastic energy is the work of motor and gas
+    less what flanks, friction, gear and bearings take, to 1e-8 of that work.
+
+    The law of contact and gear stand as they are, unrounded, so that their energies are closed
+    forms. The rate of penetration is the derivative of the penetration along the motion, not the
+    package's own closing speed.
+    """
+    pair, _ = pair_of([*ALL, WITHIN, "contact.smoothing_mm=0"])
+    law, gear, supports, drive = pair.law, pair.gear, pair.supports, pair.drive
+    undamped = eqx.tree_at(lambda law: law.damping, law, jnp.zeros(()))
+    sides = (1.0, -1.0)
+
+    def energy(tau, state):
+        motion = pair.motion(tau, state)
+        other = motion.speed + motion.rate
+        kinetic = (pair.inertia + drive.inertia) * motion.speed**2 + pair.inertia * other**2
+        kinetic += supports.mass * jnp.sum(motion.drift**2)
+        elastic = supports.stiffness * jnp.sum(motion.shift**2)
+        excess = jnp.maximum(abs(motion.relative - gear.offset) - gear.half_backlash, 0)
+        elastic += gear.stiffness * excess**2
+        for side in sides:
+            depth = jnp.maximum(pair._touch(jnp.asarray(side), motion).depth, 0)
+            elastic += 2 * law.stiffness * depth ** (law.exponent + 1) / (law.exponent + 1)
+        return (kinetic + elastic) / 2
+
+    def slope(tau, y, _):
+        state = y[:-5]
+        change, contact = pair.derivative(tau, state)
+        motion, pace = pair.motion(tau, state), pair.lapse(state)
+        other = motion.speed + motion.rate
+        flanks = rubbing = 0.0
+        for side, force in zip(sides, (contact.drive, contact.coast), strict=True):
+
+            def depth(tau, state, side=side):
+                return pair._touch(jnp.asarray(side), pair.motion(tau, state)).depth
+
+            here, growth = jax.jvp(depth, (tau, state), (jnp.ones_like(tau), change))
+            flanks += (force - undamped(here, 0.0)) * growth / (pace * pair.mesh_period)
+            sliding = pair._touch(jnp.asarray(side), motion).sliding.speed
+            rubbing += force * pair.friction(sliding) * sliding
+        engaged = abs(motion.relative - gear.offset) > gear.half_backlash
+        powers = [
+            drive.torque_at(motion.speed) * motion.speed,
+            -pair.load.torque1(motion.phi) * motion.speed - pair.load.torque2(motion.phi) * other,
+            -flanks,
+            -rubbing,
+            -jnp.where(engaged, gear.damping * motion.rate**2, 0.0)
+            - supports.damping * jnp.sum(motion.drift**2),
+        ]
+        return jnp.concatenate([change, pace * pair.mesh_period * jnp.stack(powers)])
+
+    start = jnp.asarray([-0.6, 0.0, 0.0, 0.1, 0.0, -0.1, 0.05, 0.0, 0.0, 0.0, 0.0])
+    how = Integrator("dopri8", jnp.asarray(1e-11), 20000)
+
+    @jax.jit
+    def run(start):
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(slope), how.solver(start.dtype), 0.0, 1.0, None, jnp.pad(start, (0, 5)),
+            stepsize_controller=how.controller(start.dtype), max_steps=how.max_steps,
+            adjoint=diffrax.ForwardMode(),
+        )  # fmt: skip
+        end = solution.ys[-1]
+        begin, stop = jnp.zeros(()), jnp.ones(())
+        return energy(stop, end[:-5]) - energy(begin, start), end[-5:]
+
+    stored, work = run(start)
+    work = np.asarray(work)
+    assert np.all(abs(work) > 1e-6)  # Every part has done something.
+    assert np.all(work[2:] < 0)
+    assert float(stored) == pytest.approx(work.sum(), abs=1e-8 * abs(work[:2]).max())
+
+
+def equations(jaxpr):
+    total = len(jaxpr.eqns)
+    for equation in jaxpr.eqns:
+        for value in jax.tree.leaves(equation.params, is_leaf=lambda v: hasattr(v, "jaxpr")):
+            closed = getattr(value, "jaxpr", value)
+            if hasattr(closed, "eqns"):
+                total += equations(closed)
+    return total
+
+
+def size(overrides):
+    """States, equations and numbers of a scene's right-hand side."""
+    config = load("configs/cic.yaml", overrides)
+    pair = eqx.filter_eval_shape(Scene.pair, Scene.from_config(config), design_vector(config))
+    numbers, static = eqx.partition(pair, lambda x: isinstance(x, jax.ShapeDtypeStruct))
+    program = jax.make_jaxpr(lambda tau, y, n: eqx.combine(n, static).derivative(tau, y)[0])(
+        jnp.zeros(()), jnp.zeros(pair.states), numbers
+    )
+    return pair.states, equations(program.jaxpr), len(program.jaxpr.invars)
+
+
+STATES = {"motor": 3, "supports": 10}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_an_absent_part_costs_nothing(part):
+    """A part adds its states, equations and numbers to the smallest program; without it, none of
+    them is there: whatever else is on, leaving it out makes all three smaller or equal."""
+    states, length, numbers = size([])
+    assert states == 2
+    more = size(PARTS[part])
+    assert more[0] == STATES.get(part, 2)
+    assert more[1] > length
+    # The search's own centre distance is a number of every scene.
+    assert more[2] >= numbers + (part != "centre distance error")
+    others = [override for name, one in PARTS.items() if name != part for override in one]
+    whole, rest = size(ALL), size(others)
+    assert whole[0] - rest[0] == STATES.get(part, 2) - 2
+    if part != "centre distance error":  # Supports have it looked for, error or not.
+        assert rest[1] < whole[1]
+        assert rest[2] < whole[2]
+
+
+def test_orbit_and_gradient_of_all_parts():
+    """Eleven states: the orbit closes, and its gradient is that of differences."""
+    config = load("configs/cic.yaml", [*ALL, WITHIN, "solver.rtol=1e-10"])
+    evaluator = Evaluator.of(config)
+    found = evaluator(series=True)
+    assert found.status is Status.PERIODIC
+    assert found.steady_state["residual"] < 1e-9
+    assert len(found.steady_state["floquet_multipliers"]) == 11
+    # The motor's speed forgets slowest of all.
+    assert 0.5 < found.steady_state["floquet_multiplier"] < 1
+    # Time is that of the turning rotor, on the average that of its mean speed.
+    series = found.series
+    assert np.all(np.diff(series.time) > 0)
+    mean = np.trapezoid(series.force, series.time) / np.ptp(series.time)
+    assert found.response["mean_force_N"] == pytest.approx(mean, rel=2e-3)
+    assert found.response["peak_force_N"] == pytest.approx(series.force.max(), rel=2e-3)
+    # Along a direction in which all parameters count.
+    design, step, way = np.asarray(design_vector(config)), 1e-3, np.array([1.0, -0.7, 0.8])
+    ends = [
+        evaluator(jnp.asarray(design + s * step * way), start=found.state, series=False).response
+        for s in (-1, 1)
+    ]
+    for name in ("mean_force_N", "rms_force_N"):
+        slope = (ends[1][name] - ends[0][name]) / (2 * step)
+        along = np.array(list(found.gradient[name].values())) @ way
+        assert along == pytest.approx(slope, rel=1e-5), name
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["contact.friction={}", "solver.fidelity=map"], "`solver.fidelity` must be search"),
+        (["scene.supports={stiffness_N_per_mm: 1, damping_N_s_per_mm: 0}",
+          "solver.fidelity=linear"], "scene.supports"),
+        (["scene.drive=torque"], "`scene.motor` is missing"),
+        (["scene.motor={slope_N_m_s_per_rad: 1}"], "belongs to `scene.drive` = torque"),
+        (["scene.load={}"], "neither"),
+        (["scene.load.pressure_difference_Pa=1e4"], "both"),
+        (["scene.timing_gear=null", "scene.phase_error_mrad=1"], "scene.timing_gear"),
+        (["contact.friction={friction_speed_mm_s: 50}"], "must be greater than"),
+    ],
+)  # fmt: skip
+def test_parts_that_do_not_go_together_are_refused(overrides, words):
+    with pytest.raises(InputError, match=words):
+        load("configs/cic.yaml", overrides)
+
+
+def test_a_motor_too_weak_for_its_load_is_said_to_stall():
+    weak = "scene.motor={slope_N_m_s_per_rad: 0.001, torque_N_m: 0.5}"
+    found = Evaluator.of(load("configs/cic.yaml", ["scene.drive=torque", weak]))(series=False)
+    assert found.status is Status.STALLED
+    assert not found.usable

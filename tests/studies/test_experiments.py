@@ -1,0 +1,350 @@
+"""Studies run, write their files, and give sane numbers; with `--quick` throughout."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments._common import engines
+from experiments._common.engines.scipy_nodes import ScipyNodes
+from experiments._common.scenes import FORCES
+from experiments.gradients import study as gradients
+from experiments.paper.scene import PAPER, Response, config_of, pair_of, polished
+from rootsopt.config import load
+from rootsopt.scene import Scene, design_vector
+
+pytest.importorskip("numba")
+
+PNG = b"\x89PNG"
+
+
+@pytest.fixture(scope="module")
+def programs(tmp_path_factory):
+    """Environment in which the studies keep their compiled programs in one place."""
+    return os.environ | {
+        "JAX_PLATFORMS": "cpu",
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("programs")),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+    }
+
+
+def run(study, folder, environment, *options):
+    """Make a reduced run of a study; return its standard output."""
+    command = [sys.executable, "-m", f"experiments.{study}", "--quick", "-o", str(folder), *options]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def rows_of(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def numbers(rows, key):
+    return [float(row[key]) for row in rows]
+
+
+def is_picture(path: Path):
+    return path.read_bytes()[:4] == PNG
+
+
+@pytest.mark.long
+def test_work_precision(tmp_path, programs):
+    """Errors fall with the tolerance."""
+    run("work_precision", tmp_path, programs)
+    rows = rows_of(tmp_path / "work_precision.csv")
+    assert {row["status"] for row in rows} == {"periodic"}
+    for key in ("mean_error", "peak_error"):
+        first, *tighter = numbers(rows, key)
+        # The quick run's linear contact begins with a jump, which sets a floor to the error.
+        assert 0 < max(tighter) < first / 5
+        assert tighter[-1] < 1e-7 < first < 1e-2
+    assert numbers(rows, "orbit_steps") == sorted(numbers(rows, "orbit_steps"))
+    assert is_picture(tmp_path / "work_precision.png")
+    summary = json.loads((tmp_path / "work_precision.json").read_text())
+    assert summary["references"]["cic"]["error"]["mean"] < 1e-7
+
+
+@pytest.mark.long
+def test_gradients(tmp_path, programs):
+    """Gradients of a few random pairs are those of differences, at every tolerance."""
+    said = run("gradients", tmp_path, programs)
+    assert said.endswith("0 promises broken\n")
+    rows = rows_of(tmp_path / "gradients_0_of_1.csv")
+    assert len(rows) == 12
+    assert max(numbers(rows, "mean_force_N_error")) < 1e-4
+    assert is_picture(tmp_path / "gradients.png")
+
+
+def test_gradients_that_are_off_are_told():
+    """A gradient beyond its check, and a tighter tolerance that does worse, break a promise."""
+    good = {"scene": "one", "period": 1, "status": "periodic", "gradient_disagreement": 1e-6}
+    good |= {"mean_force_N_error": 1e-6, "peak_force_N_error": 1e-6}
+    rows = [good | {"rtol": rtol} for rtol in gradients.TOLERANCES]
+    assert gradients.judge(rows).broken == []
+    for name in FORCES:
+        (said,) = gradients.judge([*rows[:2], rows[2] | {f"{name}_error": 1e-2}]).broken
+        assert said.startswith("OFF 1e-10")
+    (said,) = gradients.judge([*rows[:2], rows[2] | {"status": "not_settled"}]).broken
+    assert said.startswith("WORSE")
+
+
+@pytest.mark.long
+def test_smoothing(tmp_path, programs):
+    """The bias of the default is below its limit, and grows with the smoothing length."""
+    run("smoothing", tmp_path, programs)
+    summary = json.loads((tmp_path / "smoothing.json").read_text())["cic"]
+    assert summary["settled"] >= 5
+    sharp, wide, default = summary["by_width"].values()
+    assert sharp["greatest_bias"] == 0 < default["greatest_bias"] < 1e-4
+    assert default["greatest_bias"] <= wide["greatest_bias"]
+    assert max(default["median_gradient_error"]) < 1e-4
+    assert is_picture(tmp_path / "smoothing.png")
+
+
+@pytest.mark.long
+def test_speed(tmp_path):
+    """The slowest speed is as good as standstill; resonances lie where the harmonics meet them."""
+    run("speed", tmp_path, os.environ | {"JAX_PLATFORMS": "cpu"})
+    rows = rows_of(tmp_path / "speed.csv")
+    assert {row["status"] for row in rows} == {"periodic"}
+    summary = json.loads((tmp_path / "speed.json").read_text())
+    for design, found in summary["linearised"]["shipped"].items():
+        own = [row for row in rows if row["design"] == design]
+        assert float(own[0]["speed_rpm"]) == 300
+        assert float(own[0]["mean_force_N"]) == pytest.approx(found["static_mean_N"], rel=0.01)
+        assert float(own[0]["peak_force_N"]) == pytest.approx(found["static_peak_N"], rel=0.06)
+    resonances = rows_of(tmp_path / "speed_resonances.csv")
+    assert {row["mode"] for row in resonances} == {"contact", "gear", "average"}
+    for row in resonances:
+        harmonic = int(row["order"]) * 3 * float(row["speed_rpm"]) / 60
+        assert harmonic == pytest.approx(float(row["frequency_Hz"]), rel=1e-9)
+    outcomes = {row["optimised"]: row for row in summary["optimisations"]}
+    assert outcomes["over the range, mean"]["own_objective"] < 1
+    found = outcomes["over the range, mean"]
+    assert found["own_objective"] == pytest.approx(found["mean_over_listed"], rel=1e-6)
+    for name in ("speed", "speed_objective", "speed_resonances"):
+        assert is_picture(tmp_path / f"{name}.png")
+
+
+@pytest.mark.long
+def test_extremes(tmp_path, programs):
+    """Every scene has a named outcome, results are finite, and SciPy finds those looked at."""
+    run("extremes", tmp_path, programs)
+    rows = rows_of(tmp_path / "extremes.csv")
+    assert len(rows) == 40
+    assert {row["named"] for row in rows} == {"true"}
+    assert {"periodic", "solver_failed"} < {row["status"] for row in rows}
+    summary = json.loads((tmp_path / "extremes.json").read_text())
+    assert summary["not_finite"] == summary["unnamed"] == 0
+    assert summary["checks"]["law"]["float32"]["values"] > 10_000
+    assert summary["scipy"]["compared"] >= 1
+    assert summary["scipy"]["worst_end"] < 1e-3
+    assert is_picture(tmp_path / "extremes.png")
+
+
+@pytest.mark.long
+def test_benchmark(tmp_path, programs):
+    """Every part gives rows, the tools agree, the table of targets is complete."""
+    out = run("benchmark", tmp_path, programs)
+    rows = rows_of(tmp_path / "benchmark.csv")
+    assert all(float(row["run_s"]) > 0 for row in rows)
+    parts = {row["part"] for row in rows}
+    expected = {"scipy", "numba", "single", "batch 4", "table", "revolutions", "main job"}
+    assert parts == expected
+    for row in rows:
+        if row["value_error"]:
+            # The quick run's reference is the linear contact, 6 % off the competitors'.
+            limit = 0.1 if row["tool"].startswith("(") else 1e-2
+            assert float(row["value_error"]) < limit
+    assert all(float(row["peak_memory_MB"]) > 10 for row in rows)
+    result = json.loads((tmp_path / "benchmark.json").read_text())
+    assert set(result["not_measured"]) == {"orbit", "reverse"}
+    goals = {goal["target"]: goal for goal in result["targets"]}
+    assert len(result["targets"]) == 14
+    assert all(name.split(",")[0] in out for name in goals)
+    for name in ("gap table (ms)", "gap table and Jacobian (ms)"):
+        assert goals[name]["figure"] > 0
+        assert isinstance(goals[name]["reached"], bool)
+    assert 0.5 < goals["exponent of cost over revolutions"]["figure"] < 1.6
+    assert is_picture(tmp_path / "benchmark.png")
+
+
+@pytest.mark.long
+def test_parts(tmp_path, programs):
+    """Every part costs something, and the smallest scene least."""
+    run("parts", tmp_path, programs)
+    first, *others = rows_of(tmp_path / "parts.csv")
+    assert first["states"] == "2"
+    assert all(int(row["equations"]) > int(first["equations"]) for row in others)
+    assert others[-1]["states"] == "11"
+    assert is_picture(tmp_path / "parts.png")
+
+
+@pytest.mark.long
+def test_paper(tmp_path, programs):
+    """The shipped values give the paper's four forces (its section 4), both motions periodic; here
+    with linear contact, which is some 3 % off."""
+    run("paper", tmp_path, programs)
+    (row,) = rows_of(tmp_path / "paper.csv")
+    forces = {"cic": (102.4, 1973.3), "ee": (1047.1, 5661.4)}
+    for family, (mean, peak) in forces.items():
+        assert row[f"{family}_status"] == "periodic"
+        assert float(row[f"{family}_mean_force_N"]) == pytest.approx(mean, rel=0.035)
+        assert float(row[f"{family}_peak_force_N"]) == pytest.approx(peak, rel=0.035)
+    # Each quantity matters, and a thousandth of it changes no force by more than a hundredth.
+    rows = rows_of(tmp_path / "paper_slices.csv")
+    assert len({one["changed"] for one in rows}) == 6
+    for name in ("cic_mean_force_N", "cic_peak_force_N", "ee_mean_force_N", "ee_peak_force_N"):
+        assert numbers(rows, name) == pytest.approx([float(row[name])] * 12, rel=1e-2)
+    assert len({one["ee_mean_force_N"] for one in rows}) == 12
+    for name in ("force", "spectrum", "uniqueness"):
+        assert is_picture(tmp_path / f"paper_{name}.png")
+
+
+def test_paper_by_scipy():
+    """Another tool finds the paper's forces in the shipped scene of the CIC pair."""
+    config = load("configs/paper_cic.yaml")
+    found = ScipyNodes(
+        engines.Scene.of(config), nodes=400, rtol=1e-5, settle=10, window=2
+    ).simulate([36.43, 9.0, 4.0])
+    assert found.mean == pytest.approx(102.4, rel=1e-3)
+    assert found.peak == pytest.approx(1973.3, rel=1e-3)
+
+
+def test_paper_scene_is_shared():
+    """Both pairs stand in one scene."""
+    cic, ee = (load(f"configs/paper_{family}.yaml").model_dump() for family in ("cic", "ee"))
+    assert cic.pop("profile") != ee.pop("profile")
+    assert cic == ee
+
+
+def test_pair_of_quantities():
+    """What is differentiated by the quantities is the pair of the config with these values."""
+    values = np.array([123.0, 4.5, 6.7e4, 0.21, 0.43, 0.065])
+    config = config_of("ee", values, "solver.fidelity=linear")
+    design = design_vector(config)
+    expected = jax.tree.leaves(Scene.from_config(config).pair(design))
+    shipped = Scene.from_config(config_of("ee", None, "solver.fidelity=linear"))
+    found = jax.tree.leaves(pair_of(shipped, design, jnp.asarray(values)))
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        assert np.asarray(one) == pytest.approx(np.asarray(other), rel=1e-12)
+
+
+def test_polished():
+    """Gauss-Newton steps solve for forces that are powers of the quantities, inside their ranges
+    and with what is held left alone."""
+    powers = np.random.default_rng(3).normal(size=(4, 6))
+    start = np.array([100.0, 2.0, 2e4, 0.2, 0.3, 0.1])
+
+    def pairs(values) -> Any:
+        forces = (PAPER.ravel() * 1.2 * np.prod((values / start) ** powers, axis=1)).reshape(2, 2)
+        evaluations: Any = [
+            SimpleNamespace(response={"mean_force_N": mean, "peak_force_N": peak})
+            for mean, peak in forces
+        ]
+        return Response(np.asarray(values), evaluations, powers.reshape(2, 2, 6))
+
+    for held in ([], [1], [0, 4]):
+        found = polished(cast(Any, pairs), start, held=held)
+        assert found.misfit < 1e-4
+        assert found.values[held] == pytest.approx(start[held], rel=1e-12)
+
+
+@pytest.mark.long
+def test_paper_search(tmp_path, programs):
+    """A generation of a search simulates all its scenes, within the box that was asked for."""
+    run("paper", tmp_path, programs, "--search", "--seed", "1", "--least-clearance", "0.1")
+    rows = rows_of(tmp_path / "paper_search.csv")
+    record = json.loads((tmp_path / "paper_search.json").read_text())
+    assert len(rows) == record["scenes"] > 10
+    assert min(numbers(rows, "contact.clearance_mm")) >= 0.1
+    assert record["seed"] == 1
+    assert is_picture(tmp_path / "paper_search.png")
+
+
+@pytest.mark.long
+def test_auto_accuracy(tmp_path, programs):
+    """What `auto` chooses is within the error asked for."""
+    run("auto_accuracy", tmp_path, programs)
+    record = json.loads((tmp_path / "auto.json").read_text())
+    assert record["judged"] == record["within_request"] == 1
+    assert is_picture(tmp_path / "auto.png")
+
+
+@pytest.mark.long
+def test_landscape(tmp_path, programs):
+    """No design of the grid is better than the optimum by more than one percent."""
+    run("landscape", tmp_path, programs)
+    record = json.loads((tmp_path / "landscape.json").read_text())
+    assert record["within_one_percent"]
+    rows = rows_of(tmp_path / "landscape.csv")
+    assert len(rows) == record["grid_designs"] > 5
+    assert is_picture(tmp_path / "landscape.png")
+
+
+@pytest.mark.long
+def test_geometry(tmp_path, programs):
+    """Area and inertia are those of the polygons, in every family of the reduced run."""
+    run("geometry", tmp_path, programs)
+    rows = rows_of(tmp_path / "geometry.csv")
+    assert {(row["family"], row["lobes"]) for row in rows} >= {("cic", "2"), ("ee", "3")}
+    assert max(numbers(rows, "area_error") + numbers(rows, "polar_moment_error")) < 1e-11
+    assert is_picture(tmp_path / "geometry.png")
+
+
+@pytest.mark.long
+def test_measured(tmp_path, programs):
+    run("measured", tmp_path, programs)
+    found = json.loads((tmp_path / "measured.json").read_text())
+    assert found["form_found_um"] == pytest.approx(found["form_given_um"], abs=1.5)
+    assert found["outline"]["interference_um"] == pytest.approx(20, abs=1.5)
+    assert found["outline"]["reversed"]
+    assert is_picture(tmp_path / "measured.png")
+
+
+@pytest.mark.long
+def test_freeform(tmp_path, programs):
+    """Better than where it began, by the figures of both designs."""
+    run("freeform", tmp_path, programs)
+    designs = json.loads((tmp_path / "freeform.json").read_text())["designs"]
+    assert designs["free form"]["objective"] < designs["best CIC"]["objective"] < 1
+    assert designs["paper"]["objective"] == 1
+    found = load(tmp_path / "freeform.yaml")
+    assert len(found.profile.coefficients) == 12
+    assert is_picture(tmp_path / "freeform.png")
+
+
+@pytest.mark.long
+def test_families(tmp_path, programs):
+    """One housing for all: bore and area efficiency as the reference's, forces and ranks told."""
+    out = run("families", tmp_path, programs)
+    rows = {row["family"]: row for row in rows_of(tmp_path / "families.csv")}
+    assert set(rows) == {"cic", "arc", "free_form"}
+    reference = json.loads((tmp_path / "families.json").read_text())["references"]["cic"]
+    for row in rows.values():
+        shape = reference["geometry"]
+        assert row["status"] == "periodic"
+        assert 0 <= shape["outer_radius_mm"] - float(row["outer_radius_mm"]) <= 1.1e-3
+        if row["reached"] == "true":
+            assert float(row["area_efficiency"]) >= shape["area_efficiency"] - 6e-5
+        forces = (float(row[key]) / reference["response"][key] for key in FORCES)
+        assert float(row["objective"]) == pytest.approx(np.mean(list(forces)), rel=1e-8)
+    # The single arc of this bore is known, and has too small an area efficiency.
+    assert rows["arc"]["reached"] == "false"
+    assert float(rows["arc"]["area_efficiency"]) == pytest.approx(0.43363, abs=4e-5)
+    assert "| 1 | `" in out
+    assert is_picture(tmp_path / "families.png")
+    assert is_picture(tmp_path / "families_profiles.png")
