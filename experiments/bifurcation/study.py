@@ -17,7 +17,7 @@ from experiments._common.scenes import shipped
 from experiments._common.simulation import evaluator_of
 from rootsopt.config import Config
 from rootsopt.continuation import branch as continuation
-from rootsopt.continuation.branch import Branch, End, Kind, Steps
+from rootsopt.continuation.branch import Branch, End, Kind, StepSizes
 from rootsopt.errors import InputError
 
 Row = dict[str, Any]
@@ -177,9 +177,9 @@ def beside(branch: Branch, special) -> tuple:
     return branch.points[special.after : special.after + 2]
 
 
-def limits(diagram: Diagram, period: int) -> Steps:
+def limits(diagram: Diagram, period: int) -> StepSizes:
     """Return the range of a branch of this period, and how many points it may have."""
-    return Steps(diagram.low, diagram.high, points=max(POINTS // period, FEWEST))
+    return StepSizes(diagram.low, diagram.high, points=max(POINTS // period, FEWEST))
 
 
 def known(diagram: Diagram, value: float, period: int, forces) -> bool:

@@ -100,7 +100,7 @@ def line(config: Config, model: Scene, designs: np.ndarray, size: Size) -> list[
     for share, design in zip(np.linspace(0, 1, len(designs)), designs, strict=True):
         evaluation = evaluator(jnp.asarray(design), series=False)
         pair = _pair(evaluator.scene, jnp.asarray(design))
-        (single,) = run_members([pair], rest, settle, size.window, evaluator.how)
+        (single,) = run_members([pair], rest, settle, size.window, evaluator.integrator)
         row = {"share": share, **evaluation.design, "single_mean_force_N": single.means[0, 0]}
         for name in ("mean_force_N", "peak_force_N"):
             row[name] = evaluation.response.get(name, np.nan)
@@ -135,7 +135,7 @@ def _pathwise(model: Scene, design, periods, how):
 def pathwise(evaluator: EnsembleEvaluator, design, size: Size) -> list[dict]:
     """Measure how the single motion's derivative grows with the window."""
     slopes = np.asarray(
-        _pathwise(evaluator.scene, jnp.asarray(design), size.pathwise, evaluator.how)
+        _pathwise(evaluator.scene, jnp.asarray(design), size.pathwise, evaluator.integrator)
     )
     return [
         {"window_mesh_periods": n, "mean_force_by_pressure_angle_N_per_deg": slope}
@@ -152,7 +152,7 @@ def errors_by_members(config: Config, model: Scene, design, size: Size) -> list[
     design = jnp.asarray(design)
     start = evaluator(design, series=False)
     pair = _pair(evaluator.scene, design)
-    (large,) = run_members([pair], start.state, 0, config.ensemble.periods, evaluator.how)  # pyright: ignore[reportArgumentType]
+    (large,) = run_members([pair], start.state, 0, config.ensemble.periods, evaluator.integrator)  # pyright: ignore[reportArgumentType]
     means = np.asarray(large.means)[:, 0]
     rows = []
     for members in size.groups:

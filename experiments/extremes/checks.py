@@ -154,8 +154,8 @@ def _simulate(model: Scene, design, tolerances, method: str):
     transient, orbit = (Integrator(method, tolerances[k], STEPS) for k in range(2))
     solver = coarse(model, transient, orbit, HORIZON)
     out = respond(model, design, jnp.zeros(pair.states), solver)
-    assert pair.pace is not None
-    swings = pair.mesh_period / (2 * jnp.pi * pair.pace.swing)
+    assert pair.timescales is not None
+    swings = pair.mesh_period / (2 * jnp.pi * pair.timescales.swing)
     # Share of the static penetration that is lost in rounding.
     rounding = jnp.finfo(pair.angle_scale.dtype).eps * model.pitch_radius
     return out, swings, rounding / pair.law.depth_at(pair.force_scale), pair.force_scale

@@ -24,7 +24,7 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.figures.speeds import LABELS
 from rootsopt.optimize.search import Search
 from rootsopt.response.evaluation import Evaluation, objective_weights
-from rootsopt.response.speeds import Part, sweep
+from rootsopt.response.speeds import AtSpeed, sweep
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import design_vector
 
@@ -131,7 +131,7 @@ def crossings(found: dict[str, float], lobes: int, speeds) -> list[Row]:
     return rows
 
 
-def maxima(parts: tuple[Part, ...], rows: list[Row]) -> list[Row]:
+def maxima(parts: tuple[AtSpeed, ...], rows: list[Row]) -> list[Row]:
     """Find the local maxima of mean and peak force over speed, each with the nearest crossing."""
     speeds = np.array([part.speed_rpm for part in parts])
     found = []
@@ -173,11 +173,13 @@ class Study:
     """One scene: sweeps and linearised pairs by the design's name, optimisations, CIC's config."""
 
     config: Config
-    designs: dict[str, tuple[Part, ...]]
+    designs: dict[str, tuple[AtSpeed, ...]]
     linear: dict[str, dict[str, float]]
     outcomes: list[Row]
 
-    def over(self, parts: tuple[Part, ...], baseline: tuple[Part, ...] | None = None) -> np.ndarray:
+    def over(
+        self, parts: tuple[AtSpeed, ...], baseline: tuple[AtSpeed, ...] | None = None
+    ) -> np.ndarray:
         """Return the objective (n,) of a sweep, relative to CIC's (default: over all speeds)."""
         base = self.designs["CIC"] if baseline is None else baseline
         pairs = zip(parts, base, strict=True)

@@ -34,11 +34,11 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     formats = export.chosen(options.export)
     check_geometry(config)
     coefficients = _coefficients(options.project)
-    model, design = Scene.from_config(config), design_vector(config)
-    shape = geometry(model.profile(design))
+    scene, design = Scene.from_config(config), design_vector(config)
+    shape = geometry(scene.profile(design))
     record = {
         "design": dict(zip(design_keys(config), map(float, design), strict=True)),
-        "geometry": geometry_record(model, shape),
+        "geometry": geometry_record(scene, shape),
         "response": {},
         "gradient": {},
         "steady_state": {},

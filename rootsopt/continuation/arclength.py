@@ -82,7 +82,7 @@ class Look(NamedTuple):
     data: Any = None
 
 
-Curve = Callable[[NDArray[np.float64], Any, bool], Look]
+SolutionCurve = Callable[[NDArray[np.float64], Any, bool], Look]
 """From a place (n + 1,), a memory or None, and whether to look with more care than usual, to a
 look; raises `StoppedError` where there is none."""
 
@@ -98,7 +98,7 @@ class Spot(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Steps:
+class StepSizes:
     """How far to follow: the parameter stays in `low` … `high`; `first`, `least` and `greatest`
     step, in the length of the unknowns taken together; at most so many `points`."""
 
@@ -133,7 +133,7 @@ class Path(NamedTuple):
 
 
 def corrected(
-    curve: Curve,
+    curve: SolutionCurve,
     guess: NDArray[np.float64],
     across: NDArray[np.float64],
     along: NDArray[np.float64],
@@ -176,9 +176,9 @@ def tangent(jacobian: NDArray[np.float64], along: NDArray[np.float64]) -> NDArra
 
 
 def follow_curve(
-    curve: Curve,
+    curve: SolutionCurve,
     start: Spot,
-    steps: Steps,
+    steps: StepSizes,
     tests: Mapping[str, Callable[[Spot], float]] | None = None,
 ) -> Path:
     """The curve from `start` on, the way its tangent points, to a named end.
@@ -217,13 +217,13 @@ def follow_curve(
             step = min(1.5 * step, steps.greatest)
 
 
-def _leaves(spot: Spot, steps: Steps) -> bool:
+def _leaves(spot: Spot, steps: StepSizes) -> bool:
     """Whether the curve leaves the range here."""
     value, way = float(spot.place[-1]), float(spot.tangent[-1])
     return (value <= steps.low and way < 0) or (value >= steps.high and way > 0)
 
 
-def _next(curve: Curve, old: Spot, step: float, steps: Steps) -> Spot:
+def _next(curve: SolutionCurve, old: Spot, step: float, steps: StepSizes) -> Spot:
     """The spot after `old`, on the edge of the range at the farthest."""
     new = None
     guess = old.place + step * old.tangent
@@ -245,7 +245,7 @@ def _next(curve: Curve, old: Spot, step: float, steps: Steps) -> Spot:
     return new
 
 
-def _around_corner(curve: Curve, old: Spot, steps: Steps) -> Spot | None:
+def _around_corner(curve: SolutionCurve, old: Spot, steps: StepSizes) -> Spot | None:
     """A spot close to `old`, where the curve turns too sharply for a step to follow.
 
     It lies ahead, not behind, if the tangent there, with the orientation kept, points away.
@@ -270,7 +270,7 @@ def _orientation(spot: Spot) -> float:
     return float(np.sign(np.linalg.det(np.vstack([spot.look.jacobian, spot.tangent]))))
 
 
-def _back_at_first(curve: Curve, spots: list[Spot]) -> bool:
+def _back_at_first(curve: SolutionCurve, spots: list[Spot]) -> bool:
     """Whether the first spot lies on the last step."""
     first, old, new = spots[0], spots[-2], spots[-1]
     chord = new.place - old.place
@@ -286,7 +286,7 @@ def _back_at_first(curve: Curve, spots: list[Spot]) -> bool:
     return bool(np.linalg.norm(again.place - first.place) < _SAME)
 
 
-def _located(curve: Curve, old: Spot, new: Spot, test: Callable[[Spot], float]) -> Spot:
+def _located(curve: SolutionCurve, old: Spot, new: Spot, test: Callable[[Spot], float]) -> Spot:
     """The spot between two where `test` vanishes, by the Illinois variant of regula falsi."""
     chord = new.place - old.place
     across = chord / np.linalg.norm(chord)

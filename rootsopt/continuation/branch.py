@@ -17,7 +17,7 @@ from rootsopt.continuation.arclength import (
     End,
     Path,
     Spot,
-    Steps,
+    StepSizes,
     StoppedError,
     corrected,
     follow_curve,
@@ -36,10 +36,10 @@ from rootsopt.dynamics.verdict import RESIDUAL
 from rootsopt.errors import InputError
 
 _HALVED = 0.004
-"""Distance (as `Steps` counts) from the state half an orbit later, where a branch that ends for
+"""Distance (as `StepSizes` counts) from the state half an orbit later, where a branch that ends for
 no other reason is about to meet one of half the period."""
 _SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
-"""Distances from a bifurcation (as `Steps` counts) at which its doubled orbit is sought."""
+"""Distances from a bifurcation (as `StepSizes` counts) at which its doubled orbit is sought."""
 
 
 class Kind(enum.Enum):
@@ -80,7 +80,7 @@ class Branch:
     points: tuple[BranchPoint, ...]
     bifurcations: tuple[Bifurcation, ...]
     ends: tuple[End, End]
-    limits: Steps
+    limits: StepSizes
 
     def at(self, value: float) -> list[BranchPoint]:
         """All orbits of the branch at a value of the parameter, closed there; none where it
@@ -108,7 +108,7 @@ def follow(
     parameter: str,
     state: ArrayLike,
     period: int,
-    limits: Steps,
+    limits: StepSizes,
     ways: tuple[int, ...] = (-1, 1),
 ) -> Branch:
     """Follow the orbit of `period` mesh periods near the scaled `state` over a parameter.
@@ -153,7 +153,7 @@ def follow(
 
 
 def follow_doubled(
-    branch: Branch, bifurcation: Bifurcation, limits: Steps | None = None
+    branch: Branch, bifurcation: Bifurcation, limits: StepSizes | None = None
 ) -> Branch | None:
     """The branch of twice the period born at a period doubling of `branch`, from there on.
 
@@ -253,6 +253,6 @@ _TESTS = {"FOLD": _fold, "PERIOD_DOUBLING": _doubling, "NEIMARK_SACKER": _torus}
 
 
 __all__ = [
-    "PLACES", "RESIDUAL", "Bifurcation", "Branch", "BranchPoint", "End", "Kind", "Steps",
+    "PLACES", "RESIDUAL", "Bifurcation", "Branch", "BranchPoint", "End", "Kind", "StepSizes",
     "follow", "follow_doubled", "parameters", "value_of", "with_value",
 ]  # fmt: skip

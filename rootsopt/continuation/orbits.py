@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config, parse
-from rootsopt.continuation.arclength import End, Look, Spot, Steps, StoppedError, corrected
+from rootsopt.continuation.arclength import End, Look, Spot, StepSizes, StoppedError, corrected
 from rootsopt.dynamics.flow import Flow, Integrator, flow
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import SAMPLES
@@ -54,7 +54,7 @@ LONGEST = 8
 _STEP = 1 / 256
 """Steps (mesh periods) are not much longer than this."""
 _SAME = 1e-5
-"""Distance (as `Steps` counts) from the state half an orbit later within which an orbit is one of
+"""Distance (as `StepSizes` counts) from the state half an orbit later below which an orbit is of
 half the period (states between steps are interpolated)."""
 
 
@@ -173,7 +173,7 @@ class _Seen(NamedTuple):
 class Orbits:
     """Orbits of k mesh periods as a curve: places are (state / `SPAN`, share of the range)."""
 
-    def __init__(self, config: Config, parameter: str, period: int, limits: Steps):
+    def __init__(self, config: Config, parameter: str, period: int, limits: StepSizes):
         if config.solver.precision != "float64":
             raise InputError(
                 "`solver.precision` must be float64 to follow a branch, but is "
@@ -183,12 +183,12 @@ class Orbits:
         self.names = parameters(config)
         self.values = np.array([value_of(config, name) for name in self.names])
         self.index = self.names.index(parameter)
-        self.model = Scene.from_config(config)
-        self.how = integrators(config)[1]
+        self.scene = Scene.from_config(config)
+        self.integrator = integrators(config)[1]
         self.width = limits.high - limits.low
         self.steps = dataclasses.replace(limits, low=0.0, high=1.0)
         # Built once for its units: they stay those of the config while the parameter changes.
-        self.unit = float(_unit(self.model, self.names, self.values))
+        self.unit = float(_unit(self.scene, self.names, self.values))
 
     def value(self, place: NDArray[np.float64]) -> float:
         """The parameter at a place, in the config's unit; exact at both ends of the range."""
@@ -197,7 +197,7 @@ class Orbits:
 
     def place(self, state: ArrayLike, value: float) -> NDArray[np.float64]:
         """Place of an orbit, from its state scaled as the config with that `value` scales it."""
-        scale = float(_unit(self.model, self.names, self._values(value)))
+        scale = float(_unit(self.scene, self.names, self._values(value)))
         share = (value - self.limits.low) / self.width
         return np.append(np.asarray(state) * (scale / self.unit / SPAN), share)
 
@@ -226,9 +226,9 @@ class Orbits:
             raise StoppedError(End.NON_FINITE)
         if shot.lost:
             raise StoppedError(End.LOST_MESH)
-        if out.depth > TOO_DEEP * float(self.model.pitch_radius):
+        if out.depth > TOO_DEEP * float(self.scene.pitch_radius):
             raise StoppedError(End.TOO_DEEP)
-        if self.model.fidelity == "map" and reach > -float(self.model.deepest):
+        if self.scene.fidelity == "map" and reach > -float(self.scene.deepest):
             raise StoppedError(End.OFF_THE_MAP)
         state = SPAN * place[:-1]
         miss = np.asarray(out.end) - state
@@ -252,15 +252,15 @@ class Orbits:
     def _shot(self, place: NDArray[np.float64], grid: Any, refine: bool) -> "_Shot":
         return jax.device_get(
             _shoot(
-                self.model,
+                self.scene,
                 self.names,
                 self._values(self.value(place)),
                 np.eye(len(self.names))[self.index],
                 np.asarray(self.unit),
                 SPAN * place[:-1],
                 np.asarray(float(self.period)),
-                self.how,
-                np.full(self.how.max_steps, np.inf) if grid is None else grid,
+                self.integrator,
+                np.full(self.integrator.max_steps, np.inf) if grid is None else grid,
                 np.asarray(grid is not None),
                 np.asarray(refine),
             )
@@ -305,21 +305,21 @@ def _longest_gap(touching: NDArray[np.bool_]) -> float:
 
 
 def _build(
-    model: Scene, names: tuple[str, ...], values: Float[Array, " p"]
+    scene: Scene, names: tuple[str, ...], values: Float[Array, " p"]
 ) -> tuple[RotorPair, Float[Array, ""]]:
     """The pair with these values of the parameters (config's units), and its angle scale."""
     at = dict(zip(names, values, strict=True))
-    gear = model.gear
+    gear = scene.gear
     if gear is not None:
-        half = at["backlash_mm"] * MM / (2 * model.pitch_radius)
+        half = at["backlash_mm"] * MM / (2 * scene.pitch_radius)
         gear = eqx.tree_at(lambda g: g.half_backlash, gear, half)
     tuned = dataclasses.replace(
-        model,
+        scene,
         speed=at["speed_rpm"] * (2 * jnp.pi / 60),
-        load_torque=at.get("torque_N_m", model.load_torque),
+        load_torque=at.get("torque_N_m", scene.load_torque),
         pressure=at.get("pressure_difference_Pa"),
         gear=gear,
-        gear_damping_ratio=at.get("damping_ratio", model.gear_damping_ratio),
+        gear_damping_ratio=at.get("damping_ratio", scene.gear_damping_ratio),
     )
     design = [value for name, value in at.items() if name not in PLACES]
     pair = tuned.pair(jnp.stack(design) if design else jnp.zeros(0))
@@ -327,20 +327,20 @@ def _build(
 
 
 @Program
-def _unit(model, names, values):
-    return _build(model, names, values)[1]
+def _unit(scene, names, values):
+    return _build(scene, names, values)[1]
 
 
 @Program
 def _shoot(
-    model: Scene,
+    scene: Scene,
     names: tuple[str, ...],
     values: Float[Array, " p"],
     direction: Float[Array, " p"],
     unit: Float[Array, ""],
     state: Float[Array, " n"],
     period: Float[Array, ""],
-    how: Integrator,
+    integrator: Integrator,
     grid: Float[Array, " steps"],
     repeat: Bool[Array, ""],
     refine: Bool[Array, ""],
@@ -352,7 +352,7 @@ def _shoot(
     """
 
     def build(values):
-        pair, scale = _build(model, names, values)
+        pair, scale = _build(scene, names, values)
         return eqx.tree_at(lambda p: p.angle_scale, pair, unit), scale
 
     def arrays(values):
@@ -361,8 +361,8 @@ def _shoot(
     pair, scale = build(values)
     _, tangent = jax.jvp(arrays, (values,), (direction,))
     tangents = jax.tree.map(lambda x: x[None], tangent)
-    out = flow(pair, state, period, how, SAMPLES, tangents, grid, repeat)
-    tolerance = how.tolerance(state.dtype)
+    out = flow(pair, state, period, integrator, SAMPLES, tangents, grid, repeat)
+    tolerance = integrator.tolerance(state.dtype)
     finer = lax.cond(
         refine,
         lambda: _without_long(with_switches(pair, out, period, tolerance), period),

@@ -86,12 +86,12 @@ class Integrator(eqx.Module):
         if that is known."""
         rtol = self.tolerance(dtype)
         longest = _LONGEST[0]
-        if pair is not None and pair.pace is not None:
-            fall = pair.pace.fall / pair.mesh_period
+        if pair is not None and pair.timescales is not None:
+            fall = pair.timescales.fall / pair.mesh_period
             flying = jnp.maximum(_LONGEST[1] * fall, _LONGEST[2] / self.max_steps)
             longest = jnp.minimum(longest, flying).astype(dtype)
         base = diffrax.PIDController(rtol=rtol, atol=rtol, dtmax=longest / periods)
-        if pair is None or pair.pace is None:
+        if pair is None or pair.timescales is None:
             return base
         return LandingControl.of(base, pair, periods)
 
@@ -99,9 +99,9 @@ class Integrator(eqx.Module):
 def first_step(pair: RotorPair, dtype: Any) -> Float[Array, ""]:
     """First step (mesh periods) to be tried."""
     longest, share = _FIRST_STEP
-    if pair.pace is None:
+    if pair.timescales is None:
         return jnp.asarray(longest, dtype)
-    swing = lax.stop_gradient(pair.pace.swing / pair.mesh_period)
+    swing = lax.stop_gradient(pair.timescales.swing / pair.mesh_period)
     return jnp.minimum(longest, share * swing).astype(dtype)
 
 
@@ -224,19 +224,21 @@ class StepGrid(diffrax.AbstractAdaptiveStepSizeController):
         )
 
 
-def strobe(pair: RotorPair, state: Float[Array, " n"], periods: int, how: Integrator) -> Strobe:
+def strobe(
+    pair: RotorPair, state: Float[Array, " n"], periods: int, integrator: Integrator
+) -> Strobe:
     """Integrate the bare states over `periods` mesh periods, from φ1 = 0.
 
     Steps land on the period ends: interpolated states would carry an error far above
     the tolerance and hide that the motion repeats.
     """
     number = state.dtype.type
-    first, control = first_step(pair, state.dtype), how.controller(state.dtype, pair=pair)
+    first, control = first_step(pair, state.dtype), integrator.controller(state.dtype, pair=pair)
 
     def one_period(state, _):
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda tau, y, pair: pair.derivative(tau, y)[0]),
-            how.solver(state.dtype),
+            integrator.solver(state.dtype),
             t0=number(0.0),
             t1=number(1.0),
             dt0=first,
@@ -245,7 +247,7 @@ def strobe(pair: RotorPair, state: Float[Array, " n"], periods: int, how: Integr
             saveat=diffrax.SaveAt(t1=True),
             stepsize_controller=control,
             adjoint=diffrax.ForwardMode(),
-            max_steps=how.max_steps,
+            max_steps=integrator.max_steps,
             throw=False,
         )
         assert solution.ys is not None
@@ -264,7 +266,7 @@ def flow(
     pair: RotorPair,
     state: Float[Array, " n"],
     periods: Float[Array, ""],
-    how: Integrator,
+    integrator: Integrator,
     samples: int,
     tangents: RotorPair | None = None,
     grid: Float[Array, " steps"] | None = None,
@@ -288,7 +290,7 @@ def flow(
     force_unit = lax.stop_gradient(pair.force_scale)
     top = jnp.ones_like(force_unit) if top is None else lax.stop_gradient(top) / force_unit
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
-    solver = how.solver(dtype, "lax" if adjoint is None else "bounded")
+    solver = integrator.solver(dtype, "lax" if adjoint is None else "bounded")
     # An adjoint of the solver knows nothing of jumps: then the steps are what is differentiated.
     jumps = pair.jumps
     retraced = jumps and adjoint is not None
@@ -306,7 +308,7 @@ def flow(
         return periods * derivative(share * periods, y, dynamic)
 
     # Over the unit interval: limits known when it is traced make a smaller program.
-    ends = jnp.full(how.max_steps, jnp.inf, dtype) if grid is None else grid / periods
+    ends = jnp.full(integrator.max_steps, jnp.inf, dtype) if grid is None else grid / periods
     repeated = jnp.asarray(False if grid is None else repeat)
     start = jnp.pad(state, (0, measures.count + pair.free))
     solution = diffrax.diffeqsolve(
@@ -329,10 +331,12 @@ def flow(
             controller_state=True,
         ),
         stepsize_controller=StepGrid(  # pyright: ignore[reportCallIssue]
-            pid=how.controller(dtype, periods, lax.stop_gradient(pair)), ends=ends, repeat=repeated
+            pid=integrator.controller(dtype, periods, lax.stop_gradient(pair)),
+            ends=ends,
+            repeat=repeated,
         ),
         adjoint=diffrax.ForwardMode() if adjoint is None or retraced else adjoint,
-        max_steps=how.max_steps,
+        max_steps=integrator.max_steps,
         throw=False,
     )
     assert solution.ys is not None

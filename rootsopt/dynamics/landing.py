@@ -45,9 +45,9 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         cls, base: diffrax.PIDController, pair: RotorPair, unit: Float[Array, ""] | float
     ) -> "LandingControl":
         """The control for a pair; `unit`: mesh periods in a unit of the independent variable."""
-        assert pair.pace is not None
+        assert pair.timescales is not None
         scale = pair.angle_scale
-        play = pair.pace.free / scale
+        play = pair.timescales.free / scale
         edges = [play, -play]
         edges += [edge / scale for part in pair.all_parts for edge in part.edges]
         inside = jnp.where(play > 0, play, jnp.inf)

@@ -128,7 +128,7 @@ class _Closer(eqx.Module):
     pair: RotorPair
     tangents: RotorPair
     period: Int[Array, ""]
-    how: Integrator
+    integrator: Integrator
     measures: Measures
     shots: Int[Array, ""]
     closed: Float[Array, ""]
@@ -142,7 +142,7 @@ class _Closer(eqx.Module):
         """Nothing known of the orbit near `state`."""
         count, dtype = state.shape[0], state.dtype
         directions = jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
-        steps = self.how.max_steps
+        steps = self.integrator.max_steps
         none = Flow.empty(count, directions, self.samples, steps, self.measures, dtype)
         no, zero = jnp.zeros((), bool), jnp.zeros((), int)
         return _Closing(
@@ -190,7 +190,7 @@ class _Closer(eqx.Module):
             self.pair,
             start,
             length,
-            self.how,
+            self.integrator,
             self.samples,
             self.tangents,
             grid,
@@ -292,13 +292,13 @@ class _Closer(eqx.Module):
 class Shots(eqx.Module):
     """How an orbit is closed.
 
-    `how` it is integrated, with what `measures` of the force; `count`: integrations allowed;
+    `integrator` in use, with what `measures` of the force; `count`: integrations allowed;
     `closed`: residual (scaled) at which Newton's method may stop. `samples` of an orbit, a number
     that its period divides. With `check`, orbit and derivatives are compared with those on a grid
     with every step halved; where they disagree the orbit is closed once more, on that one.
     """
 
-    how: Integrator
+    integrator: Integrator
     measures: Measures = eqx.field(default_factory=Measures)
     count: Int[Array, ""] | int = _NEWTON_STEPS
     closed: Float[Array, ""] | float = 0.0
@@ -339,7 +339,7 @@ def orbit_or_window(
     rounding, and its derivative is as accurate as the motion.
     """
     count, dtype = state.shape[0], state.dtype
-    tolerance = shots.how.tolerance(dtype)
+    tolerance = shots.integrator.tolerance(dtype)
     roundings, tolerances, most = _CLOSED
     enough = jnp.minimum(tolerances * tolerance, most)
     enough = jnp.maximum(roundings * float(jnp.finfo(dtype).eps), enough)
@@ -347,7 +347,7 @@ def orbit_or_window(
         pair=pair,
         tangents=tangents,
         period=period,
-        how=shots.how,
+        integrator=shots.integrator,
         measures=shots.measures,
         shots=jnp.asarray(shots.count),
         closed=jnp.maximum(shots.closed, enough).astype(dtype),
@@ -413,7 +413,7 @@ def reverse_sensitivity(
     design: Float[Array, " d"],
     state: Float[Array, " n"],
     period: Int[Array, ""],
-    how: Integrator,
+    integrator: Integrator,
     grid: Float[Array, " steps"],
     measures: Measures | None = None,
     top: Float[Array, ""] | None = None,
@@ -431,7 +431,7 @@ def reverse_sensitivity(
 
     def run(state, design):
         kept = {"grid": grid, "adjoint": adjoint, "measures": measures, "top": top}
-        out = flow(build(design), state, length, how, SAMPLES, **kept)
+        out = flow(build(design), state, length, integrator, SAMPLES, **kept)
         return jnp.concatenate([out.end, out.response])
 
     end, pull = jax.vjp(run, state, design)

@@ -21,7 +21,6 @@ from rootsopt.contact.gap import Approach, Contact
 from rootsopt.contact.impact import force_rounding
 from rootsopt.contact.law import ContactLaw
 from rootsopt.contact.point import ContactPoint
-from rootsopt.dynamics.pace import Pace
 from rootsopt.dynamics.parts import (
     Drive,
     Friction,
@@ -33,6 +32,7 @@ from rootsopt.dynamics.parts import (
     TimingGear,
     Units,
 )
+from rootsopt.dynamics.timescales import Timescales
 from rootsopt.errors import InputError
 
 STALLED = 0.05
@@ -88,7 +88,7 @@ class RotorPair(eqx.Module):
     `contact`: gap and levers at a pose; `law`: contact force; `clearance` (m) added to
     every flank gap; `inertia` of one rotor (kg·m²); `drive`, `load`, `gear`, `friction`,
     `supports`: parts that the scene names; `angle_scale` (rad) and `force_scale` (N): units the
-    solver works in; `pace`: how quickly it can change, None if unknown.
+    solver works in; `timescales`: how quickly it can change, None if unknown.
     `two_sided`: whether drive and coast flanks can touch at once, which they cannot at the nominal
     centre distance. `parts`: any others. A part that is absent is None and costs nothing.
 
@@ -108,7 +108,7 @@ class RotorPair(eqx.Module):
     force_scale: Float[Array, ""]
     friction: Friction | None = None
     supports: Supports | None = None
-    pace: Pace | None = None
+    timescales: Timescales | None = None
     two_sided: bool = eqx.field(static=True, default=False)
     parts: tuple[Part, ...] = ()
 

@@ -141,8 +141,8 @@ def locate_peak(
     width = length / states.shape[0]
     scans, by_ends = -(-(last + 1) // _INNER)
     inside = 2 * last[1] > last[0]
-    if pair.pace is not None:
-        inside |= width * pair.mesh_period > pair.pace.swing
+    if pair.timescales is not None:
+        inside |= width * pair.mesh_period > pair.timescales.swing
     spread = jnp.linspace(-1, 1, _CLOSER, dtype=width.dtype)
     by_steps = jnp.repeat(jnp.arange(2), _RIVALS * _CLOSER)
 

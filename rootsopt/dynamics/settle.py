@@ -55,7 +55,7 @@ def settled_within(rtol: Float[Array, ""]) -> Float[Array, ""]:
 def settle(
     pair: RotorPair,
     state: Float[Array, " n"],
-    how: Integrator,
+    integrator: Integrator,
     tolerance: Float[Array, ""],
     max_periods: Int[Array, ""],
     max_orbit: int,
@@ -94,8 +94,10 @@ def settle(
     def advance(loop):
         carry, memory = loop
         longest, fine = _PATIENCE
-        rtol = jnp.where(carry.periods < longest, how.rtol, jnp.minimum(how.rtol, fine))
-        part = strobe(pair, carry.state, BLOCK, dataclasses.replace(how, rtol=rtol))
+        rtol = jnp.where(
+            carry.periods < longest, integrator.rtol, jnp.minimum(integrator.rtol, fine)
+        )
+        part = strobe(pair, carry.state, BLOCK, dataclasses.replace(integrator, rtol=rtol))
         memory = jnp.concatenate([memory[BLOCK:], part.states])
         end = part.states[-1]
         lost = pair.lost(end)

@@ -185,7 +185,7 @@ class _Attempts(eqx.Module):
         start = jnp.where(shorter, found.orbit.state, settled.state)
         rtol = jnp.where(now.windowed, solver.transient.rtol, now.fine)
         shots = Shots(
-            how=dataclasses.replace(solver.orbit, rtol=rtol),
+            integrator=dataclasses.replace(solver.orbit, rtol=rtol),
             measures=solver.measures,
             count=jnp.where(lost, 0, solver.shots),
             closed=solver.closed * solver.orbit.rtol,

@@ -108,12 +108,16 @@ def _numpy_of(array: Any) -> Any:
     return np if isinstance(array, np.ndarray) else jnp
 
 
-def lyapunov(pair: RotorPair, state: Float[Array, " n"], periods: int, how: Integrator) -> Window:
+def lyapunov(
+    pair: RotorPair, state: Float[Array, " n"], periods: int, integrator: Integrator
+) -> Window:
     """Integrate a window of `periods` mesh periods (a multiple of 16) from the scaled `state`."""
     one, still = jnp.ones_like(state[0]), no_tangents(pair)
 
     def step(_: Any, window: Window) -> Window:
-        return window.after(flow(pair, window.end, one, how, _SAMPLES, still, measures=Measures()))
+        return window.after(
+            flow(pair, window.end, one, integrator, _SAMPLES, still, measures=Measures())
+        )
 
     return lax.fori_loop(0, periods, step, Window.empty(state, periods))
 

@@ -3,7 +3,7 @@
 import dataclasses
 
 from rootsopt.config import Config
-from rootsopt.export.pieces import Piece, outline_pieces
+from rootsopt.export.pieces import DrawnPiece, outline_pieces
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.runtime.programs import Program
 
@@ -17,7 +17,7 @@ class Drawing:
     of `lobes`, axial `length`, twist in degrees over that length, diameter of the `bore` if it has
     one, and `notes`, lines of text with the design's numbers."""
 
-    pieces: list[Piece]
+    pieces: list[DrawnPiece]
     pitch_radius: float
     outer_radius: float
     lobes: int

@@ -124,10 +124,10 @@ class Spline:
         return np.stack([points[:-1], first, second, points[1:]], axis=-1)
 
 
-Piece = Arc | Spline
+DrawnPiece = Arc | Spline
 
 
-def outline_pieces(profile: Profile) -> list[Piece]:
+def outline_pieces(profile: Profile) -> list[DrawnPiece]:
     """The closed counter-clockwise outline (mm) from the root before the lobe on +x; every piece
     starts where the one before it stops.
 
@@ -141,12 +141,12 @@ def outline_pieces(profile: Profile) -> list[Piece]:
     return _closed(_merged(around, ROUND * float(profile.pitch_radius) * _MM))
 
 
-def area(pieces: list[Piece]) -> float:
+def area(pieces: list[DrawnPiece]) -> float:
     """Area (mm²) inside a closed outline, exact for arcs and splines."""
     return sum(map(_swept, pieces))
 
 
-def polyline(pieces: list[Piece], chord: float) -> Complex128[np.ndarray, " n"]:
+def polyline(pieces: list[DrawnPiece], chord: float) -> Complex128[np.ndarray, " n"]:
     """Closed polygon with about `chord` mm between its points, the first repeated at the end."""
     parts = []
     for piece in pieces:
@@ -155,7 +155,7 @@ def polyline(pieces: list[Piece], chord: float) -> Complex128[np.ndarray, " n"]:
     return np.concatenate([*parts, parts[0][:1]])
 
 
-def _swept(piece: Piece) -> float:
+def _swept(piece: DrawnPiece) -> float:
     """∫ (x dy - y dx) / 2 along a piece."""
     if isinstance(piece, Arc):
         across = np.imag(np.conj(piece.center) * (piece.stop - piece.start))
@@ -169,7 +169,7 @@ def _swept(piece: Piece) -> float:
     return float(np.sum(np.imag(np.conj(curve(at)) * curve.derivative()(at)) * half * weights)) / 2
 
 
-def _flank(profile: Profile) -> list[Piece]:
+def _flank(profile: Profile) -> list[DrawnPiece]:
     """Pieces of one flank, from the tip's centre to the root's."""
     size = float(profile.pitch_radius) * _MM
     segments = [(float(s.start), float(s.stop)) for s in profile.segments()]
@@ -217,7 +217,7 @@ class _Stretch:
             np.abs(speed * (self.stop - self.start)) * _MM,
         )
 
-    def pieces(self, size: float) -> list[Piece]:
+    def pieces(self, size: float) -> list[DrawnPiece]:
         """The arc, the spline or the two splines, `size` being the pitch radius (mm)."""
         if arc := self._arc(ROUND * size):
             return [arc]
@@ -288,9 +288,9 @@ class _Stretch:
         return Spline(np.asarray(curve.t), np.asarray(curve.c, dtype=complex)), error
 
 
-def _merged(pieces: list[Piece], tolerance: float) -> list[Piece]:
+def _merged(pieces: list[DrawnPiece], tolerance: float) -> list[DrawnPiece]:
     """Neighbouring arcs of one circle in one piece; the first piece may start earlier then."""
-    merged: list[Piece] = []
+    merged: list[DrawnPiece] = []
     for piece in pieces:
         if merged and (joined := _joined(merged[-1], piece, tolerance)):
             merged[-1] = joined
@@ -301,7 +301,7 @@ def _merged(pieces: list[Piece], tolerance: float) -> list[Piece]:
     return merged
 
 
-def _joined(one: Piece, other: Piece, tolerance: float) -> Arc | None:
+def _joined(one: DrawnPiece, other: DrawnPiece, tolerance: float) -> Arc | None:
     if not (isinstance(one, Arc) and isinstance(other, Arc)):
         return None
     same = abs(one.center - other.center) + abs(one.radius - other.radius) <= tolerance
@@ -310,7 +310,7 @@ def _joined(one: Piece, other: Piece, tolerance: float) -> Arc | None:
     return dataclasses.replace(one, sweep=one.sweep + other.sweep)
 
 
-def _closed(pieces: list[Piece]) -> list[Piece]:
+def _closed(pieces: list[DrawnPiece]) -> list[DrawnPiece]:
     """The pieces with every spline's ends put on those of its neighbours, which differ from them
     by rounding."""
     closed = list(pieces)

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from rootsopt.errors import InputError
-from rootsopt.export.pieces import Arc, Piece
+from rootsopt.export.pieces import Arc, DrawnPiece
 
 if TYPE_CHECKING:
     from build123d import Compound, Edge, Face, Solid
@@ -46,7 +46,7 @@ def require_kernel() -> None:
         )
 
 
-def rotor(pieces: list[Piece], length: float, bore: float | None, helix: float) -> "Solid":
+def rotor(pieces: list[DrawnPiece], length: float, bore: float | None, helix: float) -> "Solid":
     """One rotor between z = 0 and `length`: the closed outline `pieces` at z = 0, turned by
     `helix` on the way up, with a `bore` (its diameter; None for none)."""
     from build123d import Axis, Edge, Face, Shell, Solid, Vector, Wire
@@ -65,7 +65,7 @@ def rotor(pieces: list[Piece], length: float, bore: float | None, helix: float) 
 
 
 def pair(
-    pieces: list[Piece],
+    pieces: list[DrawnPiece],
     lobes: int,
     center_distance: float,
     length: float,
@@ -108,7 +108,7 @@ def _point(z: complex) -> tuple[float, float, float]:
     return float(z.real), float(z.imag), 0.0
 
 
-def _edge(piece: Piece) -> "Edge":
+def _edge(piece: DrawnPiece) -> "Edge":
     from build123d import AngularDirection, Edge, Plane
 
     if not isinstance(piece, Arc):
@@ -119,7 +119,7 @@ def _edge(piece: Piece) -> "Edge":
     return Edge.make_circle(piece.radius, plane, first, last, ways[piece.sweep < 0])
 
 
-def _side(piece: Piece, length: float, helix: float) -> "Face":
+def _side(piece: DrawnPiece, length: float, helix: float) -> "Face":
     """The side of the rotor over one piece: a cylinder over an arc of a straight rotor, else a
     B-spline surface, which is exact where the kernel's own twisted sweeps are off by 1e-4 near a
     cusp."""
@@ -144,7 +144,7 @@ def _side(piece: Piece, length: float, helix: float) -> "Face":
     )
 
 
-def _rational(piece: Piece):
+def _rational(piece: DrawnPiece):
     """Degree, knots, control points and weights of a piece as a rational B-spline; an arc must be
     shorter than half a circle."""
     if not isinstance(piece, Arc):
@@ -155,7 +155,7 @@ def _rational(piece: Piece):
     return 2, np.repeat([0, piece.length], 3), piece.center + circle, weights
 
 
-def _quarters(piece: Piece) -> list[Piece]:
+def _quarters(piece: DrawnPiece) -> list[DrawnPiece]:
     """A piece in parts of which no arc is longer than a quarter of a circle."""
     if not isinstance(piece, Arc):
         return [piece]

@@ -3,7 +3,7 @@
 from xml.sax.saxutils import escape
 
 from rootsopt.export.drawing import Drawing
-from rootsopt.export.pieces import Arc, Piece
+from rootsopt.export.pieces import Arc, DrawnPiece
 
 _STYLE = (
     ".outline{fill:#dbe9f4;fill-rule:evenodd;stroke:#000;stroke-width:.5}"
@@ -39,12 +39,12 @@ def svg_text(drawing: Drawing) -> str:
     )
 
 
-def outline_path(pieces: list[Piece]) -> str:
+def outline_path(pieces: list[DrawnPiece]) -> str:
     """The closed outline as path data: an arc as an arc, a spline as Bézier curves."""
     return f"M{_point(pieces[0].start)}" + "".join(map(_command, pieces)) + "Z"
 
 
-def _command(piece: Piece) -> str:
+def _command(piece: DrawnPiece) -> str:
     if not isinstance(piece, Arc):
         rows = (" ".join(_point(z) for z in curve[1:]) for curve in piece.beziers())
         return "".join(f"C{row}" for row in rows)

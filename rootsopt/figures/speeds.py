@@ -12,7 +12,7 @@ from rootsopt.figures.style import (
     figure,
 )
 from rootsopt.output.files import ResultFolder
-from rootsopt.response.speeds import Part
+from rootsopt.response.speeds import AtSpeed
 
 _MARKERS = {"periodic": "o", "averaged": "s", "chaotic": "x", "not_settled": "+"}
 _NO_FORCE = "v"
@@ -21,7 +21,7 @@ _FEW = 24
 LABELS = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
 
 
-def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[Part]], force: str) -> Axes:
+def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[AtSpeed]], force: str) -> Axes:
     """`force` (a key of the responses) over speed, a line for each design.
 
     A line goes through steady motions. Others are marked one by one; those without a force stand
@@ -51,7 +51,7 @@ def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[Part]], force: str) -> 
     return ax
 
 
-def legend_entries(designs: Mapping[str, Sequence[Part]]) -> list[Line2D]:
+def legend_entries(designs: Mapping[str, Sequence[AtSpeed]]) -> list[Line2D]:
     """What the designs and the markers mean."""
     entries = []
     for name, color, dashes in zip(designs, COLORS, DASHES * 2, strict=False):
@@ -76,7 +76,7 @@ def legend_entries(designs: Mapping[str, Sequence[Part]]) -> list[Line2D]:
 
 
 def speed_figure(
-    folder: ResultFolder, designs: Mapping[str, Sequence[Part]], title: str
+    folder: ResultFolder, designs: Mapping[str, Sequence[AtSpeed]], title: str
 ) -> list[str]:
     """Write speeds.png, mean and peak force over speed; return its name."""
     made, axes = figure(9, 6.6, 2, 1, sharex=True)

@@ -37,7 +37,7 @@ that are spared, as is what lies before the curve has that speed."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Curve:
+class MeasuredCurve:
     """A curve z(t) in `pieces` that follow each other, each from the `ends` to the next."""
 
     ends: Float64[np.ndarray, " k"]
@@ -82,7 +82,7 @@ class Frame:
 
 
 def stretch(
-    curve: Curve, place: int, low: float, high: float, count: int
+    curve: MeasuredCurve, place: int, low: float, high: float, count: int
 ) -> tuple[NDArray[np.float64], Frame]:
     """`count` places from `low` to `high` on a piece, and the curve there.
 
@@ -117,7 +117,7 @@ def through(
     joints: Bool[np.ndarray, " n"],
     pitch_radius: float,
     smoothing: float,
-) -> Curve:
+) -> MeasuredCurve:
     """The curve through `points`, or at an RMS distance `smoothing` (mm) from them.
 
     Without smoothing it is a quintic spline between `joints` and between places where the
@@ -150,10 +150,10 @@ def through(
         with guarded(_KEY, "no curve goes through its points", _UNEVEN):
             pieces.append(make_interp_spline(t, part, k=degree))
         places.append(t[-1])
-    return Curve(np.array(places), tuple(pieces))
+    return MeasuredCurve(np.array(places), tuple(pieces))
 
 
-def _smoothed(points: NDArray[np.complex128], smoothing: float) -> Curve:
+def _smoothed(points: NDArray[np.complex128], smoothing: float) -> MeasuredCurve:
     """The smoothest spline at an RMS distance `smoothing` from the points."""
     t = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points)))])
     sides = [np.real(points), np.imag(points)]
@@ -172,7 +172,7 @@ def _smoothed(points: NDArray[np.complex128], smoothing: float) -> Curve:
         spline, _ = make_splprep(sides, u=t, k=5, s=squares)  # type: ignore[arg-type]
     controls = np.asarray(spline.c)
     controls = controls[0] + 1j * controls[1] if controls.shape[0] == 2 else controls @ [1, 1j]
-    return Curve(t[[0, -1]], (BSpline(spline.t, controls, spline.k),))
+    return MeasuredCurve(t[[0, -1]], (BSpline(spline.t, controls, spline.k),))
 
 
 def _parameter(points: NDArray[np.complex128], weight: float) -> NDArray[np.float64]:

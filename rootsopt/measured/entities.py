@@ -40,7 +40,7 @@ _TILT = 1e-6
 """Tilt (rad) of an entity's plane above which it does not lie in that of the drawing."""
 
 
-class Segment(abc.ABC):
+class Stroke(abc.ABC):
     """Part of an entity."""
 
     curved: bool
@@ -58,7 +58,7 @@ class Segment(abc.ABC):
 
 
 @dataclasses.dataclass(frozen=True)
-class _Corners(Segment):
+class _Corners(Stroke):
     """Points joined by straight lines."""
 
     corners: NDArray[np.complex128]
@@ -75,7 +75,7 @@ class _Corners(Segment):
 
 
 @dataclasses.dataclass(frozen=True)
-class _Ellipse(Segment):
+class _Ellipse(Stroke):
     """center + major cos t + minor sin t for t from start over sweep; an arc is one, too."""
 
     center: complex
@@ -95,7 +95,7 @@ class _Ellipse(Segment):
 
 
 @dataclasses.dataclass(frozen=True)
-class _Spline(Segment):
+class _Spline(Stroke):
     """A spline in homogeneous coordinates (x, y, weight), evenly divided between its knots."""
 
     curve: BSpline
@@ -121,7 +121,7 @@ def _bounded(count: float) -> int:
     return math.ceil(min(max(_FEWEST, count), _MOST))
 
 
-def chain(parts: list[Segment], spacing: float) -> Loop:
+def chain(parts: list[Stroke], spacing: float) -> Loop:
     """Points of the segments of one entity; the ends of its curves are joints."""
     points, joints = [], []
     for segment in parts:
@@ -155,7 +155,7 @@ class Entity:
             data = _KINDS[kind][0](entity)
         return cls(kind, f"{name}: {kind} (handle {handle})", normal, data)
 
-    def segments(self, scale: float) -> list[Segment]:
+    def segments(self, scale: float) -> list[Stroke]:
         """Its segments, `scale` mm for a drawing unit; none if it has no extent.
 
         Raises `InputError` for an entity that makes no sense.
@@ -207,7 +207,7 @@ def _read_line(entity: Any):
     return (_plain([entity.dxf.start, entity.dxf.end]),)
 
 
-def _line(ends, plane, fault) -> list[Segment]:
+def _line(ends, plane, fault) -> list[Stroke]:
     del fault
     return [_Corners(plane.scale * ends)] if ends[0] != ends[1] else []
 
@@ -218,7 +218,7 @@ def _read_arc(entity: Any):
     return _plain([dxf.center])[0], *numbers
 
 
-def _arc(center, radius, first, last, plane, fault) -> list[Segment]:
+def _arc(center, radius, first, last, plane, fault) -> list[Stroke]:
     if not radius > 0:
         raise fault("have a radius above 0", f"has {radius:g}")
     axis = radius * np.exp(1j * math.radians(first))
@@ -233,7 +233,7 @@ def _read_ellipse(entity: Any):
     return center, major, minor, float(dxf.start_param), float(dxf.end_param)
 
 
-def _ellipse(center, major, minor, first, last, plane, fault) -> list[Segment]:
+def _ellipse(center, major, minor, first, last, plane, fault) -> list[Stroke]:
     if not min(abs(major), abs(minor)) > 0:
         raise fault("have axes longer than 0", f"has {abs(major):g} and {abs(minor):g}")
     first, sweep = first % math.tau, (last - first) % math.tau
@@ -254,7 +254,7 @@ def _floats(values: Iterable[Any]) -> NDArray[np.float64]:
     return np.array([float(x) for x in values], float)
 
 
-def _spline(controls, degree, knots, weights, plane, fault) -> list[Segment]:
+def _spline(controls, degree, knots, weights, plane, fault) -> list[Stroke]:
     if not 1 <= degree <= _DEGREES:
         raise fault(f"have a degree from 1 to {_DEGREES}", f"has {degree}")
     count = len(controls)
@@ -298,14 +298,14 @@ def _read_polyline(entity: Any):
     return points, bulges, bool(entity.is_closed), bool(entity.is_3d_polyline)
 
 
-def _polyline(corners, bulges, closed, spatial, plane, fault) -> list[Segment]:
+def _polyline(corners, bulges, closed, spatial, plane, fault) -> list[Stroke]:
     """Straight runs and arcs; a bulge is the tangent of a quarter of an arc's angle."""
     del fault
     corners = plane.scale * corners if spatial else plane(corners)
     bulges = -bulges if plane.below and not spatial else bulges
     if closed and len(corners) > 1:
         corners = np.append(corners, corners[0])
-    made: list[Segment] = []
+    made: list[Stroke] = []
     run = 0
     steps = np.diff(corners)
     for k in np.flatnonzero((np.abs(bulges[: len(steps)]) > _STRAIGHT) & (steps != 0)):

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 from rootsopt.errors import InputError
 from rootsopt.measured.checks import Checks
-from rootsopt.measured.curves import Curve, Frame, stretch, through
+from rootsopt.measured.curves import Frame, MeasuredCurve, stretch, through
 from rootsopt.measured.loop import Loop, signed_area
 from rootsopt.profiles.outline import Outline, Table
 
@@ -44,7 +44,7 @@ class _Flank:
     """A flank in its own lobe's frame, tip on +x, mirrored if it is a trailing one: its curve, and
     where (parameter) it passes tip, pitch circle and root; `off`: RMS distance of the points."""
 
-    curve: Curve
+    curve: MeasuredCurve
     tip: float
     pitch: float
     root: float

@@ -24,7 +24,7 @@ _NEAR = 0.1
 _CANDIDATES = 3
 
 
-class Verdict(NamedTuple):
+class Verification(NamedTuple):
     """Outcome of a verification: `problem` relative to the `baseline` as averaged anew,
     `optimized` if a design held up, and the `record` for the result file."""
 
@@ -52,7 +52,7 @@ def add_errors(rows: list[dict[str, Any]], trials: Sequence, problem: Problem) -
         row["objective_standard_error"] = standard_error(problem, trial.evaluation)
 
 
-def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> Verdict:
+def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> Verification:
     """Choose among the best candidates by one larger ensemble, and compare the one chosen with
     the baseline by another. Gradients are from ensembles of the search's size."""
     chooser, judge = (evaluator.independent(k).without_gradient() for k in (1, 2))
@@ -73,11 +73,11 @@ def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> 
     ]
     tried = [one for one in tried if np.isfinite(one[0])]
     if not tried:
-        return Verdict(problem, problem.baseline, None, record)
+        return Verification(problem, problem.baseline, None, record)
     _, searched, point = min(tried, key=lambda one: one[0])
     baseline = judge(jnp.asarray(list(problem.baseline.design.values())))
     if not baseline.usable:
-        return Verdict(problem, baseline, None, record)
+        return Verification(problem, baseline, None, record)
     baseline = _with_gradient(baseline, problem.baseline)
     renewed = dataclasses.replace(problem, baseline=baseline)
     evaluation = judge(problem.design(point))
@@ -93,9 +93,9 @@ def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> 
         "holds_up": holds,
     }
     if not holds:
-        return Verdict(renewed, baseline, None, record | {"design": evaluation.design})
+        return Verification(renewed, baseline, None, record | {"design": evaluation.design})
     search = evaluator(problem.design(point), series=False)
-    return Verdict(renewed, baseline, _with_gradient(evaluation, search), record)
+    return Verification(renewed, baseline, _with_gradient(evaluation, search), record)
 
 
 def _with_gradient(evaluation: Evaluation, other: Evaluation) -> Evaluation:

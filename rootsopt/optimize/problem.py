@@ -18,7 +18,7 @@ from rootsopt.design.space import Space, slacks_and_slopes
 from rootsopt.dynamics.measures import line_name
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluation, objective_weights
-from rootsopt.response.speeds import counted, parts_of
+from rootsopt.response.speeds import at_speeds, counted
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 
@@ -60,7 +60,7 @@ class Problem:
         Raises `InputError` where a measure is to fall that is 0 for the baseline: nothing is
         relative to that."""
         orders = {line_name(order): order for order in config.objective.line_weights}
-        counting = [part for part in parts_of(baseline) if part.share > 0]
+        counting = [part for part in at_speeds(baseline) if part.share > 0]
         for name, part in itertools.product(objective_weights(config), counting):
             one = part.evaluation
             least = _NO_LINE * one.response["mean_force_N"] if name in orders else 0.0
@@ -91,7 +91,7 @@ class Problem:
     def by_speed(self, evaluation: Evaluation) -> list[dict[str, float]]:
         """The objective at each speed by itself, if there are several; NaN where the baseline's is
         relative to nothing, which no speed with a share is."""
-        parts = zip(parts_of(evaluation), parts_of(self.baseline), strict=True)
+        parts = zip(at_speeds(evaluation), at_speeds(self.baseline), strict=True)
         return [
             {
                 "speed_rpm": part.speed_rpm,

@@ -280,13 +280,13 @@ def _spread(low: float, high: float, count: int) -> NDArray[np.float64]:
 def _settled(evaluator: Evaluator, pair: RotorPair, starts) -> tuple[Transient, Any]:
     """Ends of the transients from scaled states (m, n), with a leading axis (m,), and what
     `transient_status` says of each."""
-    how = evaluator.scene.solver.transient
+    integrator = evaluator.scene.solver.transient
     dtype = pair.angle_scale.dtype
     limit = np.asarray(max(evaluator.config.solver.max_mesh_periods // 4, 8 * BLOCK))
-    tolerance = np.asarray(settled_within(how.rtol), dtype)
+    tolerance = np.asarray(settled_within(integrator.rtol), dtype)
     most = evaluator.config.solver.max_orbit_periods
     states = np.asarray(starts, dtype)
-    settings = how, tolerance, limit, most
+    settings = integrator, tolerance, limit, most
     if jax.default_backend() == "cpu":
         ends = on_all_cores(lambda part: _in_turn(pair, part, *settings), states)
     else:
@@ -310,9 +310,9 @@ def _together(pair, states, *settings):
 
 
 @Program
-def _cycle(pair: RotorPair, state, how: Integrator):
+def _cycle(pair: RotorPair, state, integrator: Integrator):
     """The states at the begin of `_LONGEST` mesh periods."""
-    return jnp.concatenate([state[None], strobe(pair, state, _LONGEST - 1, how).states])
+    return jnp.concatenate([state[None], strobe(pair, state, _LONGEST - 1, integrator).states])
 
 
 @dataclasses.dataclass(frozen=True)

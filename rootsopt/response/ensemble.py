@@ -96,7 +96,7 @@ class EnsembleEvaluator(Wrapper):
     differentiate: bool = True
 
     @property
-    def how(self) -> Integrator:
+    def integrator(self) -> Integrator:
         """How the motions are integrated."""
         transient = self.scene.solver.transient
         return dataclasses.replace(transient, rtol=jnp.maximum(transient.rtol, _RTOL))
@@ -124,7 +124,7 @@ class EnsembleEvaluator(Wrapper):
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now = self._around(self.single._sized(design))
         pair, _ = _pair.result_shape(now.scene, design)
-        prepare_members(pair, self.how)
+        prepare_members(pair, self.integrator)
         if not self.single.survey:
             state = jax.ShapeDtypeStruct((pair.states,), pair.angle_scale.dtype)
             lyapunov_program.prepare(pair, state, PERIODS, self.scene.solver.transient)
@@ -165,7 +165,7 @@ class EnsembleEvaluator(Wrapper):
                     f"Argument `start` must be the states (members, n) of an ensemble, but has "
                     f"shape {states.shape}; pass None to begin anew"
                 )
-        runs = run_members([pair], states, settle, self.settings.periods, self.how)
+        runs = run_members([pair], states, settle, self.settings.periods, self.integrator)
         return _Outcome(pair, shape, runs)
 
     def _report(self, design, outcome: "_Outcome", began: float, with_series: bool) -> Evaluation:
@@ -262,7 +262,9 @@ class EnsembleEvaluator(Wrapper):
             with ThreadPoolExecutor(os.cpu_count()) as pool:
                 built = list(pool.map(functools.partial(_pair, now.scene), designs))
             pairs, shapes = zip(*built, strict=True)
-            runs = run_members(pairs, members.states, settle, self.settings.periods, self.how)
+            runs = run_members(
+                pairs, members.states, settle, self.settings.periods, self.integrator
+            )
             return _Outcome(pairs[0], shapes[0], runs)
 
         _, around = self._fitted(design, attempt)

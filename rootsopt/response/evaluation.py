@@ -314,8 +314,8 @@ class Evaluator:
                 motion = _orbit_series(pair, orbit, period) if series else None
         elif int(found.window.done):
             steady, response, motion = unsettled(pair, status, found.window, series)
-        elif status is Status.SOLVER_FAILED and pair.pace is not None:
-            swings = pair.mesh_period / (2 * np.pi * pair.pace.swing)
+        elif status is Status.SOLVER_FAILED and pair.timescales is not None:
+            swings = pair.mesh_period / (2 * np.pi * pair.timescales.swing)
             statistics["swings_per_mesh_period"] = float(swings)
         return Evaluation(
             design=dict(zip(self.keys, map(float, design), strict=True)),
@@ -482,10 +482,19 @@ def floquet(monodromy) -> list[list[float]]:
 
 
 @Program
-def _reverse(scene: Scene, design, orbit: Orbit, period, how: Integrator, measures: Measures):
+def _reverse(
+    scene: Scene, design, orbit: Orbit, period, integrator: Integrator, measures: Measures
+):
     grid, peak = orbit.flow.grid, orbit.flow.peak
     return reverse_sensitivity(
-        scene.pair, design, orbit.state, period, how, grid, measures, jnp.maximum(peak, 1e-30)
+        scene.pair,
+        design,
+        orbit.state,
+        period,
+        integrator,
+        grid,
+        measures,
+        jnp.maximum(peak, 1e-30),
     )
 
 

@@ -97,11 +97,11 @@ def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float
     return pair.at_start(play)
 
 
-def prepare_members(pair: RotorPair, how: Integrator) -> None:
+def prepare_members(pair: RotorPair, integrator: Integrator) -> None:
     """Compile, in the background, what `run_members` takes on CPUs for pairs like this one."""
     states = jax.ShapeDtypeStruct((_MEMBERS, pair.states), pair.angle_scale.dtype)
     count = jax.ShapeDtypeStruct((), int)
-    _in_turn.prepare(pair, states, count, count, how)
+    _in_turn.prepare(pair, states, count, count, integrator)
 
 
 def run_members(
@@ -109,7 +109,7 @@ def run_members(
     states: NDArray[np.float64] | Float[Array, "m 2"],
     settle: int,
     periods: int,
-    how: Integrator,
+    integrator: Integrator,
 ) -> list[Members]:
     """The `Members` of each of `pairs`, all from the same scaled `states` (m, 2), over
     `periods` mesh periods after `settle` others.
@@ -121,7 +121,7 @@ def run_members(
     counts = np.asarray(settle), np.asarray(periods)
     if jax.default_backend() != "cpu":
         stacked = jax.tree.map(lambda *x: jnp.stack(x), *pairs)
-        together = jax.device_get(_together(stacked, states, *counts, how))
+        together = jax.device_get(_together(stacked, states, *counts, integrator))
         return [jax.tree.map(lambda x, i=i: x[i], together) for i in range(len(pairs))]
     # Parts of one size share a compiled program; the last member fills the last part up.
     count = len(states)
@@ -130,7 +130,7 @@ def run_members(
 
     def part(task):
         pair, rows = task
-        return jax.device_get(_in_turn(pair, states[rows], *counts, how))
+        return jax.device_get(_in_turn(pair, states[rows], *counts, integrator))
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         done = list(pool.map(part, [(pair, row) for pair in pairs for row in rows]))
@@ -141,7 +141,7 @@ def run_members(
 
 
 def member(
-    pair: RotorPair, state: Float[Array, " n"], settle: Any, periods: Any, how: Integrator
+    pair: RotorPair, state: Float[Array, " n"], settle: Any, periods: Any, integrator: Integrator
 ) -> Members:
     """One motion from the scaled `state`, as a pure function; leaves without the axis m."""
     dtype = state.dtype
@@ -149,14 +149,14 @@ def member(
 
     def pass_by(_, carry):
         state, solved = carry
-        out = strobe(pair, state, 1, how)
+        out = strobe(pair, state, 1, integrator)
         return out.states[-1], solved & out.solved
 
     half = periods // 2
 
     def count(index, carry):
         state, solved, means, drift, greatest, reach, depth, memory = carry
-        out = flow(pair, state, one, how, _SAMPLES)
+        out = flow(pair, state, one, integrator, _SAMPLES)
         reach = jnp.maximum(reach, jnp.max(jnp.abs(out.states[:, 0])))
         return (
             out.end,
@@ -193,11 +193,11 @@ def member(
 
 
 @Program
-def _in_turn(pair, states, settle, periods, how) -> Members:
-    return lax.map(lambda state: member(pair, state, settle, periods, how), states)
+def _in_turn(pair, states, settle, periods, integrator) -> Members:
+    return lax.map(lambda state: member(pair, state, settle, periods, integrator), states)
 
 
 @Program
-def _together(pairs, states, settle, periods, how) -> Members:
-    run = functools.partial(member, settle=settle, periods=periods, how=how)
+def _together(pairs, states, settle, periods, integrator) -> Members:
+    run = functools.partial(member, settle=settle, periods=periods, integrator=integrator)
     return jax.vmap(lambda pair: jax.vmap(lambda state: run(pair, state))(states))(pairs)

@@ -27,7 +27,7 @@ _STEADY = (
 )
 
 
-class Part(NamedTuple):
+class AtSpeed(NamedTuple):
     """The `evaluation` at one speed, and the `share` of that speed in the objective."""
 
     speed_rpm: float
@@ -53,7 +53,7 @@ class SpeedsEvaluation(Evaluation):
     (m, 1 + n): number of the part and scaled state, a row for each motion known.
     """
 
-    parts: tuple[Part, ...] = ()
+    parts: tuple[AtSpeed, ...] = ()
 
     def record(self) -> dict[str, Any]:
         return super().record() | {
@@ -71,12 +71,12 @@ class SpeedsEvaluator(Wrapper):
     evaluation that forces at each speed are relative to.
     """
 
-    baseline: tuple["Part", ...] = ()
+    baseline: tuple["AtSpeed", ...] = ()
 
     def relative_to(self, baseline: Evaluation) -> "SpeedsEvaluator":
         """Return another evaluator, whose forces at each speed are compared relative to those of
         the `baseline` at that speed."""
-        return dataclasses.replace(self, baseline=parts_of(baseline))
+        return dataclasses.replace(self, baseline=at_speeds(baseline))
 
     def fit(self, design=None, start=None, series=True) -> tuple["SpeedsEvaluator", Evaluation]:
         """As `Evaluator.fit`; `start`: the `state` of a neighbouring design's evaluation."""
@@ -89,12 +89,12 @@ class SpeedsEvaluator(Wrapper):
                 now = now.relative_to(self.baseline[number].evaluation)
             known = None if start is None else _rows(start, number)
             now, found = now.fit(design, known, series and speed == own)
-            parts.append(Part(speed, share, found))
+            parts.append(AtSpeed(speed, share, found))
         fitted = dataclasses.replace(self, single=now.at_speed(own))
         return fitted, together(parts, own)
 
 
-def together(parts: Sequence["Part"], own: float) -> SpeedsEvaluation:
+def together(parts: Sequence["AtSpeed"], own: float) -> SpeedsEvaluation:
     """Return the evaluation at several speeds, reported at the speed `own` (rpm)."""
     (head,) = (part.evaluation for part in parts if part.speed_rpm == own)
     status, message = overall(parts)
@@ -114,7 +114,7 @@ def together(parts: Sequence["Part"], own: float) -> SpeedsEvaluation:
     )
 
 
-def _states(parts: Sequence[Part]) -> NDArray[np.float64]:
+def _states(parts: Sequence[AtSpeed]) -> NDArray[np.float64]:
     rows = [np.atleast_2d(np.asarray(part.evaluation.state)) for part in parts]
     numbered = (np.insert(states, 0, number, axis=1) for number, states in enumerate(rows))
     return np.concatenate(list(numbered))
@@ -148,11 +148,11 @@ def shares(config: Config) -> dict[float, float]:
     return dict(sorted(found.items()))
 
 
-def parts_of(evaluation: Evaluation) -> tuple[Part, ...]:
+def at_speeds(evaluation: Evaluation) -> tuple[AtSpeed, ...]:
     """The parts of an evaluation at several speeds; of another one, itself."""
     if isinstance(evaluation, SpeedsEvaluation):
         return evaluation.parts
-    return (Part(math.nan, 1.0, evaluation),)
+    return (AtSpeed(math.nan, 1.0, evaluation),)
 
 
 def counted(
@@ -166,7 +166,7 @@ def counted(
     baseline)`."""
     pairs = [
         (part.share, part.evaluation, base.evaluation)
-        for part, base in zip(parts_of(evaluation), parts_of(baseline), strict=True)
+        for part, base in zip(at_speeds(evaluation), at_speeds(baseline), strict=True)
         if part.share > 0
     ]
     if config.objective.over_speeds == "weighted":
@@ -191,17 +191,17 @@ def sweep(
     speeds_rpm: Sequence[float],
     design: Any = None,
     progress: Callable[[int, int], None] = lambda done, expected: None,
-) -> tuple[Part, ...]:
+) -> tuple[AtSpeed, ...]:
     """`design` (config units; default: the config's own) at each of the speeds, every one from
     rest; equal shares.
 
     `evaluator`: one that looks at a single speed. `progress` is called with (speeds done, all).
     """
-    parts: list[Part] = []
+    parts: list[AtSpeed] = []
 
-    def at(speed: float) -> Part:
+    def at(speed: float) -> AtSpeed:
         found = evaluator.at_speed(speed)(design, series=False)
-        return Part(speed, 1 / len(speeds_rpm), found)
+        return AtSpeed(speed, 1 / len(speeds_rpm), found)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for part in pool.map(at, speeds_rpm):
@@ -210,7 +210,7 @@ def sweep(
     return tuple(parts)
 
 
-def overall(parts: Sequence[Part]) -> tuple[Status, str]:
+def overall(parts: Sequence[AtSpeed]) -> tuple[Status, str]:
     """The status of the first part that is not usable, and its message; else of them all."""
     for part in parts:
         if not part.evaluation.usable:

@@ -21,7 +21,6 @@ from rootsopt.contact.linear import LinearContact
 from rootsopt.contact.map import MapContact
 from rootsopt.contact.search import SearchContact
 from rootsopt.contact.segments import NodeContact
-from rootsopt.dynamics.pace import Pace
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import (
     ConstantLoad,
@@ -37,6 +36,7 @@ from rootsopt.dynamics.parts import (
     TimingGear,
 )
 from rootsopt.dynamics.steady import Solver
+from rootsopt.dynamics.timescales import Timescales
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Outline, Profile, geometry
 from rootsopt.runtime.precision import check_precision
@@ -134,7 +134,7 @@ class Scene(eqx.Module):
         return self.density * self.length * area
 
     @property
-    def both(self) -> bool:
+    def two_sided(self) -> bool:
         """Whether drive and coast flanks may touch at once: the axes may be elsewhere than at the
         nominal centre distance, or the flanks are not conjugate."""
         odd = self.supports, self.center_distance_error, self.outline
@@ -165,7 +165,7 @@ class Scene(eqx.Module):
                 "`solver.fidelity` must be chosen before a pair is built, but is auto; call "
                 "rootsopt.response.choice.choose first"
             )
-        if not self.both:
+        if not self.two_sided:
             return SearchContact.of(profile)
         error = self.center_distance_error
         distance = 2 * profile.pitch_radius + (0.0 if error is None else error)
@@ -254,11 +254,13 @@ class Scene(eqx.Module):
             force_scale=force,
             friction=self.friction,
             supports=supports,
-            two_sided=self.both,
+            two_sided=self.two_sided,
             parts=extra,
         )
-        pace = Pace.of(self.law, pair.all_parts, inertia, force, self.pitch_radius, self.clearance)
-        pair = dataclasses.replace(pair, pace=pace)
+        timescales = Timescales.of(
+            self.law, pair.all_parts, inertia, force, self.pitch_radius, self.clearance
+        )
+        pair = dataclasses.replace(pair, timescales=timescales)
         if self.precision == "float32":
             # Built in double precision; single only where it is integrated.
             pair = jax.tree.map(_single, pair)

@@ -16,7 +16,7 @@ from rootsopt.continuation.arclength import (
     CORNER,
     End,
     Look,
-    Steps,
+    StepSizes,
     StoppedError,
     corrected,
     follow_curve,
@@ -58,7 +58,7 @@ def start_of(curve, x, p, way=1.0):
 
 def test_circle_is_closed_with_a_fold_on_either_side():
     """Every point lies on the circle, both folds are at ±1, and the curve ends at its start."""
-    path = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), Steps(-2, 2, 0.02, 1e-6, 0.1), FOLD)
+    path = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), StepSizes(-2, 2, 0.02, 1e-6, 0.1), FOLD)
     assert path.end is End.CLOSED
     places = np.array([spot.place for spot in path.spots])
     np.testing.assert_allclose(np.hypot(*places.T), 1, atol=1e-10)
@@ -71,7 +71,7 @@ def test_circle_is_closed_with_a_fold_on_either_side():
 
 def test_cubic_passes_both_folds_to_the_end_of_the_range():
     """λ = x - x³ folds at x = ±1/√3; three points at λ = 0 are on one curve."""
-    path = follow_curve(CUBIC, start_of(CUBIC, -1.4, 1.3, -1), Steps(-1.5, 1.5), FOLD)
+    path = follow_curve(CUBIC, start_of(CUBIC, -1.4, 1.3, -1), StepSizes(-1.5, 1.5), FOLD)
     assert path.end is End.RANGE_END
     assert path.spots[-1].place[-1] == -1.5
     x, p = np.array([spot.place for spot in path.spots]).T
@@ -85,9 +85,9 @@ def test_cubic_passes_both_folds_to_the_end_of_the_range():
 
 
 def test_steps_follow_the_rate_of_convergence():
-    """Steps grow to the greatest on a straight stretch."""
+    """StepSizes grow to the greatest on a straight stretch."""
     line = curve_of(lambda x, p: x - p, lambda x, p: [1.0, -1.0])
-    path = follow_curve(line, start_of(line, 0.0, 0.0), Steps(-1, 1, 1e-3, 1e-6, 0.05))
+    path = follow_curve(line, start_of(line, 0.0, 0.0), StepSizes(-1, 1, 1e-3, 1e-6, 0.05))
     strides = [np.linalg.norm(b.place - a.place) for a, b in itertools.pairwise(path.spots)]
     np.testing.assert_allclose(strides[:3], [1e-3, 1.5e-3, 2.25e-3], rtol=1e-9)
     assert max(strides) == pytest.approx(0.05)
@@ -95,7 +95,7 @@ def test_steps_follow_the_rate_of_convergence():
 
 def test_ends_are_named():
     """Too many points, a curve that stops, a start that leaves the range at once."""
-    few = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), Steps(-2, 2, points=7))
+    few = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), StepSizes(-2, 2, points=7))
     assert (few.end, len(few.spots)) == (End.MAX_POINTS, 7)
 
     def until(place, memory, careful):
@@ -103,10 +103,10 @@ def test_ends_are_named():
             raise StoppedError(End.TOO_DEEP)
         return CIRCLE(place, memory, careful)
 
-    path = follow_curve(until, start_of(CIRCLE, 1.0, 0.0), Steps(-2, 2))
+    path = follow_curve(until, start_of(CIRCLE, 1.0, 0.0), StepSizes(-2, 2))
     assert path.end is End.TOO_DEEP
     assert path.spots[-1].place[-1] == pytest.approx(0.5, abs=1e-4)
-    outward = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), Steps(-1, 0))
+    outward = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), StepSizes(-1, 0))
     assert (outward.end, len(outward.spots)) == (End.RANGE_END, 1)
     nowhere = curve_of(lambda x, p: x**2 + 1, lambda x, p: [2 * x, 0.0])
     with pytest.raises(StoppedError):
@@ -116,7 +116,7 @@ def test_ends_are_named():
 def test_a_corner_is_passed():
     """λ = -|x| turns by a right angle; the curve is found again beyond, and the corner noted."""
     roof = curve_of(lambda x, p: p + abs(x), lambda x, p: [np.sign(x), 1.0])
-    path = follow_curve(roof, start_of(roof, -1.0, -1.0), Steps(-2, 1), FOLD)
+    path = follow_curve(roof, start_of(roof, -1.0, -1.0), StepSizes(-2, 1), FOLD)
     assert path.end is End.RANGE_END
     assert path.spots[-1].place == pytest.approx([2.0, -2.0])
     assert [name for _, name, _ in path.crossings] == [CORNER, "FOLD"]
@@ -138,7 +138,7 @@ def test_tangent_is_normal_to_the_equations():
 )
 def test_steps_are_checked(wrong, word):
     with pytest.raises(ValueError, match=word):
-        dataclasses.replace(Steps(0.0, 1.0), **wrong)
+        dataclasses.replace(StepSizes(0.0, 1.0), **wrong)
 
 
 # Orbits
@@ -147,7 +147,7 @@ SCENE = (
     "scene.load.torque_N_m=4.775",
     "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.2, backlash_mm: 0.2}",
 )
-RANGE = Steps(3740, 5000)
+RANGE = StepSizes(3740, 5000)
 START = (-0.235, -1.809)
 
 
@@ -213,7 +213,7 @@ def test_derivatives_are_those_of_finite_differences(branch, parameter):
     point = branch.at(4000.0)[0]
     config = config_at(4000.0)
     value = value_of(config, parameter)
-    orbits = Orbits(config, parameter, 1, Steps(0.9 * value, 1.0 * value + 1e-3))
+    orbits = Orbits(config, parameter, 1, StepSizes(0.9 * value, 1.0 * value + 1e-3))
     place = orbits.place(point.state, value)
     fixed = np.eye(3)[-1]
     spot = corrected(orbits, place, fixed, fixed)
@@ -235,7 +235,7 @@ def test_units_of_the_state_are_those_of_each_config(branch):
     """Where the scale of the angle changes with the parameter, states can still be started from."""
     point = branch.at(4000.0)[0]
     config = config_at(4000.0)
-    other = follow(config, "backlash_mm", point.state, 1, Steps(0.19, 0.21), ways=(-1,))
+    other = follow(config, "backlash_mm", point.state, 1, StepSizes(0.19, 0.21), ways=(-1,))
     end = other.points[-1]
     assert (end.value, other.ends) == (0.19, (End.START, End.RANGE_END))
     there = with_value(config, "backlash_mm", 0.19)
@@ -248,7 +248,9 @@ def test_period_doubling_leads_to_the_doubled_orbit(branch, monkeypatch):
     """Below 3651 rpm the orbit is unstable and one of twice the period is born; it is found on the
     other side where the first gives none."""
     lowest = min((p for p in branch.at(3900.0) if p.stable), key=lambda p: p.peak)
-    below = follow(config_at(3900.0), "speed_rpm", lowest.state, 1, Steps(3600, 4000), ways=(-1,))
+    below = follow(
+        config_at(3900.0), "speed_rpm", lowest.state, 1, StepSizes(3600, 4000), ways=(-1,)
+    )
     (doubling,) = (one for one in below.bifurcations if one.kind is Kind.PERIOD_DOUBLING)
     assert np.min(np.abs(doubling.point.multipliers + 1)) < 1e-3
     assert doubling.value == pytest.approx(3650.23, abs=0.5)
@@ -264,7 +266,7 @@ def test_period_doubling_leads_to_the_doubled_orbit(branch, monkeypatch):
         return corrected(orbits, place, *rest)
 
     monkeypatch.setattr("rootsopt.continuation.branch.corrected", one_side)
-    doubled = follow_doubled(below, doubling, Steps(3600, 4000, points=6))
+    doubled = follow_doubled(below, doubling, StepSizes(3600, 4000, points=6))
     assert asked == [1, 2, 2]
     assert np.linalg.norm(sides[1]) == pytest.approx(1)
     np.testing.assert_array_equal(sides[2], -sides[1])
@@ -283,9 +285,9 @@ def test_wrong_input_is_explained(branch):
     with pytest.raises(InputError, match=r"speed_rpm.*torque_N_m.*backlash_mm"):
         follow(config, "speed", state, 1, RANGE)
     with pytest.raises(InputError, match="must lie in the range"):
-        follow(config, "speed_rpm", state, 1, Steps(4100, 4200))
+        follow(config, "speed_rpm", state, 1, StepSizes(4100, 4200))
     with pytest.raises(InputError, match="backlash_mm"):
-        follow(config, "backlash_mm", state, 1, Steps(-0.1, 0.3))
+        follow(config, "backlash_mm", state, 1, StepSizes(-0.1, 0.3))
     with pytest.raises(InputError, match="period"):
         follow(config, "speed_rpm", state, 0, RANGE)
     bare = load("configs/ee.yaml", ["scene.timing_gear=null"])
@@ -294,14 +296,14 @@ def test_wrong_input_is_explained(branch):
         value_of(bare, "backlash_mm")
     single = load("configs/cic.yaml", ["solver.precision=float32", "solver.rtol=1e-5"])
     with pytest.raises(InputError, match="float64"):
-        follow(single, "speed_rpm", state, 1, Steps(300, 6000))
+        follow(single, "speed_rpm", state, 1, StepSizes(300, 6000))
 
 
 def test_a_design_ends_where_no_profile_can_be_made(branch):
     """The involute cannot grow longer than the roll angle allows."""
     config = config_at(4000.0)
     state = branch.at(4000.0)[0].state
-    path = follow(config, "involute_length_mm", state, 1, Steps(8.9, 9.5), ways=(1,))
+    path = follow(config, "involute_length_mm", state, 1, StepSizes(8.9, 9.5), ways=(1,))
     assert path.ends[1] is End.NO_GEOMETRY
     assert path.points[-1].value == pytest.approx(9.071, abs=2e-3)
 

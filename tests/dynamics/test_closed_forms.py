@@ -22,7 +22,7 @@ from rootsopt.contact.nodes import signed_distance
 from rootsopt.contact.search import SearchContact
 from rootsopt.contact.size import MapSize, _smallest
 from rootsopt.continuation import orbits
-from rootsopt.continuation.arclength import Steps
+from rootsopt.continuation.arclength import StepSizes
 from rootsopt.design.space import sobol
 from rootsopt.dynamics import peak, window
 from rootsopt.dynamics.flow import Flow, Integrator
@@ -39,7 +39,7 @@ from rootsopt.profiles import CIC
 from rootsopt.response import ensemble, evaluation, members, speeds
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.response.members import Members
-from rootsopt.response.speeds import Part, SpeedsEvaluator
+from rootsopt.response.speeds import AtSpeed, SpeedsEvaluator
 from rootsopt.runtime.threads import on_all_cores
 from rootsopt.scene import Scene
 from rootsopt.status import Status
@@ -439,8 +439,8 @@ def test_longest_gap_of_an_orbit_is_in_mesh_periods(monkeypatch, period):
     shot = orbits._Shot(out, np.zeros(4), np.asarray(False), touching, np.asarray(2e-3))
     subject = object.__new__(orbits.Orbits)
     subject.period, subject.unit, subject.width = period, 1e-3, 200.0
-    subject.limits = Steps(100.0, 300.0)
-    subject.model = types.SimpleNamespace(fidelity="search", pitch_radius=0.033)
+    subject.limits = StepSizes(100.0, 300.0)
+    subject.scene = types.SimpleNamespace(fidelity="search", pitch_radius=0.033)
     monkeypatch.setattr(orbits.Orbits, "_check_design", lambda self, value: None)
     monkeypatch.setattr(orbits.Orbits, "_shot", lambda self, *args, **options: shot)
     look = subject(np.array([0.4, -0.2, 0.5 * orbits.SPAN]) / orbits.SPAN, None, False)
@@ -561,7 +561,7 @@ def test_every_speed_simulated_counts_in_the_status(monkeypatch, failing):
     assert found.statistics["seconds"] == 3
     parts = [part._replace(evaluation=evaluation_of()) for part in found.parts]
     assert speeds.overall(parts)[0] is Status.PERIODIC
-    wrong = [Part(1.0, 0.0, evaluation_of(status=Status.CHAOTIC)), *parts]
+    wrong = [AtSpeed(1.0, 0.0, evaluation_of(status=Status.CHAOTIC)), *parts]
     assert speeds.overall(wrong)[0] is Status.CHAOTIC
 
 

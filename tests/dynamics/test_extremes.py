@@ -15,10 +15,10 @@ from rootsopt.contact.impact import ImpactLaw, force_rounding
 from rootsopt.dynamics.flow import Flow, Integrator, first_step
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.orbit import Orbit
-from rootsopt.dynamics.pace import Pace
 from rootsopt.dynamics.parts import TimingGear
 from rootsopt.dynamics.peak import Steps, locate_peak
 from rootsopt.dynamics.steady import _Attempts
+from rootsopt.dynamics.timescales import Timescales
 from rootsopt.dynamics.verdict import is_consistent, is_idle, judged
 from rootsopt.errors import InputError
 from rootsopt.profiles import geometry
@@ -97,18 +97,20 @@ def test_single_precision_force_is_that_of_the_law():
 # Steps from the scene
 
 
-def pace(play=1e-3, torque=5.0, inertia=2e-3, exponent=1.0, stiffness=1e7):
-    """Pace of a pair of 33 mm pitch radius, a gear of 2e4 N m/rad, and its parts."""
+def timescales(play=1e-3, torque=5.0, inertia=2e-3, exponent=1.0, stiffness=1e7):
+    """Timescales of a pair of 33 mm pitch radius, a gear of 2e4 N m/rad, and its parts."""
     law = ImpactLaw(*(jnp.asarray(x) for x in (stiffness, exponent, 0.0, 1e-5, 0.0)))
     gear = TimingGear(*(jnp.asarray(x) for x in (2e4, 0.0, play / 2, 0.0)))
     radius = 0.033
     force = jnp.asarray(torque / radius)
-    return Pace.of(law, (gear,), jnp.asarray(inertia), force, jnp.asarray(radius), jnp.asarray(0.0))
+    return Timescales.of(
+        law, (gear,), jnp.asarray(inertia), force, jnp.asarray(radius), jnp.asarray(0.0)
+    )
 
 
 def test_pace_in_closed_form():
     """A linear contact beside the gear is a spring, and the fall through the play s = a t²/2."""
-    found = pace()
+    found = timescales()
     spring = 1e7 * 0.033**2 + 2e4
     assert float(found.swing) == pytest.approx(np.sqrt(2e-3 / spring), rel=1e-12)
     assert float(found.fall) == pytest.approx(np.sqrt(2 * 1e-3 * 2e-3 / 5.0), rel=1e-12)
@@ -117,12 +119,12 @@ def test_pace_in_closed_form():
 def test_impact_after_a_fall_sets_the_pace():
     """With e = 2 the work of the load on the play, K δ³/3, goes into a deeper and stiffer
     contact; without play the static depth counts, and there is no flight."""
-    found, radius, torque = pace(play=5e-3, exponent=2.0, stiffness=1e12), 0.033, 5.0
+    found, radius, torque = timescales(play=5e-3, exponent=2.0, stiffness=1e12), 0.033, 5.0
     depth = (3 * torque * 5e-3 / 1e12) ** (1 / 3)
     assert depth > (torque / radius / 1e12) ** 0.5
     spring = 2 * 1e12 * depth * radius**2 + 2e4
     assert float(found.swing) == pytest.approx(np.sqrt(2e-3 / spring), rel=1e-12)
-    still = pace(play=0.0, exponent=2.0, stiffness=1e12)
+    still = timescales(play=0.0, exponent=2.0, stiffness=1e12)
     spring = 2 * 1e12 * (torque / radius / 1e12) ** 0.5 * radius**2 + 2e4
     assert float(still.swing) == pytest.approx(np.sqrt(2e-3 / spring), rel=1e-12)
     assert np.isinf(float(still.fall))
@@ -135,7 +137,9 @@ def test_steps_follow_the_scene(speed, stiffness):
     config = config_of(scene__speed_rpm=speed, contact__stiffness_N_per_mm_e=stiffness)
     pair = pair_of(Scene.from_config(config), design_vector(config))
     how = Integrator("tsit5", jnp.asarray(1e-8), 4096)
-    swing, fall = (float(t / pair.mesh_period) for t in (pair.pace.swing, pair.pace.fall))
+    swing, fall = (
+        float(t / pair.mesh_period) for t in (pair.timescales.swing, pair.timescales.fall)
+    )
     first = float(first_step(pair, np.dtype(float)))
     longest = float(how.controller(np.dtype(float), pair=pair).base.dtmax)
     assert first == pytest.approx(min(1e-3, swing / 20))

@@ -19,7 +19,7 @@ from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import geometry
 from rootsopt.response.attractors import Attractor, AttractorEvaluator, Basins, _averaged
 from rootsopt.response.evaluation import Evaluation, Evaluator, idle_hint, unsettled
-from rootsopt.response.speeds import Part, SpeedsEvaluation, overall
+from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation, overall
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 
@@ -191,7 +191,7 @@ def test_forces_of_any_size_have_a_finite_objective():
 def several(*responses, shares=(0.0, 1.0)):
     """An evaluation at two speeds, idle where the response is zero."""
     parts = tuple(
-        Part(1000.0 * k, share, made_up(r, Status.PERIODIC if any(r.values()) else Status.IDLE))
+        AtSpeed(1000.0 * k, share, made_up(r, Status.PERIODIC if any(r.values()) else Status.IDLE))
         for k, (share, r) in enumerate(zip(shares, responses, strict=True), 1)
     )
     status, message = overall(parts)

@@ -23,7 +23,7 @@ _OF = {
     "dynamics/linear": "steady measures",
     "dynamics/measures": "measures extremes",
     "dynamics/orbit": "closed_forms measures steady gradients extremes",
-    "dynamics/pace": "extremes dynamics",
+    "dynamics/timescales": "extremes dynamics",
     "dynamics/pair": "closed_forms drive dynamics scene steady",
     "dynamics/peak": "closed_forms extremes steady gradients",
     "dynamics/saltation": "gradients steady",

@@ -16,7 +16,7 @@ from rootsopt.response import choice, speeds
 from rootsopt.response.attractors import AttractorEvaluator
 from rootsopt.response.evaluation import Evaluator, _build, _motion
 from rootsopt.response.evaluators import evaluator_for
-from rootsopt.response.speeds import Part, SpeedsEvaluator
+from rootsopt.response.speeds import AtSpeed, SpeedsEvaluator
 from rootsopt.scene import design_vector
 from rootsopt.status import Status
 
@@ -148,7 +148,7 @@ def test_each_speed_begins_on_its_own_orbit(baseline, moved, monkeypatch):
     # Several motions at a speed, and one at another.
     states = [np.arange(6.0).reshape(3, 2), np.array([7.0, 8.0])]
     parts = [
-        Part(1.0, 1.0, dataclasses.replace(found.parts[0].evaluation, state=state))
+        AtSpeed(1.0, 1.0, dataclasses.replace(found.parts[0].evaluation, state=state))
         for state in states
     ]
     both = speeds._states(parts)

@@ -153,7 +153,7 @@ def test_energy_balance_with_all_parts():
     def slope(tau, y, _):
         state = y[:-5]
         change, contact = pair.derivative(tau, state)
-        motion, pace = pair.motion(tau, state), pair.lapse(state)
+        motion, timescales = pair.motion(tau, state), pair.lapse(state)
         other = motion.speed + motion.rate
         flanks = rubbing = 0.0
         for side, force in zip(sides, (contact.drive, contact.coast), strict=True):
@@ -162,7 +162,7 @@ def test_energy_balance_with_all_parts():
                 return pair._touch(jnp.asarray(side), pair.motion(tau, state)).depth
 
             here, growth = jax.jvp(depth, (tau, state), (jnp.ones_like(tau), change))
-            flanks += (force - undamped(here, 0.0)) * growth / (pace * pair.mesh_period)
+            flanks += (force - undamped(here, 0.0)) * growth / (timescales * pair.mesh_period)
             sliding = pair._touch(jnp.asarray(side), motion).sliding.speed
             rubbing += force * pair.friction(sliding) * sliding
         engaged = abs(motion.relative - gear.offset) > gear.half_backlash
@@ -174,7 +174,7 @@ def test_energy_balance_with_all_parts():
             -jnp.where(engaged, gear.damping * motion.rate**2, 0.0)
             - supports.damping * jnp.sum(motion.drift**2),
         ]
-        return jnp.concatenate([change, pace * pair.mesh_period * jnp.stack(powers)])
+        return jnp.concatenate([change, timescales * pair.mesh_period * jnp.stack(powers)])
 
     start = jnp.asarray([-0.6, 0.0, 0.0, 0.1, 0.0, -0.1, 0.05, 0.0, 0.0, 0.0, 0.0])
     how = Integrator("dopri8", jnp.asarray(1e-11), 20000)

@@ -11,7 +11,7 @@ from rootsopt.contact.law import ContactLaw
 from rootsopt.dynamics.parts import Part
 
 
-class Pace(eqx.Module):
+class Timescales(eqx.Module):
     """Times (s) of the quickest swing and of free flight.
 
     `swing`: in which the phase of rotor 2's swing on flank and timing gear, or that of any other
@@ -34,8 +34,8 @@ class Pace(eqx.Module):
         force: Float[Array, ""],
         radius: Float[Array, ""],
         clearance: Float[Array, ""],
-    ) -> "Pace":
-        """Pace of a pair whose flanks carry the static `force` (N) at the pitch `radius` (m).
+    ) -> "Timescales":
+        """Timescales of a pair whose flanks carry the static `force` (N) at the pitch `radius` (m).
 
         The contact is as stiff as at the static depth, or at that of an impact after a fall
         through the play if this is deeper (its energy is the work of the load).
