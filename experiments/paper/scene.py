@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from experiments._common.scenes import FORCES, shipped
 from experiments._common.simulation import evaluator_of
 from rootsopt.config import Config
-from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.orbit import Shots, close_orbit
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.response.evaluation import Evaluation, Evaluator

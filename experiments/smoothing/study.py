@@ -23,7 +23,7 @@ from experiments._common.engines import FD_STEPS
 from experiments._common.scenes import shipped
 from experiments._common.simulation import stacked
 from rootsopt.config import Config
-from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.errors import InputError
 from rootsopt.response.batch import Batch, coarse, on_all_cores, respond
 from rootsopt.runtime.programs import Program

@@ -18,7 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config, parse
 from rootsopt.continuation.arclength import End, Look, Spot, StepSizes, StoppedError, corrected
-from rootsopt.dynamics.flow import Flow, Integrator, flow
+from rootsopt.dynamics.flow import Flow, flow
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import SAMPLES
 from rootsopt.dynamics.switches import with_switches
@@ -332,7 +333,7 @@ def _unit(scene, names, values):
 
 
 @Program
-def _shoot(
+def _shoot(  # Eleven parameters: a compiled program is called with its arrays alone.
     scene: Scene,
     names: tuple[str, ...],
     values: Float[Array, " p"],

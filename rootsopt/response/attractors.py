@@ -16,7 +16,8 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
-from rootsopt.dynamics.flow import Integrator, strobe
+from rootsopt.dynamics.flow import strobe
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import BLOCK, Transient, settle, settled_within
 from rootsopt.dynamics.steady import transient_status

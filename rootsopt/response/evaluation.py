@@ -19,7 +19,7 @@ from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
 from rootsopt.dynamics.orbit import Orbit, reverse_sensitivity
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import BLOCK
-from rootsopt.dynamics.steady import Steady, steady_motion, window_status
+from rootsopt.dynamics.steady import CLOSED, Steady, steady_motion, window_status
 from rootsopt.dynamics.window import Window, lyapunov
 from rootsopt.profiles import Geometry
 from rootsopt.response.terms import terms_of, values_of
@@ -287,7 +287,7 @@ class Evaluator:
         response: dict[str, float] = {}
         gradient = self._gradient(design, found) if status is Status.PERIODIC else {}
         hint, motion, state = "", None, None
-        if status in _CLOSED:
+        if status in CLOSED:
             named = self.scene.solver.measures.named(orbit.response[:, None], period)
             response = {name: value for name, (value, _) in named.items()}
             steady = {"kind": "periodic"} | _closed(orbit, period)
@@ -307,11 +307,11 @@ class Evaluator:
                 motion = _window_series(pair, found.window) if series else None
             else:
                 hint = idle_hint(self.config, float(orbit.flow.depth))
-            if found.verdict.steady:
-                # Held by the timing gear; a pair that floats can rest anywhere.
-                steady |= _closed(orbit, period)
-                state = np.asarray(orbit.state, np.float64)
-                motion = _orbit_series(pair, orbit, period) if series else None
+                if found.verdict.steady:
+                    # Held by the timing gear; a pair that floats can rest anywhere.
+                    steady |= _closed(orbit, period)
+                    state = np.asarray(orbit.state, np.float64)
+                    motion = _orbit_series(pair, orbit, period) if series else None
         elif int(found.window.done):
             steady, response, motion = unsettled(pair, status, found.window, series)
         elif status is Status.SOLVER_FAILED and pair.timescales is not None:
@@ -372,10 +372,6 @@ class Evaluator:
         }
 
 
-_CLOSED = (Status.PERIODIC, Status.INACCURATE, Status.TOO_DEEP, Status.UNRESOLVED)
-"""Statuses of a closed orbit with contact."""
-
-
 def at_speed(scene: Scene, speed_rpm: float) -> Scene:
     """Return the `scene` at another speed."""
     speed = jnp.asarray(speed_rpm * 2 * np.pi / 60)
@@ -385,7 +381,7 @@ def at_speed(scene: Scene, speed_rpm: float) -> Scene:
 def _reached(pair: RotorPair, found: Steady) -> float:
     """Largest |ε| (rad) of the steady motion, as far as known."""
     scale = float(pair.angle_scale)
-    if Status.of(found.status) in (*_CLOSED, Status.IDLE):
+    if Status.of(found.status) in (*CLOSED, Status.IDLE):
         return scale * float(np.max(np.abs(found.orbit.flow.states[:, 0])))
     if int(found.window.done):
         return scale * float(np.max(np.abs(found.window.states[..., 0])))

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from rootsopt.config import Config
 from rootsopt.contact.impact import ImpactLaw
-from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.parts import Friction, MotorDrive, Supports, TimingGear
 from rootsopt.dynamics.steady import Solver
