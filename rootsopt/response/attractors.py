@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
+from rootsopt.config.units import MM
 from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
@@ -259,7 +260,7 @@ def _axes(config: Config, pair: RotorPair) -> tuple[NDArray[np.float64], NDArray
     closes the play, or at which the play is crossed within a mesh period.
     """
     wanted = config.attractors
-    radius = config.profile.pitch_radius_mm * 1e-3
+    radius = config.profile.pitch_radius_mm * MM
     load = max(float(pair.load.torque), 1e-3)
     depth = float(pair.law.depth_at(jnp.asarray(load / radius)))
     play = (float(pair.clearance) + _DEPTHS * depth) / radius

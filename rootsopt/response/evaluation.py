@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config
+from rootsopt.config.units import MM, RPM
 from rootsopt.contact.size import size_map
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
@@ -25,7 +26,6 @@ from rootsopt.profiles import Geometry
 from rootsopt.response.terms import terms_of, values_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_keys, design_vector
-from rootsopt.scene.families import MM
 from rootsopt.status import Status
 
 if TYPE_CHECKING:
@@ -374,7 +374,7 @@ class Evaluator:
 
 def at_speed(scene: Scene, speed_rpm: float) -> Scene:
     """Return the `scene` at another speed."""
-    speed = jnp.asarray(speed_rpm * 2 * np.pi / 60)
+    speed = jnp.asarray(speed_rpm * RPM)
     return eqx.tree_at(lambda scene: scene.speed, scene, speed)
 
 
