@@ -25,7 +25,7 @@ def by_study(data: dict[str, Any]) -> dict[str, list[Row]]:
 
 
 def is_missing(row: Row) -> bool:
-    """Tell whether a row has no periodic motion."""
+    """Return whether a row has no periodic motion."""
     return row["objective"] is None or not np.isfinite(row["objective"])
 
 

@@ -1,4 +1,4 @@
-"""Figure of the bias, the orbits closed and the errors of gradients over the smoothing length."""
+"""Figure of bias, closed orbits and errors of gradients over the smoothing length."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,7 +12,7 @@ MARKS = {"cic": "o", "ee": "s", "pump": "^"}
 
 
 def lengths(found: list[Measured]) -> Figure:
-    """Draw bias, orbits closed and gradient error over the smoothing length."""
+    """Draw bias, closed orbits and gradient error over the smoothing length."""
     made, axes = sheet(13, 4.4, 1, 3)
     (left, middle, right) = axes[0]
     for measured in found:
