@@ -57,7 +57,7 @@ def atlas(rows: list[Row]) -> Figure:
         outcomes(ax, group, [row for row in rows if solver_of(row) == group], present)
     ax = axes[len(groups)]
     deviations(ax, groups, [row for row in rows if row.get("reference") == "closed"])
-    # Put it beside the panels, in an empty one if there is one.
+    # Put the legend into an empty panel, if there is one.
     handles, labels = ax.get_legend_handles_labels()
     for free in axes[len(groups) + 1 : len(groups) + 2]:
         free.legend(handles, labels, fontsize=8, loc="center left", frameon=False)

@@ -21,7 +21,7 @@ def body(run: Run) -> int:
     from experiments.smoothing import figures, study
 
     def keep(found: "list[Measured]") -> None:
-        # Save before the last kind, which compiles for long.
+        # Save after each kind: the last one compiles for long.
         run.csv("smoothing.csv", [row for one in found for row in study.rows_of(one)])
         run.json("smoothing.json", {one.kind: study.summary(one) for one in found})
         run.figure("smoothing.png", figures.lengths(found))
