@@ -32,7 +32,7 @@ def errors(rows: list[Row]) -> Figure:
     ax.margins(y=0.15)
     ax.set_yticks(range(len(families)), [family.replace("_", " ") for family in families])
     ax.invert_yaxis()
-    ax.set_xlabel("greatest relative error")
+    ax.set_xlabel("largest relative error")
     ax.set_title(f"{sum(row['sound'] for row in rows)} designs against polygons of their outlines")
     grid_below(ax)
     figure.legend(loc="outside lower center", ncols=len(SERIES), frameon=False)

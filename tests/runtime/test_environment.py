@@ -1,4 +1,4 @@
-"""Environment variables and machines: what is set aside, what is refused, what works."""
+"""Environment variables and machines: what is ignored, what is refused, what works."""
 
 import json
 import os
