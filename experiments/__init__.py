@@ -2,6 +2,6 @@
 
 import os
 
-# Equinox reads this once, when it is first imported;
-# `rootsopt.commands.cli` says why they are off.
+# Turn Equinox's checks off; `rootsopt.commands.cli` says why. Equinox reads this variable once,
+# when it is first imported.
 os.environ.setdefault("EQX_ON_ERROR", "off")

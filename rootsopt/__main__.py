@@ -1,4 +1,4 @@
-"""`python -m rootsopt COMMAND ...`: all commands by their names."""
+"""`python -m rootsopt COMMAND ...`: run a command by its name."""
 
 from rootsopt.commands.console import console
 

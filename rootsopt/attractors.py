@@ -1,4 +1,4 @@
-"""`python -m rootsopt.attractors CONFIG`: the motions that coexist in one scene."""
+"""`python -m rootsopt.attractors CONFIG`: find the coexisting motions of one scene."""
 
 from rootsopt.commands.attractors import main
 from rootsopt.commands.door import leave

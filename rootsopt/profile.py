@@ -1,4 +1,4 @@
-"""`python -m rootsopt.profile CONFIG`: geometry of one design."""
+"""`python -m rootsopt.profile CONFIG`: compute the geometry of one design."""
 
 from rootsopt.commands.door import leave
 from rootsopt.commands.profile import main

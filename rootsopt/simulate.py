@@ -1,4 +1,4 @@
-"""`python -m rootsopt.simulate CONFIG`: one design, one scene."""
+"""`python -m rootsopt.simulate CONFIG`: simulate one design in one scene."""
 
 from rootsopt.commands.door import leave
 from rootsopt.commands.simulate import main

@@ -1,4 +1,4 @@
-"""`python -m rootsopt.sweep CONFIG`: one design at many speeds."""
+"""`python -m rootsopt.sweep CONFIG`: simulate one design at many speeds."""
 
 from rootsopt.commands.door import leave
 from rootsopt.commands.sweep import main

@@ -1,1 +1,1 @@
-"""What studies share: the command line, scenes, calls into rootsopt, tables, style, timing."""
+"""Code shared by studies: the command line, scenes, calls into rootsopt, tables, style, timing."""

@@ -1,10 +1,10 @@
 """The command line of a study: common options, precision, result folder, exit code.
 
-Exit 0: success. 2: bad input, one message on stderr. 3: there is no result, or the results break
-what the study promises.
+Exit code 0: success. 2: bad input, one message on stderr. 3: no result, or the results break a
+promise that the study checks.
 
-Loads neither JAX nor a study, so that `--help` answers at once. A study is imported inside the body
-of its `__main__.py`, after double precision has been chosen.
+This module imports neither JAX nor a study, so `--help` answers at once. A study is imported inside
+the body of its `__main__.py`, after double precision has been chosen.
 """
 
 import argparse
@@ -27,20 +27,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RESULTS = Path("results/experiments")
-"""Folder of the result folders, from the repository root."""
+"""Folder of the result folders, relative to the repository root."""
 DOCS = Path("docs")
-"""Folder of the published figures, from the repository root."""
+"""Folder of the published figures, relative to the repository root."""
 
 
 class NoResultError(Exception):
-    """A study cannot go on: the message says why, and the exit code is 3."""
+    """A study cannot continue: the message says why, and the exit code is 3."""
 
 
 def start_process(cache: bool = False, gpu: bool = False) -> None:
     """Choose double precision for this process, before it computes anything.
 
-    `cache`: keep compiled programs between processes. `gpu`: let JAX use a GPU, too. Raises
-    `InputError` where the environment does not let JAX start.
+    `cache`: keep compiled programs between processes. `gpu`: also let JAX use a GPU. Raises
+    `InputError` where the environment prevents JAX from starting.
     """
     use_float64()
     if cache:
@@ -55,7 +55,7 @@ def start_process(cache: bool = False, gpu: bool = False) -> None:
 class Run:
     """One run of a study: its options, its result folder, and its published figures.
 
-    `published` maps a figure's name in the result folder to its name in `docs/`; `began` is the
+    `published` maps a figure's name in the result folder to its name in `docs/`. `began` is the
     clock (s) at the start.
     """
 
@@ -66,12 +66,12 @@ class Run:
 
     @property
     def quick(self) -> bool:
-        """Whether this is the reduced run."""
+        """Return whether this is the reduced run."""
         return self.options.quick
 
     @property
     def seconds(self) -> float:
-        """Seconds since the start."""
+        """Return the seconds since the start."""
         return time.perf_counter() - self.began
 
     def say(self, text: str) -> None:
@@ -81,22 +81,22 @@ class Run:
     def csv(
         self, name: str, rows: Sequence[Mapping[str, Any]], keys: Iterable[str] | None = None
     ) -> None:
-        """Write rows as a CSV file; `keys` orders the columns (default: as first met)."""
+        """Write rows as a CSV file; `keys` orders the columns (default: order of appearance)."""
         self.folder.write_csv(name, row_columns(rows, keys))
 
     def json(self, name: str, data: Mapping[str, Any]) -> None:
-        """Write a record as JSON, with the versions it was made with."""
+        """Write a record as JSON, with the versions of the libraries used."""
         self.folder.write_json(name, {**data, "versions": versions()})
 
     def figure(self, name: str, figure: "Figure") -> None:
-        """Write a figure, with `--docs` also the published one."""
+        """Write a figure; with `--docs` also write the published one."""
         self.folder.write_figure(name, figure)
         if self.options.docs and name in self.published:
             ResultFolder(DOCS).write_figure(self.published[name], figure)
 
 
 Body = Callable[[Run], int]
-"""What a study does with a run: compute, write, print. Returns the exit code."""
+"""Body of a study for a run: compute, write, print. Returns the exit code."""
 
 
 def drive(
@@ -112,15 +112,15 @@ def drive(
 ) -> int:
     """Parse the arguments, choose double precision, run a study's body; return the exit code.
 
-    `purpose` is the text of `--help`, `quick` says what `--quick` leaves out, `published` is as in
-    `Run`, and `add_options` adds the study's own options. Without `precision` JAX is left alone:
-    the study starts it in processes of its own. `cache` is as in `start_process`.
+    `purpose` is the text of `--help`. `quick` says what `--quick` omits. `published` is as in
+    `Run`, and `cache` as in `start_process`. `add_options` adds the study's own options. Without
+    `precision` JAX is not touched: the study starts it in its own processes.
     """
     parser = _parser(name, purpose, quick, bool(published))
     add_options(parser)
     options = parser.parse_args()
     if options.quick and options.docs:
-        parser.error("--docs publishes figures, and must not be given with --quick; drop one")
+        parser.error("--docs publishes figures and cannot be combined with --quick; remove one")
     environment.own_process()
     began = time.perf_counter()
     try:
@@ -136,12 +136,12 @@ def drive(
 
 
 def verdict(kept: bool) -> int:
-    """Exit code of a study whose promises are kept, or not."""
+    """Return the exit code of a study whose promises are kept, or not."""
     return OK if kept else NO_RESULT
 
 
 def _parser(name: str, purpose: str | None, quick: str, publishes: bool) -> argparse.ArgumentParser:
-    """Common options of all studies."""
+    """Make a parser with the common options of all studies."""
     parser = argparse.ArgumentParser(
         prog=f"python -m experiments.{name}",
         description=purpose,

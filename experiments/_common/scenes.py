@@ -3,7 +3,7 @@
 from rootsopt.config import Config, load
 
 CIC = "configs/cic.yaml"
-"""The shipped CIC pair, from the repository root."""
+"""The shipped CIC pair, relative to the repository root."""
 FORCES = ("mean_force_N", "peak_force_N")
 """Names of the forces that most studies compare."""
 

@@ -1,4 +1,4 @@
-"""The calls into rootsopt's evaluators and models that several studies make."""
+"""Calls into rootsopt's evaluators and models that several studies make."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.scene import Scene, design_vector
 
 pair_of_model = eqx.filter_jit(Scene.pair)
-"""The rotor pair of a model and a design, compiled."""
+"""Compiled function that returns the rotor pair of a model and a design."""
 
 
 def evaluator_of(config: Config, give_up_early: bool = False) -> Evaluator:
@@ -28,27 +28,29 @@ def evaluator_of(config: Config, give_up_early: bool = False) -> Evaluator:
 
 
 def evaluate(config: Config) -> Evaluation:
-    """Simulate the design of a config from rest; no time series."""
+    """Simulate the design of a config from rest, without time series."""
     return evaluator_of(config)(series=False)
 
 
 def at(evaluator: Evaluator, rtol: float, transient: float | None = None) -> Evaluator:
-    """Return another evaluator, with these tolerances of orbit and transient (default: the same);
-    nothing is compiled anew."""
+    """Return an evaluator with other tolerances of orbit and transient (default: the same).
+
+    Nothing is compiled again.
+    """
     coarse = jnp.asarray(rtol if transient is None else transient)
     scene = eqx.tree_at(lambda scene: scene.solver.transient.rtol, evaluator.scene, coarse)
     return dataclasses.replace(evaluator, scene=scene).at_tolerance(rtol)
 
 
 def profile_of(config: Config, design: ArrayLike | None = None) -> Profile:
-    """Profile of a design (d,) in config units; by default that of the config."""
+    """Return the profile of a design (d,) in config units; default: the config's design."""
     chosen = design_vector(config) if design is None else jnp.asarray(design)
     return Scene.from_config(config).profile(chosen)
 
 
 def stacked(configs: Sequence[Config], precision: str) -> Scene:
-    """Models of scenes with one kind of pair, at one precision, their numbers stacked along a
-    leading axis (n,)."""
+    """Return the models of scenes with one kind of pair, at one precision; their numbers are
+    stacked along a leading axis (n,)."""
     models = [
         jax.tree.map(
             np.asarray, dataclasses.replace(Scene.from_config(config), precision=precision)
@@ -59,8 +61,8 @@ def stacked(configs: Sequence[Config], precision: str) -> Scene:
 
 
 def objective(evaluation: Evaluation, reference: dict[str, float]) -> float:
-    """Mean of mean and peak force, each relative to the reference's; NaN without a periodic
-    motion."""
+    """Return the average of mean and peak force, each relative to the reference's; NaN without a
+    periodic motion."""
     if not evaluation.usable:
         return float("nan")
     return float(np.mean([evaluation.response[key] / reference[key] for key in FORCES]))

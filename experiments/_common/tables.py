@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 _WIDTH = 250
-"""Characters of a line; wider than a terminal, so that nothing is cut in a file."""
+"""Width of a line (characters); wider than a terminal, so that a file holds everything."""
 
 
 def show(
@@ -16,7 +16,7 @@ def show(
 ) -> None:
     """Print rows under a title; `columns` chooses and orders (default: those of the first row).
 
-    Columns of text stand left, all others right.
+    Text columns are left-aligned, all others right-aligned.
     """
     keys = list(rows[0]) if columns is None else list(columns)
     table = Table(title=title)
@@ -29,7 +29,7 @@ def show(
 
 
 def print_record(record: Mapping[str, Any]) -> None:
-    """Print a line for each entry of a record."""
+    """Print one line per entry of a record."""
     for key, value in record.items():
         print(f"{key}: {value}")
 

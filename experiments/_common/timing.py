@@ -19,7 +19,7 @@ def ready(result: Any) -> Any:
 
 
 def times_of(call: Callable[[], Any], repeats: int, at_most: float = math.inf) -> list[float]:
-    """Seconds of each of `repeats` calls; no further call after `at_most` seconds in all."""
+    """Return the seconds of each of `repeats` calls; stop after `at_most` seconds in all."""
     times: list[float] = []
     while not times or (len(times) < repeats and sum(times) < at_most):
         began = time.perf_counter()
@@ -31,7 +31,7 @@ def times_of(call: Callable[[], Any], repeats: int, at_most: float = math.inf) -
 def median_time(
     call: Callable[[], Any], repeats: int, at_most: float = math.inf
 ) -> tuple[float, Any]:
-    """Median seconds of a call and its last result; stops repeating after `at_most` seconds."""
+    """Return the median seconds of a call and its last result; stop after `at_most` seconds."""
     results = []
 
     def keep() -> None:
@@ -43,12 +43,13 @@ def median_time(
 def first_and_warm(
     call: Callable[[], Any], repeats: int, at_most: float = math.inf
 ) -> tuple[float, float, Any]:
-    """Seconds of compilation (first call less a warm one) and of a warm call, and the result."""
+    """Return the seconds of compilation (first call minus a warm one), of a warm call, and the
+    result."""
     first, _ = median_time(call, 1)
     warm, result = median_time(call, repeats, at_most)
     return max(first - warm, 0.0), warm, result
 
 
 def peak_memory() -> float:
-    """Greatest resident memory (MB) of this process so far."""
+    """Return the largest resident memory (MB) of this process so far."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 * MB

@@ -1,7 +1,7 @@
-"""Does `solver.fidelity: auto` keep within the error asked for?
+"""Does `solver.fidelity: auto` keep within the requested error?
 
-Writes auto.csv (a row for each scene), auto.json and auto.png. The exit status is 3 if a request
-was missed.
+Writes auto.csv (a row per scene), auto.json and auto.png. The exit code is 3 if a request was
+missed.
 """
 
 import argparse
@@ -29,7 +29,7 @@ def body(run: Run) -> int:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the size and the seed of the draw."""
     parser.add_argument("--count", type=int, default=50, help="periodic scenes (default: 50)")
-    parser.add_argument("--seed", type=int, default=0, help="of the draw (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the draw (default: 0)")
 
 
 def main() -> int:

@@ -1,4 +1,4 @@
-"""Figure of the true errors of what `auto` chooses."""
+"""Figure of the true errors of the settings that `auto` chooses."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,7 +10,7 @@ MARKS = {"linear": ("o", BLUE), "search": ("s", VERMILION), "map": ("^", GREEN)}
 
 
 def errors(rows: list[Row]) -> Figure:
-    """Draw the true error over the error asked for; all points belong below the line."""
+    """Draw the true error over the requested error; all points should be below the line."""
     figure, axes = sheet(6.4, 4.8)
     ax = axes[0, 0]
     spread = np.random.default_rng(0)
@@ -25,9 +25,9 @@ def errors(rows: list[Row]) -> Figure:
                 mark, color=colour, mfc="none", label=f"{fidelity} chosen ({len(chosen)})",
             )  # fmt: skip
     line = np.array([3e-5, 3e-2])
-    ax.loglog(line, line, "k-", lw=1, label="error asked for")
-    ax.set_xlabel("relative error asked for (points spread for legibility)")
-    ax.set_ylabel("true error of mean and peak force, the larger")
+    ax.loglog(line, line, "k-", lw=1, label="requested error")
+    ax.set_xlabel("requested relative error (points spread for legibility)")
+    ax.set_ylabel("true error of mean or peak force, the larger")
     ax.set_title(f"{len(rows)} random designs and scenes", fontsize=11)
     ax.legend(fontsize=8)
     ax.grid(alpha=0.3)

@@ -1,9 +1,9 @@
-"""Measures the true error of what `solver.fidelity: auto` chooses, on random designs and scenes.
+"""Measures the true error of the settings that `auto` chooses, on random designs and scenes.
 
-Draws profiles (CIC of random pressure angle, involute and tip land, EE; two to four lobes) and
-scenes (speed, load, backlash, damping). `auto` chooses for a relative error of 1 %, 0.1 % or
-0.01 % in turn. The true error of mean and peak force is taken against contact by search with Dopri8
-at 1e-10. Scenes without a periodic orbit are listed, and others drawn in their place.
+Profiles are CIC of random pressure angle, involute and tip land, and EE, with two to four lobes.
+Scenes vary speed, load, backlash and damping. `auto` chooses for a relative error of 1 %, 0.1 % or
+0.01 % in turn. The true error of mean and peak force is measured against contact by search with
+dopri8 at 1e-10. Scenes without a periodic orbit are listed, and others drawn in their place.
 """
 
 import time
@@ -24,11 +24,11 @@ REQUESTS = (1e-2, 1e-3, 1e-4)
 SHARP = ("solver.fidelity=search", "solver.method=dopri8", "solver.rtol=1e-10")
 FIDELITIES = ("linear", "search", "map")
 QUICK_COUNT = 1
-"""Scenes of a reduced run."""
+"""Number of scenes of a reduced run."""
 
 
 def scenes(seed: int) -> Iterator[tuple[str, list[str]]]:
-    """Yield endless pairs of a shipped config's name and random overrides."""
+    """Yield pairs of a shipped config's name and random overrides, without end."""
     draw = np.random.default_rng(seed)
     while True:
         family = "ee" if draw.uniform() < 0.25 else "cic"
@@ -53,7 +53,7 @@ def scenes(seed: int) -> Iterator[tuple[str, list[str]]]:
 
 
 def measure(config: Config, overrides: list[str], family: str, wanted: float) -> Row:
-    """Measure one scene: what was asked for, chosen and estimated, and the true error."""
+    """Measure one scene: requested, chosen and estimated accuracy, and the true error."""
     truth = evaluate(shipped(family, *overrides, *SHARP))
     row: Row = {"family": family, "scene": " ".join(overrides), "requested": wanted}
     row |= {"fidelity": "", "rtol": np.nan, "estimated": np.nan, "error": np.nan}
@@ -77,7 +77,7 @@ def measure(config: Config, overrides: list[str], family: str, wanted: float) ->
 def run(
     quick: bool, count: int = 50, seed: int = 0, say: Callable[[str], None] = lambda text: None
 ) -> list[Row]:
-    """Measure random scenes until `count` of them are periodic; a row for each scene tried."""
+    """Measure random scenes until `count` of them are periodic; return a row per scene tried."""
     count = QUICK_COUNT if quick else count
     rows: list[Row] = []
     periodic = 0
@@ -93,7 +93,7 @@ def run(
         periodic += row["fidelity"] != ""
         say(
             f"{periodic}/{count} {family} {row['status']} {row['fidelity']}"
-            f" asked {wanted:g} estimated {row['estimated']:.1e} true {row['error']:.1e}"
+            f" requested {wanted:g} estimated {row['estimated']:.1e} true {row['error']:.1e}"
         )
         if periodic >= count:
             break
@@ -101,12 +101,12 @@ def run(
 
 
 def judged(rows: list[Row]) -> list[Row]:
-    """Return the rows of scenes that are periodic, for which `auto` has chosen."""
+    """Return the rows of periodic scenes, for which `auto` has chosen."""
     return [row for row in rows if row["fidelity"]]
 
 
 def summary(rows: list[Row]) -> dict[str, Any]:
-    """Count the requests kept and the settings chosen."""
+    """Count the fulfilled requests and the chosen settings."""
     known = judged(rows)
     return {
         "judged": len(known),

@@ -1,4 +1,4 @@
-"""How fast is rootsopt beside SciPy and Numba, and what memory does it take?
+"""How fast is rootsopt compared with SciPy and Numba, and how much memory does it need?
 
 Writes benchmark.csv, benchmark.json and benchmark.png, and ends with the table of targets.
 """
@@ -34,7 +34,7 @@ COLUMNS = (
 
 
 def body(run: Run) -> int:
-    """Run all parts, write, print the tables; or run one part for its process."""
+    """Run all parts, write, print the tables; or run one part in its process."""
     from experiments.benchmark import study
 
     options = run.options
@@ -48,13 +48,13 @@ def body(run: Run) -> int:
 
 
 def report(run: Run, parts: "Parts") -> None:
-    """Write and print what all parts have found."""
+    """Write and print the findings of all parts."""
     from experiments._common.tables import show
     from experiments.benchmark import figures
     from experiments.benchmark.targets import targets
 
     goals = targets(parts.rows)
-    # Columns in their usual order; what only some rows have comes last.
+    # Columns in their usual order; those that only some rows have come last.
     keys = dict.fromkeys([*COLUMNS, *(key for one in parts.rows for key in one)])
     run.csv("benchmark.csv", parts.rows, keys)
     run.json(
@@ -77,7 +77,7 @@ def report(run: Run, parts: "Parts") -> None:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the GPU, and what the study says to the processes of its parts."""
+    """Add the GPU option, and the options that the study passes to the processes of its parts."""
     parser.add_argument("--gpu", action="store_true", help="large batches on a GPU as well")
     inner = parser.add_argument_group("used by the study itself, for one part's process")
     inner.add_argument("--part", metavar="NAME")

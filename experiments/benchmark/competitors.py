@@ -24,7 +24,7 @@ from rootsopt.config import load
 def tuned(
     make: Callable[..., Simulator], settings: Sequence[dict[str, Any]], truth: Any
 ) -> tuple[dict[str, Any], Simulator]:
-    """Choose the fastest of `settings` that is good enough at the baseline, or else the best."""
+    """Choose the fastest of `settings` that is accurate enough at the baseline, or the best."""
     tried = []
     for one in settings:
         tool = make(**one)
@@ -82,7 +82,7 @@ def part_scipy(job: Job) -> dict[str, Any]:
 def part_numba(job: Job) -> dict[str, Any]:
     """Measure (b): search and map, with few and with four periods to settle.
 
-    Measures the setting whose gradient is good to 1e-3, too.
+    Also measures the setting with a gradient accurate to 1e-3.
     """
     from experiments._common.engines import motion_of, rotor_of
     from experiments._common.engines import numba_pair as numba

@@ -1,4 +1,4 @@
-"""One design and batches of designs, by rootsopt."""
+"""One design and batches of designs, computed by rootsopt."""
 
 import dataclasses
 import functools
@@ -30,17 +30,17 @@ from rootsopt.config import load
 
 REFERENCE_RTOL = 1e-11
 REFERENCE_STEPS = tuple(step / 5 for step in FD_STEPS)
-"""Steps (deg, mm, deg) of the reference's central differences: truncation some 1e-5."""
+"""Steps (deg, mm, deg) of the reference's central differences; their truncation error is 1e-5."""
 CHECKED = 8
-"""Designs of a batch whose reference is computed."""
+"""Number of designs of a batch with a reference."""
 TOLERANCES = ((1e-4, 1e-4), (1e-5, 1e-5), (1e-6, 1e-6), (1e-5, 1e-6), (1e-7, 1e-7))
 """Tolerances of orbit and transient."""
 
 
 def part_reference(job: Job) -> dict[str, Any]:
-    """Compute the reference by the tightest settings, at the baseline and the checked designs.
+    """Compute the reference at the tightest settings, at the baseline and the checked designs.
 
-    Gradients are central differences of its forces, independent of how rootsopt differentiates.
+    Gradients are central differences of its forces, so they do not use rootsopt's differentiation.
     """
     start_process()
     from experiments._common.simulation import at, evaluator_of
@@ -79,9 +79,9 @@ def part_reference(job: Job) -> dict[str, Any]:
 
 
 def part_single(job: Job) -> dict[str, Any]:
-    """Time one design through `Evaluator`, at the cheapest good setting and at the default one.
+    """Time one design through `Evaluator`, at the cheapest sufficient setting and at the default.
 
-    Times the traceable `respond`, too, with and without gradient.
+    Also times the traceable `respond`, with and without gradient.
     """
     start_process()
     import equinox as eqx
@@ -152,13 +152,13 @@ def part_single(job: Job) -> dict[str, Any]:
                 note="batch.respond: settlement checked, orbit closed, no second attempts",
             )
         )
-    # A little deeper, for designs that dip deeper than the baseline.
+    # A little deeper, for designs with deeper contact than the baseline.
     deepest = {name: 1.1 * float(tool.scene.deepest) for name, tool in tools.items()}
     return {"rows": rows, "tried": tried, "choice": choice, "deepest": deepest}
 
 
 class _Batch:
-    """Designs around the baseline, each simulated from rest, and the truth of the checked ones."""
+    """Designs around the baseline, each simulated from rest, and references of the checked ones."""
 
     def __init__(self, job: Job):
         import jax.numpy as jnp
@@ -190,9 +190,9 @@ class _Batch:
         return ready(respond_many(scene, self.designs, self.states, solver, gradient))
 
     def errors(self, out: Any) -> tuple[int, float, list[float]]:
-        """Count usable designs, and compare the checked ones with the truth.
+        """Count usable designs, and compare the checked ones with the reference.
 
-        Returns the count, the greatest error of the forces, and that of each gradient.
+        Returns the count, the largest error of the forces, and that of each gradient.
         """
         usable = np.asarray(out.usable)[: self.checked]
         forces = np.asarray(out.response)[: self.checked, :2][usable]
@@ -202,9 +202,9 @@ class _Batch:
         return int(out.usable.sum()), off, [gradient_error(*pair) for pair in pairs]
 
     def choose(self) -> tuple[str, float, float]:
-        """Choose the cheapest contact and tolerances with which all designs are good enough.
+        """Choose the cheapest contact and tolerances at which all designs are accurate enough.
 
-        Where there are none, the finest are chosen.
+        If there are none, choose the finest.
         """
         job = self.job
         contacts = job.contacts[job.contacts.index(job.known["choice"][0]) :]
@@ -226,7 +226,7 @@ class _Batch:
         return contacts[-1], *TOLERANCES[-1]
 
     def timed(self, setting: tuple[str, float, float], gradient: bool) -> Row:
-        """Time the batch with a setting; the first call is that of compilation."""
+        """Time the batch with a setting; the first call includes compilation."""
         from rootsopt.runtime.timing import CompileClock
 
         job, (contact, rtol, coarse) = self.job, setting
@@ -241,11 +241,11 @@ class _Batch:
             "value+gradient" if gradient else "value",
             seconds,
             designs=job.size,
-            # Compiled before, where this batch was the one to choose.
+            # None if it was compiled before, when this batch chose the setting.
             compile_s=clock.seconds if not (self.tried and gradient) else None,
             value_error=off,
-            # Where the peak falls on a corner of the force a gradient may fail: the typical
-            # design counts, and the note tells the worst.
+            # Where the peak falls on a corner of the force, a gradient may fail. The median design
+            # counts, and the note gives the worst.
             gradient_error=float(np.median(by)) if by else None,
             settings=f"{contact}, rtol {rtol:g}, transient {coarse:g}",
             note=f"{usable} of {job.size} periodic"
@@ -257,7 +257,7 @@ class _Batch:
 def part_batch(job: Job) -> dict[str, Any]:
     """Time designs around the baseline through `respond_many`, each from rest.
 
-    The first batch looks for the cheapest setting that is good enough; later ones keep to it.
+    The first batch searches for the cheapest sufficient setting; later ones use it.
     """
     start_process(gpu=job.part == "gpu")
     import jax

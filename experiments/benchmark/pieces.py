@@ -1,4 +1,4 @@
-"""What one evaluation is made of, by rootsopt: gap table, orbit, integration, reverse mode."""
+"""Times of the pieces of one evaluation: gap table, orbit, integration, reverse mode."""
 
 import dataclasses
 import functools
@@ -25,9 +25,9 @@ from rootsopt.config import load
 
 REVOLUTIONS = (1, 4, 15, 55, 200)
 MESH_PERIODS = 3
-"""Mesh periods in a revolution, for three lobes."""
+"""Mesh periods per revolution, for three lobes."""
 ORBIT_ACCURACY = 1e-6
-"""Relative error of mean and peak force to which orbit and transient are compared."""
+"""Relative error of mean and peak force at which orbit and transient are compared."""
 ORBIT_TOLERANCES = (1e-6, 1e-7, 1e-8, 1e-9)
 ORBIT_SETTLES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 ORBIT_SCENES = {
@@ -65,10 +65,10 @@ def part_table(job: Job) -> dict[str, Any]:
 
 
 def part_orbit(job: Job) -> dict[str, Any]:
-    """Time value and gradient on the orbit, beside averaging after the transient.
+    """Time value and gradient on the orbit, and by averaging after the transient.
 
-    The orbit starts from that of a neighbouring design. Both are right to `ORBIT_ACCURACY`, on one
-    processor core.
+    The orbit starts from that of a neighbouring design. Both are accurate to `ORBIT_ACCURACY`, on
+    one processor core.
     """
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
@@ -122,7 +122,7 @@ def part_orbit(job: Job) -> dict[str, Any]:
 
 
 def part_revolutions(job: Job) -> dict[str, Any]:
-    """Time plain integration from rest over more and more revolutions."""
+    """Time plain integration from rest over an increasing number of revolutions."""
     start_process()
     import equinox as eqx
     import jax.numpy as jnp

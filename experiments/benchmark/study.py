@@ -1,14 +1,18 @@
-"""Measures speed and memory beside two competitors, in one run on one machine.
+"""Measures speed and memory of rootsopt and two competitors, in one run on one machine.
 
-The shipped CIC scene, every tool at the cheapest setting that gives mean and peak force to 1e-3:
-(a) SciPy with node-to-segment contact, (b) the pair compiled by Numba, both with central
-differences, (c) rootsopt, one design and batches; (d) gap table and its Jacobian, (e) cost over
-revolutions and batch size, memory of a long reverse-mode gradient, (f) the main job from a cold
-process, without compiled programs and with them, (g) large batches on a GPU.
+The scene is the shipped CIC scene. Every tool runs at its cheapest setting with mean and peak force
+accurate to 1e-3:
+(a) SciPy with node-to-segment contact and central differences;
+(b) the pair compiled by Numba, with central differences;
+(c) rootsopt, one design and batches;
+(d) gap table and its Jacobian;
+(e) cost over revolutions and batch size, and memory of a long reverse-mode gradient;
+(f) the main job from a cold process, without and with cached programs;
+(g) large batches on a GPU.
 
-Each part runs in a process of its own (`--part NAME`, which writes JSON), so that its peak memory
-is its own; no module here loads JAX before a part needs it. Build, compile and run are timed apart,
-and the error reached stands beside the time.
+Each part runs in its own process (`--part NAME`, which writes JSON), so that its peak memory is its
+own. No module here loads JAX before a part needs it. Build, compile and run are timed separately,
+and the error reached is listed next to the time.
 """
 
 import json
@@ -38,9 +42,9 @@ Say = Callable[[str], None]
 SIZES = (16, 256, 1024)
 GPU_SIZES = (256, 4096, 16384, 65536)
 MODULE = "experiments.benchmark"
-"""What a part's process runs."""
+"""Module that a part's process runs."""
 RESULT = "part.json"
-"""File of a part's findings, in the result folder of its process."""
+"""File with a part's findings, in the result folder of its process."""
 
 PARTS: dict[str, Callable[[Job], dict[str, Any]]] = {
     "reference": part_reference,
@@ -64,13 +68,13 @@ def timed_child(
     with open(log, "wb") as sink:
         child = subprocess.Popen(command, env=environment, stdout=sink, stderr=sink)
         _, status, usage = os.wait4(child.pid, 0)
-    # wait4 has reaped it behind Popen's back.
+    # wait4 has collected the exit status, which Popen does not know.
     child.returncode = os.waitstatus_to_exitcode(status)
     return time.perf_counter() - began, usage.ru_maxrss * 1024 * MB, child.returncode
 
 
 class Parts:
-    """Runs the parts one after the other and gathers their rows and findings."""
+    """Runs the parts one after the other and collects their rows and findings."""
 
     def __init__(self, quick: bool, scratch: Path, say: Say):
         self.quick, self.scratch, self.say = quick, scratch, say
@@ -79,7 +83,7 @@ class Parts:
         self.failed: dict[str, str] = {}
 
     def part(self, name: str, size: int = 0) -> bool:
-        """Run a part in its own process; tell whether it gave a result."""
+        """Run a part in its own process; return whether it gave a result."""
         said = name + (f" {size}" if size else "")
         state, log, folder = (self.scratch / one for one in ("known.json", "log.txt", "part"))
         out = folder / RESULT
@@ -101,10 +105,10 @@ class Parts:
         return True
 
     def batches(self, name: str, sizes: Sequence[int]) -> None:
-        """Run batches from small to large, as long as they can be expected to end in time."""
+        """Run batches from small to large, while they are expected to end in time."""
         for size in sizes:
             before = [r for r in self.rows if r["part"].startswith(f"{name} ")]
-            # Each is run at least twice.
+            # Each batch is run at least twice.
             expected = sum(2e-3 * r["per_design_ms"] * size for r in before[-2:])
             if expected > BATCH_SECONDS:
                 self.failed[f"{name} {size}"] = f"not run: {expected:.0f} s expected"
@@ -113,7 +117,7 @@ class Parts:
                 break
 
     def main_job(self) -> None:
-        """Run the main job from a cold process: no cache, an empty one, a filled one."""
+        """Run the main job from a cold process: without cache, with an empty and a filled one."""
         job, options = "rootsopt.optimize", []
         cases = ["cold", "filling the cache", "cached"]
         if self.quick:
@@ -132,9 +136,9 @@ class Parts:
 
 
 def run(quick: bool, gpu: bool = False, say: Say = lambda text: None) -> Parts:
-    """Run all parts; raises `NoResultError` where there is no reference.
+    """Run all parts. Raises `NoResultError` where there is no reference.
 
-    A reduced run takes coarse contact and small sizes, and leaves out the longest parts.
+    A reduced run uses coarse contact and small sizes, and omits the longest parts.
     """
     with tempfile.TemporaryDirectory() as scratch:
         parts = Parts(quick, Path(scratch), say)
@@ -148,7 +152,7 @@ def run(quick: bool, gpu: bool = False, say: Say = lambda text: None) -> Parts:
             parts.part(name)
         for name in ("orbit", "reverse"):
             if quick:
-                parts.failed[name] = "left out of a reduced run"
+                parts.failed[name] = "omitted in a reduced run"
             else:
                 parts.part(name)
         parts.main_job()
@@ -158,5 +162,5 @@ def run(quick: bool, gpu: bool = False, say: Say = lambda text: None) -> Parts:
 
 
 def run_part(name: str, quick: bool, size: int, known: dict[str, Any]) -> dict[str, Any]:
-    """Run one part in this process; return its findings, its rows under `rows`."""
+    """Run one part in this process; return its findings, with its rows under `rows`."""
     return PARTS[name](Job(name, quick, size, known))

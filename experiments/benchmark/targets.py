@@ -1,4 +1,4 @@
-"""Targets of the benchmark, and the figures of a finished run that they are held against."""
+"""Targets of the benchmark, and the figures of a finished run to compare with them."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from experiments.benchmark.job import ACCURACY, GRADIENT_ACCURACY, Row
 
 
 def exponent(points: Sequence[tuple[float, float]]) -> float | None:
-    """Fit the slope of log time over log size; None for fewer than two points."""
+    """Fit the slope of log time over log size; `None` for fewer than two points."""
     if len(points) < 2:
         return None
     x, y = np.log(np.array(points)).T
@@ -23,7 +23,7 @@ class Lookup:
     rows: list[Row]
 
     def best(self, tool: str, what: str) -> Row | None:
-        """Find the fastest row, good enough, of the tools whose names start with `tool`."""
+        """Find the fastest sufficient row of the tools whose names start with `tool`."""
         rows = [r for r in self.rows if r["tool"].startswith(tool) and r["what"] == what]
         fine = [
             r
@@ -34,45 +34,45 @@ class Lookup:
         return min(fine, key=lambda r: r["per_design_ms"], default=None)
 
     def ratio(self, slow: tuple[str, str], fast: tuple[str, str]) -> float | None:
-        """Divide the times of two tools for a design."""
+        """Return the ratio of the times of two tools for a design."""
         one, other = self.best(*slow), self.best(*fast)
         return one["per_design_ms"] / other["per_design_ms"] if one and other else None
 
     def seconds(self, what: str) -> float | None:
-        """Return the seconds of the first task whose name ends so."""
+        """Return the seconds of the first task whose name ends with `what`."""
         found = [r["run_s"] for r in self.rows if r["what"].endswith(what)]
         return found[0] if found else None
 
     def revolutions(self) -> list[tuple[float, float]]:
-        """List (revolutions, seconds)."""
+        """Return (revolutions, seconds) of each run."""
         rows = [r for r in self.rows if r["part"] == "revolutions"]
         return [(r["revolutions"], r["run_s"]) for r in rows]
 
     def batches(self, what: str, part: str = "batch") -> list[tuple[float, float]]:
-        """List (designs, seconds) of the batches."""
+        """Return (designs, seconds) of the batches."""
         rows = [r for r in self.rows if r["part"].startswith(f"{part} ") and r["what"] == what]
         return [(r["designs"], r["run_s"]) for r in rows]
 
 
 def targets(rows: list[Row]) -> list[Row]:
-    """List the targets with the figures reached; `reached` is None where not measured."""
+    """List the targets with the measured figures; `reached` is `None` where not measured."""
     look = Lookup(rows)
     both, value, one, many = "value+gradient", "value", "rootsopt, ", "rootsopt, batch of 256"
     single = Lookup([r for r in rows if r["part"] == "single" or r["tool"].startswith("(")])
     reverse = [r for r in rows if r["part"] == "reverse"]
     orbit = next((r for r in rows if r["tool"] == "orbit"), None)
     limits = (
-        ("value + gradient, times faster than (a)", ">=", 200.0,
+        ("value + gradient, speed-up over (a)", ">=", 200.0,
          single.ratio(("(a)", both), (one, both)), "one design"),
         ("the same in a batch of 256", ">=", 200.0,
          look.ratio(("(a)", both), (many, both)), "per design"),
-        ("value + gradient, times faster than (b)", ">=", 1.0,
+        ("value + gradient, speed-up over (b)", ">=", 1.0,
          single.ratio(("(b)", both), (one, both)), "one design"),
         ("the same in a batch of 256", ">=", 1.0,
          look.ratio(("(b)", both), (many, both)), "per design"),
-        ("one value, time in units of (b)'s", "<=", 3.0,
+        ("one value, in units of (b)'s time", "<=", 3.0,
          single.ratio((one, value), ("(b)", value)), "one design"),
-        ("a value in a batch of 256, in units of (b)'s", "<=", 1.0,
+        ("a value in a batch of 256, in units of (b)'s time", "<=", 1.0,
          look.ratio((many, value), ("(b)", value)), "per design"),
         ("value + gradient on the orbit (ms)", "<=", 50.0,
          milli(orbit["run_s"]) if orbit else None, "to 1e-6, one core"),

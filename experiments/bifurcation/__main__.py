@@ -1,7 +1,7 @@
 """Which quiet and noisy orbits does a rotor pair have over speed, load, backlash and design?
 
 Writes bifurcation.csv (all points), special_points.csv, bifurcation.json, bifurcation_speed.png,
-bifurcation_scene.png and bifurcation_ranges.png, anew after every parameter followed.
+bifurcation_scene.png and bifurcation_ranges.png, updated after every parameter.
 """
 
 import sys
@@ -36,7 +36,7 @@ def body(run: Run) -> int:
 
 
 def write(run: Run, diagrams: "list[Diagram]") -> None:
-    """Write everything known so far, so that a long run can be looked at."""
+    """Write everything known so far, so that a long run can be inspected."""
     from experiments.bifurcation import figures, study
 
     run.csv("bifurcation.csv", study.point_rows(diagrams))

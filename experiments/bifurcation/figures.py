@@ -62,7 +62,7 @@ def draw_branches(ax, diagram: Diagram, quantity: str, color: str) -> None:
 
 
 def drawn_specials(diagram: Diagram) -> list[Bifurcation]:
-    """Return the special points where something stable begins or ends."""
+    """Return the special points where a stable part begins or ends."""
     return [
         special
         for branch in diagram.branches
@@ -77,7 +77,7 @@ def chaotic(diagram: Diagram) -> list[float]:
 
 
 def legend_handles(diagrams: list[Diagram]) -> list:
-    """Make the entries of what the diagrams hold."""
+    """Return legend entries for the content of the diagrams."""
     families = dict.fromkeys(diagram.family for diagram in diagrams)
     handles: list = [Patch(color=COLORS[name], label=name.upper()) for name in families]
     handles += [
@@ -97,7 +97,7 @@ def legend_handles(diagrams: list[Diagram]) -> list:
 
 
 def pictures(diagrams: list[Diagram]) -> dict[str, Figure]:
-    """Draw all figures, by name: over speed, over the other parameters (if any), and ranges."""
+    """Draw all figures by name: over speed, over the other parameters (if any), and ranges."""
     over_speed = [d for d in diagrams if d.parameter == "speed_rpm"]
     scenes = list(dict.fromkeys(d.scene for d in over_speed))
     columns = [[d for d in over_speed if d.scene == scene] for scene in scenes]
@@ -109,7 +109,7 @@ def pictures(diagrams: list[Diagram]) -> dict[str, Figure]:
 
 
 def draw_grid(columns: list[list[Diagram]], titles: list[str]) -> Figure:
-    """Draw peak force above, mean force below; a column for each list of diagrams."""
+    """Draw peak force above and mean force below, one column per list of diagrams."""
     count = len(columns)
     figure, axes = sheet(1.5 + 5.2 * count, 7.4, 2, count, sharey="row", sharex="col")
     for column, (diagrams, title) in enumerate(zip(columns, titles, strict=True)):

@@ -1,9 +1,9 @@
 """Follows the periodic orbits of both rotor pairs over speed, load, backlash and design.
 
-Starts from rest and from up to five other states at a few values of a parameter. Follows every
-periodic orbit reached over the whole range, through folds and period doublings, stable or not
-(`rootsopt.continuation`). Reports where a stable quiet orbit exists, where a stable noisy one, and
-where both do.
+The study starts from rest and from up to five other states at a few values of a parameter. It
+follows every periodic orbit reached over the whole range, stable or not, through folds and period
+doublings (`rootsopt.continuation`). It reports where a stable quiet orbit exists, where a stable
+noisy one, and where both.
 """
 
 import dataclasses
@@ -27,24 +27,24 @@ STARTS = ((0.0, 0.0), (-0.2, -1.8), (-1.0, 0.0), (-3.0, 0.0), (0.8, 5.0), (-0.5,
 LIVELY = ("scene.timing_gear.backlash_mm=0.2", "scene.timing_gear.damping_ratio=0.2")
 SCENES = {"shipped": (), "livelier": LIVELY}
 SLOWEST = {"shipped": 300, "livelier": 3500}
-"""Lowest speed (rpm). Below it the livelier pair bounces so often within a mesh period that its
+"""Lowest speed (rpm) studied. Below it the livelier pair bounces so often per mesh period that its
 orbits can hardly be followed."""
 QUIET = 4.0
-"""Peak force, in units of the force that carries the load at the pitch radius, above which the
-flanks hammer: the orbit is noisy."""
+"""Peak force, in units of the force that carries the load at the pitch radius, above which an orbit
+is noisy: the flanks hammer."""
 POINTS, FEWEST = 100, 25
-"""Mesh periods in all points of a branch, and the least number of points of a branch."""
+"""Mesh periods in all points of a branch, and the minimum number of points of a branch."""
 LONGEST, DOUBLED = 4, 2
 """Longest orbits (mesh periods) followed: reached by a simulation, and by a period doubling."""
 CELLS = 570
-"""Cells of a range, each searched for quiet and noisy orbits."""
+"""Number of cells of a range, each searched for quiet and noisy orbits."""
 
 
 @dataclasses.dataclass
 class Diagram:
     """Branches of one pair in one scene over one parameter.
 
-    `seeds`: (value, status) of the evaluations that looked for orbits.
+    `seeds`: (value, status) of the evaluations that searched for orbits.
     """
 
     scene: str
@@ -58,8 +58,10 @@ class Diagram:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """A pair in a scene, a parameter and its range, the number of values to start from, and the
-    scaled states tried at each."""
+    """A pair in a scene, a parameter and its range.
+
+    Also the number of values to start from, and the scaled states tried at each.
+    """
 
     scene: str
     config: Config
@@ -71,7 +73,7 @@ class Plan:
 
 
 def plans(quick: bool) -> list[Plan]:
-    """List what is explored."""
+    """List the plans of a run."""
     configs = {
         (scene, family): shipped(family, *overrides)
         for scene, overrides in SCENES.items()
@@ -97,7 +99,7 @@ def run(
     say: Say = lambda text: None,
     keep: Callable[[list[Diagram]], None] = lambda diagrams: None,
 ) -> list[Diagram]:
-    """Explore all plans; `keep` is given all diagrams so far after each."""
+    """Explore all plans; call `keep` with all diagrams so far after each."""
     diagrams: list[Diagram] = []
     for plan in plans(quick):
         diagrams.append(explore(plan, say))
@@ -114,7 +116,7 @@ def explore(plan: Plan, say: Say) -> Diagram:
         patient, hasty = evaluator_of(here), evaluator_of(here, give_up_early=True)
         found: list[tuple[float, float]] = []
         for number, start in enumerate(plan.starts):
-            # A chaotic motion takes long to tell, and need not be told from everywhere.
+            # A chaotic motion takes long to recognise, and one start is enough for that.
             evaluator = hasty if number else patient
             evaluation = evaluator(start=np.array(start), series=False)
             diagram.seeds.append((float(value), evaluation.status.label))
@@ -183,7 +185,7 @@ def limits(diagram: Diagram, period: int) -> StepSizes:
 
 
 def known(diagram: Diagram, value: float, period: int, forces) -> bool:
-    """Tell whether a branch of the diagram has this orbit."""
+    """Return whether a branch of the diagram contains this orbit."""
     return any(
         np.allclose(forces, (point.mean, point.peak), rtol=1e-3)
         for branch in diagram.branches
@@ -193,7 +195,7 @@ def known(diagram: Diagram, value: float, period: int, forces) -> bool:
 
 
 def known_branch(branches: list[Branch], new: Branch) -> bool:
-    """Tell whether the middle of a branch lies on another one of the same period."""
+    """Return whether the middle of a branch lies on another one of the same period."""
     middle = new.points[len(new.points) // 2]
     return any(
         np.allclose((middle.mean, middle.peak), (point.mean, point.peak), rtol=1e-3)
@@ -204,7 +206,7 @@ def known_branch(branches: list[Branch], new: Branch) -> bool:
 
 
 def described(diagram: Diagram, branch: Branch) -> str:
-    """Describe a branch in a line."""
+    """Describe a branch in one line."""
     ends = " and ".join(end.name.lower().replace("_", " ") for end in branch.ends)
     values = [point.value for point in branch.points]
     return (
@@ -215,7 +217,7 @@ def described(diagram: Diagram, branch: Branch) -> str:
 
 
 def ranges(diagram: Diagram) -> dict[str, list[list[float]]]:
-    """Find the ranges with a stable quiet orbit, a stable noisy one, both, and none."""
+    """Return the ranges with a stable quiet orbit, a stable noisy one, both, and none."""
     edges = np.linspace(diagram.low, diagram.high, CELLS + 1)
     centres = (edges[1:] + edges[:-1]) / 2
     quiet, noisy = np.zeros(CELLS, bool), np.zeros(CELLS, bool)
@@ -233,7 +235,7 @@ def ranges(diagram: Diagram) -> dict[str, list[list[float]]]:
 
 
 def peak_ratio(branch: Branch, point) -> float:
-    """Divide the peak force by the static one."""
+    """Return the ratio of the peak force to the static one."""
     torque = branch.config.scene.load.torque_N_m
     torque = point.value if branch.parameter == "torque_N_m" else torque
     assert torque is not None  # Scenes here have a constant load.
@@ -248,7 +250,7 @@ def runs(mask: np.ndarray, edges: np.ndarray) -> Iterator[list[float]]:
 
 
 def overlaps(diagram: Diagram) -> list[list[float]]:
-    """Find the ranges in which more than one stable orbit exists, quiet or noisy."""
+    """Return the ranges with more than one stable orbit, quiet or noisy."""
     edges = np.linspace(diagram.low, diagram.high, CELLS + 1)
     centres = (edges[1:] + edges[:-1]) / 2
     count = np.zeros(CELLS, int)
@@ -282,7 +284,7 @@ def special_rows(diagrams: list[Diagram]) -> list[Row]:
 
 
 def branches_of(diagrams: list[Diagram]) -> Iterator[tuple[Row, Branch]]:
-    """Yield every branch, with the columns that say which it is."""
+    """Yield every branch, with the columns that identify it."""
     for diagram in diagrams:
         keys = {name: getattr(diagram, name) for name in ("scene", "family", "parameter")}
         for number, branch in enumerate(diagram.branches):

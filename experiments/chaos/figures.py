@@ -39,7 +39,7 @@ def averages(ax: Axes, rows: Rows) -> None:
            label="one motion from rest")  # fmt: skip
     ax.errorbar(share, column(rows, "mean_force_N"), column(rows, ERRORS["mean_force_N"]), fmt="o",
                color=BLUE, ms=4, capsize=2, label="ensemble, ± standard error")  # fmt: skip
-    ax.set(xlabel="share of the way from baseline to optimum", ylabel="mean contact force (N)")
+    ax.set(xlabel="fraction of the way from baseline to optimum", ylabel="mean contact force (N)")
     ax.set_ylim(0, None)
     ax.set_title("(a) Average along a line of designs")
     ax.legend(frameon=False)

@@ -3,7 +3,7 @@
 - The average of a single motion along a line of designs, against the average over an ensemble.
 - The derivative of a single motion's average, against the slope estimated from an ensemble.
 - An optimisation of the ensemble's average, and its verification by independent ensembles.
-- How the standard errors fall with the members, and whether the scatter is what they say.
+- How the standard errors fall with the members, and whether they agree with the scatter.
 """
 
 import dataclasses
@@ -56,11 +56,11 @@ QUICK = (
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """Sizes of the studies beside the optimisation.
+    """Sizes of all parts except the optimisation.
 
-    `line`: designs along the line. `members`, `window`: members and mesh periods of an average.
-    `pathwise`: mesh periods of the single motion that is differentiated. `large`: members of the
-    ensemble that is divided into `groups`. `slopes`: (designs, members) of each gradient.
+    line: designs along the line; members, window: members and mesh periods of an average; pathwise:
+    mesh periods of the single motion that is differentiated; large: members of the ensemble that is
+    divided into `groups`; slopes: (designs, members) of each gradient.
     """
 
     line: int
@@ -73,7 +73,7 @@ class Size:
 
 
 def _slopes(designs: int, members: int, count: int) -> tuple[tuple[int, int], ...]:
-    """List (designs, members): first more members, then more designs, each time twice as many."""
+    """List (designs, members): first more members, then more designs, doubling each time."""
     more = [(designs, members * 2**k) for k in range(count)]
     return (*more, *((designs * 2**k, members) for k in range(1, count)))
 
@@ -116,7 +116,7 @@ _pair = Program(Scene.pair)
 def _pathwise(model: Scene, design, periods, how):
     """Differentiate the mean force with respect to the design, along the motion from rest.
 
-    Returns (periods, d): the mean is taken from the start to the end of each mesh period.
+    Returns (periods, d): the k-th mean covers the time from the start to the end of period k.
     """
     pair, tangents, _ = model.pair_and_tangents(design)
 
@@ -146,7 +146,7 @@ def pathwise(evaluator: EnsembleEvaluator, design, size: Size) -> list[dict]:
 def errors_by_members(config: Config, model: Scene, design, size: Size) -> list[dict]:
     """Compare the stated standard error of the mean force with the scatter of independent groups.
 
-    The groups are taken from one large ensemble; the scatter has a standard error of its own.
+    The groups come from one large ensemble; the scatter has its own standard error.
     """
     evaluator = resized(config, model, members=size.large)
     design = jnp.asarray(design)
@@ -172,8 +172,10 @@ def errors_by_members(config: Config, model: Scene, design, size: Size) -> list[
 
 
 def gradients(config: Config, model: Scene, design, size: Size) -> list[dict]:
-    """Estimate the slope of the mean force over the pressure angle, with its standard error, from
-    more members or from more designs."""
+    """Estimate the slope of the mean force over the pressure angle, with its standard error.
+
+    Compare more members with more designs.
+    """
     rows = []
     for designs, members in size.slopes:
         evaluator = resized(config, model, members=members, designs=designs)
@@ -213,7 +215,7 @@ def summary(problem: Problem, result: Optimization) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """What the study finds: the optimisation, and a table of rows for each other part."""
+    """Results of the study: the optimisation, and a table of rows for each other part."""
 
     config: Config
     problem: Problem
@@ -226,7 +228,7 @@ class Results:
 
     @property
     def tables(self) -> dict[str, list[dict]]:
-        """Rows by the name of their part."""
+        """Return the rows by the name of their part."""
         return {
             "line": self.line,
             "pathwise": self.pathwise,
@@ -236,7 +238,7 @@ class Results:
         }
 
     def record(self) -> dict[str, Any]:
-        """Summary, scene and times for a result file."""
+        """Return summary, scene and times for a result file."""
         return summary(self.problem, self.optimization) | {
             "scene": list(SCENE),
             "ensemble": self.config.ensemble.model_dump(),

@@ -1,7 +1,7 @@
 """Where do solvers and precisions hold, up to the limits of every key?
 
-Writes extremes.csv (a row for each scene, anew after every stage), extremes.json (counts and worst
-deviations) and extremes.png. The exit status is 3 if a promise is broken.
+Writes extremes.csv (a row per scene, updated after every stage), extremes.json (counts and worst
+deviations) and extremes.png. The exit code is 3 if a promise is broken.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def body(run: Run) -> int:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the number of threads."""
     parser.add_argument(
-        "--jobs", type=int, default=2, help="scenes simulated side by side (default: 2)"
+        "--jobs", type=int, default=2, help="scenes simulated in parallel (default: 2)"
     )
 
 

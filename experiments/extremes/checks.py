@@ -1,4 +1,4 @@
-"""The checks of every scene: finite numbers, a named end, the truth, the public path."""
+"""Checks of every scene: finite numbers, a named status, the reference, the public path."""
 
 import dataclasses
 import functools
@@ -30,30 +30,30 @@ from rootsopt.status import Status
 HORIZON = 24
 """Longest transient (mesh periods) of most scenes."""
 STEPS = 1024
-"""Most solver steps in a mesh period."""
+"""Maximum number of solver steps in a mesh period."""
 ALLOWED = 100.0
-"""Deviation of a force (tolerances, relative to the greater of the true and the static force) above
-which a promise is broken. In single precision five roundings of the gap are added."""
+"""Deviation of a force (in tolerances, relative to the larger of the true and the static force)
+above which a promise is broken. In single precision five roundings of the gap are added."""
 CORNER = 1e-9
-"""Tolerance below which deviations are judged as at this one: a peak on a corner of the force is
+"""Tolerance below which the limit stays that of this tolerance. A peak on a corner of the force is
 known to some 1e-8 only (docs/accuracy.md)."""
 SINGLE = 2.4e-6
-"""Finest tolerance that single precision holds."""
+"""Finest tolerance possible in single precision."""
 SHARP = "dopri8", 1e-12, 20_000
-"""Method, tolerance and most steps of the reference."""
+"""Method, tolerance and maximum number of steps of the reference."""
 FEW = 50
-"""Swings in a mesh period above which SciPy, an explicit method in Python, is not asked."""
+"""Contact oscillations per mesh period above which SciPy (explicit, in Python) is not used."""
 PATIENCE = 24
-"""Mesh periods of plain motion where Newton's method does not close a reference."""
+"""Mesh periods of plain motion if Newton's method does not close a reference."""
 DEPTHS = np.concatenate([[-1e-3, 0.0], np.geomspace(1e-36, 1e-2, 39)])
 RATES = np.concatenate([-np.geomspace(1e-9, 1e3, 7), [0.0], np.geomspace(1e-9, 1e3, 4)])
 POSES = 4
-"""Random states of each scene at which the equation of motion is evaluated."""
+"""Number of random states of each scene at which the equation of motion is evaluated."""
 
 
 @dataclasses.dataclass
 class Case:
-    """A scene, its line of the table, and the scaled state of its orbit, once known."""
+    """A scene, its row of the table, and the scaled state of its orbit, once known."""
 
     kind: Kind
     config: Config
@@ -99,7 +99,7 @@ def _equation_values(models: Scene, designs, poses):
 
 
 def law(cases: list[Case]) -> dict[str, Any]:
-    """Count the values of the law that are not finite, or negative, among all scenes."""
+    """Count the values of the law that are not finite, or negative, over all scenes."""
     laws = [jax.tree.map(np.asarray, Scene.from_config(case.config).law) for case in cases]
     laws = jax.tree.map(lambda *leaves: np.stack(leaves), *laws)
     found: dict[str, Any] = {}
@@ -115,10 +115,10 @@ def law(cases: list[Case]) -> dict[str, Any]:
 
 
 def equation(cases: list[Case], seed: int) -> dict[str, Any]:
-    """Count values of the equation of motion, and of its derivatives, that are not finite.
+    """Count non-finite values of the equation of motion and of its derivatives.
 
-    Derivatives are taken with respect to state and design. Times are random, and states lie some
-    static depths and plays to either side, at any speed.
+    Derivatives are with respect to state and design. Times are random. States lie some static
+    depths and plays to either side, at any speed.
     """
     draw = np.random.default_rng(seed)
     found: dict[str, Any] = {}
@@ -157,7 +157,7 @@ def _simulate(model: Scene, design, tolerances, method: str):
     out = respond(model, design, jnp.zeros(pair.states), solver)
     assert pair.timescales is not None
     swings = pair.mesh_period / (2 * jnp.pi * pair.timescales.swing)
-    # Share of the static penetration that is lost in rounding.
+    # Share of the static penetration that rounding loses.
     rounding = jnp.finfo(pair.angle_scale.dtype).eps * model.pitch_radius
     return out, swings, rounding / pair.law.depth_at(pair.force_scale), pair.force_scale
 
@@ -196,7 +196,7 @@ def simulate(case: Case) -> None:
         "mean_force_N": mean,
         "peak_force_N": peak,
         "rms_force_N": rms,
-        # What is called a result is finite, and nothing else looks like one.
+        # A usable status must have finite numbers, and only a usable status may look like a result.
         "named": bool(np.all(np.isfinite(numbers)) if status.usable else np.all(np.isnan(numbers))),
     }
 
@@ -238,7 +238,7 @@ def refine(case: Case) -> None:
     period = np.asarray(case.row["period"])
     orbit = jax.device_get(_sharp(model, design, case.state, period))
     closed = bool(orbit.flow.solved) and float(orbit.residual) < 1e-9
-    closed = closed and float(orbit.flow.strain) < 100.0  # Steps a solver would have taken.
+    closed = closed and float(orbit.flow.strain) < 100.0  # A solver would have accepted the steps.
     state, numbers = orbit.state, orbit.response[:3]
     if not closed:
         out, state = jax.device_get(_patient(model, design, case.state, period))
@@ -251,7 +251,7 @@ def refine(case: Case) -> None:
     off = np.abs(found - truth) / np.maximum(truth, case.row["static_force_N"])
     allowed = ALLOWED * max(case.config.solver.rtol, CORNER)
     if case.kind.precision == "float32":
-        # Of the reference's gap in double; single rounds 2^29 times as coarsely.
+        # Rounding of the reference's gap in double; single precision rounds 2^29 times as coarsely.
         depth, law = jnp.asarray(orbit.flow.depth), model.law
         rounding = 2**29 * float(force_rounding(depth, law.exponent, model.pitch_radius))
         allowed = ALLOWED * max(case.config.solver.rtol, SINGLE) + 5 * rounding
@@ -269,9 +269,9 @@ def refine(case: Case) -> None:
 
 
 def by_scipy(case: Case) -> None:
-    """Follow the orbit by SciPy (that of the reference, if there is one).
+    """Follow the orbit (that of the reference, if there is one) with SciPy.
 
-    Measures how far the end is from the start, and the mean force.
+    Measures the distance from start to end, and the mean force.
     """
     model = dataclasses.replace(Scene.from_config(case.config), precision="float64")
     pair = pair_of_model(model, design_vector(case.config))

@@ -1,4 +1,4 @@
-"""The atlas of the extremes: outcome over stiffness and speed, deviation over tolerance."""
+"""Figures of the extremes: outcome over stiffness and speed, deviation over tolerance."""
 
 from collections import Counter
 from typing import Any
@@ -34,7 +34,7 @@ COLOURS = {
     "non_finite": BLACK,
 }
 MOST = 7
-"""Solvers shown, those with most scenes first."""
+"""Number of solvers shown, those with most scenes first."""
 _EDGES = np.logspace(-2, 8, 11)
 MARKS = "os^vD<>"
 
@@ -57,7 +57,7 @@ def atlas(rows: list[Row]) -> Figure:
         outcomes(ax, group, [row for row in rows if solver_of(row) == group], present)
     ax = axes[len(groups)]
     deviations(ax, groups, [row for row in rows if row.get("reference") == "closed"])
-    # Beside the panel, where there is one left empty.
+    # Put the legend into an empty panel, if there is one.
     handles, labels = ax.get_legend_handles_labels()
     for free in axes[len(groups) + 1 : len(groups) + 2]:
         free.legend(handles, labels, fontsize=8, loc="center left", frameon=False)
@@ -73,7 +73,7 @@ def atlas(rows: list[Row]) -> Figure:
 
 
 def outcomes(ax: Axes, group: tuple[str, str, str], mine: list[Row], present: list[str]) -> None:
-    """Draw the share of each outcome over the swings of the contact in a mesh period."""
+    """Draw the share of each outcome over the contact oscillations in a mesh period."""
     bins = len(_EDGES) - 1
     swings = np.clip([row["swings"] for row in mine], _EDGES[0], _EDGES[-1] * 0.999)
     place = np.digitize(swings, _EDGES) - 1
@@ -92,7 +92,7 @@ def outcomes(ax: Axes, group: tuple[str, str, str], mine: list[Row], present: li
     ax.set_xlim(_EDGES[0], _EDGES[-1])
     ax.set_ylim(0, 1)
     ax.set_title(f"{group[1]}, {group[2]}, {group[0]} ({len(mine)} scenes)", fontsize=9)
-    ax.set_xlabel("swings of the contact in a mesh period", fontsize=8)
+    ax.set_xlabel("oscillations of the contact in a mesh period", fontsize=8)
     ax.set_ylabel("share of scenes", fontsize=8)
 
 

@@ -1,7 +1,7 @@
 """Scenes at and between the limits of a config, as a cloud and as a grid.
 
-All numbers are drawn. What decides which program runs (family, lobes, gear, contact, solver,
-precision) is a `Kind`, so that all scenes of a kind share one compiled program.
+All numbers are drawn at random. A `Kind` holds what determines the compiled program (family, lobes,
+gear, contact, solver, precision), so all scenes of a kind share one program.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from experiments._common.scenes import shipped
 from rootsopt.config import DESIGN_KEYS, Config
 
 _OVERLENGTH = 1.02
-"""Longest involute that a config may ask for, in units of u_max."""
+"""Longest involute that a config accepts, in units of u_max."""
 SPANS: dict[str, tuple[float, float]] = {
     "contact.stiffness_N_per_mm_e": (1e3, 1e9),
     "contact.max_damping_N_s_per_mm": (1e-4, 10.0),
@@ -31,7 +31,7 @@ SPANS: dict[str, tuple[float, float]] = {
     "solver.rtol": (1e-12, 1e-2),
     "solver.transient_rtol": (1e-12, 1e-2),
 }
-"""Ranges drawn from, evenly in the logarithm."""
+"""Ranges of the draw, uniform in the logarithm."""
 PUMP_SPANS: dict[str, tuple[float, float]] = {
     "scene.load.pressure_difference_Pa": (1.0, 1e7),
     "scene.motor.slope_N_m_s_per_rad": (1e-3, 10.0),
@@ -42,9 +42,9 @@ PUMP_SPANS: dict[str, tuple[float, float]] = {
     "contact.friction.stiction_speed_mm_s": (1.0, 1e4),
     "contact.clearance_mm": (1e-4, 0.1),
 }
-"""The same for the parts of a scene with everything, in place of its constant load."""
+"""Ranges for the parts of a scene with everything, which replace its constant load."""
 SIGNED = {"scene.center_distance_error_mm": 1.0, "scene.phase_error_mrad": 100.0}
-"""Greatest errors of assembly (config units), to either side; drawn over four decades."""
+"""Largest assembly errors (config units), to either side; drawn over four decades."""
 EXPONENT = 1.0, 3.0
 MAY_VANISH = (
     "contact.max_damping_N_s_per_mm",
@@ -65,14 +65,14 @@ GRID: dict[str, tuple[float, ...]] = {
     "scene.timing_gear.backlash_mm": (0.0, 0.03, 1.0),
     "contact.full_damping_depth_mm": (1e-5, 1e-2, 1.0),
 }
-"""Corners and middle of the ranges; all else as in the shipped CIC scene."""
+"""Corners and middle of the ranges; everything else as in the shipped CIC scene."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """What the scenes of one compiled program have in common.
+    """Common properties of the scenes of one compiled program.
 
-    `scene` is plain (flanks alone), gear, or pump (everything a scene can hold).
+    `scene` is plain (flanks alone), gear, or pump (all parts of a scene).
     """
 
     method: str = "tsit5"
@@ -84,7 +84,7 @@ class Kind:
 
     @property
     def label(self) -> str:
-        """Name in tables."""
+        """Return the name in tables."""
         scene = "" if self.scene == "gear" else f", {self.scene}"
         return (
             f"{self.family} {self.lobes}, {self.fidelity}, {self.method}, {self.precision}{scene}"
@@ -92,7 +92,7 @@ class Kind:
 
     @property
     def states(self) -> int:
-        """How many states the equation of motion has."""
+        """Return the number of states of the equation of motion."""
         return 11 if self.scene == "pump" else 2
 
 
@@ -128,7 +128,7 @@ def config_of(kind: Kind, values: dict[str, float]) -> Config:
 
 
 def _design(draw: np.random.Generator, lobes: int, radius: float) -> dict[str, float]:
-    """Draw pressure angle, u and tip arc; a fifth of the draws of each are on a limit."""
+    """Draw pressure angle, u and tip arc; a fifth of the draws of each is on a limit."""
     half = 90 / lobes
     while True:
         angle = draw.choice([1.0, 89.0]) if draw.uniform() < 0.2 else draw.uniform(1, 89)
@@ -150,7 +150,7 @@ def _design(draw: np.random.Generator, lobes: int, radius: float) -> dict[str, f
 
 
 def _assembly(draw: np.random.Generator, values: dict[str, float]) -> dict[str, float]:
-    """Draw errors of assembly, and the friction that follows from other `values`."""
+    """Draw assembly errors, and the friction that follows from other `values`."""
     kinetic = values["contact.friction.kinetic"]
     stiction = values["contact.friction.stiction_speed_mm_s"]
     found = {
@@ -164,7 +164,7 @@ def _assembly(draw: np.random.Generator, values: dict[str, float]) -> dict[str, 
 
 
 def cloud(kind: Kind, count: int, seed: int) -> Iterator[Config]:
-    """Yield `count` random scenes of a kind; a tenth of the values that may vanish are 0."""
+    """Yield `count` random scenes of a kind; a tenth of the values that may be 0 are 0."""
     draw = np.random.default_rng([seed, *kind.label.encode()])
     radius = _base(kind).profile.pitch_radius_mm
     spans = SPANS

@@ -1,16 +1,16 @@
-"""Looks for where solvers and precisions hold: scenes at and between the limits of every key.
+"""Tests where solvers and precisions hold: scenes at and between the limits of every key.
 
-1. Law: force and derivatives of every scene's contact law, from no penetration to far beyond any,
-   must be finite in either precision; so must the equation of motion and its derivatives with
-   respect to state and design.
-2. Motion: every scene is simulated from rest and must end in a finite result or in a named status.
-3. Truth: a sample of those that ended periodic is closed again from the same state by dopri8 at
-   1e-12 in double precision, and by SciPy's DOP853 along that orbit. The relative deviation of
-   mean and peak force must be below `ALLOWED` times the tolerance.
+1. Law: force and derivatives of every scene's contact law must be finite in either precision, from
+   no penetration to far beyond any. So must the equation of motion and its derivatives with respect
+   to state and design.
+2. Motion: every scene is simulated from rest and must end in a finite result or a named status.
+3. Truth: a sample of the periodic results is closed again from the same state by dopri8 at 1e-12 in
+   double precision, and by SciPy's DOP853 along that orbit. The relative deviation of mean and peak
+   force must be below `ALLOWED` times the tolerance.
 4. Public path: a sample goes through the evaluator from config to record, some with up to 1000
    revolutions.
 
-`scenes.py` draws the scenes, `checks.py` asks each of them.
+`scenes.py` draws the scenes, `checks.py` checks each of them.
 """
 
 import dataclasses
@@ -34,10 +34,10 @@ Keep = Callable[[list[Case]], None]
 class Size:
     """Number of scenes.
 
-    `kinds`: each with its number of random scenes. `gridded`: whether the grid is added.
-    `references`, `scipy`, `evaluated`: scenes of each kind that go to the reference (a third where
-    that needs a program of its own), to SciPy, and through the evaluator. `long`: how many of the
-    last have the long `horizon` (mesh periods).
+    kinds: each with its number of random scenes; gridded: whether the grid is added; references,
+    scipy, evaluated: scenes of each kind that go to the reference (a third where that needs its own
+    program), to SciPy, and through the evaluator; long: how many of the last have the long
+    `horizon` (mesh periods).
     """
 
     kinds: tuple[tuple[Kind, int], ...]
@@ -87,14 +87,14 @@ QUICK = Size(
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """All scenes with their rows, and the finite values of law and equation."""
+    """All scenes with their rows, and the counts of non-finite values of law and equation."""
 
     cases: list[Case]
     checks: dict[str, Any]
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """A row for each scene."""
+        """Return a row per scene."""
         return [case.row for case in self.cases]
 
 
@@ -104,7 +104,7 @@ def run(
     say: Say = lambda text: None,
     keep: Keep = lambda cases: None,
 ) -> Results:
-    """Draw and check all scenes, `jobs` at a time; `keep` is given them after every stage."""
+    """Draw and check all scenes, `jobs` at a time; call `keep` with them after every stage."""
     size = QUICK if quick else FULL
     cases = drawn(size)
     say(f"{len(cases)} scenes")
@@ -119,7 +119,7 @@ def run(
                     say(f"{what}: {done} of {len(chosen)}")
         say(f"{what}: {len(chosen)} in {time.perf_counter() - began:.0f} s")
 
-    # The next kind's program is made while scenes of this one are simulated.
+    # The next kind's program compiles while scenes of this one are simulated.
     first = [next(case for case in cases if case.kind == kind) for kind, _ in size.kinds]
     for number, (kind, _) in enumerate(size.kinds):
         for case in first[number : number + 2]:
@@ -164,9 +164,9 @@ def samples(size: Size, cases: list[Case]) -> tuple[list[Case], list[Case]]:
         mine = [case for case in cases if case.kind == kind]
         good = [case for case in mine if case.row["status"] == "periodic"]
         own = shape != (3, "cic", "search", "gear")
-        if kind.fidelity != "linear":  # Whose jumps no reference gets over.
+        if kind.fidelity != "linear":  # A reference cannot resolve the jumps of linear contact.
             picked += good[: size.references // (3 if own else 1)]
-        if kind.scene != "pump":  # Whose independent equation is that of tests/planar.py.
+        if kind.scene != "pump":  # tests/planar.py has its independent equation.
             compared += [case for case in good if case.row["swings"] < FEW][: size.scipy]
     return picked, compared
 

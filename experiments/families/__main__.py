@@ -1,7 +1,7 @@
 """Which profile family has the least contact force in the same housing?
 
-Writes families.csv (a row for each design), families.json, families.md (the tables), families.png
-(the ranking) and families_profiles.png.
+Writes families.csv (a row per design), families.json, families.md (the tables), families.png (the
+ranking) and families_profiles.png.
 """
 
 import argparse
@@ -13,7 +13,7 @@ from experiments._common.driver import OK, Run, drive
 
 FIGURES = {"families.png": "ranking.png", "families_profiles.png": "ranking_profiles.png"}
 LONG = ("design", "outline_mm", "config")
-"""Entries of a row that the table leaves out."""
+"""Entries of a row that the table omits."""
 
 
 def body(run: Run) -> int:
@@ -38,7 +38,7 @@ def body(run: Run) -> int:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add references, families, processes, and an earlier run."""
+    """Add options for references, families, processes, and an earlier run."""
     parser.add_argument(
         "configs",
         nargs="*",
@@ -46,7 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="references (default: configs/ee.yaml configs/cic.yaml)",
     )
     parser.add_argument("--families", help="comma-separated (default: all but the free form)")
-    parser.add_argument("--jobs", type=int, default=2, help="families side by side (default: 2)")
+    parser.add_argument("--jobs", type=int, default=2, help="families in parallel (default: 2)")
     parser.add_argument("--show", type=Path, help="families.json of an earlier run to show")
 
 

@@ -1,4 +1,4 @@
-"""Figures of the ranking of profile families, and of the flanks found."""
+"""Figures of the ranking of profile families, and of the optimised flanks."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ _COLUMNS = 4
 
 
 def ranking_figure(data: dict[str, Any]) -> Figure:
-    """Draw the forces of each family relative to the reference's, a panel for each housing."""
+    """Draw the forces of each family relative to the reference's, one panel per housing."""
     studies = by_study(data)
     longest = max(len(rows) for rows in studies.values())
     made, axes = sheet(6.2 * len(studies), 2.0 + 0.34 * longest, 1, len(studies))
@@ -39,7 +39,7 @@ def ranking_figure(data: dict[str, Any]) -> Figure:
         ("o", BLUE, BLUE, "mean force"),
         ("^", VERMILION, VERMILION, "peak force"),
         ("D", "black", "black", "objective: mean of both"),
-        ("D", "black", "white", "the same, with less area efficiency than asked"),
+        ("D", "black", "white", "the same, with less area efficiency than required"),
     )
     handles = [
         Line2D([], [], marker=marker, color=color, markerfacecolor=face, ls="", label=label)
@@ -56,7 +56,7 @@ def _panel_name(row: Row) -> str:
 
 
 def profiles_figure(data: dict[str, Any]) -> Figure:
-    """Draw each flank found over the best of its housing."""
+    """Draw each optimised flank over the best of its housing."""
     studies = by_study(data)
     heights = [-(-len(rows) // _COLUMNS) for rows in studies.values()]
     made, axes = sheet(3.0 * _COLUMNS, 2.15 * sum(heights) + 0.4, sum(heights), _COLUMNS)

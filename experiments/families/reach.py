@@ -1,4 +1,4 @@
-"""Finds what a family can do inside a housing, by geometry alone: designs, area efficiency."""
+"""Finds what a family can reach inside a housing, from geometry alone: designs, area efficiency."""
 
 from typing import Any, NamedTuple, cast
 
@@ -16,19 +16,18 @@ from rootsopt.profiles import geometry
 from rootsopt.scene import Scene, design_keys
 
 BAND_MM = 1e-3
-"""Clearance (mm) below the bore's radius up to which an outer radius fills it."""
+"""Clearance (mm) up to which an outer radius fills the bore."""
 SAMPLE = 256
-"""Points of a family's box among which designs to start from are chosen."""
+"""Number of points of a family's unit box from which starting designs are chosen."""
 STARTS = 4
 _LEAST_SHARE = 1e-3
-"""Least value of a parameter that must not be 0, as a share of its bound."""
+"""Smallest value of a parameter that must not be 0, as a share of its bound."""
 _CLOSE = 1e-7
 """Margin of the constraints in the search for the extremes of area efficiency."""
 
 
 class Reach(NamedTuple):
-    """Feasible points (n, d) of a family's unit box, the best area efficiency last, and their area
-    efficiencies (n,)."""
+    """Feasible points (n, d) of a family's unit box and their area efficiencies (n,), best last."""
 
     points: NDArray[np.float64]
     efficiencies: NDArray[np.float64]
@@ -55,7 +54,7 @@ def of_family(reference: Config, family: str) -> Config:
 
 
 def changed(config: Config, **sections: dict[str, Any]) -> Config:
-    """Change values in some `sections` of a config; a profile is replaced altogether."""
+    """Change values in some `sections` of a config; a profile is replaced completely."""
     data = config.model_dump()
     for section, values in sections.items():
         data[section] = values if section == "profile" else data[section] | values
@@ -63,7 +62,7 @@ def changed(config: Config, **sections: dict[str, Any]) -> Config:
 
 
 def in_housing(config: Config, bore_radius_mm: float, area_efficiency: float) -> Config:
-    """Require rotors that fill a bore of this radius, and have this area efficiency at least."""
+    """Require rotors that fill a bore of this radius and have at least this area efficiency."""
     return changed(
         config,
         constraints={
@@ -77,15 +76,15 @@ def in_housing(config: Config, bore_radius_mm: float, area_efficiency: float) ->
 
 
 def problem_of(config: Config) -> Problem:
-    """Make the geometric side of a design problem: constraints, without a baseline."""
+    """Return the geometric part of a design problem: constraints, without a baseline."""
     return Problem(config, cast(Any, None), Space.of(config, Scene.from_config(config), 0.0))
 
 
 def reach(config: Config, sample: int = SAMPLE) -> Reach | None:
-    """Find sound designs of a family in the housing of a config, without a floor of efficiency.
+    """Find valid designs of a family in the housing of a config, without a limit on efficiency.
 
-    They come from a Sobol sample projected onto the constraints, and from climbing and descending
-    from there to the greatest and the least area efficiency. None if the family does not fit.
+    They come from a Sobol sample projected onto the constraints. From there, a search follows the
+    area efficiency up and down to its maximum and minimum. `None` if the family does not fit.
     """
     size = len(design_keys(config))
     if size == 0:
@@ -117,7 +116,7 @@ def _only(config: Config) -> Reach | None:
 
 
 def _efficiency(problem: Problem, point) -> float:
-    """Compute the area efficiency at a point of the box, -inf where it is NaN."""
+    """Return the area efficiency at a point of the box, -inf where it is NaN."""
     first = problem.space.constraints[0]
     assert first.quantity == "area_efficiency"
     value = float(problem.look(point)[2][0]) * first.scale + float(first.limit)
@@ -125,7 +124,7 @@ def _efficiency(problem: Problem, point) -> float:
 
 
 def _extreme(problem: Problem, start, sign: float) -> NDArray[np.float64]:
-    """Find the greatest (`sign` 1) or the least (-1) area efficiency near `start`."""
+    """Find the maximum (`sign` 1) or minimum (-1) area efficiency near `start`."""
 
     def goal(point):
         return -sign * problem.look(point)[2][0], -sign * problem.look(point)[3][0]

@@ -1,11 +1,11 @@
 """Puts every profile family into the same housings, and optimises each there.
 
-Every config given is a reference: its pitch radius, its outer radius (the bore of the housing) and
+Every given config is a reference: its pitch radius, its outer radius (the bore of the housing) and
 its area efficiency. Each classical family gets the pitch radius and the outer radius of the
-reference, and at least its area efficiency, or the most that the family can reach. All else of it
-is optimised in the config's scene, for the mean of mean and peak force, each relative to the
-reference's. The free form starts from the best of them. The designs found are simulated in further
-scenes.
+reference. It also gets at least its area efficiency, or the maximum the family can reach. The other
+parameters are optimised in the config's scene. The objective is the average of mean and peak force,
+each relative to the reference's. The free form starts from the best family. The optimised designs
+are then simulated in further scenes.
 """
 
 import functools
@@ -37,9 +37,9 @@ from rootsopt.scene.families import classical, free_form_of, with_design
 Row = dict[str, Any]
 REFERENCES = ("configs/ee.yaml", "configs/cic.yaml")
 EQUAL = 5e-5
-"""Difference of area efficiency below which two are equal."""
+"""Difference of area efficiency below which two values count as equal."""
 TRIED = 6
-"""Designs of different area efficiency; a search starts from the best of them."""
+"""Number of designs of different area efficiency; a search starts from the best of them."""
 COEFFICIENTS = 12
 """Number of coefficients of the free form."""
 SCENES: dict[str, dict[str, Any]] = {
@@ -47,17 +47,17 @@ SCENES: dict[str, dict[str, Any]] = {
     "6000 rpm": {"speed_rpm": 6000.0},
     "20 N m": {"load": {"torque_N_m": 20.0}},
 }
-"""Further scenes, as changes of the one in which the designs were found."""
+"""Further scenes, as changes of the scene of the optimisation."""
 SEARCH = {"screening": 24, "starts": 4, "iterations": 40, "learning_rate": 0.06}
 SEARCH_FREE = {"screening": 0, "starts": 1, "iterations": 100, "learning_rate": 0.005}
 QUICK = ("cic", "arc")
 """Families of a reduced run, with linear contact."""
 COARSE = {"fidelity": "map", "map_rolls": 192, "map_relatives": 12}
-"""Contact of the free form there: with `linear`, its motion does not settle."""
+"""Contact of the free form in a reduced run: with `linear`, its motion does not settle."""
 
 
 def curvature(profile: Profile) -> dict[str, float]:
-    """Find the least radii of curvature (mm): of the addendum, and of two flanks in contact.
+    """Find the smallest radii of curvature (mm): of the addendum, and of two flanks in contact.
 
     The second is 1 / (1/ρ1 + 1/ρ2). Both are 0 at a cusp.
     """
@@ -72,7 +72,7 @@ def curvature(profile: Profile) -> dict[str, float]:
         if not one.land:
             bend = 1 / first + 1 / np.asarray(profile.dedendum_curvature_radius(nu))
             relative = min(relative, (1 / np.maximum(bend, 1e-9)).min())
-    # Half an interval beside a cusp its radius is some micrometres.
+    # Half an interval from a cusp, its radius is some micrometres.
     cusp = profile.cusp and float(profile.addendum_speed(profile.pitch_normal)) < 1e-9
     return {
         "least_radius_mm": 0.0 if cusp else addendum / MM,
@@ -81,9 +81,9 @@ def curvature(profile: Profile) -> dict[str, float]:
 
 
 def weighed(config: Config, response: dict[str, float], reference: dict[str, float]) -> Config:
-    """Weigh the forces so that the search minimises the mean of both relative to `reference`.
+    """Weigh the forces so that the search minimises the average of both relative to `reference`.
 
-    The search itself takes them relative to its baseline's `response`.
+    The search itself divides them by its baseline's `response`.
     """
     shares = {key.split("_")[0]: response[key] / reference[key] for key in FORCES}
     total = sum(shares.values())
@@ -93,7 +93,7 @@ def weighed(config: Config, response: dict[str, float], reference: dict[str, flo
 
 
 def optimised(config: Config, reference: dict[str, float]) -> tuple[Config, int]:
-    """Optimise from the design of a config; return the best one and how many were simulated."""
+    """Optimise from the design of a config; return the best one and the number simulated."""
     start = evaluate(config)
     if not start.usable:
         return config, 1
@@ -112,10 +112,10 @@ def with_values(config: Config, design: ArrayLike) -> Config:
 def placed(
     base: Config, found: Reach, reference: Evaluation, quick: bool
 ) -> tuple[Config, bool, int]:
-    """Choose the design that a search starts from, among some of different area efficiency.
+    """Choose the start of a search among some designs of different area efficiency.
 
-    Returns the config with its floor of area efficiency, whether the family reaches the floor asked
-    for, and how many designs were simulated.
+    Returns the config with its limit of area efficiency, whether the family reaches the required
+    efficiency, and how many designs were simulated.
     """
     bore, floor = (reference.geometry[key] for key in ("outer_radius_mm", "area_efficiency"))
     reached = found.efficiencies[-1] >= floor - EQUAL
@@ -168,7 +168,7 @@ def reference_of(path: str, quick: bool) -> tuple[Config, Evaluation]:
 
 
 def one_family(path: str, family: str, quick: bool) -> dict[str, Any] | None:
-    """Find a family's best design in the housing of a reference; None where it does not fit."""
+    """Find a family's best design in the housing of a reference; `None` where it does not fit."""
     began = time.perf_counter()
     reference, base = reference_of(path, quick)
     config = in_housing(of_family(reference, family), base.geometry["outer_radius_mm"], 0.0)
@@ -225,11 +225,10 @@ def run(
     jobs: int = 2,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """Study all families in all housings, `jobs` at a time in processes of their own.
+    """Study all families in all housings, `jobs` at a time in their own processes.
 
-    `families`: by default the classical ones. Returns the records of the references, and a row for
-    each design; the free forms come last. A reduced run takes the last housing and the families
-    `QUICK`.
+    `families`: by default the classical ones. Returns the records of the references, and a row per
+    design; the free forms come last. A reduced run takes the last housing and the families `QUICK`.
     """
     paths, families = (paths[-1:], QUICK) if quick else (paths, families or classical())
     references = {Path(path).stem: reference_of(path, quick)[1].record() for path in paths}

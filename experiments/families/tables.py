@@ -25,7 +25,7 @@ def by_study(data: dict[str, Any]) -> dict[str, list[Row]]:
 
 
 def is_missing(row: Row) -> bool:
-    """Tell whether a row has no periodic motion."""
+    """Return whether a row has no periodic motion."""
     return row["objective"] is None or not np.isfinite(row["objective"])
 
 
@@ -65,8 +65,8 @@ def _name(row: Row) -> str:
 
 
 def _ranking(rows: list[Row]) -> str:
-    heads = "|family|objective|mean, N|peak, N|area efficiency|can have|seal, mm"
-    heads += "|undercut margin, mm|least radius, mm|least relative radius, mm"
+    heads = "|family|objective|mean, N|peak, N|area efficiency|reachable|seal, mm"
+    heads += "|undercut margin, mm|smallest radius, mm|smallest relative radius, mm"
     lines, place = [], 0
     for row in rows:
         ranked = row["reached"] and not is_missing(row)
@@ -97,7 +97,7 @@ def _designs(rows: list[Row]) -> str:
     for row in rows:
         values = row["design"]
         if row["family"] == "free_form":
-            text = f"begun at `{row['begun_at']}`, {row['departure_um']:.0f} µm from it"
+            text = f"started at `{row['begun_at']}`, {row['departure_um']:.0f} µm from it"
         else:
             text = ", ".join(f"{key} {value:.4g}" for key, value in values.items())
         lines.append([_name(row), text or "(none)"])

@@ -1,6 +1,6 @@
 """What does a free form gain over the best CIC, and where does it depart from it?
 
-Writes freeform.json, freeform.yaml (the config with the design found) and freeform.png.
+Writes freeform.json, freeform.yaml (the config with the optimised design) and freeform.png.
 """
 
 import argparse
@@ -29,7 +29,7 @@ def body(run: Run) -> int:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the config."""
+    """Add the option for the config."""
     parser.add_argument(
         "config", nargs="?", default="configs/free.yaml", help="(default: %(default)s)"
     )

@@ -1,4 +1,4 @@
-"""Figure of a free form beside the best CIC."""
+"""Figure of a free form compared with the best CIC."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,7 +34,7 @@ def comparison(results: Results) -> Figure:
     axes[0, 1].set(xlabel="roll angle β (°)", ylabel="pressure angle ψ (°)", ylim=(0, 95))
     axes[0, 1].set_title("Pressure angle")
     axes[1, 0].set(xlabel="normal angle ν (°)", ylabel="share τ = -dψ/dν")
-    axes[1, 0].set_title("What the coefficients shape")
+    axes[1, 0].set_title("The share τ that the coefficients set")
     axes[1, 1].set(xlabel="radius (mm)", ylabel="normal distance from the best CIC (µm)")
     axes[1, 1].set_title("Departure, positive outwards")
     for ax in axes.ravel():

@@ -48,8 +48,11 @@ def signed_departures(profile: Profile, other: Profile) -> tuple[np.ndarray, np.
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """Profiles before and after the search, its result, the config with the design found, and the
-    record of both designs beside the paper's."""
+    """Results of the study.
+
+    It holds the profiles before and after the search, its result, the config with the optimised
+    design, and the record of both designs beside the paper's.
+    """
 
     start: Profile
     found: Profile

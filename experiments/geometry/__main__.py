@@ -1,7 +1,7 @@
 """How exact are area and inertia of every profile family?
 
-Writes geometry.csv (a row for each family and number of lobes with the greatest relative errors and
-the design that has it) and geometry.png.
+Writes geometry.csv (a row per family and number of lobes, with the largest relative errors and the
+design that has them) and geometry.png.
 """
 
 import argparse
@@ -29,7 +29,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--draws", type=int, default=2000, help="designs drawn of each kind (default: 2000)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the draw (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the draw (default: 0)")
 
 
 def main() -> int:

@@ -13,17 +13,17 @@ SERIES = {
     "reference_error": ("reference itself (estimate)", "x", GREY),
 }
 FLOOR = 1e-17
-"""Least error drawn."""
+"""Smallest error drawn."""
 
 
 def errors(rows: list[Row]) -> Figure:
-    """Draw the greatest error of each family over all numbers of lobes."""
+    """Draw the largest error of each family over all numbers of lobes."""
     families = list(dict.fromkeys(row["family"] for row in rows))
     figure, axes = sheet(8, 1.6 + 0.3 * len(families))
     ax = axes[0, 0]
     for key, (label, mark, color) in SERIES.items():
         worst = [[row[key] for row in rows if row["family"] == family] for family in families]
-        # Without a sound design there is no error to draw.
+        # Without a valid design there is no error to draw.
         known = [max((x for x in one if np.isfinite(x)), default=np.nan) for one in worst]
         ax.plot(np.maximum(known, FLOOR), range(len(families)), mark, color=color, label=label)
     ax.set_xscale("log")
@@ -32,7 +32,7 @@ def errors(rows: list[Row]) -> Figure:
     ax.margins(y=0.15)
     ax.set_yticks(range(len(families)), [family.replace("_", " ") for family in families])
     ax.invert_yaxis()
-    ax.set_xlabel("greatest relative error")
+    ax.set_xlabel("largest relative error")
     ax.set_title(f"{sum(row['sound'] for row in rows)} designs against polygons of their outlines")
     grid_below(ax)
     figure.legend(loc="outside lower center", ncols=len(SERIES), frameon=False)

@@ -1,9 +1,9 @@
 """Compares area and inertia of every profile family with polygons of its own outline.
 
-Draws designs of each family and number of lobes over the whole range that a config allows, keeps
-the sound ones, and compares `rootsopt.profiles.geometry` with polygons through points of the
-outline. The reference uses positions alone, neither arc lengths nor quadrature: polygons at four
-spacings, each half the last, extrapolated (Romberg).
+The study draws designs of each family and number of lobes over the whole range that a config
+allows, and keeps the valid ones. It compares `rootsopt.profiles.geometry` with polygons through
+points of the outline. The reference uses positions alone, neither arc lengths nor quadrature:
+polygons at four spacings, each half the last, extrapolated (Romberg).
 """
 
 import functools
@@ -28,26 +28,26 @@ RADIUS_MM = 33.0
 LOBES = (2, 3, 4, 5, 6)
 FAMILIES = tuple(family for family in FAMILY_KEYS if family != "outline")
 COEFFICIENTS = (3, 8, 24)
-"""Sizes of a free form."""
+"""Numbers of coefficients of a free form."""
 QUICK = ("cic", "ee", "arc"), (2, 3)
 """Families and lobes of a reduced run."""
 QUICK_DRAWS = 50
-"""Designs drawn of each in a reduced run."""
+"""Number of designs drawn of each in a reduced run."""
 _LEVELS = 4
 _SHORT, _SPAN, _WHOLE = 64, 512, 2048
-"""Sides of the finest polygon: on an interval of a curve, a knot span of a free form, a segment."""
+"""Sides of the finest polygon: per interval of a curve, knot span of a free form, segment."""
 _GRADED = 5
-"""Power with which points crowd at both ends of a segment, where an outline may have a root."""
+"""Exponent with which points crowd at both ends of a segment, where an outline may have a root."""
 _LONGEST_INVOLUTE = 1.02
-"""Length of an involute that a config accepts, as a share of the longest."""
+"""Longest involute that a config accepts, as a fraction of the longest possible."""
 _ROUNDING = 1e-9
-"""Margin, relative to its scale, that counts as 0."""
+"""Margin, relative to its scale, below which it counts as 0."""
 
 
 def by_polygons(profile):
     """Integrate area (m²) and polar moment of area (m⁴) from positions on the outline alone.
 
-    Returns both (2,), and an estimate of the greater of their relative errors.
+    Returns both (2,), and an estimate of the larger of their relative errors.
     """
     x = np.arange(_SHORT + 1) / _SHORT
     if isinstance(profile, Curve):
@@ -64,7 +64,7 @@ def by_polygons(profile):
     nu = ends[:-1, None] + jnp.diff(ends)[:, None] * jnp.asarray(x)
     levels = jnp.zeros((_LEVELS, 2))
     for sign, point in ((1.0, profile.addendum), (-1.0, profile.dedendum)):
-        # The dedendum runs from the root up, which is clockwise.
+        # The dedendum runs upwards from the root, which is clockwise.
         places = profile.position(point(nu))
         levels += sign * jnp.stack([_polygon(places[:, :: 2**k]) for k in range(_LEVELS)])
     before = after = levels
@@ -83,9 +83,9 @@ def _polygon(places):
 
 
 def draw(family: str, lobes: int, count: int, random: np.random.Generator, size: int = 8):
-    """Draw `count` designs (count, d) of a family in config units, not all of them sound.
+    """Draw `count` designs (count, d) of a family in config units; not all of them are valid.
 
-    Half lie within the usual bounds, the others as far as a config allows, crowding towards the
+    Half lie within the usual bounds. The others lie as far as a config allows, crowded towards the
     limits. `size` is the number of coefficients of a free form.
     """
     usual, wide = [np.zeros((count, 0))], [np.zeros((count, 0))]
@@ -97,7 +97,7 @@ def draw(family: str, lobes: int, count: int, random: np.random.Generator, size:
         usual.append(low + (high - low) * share)
         share = random.random(shape)
         if key == "coefficients":
-            # Around an epicycloid, which is constant; many of these are sound.
+            # Around an epicycloid, which has constant coefficients; many of these are valid.
             level = random.uniform(-0.5, 1.0, (count, 1))
             spread = 10.0 ** random.uniform(-3, 0, (count, 1))
             wide.append(np.clip(level + spread * (2 * share - 1), -1.0, 1.0))
@@ -113,7 +113,7 @@ def draw(family: str, lobes: int, count: int, random: np.random.Generator, size:
     design = np.where(first, np.hstack(usual), np.hstack(wide))
     keys = FAMILY_KEYS[family]
     if "involute_length_mm" in keys:
-        # As a share of the longest one: no other length can be made.
+        # Relative to the longest possible: no longer involute can be made.
         angle, length = keys.index("pressure_angle_deg"), keys.index("involute_length_mm")
         tip = design[:, 2] if family == "cic" else 0.0
         longest = RADIUS_MM * np.sin(design[:, angle] * DEG) * (half - tip) * DEG
@@ -124,14 +124,14 @@ def draw(family: str, lobes: int, count: int, random: np.random.Generator, size:
 
 
 def _crowded(share, least):
-    """Crowd even shares towards both ends, down to the `least` distance."""
+    """Crowd uniform shares towards both ends, down to the distance `least`."""
     near = 0.5 * (2 * least) ** (1 - np.abs(2 * share - 1))
     return np.where(share < 0.5, near, 1 - near)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def judged(family: str, lobes: int, designs):
-    """Tell whether configs with these designs (n, d) are accepted, (n,)."""
+    """Return whether configs with these designs (n, d) are accepted, (n,)."""
     return lax.map(functools.partial(_sound, family, lobes), designs)
 
 
@@ -176,13 +176,13 @@ def compared(family: str, lobes: int, designs):
 
 
 def errors(family: str, lobes: int, count: int, random: np.random.Generator, size: int = 8):
-    """Draw `count` designs; return the sound ones (n, d) and their errors (n, 3)."""
+    """Draw `count` designs; return the valid ones (n, d) and their errors (n, 3)."""
     # A family without parameters has one design.
     designs = draw(family, lobes, count if FAMILY_KEYS[family] else 1, random, size)
     kept = designs[np.asarray(judged(family, lobes, designs))]
     if not len(kept):
         return kept, np.zeros((0, 3))
-    # One size for all, so that a family is compiled once.
+    # Use one size for all, so that a family is compiled once.
     padded = np.concatenate([kept, np.repeat(kept[:1], len(designs) - len(kept), axis=0)])
     return kept, np.asarray(compared(family, lobes, padded))[: len(kept)]
 
@@ -193,7 +193,7 @@ def run(
     seed: int = 0,
     say: Callable[[str], None] = lambda text: None,
 ) -> list[Row]:
-    """Compare all families; a row for each family, size and number of lobes.
+    """Compare all families; return a row per family, size and number of lobes.
 
     A reduced run takes the families and lobes of `QUICK`, and few draws.
     """
@@ -212,7 +212,7 @@ def run(
 
 
 def row_of(family: str, lobes: int, size: int, designs: np.ndarray, found: np.ndarray) -> Row:
-    """List the greatest errors among sound designs (n, d), and the design that has the worst.
+    """List the largest errors among valid designs (n, d), and the design that has the worst.
 
     `found` (n, 3) is as returned by `compared`; `size` is the number of coefficients, or 0.
     """

@@ -1,8 +1,8 @@
-"""How right are the gradients that are reported?
+"""How accurate are the reported gradients?
 
-Writes gradients_K_of_N.csv (a part of the pairs, anew after each) and gradients.png, drawn from all
-parts in the result folder. The exit status is 3 if a tolerance ends without a result where a looser
-one has one, or if a gradient is further off than its check promises.
+Writes gradients_K_of_N.csv (a part of the pairs, updated after each) and gradients.png, drawn from
+all parts in the result folder. The exit code is 3 if a tolerance gives no result where a looser one
+does, or if a gradient error exceeds what its check promises.
 """
 
 import argparse
@@ -40,9 +40,9 @@ def body(run: Run) -> int:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add size, seed and part of the draw, and drawing alone."""
+    """Add options for size, seed and part of the draw, and for drawing alone."""
     parser.add_argument("--count", type=int, default=200, help="pairs (default: 200)")
-    parser.add_argument("--seed", type=int, default=0, help="of the draw (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the draw (default: 0)")
     parser.add_argument(
         "--part",
         type=part_of,

@@ -1,9 +1,9 @@
 """Compares reported gradients of random designs and scenes with differences of orbits.
 
-Draws designs (CIC with two and three lobes, arc and involute) and scenes (speed, load, backlash,
-gear, with gas and friction or a motor). Keeps those that settle on a periodic orbit, as many as
-possible with periods beyond one and some beyond four, and evaluates each at rtol 1e-8, 1e-9 and
-1e-10. The derivatives of the mean and peak force are compared with central differences of the
+The study draws designs (CIC with two and three lobes, arc and involute) and scenes (speed, load,
+backlash, gear, with gas and friction or a motor). It keeps those that settle on a periodic orbit,
+as many as possible with periods above one and some above four. It evaluates each at rtol 1e-8, 1e-9
+and 1e-10. The derivatives of the mean and peak force are compared with central differences of the
 forces of orbits closed with another method (dopri8) at 1e-12.
 """
 
@@ -29,14 +29,14 @@ from rootsopt.scene import Scene
 Row = dict[str, Any]
 TOLERANCES = (1e-8, 1e-9, 1e-10)
 STEP = 2e-5
-"""Relative step of the differences: orbits are known to 1e-12, which leaves 1e-7."""
+"""Relative step of the differences. Orbits are known to 1e-12, so differences are known to 1e-7."""
 CLOSER = 1e-4
-"""Disagreement above which the differences are taken again with a quarter of the step, and
-extrapolated to step 0: close to a bifurcation forces bend."""
+"""Disagreement above which the differences are repeated with a quarter of the step and extrapolated
+to step 0: close to a bifurcation, forces are strongly curved."""
 SHARE = 0.6
-"""Share of pairs with a period beyond one that a draw waits for."""
+"""Share of pairs with a period above one that a draw waits for."""
 QUICK_COUNT = 4
-"""Pairs of a reduced run."""
+"""Number of pairs of a reduced run."""
 KINDS: dict[str, tuple[str, list[str]]] = {
     "cic, 3 lobes": ("cic", []),
     "cic, 2 lobes": ("cic", ["profile.lobes=2"]),
@@ -59,14 +59,14 @@ KINDS: dict[str, tuple[str, list[str]]] = {
     "cic, long periods": ("cic", []),
 }
 LONG = "cic, long periods"
-"""Kind of which only orbits of five periods or more are kept, from livelier scenes: one pair in
-twenty."""
+"""Kind of which only orbits of five periods or more are kept. They come from livelier scenes: one
+pair in twenty."""
 PATIENCE = 60
-"""Scenes of the kind `LONG` drawn for each pair wanted, at most."""
+"""Maximum number of scenes of the kind `LONG` drawn for each pair wanted."""
 
 
 def pairs(seed: int, kind: str) -> Iterator[list[str]]:
-    """Yield endless overrides of configs/cic.yaml of one kind."""
+    """Yield overrides of configs/cic.yaml of one kind, without end."""
     family, fixed = KINDS[kind]
     draw = np.random.default_rng([seed, list(KINDS).index(kind)])
     lobes = 2 if "2 lobes" in kind else 3
@@ -138,7 +138,7 @@ def evaluated(config: Config) -> Iterator[tuple[float, Evaluation]]:
 
 
 def errors(found: Evaluation, truth: np.ndarray) -> list[float]:
-    """Find the greatest error of each gradient, relative to its greatest component."""
+    """Return the largest error of each gradient, relative to its largest component."""
     slopes = [np.array(list(found.gradient[measure].values())) for measure in FORCES]
     return [
         float(np.max(np.abs(slope - row)) / np.max(np.abs(row)))
@@ -149,7 +149,7 @@ def errors(found: Evaluation, truth: np.ndarray) -> list[float]:
 def rows_of(
     config: Config, kind: str, overrides: list[str], found: dict[float, Evaluation]
 ) -> list[dict[str, Any]]:
-    """List the evaluations and their errors, a row for each tolerance."""
+    """List the evaluations and their errors, one row per tolerance."""
     truth = None
     rows = []
     for rtol, one in found.items():
@@ -173,9 +173,9 @@ def rows_of(
 
 @dataclasses.dataclass(frozen=True)
 class Draw:
-    """The pairs drawn: how many, from which seed, and which part of the kinds.
+    """The pairs of a draw: how many, from which seed, and which part of the kinds.
 
-    `part` (k, n): every n-th kind, from the k-th on.
+    `part` (k, n): every n-th kind, starting with the k-th.
     """
 
     count: int = 200
@@ -199,9 +199,10 @@ def run(
     say: Callable[[str], None] = lambda text: None,
     keep: Callable[[list[Row]], None] = lambda rows: None,
 ) -> list[Row]:
-    """Measure the pairs of a draw; three rows for each pair, one for each tolerance.
+    """Measure the pairs of a draw; return three rows per pair, one per tolerance.
 
-    `keep` is given all rows so far after each pair. A reduced run measures four pairs of one kind.
+    `keep` is called with all rows so far after each pair. A reduced run measures four pairs of one
+    kind.
     """
     draw = draw or Draw()
     part, parts = draw.part
@@ -222,7 +223,7 @@ def pairs_of_kind(
     for number, overrides in enumerate(pairs(seed, kind)):
         if lively + plain >= wanted or (kind == LONG and number > PATIENCE * wanted):
             break
-        # Rare longer periods are waited for, but not for ever.
+        # Wait for rare longer periods, but not for ever.
         patient = number < 6 * wanted
         config = load(CIC, overrides)
         series = evaluated(config)
@@ -254,9 +255,9 @@ def read(folder: Path) -> list[dict[str, Any]]:
 class Judgement:
     """Pairs, counts of their periods, quantiles of the errors, and broken promises.
 
-    `errors`: rtol → (periodic pairs, all pairs, force → (median, 95 %, greatest, compared)).
-    `broken`: a line for each gradient that is further off than its check promises, and for each
-    pair that ends without a result at a tolerance although a looser one has one.
+    `errors`: rtol → (periodic pairs, all pairs, force → (median, 95 %, maximum, compared)).
+    `broken`: a line for each gradient whose error exceeds what its check promises, and for each
+    pair without a result at a tolerance although a looser one has one.
     """
 
     pairs: int
@@ -272,7 +273,7 @@ class Judgement:
             parts = [f"rtol {rtol:g}: {good} periodic of {count}"]
             for name, (median, most, worst, compared) in forces.items():
                 parts.append(
-                    f"{name}: median {median:.1e}, 95 % {most:.1e}, most {worst:.1e}"
+                    f"{name}: median {median:.1e}, 95 % {most:.1e}, maximum {worst:.1e}"
                     f" ({compared} compared)"
                 )
             yield "; ".join(parts)
@@ -281,7 +282,7 @@ class Judgement:
 
 
 def judge(rows: Sequence[Row]) -> Judgement:
-    """Compare the rows of all parts with what the checks promise."""
+    """Compare the rows of all parts with the promises of the checks."""
     scenes: dict[str, dict[float, Row]] = {}
     for row in rows:
         scenes.setdefault(row["scene"], {})[float(row["rtol"])] = row

@@ -1,7 +1,7 @@
-"""How good is the optimum, beside an exhaustive grid of designs?
+"""How good is the optimum, compared with an exhaustive grid of designs?
 
-Writes landscape.csv (a row for each design), landscape.json and landscape.png. The exit status is 3
-unless the optimum is within one percent of the best of the grid.
+Writes landscape.csv (a row per design), landscape.json and landscape.png. The exit code is 3 unless
+the optimum is within one percent of the best of the grid.
 """
 
 import argparse
@@ -27,12 +27,12 @@ def body(run: Run) -> int:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the config and the size of the grid."""
+    """Add options for the config and the size of the grid."""
     parser.add_argument(
         "config", nargs="?", default="configs/cic.yaml", help="(default: %(default)s)"
     )
     parser.add_argument(
-        "--designs", type=int, default=2000, help="least number of designs (default: 2000)"
+        "--designs", type=int, default=2000, help="minimum number of designs (default: 2000)"
     )
 
 

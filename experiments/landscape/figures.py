@@ -12,7 +12,7 @@ from experiments.landscape.study import Results
 
 
 def designs(results: Results) -> Figure:
-    """Draw the objective over each pair of parameters, the best designs on top."""
+    """Draw the objective over each pair of parameters, with the best designs on top."""
     rows, optimum, objective = results.rows, results.design, results.objective
     figure, axes = sheet(12, 4.6, 1, 3)
     axes = axes[0]

@@ -1,8 +1,8 @@
 """Compares the optimum with an exhaustive grid of designs in the same scene.
 
-Lays a regular grid over pressure angle, involute share and tip arc angle within the config's
-bounds, fine enough for the number of feasible designs asked for. Simulates each from rest exactly
-as the optimiser does, and compares the best with what `rootsopt optimize` finds.
+The study lays a regular grid over pressure angle, involute share and tip arc angle within the
+config's bounds, fine enough for the requested number of feasible designs. It simulates each from
+rest exactly as the optimiser does, and compares the best with the result of `rootsopt optimize`.
 """
 
 import dataclasses
@@ -22,9 +22,9 @@ from rootsopt.optimize.search import Search
 
 Row = dict[str, Any]
 GRID = 10
-"""Points of the first grid along each axis."""
+"""Number of points of the first grid along each axis."""
 QUICK_GRID = 6
-"""The same in a reduced run."""
+"""Number of points along each axis in a reduced run."""
 QUICK = (
     "solver.fidelity=linear",
     "optimizer.screening=8",
@@ -54,7 +54,7 @@ def feasible_grid(problem: Problem, wanted: int, first: int = GRID) -> np.ndarra
 
 
 def survey(search: Search, points: np.ndarray, say: Callable[[str], None]) -> list[Row]:
-    """Simulate every point from rest; a row for each design."""
+    """Simulate every point from rest; return a row per design."""
     rows = []
     began = time.perf_counter()
     for number, point in enumerate(points, 1):
@@ -77,7 +77,7 @@ def survey(search: Search, points: np.ndarray, say: Callable[[str], None]) -> li
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """A row for each design of the grid, and the optimiser's design and objective."""
+    """A row per design of the grid, and the optimiser's design and objective."""
 
     rows: list[Row]
     design: dict[str, float]
@@ -103,7 +103,7 @@ def run(
     designs: int = 2000,
     say: Callable[[str], None] = lambda text: None,
 ) -> Results:
-    """Optimise a config, and simulate a grid of at least so many `designs`.
+    """Optimise a config, and simulate a grid of at least `designs` designs.
 
     Raises `NoResultError` where the optimiser finds nothing better than the baseline.
     """

@@ -24,7 +24,7 @@ def body(run: Run) -> int:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the config."""
+    """Add the option for the config."""
     parser.add_argument(
         "config", nargs="?", default="configs/cic.yaml", help="(default: %(default)s)"
     )

@@ -1,4 +1,4 @@
-"""Figure of a measured rotor beside its design."""
+"""Figure of a measured rotor compared with its design."""
 
 import numpy as np
 from matplotlib.figure import Figure

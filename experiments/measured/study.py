@@ -1,8 +1,8 @@
 """Compares a measured rotor with its design: form, gap in rolling, contact force.
 
-Makes the points that a coordinate measuring machine may give of a rotor ground a little wrong. They
-lie along the outline of the config's profile, with a form error of its addenda, another for each
-lobe, and noise, in clockwise order and turned. The points are imported as family `outline`.
+The study makes the points that a coordinate measuring machine may give of a slightly wrong rotor.
+They lie along the outline of the config's profile, with a form error of its addenda, another for
+each lobe, and noise, in clockwise order and turned. They are imported as family `outline`.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ def complex_points(profile: Profile, points: int) -> np.ndarray:
 
 
 def measured(profile: Profile, seed: int = 0) -> np.ndarray:
-    """Make the points (n,) of the rotor as measured (mm)."""
+    """Return the points (n,) of the rotor as measured (mm)."""
     random = np.random.default_rng(seed)
     points = complex_points(profile, 240)
     along = np.roll(points, -1) - np.roll(points, 1)
@@ -48,7 +48,7 @@ def measured(profile: Profile, seed: int = 0) -> np.ndarray:
 
 
 def imported(config: Config, path: Path) -> Config:
-    """Put the outline in a file in the place of a config's profile."""
+    """Replace a config's profile by the outline in a file."""
     gone = dict.fromkeys(design_keys(config))
     found = {"family": "outline", "outline_file": str(path), "outline_smoothing_mm": NOISE}
     profile = config.profile.model_copy(update=gone | found)
@@ -56,15 +56,18 @@ def imported(config: Config, path: Path) -> Config:
 
 
 def off_um(points: np.ndarray, design: Profile) -> np.ndarray:
-    """Measure the normal distance (µm) of points (mm) from a design."""
+    """Return the normal distance (µm) of points (mm) from a design."""
     fine = np.asarray(outline(design, 2000)) / MM
     return 1e3 * signed_distance(np.stack([np.real(points), np.imag(points)], axis=1), fine)
 
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """Both profiles, the points on the axes of the design (mm), the gaps in rolling by name, and
-    the record of all numbers found."""
+    """Results of the study.
+
+    It holds both profiles, the points on the axes of the design (mm), the gaps in rolling by name,
+    and the record of all numbers.
+    """
 
     config: Config
     design: Profile
@@ -78,7 +81,7 @@ def run(quick: bool, folder: ResultFolder, config: str = CIC) -> Results:
     """Make a measured rotor, import it, and compare it with its design.
 
     The points are written into `folder` as measured.csv, which the import reads. A reduced run
-    leaves out the simulations.
+    omits the simulations.
     """
     settings = load(config)
     design = profile_of(settings)

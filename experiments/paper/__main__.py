@@ -1,9 +1,9 @@
 """Which scene gives the paper's contact forces, and how far do they determine it?
 
 Writes paper.csv, paper_motions.csv, paper_definitions.csv, paper_slices.csv, paper_profile.csv,
-paper.json, paper_force.png, paper_spectrum.png and paper_uniqueness.png. With --search it looks for
-such scenes anew, and writes paper_search.csv, paper_search.json and paper_search.png; the exit
-status is 3 if it finds none. Finding: docs/paper.md.
+paper.json, paper_force.png, paper_spectrum.png and paper_uniqueness.png. With --search it searches
+for such scenes, and writes paper_search.csv, paper_search.json and paper_search.png. The exit code
+is then 3 if it finds none. Results: docs/paper.md.
 """
 
 import argparse
@@ -66,7 +66,7 @@ def reproduce(run: Run) -> int:
 
 
 def search(run: Run) -> int:
-    """Look for values anew, write, print the best."""
+    """Search for values, write, print the best."""
     from experiments.paper import figures, study
     from experiments.paper.scene import FAMILIES, FORCES, QUANTITIES, summary
 
@@ -104,10 +104,10 @@ def body(run: Run) -> int:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the search and its settings."""
-    parser.add_argument("--search", action="store_true", help="look for the values anew")
-    parser.add_argument("--seed", type=int, default=0, help="of the search (default: 0)")
+    parser.add_argument("--search", action="store_true", help="search for other values")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the search (default: 0)")
     parser.add_argument(
-        "--least-clearance", type=float, metavar="MM", help="least flank clearance searched"
+        "--least-clearance", type=float, metavar="MM", help="smallest flank clearance searched"
     )
 
 

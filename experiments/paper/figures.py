@@ -10,7 +10,7 @@ from experiments.paper.study import Found, Row
 from rootsopt.figures.force import plot_force, plot_spectrum
 
 LOWEST, HIGHEST = 0.1, 300.0
-"""Misfits (%) shown. Greater ones, and motions that are not periodic, stand at the upper edge."""
+"""Range of misfits (%) shown. Larger ones and non-periodic motions are at the upper edge."""
 MARKS = "os^Dvp"
 
 
@@ -50,13 +50,13 @@ def uniqueness_figure(alone: list[Row], solved: list[Row]) -> Figure:
             xlabel="change of the quantity (%)", title=title, yscale="log", ylim=(LOWEST, HIGHEST)
         )
         grid_below(ax)
-    axes[0, 0].set_ylabel("greatest error of the four forces (%)")
+    axes[0, 0].set_ylabel("largest error of the four forces (%)")
     axes[0, -1].legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
     return made
 
 
 def search_figure(found: Found) -> Figure:
-    """Draw the misfit of the searched scenes over each quantity, periodic ones apart."""
+    """Draw the misfit of the searched scenes over each quantity; mark periodic ones."""
     made, axes = sheet(11, 6.4, 2, 3, sharey=True)
     misfit = 100 * found.misfits
     for number, (ax, quantity) in enumerate(zip(axes.flat, QUANTITIES, strict=True)):
@@ -73,6 +73,6 @@ def search_figure(found: Found) -> Figure:
             ax.xaxis.set_minor_formatter(NullFormatter())
         grid_below(ax)
     for ax in axes[:, 0]:
-        ax.set_ylabel("greatest error of the four forces (%)")
+        ax.set_ylabel("largest error of the four forces (%)")
     axes[0, 0].legend(loc="lower left", frameon=False, markerscale=4, fontsize=8)
     return made

@@ -1,8 +1,8 @@
-"""The quantities the paper leaves out, as numbers that can be searched and differentiated.
+"""The quantities that the paper omits, as numbers to search and differentiate.
 
-`QUANTITIES` names them with plausible ranges. `Pairs` gives the four forces of the paper's section
-4 for values of them, with derivatives on periodic orbits. `polished` solves by these derivatives
-for values that give the paper's forces.
+`QUANTITIES` names them with plausible ranges. `Pairs` computes from their values the four forces of
+the paper's section 4, with derivatives on periodic orbits. `polished` uses these derivatives to
+solve for values that reproduce the paper's forces.
 """
 
 import dataclasses
@@ -34,8 +34,8 @@ from rootsopt.status import Status
 class Quantity:
     """A quantity that the paper does not state.
 
-    Its key in the config, the plausible range in the config's unit, whether it is searched on a
-    logarithmic scale, and its name in figures.
+    Fields: its key in the config, the plausible range in the config's unit, whether it is searched
+    on a logarithmic scale, and its name in figures.
     """
 
     key: str
@@ -53,12 +53,12 @@ QUANTITIES = (
     Quantity("scene.timing_gear.backlash_mm", 0.02, 1.5, True, "gear backlash (mm)"),
     Quantity("contact.clearance_mm", 0.005, 0.5, True, "flank clearance (mm)"),
 )
-"""In the order of all vectors of values (p,). Ranges and their reasons: docs/paper.md."""
+"""The order is that of all vectors of values (p,). Ranges and their reasons: docs/paper.md."""
 FAMILIES = ("cic", "ee")
 PAPER = np.array([[102.4, 1973.3], [1047.1, 5661.4]])
 """Mean and maximum contact force (N) by pair (`FAMILIES`), from the paper's section 4."""
 _NEAR = 0.1
-"""Longest step of `polished`, in logarithms of the quantities."""
+"""Maximum step of `polished`, in logarithms of the quantities."""
 
 
 def config_of(family: str, values: ArrayLike | None = None, *overrides: str) -> Config:
@@ -81,10 +81,10 @@ def values_of(config: Config) -> NDArray[np.float64]:
 
 @dataclasses.dataclass(frozen=True)
 class Response:
-    """Both pairs with one set of `values` (p,).
+    """Response of both pairs with one set of `values` (p,).
 
-    `evaluations` are in the order of `FAMILIES`. `slopes` (2, 2, p): derivatives of the logarithms
-    of the forces with respect to those of the quantities; None unless both motions are periodic.
+    evaluations: in the order of `FAMILIES`; slopes (2, 2, p): derivatives of the logarithms of the
+    forces with respect to those of the quantities, `None` unless both motions are periodic.
     """
 
     values: NDArray[np.float64]
@@ -93,38 +93,38 @@ class Response:
 
     @property
     def forces(self) -> NDArray[np.float64]:
-        """(2, 2) mean and peak force (N) by pair, NaN where there is none."""
+        """Return mean and peak force (N) by pair (2, 2), NaN where there is none."""
         return np.array(
             [[one.response.get(name, np.nan) for name in FORCES] for one in self.evaluations]
         )
 
     @property
     def errors(self) -> NDArray[np.float64]:
-        """(2, 2) relative differences from the paper's forces."""
+        """Return the relative differences from the paper's forces (2, 2)."""
         return self.forces / PAPER - 1
 
     @property
     def misfit(self) -> float:
-        """The greatest relative difference, infinite without forces."""
+        """Return the largest relative difference, infinite without forces."""
         worst = np.max(np.abs(self.errors))
         return float(worst) if np.isfinite(worst) else np.inf
 
     @property
     def periods(self) -> tuple[int, ...]:
-        """Mesh periods after which each motion repeats; 0 where it does not."""
+        """Return the mesh periods after which each motion repeats; 0 where it does not."""
         return tuple(int(one.steady_state.get("period", 0)) for one in self.evaluations)
 
     @property
     def usable(self) -> bool:
-        """Whether both motions are stable periodic orbits."""
+        """Return whether both motions are stable periodic orbits."""
         return all(one.status is Status.PERIODIC for one in self.evaluations)
 
 
 class Pairs:
     """Evaluates both pairs for values of the quantities; compiled programs are shared.
 
-    With `give_up_early` a motion that settles late is given up; `overrides` of the configs, each
-    `dotted.key=value`.
+    With `give_up_early`, a motion that settles late is given up. `overrides` of the configs are
+    each `dotted.key=value`.
     """
 
     def __init__(self, *overrides: str, give_up_early: bool = False):
@@ -167,7 +167,7 @@ def _slopes(evaluator: Evaluator, one: Evaluation, values) -> NDArray[np.float64
 
 
 def pair_of(model: Scene, design, values: Float[Array, " p"]) -> RotorPair:
-    """Make the rotor pair with these values of the quantities (config units)."""
+    """Return the rotor pair with these values of the quantities (config units)."""
     length, torque, stiffness, damping_ratio, backlash, clearance = values
     half = backlash * MM / (2 * model.pitch_radius)
     gear = eqx.tree_at(lambda g: (g.stiffness, g.half_backlash), model.gear, (stiffness, half))
@@ -202,11 +202,11 @@ def polished(
     steps: int = 12,
     target: NDArray[np.float64] = PAPER,
 ) -> Response:
-    """Solve for the values nearest to `values` that give the `target` forces; `held` ones stay.
+    """Solve for the values nearest to `values` that give the `target` forces; keep `held` ones.
 
-    Gauss-Newton steps of least length in the logarithms, halved until the misfit falls and both
-    motions stay periodic; both start at rest every time. Ends when the misfit is `within`, or can
-    no longer be lowered. Returns the best response found, inside the plausible ranges.
+    It takes Gauss-Newton steps of minimum length in the logarithms, halved until the misfit falls
+    and both motions stay periodic. Both start at rest every time. It ends when the misfit is below
+    `within` or cannot be lowered. Returns the best response found, inside the plausible ranges.
     """
     free = [i for i in range(len(QUANTITIES)) if i not in held]
     low, high = (np.log([getattr(q, end) for q in QUANTITIES]) for end in ("low", "high"))
@@ -217,7 +217,7 @@ def polished(
         wanted = np.log(target / best.forces).ravel()
         place = np.log(best.values)
         step = _least_step(best.slopes.reshape(4, -1), wanted, free)
-        # A quantity at an end of its range that would leave it stays there.
+        # Keep a quantity at an end of its range if the step would leave the range.
         inside = [i for i in free if low[i] < place[i] + step[i] * 1e-3 < high[i]]
         step = _least_step(best.slopes.reshape(4, -1), wanted, inside)
         step *= min(1.0, _NEAR / max(np.max(np.abs(step)), 1e-12))
@@ -238,7 +238,7 @@ def compensated(
 ) -> NDArray[np.float64]:
     """Multiply the `number`-th value by `factor`, and change the others (p,) as little as possible.
 
-    The forces stay the same to first order, and the others within their ranges.
+    To first order the forces stay the same. The others stay within their ranges.
     """
     others = [i for i in range(len(values)) if i != number]
     flat = slopes.reshape(-1, len(values))
@@ -249,7 +249,7 @@ def compensated(
 
 
 def _least_step(slopes, wanted, free: Sequence[int]) -> NDArray[np.float64]:
-    """Find the shortest step (p,) of the `free` quantities that changes the forces as `wanted`."""
+    """Return the shortest step (p,) of `free` quantities that changes the forces as `wanted`."""
     step = np.zeros(slopes.shape[1])
     step[list(free)] = np.linalg.pinv(slopes[:, list(free)], rcond=1e-3) @ wanted
     return step

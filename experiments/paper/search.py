@@ -1,8 +1,8 @@
-"""Global search for the quantities the paper leaves out, compiled by Numba.
+"""Global search for the quantities that the paper omits, compiled by Numba.
 
-Simulates thousands of scenes from rest with `experiments._common.engines.numba_pair` and rootsopt's
-contact map of each rotor, made once for all scenes. That is coarse, but within a percent or so of
-the package on a periodic motion. SciPy's differential evolution minimises the distance of the four
+The search simulates thousands of scenes from rest with `experiments._common.engines.numba_pair` and
+rootsopt's contact map of each rotor, made once for all scenes. On a periodic motion this is within
+a percent or so of the package. SciPy's differential evolution minimises the distance of the four
 forces from the paper's over the whole box of plausible values.
 """
 
@@ -27,22 +27,22 @@ from rootsopt.contact.map import MapContact
 from rootsopt.profiles import geometry
 
 _DEEPEST = -0.035
-"""Relative rotation (rad) down to which the flanks are mapped: all plays, and some more."""
+"""Relative rotation (rad) down to which the flanks are mapped: all plays, with a reserve."""
 _ROLLS, _RELATIVES = 1024, 96
 _SETTLE, _WINDOW, _RTOL = 32, 12, 1e-5
-"""Mesh periods before the forces count and while they do; tolerance of the motion."""
+"""Mesh periods before the forces count, mesh periods that count, tolerance of the motion."""
 _LONGEST = 6
-"""Longest repetition looked for (mesh periods)."""
+"""Longest repetition searched for (mesh periods)."""
 _REPEATS = 1e-2
 """Scaled difference below which a motion repeats."""
 _APERIODIC = 0.35
-"""What a pair that does not repeat adds to the cost of a scene, in logarithms of a force."""
+"""Cost added for a pair that does not repeat, in logarithms of a force."""
 _LOST = 5.0
 """Cost of a scene whose lobes pass through each other."""
 
 
 class Rotors(NamedTuple):
-    """A pair's polar area moment (m⁴) and contact map, and what its compiled motion needs."""
+    """A pair's polar area moment (m⁴), its contact map, and constants of its compiled motion."""
 
     moment: float
     table: Table
@@ -52,8 +52,11 @@ class Rotors(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """n scenes: `values` (n, p), `forces` (n, 2, 2) by pair (N, NaN if lost) and `periods`
-    (n, 2) in mesh periods, 0 where the motion does not repeat."""
+    """n simulated scenes.
+
+    values: (n, p); forces: (n, 2, 2) by pair (N, NaN if lost); periods: (n, 2) in mesh periods, 0
+    where the motion does not repeat.
+    """
 
     values: NDArray[np.float64]
     forces: NDArray[np.float64]
@@ -61,13 +64,13 @@ class Samples(NamedTuple):
 
     @property
     def misfits(self) -> NDArray[np.float64]:
-        """(n,) greatest relative difference of a force from the paper's; inf if lost."""
+        """Return the largest relative difference of a force from the paper's (n,); inf if lost."""
         worst = np.max(np.abs(self.forces / PAPER - 1), axis=(1, 2))
         return np.where(np.isfinite(worst), worst, np.inf)
 
     @property
     def periodic(self) -> NDArray[np.bool_]:
-        """(n,) whether both motions repeat."""
+        """Return whether both motions repeat (n,)."""
         return np.all(self.periods > 0, axis=1)
 
     @classmethod
@@ -76,7 +79,7 @@ class Samples(NamedTuple):
 
 
 def rotors_of(family: str) -> Rotors:
-    """Make what all scenes with a pair share."""
+    """Return what all scenes with a pair share."""
     config = config_of(family, None, "solver.fidelity=map")
     profile = profile_of(config)
     contact = jax.jit(lambda p: MapContact.of(p, _DEEPEST, _ROLLS, _RELATIVES))(profile)  # pyright: ignore[reportArgumentType]
@@ -85,7 +88,7 @@ def rotors_of(family: str) -> Rotors:
         *(float(x) for x in (contact.first_roll, contact.roll_step)),
         *(float(x) for x in (contact.deepest, contact.relative_step)),
     )
-    # With a map, the compiled motion asks the rotor for its pitch angle alone.
+    # With a map, the compiled motion needs only the rotor's pitch angle.
     radius, lobes = config.profile.pitch_radius_mm * 1e-3, config.profile.lobes
     rotor = Rotor(lobes, radius, 0.0, math.pi / (2 * lobes), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     idle = Search(np.zeros((1, 5)), np.zeros(1))
@@ -112,7 +115,7 @@ def rotors_of(family: str) -> Rotors:
 
 
 def motion_at(rotors: Rotors, values: NDArray[np.float64]) -> Motion:
-    """Constants of the motion with these values (p,) of the quantities."""
+    """Return the constants of the motion with these values (p,) of the quantities."""
     length, torque, stiffness, damping_ratio, backlash, clearance = map(float, values)
     scene = dataclasses.replace(
         rotors.scene,
@@ -128,8 +131,10 @@ def motion_at(rotors: Rotors, values: NDArray[np.float64]) -> Motion:
 
 @njit(nogil=True, error_model="numpy")
 def _simulate(rotor, motion, table, search, settle, window, rtol):
-    """Mean and peak force (N) over the window from rest, and the period (0: none); NaN if the
-    lobes pass through each other."""
+    """Return mean and peak force (N) over the window from rest, and the period (0: no period).
+
+    NaN if the lobes pass through each other.
+    """
     angle = rate = total = peak = 0.0
     states = np.zeros((window, 2))
     for i in range(settle + window):
@@ -150,7 +155,7 @@ def _simulate(rotor, motion, table, search, settle, window, rtol):
 
 
 def scan(pairs: list[Rotors], values: NDArray[np.float64]) -> Samples:
-    """Simulate both pairs for each of `values` (n, p), by a thread for each core."""
+    """Simulate both pairs for each of `values` (n, p), one thread per core."""
 
     def one(at):
         found = []
@@ -168,7 +173,7 @@ def scan(pairs: list[Rotors], values: NDArray[np.float64]) -> Samples:
 
 
 def costs(samples: Samples) -> NDArray[np.float64]:
-    """(n,) root mean square of log(force / paper's), more where a motion does not repeat."""
+    """Return the RMS of log(force / paper's) (n,), increased where a motion does not repeat."""
     with np.errstate(invalid="ignore", divide="ignore"):
         away = np.log(np.maximum(samples.forces, 1e-3) / PAPER)
         cost = np.sqrt(np.mean(away**2, axis=(1, 2)))
@@ -179,7 +184,7 @@ def costs(samples: Samples) -> NDArray[np.float64]:
 def values_at(
     points: NDArray[np.float64], quantities: Sequence[Quantity] = QUANTITIES
 ) -> NDArray[np.float64]:
-    """Values (n, p) of the quantities at points (n, p) of the unit box of their ranges."""
+    """Return the values (n, p) of the quantities at points (n, p) of the unit box."""
     low, high = (np.array([getattr(q, end) for q in quantities]) for end in ("low", "high"))
     logarithmic = low * (high / low) ** points
     return np.where([q.logarithmic for q in QUANTITIES], logarithmic, low + (high - low) * points)
@@ -192,8 +197,11 @@ def explore(
     quantities: Sequence[Quantity] = QUANTITIES,
     report: Callable[[Samples], None] = lambda samples: None,
 ) -> Samples:
-    """All scenes that differential evolution from `seed` looks at, over the box of the ranges of
-    `quantities`; `population` scenes for each quantity in a generation."""
+    """Return all scenes that differential evolution tries, starting from `seed`.
+
+    It covers the box of the ranges of `quantities`, with `population` scenes per quantity in a
+    generation.
+    """
     pairs = [rotors_of(family) for family in FAMILIES]
     parts: list[Samples] = []
 
@@ -220,8 +228,10 @@ def explore(
 
 
 def regimes(samples: Samples, within: float) -> list[int]:
-    """Indices of the best scene of every regime (periods of both motions), best first, among
-    those that repeat and have a misfit of at most `within`."""
+    """Return the index of the best scene of every regime (periods of both motions), best first.
+
+    Only scenes that repeat and have a misfit of at most `within` count.
+    """
     order = np.argsort(samples.misfits)
     found: dict[tuple[int, ...], int] = {}
     for i in order[: np.searchsorted(samples.misfits[order], within, side="right")]:

@@ -1,10 +1,10 @@
-"""Simulates the paper's scene, and studies how far its forces determine what it leaves out.
+"""Simulates the paper's scene, and studies how far its forces determine the omitted quantities.
 
 Section 4 of the paper gives the mean and maximum contact force of a CIC and an EE pair, but not the
 rotors' length, load, timing gear or backlash. `run` simulates the values of
-`configs/paper_cic.yaml` and `configs/paper_ee.yaml` from rest. It looks for motions that coexist,
-takes other definitions of mean and maximum, changes each quantity alone, and changes each with the
-others solved for again. `look` searches for such values anew, in the box of plausible ones.
+`configs/paper_cic.yaml` and `configs/paper_ee.yaml` from rest. It searches for coexisting motions,
+and applies other definitions of mean and maximum. It changes each quantity alone, then with the
+others solved for again. `look` searches for other values in the box of plausible ones.
 """
 
 import dataclasses
@@ -37,33 +37,33 @@ from rootsopt.scene import design_vector
 from rootsopt.status import Status
 
 WINDOWS = ((0.0, 0.1), (0.0, 0.2), (0.05, 0.2), (0.1, 0.2), (0.1, 0.8))
-"""Start and end (s) of the windows that mean and maximum may have been taken over."""
+"""Windows (start, end in s) over which mean and maximum may have been taken."""
 THINNINGS = (1, 3, 15)
-"""Each keeps every n-th sample of the window."""
+"""Thinning factors: each keeps every n-th sample of the window."""
 GRID = ("attractors.relatives=24", "attractors.rates=18")
-"""Initial states of the motions that coexist."""
+"""Grid of initial states for coexisting motions."""
 OTHERS = {
     "tight play": (330.0, 5.6142, 7252.4, 0.77, 0.41829, 0.076577),
     "low gear damping": (361.942, 6.5715, 27871.46, 0.6085, 0.8734, 0.225),
     "short rotor": (253.46, 5.6804, 16489.5, 0.9866, 1.0063, 0.2879),
     "light load": (300.23, 0.21735, 31959.0, 0.93524, 0.99737, 0.29273),
 }
-"""Other values that came out of searches; they are solved again for the paper's forces."""
+"""Other values found by searches; they are solved again for the paper's forces."""
 CHANGES = {False: (-0.1, -0.05, -0.02, -0.01, 0.01, 0.02, 0.05, 0.1), True: (-1e-3, 1e-3)}
-"""Shares by which each quantity is changed alone, in a full and in a reduced run."""
+"""Relative changes of each quantity alone, in a full and in a reduced run."""
 STEP, COUNT = 0.04, 6
-"""Factor (less 1) and greatest number of steps each way along the profile."""
+"""Step factor (minus 1) and maximum number of steps in each direction along the profile."""
 WITHIN, LIMIT = 5e-3, 0.03
-"""Misfit below which a place of the profile is good enough, and above which the profile ends."""
+"""Misfit below which a point of the profile is accepted, and above which the profile ends."""
 GENERATIONS, POPULATION = 70, 16
 QUICK_SEARCH = 1, 2
 """Generations and population of a reduced search."""
 QUICK = ("solver.fidelity=linear",)
-"""Settings of a reduced run: compiled in half the time, and some 3 % off."""
+"""Settings of a reduced run: they compile in half the time, and forces are some 3 % off."""
 TARGET = 0.1
-"""Error of a force above which a search has found nothing."""
+"""Error of a force above which a search has no result."""
 POLISHED = 4
-"""Regimes whose best scene is solved for the paper's forces."""
+"""Number of regimes whose best scene is solved for the paper's forces."""
 Row = dict[str, Any]
 Say = Callable[[str], None]
 
@@ -85,7 +85,7 @@ def row_of(response: Response) -> Row:
 
 
 def motions(values: ArrayLike) -> list[Row]:
-    """Find the motions that coexist with these values; a row for each."""
+    """Find the coexisting motions with these values; return a row per motion."""
     rows = []
     for family in FAMILIES:
         found = attractors.find(evaluator_of(config_of(family, values, *GRID)))
@@ -95,9 +95,9 @@ def motions(values: ArrayLike) -> list[Row]:
 
 
 def definitions(values: ArrayLike) -> list[Row]:
-    """Take mean and maximum over windows of one motion from rest, start-up included or not.
+    """Apply definitions of mean and maximum to one motion from rest, with and without start-up.
 
-    Returns a row for each window and sampling rate.
+    Returns a row per window and sampling rate.
     """
     runs = []
     for family in FAMILIES:
@@ -126,7 +126,7 @@ def definitions(values: ArrayLike) -> list[Row]:
 
 
 def slices(pairs: Pairs, values: ArrayLike, changes: Sequence[float], say: Say) -> list[Row]:
-    """Change each quantity alone by a share of itself; a row for each change."""
+    """Change each quantity alone by a share of itself; return a row per change."""
     rows = []
     for number, quantity in enumerate(QUANTITIES):
         for change in changes:
@@ -139,10 +139,10 @@ def slices(pairs: Pairs, values: ArrayLike, changes: Sequence[float], say: Say) 
 
 
 def profile(pairs: Pairs, found: Response, say: Say) -> list[Row]:
-    """Move each quantity away, and solve for the others again from where they were.
+    """Move each quantity away, and solve for the others again, starting from the last solution.
 
-    A quantity moves by factors of 1 ± `STEP`, at most `COUNT` times each way, until the misfit
-    stays above `LIMIT`. Returns a row for each place.
+    A quantity moves by factors of 1 ± `STEP`, at most `COUNT` times in each direction, until the
+    misfit stays above `LIMIT`. Returns a row per point.
     """
     rows = []
     for number, quantity in enumerate(QUANTITIES):
@@ -167,7 +167,7 @@ class Results:
     """The shipped values, other values solved for the paper's forces, and tables of rows.
 
     `alone`: each quantity changed alone. `solved`: with the others solved for again. `motions`,
-    `definitions`: as the functions of these names. A reduced run leaves all but `alone` empty.
+    `definitions`: results of these functions. In a reduced run only `alone` has rows.
     """
 
     shipped: Response
@@ -179,7 +179,7 @@ class Results:
 
     @property
     def tables(self) -> dict[str, list[Row]]:
-        """Rows by the name of their part, without the empty ones."""
+        """Return the rows by the name of their part, without the empty ones."""
         named = {
             "motions": self.motions,
             "definitions": self.definitions,
@@ -196,7 +196,7 @@ def run(
 ) -> Results:
     """Simulate the shipped values and study how far they are determined.
 
-    `tell` is given each response with its name, as soon as it is known. Raises `NoResultError`
+    `tell` is called with each response and its name as soon as it is known. Raises `NoResultError`
     unless both motions are periodic and both configs hold the same values.
     """
     settings = QUICK if quick else ()
@@ -224,7 +224,7 @@ def run(
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """What a search finds: its scenes, seconds, and the best ones solved for the paper's forces.
+    """Results of a search: its scenes, seconds, and the best ones solved for the paper's forces.
 
     `polished`: periods of both motions → (misfit of the search, response).
     """
@@ -238,12 +238,12 @@ class Found:
 
     @property
     def periodic(self) -> NDArray[np.bool_]:
-        """(n,) whether both motions repeat."""
+        """Return whether both motions repeat (n,)."""
         return np.all(self.periods > 0, axis=1)
 
     @property
     def enough(self) -> bool:
-        """Whether some values give all four forces within `TARGET`."""
+        """Return whether some values give all four forces within `TARGET`."""
         return any(response.misfit <= TARGET for _, response in self.polished.values())
 
 
@@ -253,7 +253,7 @@ def look(
     least_clearance: float = QUANTITIES[-1].low,
     say: Say = lambda text: None,
 ) -> Found:
-    """Search for values anew, with no clearance (mm) below the least.
+    """Search for other values, with no clearance (mm) below the least.
 
     A reduced run takes one generation, and solves for nothing.
     """

@@ -1,6 +1,6 @@
 """What does each part of a scene cost?
 
-Writes parts.csv (a row for each part) and parts.png.
+Writes parts.csv (a row per part) and parts.png.
 """
 
 import sys

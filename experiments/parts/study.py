@@ -1,9 +1,9 @@
 """Measures what each part of a scene costs.
 
-Adds every part by itself to the smallest scene, contact driven at constant speed, and all of them
-together. Measures states, equations of the traced right-hand side, time of one right-hand side
-inside a compiled loop, and time of a simulation with gradient (warm, and the first with its
-compilation). Ratios are to the smallest scene in the same run.
+The study adds every part on its own to the smallest scene (contact driven at constant speed), and
+then all of them. It measures states, equations of the traced right-hand side, time of one
+right-hand side inside a compiled loop, and time of a simulation with gradient (warm, and the first
+with its compilation). Ratios are to the smallest scene in the same run.
 """
 
 import statistics
@@ -22,7 +22,7 @@ from rootsopt.config import Config, load
 from rootsopt.scene import Scene, design_vector
 
 Row = dict[str, Any]
-# A light load at high speed, which flanks alone can hold. Slower, lobes pass through each other.
+# The flanks alone can hold a light load at high speed. At lower speed the lobes pass through.
 BARE = (
     "scene.timing_gear=null",
     "scene.speed_rpm=6000",
@@ -43,7 +43,7 @@ PARTS = {
 
 
 def equations(jaxpr) -> int:
-    """Count the equations of a traced program, with those of its inner ones."""
+    """Count the equations of a traced program, including inner ones."""
     total = len(jaxpr.eqns)
     for equation in jaxpr.eqns:
         for value in jax.tree.leaves(equation.params, is_leaf=lambda v: hasattr(v, "jaxpr")):
@@ -76,7 +76,7 @@ def right_hand_side(config: Config, calls: int) -> dict[str, float]:
 
 
 def evaluation(config: Config, repeats: int) -> dict[str, float | str]:
-    """Time the first evaluation (s) and later ones (ms), value and gradient."""
+    """Time the first evaluation (s) and later ones (ms), with value and gradient."""
     evaluator = evaluator_of(config)
     began = time.perf_counter()
     evaluator, found = evaluator.fit(series=False)
@@ -91,9 +91,9 @@ def evaluation(config: Config, repeats: int) -> dict[str, float | str]:
 
 
 def run(quick: bool, say: Callable[[str], None] = lambda text: None) -> list[Row]:
-    """Measure every part by itself, and all together; a row for each.
+    """Measure every part on its own, and all together; return a row for each.
 
-    A reduced run measures the right-hand sides of three scenes alone, with few calls.
+    A reduced run measures only the right-hand sides of three scenes, with few calls.
     """
     scenes = {name: load(CIC, [*BARE, *more]) for name, more in PARTS.items()}
     scenes["all of them"] = shipped("pump")

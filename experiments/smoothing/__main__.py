@@ -1,7 +1,7 @@
 """What does rounding the corners of contact law and timing gear change?
 
-Writes smoothing.csv (a row for every scene and length), smoothing.json and smoothing.png, anew
-after every kind of scene. The exit status is 3 unless the default's bias is below the limit.
+Writes smoothing.csv (a row per scene and length), smoothing.json and smoothing.png, updated after
+every kind of scene. The exit code is 3 unless the default's bias is below the limit.
 """
 
 import argparse
@@ -21,7 +21,7 @@ def body(run: Run) -> int:
     from experiments.smoothing import figures, study
 
     def keep(found: "list[Measured]") -> None:
-        # The last kind compiles for long.
+        # Save after each kind: the last one compiles for long.
         run.csv("smoothing.csv", [row for one in found for row in study.rows_of(one)])
         run.json("smoothing.json", {one.kind: study.summary(one) for one in found})
         run.figure("smoothing.png", figures.lengths(found))
@@ -38,7 +38,7 @@ def body(run: Run) -> int:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the size and the seed of the draw."""
     parser.add_argument("--count", type=int, help="random scenes of CIC; fewer of the others")
-    parser.add_argument("--seed", type=int, default=0, help="of the draw (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the draw (default: 0)")
 
 
 def main() -> int:

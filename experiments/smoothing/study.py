@@ -1,11 +1,11 @@
 """Measures what rounding the corners of contact law and timing gear changes, over many scenes.
 
-Random designs and scenes of both shipped pairs, the shipped configs themselves, those of the paper,
-and a blower with all parts are brought to their orbit at the default `contact.smoothing_mm`, which
-follows the scene. The orbit is closed again at that and at fixed smoothing lengths, at a tight
-tolerance. Bias is the relative difference of mean, peak and RMS force from those at the least
-length; the greatest of the three counts. Scenes whose orbit is not closed at a length are counted.
-The gradient by differentiation is compared with central differences of tight orbits.
+The scenes are random designs and scenes of both shipped pairs, the shipped configs, those of the
+paper, and a blower with all parts. They are simulated to their orbit at the default
+`contact.smoothing_mm`, which follows the scene. The orbit is closed again at this and at fixed
+smoothing lengths, at a tight tolerance. Bias is the largest relative difference of mean, peak and
+RMS force from those at the smallest length. Scenes whose orbit does not close at a length are
+counted. Derivatives are compared with central differences of tight orbits.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ from rootsopt.status import Status
 
 Say = Callable[[str], None]
 DEFAULT = 0.0
-"""Stands for the default of `contact.smoothing_mm` among the smoothing lengths (mm)."""
+"""Value that stands for the default of `contact.smoothing_mm` among the smoothing lengths (mm)."""
 WIDTHS = (1e-6, 1e-5, 3e-5, 1e-4, 1e-3, DEFAULT)
 """Smoothing lengths (mm); the first is the reference."""
 COMPARED = (1e-6, 1e-5, DEFAULT)
@@ -45,9 +45,9 @@ USUAL, TIGHT = (1e-6, 1e-8), (1e-8, 1e-10)
 PERIODS = 200, 100
 """Longest transients (mesh periods), in the same order."""
 SAME = 0.02
-"""Scaled distance at φ1 = 0 above which two orbits are different motions."""
+"""Scaled distance at φ1 = 0 above which two orbits count as different motions."""
 FD_SHARE = 0.05
-"""Steps of the central differences in units of `FD_STEPS`."""
+"""Steps of the central differences, in units of `FD_STEPS`."""
 SHAKY = (
     "scene.speed_rpm=1700",
     "scene.load.torque_N_m=3",
@@ -58,18 +58,18 @@ SHAKY = (
     "profile.involute_length_mm=4",
     "profile.tip_arc_angle_deg=1.5",
 )
-"""A stable orbit of two mesh periods, which magnifies what is changed."""
+"""A stable orbit of two mesh periods that is sensitive to changes."""
 KNOWN: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
     "cic": (("cic", ()), ("cic", SHAKY), ("paper_cic", ())),
     "ee": (("ee", ()), ("paper_ee", ())),
     "pump": (("pump", ()),),
 }
 COUNTS = {"cic": 60, "ee": 30, "pump": 5}
-"""Random scenes of each kind."""
+"""Number of random scenes of each kind."""
 
 
 def drawn(kind: str, seed: int) -> Iterator[Config]:
-    """Yield endless random scenes of a kind, with random designs where it has parameters."""
+    """Yield random scenes of a kind without end, with random designs where it has parameters."""
     draw = np.random.default_rng([seed, *kind.encode()])
 
     def even_in_logarithm(low: float, high: float) -> float:
@@ -121,7 +121,7 @@ def _respond(models: Scene, designs, states, tolerances, periods, gradient: bool
 def responses(
     models: Scene, designs, states, tolerances: tuple[float, float], periods: int, slopes=True
 ) -> Batch:
-    """Simulate n scenes, each with its own design and scaled state to start from."""
+    """Simulate n scenes, each with its own design and initial scaled state."""
     leaves, structure = jax.tree.flatten(models)
 
     def work(designs, states, *leaves):
@@ -134,7 +134,7 @@ def responses(
 
 
 def rounded(models: Scene, width: float) -> Scene:
-    """Round all corners of the models over `width` (mm), or leave them as they are by default."""
+    """Round all corners of the models over `width` (mm); `DEFAULT` leaves them unchanged."""
     if width == DEFAULT:
         return models
     length = np.full_like(models.pitch_radius, width * MM)
@@ -143,9 +143,9 @@ def rounded(models: Scene, width: float) -> Scene:
 
 
 def bias(found: Batch, truth: Batch) -> NDArray[np.float64]:
-    """Find the greatest relative difference (n,) of mean, peak and RMS.
+    """Return the largest relative difference (n,) of mean, peak and RMS.
 
-    NaN where one is not known, or where the motions are not the same.
+    NaN where one is unknown, or where the motions differ.
     """
     same = np.max(np.abs(found.state - truth.state), axis=1) < SAME
     same &= found.usable & truth.usable & (found.period == truth.period)
@@ -156,7 +156,7 @@ def bias(found: Batch, truth: Batch) -> NDArray[np.float64]:
 def gradient_errors(models: Scene, designs, found: Batch) -> NDArray[np.float64]:
     """Compare the gradients of mean, peak and RMS with central differences.
 
-    Returns errors (n, 3), relative to the greatest entry of each.
+    Returns errors (n, 3), relative to the largest entry of each.
     """
     columns, same = [], np.asarray(found.usable)
     for k, step in enumerate(FD_STEPS):
@@ -176,8 +176,11 @@ def gradient_errors(models: Scene, designs, found: Batch) -> NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """Random scenes of each kind, smoothing lengths (mm), those at which gradients are compared,
-    and the number of scenes whose gradients are."""
+    """Size of a run.
+
+    It holds the random scenes of each kind, smoothing lengths (mm), the lengths at which gradients
+    are compared, and the number of scenes with compared gradients.
+    """
 
     counts: dict[str, int]
     widths: tuple[float, ...] = WIDTHS
@@ -186,7 +189,7 @@ class Size:
 
 
 def size_of(quick: bool, count: int | None) -> Size:
-    """Choose the size of a run; `count`: random scenes of CIC, and fewer of the others."""
+    """Choose the size of a run; `count`: random scenes of CIC, with fewer of the others."""
     if quick:
         return Size({"cic": 5}, (1e-6, 1e-4, DEFAULT), (DEFAULT,), 2)
     share = 1.0 if count is None else count / COUNTS["cic"]
@@ -204,12 +207,12 @@ class Measured:
     gradients: dict[float, NDArray[np.float64]]
 
     def bias(self, width: float) -> NDArray[np.float64]:
-        """Bias (n,) at a smoothing length (mm)."""
+        """Return the bias (n,) at a smoothing length (mm)."""
         return bias(self.orbits[width], self.orbits[WIDTHS[0]])
 
 
 def measure(kind: str, size: Size, seed: int, say: Say) -> Measured:
-    """Bring the scenes of a kind to their orbits, and those to other smoothing lengths."""
+    """Simulate the scenes of a kind to their orbits, then close these at other lengths."""
     configs = scenes(kind, size.counts[kind], seed)
     models = stacked(configs, "float64")
     designs = np.stack([np.asarray(design_vector(config)) for config in configs])
@@ -296,7 +299,7 @@ def run(
     say: Say = lambda text: None,
     keep: Callable[[list[Measured]], None] = lambda found: None,
 ) -> list[Measured]:
-    """Measure all kinds of scenes; `keep` is given those so far after each."""
+    """Measure all kinds of scenes; call `keep` with those so far after each."""
     size = size_of(quick, count)
     found: list[Measured] = []
     for kind in size.counts:
@@ -306,5 +309,5 @@ def run(
 
 
 def within_limit(found: list[Measured]) -> bool:
-    """Tell whether the default's bias stays below the limit in all scenes."""
+    """Return whether the default's bias stays below the limit in all scenes."""
     return bool(max(np.nanmax(one.bias(DEFAULT)) for one in found) < LIMIT)

@@ -1,4 +1,4 @@
-"""How do speed and optimised forces go together?
+"""How does the contact force depend on speed, and does optimising over a range pay off?
 
 Writes speed.csv, speed_resonances.csv, speed_maxima.csv, speed.json, speed.png, speed_objective.png
 and speed_resonances.png.

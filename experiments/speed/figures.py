@@ -21,7 +21,7 @@ TITLES = {"shipped": "shipped scene", "light": "gear damping ratio 0.1"}
 
 
 def over_speed(results: Results) -> Figure:
-    """Draw mean and peak force over speed, a column for each scene."""
+    """Draw mean and peak force over speed, one column per scene."""
     studies = results.studies
     made, axes = sheet(13, 7.4, 2, len(studies), sharex=True, sharey="row")
     *shown, _ = OPTIMISED
@@ -73,7 +73,7 @@ def objectives(results: Results) -> Figure:
     axes[0, 0].set_ylabel("objective / CIC at the same speed")
     lines, names = axes[0, 0].get_legend_handles_labels()
     made.legend(lines, names, loc="outside lower center", ncols=3, frameon=False)
-    made.suptitle("What an optimum is worth at other speeds (markers: speeds of its objective)")
+    made.suptitle("Objective of each optimum at other speeds (markers: speeds of its objective)")
     return made
 
 
@@ -125,5 +125,5 @@ def resonances(results: Results) -> Figure:
         ],
         loc="outside lower center", ncols=3, frameon=False,
     )  # fmt: skip
-    made.suptitle("Peak force over speed, and where harmonics k meet a natural frequency")
+    made.suptitle("Peak force over speed; lines: harmonic k meets a natural frequency")
     return made

@@ -1,9 +1,9 @@
 """Relates speed to contact force: sweeps, optimised designs, and natural frequencies.
 
-Takes mean and peak contact force over speed, every speed from rest, of the shipped CIC and EE pairs
-and of CIC designs optimised at 3000 rpm, over the range (weighted mean) and for its worst speed; in
-the shipped scene and in one with less damping in the gear. Linearises the pair for its natural
-frequencies, and finds the speeds at which a harmonic of the mesh frequency meets one.
+The study sweeps mean and peak contact force over speed, each speed from rest. Designs: the shipped
+CIC and EE pairs, and CIC optimised at 3000 rpm, over the range (weighted mean) and for its worst
+speed. Scenes: the shipped one, and one with less damping in the gear. It linearises the pair for
+its natural frequencies, and finds the speeds at which a harmonic of the mesh frequency meets one.
 """
 
 import dataclasses
@@ -38,9 +38,9 @@ OPTIMISED = {
 """Settings of each optimisation."""
 QUICK = ("optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=1")
 PHASES = 240
-"""Phases of a mesh period at which the pair is linearised."""
+"""Number of phases of a mesh period at which the pair is linearised."""
 ORDERS = 6
-"""Harmonics of the mesh frequency considered."""
+"""Number of harmonics of the mesh frequency considered."""
 PROMINENCE = 0.02
 """Rise above the surroundings, relative to the height, above which a point is a maximum."""
 NEAR = 0.03
@@ -64,7 +64,7 @@ def equilibria(pair: RotorPair, phases):
     still = jnp.asarray(0.0)
 
     def flank(phase, relative):
-        # Without the damping that sliding at speed gives.
+        # Without the damping from sliding at speed.
         side = jnp.where(relative < 0, 1.0, -1.0)
         pose = -side * (2 * np.pi / pair.lobes * phase + relative / 2), side * relative
         gap, _, lever = pair.contact(*pose)
@@ -93,10 +93,11 @@ def equilibria(pair: RotorPair, phases):
 def linearised(pair: RotorPair) -> dict[str, float]:
     """Find the natural frequencies (Hz) of the pair about its static equilibrium, rotor 1 held.
 
-    `contact`: of rotor 2 on the flanks, with the mean of their stiffness over the phases in which
-    they carry most of the load, a share `contact_share` of all; `gear`: on the gear; `average`:
-    mean over all phases of the local frequency, with whatever carries. `both_share`: share of the
-    phases in which flanks and gear both carry; `static_peak_N`, `static_mean_N`: contact force.
+    `contact`: of rotor 2 on the flanks, with their stiffness averaged over the phases in which they
+    carry most of the load, a share `contact_share` of all phases; `gear`: on the gear; `average`:
+    mean over all phases of the local frequency, with flanks and gear as they carry. `both_share`:
+    share of the phases in which flanks and gear both carry; `static_peak_N`, `static_mean_N`:
+    contact force.
     """
     phases = (np.arange(PHASES) + 0.5) / PHASES
     stiffness, on_flank, torque, force = map(np.asarray, equilibria(pair, phases))
@@ -155,7 +156,7 @@ def maxima(parts: tuple[AtSpeed, ...], rows: list[Row]) -> list[Row]:
 
 
 def covered(rows: list[Row], speeds) -> float:
-    """Return the share of the speeds that lie at a crossing: what chance alone would give."""
+    """Return the share of the speeds that lie at a crossing, as expected by chance alone."""
     at = np.array([row["speed_rpm"] for row in rows])
     return float(np.mean(np.min(np.abs(np.asarray(speeds)[:, None] / at - 1), axis=1) <= NEAR))
 
@@ -233,7 +234,7 @@ def worth(along: np.ndarray, speeds) -> Row:
 class Results:
     """Scenes by name, speeds (rpm) of the objective, and rows of sweeps, crossings and maxima.
 
-    `chance`: share of the maxima that chance puts at a crossing, by scene and design.
+    `chance`: share of the maxima expected at a crossing by chance, by scene and design.
     """
 
     studies: dict[str, Study]

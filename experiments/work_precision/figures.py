@@ -54,9 +54,9 @@ STYLES = ("search", "map 384x16", "map 192x12", "map 768x24", "linear", "nodes 1
 
 
 def style_of(curve: Curve) -> int:
-    """Number the colour and mark of a contact.
+    """Return the number of a contact's colour and mark.
 
-    Search with dopri8 takes those of nodes 100, which it does not meet in a panel.
+    Search with dopri8 uses those of nodes 100, which is never in the same panel.
     """
     return STYLES.index(curve.contact if curve.method == "tsit5" else "nodes 100")
 

@@ -1,12 +1,13 @@
 """Measures error of mean and peak force against run time.
 
-Three scenes: the shipped CIC and EE pairs, and a lively CIC pair (more backlash, less damping,
-lower speed). A curve is one choice of contact, solver and precision; along it the tolerance of
-transient and orbit runs from coarse to fine. The time is that of one whole evaluation of a design,
-warm: transient, closed orbit, forces and gradient. The reference is the search at every call with
-dopri8 at a tolerance of 1e-11; its own error is taken from other tolerances and another solver.
+There are three scenes: the shipped CIC and EE pairs, and a lively CIC pair (more backlash, less
+damping, lower speed). A curve is one choice of contact, solver and precision. Along it the
+tolerance of transient and orbit runs from coarse to fine. The time is that of one whole evaluation
+of a design, warm: transient, closed orbit, forces and gradient. The reference is the search at
+every call with dopri8 at a tolerance of 1e-11. Its own error is estimated from other tolerances and
+another solver.
 
-The study `smoothing` measures what rounding the corners of contact law and timing gear costs.
+The study `smoothing` measures the effect of rounding the corners of contact law and timing gear.
 """
 
 import dataclasses
@@ -44,20 +45,20 @@ FORCES = {"mean": "mean_force_N", "peak": "peak_force_N"}
 REPEATS = 5
 FINE = tuple(10.0**-k for k in range(3, 11))
 ROUGH = FINE[:5]
-"""Tolerances of contacts whose own error is far greater than any of the solver."""
+"""Tolerances of contacts whose own error is far larger than the solver's."""
 NODES = FINE[:4]
-"""Tolerances of nodes, which leave steps in the force: a finer tolerance gets stuck there."""
+"""Tolerances of nodes. Nodes leave steps in the force, at which a finer tolerance stalls."""
 PERIODS = 64
 """Longest transient (mesh periods); all scenes settle within a few."""
 PATIENCE = 3.0
-"""Seconds of a setting's runs above which it is not repeated."""
+"""Time (s) of a setting's runs above which it is not repeated."""
 SINGLE = (1e-3, 1e-4, 1e-5, 2e-6)
-"""Tolerances of single precision, which holds none finer."""
+"""Tolerances of single precision; it allows none finer."""
 REFERENCE_RTOL = 1e-11
 FLOOR = 1e-12
-"""Least error (relative) drawn."""
+"""Smallest relative error drawn."""
 OTHER_ORBIT = 0.3
-"""Scaled distance from the reference's orbit at φ = 0 above which an orbit is another one."""
+"""Scaled distance from the reference's orbit at φ = 0 above which an orbit counts as another."""
 
 
 def contact(name: str) -> tuple[str, ...]:
@@ -74,7 +75,7 @@ def contact(name: str) -> tuple[str, ...]:
 class Curve:
     """One choice of contact, solver and precision in a scene, over its tolerances.
 
-    `panels`: where it is drawn. `transient`: tolerance of the transient, where it is not that of
+    `panels`: where it is drawn. `transient`: tolerance of the transient, if it differs from that of
     the orbit. Curves with the same `compiled` share a compiled program.
     """
 
@@ -88,7 +89,7 @@ class Curve:
 
     @property
     def compiled(self) -> tuple[str, str, str, bool]:
-        """What decides on the compiled program."""
+        """Return what determines the compiled program."""
         return self.contact, self.method, self.precision, self.scene == "ee"
 
     def label(self, panel: str) -> str:
@@ -177,7 +178,7 @@ def errors(found: Evaluation, truth: Evaluation) -> dict[str, float]:
 def reference(scene: str, curve: Curve, check: Curve, say: Say) -> Reference:
     """Evaluate a scene as tightly as `curve`'s program can.
 
-    Its error is that against itself at ten times the tolerance, and against `check`'s solver.
+    Its error is the difference from itself at ten times the tolerance, and from `check`'s solver.
     Raises `NoResultError` unless the orbit is periodic.
     """
     found = at(curve.evaluator(), REFERENCE_RTOL)(series=False)
@@ -191,7 +192,7 @@ def reference(scene: str, curve: Curve, check: Curve, say: Say) -> Reference:
 
 
 def verdict(found: Evaluation, truth: Evaluation) -> str:
-    """Return the status of an evaluation, or that it is another orbit than the reference's."""
+    """Return the status of an evaluation, or that its orbit is not the reference's."""
     if not found.usable:
         return found.status.label
     same = found.steady_state["period"] == truth.steady_state["period"]
@@ -202,7 +203,7 @@ def verdict(found: Evaluation, truth: Evaluation) -> str:
 
 
 def measure(curve: Curve, truth: Evaluation, repeats: int) -> list[dict[str, Any]]:
-    """Measure a curve; a row for every tolerance."""
+    """Measure a curve; return a row per tolerance."""
     rows = []
     tool = curve.evaluator()
     for rtol in curve.tolerances:
@@ -243,7 +244,7 @@ class Results:
 
     @property
     def rows(self) -> list[Row]:
-        """Rows of all curves."""
+        """Return the rows of all curves."""
         return [row for _, part in self.measured for row in part]
 
 

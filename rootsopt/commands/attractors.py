@@ -1,4 +1,4 @@
-"""`rootsopt attractors CONFIG`: the motions that coexist, and where they begin."""
+"""`rootsopt attractors CONFIG`: coexisting motions and the initial states that lead to each."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rootsopt.config import Config
     from rootsopt.output.runs import RunFolder
 
-PURPOSE = "Find the motions that coexist in a scene and the initial states that lead to each."
+PURPOSE = "Find the coexisting motions of a scene and the initial states that lead to each."
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
@@ -46,7 +46,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     columns = {
         "relative_rotation_mrad": relative.ravel(),
         "relative_speed_rad_s": rate.ravel(),
-        # 0: the motion is lost.
+        # 0: the initial state leads to no reported motion.
         "attractor": found.leads_to.ravel() + 1,
     }
     folder.write_csv("basins.csv", columns)
@@ -69,7 +69,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; return the exit code."""
     return door.through("attractors", lambda: _run(argv), own=argv is None)
 
 

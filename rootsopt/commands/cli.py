@@ -1,7 +1,7 @@
-"""What the commands share: arguments, result folder, float64, exit codes.
+"""Shared parts of the commands: arguments, result folder, float64, exit codes.
 
-Exit 0: success. 2: bad input, one message on stderr. 3: the run ended without a usable
-result; the status says why.
+Exit code 0: success. 2: bad input, one message on stderr. 3: the run ended without a usable result;
+the status says why.
 """
 
 import argparse
@@ -26,31 +26,31 @@ if TYPE_CHECKING:
 
     from rootsopt.output.runs import RunFolder
 
-# Equinox's checks of traced values call back to Python, and a program that does so cannot
-# be kept between processes. Every integration here returns a status instead. Read once,
-# when equinox is first imported.
+# Equinox's checks of traced values call back to Python, and a program with callbacks cannot be
+# cached between processes. Every integration here returns a status instead. Equinox reads this
+# variable once, when it is first imported.
 os.environ.setdefault("EQX_ON_ERROR", "off")
 
 
 class Outcome(NamedTuple):
-    """What a command came to: its exit `code`, and `show`, which prints it."""
+    """The result of a command. code: exit code; show: function that prints the result."""
 
     code: int
     show: "Callable[[Console], None]"
 
 
 Body = Callable[[Config, argparse.Namespace, "RunFolder"], Outcome]
-"""What a command does: check, compute, write into the folder it is given."""
+"""Function of a command: check, compute, write into the given folder."""
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """One line, as for other bad input."""
+        """Print one line and exit, as for other bad input."""
         self.exit(BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
 def parser(command: str, purpose: str) -> argparse.ArgumentParser:
-    """The arguments every command takes."""
+    """Return a parser with the arguments that every command takes."""
     result = _Parser(
         prog=f"rootsopt {command}",
         description=purpose,
@@ -63,8 +63,8 @@ def parser(command: str, purpose: str) -> argparse.ArgumentParser:
         "-o",
         "--output",
         metavar="DIR",
-        help=f"result folder (default: results/CONFIG-{command}); appears whole when the run has "
-        "ended, and an earlier run in it is moved to DIR.1, DIR.2 ...",
+        help=f"result folder (default: results/CONFIG-{command}); appears complete when the run "
+        "has ended, and an earlier run in it is moved to DIR.1, DIR.2 ...",
     )
     result.add_argument(
         "--overwrite",
@@ -77,15 +77,15 @@ def parser(command: str, purpose: str) -> argparse.ArgumentParser:
         default=[],
         metavar="KEY=VALUE",
         dest="overrides",
-        help="override a config key, as in --set scene.speed_rpm=1500; repeatable",
+        help="override a config key, for example --set scene.speed_rpm=1500; repeatable",
     )
     _add_import(result)
     result.add_argument("--no-figures", action="store_true", help="write no figures")
     result.add_argument(
         "--no-cache",
         action="store_true",
-        help="compile anew, and keep no compiled programs in the user's cache folder "
-        "(ROOTSOPT_CACHE=DIR names another folder, ROOTSOPT_CACHE=off is as this option)",
+        help="compile again, and keep no compiled programs in the user's cache folder "
+        "(ROOTSOPT_CACHE=DIR names another folder, ROOTSOPT_CACHE=off does the same)",
     )
     return result
 
@@ -102,7 +102,7 @@ def _add_import(arguments: argparse.ArgumentParser) -> None:
 
 
 def _import_extensions(command: str, argv: Sequence[str] | None) -> None:
-    """Import what `--import` names, before config keys are described and read."""
+    """Import what `--import` names, before config keys are listed and read."""
     early = _Parser(prog=f"rootsopt {command}", add_help=False, allow_abbrev=False)
     _add_import(early)
     names = early.parse_known_args(argv)[0].imports
@@ -119,15 +119,19 @@ def run(
     argv: Sequence[str] | None,
     add_options: Callable[[argparse.ArgumentParser], None] = lambda _: None,
 ) -> int:
-    """Parse, load, choose float64, run `body` in a folder of its own, put that in place, print;
-    turn `InputError` into exit 2. `add_options` adds the command's own arguments."""
+    """Run a command and return its exit code.
+
+    It parses arguments, loads the config, chooses float64, runs `body` in its own folder, puts the
+    folder in place and prints. `InputError` becomes exit code 2. `add_options` adds the command's
+    own arguments.
+    """
     environment.own_process()
     try:
         _import_extensions(command, argv)
         arguments = parser(command, purpose)
         add_options(arguments)
         options = arguments.parse_args(argv)
-        for name in options.imports:  # Those that only the whole parser knows: an abbreviation.
+        for name in options.imports:  # Only the whole parser knows abbreviated options.
             import_named(name)
         if options.output is None:
             options.output = os.path.join("results", f"{options.config.stem}-{command}")
@@ -159,7 +163,7 @@ def _in_folder(command: str, body: Body, config: Config, options: argparse.Names
     ):
         outcome = body(config, options, folder)
         notes = folder.put_in_place()
-        # The console takes half of the time to import, and stdout may fail: files come first.
+        # Write files first: importing the console takes half of the time, and stdout may fail.
         from rich.console import Console
 
         out = Console()
@@ -172,7 +176,7 @@ def _in_folder(command: str, body: Body, config: Config, options: argparse.Names
 
 @contextlib.contextmanager
 def waiting(console: "Console", what: str) -> Iterator[None]:
-    """Say `what` goes on, on a terminal; nothing in a pipe."""
+    """Show `what` on a terminal while it is in progress; nothing in a pipe."""
     if not console.is_terminal:
         yield
         return
@@ -181,10 +185,10 @@ def waiting(console: "Console", what: str) -> Iterator[None]:
 
 
 def use_cache() -> None:
-    """Keep compiled programs between processes, in the user's cache folder.
+    """Cache compiled programs between processes, in the user's cache folder.
 
-    A folder that cannot be used is no error: the programs are then compiled anew. One line on
-    stderr says so where others could change what is kept there.
+    A folder that cannot be used is not an error: the programs are compiled again. If others could
+    change its content, one line on stderr says so.
     """
     import platformdirs
 

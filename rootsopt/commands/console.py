@@ -1,4 +1,4 @@
-"""`rootsopt COMMAND ...`: all commands by their names."""
+"""`rootsopt COMMAND ...`: run a command by its name."""
 
 import sys
 from collections.abc import Sequence
@@ -8,14 +8,14 @@ from rootsopt.commands import door
 COMMANDS = {
     "optimize": "optimise a design and compare it with the baseline",
     "simulate": "simulate one design in one scene",
-    "sweep": "one design at many speeds",
-    "attractors": "the motions that coexist in one scene",
-    "profile": "geometry of one design",
+    "sweep": "simulate one design at many speeds",
+    "attractors": "find the coexisting motions of one scene",
+    "profile": "compute the geometry of one design",
 }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The console command `rootsopt`; returns the exit code."""
+    """Run the console command `rootsopt`; return the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     command = arguments[0] if arguments and arguments[0] in COMMANDS else ""
     return door.through(command, lambda: _called(arguments), own=argv is None)
@@ -47,5 +47,5 @@ def _called(arguments: list[str]) -> int:
 
 
 def console() -> None:
-    """Entry point of the installed command: ends the process."""
+    """Run the installed command and end the process."""
     door.leave(main())

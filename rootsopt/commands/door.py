@@ -1,9 +1,9 @@
 """The edge of the process: signals, standard streams, exit code.
 
-What a command line owns and a library must leave alone. Everything here lasts only while a command
-runs as the process's own (`main()` without arguments); called from Python with arguments, a command
-touches neither signals nor file descriptors. Loads little, so that an interrupt is answered even
-while the rest is being imported.
+A command line owns these, and a library must leave them alone. Everything here is active only while
+a command runs as its own process (`main()` without arguments). Called from Python with arguments, a
+command touches neither signals nor file descriptors. This module imports little, so that an
+interrupt works even while the rest is being imported.
 """
 
 import contextlib
@@ -18,17 +18,17 @@ from typing import Any
 OK, BAD_INPUT, NO_RESULT = 0, 2, 3
 _NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 _GONE = (errno.EPIPE, errno.EBADF, errno.ESHUTDOWN)
-"""Errors of a stream that has no reader any more; the run goes on."""
+"""Errors of a stream without a reader; the run continues."""
 _WAITING = "rootsopt signals"
 _SHOW_CURSOR = "\x1b[?25h"
 
 
 class Signals:
-    """What SIGINT and SIGTERM do to a run.
+    """Response of a run to SIGINT and SIGTERM.
 
-    A thread waits for them, as the main one may be in compiled code for long. The first signal
-    stops the run at once: `abandon` removes what is unfinished, one line says so, exit code 3.
-    With `patient`, the first one sets `stop` instead and only the second stops at once.
+    A thread waits for the signals, because the main thread may be in compiled code for long. The
+    first signal stops the run at once: `abandon` removes unfinished files, one line says so, and
+    the exit code is 3. With `patient`, the first signal only sets `stop`; the second stops at once.
     """
 
     def __init__(self, command: str):
@@ -42,7 +42,7 @@ class Signals:
         self._wakeup = -1
 
     def install(self) -> None:
-        """Take the signals over that nobody has claimed or told to be ignored."""
+        """Take over the signals that have their default handler; leave others alone."""
         if threading.current_thread() is not threading.main_thread():
             return
         for number in _NAMES:
@@ -60,7 +60,7 @@ class Signals:
             signal.signal(number, _nothing)
 
     def remove(self) -> None:
-        """Leave the signals as they were."""
+        """Restore the signals."""
         if self._pipe is None:
             return
         for number, before in self._before.items():
@@ -85,7 +85,7 @@ class Signals:
         os._exit(NO_RESULT)
 
     def say(self, text: str) -> None:
-        """One line on stderr, whatever the streams are doing."""
+        """Write one line to stderr, whatever the state of the streams."""
         shown = f"rootsopt {self.command}".rstrip()
         try:
             start = f"\r{_SHOW_CURSOR}" if os.isatty(2) else ""
@@ -95,7 +95,7 @@ class Signals:
 
 
 def _nothing(number: int, frame: object) -> None:
-    """What the main thread does on a signal: go on."""
+    """Let the main thread continue after a signal."""
 
 
 _running: Signals | None = None
@@ -103,19 +103,22 @@ _running: Signals | None = None
 
 @contextlib.contextmanager
 def patience(promise: str) -> Iterator[threading.Event]:
-    """An event that the first signal sets, instead of stopping the run; `promise` tells the user
-    what happens then. From a command that is not the process's own, an event nobody sets."""
+    """Yield an event that the first signal sets instead of stopping the run.
+
+    `promise` tells the user what happens then. In a command that is not its own process, nothing
+    sets the event.
+    """
     signals = _running
     if signals is None:
         yield threading.Event()
         return
     signals.promise, signals.patient = promise, True
-    yield signals.stop  # Patient up to the end: results that took long are written.
+    yield signals.stop  # Stay patient to the end: results that took long must be written.
 
 
 @contextlib.contextmanager
 def leaving(abandon: Callable[[], str]) -> Iterator[None]:
-    """Have `abandon` called if the process is stopped meanwhile; it returns what to tell."""
+    """Call `abandon` if the process is stopped meanwhile; it returns the text for the user."""
     signals = _running
     if signals is None:
         yield
@@ -128,7 +131,7 @@ def leaving(abandon: Callable[[], str]) -> Iterator[None]:
 
 
 class _Stream:
-    """A standard stream whose failures do not end the run, but are kept in `error`."""
+    """A standard stream whose errors do not end the run, but are stored in `error`."""
 
     def __init__(self, stream: Any, number: int | None):
         self.stream, self.number = stream, number
@@ -136,7 +139,7 @@ class _Stream:
         self.closed_early = False
 
     def write(self, text: str) -> int:
-        """As that of a file, without errors."""
+        """Write as a file does, without raising errors."""
         if not self.closed_early:
             self._guarded(lambda: self.stream.write(text))
         return len(text)
@@ -146,7 +149,7 @@ class _Stream:
             self.write(line)
 
     def flush(self) -> None:
-        """As that of a file, without errors."""
+        """Flush as a file does, without raising errors."""
         if not self.closed_early:
             self._guarded(self.stream.flush)
 
@@ -159,7 +162,7 @@ class _Stream:
             if error.errno not in gone:
                 self.error = error
             if self.number is not None:
-                # What is left in its buffer goes nowhere, at the end of the process too.
+                # Discard what is left in the buffer, also at the end of the process.
                 _nowhere(self.number)
 
     def _terminal(self) -> bool:
@@ -173,7 +176,7 @@ class _Stream:
 
 
 def _nowhere(number: int) -> None:
-    """Let a file descriptor lead to the null device."""
+    """Redirect a file descriptor to the null device."""
     with contextlib.suppress(OSError):
         null = os.open(os.devnull, os.O_RDWR)
         if null != number:
@@ -183,7 +186,7 @@ def _nowhere(number: int) -> None:
 
 @contextlib.contextmanager
 def _streams(own: bool) -> Iterator[_Stream]:
-    """Guard stdout and stderr; if they are the process's `own`, open those that are closed."""
+    """Guard stdout and stderr; if they are the process's `own`, open closed ones."""
     if own:
         for number in (0, 1, 2):
             try:
@@ -197,7 +200,7 @@ def _streams(own: bool) -> Iterator[_Stream]:
             stream = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
         elif own:
             with contextlib.suppress(AttributeError, ValueError, OSError):
-                # A terminal that lacks a letter shows a question mark.
+                # A terminal without a character shows a question mark.
                 stream.reconfigure(errors="replace")
         guards.append(_Stream(stream, number if own else None))
     sys.stdout, sys.stderr = guards
@@ -210,10 +213,10 @@ def _streams(own: bool) -> Iterator[_Stream]:
 
 
 def through(command: str, work: Callable[[], int], own: bool) -> int:
-    """Run a command's `work` and return its exit code, with the edges of the process guarded.
+    """Run a command's `work` and return its exit code; guard the edges of the process.
 
-    `own`: the process is the command's own. A reader that has gone (as in `| true`) does not change
-    the exit code; a stdout that cannot take what is written makes it 2.
+    `own`: the process is the command's own. A missing reader (as in `| true`) does not change the
+    exit code. If stdout cannot take the output, the exit code is 2.
     """
     global _running
     if not own or _running is not None:
@@ -228,13 +231,13 @@ def through(command: str, work: Callable[[], int], own: bool) -> int:
         with _streams(own=True) as out:
             try:
                 code = work()
-            except SystemExit as end:  # of the parser: help, or wrong arguments
+            except SystemExit as end:  # raised by the parser: help, or wrong arguments
                 code = end.code if isinstance(end.code, int) else NO_RESULT
             out.flush()
             code = _code(command, code, out)
             sys.stderr.flush()
             if signals.stop.is_set():
-                # Evaluations nobody waits for may still be running in other threads.
+                # Abandoned evaluations may still be running in other threads.
                 os._exit(code)
     finally:
         _running = None
@@ -252,10 +255,11 @@ def _code(command: str, code: int, out: _Stream) -> int:
 
 
 def leave(code: int) -> None:
-    """End the process; a signal on the way out changes nothing.
+    """End the process; a signal during the exit changes nothing.
 
-    Threads that still compile what nobody waits for any more are not waited for either, and Python
-    is not taken down around them: that can abort the process, with another exit code."""
+    If other threads still compile, end at once without waiting for them. Shutting Python down
+    around them can abort the process with another exit code.
+    """
     for number in _NAMES:
         with contextlib.suppress(ValueError, OSError):
             signal.signal(number, lambda *_: os._exit(code))

@@ -1,4 +1,4 @@
-"""`rootsopt optimize CONFIG`: an optimised design against the baseline."""
+"""`rootsopt optimize CONFIG`: optimise a design and compare it with the baseline."""
 
 import contextlib
 import threading
@@ -19,7 +19,7 @@ PURPOSE = "Optimise the design parameters for low contact force and compare with
 
 
 _PATIENCE = 5.0
-"""Time (s) after an interrupt for simulating the best design so far again from rest."""
+"""Time (s) after an interrupt to simulate the best design so far again from rest."""
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
@@ -79,8 +79,10 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
 
 def _searched(config: "Config", progress, stop: threading.Event):
-    """Config without `auto`, what was chosen there, and the search's outcome: None if it was
-    stopped before the baseline was simulated."""
+    """Run the search; return the config without `auto`, the chosen settings and the result.
+
+    The result is `None` if the search was stopped before the baseline was simulated.
+    """
     from rootsopt.optimize.search import Search, until_stopped
     from rootsopt.response.choice import resolve
 
@@ -98,7 +100,7 @@ def _searched(config: "Config", progress, stop: threading.Event):
 
 
 def _nothing_known(config: "Config", folder: "RunFolder") -> "Outcome":
-    """Write what there is of a run that was stopped before the baseline was simulated."""
+    """Write the files of a run that was stopped before the baseline was simulated."""
     from rootsopt.commands import cli
     from rootsopt.output import files
     from rootsopt.status import Status
@@ -108,13 +110,13 @@ def _nothing_known(config: "Config", folder: "RunFolder") -> "Outcome":
     files.write_config(folder, config)
     data = {"baseline": None, "optimized": None, "status": status.label, "message": message}
     folder.write_json("result.json", data | {"versions": files.versions()})
-    folder.overwrite = False  # An earlier result is worth more than this.
+    folder.overwrite = False  # An earlier result is more valuable than this one.
     text = f"{status.label}: {message}"
     return cli.Outcome(cli.NO_RESULT, lambda out: out.print(text, soft_wrap=True))
 
 
 def _alike(config: "Config", result) -> dict:
-    """What a free form that was found resembles, for report and result file."""
+    """Return what an optimised free form resembles, for report and result file."""
     from rootsopt.config.families import family_of
 
     if family_of(config.profile.family).classical or result.optimized is None:
@@ -130,7 +132,7 @@ def _alike(config: "Config", result) -> dict:
 
 
 def _message(result) -> str:
-    """What to say of a search that was interrupted or has found nothing."""
+    """Return the text for a search that was interrupted or found nothing."""
     return f"{result.status.label}: {_advice(result)}"
 
 
@@ -154,11 +156,11 @@ def _advice(result) -> str:
 
 
 def _interrupted(result) -> str:
-    """How far an interrupted search got."""
+    """Describe how far an interrupted search got."""
     count = len(result.history)
     begin = f"The search was stopped after {count} design{'s' if count != 1 else ''}"
     if not result.baseline.usable:
-        return f"{begin}, and the baseline is of no use: {result.baseline.message}"
+        return f"{begin}, and the baseline cannot be used: {result.baseline.message}"
     if result.optimized is None:
         return f"{begin}; none of them is known to be feasible and better than the baseline."
     if result.verification["holds_up"]:
@@ -222,7 +224,7 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
 
 @contextlib.contextmanager
 def _progress(console) -> Iterator:
-    """A progress bar with the current best objective on a terminal, nothing in a pipe."""
+    """Show a progress bar with the best objective so far on a terminal, nothing in a pipe."""
     if not console.is_terminal:
         yield None
         return
@@ -247,7 +249,7 @@ def _progress(console) -> Iterator:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; return the exit code."""
     return door.through("optimize", lambda: _run(argv), own=argv is None)
 
 

@@ -1,4 +1,4 @@
-"""`rootsopt profile CONFIG`: geometry only."""
+"""`rootsopt profile CONFIG`: compute the geometry of one design."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -14,9 +14,12 @@ if TYPE_CHECKING:
     from rootsopt.config import Config
     from rootsopt.output.runs import RunFolder
 
-PURPOSE = "Geometry of one design: radii, area, inertia, margins; drawings, solids, animation."
+PURPOSE = (
+    "Compute the geometry of one design (radii, area, inertia, margins) and export drawings, "
+    "solids or an animation."
+)
 EXPORT = "dxf,svg"
-"""What is written if nothing is said: a drawing takes less than a second, a solid ten."""
+"""Default formats: a drawing takes less than a second, a solid ten."""
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
@@ -69,7 +72,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
 
 def _coefficients(given: str | None) -> int | None:
-    """The number of coefficients that `--project` asks for. Raises `InputError`."""
+    """Return the number of coefficients in `--project`. Raises `InputError` if it is invalid."""
     from rootsopt.errors import InputError
 
     if given is None:
@@ -83,7 +86,7 @@ def _coefficients(given: str | None) -> int | None:
 
 
 def _projected(folder: "RunFolder", config: "Config", count: int) -> str:
-    """Write the config with its profile as a free form; what there is to say of that."""
+    """Write the config with its profile as a free form; return the text for the user."""
     from rootsopt.scene.families import free_form_of
 
     profile, away = free_form_of(config.profile, count)
@@ -101,13 +104,13 @@ def _options(parser: "argparse.ArgumentParser") -> None:
     parser.add_argument(
         "--project",
         metavar="N",
-        help="write free_form.yaml, the same config with the profile as a free form of N "
-        "coefficients, to begin an optimisation with",
+        help="write free_form.yaml: the same config with the profile as a free form of N "
+        "coefficients, as the start of an optimisation",
     )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; return the exit code."""
     return door.through("profile", lambda: _run(argv), own=argv is None)
 
 

@@ -1,4 +1,4 @@
-"""`rootsopt simulate CONFIG`: one design, one scene."""
+"""`rootsopt simulate CONFIG`: simulate one design in one scene."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -53,7 +53,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; return the exit code."""
     return door.through("simulate", lambda: _run(argv), own=argv is None)
 
 

@@ -1,4 +1,4 @@
-"""`rootsopt sweep CONFIG`: one design at many speeds."""
+"""`rootsopt sweep CONFIG`: simulate one design at many speeds."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
@@ -62,7 +62,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
 @contextlib.contextmanager
 def _progress(console) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar on a terminal, nothing in a pipe."""
+    """Show a progress bar on a terminal, nothing in a pipe."""
     if not console.is_terminal:
         yield lambda done, expected: None
         return
@@ -74,7 +74,7 @@ def _progress(console) -> Iterator[Callable[[int, int], None]]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; return the exit code."""
     return door.through("sweep", lambda: _run(argv), own=argv is None)
 
 

@@ -1,4 +1,4 @@
-"""Drawings, solids and animations of a design, all from one outline of arcs and splines."""
+"""Drawings, solids and animations of a design, all made from one outline of arcs and splines."""
 
 from rootsopt.export.command import FORMATS, add_option, chosen, write, write_simulated
 

@@ -27,16 +27,18 @@ _MOST_PERIODS = 4
 _MILLISECONDS = 60  # per frame
 _DPI = 80
 _COLORS = 64
-_CHORD = 0.01  # of the polygons drawn, in outer radii
+_CHORD = 0.01  # chord of the drawn polygons, in outer radii
 _ARROW = 0.75  # length of the longest arrow, in pitch radii
 _FLANKS = ("drive flank", BLUE), ("coast flank", VERMILION)
 
 
 @dataclasses.dataclass(frozen=True)
 class Contacts:
-    """Where flanks touch at several rotations φ of rotor 1, one row for each: `point` (n, 2) in
-    mm in the fixed frame, unit `normal` (n, 2) from rotor 1 to rotor 2, and whether there is a
-    contact at all (`present`)."""
+    """Contacts at n rotations φ of rotor 1.
+
+    point: contact point (mm, fixed frame, (n, 2)); normal: unit normal from rotor 1 to rotor 2
+    ((n, 2)); present: whether there is a contact ((n,)).
+    """
 
     point: NDArray[np.float64]
     normal: NDArray[np.float64]
@@ -45,7 +47,7 @@ class Contacts:
 
 @Program
 def _rolling(profile, roll):
-    """Pressure angle (rad) and distance (m) from the pitch point at a roll angle of a flank."""
+    """Return pressure angle (rad) and distance (m) from the pitch point at a flank's roll angle."""
     half = profile.half_pitch
     beyond = roll > half
     point = profile.addendum(profile.normal_at(jnp.where(beyond, 2 * half - roll, roll)))
@@ -55,11 +57,11 @@ def _rolling(profile, roll):
 def rolling_contacts(
     profile: Profile, rotation: Float[np.ndarray, " n"], coast: bool = False
 ) -> Contacts:
-    """Contacts of the drive (or coast) flanks in perfect rolling, at rotations φ (rad).
+    """Return the contacts of the drive (or coast) flanks in perfect rolling, at rotations φ (rad).
 
-    A drive flank touches at roll angle β = -φ, in 0 ≤ β ≤ π/N of every lobe pitch; outside, the
-    point is that of the nearer end. The contact is (r + s sin ψ, s cos ψ), its normal
-    (sin ψ, cos ψ); a coast flank is the mirror image, β = φ.
+    A drive flank touches at the roll angle β = -φ, for 0 ≤ β ≤ π/N in every lobe pitch. Outside,
+    the point is that of the nearer end. The contact is (r + s sin ψ, s cos ψ), its normal
+    (sin ψ, cos ψ). A coast flank is the mirror image, with β = φ.
     """
     half = np.pi / (2 * profile.lobes)
     roll = (rotation if coast else -rotation) - half
@@ -71,11 +73,13 @@ def rolling_contacts(
 
 
 def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
-    """The pair in perfect rolling over one lobe pitch: the contact and the direction of its
-    force, whose size is not known without a simulation."""
+    """Return a GIF of the pair in perfect rolling over one lobe pitch.
+
+    It shows the contact and the direction of its force; the size of the force needs a simulation.
+    """
     rotation = 2 * np.pi / profile.lobes * np.arange(_FRAMES) / _FRAMES
     flanks = [rolling_contacts(profile, rotation, coast) for coast in (False, True)]
-    # Where one flank hands over to the next both ends touch; one arrow is enough.
+    # Where one flank takes over from the other, both ends touch. Show one arrow only.
     flanks[1] = dataclasses.replace(flanks[1], present=flanks[1].present & ~flanks[0].present)
     made, axes = figure(9, 5.4)
     scene = _Scene(axes[0, 0], drawing)
@@ -90,8 +94,11 @@ def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
 
 
 def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: int) -> bytes:
-    """A simulated motion over so many mesh periods: contacts, with arrows as long as the largest
-    force of the time a frame stands for, and the force over the rotation."""
+    """Return a GIF of a simulated motion over `periods` mesh periods (4 at most).
+
+    It shows the contacts and the force over the rotation. Each arrow is as long as the largest
+    force in the time interval of its frame.
+    """
     pitch = 2 * np.pi / profile.lobes
     whole = max(1, round(float(np.ptp(series.rotation)) / pitch))
     periods = max(1, min(periods, whole, _MOST_PERIODS))
@@ -108,7 +115,7 @@ def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: 
     flanks = [rolling_contacts(profile, rotation, coast) for coast in (False, True)]
     made, axes = figure(9, 7.4, 2, 1, gridspec_kw={"height_ratios": [2.6, 1]})
     scene = _Scene(axes[0, 0], drawing)
-    axes[0, 0].set_title("Contact force on rotor 2, its length as the force below")
+    axes[0, 0].set_title("Contact force on rotor 2; the arrow's length shows the force below")
     cursor = _force_panel(axes[1, 0], series, samples)
     degrees = np.degrees(rotation - series.rotation[0])
 
@@ -122,7 +129,7 @@ def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: 
 
 
 def _force_panel(ax: Axes, series: Series, samples: int):
-    """Flank forces over the rotation; returns the line that marks the frame."""
+    """Draw flank forces over the rotation; return the line that marks the frame."""
     shown = slice(0, samples)
     degrees = np.degrees(series.rotation[shown] - series.rotation[0])
     forces = series.drive_force[shown], series.coast_force[shown]
@@ -141,7 +148,7 @@ def _force_panel(ax: Axes, series: Series, samples: int):
 
 
 class _Arrow:
-    """A contact and its force on one kind of flank."""
+    """The contact and its force on one kind of flank."""
 
     def __init__(self, ax: Axes, color: str, longest: float):
         self.longest = longest
@@ -156,7 +163,7 @@ class _Arrow:
         )  # fmt: skip
 
     def show(self, point, normal, share: float) -> None:
-        """Put the arrow at `point` along `normal`, at a share of the longest; 0 hides it."""
+        """Put the arrow at `point` along `normal`, at a fraction of the longest; 0 hides it."""
         self.point.set_data([point[0]], [point[1]])
         for artist in (self.point, self.arrow):
             artist.set_visible(share > 0)
@@ -165,7 +172,7 @@ class _Arrow:
 
 
 class _Scene:
-    """The axes with both rotors, to be turned frame by frame."""
+    """The axes with both rotors, turned frame by frame."""
 
     def __init__(self, ax: Axes, drawing: Drawing):
         points = polyline(drawing.pieces, _CHORD * drawing.outer_radius)
@@ -183,7 +190,7 @@ class _Scene:
         self.arrows = [_Arrow(ax, color, _ARROW * drawing.pitch_radius) for _, color in _FLANKS]
 
     def _rotor(self, ax, drawing, color, name, x):
-        """Draw a rotor with its axis at `x`; returns the part that turns."""
+        """Draw a rotor with its axis at `x`; return the part that turns."""
         line = {"edgecolor": "black", "linewidth": 0.8}
         (patch,) = ax.fill(*self.outline.T, facecolor=color, alpha=0.75, **line)
         circle = np.exp(1j * np.linspace(0, 2 * np.pi, 181))
@@ -207,7 +214,7 @@ class _Scene:
 
 
 def _gif(made: Figure, draw, count: int) -> bytes:
-    """Frames 0 to `count` - 1, as `draw` leaves them, as one endless GIF with one palette."""
+    """Return frames 0 to `count` - 1, as drawn by `draw`, as one endless GIF with one palette."""
     made.set_dpi(_DPI)
     canvas = FigureCanvasAgg(made)
     pictures: list[Image.Image] = []
@@ -215,9 +222,9 @@ def _gif(made: Figure, draw, count: int) -> bytes:
         draw(i)
         canvas.draw()
         if i == 0:
-            made.set_layout_engine("none")  # laid out once, so that nothing wobbles
+            made.set_layout_engine("none")  # laid out once, so that nothing moves
         pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
-    # Some frames side by side have all the colours there are.
+    # A few frames side by side contain all the colours.
     some = np.hstack([np.asarray(picture) for picture in pictures[:: max(1, count // 8)]])
     palette = Image.fromarray(some).quantize(_COLORS, Image.Quantize.MAXCOVERAGE)
     frames = [one.quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures]

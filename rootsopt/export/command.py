@@ -1,4 +1,4 @@
-"""`--export` of the commands: which files, and writing them."""
+"""The `--export` option of the commands: choose formats and write the files."""
 
 import argparse
 from collections.abc import Sequence
@@ -18,25 +18,27 @@ FORMATS = {
     "stl": "rotor.stl and pair.stl, triangles (needs the [cad] extra)",
     "gif": "figures/meshing.gif, the pair in motion with contact and force",
 }
-"""Formats with the files they make; lengths are in mm."""
+"""Formats and the files they write; lengths are in mm."""
 _SOLID = ("step", "stl")
 
 
 def add_option(parser: argparse.ArgumentParser, default: str) -> None:
-    """Add `--export` to a command that writes `default` if not told otherwise."""
+    """Add `--export` to a command that writes `default` unless told otherwise."""
     formats = "; ".join(f"{name}: {files}" for name, files in FORMATS.items())
     parser.add_argument(
         "--export",
         default=default,
         metavar="LIST",
-        help=f"files to draw the rotors in (mm), as in --export dxf,step; all; none. {formats} "
-        f"(default: {default})",
+        help=f"formats to draw the rotors in (mm), for example --export dxf,step; all; none. "
+        f"{formats} (default: {default})",
     )
 
 
 def chosen(text: str) -> tuple[str, ...]:
-    """The formats `--export` names. Raises `InputError` for one that is not known, or that needs
-    a CAD kernel where there is none."""
+    """Return the formats that `--export` names.
+
+    Raises `InputError` for an unknown format, and for one that needs a CAD kernel if there is none.
+    """
     names = tuple(name.strip() for name in text.lower().split(",") if name.strip())
     if names == ("none",):
         return ()
@@ -46,7 +48,7 @@ def chosen(text: str) -> tuple[str, ...]:
         if name not in FORMATS:
             raise InputError(
                 f"`--export` must be formats out of {', '.join(FORMATS)}, or all, or none, but "
-                f"has {name!r}; leave it out"
+                f"has {name!r}; remove it"
             )
     if set(names) & set(_SOLID):
         from rootsopt.export.solid import require_kernel
@@ -63,8 +65,10 @@ def write(
     series: "Series | None" = None,
     periods: int = 1,
 ) -> list[str]:
-    """Write a `design` (config units) in the `formats`, and return the files' names. With the
-    `series` of a simulation, the GIF shows `periods` mesh periods of it."""
+    """Write a `design` (config units) in the `formats`; return the files' names.
+
+    With the `series` of a simulation, the GIF shows `periods` mesh periods of it.
+    """
     if not formats:
         return []
     import jax.numpy as jnp
@@ -102,7 +106,7 @@ def write(
 def write_simulated(
     folder: "ResultFolder", config: "Config", formats: Sequence[str], evaluation: "Evaluation"
 ) -> list[str]:
-    """As `write`, for a design that was simulated; the GIF shows its motion, if it has one."""
+    """Write a simulated design as `write` does; the GIF shows its motion if it has one."""
     series = evaluation.series
     if series is None:
         formats = tuple(name for name in formats if name != "gif")
@@ -111,7 +115,7 @@ def write_simulated(
 
 
 def _solids(drawing, formats, place) -> dict[str, bytes]:
-    """The STEP and STL files, each solid made once."""
+    """Return the STEP and STL files; each solid is made once."""
     import math
 
     from rootsopt.export import solid

@@ -1,4 +1,4 @@
-"""What a drawing of one rotor shows, whatever the format (mm, angles in rad)."""
+"""Content of the drawing of one rotor, for every format (mm, angles in rad)."""
 
 import dataclasses
 
@@ -13,9 +13,12 @@ _shape = Program(geometry)
 
 @dataclasses.dataclass(frozen=True)
 class Drawing:
-    """One rotor: its closed outline in `pieces`, the radii of its pitch and outer circle, number
-    of `lobes`, axial `length`, twist in degrees over that length, diameter of the `bore` if it has
-    one, and `notes`, lines of text with the design's numbers."""
+    """One rotor to draw.
+
+    pieces: closed outline; pitch_radius, outer_radius: radii (mm); lobes: number of lobes; length:
+    axial length (mm); helix_deg: twist over the length (deg); bore: diameter (mm), `None` without a
+    bore; notes: lines of text with the design's numbers.
+    """
 
     pieces: list[DrawnPiece]
     pitch_radius: float
@@ -28,7 +31,7 @@ class Drawing:
 
     @classmethod
     def of(cls, config: Config, profile: Profile, design: dict[str, float]) -> "Drawing":
-        """The drawing of `profile`, a `design` (config units) of a config."""
+        """Return the drawing of `profile`, made from a `design` (config units)."""
         shape: Geometry = _shape(profile)
         outer, root = float(shape.outer_radius) * _MM, float(shape.root_radius) * _MM
         rotor, radius = config.rotor, config.profile.pitch_radius_mm
@@ -44,7 +47,7 @@ class Drawing:
             f"outer radius {outer:.6f} mm, root radius {root:.6f} mm, "
             f"area {float(shape.area) * _MM**2:.6f} mm2",
             body,
-            f"dimensions in mm, flank clearance {config.contact.clearance_mm:g} mm not taken off",
+            f"dimensions in mm, flank clearance {config.contact.clearance_mm:g} mm not subtracted",
         ]
         return cls(
             pieces=outline_pieces(profile),
@@ -59,5 +62,5 @@ class Drawing:
 
     @property
     def reach(self) -> float:
-        """How far centre lines go from the axis (mm)."""
+        """Distance (mm) that centre lines extend from the axis."""
         return 1.08 * self.outer_radius

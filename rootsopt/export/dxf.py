@@ -9,7 +9,7 @@ from rootsopt.export.drawing import Drawing
 from rootsopt.export.pieces import Arc
 
 OUTLINE, BORE, PITCH, CENTER, TEXT = "OUTLINE", "BORE", "PITCH_CIRCLE", "CENTER_LINES", "TEXT"
-"""The layers."""
+"""Names of the layers."""
 _MILLIMETRES = 4
 # Layer: colour index of AutoCAD (7 is black on white), line type, line width in 1/100 mm.
 _STYLES = {
@@ -22,9 +22,9 @@ _STYLES = {
 
 
 def dxf_bytes(drawing: Drawing) -> bytes:
-    """A DXF file (R2010). The entities of the outline follow one another counter-clockwise, each
-    starting where the last one stops."""
-    # A quarter of a second to import; it announces itself in the log.
+    """Return a DXF file (R2010). The outline's entities follow counter-clockwise, each starting
+    where the last one stops."""
+    # Imported here because it takes a quarter of a second; it also logs its start.
     logging.getLogger("ezdxf").setLevel(logging.WARNING)
     import ezdxf
 
@@ -35,7 +35,7 @@ def dxf_bytes(drawing: Drawing) -> bytes:
     space = document.modelspace()
     for piece in drawing.pieces:
         if isinstance(piece, Arc):
-            # An arc runs counter-clockwise here.
+            # In DXF an arc runs counter-clockwise.
             ends = sorted([piece.begin, piece.begin + piece.sweep])
             first, last = np.degrees(ends)
             center = piece.center.real, piece.center.imag

@@ -1,11 +1,11 @@
 """The outline of a rotor as true arcs and cubic splines: the one source of every drawing.
 
-Each smooth stretch of the flank is either a circular arc, recognised by its own points and
-normals, or is fitted by a cubic B-spline through exact points with exact end tangents, refined
-until it deviates nowhere by more than `TOLERANCE`. Joints are shared to the last bit or, at the
-end of an arc, to rounding; a corner or cusp is a joint and is not smoothed over.
+Each smooth segment of the flank becomes an arc or a spline. A circular arc is recognised by its
+points and normals. Otherwise a cubic B-spline is fitted through exact points with exact end
+tangents. It is refined until it deviates by at most `TOLERANCE`. Adjacent pieces share their joint
+exactly or, at the end of an arc, to rounding. A corner or cusp is a joint and is not smoothed.
 
-Lengths are in millimetres, angles in radians, points complex numbers x + iy in the rotor frame
+Lengths are in millimetres, angles in radians. Points are complex numbers x + iy in the rotor frame,
 with a lobe tip on +x.
 """
 
@@ -22,29 +22,32 @@ from rootsopt.profiles import Profile
 from rootsopt.runtime.programs import Program
 
 TOLERANCE = 1e-7
-"""Largest deviation of a spline from the true flank, in pitch radii. As the perimeter times it
-bounds the error in area, that is below 1e-6 for every rotor."""
+"""Largest deviation (pitch radii) of a spline from the true flank. The perimeter times it bounds
+the error in area, which is below 1e-6 for every rotor."""
 ROUND = 1e-9
-"""Deviation from a circle, in pitch radii, up to which a stretch is an arc."""
+"""Deviation (pitch radii) from a circle up to which a segment counts as an arc."""
 _MM = 1e3
 _SAMPLES = 65
-"""Points at which a stretch is compared with a circle."""
+"""Number of points at which a segment is compared with a circle."""
 _BETWEEN = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
-"""Where between two nodes a spline is compared with the true flank."""
+"""Positions between two nodes at which a spline is compared with the true flank."""
 _MOST_NODES = 4096
 _UNEVEN = 100
-"""Ratio of a spline's longest to its shortest span past which it becomes two: towards a cusp the
-spans shrink, and programs that integrate over a whole edge by a fixed rule are then off by more
-than 1e-6."""
+"""Ratio of a spline's longest to its shortest span above which it is split in two. Spans shrink
+towards a cusp. Programs that integrate a whole edge by a fixed rule are then off by more than
+1e-6."""
 _BLOCK = 512
-"""Points evaluated at once, always as many, so that one compiled program serves all."""
+"""Number of points evaluated at once. It is constant, so that one compiled program serves all."""
 _GAUSS = np.polynomial.legendre.leggauss(8)
 
 
 @dataclasses.dataclass(frozen=True)
 class Arc:
-    """Part of a circle: `center`, `radius` > 0, from angle `begin` through `sweep` (> 0 is
-    counter-clockwise)."""
+    """Part of a circle.
+
+    center: its centre; radius: > 0; begin: first angle; sweep: angle covered, > 0
+    counter-clockwise.
+    """
 
     center: complex
     radius: float
@@ -52,7 +55,7 @@ class Arc:
     sweep: float
 
     def at(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
-        """Points at shares 0 to 1 of the way."""
+        """Return points at fractions 0 to 1 of the arc."""
         angle = self.begin + np.asarray(share) * self.sweep
         return np.asarray(self.center + self.radius * np.exp(1j * angle))
 
@@ -69,26 +72,28 @@ class Arc:
         return self.radius * abs(self.sweep)
 
     def turned(self, angle: float) -> "Arc":
-        """The arc turned about the rotor's axis."""
+        """Return the arc rotated about the rotor's axis."""
         center = complex(self.center * np.exp(1j * angle))
         return dataclasses.replace(self, center=center, begin=self.begin + angle)
 
     def mirrored(self) -> "Arc":
-        """The mirror image in the x axis, run through the other way."""
+        """Return the mirror image in the x axis, in reverse direction."""
         begin = -(self.begin + self.sweep)
         return dataclasses.replace(self, center=complex(np.conj(self.center)), begin=begin)
 
 
 @dataclasses.dataclass(frozen=True)
 class Spline:
-    """A cubic B-spline that starts at its first control point and stops at its last:
-    `knots` (n + 4,), the ends fourfold, `controls` (n,)."""
+    """A cubic B-spline from its first control point to its last.
+
+    knots: (n + 4,), fourfold at the ends; controls: control points (n,).
+    """
 
     knots: Float64[np.ndarray, " m"]
     controls: Complex128[np.ndarray, " n"]
 
     def at(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
-        """Points at shares 0 to 1 of the parameter, which is nearly arc length."""
+        """Return points at fractions 0 to 1 of the parameter, which is nearly arc length."""
         first, last = self.knots[0], self.knots[-1]
         return np.asarray(BSpline(self.knots, self.controls, 3)(first + share * (last - first)))
 
@@ -105,16 +110,16 @@ class Spline:
         return float(self.knots[-1] - self.knots[0])
 
     def turned(self, angle: float) -> "Spline":
-        """The spline turned about the rotor's axis."""
+        """Return the spline rotated about the rotor's axis."""
         return dataclasses.replace(self, controls=self.controls * np.exp(1j * angle))
 
     def mirrored(self) -> "Spline":
-        """The mirror image in the x axis, run through the other way."""
+        """Return the mirror image in the x axis, in reverse direction."""
         knots = self.knots[0] + (self.knots[-1] - self.knots[::-1])
         return Spline(knots, np.conj(self.controls[::-1]))
 
     def beziers(self) -> Complex128[np.ndarray, "k 4"]:
-        """The same curve as cubic Bézier curves, one a row."""
+        """Return the same curve as cubic Bézier curves, one per row."""
         curve = BSpline(self.knots, self.controls, 3)
         ends = np.unique(self.knots)
         points, third = curve(ends), np.diff(ends) / 3
@@ -128,11 +133,10 @@ DrawnPiece = Arc | Spline
 
 
 def outline_pieces(profile: Profile) -> list[DrawnPiece]:
-    """The closed counter-clockwise outline (mm) from the root before the lobe on +x; every piece
-    starts where the one before it stops.
+    """Return the closed counter-clockwise outline (mm), from the root before the lobe on +x.
 
-    Raises `InputError` where a stretch of the flank takes too many nodes to come within
-    `TOLERANCE` of the true one.
+    Every piece starts where the one before it stops. Raises `InputError` where a segment of the
+    flank needs too many nodes to come within `TOLERANCE` of the true one.
     """
     flank = _flank(profile)
     lobe = [piece.mirrored() for piece in reversed(flank)] + flank
@@ -142,12 +146,12 @@ def outline_pieces(profile: Profile) -> list[DrawnPiece]:
 
 
 def area(pieces: list[DrawnPiece]) -> float:
-    """Area (mm²) inside a closed outline, exact for arcs and splines."""
+    """Return the area (mm²) inside a closed outline, exact for arcs and splines."""
     return sum(map(_swept, pieces))
 
 
 def polyline(pieces: list[DrawnPiece], chord: float) -> Complex128[np.ndarray, " n"]:
-    """Closed polygon with about `chord` mm between its points, the first repeated at the end."""
+    """Return a closed polygon with about `chord` mm between points; the first point is repeated."""
     parts = []
     for piece in pieces:
         count = max(2, int(np.ceil(piece.length / chord)))
@@ -156,7 +160,7 @@ def polyline(pieces: list[DrawnPiece], chord: float) -> Complex128[np.ndarray, "
 
 
 def _swept(piece: DrawnPiece) -> float:
-    """∫ (x dy - y dx) / 2 along a piece."""
+    """Return ∫ (x dy - y dx) / 2 along a piece."""
     if isinstance(piece, Arc):
         across = np.imag(np.conj(piece.center) * (piece.stop - piece.start))
         return float(across + piece.radius**2 * piece.sweep) / 2
@@ -170,21 +174,21 @@ def _swept(piece: DrawnPiece) -> float:
 
 
 def _flank(profile: Profile) -> list[DrawnPiece]:
-    """Pieces of one flank, from the tip's centre to the root's."""
+    """Return the pieces of one flank, from the tip's centre to the root's."""
     size = float(profile.pitch_radius) * _MM
     segments = [(float(s.start), float(s.stop)) for s in profile.segments()]
     stretches = [_Stretch(profile, start, stop, False) for start, stop in segments]
     stretches += [_Stretch(profile, stop, start, True) for start, stop in reversed(segments)]
     whole = [stretch for stretch in stretches if stretch.start != stretch.stop]
     pieces = [piece for stretch in whole for piece in stretch.pieces(size)]
-    # A tip land of no width, say, is left out.
+    # Leave out pieces without length, such as a tip land of zero width.
     return [piece for piece in pieces if piece.length > 1e-12 * size]
 
 
 @Program
 def _points(profile, nu):
-    """Points (m) and directions of the outward normal (rad), and arc length per normal angle
-    (m/rad), of addendum and dedendum."""
+    """Return points (m), directions of the outward normal (rad) and arc length per normal angle
+    (m/rad), first of the addendum, then of the dedendum."""
     _, addendum, dedendum = profile.speeds(nu)
     below = profile.dedendum(nu)
     turned = below.beta + jnp.pi / 2 - below.psi
@@ -202,8 +206,11 @@ class _Stretch:
     dedendum: bool
 
     def look(self, share: NDArray[np.float64]):
-        """Points (mm), unit normals, and arc length per share (mm) at shares 0 to 1 of the normal
-        angle. Each end is looked at from just inside, so that it belongs to its segment."""
+        """Return points (mm), unit normals and arc length per share (mm).
+
+        A share is a fraction (0 to 1) of the range of normal angles. Each end is evaluated just
+        inside, so that it belongs to its segment.
+        """
         inside = np.clip(share, 1e-12, 1 - 1e-12)
         inside = np.pad(inside, (0, -len(share) % _BLOCK), mode="edge")
         nu = self.start + (self.stop - self.start) * inside.reshape(-1, _BLOCK)
@@ -218,7 +225,7 @@ class _Stretch:
         )
 
     def pieces(self, size: float) -> list[DrawnPiece]:
-        """The arc, the spline or the two splines, `size` being the pitch radius (mm)."""
+        """Return the arc, the spline or the two splines; `size` is the pitch radius (mm)."""
         if arc := self._arc(ROUND * size):
             return [arc]
         spline = self._spline(TOLERANCE * size)
@@ -233,8 +240,8 @@ class _Stretch:
         return [part._spline(TOLERANCE * size) for part in parts]
 
     def _arc(self, tolerance: float) -> Arc | None:
-        """The circle P = C + ρ n that is nearest to a sample of points and normals, if all of
-        them are on it."""
+        """Return the circle P = C + ρ n nearest to a sample of points and normals; `None` unless
+        all of them are on it."""
         points, normals, _ = self.look(np.linspace(0, 1, _SAMPLES))
         spread = normals - normals.mean()
         turning = np.sum(np.abs(spread) ** 2)
@@ -250,7 +257,7 @@ class _Stretch:
         return Arc(complex(center), float(abs(radius)), float(np.angle(ends[0])) + side, sweep)
 
     def _spline(self, tolerance: float) -> Spline:
-        """Cubic spline over arc length, with nodes halved between until it is close enough."""
+        """Return a cubic spline over arc length; nodes are added until it is within tolerance."""
         nodes = np.linspace(0, 1, 5)
         while len(nodes) <= _MOST_NODES:
             spline, error = self._fitted(nodes)
@@ -261,12 +268,12 @@ class _Stretch:
             nodes = np.sort(np.concatenate([nodes, middle]))
         raise InputError(
             f"the flank between normal angles {self.start:.6g} and {self.stop:.6g} rad needs more "
-            f"than {_MOST_NODES} nodes to be drawn within {tolerance:.2g} mm; change the design a "
-            "little"
+            f"than {_MOST_NODES} nodes to be drawn within {tolerance:.2g} mm; change the design "
+            "slightly"
         )
 
     def _fitted(self, nodes: NDArray[np.float64]) -> tuple[Spline, NDArray[np.float64]]:
-        """The spline through `nodes`, and its largest deviation (mm) between each two of them."""
+        """Return the spline through `nodes`, and its largest deviation (mm) in each interval."""
         width = np.diff(nodes)
         gauss, weights = _GAUSS
         at = nodes[:-1, None] + width[:, None] * (1 + gauss) / 2
@@ -278,7 +285,7 @@ class _Stretch:
         between = (nodes[:-1, None] + width[:, None] * _BETWEEN).ravel()
         true = self.look(between)[0]
         foot = np.interp(between, nodes, length)
-        # The parameter of the foot point, by Newton's method; what is left is the deviation.
+        # Newton's method finds the parameter of the foot point; the distance is the deviation.
         slope = curve.derivative()
         for _ in range(4):
             tangent = slope(foot)
@@ -289,7 +296,7 @@ class _Stretch:
 
 
 def _merged(pieces: list[DrawnPiece], tolerance: float) -> list[DrawnPiece]:
-    """Neighbouring arcs of one circle in one piece; the first piece may start earlier then."""
+    """Join adjacent arcs of the same circle; the first piece may then start earlier."""
     merged: list[DrawnPiece] = []
     for piece in pieces:
         if merged and (joined := _joined(merged[-1], piece, tolerance)):
@@ -311,8 +318,7 @@ def _joined(one: DrawnPiece, other: DrawnPiece, tolerance: float) -> Arc | None:
 
 
 def _closed(pieces: list[DrawnPiece]) -> list[DrawnPiece]:
-    """The pieces with every spline's ends put on those of its neighbours, which differ from them
-    by rounding."""
+    """Move the ends of every spline to those of its neighbours, which differ by rounding."""
     closed = list(pieces)
     for i, piece in enumerate(closed):
         if isinstance(piece, Spline):

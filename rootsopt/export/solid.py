@@ -1,7 +1,7 @@
 """Solids of one rotor and of the pair: STEP with true arcs and B-splines, STL for printing.
 
-The only place that knows the CAD kernel (build123d on Open CASCADE), an optional dependency.
-Lengths in millimetres, angles in radians.
+This is the only module that uses the CAD kernel (build123d on Open CASCADE), an optional
+dependency. Lengths are in millimetres, angles in radians.
 """
 
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
@@ -29,12 +29,12 @@ CHORD = 0.005
 TURN = 0.05
 """Largest angle (rad) between neighbouring facets of a curved face of an STL file."""
 _STEP = np.pi / 48
-"""Twist (rad) between the knots of a helical face: a cubic spline of the turning that fine is
-off by 5e-8 of the radius."""
+"""Twist (rad) between the knots of a helical face. With this step, a cubic spline of the rotation
+is off by 5e-8 of the radius."""
 _SPANS = 8
-"""Least knot spans along a face. One would do for a straight rotor, but what most programs give
-as volume is the kernel's Gauss quadrature, and that is finer the more knots it meets: with a
-single span it is off by 2e-4 next to a cusp, where the solid itself is right to 1e-8."""
+"""Minimum number of knot spans along a face. A straight rotor needs only one. But most programs
+compute a volume with the kernel's Gauss quadrature, which is finer with more knots. With a single
+span it is off by 2e-4 next to a cusp, where the solid itself is exact to 1e-8."""
 
 
 def require_kernel() -> None:
@@ -47,8 +47,11 @@ def require_kernel() -> None:
 
 
 def rotor(pieces: list[DrawnPiece], length: float, bore: float | None, helix: float) -> "Solid":
-    """One rotor between z = 0 and `length`: the closed outline `pieces` at z = 0, turned by
-    `helix` on the way up, with a `bore` (its diameter; None for none)."""
+    """Return one rotor between z = 0 and `length` (mm).
+
+    pieces: closed outline at z = 0, turned by `helix` (rad) on the way up; bore: its diameter (mm),
+    `None`: no bore.
+    """
     from build123d import Axis, Edge, Face, Shell, Solid, Vector, Wire
 
     if helix != 0:
@@ -72,19 +75,22 @@ def pair(
     bore: float | None,
     helix: float,
 ) -> "Compound":
-    """Both rotors at φ = 0: rotor 1 at the origin with a lobe on +x, rotor 2 at
-    (`center_distance`, 0) with a space there, twisted the other way."""
+    """Return both rotors at φ = 0.
+
+    Rotor 1 is at the origin with a lobe on +x. Rotor 2 is at (`center_distance`, 0) with a space
+    there, twisted the other way.
+    """
     from build123d import Axis, Compound, Vector
 
     first, second = (rotor(pieces, length, bore, turn) for turn in (helix, -helix))
-    # The mirror image of a symmetric rotor that is turned by π/N.
+    # Rotor 2 is the mirror image of a symmetric rotor, turned by π/N.
     second = second.rotate(Axis.Z, 180 - 180 / lobes).translate(Vector(center_distance, 0, 0))
     first.label, second.label = "rotor_1", "rotor_2"
     return Compound(label="rotor_pair", children=[first, second])
 
 
 def step_bytes(shape: "Shape") -> bytes:
-    """A STEP file (mm) of a solid or an assembly."""
+    """Return a STEP file (mm) of a solid or an assembly."""
     from build123d import export_step
 
     file = io.BytesIO()
@@ -93,14 +99,16 @@ def step_bytes(shape: "Shape") -> bytes:
 
 
 def stl_bytes(shape: "Shape", place: Path | None = None) -> bytes:
-    """A binary STL file (mm) within `CHORD` and `TURN` of a solid or an assembly. The kernel
-    writes it to a file, which is in the folder `place` meanwhile."""
+    """Return a binary STL file (mm) within `CHORD` and `TURN` of a solid or an assembly.
+
+    The kernel writes it to a temporary file in the folder `place`.
+    """
     from build123d import export_stl
 
     with tempfile.TemporaryDirectory(dir=place) as folder:
         file = Path(folder) / "shape.stl"
         if not export_stl(shape, file, tolerance=CHORD, angular_tolerance=TURN):
-            raise InputError("the solid cannot be cut into triangles; export step instead")
+            raise InputError("the solid cannot be split into triangles; export step instead")
         return file.read_bytes()
 
 
@@ -120,15 +128,18 @@ def _edge(piece: DrawnPiece) -> "Edge":
 
 
 def _side(piece: DrawnPiece, length: float, helix: float) -> "Face":
-    """The side of the rotor over one piece: a cylinder over an arc of a straight rotor, else a
-    B-spline surface, which is exact where the kernel's own twisted sweeps are off by 1e-4 near a
-    cusp."""
+    """Return the side of the rotor over one piece.
+
+    Over an arc of a straight rotor it is a cylinder, otherwise a B-spline surface. The surface is
+    accurate; the kernel's own twisted sweeps are off by 1e-4 near a cusp.
+    """
     from build123d import Face, Vector
 
     if isinstance(piece, Arc) and helix == 0:
         return Face.extrude(_edge(piece), Vector(0, 0, length))
     degree, knots, controls, weights = _rational(piece)
-    # Along z the points turn as exp(iθ), of which a cubic spline ρ gives control points c ρ.
+    # Along z the points turn as exp(iθ). If ρ are the controls of its cubic spline, the surface's
+    # are c ρ.
     turns = max(_SPANS, int(np.ceil(abs(helix) / _STEP)))
     share = np.linspace(0, 1, turns + 1)
     rate = 1j * helix
@@ -145,8 +156,10 @@ def _side(piece: DrawnPiece, length: float, helix: float) -> "Face":
 
 
 def _rational(piece: DrawnPiece):
-    """Degree, knots, control points and weights of a piece as a rational B-spline; an arc must be
-    shorter than half a circle."""
+    """Return degree, knots, control points and weights of a piece as a rational B-spline.
+
+    An arc must be shorter than half a circle.
+    """
     if not isinstance(piece, Arc):
         return 3, piece.knots, piece.controls, np.ones(len(piece.controls))
     half = piece.sweep / 2
@@ -156,7 +169,7 @@ def _rational(piece: DrawnPiece):
 
 
 def _quarters(piece: DrawnPiece) -> list[DrawnPiece]:
-    """A piece in parts of which no arc is longer than a quarter of a circle."""
+    """Split a piece so that no arc is longer than a quarter of a circle."""
     if not isinstance(piece, Arc):
         return [piece]
     count = int(np.ceil(abs(piece.sweep) / (np.pi / 2) - 1e-9))
@@ -166,7 +179,7 @@ def _quarters(piece: DrawnPiece) -> list[DrawnPiece]:
 
 
 def _surface(degrees, knots, points, heights, weights) -> "Face":
-    """A face on a rational B-spline surface: `points` complex (n, m), at `heights`."""
+    """Return a face on a rational B-spline surface: `points` complex (n, m), at `heights`."""
     from build123d import Face
     from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeFace
     from OCP.collections import Array1_double, Array1_int, Array2_double, Array2_gp_Pnt

@@ -1,4 +1,4 @@
-"""SVG drawing of one rotor for documents, in its true size."""
+"""SVG drawing of one rotor for documents, in true size."""
 
 from xml.sax.saxutils import escape
 
@@ -10,11 +10,11 @@ _STYLE = (
     ".pitch{fill:none;stroke:#0072b2;stroke-width:.25;stroke-dasharray:6 1.5 .5 1.5}"
     ".center{fill:none;stroke:#808080;stroke-width:.25;stroke-dasharray:9 1.5 2 1.5}"
 )
-"""Widths and dashes in mm."""
+"""Style sheet; widths and dashes in mm."""
 
 
 def svg_text(drawing: Drawing) -> str:
-    """An SVG file; one user unit is a millimetre, y points up in the drawing."""
+    """Return an SVG file. One user unit is a millimetre; y points up in the drawing."""
     reach = drawing.reach + 1
     size = _number(2 * reach)
     corner = _number(-reach)
@@ -40,7 +40,7 @@ def svg_text(drawing: Drawing) -> str:
 
 
 def outline_path(pieces: list[DrawnPiece]) -> str:
-    """The closed outline as path data: an arc as an arc, a spline as Bézier curves."""
+    """Return the closed outline as path data: arcs as arcs, splines as Bézier curves."""
     return f"M{_point(pieces[0].start)}" + "".join(map(_command, pieces)) + "Z"
 
 
@@ -50,7 +50,7 @@ def _command(piece: DrawnPiece) -> str:
         return "".join(f"C{row}" for row in rows)
     radius = _number(piece.radius)
     large = int(abs(piece.sweep) > 3.141592653589793)
-    # y points down in SVG, where a sweep of 1 is clockwise to the eye.
+    # In SVG y points down, so a sweep flag of 1 looks clockwise.
     return f"A{radius} {radius} 0 {large} {int(piece.sweep < 0)} {_point(piece.stop)}"
 
 
@@ -64,5 +64,5 @@ def _point(z: complex) -> str:
 
 
 def _number(value: float) -> str:
-    """Ten decimals of a millimetre at most."""
+    """Format with ten decimals of a millimetre at most."""
     return f"{value + 0.0:.10f}".rstrip("0").rstrip(".")

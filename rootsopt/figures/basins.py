@@ -24,8 +24,8 @@ _PANELS = 6
 
 
 def plot_basins(ax: Axes, basins: Basins) -> Axes:
-    """Which motion each initial state leads to, and where the motions are when rotor 1 is at
-    φ = 0 mod one lobe pitch."""
+    """Draw which motion each initial state leads to. Mark each motion's states at φ = 0 mod one
+    lobe pitch of rotor 1."""
     colors = [_LOST, *_colors(basins)]
     bounds = np.arange(len(colors) + 1) - 1.5
     pale = [_pale(color) for color in colors]
@@ -48,13 +48,13 @@ def plot_basins(ax: Axes, basins: Basins) -> Axes:
     ax.set(
         xlabel="initial relative rotation (mrad)",
         ylabel="initial relative speed (rad/s)",
-        title="Where motions begin and lead to",
+        title="Where motions start and where they lead",
     )
     return ax
 
 
 def plot_motions(axes: Sequence[Axes], attractors: Sequence[Attractor], colors, lobes: int) -> None:
-    """Contact force of each motion over the same number of mesh periods, a panel each."""
+    """Draw the contact force of each motion over the same mesh periods, one panel each."""
     longest = max(one.evaluation.steady_state.get("period", lobes) for one in attractors)
     shown = max(longest, 2)
     for ax, one, color in zip(axes, attractors, colors, strict=True):
@@ -112,7 +112,7 @@ def _pale(color: str) -> str:
 
 
 def basin_figures(folder: ResultFolder, basins: Basins, config: Config) -> list[str]:
-    """Write basins.png; return its name. The motions with the greatest shares have a panel."""
+    """Write basins.png; return its name. The motions with the largest shares have a panel."""
     pairs = list(zip(basins.attractors, _colors(basins), strict=True))
     shown = [(one, color) for one, color in pairs if one.evaluation.series is not None][:_PANELS]
     made = Figure(figsize=(13, 6.6), layout="constrained")
@@ -127,7 +127,7 @@ def basin_figures(folder: ResultFolder, basins: Basins, config: Config) -> list[
         plot_motions(list(axes), attractors, colors, config.profile.lobes)
         axes[0].set_ylim(0, None)
     made.suptitle(
-        f"{config.profile.family.upper()} at {config.scene.speed_rpm:g} rpm: motions that coexist"
+        f"{config.profile.family.upper()} at {config.scene.speed_rpm:g} rpm: coexisting motions"
     )
     name = "figures/basins.png"
     folder.write_figure(name, made)

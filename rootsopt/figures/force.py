@@ -1,4 +1,4 @@
-"""Contact force over time and frequency. Each function draws on the axes it is given."""
+"""Contact force over time and frequency. Each function draws on the given axes."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,9 +14,9 @@ from rootsopt.figures.style import (
 )
 from rootsopt.response.evaluation import Series
 
-_MOST_TURNS = 4  # revolutions of a force panel
-_LINES = 400  # spectral lines drawn one by one
-_NOTHING = 1e-300  # stands for 0 on a logarithmic axis
+_MOST_TURNS = 4  # revolutions in a force panel, at most
+_LINES = 400  # spectral lines above which a curve is drawn instead of single lines
+_NOTHING = 1e-300  # amplitude drawn for 0 on a logarithmic axis
 
 
 def plot_force(
@@ -24,11 +24,11 @@ def plot_force(
     series: Mapping[str, Series],
     responses: Mapping[str, Mapping[str, float]],
 ) -> Sequence[Axes] | NDArray:
-    """Contact force over time, one panel per design, all on one scale.
+    """Draw the contact force over time, one panel per design, all on one scale.
 
-    Mean and peak are the given responses (`mean_force_N`, `peak_force_N`), which are finer
-    than the samples. Every panel is as long as the shortest window, a few revolutions at
-    most, and has the largest force in it; time counts from its start.
+    Mean and peak come from `responses` (`mean_force_N`, `peak_force_N`), which are more exact than
+    the samples. All panels are as long as the shortest window, a few revolutions at most, and
+    include the largest force. Time counts from the start of the panel.
     """
     turns = min(_MOST_TURNS, *(np.ptp(run.rotation) / (2 * np.pi) for run in series.values()))
     for ax, (name, run) in zip(axes, series.items(), strict=True):
@@ -62,12 +62,12 @@ def _flank_force(ax, time, force, color, label):
 
 
 def number(value: float) -> str:
-    """Four significant digits, final zeros kept."""
+    """Format with four significant digits, keeping final zeros."""
     return f"{value:#.4g}".rstrip(".")
 
 
 def _around_peak(run: Series, turns: float) -> slice:
-    """So many revolutions with the largest force in the middle, as far as there are samples."""
+    """Return a slice of `turns` revolutions around the largest force, as far as samples exist."""
     count = len(run.time)
     shown = min(count, round(count * turns * 2 * np.pi / np.ptp(run.rotation)))
     start = 0 if shown == count else int(np.argmax(run.force)) - shown // 2
@@ -78,10 +78,10 @@ def _around_peak(run: Series, turns: float) -> slice:
 def amplitude_spectrum(
     signal: ArrayLike, step: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Frequencies (1/unit of `step`) above 0 and one-sided amplitudes of a signal (n,).
+    """Return frequencies (1/unit of `step`) above 0 and one-sided amplitudes of a signal (n,).
 
-    The samples must be uniform and cover whole periods, without the end point: then a
-    cosine of amplitude a gives one line of height a and no window function is needed.
+    The samples must be uniform and cover whole periods, without the end point. A cosine of
+    amplitude a then gives one line of height a, and no window function is needed.
     """
     signal = np.asarray(signal)
     amplitude = 2 * np.abs(np.fft.rfft(signal)) / len(signal)
@@ -97,9 +97,9 @@ def plot_spectrum(
     mesh_frequency_Hz: float,
     harmonics: int = 40,
 ) -> Sequence[Axes] | NDArray:
-    """Amplitude spectrum of the contact force, one panel per design, all on one scale.
+    """Draw the amplitude spectrum of the contact force, one panel per design, all on one scale.
 
-    Up to `harmonics` times the mesh frequency; the mean (0 Hz) is left out.
+    The axis ends at `harmonics` times the mesh frequency. The mean (0 Hz) is omitted.
     """
     limit = (harmonics + 0.5) * mesh_frequency_Hz
     top = 0.0

@@ -24,12 +24,12 @@ def plot_history(
     history: Sequence[Mapping[str, Any]],
     keys: Sequence[str] = DESIGN_KEYS,
 ) -> Sequence[Axes] | NDArray:
-    """Objective with best so far, then the design parameters, over the evaluations.
+    """Draw the objective with its best so far, then the design parameters, over the evaluations.
 
-    `axes` holds a panel more than there are `keys`, those of the family in the config; a list of
-    parameters shares a panel, which shows the local searches only. A row without `start`, or with
-    a negative one, belongs to the screening. Unusable designs (objective not finite) stand as
-    crosses at the top.
+    `axes` has one panel more than `keys`, the parameters of the config's family. A list of
+    parameters shares a panel, which shows local searches only. A row without `start`, or with a
+    negative one, belongs to the screening. Unusable designs (objective not finite) are crosses at
+    the top.
     """
     keys = ("objective", *keys)
     for ax, key in zip(axes, keys, strict=True):
@@ -49,14 +49,14 @@ def plot_history(
 
 
 def _label(key: str) -> str:
-    """Name of a design parameter with its unit."""
+    """Return the name of a design parameter with its unit."""
     units = {"_deg": " (°)", "_mm": " (mm)"}
     unit = next((end for end in units if key.endswith(end)), "")
     return key.removesuffix(unit).replace("_", " ") + units.get(unit, "")
 
 
 def _traces(ax, rows, key):
-    """The entries of a list of parameters over the evaluations of a local search."""
+    """Draw the entries of a list of parameters over the evaluations of a local search."""
     rows = [row for row in rows if _start(row) >= 0]
     if not rows:
         return
@@ -71,7 +71,7 @@ def _traces(ax, rows, key):
 
 
 def _starts(history) -> Iterator[tuple[list[Mapping[str, Any]], dict[str, Any]]]:
-    """Rows and line style of the screening and of each start."""
+    """Yield rows and line style of the screening and of each start."""
     groups: dict[Any, list] = {}
     for row in history:
         groups.setdefault(_start(row), []).append(row)
@@ -92,7 +92,7 @@ def _start(row) -> int:
 
 
 def _trace(ax, rows, key, style):
-    """Values over evaluations; hollow where a constraint is not met."""
+    """Draw values over evaluations; hollow markers violate a constraint."""
     x, y = _values(rows, "evaluation"), _values(rows, key)
     met = np.asarray([bool(row.get("feasible", True)) for row in rows])
     ax.plot(x, y, **(style | {"marker": "", "label": None}), alpha=0.6)
@@ -107,7 +107,7 @@ def _values(rows, key) -> NDArray[np.float64]:
 
 
 def _best(axes, keys, history):
-    """Best objective so far as a line, and a star on the best design in every panel."""
+    """Draw the best objective so far as a line, and a star on the best design in every panel."""
     x, best = [row["evaluation"] for row in history], _values(history, "best_objective")
     axes[0].step(x, best, where="post", color="black", linewidth=1.8, label="best so far")
     if not np.isfinite(best).any():
@@ -123,7 +123,7 @@ def _best(axes, keys, history):
 
 
 def _outside(ax, history):
-    """Limits that a few bad designs cannot stretch, and marks for what lies outside them."""
+    """Set limits that a few bad designs cannot stretch, and mark the values outside them."""
     values = _values(history, "objective")
     x = _values(history, "evaluation")
     known = values[np.isfinite(values)]

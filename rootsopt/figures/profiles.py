@@ -1,4 +1,4 @@
-"""Rotor profiles, meshing and conjugacy. Each function draws on the axes it is given."""
+"""Rotor profiles, meshing and conjugacy. Each function draws on the given axes."""
 
 from collections.abc import Mapping, Sequence
 
@@ -13,7 +13,7 @@ from rootsopt.figures.style import COLORS, DASHES, GREY, ORANGE, SKY, VERMILION
 def plot_profiles(
     ax: Axes, outlines: Mapping[str, NDArray[np.float64]], pitch_radius_mm: float
 ) -> Axes:
-    """Closed outlines (n, 2) in mm, overlaid, with the pitch circle."""
+    """Draw closed outlines (n, 2) in mm on top of each other, with the pitch circle."""
     _overlay(ax, outlines, pitch_radius_mm)
     reach = 1.06 * max(np.max(np.hypot(*points.T)) for points in outlines.values())
     ax.plot(0, 0, "+", color="black", markersize=9)
@@ -24,7 +24,7 @@ def plot_profiles(
 def plot_flank(
     ax: Axes, outlines: Mapping[str, NDArray[np.float64]], lobes: int, pitch_radius_mm: float
 ) -> Axes:
-    """One flank from tip (+x axis) to root, enlarged: all there is, the rest is symmetry."""
+    """Draw one flank from tip (+x axis) to root, enlarged; the rest follows by symmetry."""
     _overlay(ax, outlines, pitch_radius_mm)
     flanks = []
     for points in outlines.values():
@@ -60,7 +60,7 @@ def plot_meshing(
     pitch_radius_mm: float,
     angles_deg: Sequence[float] | NDArray[np.float64],
 ) -> Sequence[Axes] | NDArray:
-    """The meshing pair at several angles of rotor 1, one panel each."""
+    """Draw the meshing pair at several angles of rotor 1, one panel each."""
     center = 2 * pitch_radius_mm
     for ax, angle in zip(axes, angles_deg, strict=True):
         turn = np.radians(angle)
@@ -78,8 +78,8 @@ def plot_meshing(
 
 
 def plot_conjugacy(ax: Axes, gaps: Mapping[str, tuple[NDArray, NDArray]]) -> Axes:
-    """Gap (µm) that pairs leave in perfect rolling, over rotor 1's angle (deg) from where its tip
-    passes the line of centres."""
+    """Draw the gap (µm) of pairs in perfect rolling over rotor 1's angle (deg), which is 0 where
+    its tip passes the line of centres."""
     for (name, (angle, gap)), color, dashes in zip(gaps.items(), COLORS, DASHES * 2, strict=False):
         ax.plot(angle, gap, color=color, linestyle=dashes, linewidth=1.6, label=name)
     ax.axhline(0, color="black", linewidth=0.8)

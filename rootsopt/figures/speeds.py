@@ -17,15 +17,15 @@ from rootsopt.response.speeds import AtSpeed
 _MARKERS = {"periodic": "o", "averaged": "s", "chaotic": "x", "not_settled": "+"}
 _NO_FORCE = "v"
 _FEW = 24
-"""Up to so many speeds every one is marked."""
+"""Number of speeds up to which each speed is marked."""
 LABELS = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
 
 
 def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[AtSpeed]], force: str) -> Axes:
-    """`force` (a key of the responses) over speed, a line for each design.
+    """Draw `force` (a key of the responses) over speed, one line per design.
 
-    A line goes through steady motions. Others are marked one by one; those without a force stand
-    at the bottom.
+    Lines connect steady motions. Other motions are single markers; those without a force are at the
+    bottom.
     """
     for (name, parts), color, dashes in zip(designs.items(), COLORS, DASHES * 2, strict=False):
         speeds = np.array([part.speed_rpm for part in parts])
@@ -33,7 +33,7 @@ def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[AtSpeed]], force: str) 
         usable = np.array([part.evaluation.usable for part in parts])
         line = np.where(usable, values, np.nan)
         ax.plot(speeds, line, color=color, linestyle=dashes, linewidth=1.5, label=name)
-        # A single one between motions that are not steady makes no line.
+        # A single steady motion between others gives no line, so it is marked.
         beside = np.concatenate([[False], usable, [False]])
         marked = ~usable | (len(parts) <= _FEW) | ~(beside[:-2] | beside[2:])
         for part, value, mark in zip(parts, values, marked, strict=True):
@@ -52,7 +52,7 @@ def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[AtSpeed]], force: str) 
 
 
 def legend_entries(designs: Mapping[str, Sequence[AtSpeed]]) -> list[Line2D]:
-    """What the designs and the markers mean."""
+    """Return legend entries for the designs and the markers."""
     entries = []
     for name, color, dashes in zip(designs, COLORS, DASHES * 2, strict=False):
         entries.append(Line2D([], [], color=color, linestyle=dashes, linewidth=1.5, label=name))

@@ -6,19 +6,19 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-# Okabe and Ito's palette, told apart with any colour vision and in grey.
+# Okabe and Ito's palette: distinguishable with any colour vision, and in grey.
 BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"
 ORANGE, SKY, PURPLE, GREY = "#E69F00", "#56B4E9", "#CC79A7", "#808080"
 COLORS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
-"""Colours of the curves of one figure, in their order."""
+"""Colours of the curves of one figure, in this order."""
 DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), "-.")
-"""Line styles of the curves of one figure, in their order."""
+"""Line styles of the curves of one figure, in this order."""
 
 
 def figure(
     width: float, height: float, rows: int = 1, columns: int = 1, **options: Any
 ) -> tuple[Figure, NDArray]:
-    """A headless figure (sizes in inches) and its (rows, columns) array of axes."""
+    """Return a headless figure (sizes in inches) and its (rows, columns) array of axes."""
     made = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(made)
     return made, made.subplots(rows, columns, squeeze=False, **options)

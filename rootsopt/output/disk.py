@@ -1,7 +1,7 @@
-"""The file operations everything that is written goes through.
+"""File operations used for everything that is written.
 
-Thin on purpose: a test makes each of these calls fail, or ends the process there, one after the
-other. Standard library only.
+They are thin on purpose: a test makes each of these calls fail, or ends the process there, one
+after the other. Standard library only.
 """
 
 import ctypes
@@ -18,8 +18,8 @@ _UNSUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 
 
 def create(path: Path, data: bytes) -> None:
-    """Write a new file with the user's usual permissions, through to the disk; on failure none is
-    left."""
+    """Write a new file with the user's usual permissions and flush it to the disk; on failure
+    leave no file."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     file = os.open(path, flags, 0o666)
     try:
@@ -41,7 +41,7 @@ def make_folder(path: Path) -> None:
 
 
 def make_folders(folder: Path, made: list[Path]) -> None:
-    """Make a folder and its parents, noting the new ones in `made` as they appear."""
+    """Create a folder and its parents; append the new ones to `made` as they appear."""
     missing = []
     while not folder.is_dir():
         missing.append(folder)
@@ -52,14 +52,14 @@ def make_folders(folder: Path, made: list[Path]) -> None:
         try:
             make_folder(new)
         except FileExistsError:
-            if not new.is_dir():  # not merely another process that was faster
+            if not new.is_dir():  # otherwise another process was faster
                 raise
         else:
             made.append(new)
 
 
 def sync_folder(path: Path) -> None:
-    """Put the names in a folder through to the disk, where the file system can do that."""
+    """Flush the names in a folder to the disk, where the file system can do that."""
     try:
         folder = os.open(path, os.O_RDONLY)
     except PermissionError:  # where folders cannot be opened
@@ -74,17 +74,17 @@ def sync_folder(path: Path) -> None:
 
 
 def move(source: Path, target: Path) -> None:
-    """Rename in one step; an empty folder at `target` is replaced."""
+    """Rename a folder in one step; an empty folder at `target` is replaced."""
     os.rename(source, target)
 
 
 def replace(source: Path, target: Path) -> None:
-    """Rename in one step; a file at `target` is replaced."""
+    """Rename a file in one step; a file at `target` is replaced."""
     os.replace(source, target)
 
 
 def exchange(first: Path, second: Path) -> bool:
-    """Let two folders change places in one step; False where the system cannot do that."""
+    """Exchange two folders in one step; return `False` where the system cannot do that."""
     call = _renameat2()
     if call is None:
         return False
@@ -97,7 +97,7 @@ def exchange(first: Path, second: Path) -> bool:
 
 
 def can_exchange(folder: Path) -> bool:
-    """Whether folders on the file system of `folder` can change places."""
+    """Return whether the file system of `folder` can exchange two folders."""
     pair = [folder / name for name in (".first", ".second")]
     for one in pair:
         os.mkdir(one)
@@ -109,14 +109,14 @@ def can_exchange(folder: Path) -> bool:
 
 
 def _exchanged(call, first: bytes, second: bytes) -> int:
-    """The error number of an exchange, 0 for none."""
+    """Return the error number of an exchange, 0 for success."""
     done = call(_AT_FDCWD, first, _AT_FDCWD, second, _RENAME_EXCHANGE)
     return ctypes.get_errno() if done else 0
 
 
 @functools.cache
 def _renameat2():
-    """The C library's function, or None."""
+    """Return the C library's function, or `None`."""
     try:
         call = ctypes.CDLL(None, use_errno=True).renameat2
     except (OSError, AttributeError, TypeError):
@@ -127,7 +127,7 @@ def _renameat2():
 
 
 def adopt_mode(path: Path, model: Path) -> None:
-    """Give a folder the permissions of another, as far as that is allowed."""
+    """Give a folder the permissions of another, as far as allowed."""
     try:
         os.chmod(path, stat.S_IMODE(os.stat(model).st_mode))
     except OSError:
@@ -135,7 +135,7 @@ def adopt_mode(path: Path, model: Path) -> None:
 
 
 def discard(path: Path) -> None:
-    """Remove a file or an empty folder, if there is one and it can be removed."""
+    """Remove a file or an empty folder if it exists and can be removed."""
     try:
         if path.is_dir() and not path.is_symlink():
             os.rmdir(path)
@@ -146,5 +146,5 @@ def discard(path: Path) -> None:
 
 
 def discard_tree(path: Path) -> None:
-    """Remove a folder with all it holds, as far as possible."""
+    """Remove a folder and its content, as far as possible."""
     shutil.rmtree(path, ignore_errors=True)

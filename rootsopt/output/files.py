@@ -1,8 +1,8 @@
-"""Result files: written whole or not at all, into a folder checked before the work begins.
+"""Result files, written completely or not at all, into a folder checked before the work starts.
 
-Every file goes to a temporary name in its own folder and then takes the final name in one
-step, so a reader (or a killed run) sees the old file or the new one, never half of it. Commands
-write whole folders that way (`rootsopt.output.runs`).
+Every file is written under a temporary name in its folder, then renamed in one step. A reader, or a
+killed run, sees the old file or the new one, never half of it. Commands write whole folders in the
+same way (`rootsopt.output.runs`).
 """
 
 import csv
@@ -33,15 +33,14 @@ if TYPE_CHECKING:
     from rootsopt.response.evaluation import Series
 
 DPI = 150
-"""Resolution of the figures written."""
+"""Resolution (dots per inch) of the figures."""
 _LIBRARIES = ("jax", "jaxlib", "diffrax", "optax", "equinox", "numpy")
 
 
 class ResultFolder:
-    """A folder that takes result files.
+    """A folder for result files, created with its parents if it does not exist.
 
-    Made with its parents where it does not exist. Raises `InputError` if it cannot be made
-    or written into, and then leaves nothing behind.
+    Raises `InputError` if it cannot be created or written to; it then leaves nothing behind.
     """
 
     def __init__(self, path: str | os.PathLike):
@@ -64,11 +63,11 @@ class ResultFolder:
 
     @property
     def place(self) -> Path:
-        """Where files are."""
+        """Folder where files are written."""
         return self.path
 
     def write_bytes(self, name: str, data: bytes) -> Path:
-        """Write `data` as `name`, which may lie in a subfolder (`figures/force.png`)."""
+        """Write `data` as `name`, which may include a subfolder (`figures/force.png`)."""
         target = self.path / name
         temporary = target.with_name(_temporary(target.name))
         try:
@@ -81,7 +80,7 @@ class ResultFolder:
                 raise
         except OSError as error:
             raise InputError(
-                f"{str(target)!r}: cannot be written: {sources.reason(error)}; free the place or "
+                f"{str(target)!r}: cannot be written: {sources.reason(error)}; make room there or "
                 "choose another output folder"
             ) from None
         return target
@@ -98,14 +97,14 @@ class ResultFolder:
         return self.write_bytes(name, data)
 
     def write_json(self, name: str, data: Any) -> Path:
-        """Write `data` as strict JSON: numbers that are not finite become null."""
+        """Write `data` as strict JSON: non-finite numbers become null."""
         text = json.dumps(_plain(data), indent=2, allow_nan=False, ensure_ascii=False)
         return self.write_text(name, text + "\n")
 
     def write_csv(self, name: str, columns: Mapping[str, ArrayLike]) -> Path:
-        """Write equally long columns under a header line, floats with 10 digits.
+        """Write columns of equal length below a header line, floats with 10 digits.
 
-        Text, truth values (`true`, `false`) and None (empty) may stand among numbers.
+        Text, truth values (`true`, `false`) and `None` (empty) may be mixed with numbers.
         Raises `ValueError` for columns that differ in length or are not one-dimensional.
         """
         return self.write_text(name, _csv(columns))
@@ -122,7 +121,7 @@ def _temporary(name: str) -> str:
 
 
 def _plain(data: Any) -> Any:
-    """`data` in JSON's own types."""
+    """Convert `data` to JSON's own types."""
     if isinstance(data, Mapping):
         return {str(key): _plain(value) for key, value in data.items()}
     if isinstance(data, (list, tuple)):
@@ -167,8 +166,8 @@ def _cell(value: Any) -> str:
 
 
 def write_config(folder: ResultFolder, config: "Config") -> None:
-    """Write config.yaml, and beside it a copy of the file that an outline is in, which it names:
-    the folder stays whole wherever it is moved."""
+    """Write config.yaml, and next to it a copy of the outline file that it names. The folder can
+    then be moved."""
     profile = config.profile
     if profile.outline_file is not None:
         source = sources.regular_file(profile.outline_file, "an outline")
@@ -184,13 +183,13 @@ def write_config(folder: ResultFolder, config: "Config") -> None:
 
 
 def profile_columns(outline_mm: ArrayLike) -> dict[str, NDArray[np.float64]]:
-    """Columns of `profile_*.csv` from a closed outline (n, 2) in mm."""
+    """Return the columns of `profile_*.csv` from a closed outline (n, 2) in mm."""
     outline = np.asarray(outline_mm)
     return {"x_mm": outline[:, 0], "y_mm": outline[:, 1]}
 
 
 def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
-    """Columns of `response_*.csv`: motion and forces over the reported window."""
+    """Return the columns of `response_*.csv`: motion and forces over the reported window."""
     return {
         "time_s": series.time,
         "rotation_deg": np.degrees(series.rotation),
@@ -205,9 +204,9 @@ def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
 def row_columns(
     rows: Sequence[Mapping[str, Any]], keys: Iterable[str] | None = None
 ) -> dict[str, NDArray]:
-    """Columns from dict rows such as the optimisation history; an absent entry is None.
+    """Return columns from dict rows such as the optimisation history; an absent entry is `None`.
 
-    `keys` orders the columns (default: as first met), and gives the header where there
+    `keys` orders the columns (default: order of appearance). It also gives the header when there
     are no rows.
     """
     if keys is None:
@@ -220,6 +219,6 @@ def row_columns(
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, this package and the libraries that decide its numbers."""
+    """Return the versions of Python, this package and the libraries that affect its numbers."""
     found = {"python": platform.python_version(), "rootsopt": rootsopt.__version__}
     return found | {name: importlib.metadata.version(name) for name in _LIBRARIES}

@@ -1,7 +1,7 @@
-"""One process at a time: a lock that dies with its process.
+"""A lock for one process at a time, released when its process ends.
 
-`filelock` was considered, but empties the file of a lock it does not get, and with it the number
-of the process that holds it.
+`filelock` was rejected: it empties the file of a lock it does not get. The number of the process
+that holds the lock would be lost.
 """
 
 import contextlib
@@ -13,14 +13,14 @@ from rootsopt.errors import InputError
 
 try:
     import fcntl
-except ImportError:  # no such locks on this system
+except ImportError:  # this system has no such locks
     fcntl = None
 
 _TAKEN = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
 
 
 class TakenError(InputError):
-    """Another process holds the lock; `process`: its number, if it is known."""
+    """Another process holds the lock. `process`: its number, or `None` if unknown."""
 
     def __init__(self, process: int | None):
         super().__init__("the lock is held by another process")
@@ -28,11 +28,11 @@ class TakenError(InputError):
 
 
 class Lock:
-    """An advisory lock on the file `path`, which exists only as long as the lock is held.
+    """An advisory lock on the file `path`, which exists only while the lock is held.
 
-    The system takes it back when the process ends, however it ends. Where the file system has no
-    locks, `held` is False and everything goes on without. Raises `TakenError`, and `OSError` where
-    the file cannot be made.
+    The system releases it when the process ends, for whatever reason. Where the file system has no
+    locks, `held` is False and the run continues without a lock. Raises `TakenError` if another
+    process holds it, and `OSError` where the file cannot be created.
     """
 
     def __init__(self, path: Path):
@@ -54,13 +54,13 @@ class Lock:
                 process = _number(file)
                 os.close(file)
                 raise TakenError(process) from None
-        # Its last holder may have removed the file between the two steps.
+        # The last holder may have removed the file between the two steps.
         if self.held and not self._same(file):
             os.close(file)
             self.held = False
             return
         self._file = file
-        with contextlib.suppress(OSError):  # Without its number the lock is as good.
+        with contextlib.suppress(OSError):  # The lock also works without the number.
             os.ftruncate(file, 0)
             os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
 
@@ -68,7 +68,7 @@ class Lock:
         flags = os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
         try:
             return os.open(self.path, os.O_RDWR | flags, 0o666)
-        except PermissionError:  # another user's
+        except PermissionError:  # the file of another user
             return os.open(self.path, os.O_RDONLY)
 
     def _same(self, file: int) -> bool:
@@ -79,11 +79,11 @@ class Lock:
         return (there.st_dev, there.st_ino) == (here.st_dev, here.st_ino)
 
     def release(self) -> None:
-        """Remove the file and give the lock back; a second time does nothing."""
+        """Remove the file and release the lock; a second call does nothing."""
         if self._file < 0:
             return
         file, self._file, self.held = self._file, -1, False
-        # While it is still held: nobody else can have taken it by then.
+        # Remove it while the lock is held: nobody else can have taken it by then.
         with contextlib.suppress(OSError):
             os.unlink(self.path)
         os.close(file)

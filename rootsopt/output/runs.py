@@ -1,20 +1,20 @@
-"""The result folder of one run of a command: written aside, put in place whole.
+"""The result folder of one run of a command: written aside, then put in place complete.
 
-A run writes into a folder of its own beside the target, `.NAME.PROCESS-XXXXXXXX.rootsopt`. When all
-is written, that folder takes the target's name in one step. So the target is the run before or this
-one, never a mixture. A lock file beside it, `.NAME.rootsopt`, keeps a second process out. Both
-vanish with the run; what a killed run leaves, the next one removes.
+A run writes into its own folder beside the target, `.NAME.PROCESS-XXXXXXXX.rootsopt`. When all
+files are written, that folder takes the target's name in one step. The target is therefore the
+earlier run or this one, never a mixture. A lock file beside it, `.NAME.rootsopt`, keeps a second
+process out. Both disappear with the run. The next run removes the remains of a killed one.
 
-What is in the target already:
+The content of the target decides what happens:
 
 - nothing: the new run takes its place;
-- an earlier run: it is moved aside to `NAME.1`, `NAME.2` …, or with `overwrite` replaced, unless
-  there are files in it that are not its own;
-- anything else: refused.
+- an earlier run: it is moved to `NAME.1`, `NAME.2` …; with `overwrite` it is replaced, unless it
+  holds files that are not its own;
+- anything else: the target is refused.
 
 Where the file system can exchange two folders (Linux), the target exists at any time. Elsewhere the
-older run is moved away first; if the process is killed just then, the next run puts the finished
-folder in place.
+earlier run is moved away first. If the process is killed at that moment, the next run puts the
+finished folder in place.
 """
 
 import contextlib
@@ -37,23 +37,23 @@ from rootsopt.output.files import ResultFolder
 from rootsopt.output.lock import Lock, TakenError
 
 RESULT = "result.json"
-"""The file that is written last and lists all others."""
+"""Name of the file that is written last and lists all others."""
 _CONFIG = "config.yaml"
 _SUFFIX = ".rootsopt"
 _STAGE = re.compile(r"(\..+)\.\d+-[0-9a-f]{8}" + re.escape(_SUFFIX))
 _LONGEST = 150
-"""Bytes of a folder's name up to which temporary names contain it."""
+"""Length (bytes) of a folder's name above which temporary names contain its digest instead."""
 _PATIENCE = 10.0
 """Time (s) that a write in progress has left when the process is stopped."""
 _State = Literal["absent", "empty", "ours", "more", "foreign"]
 
 
 class RunFolder(ResultFolder):
-    """A `ResultFolder` that appears whole, with `put_in_place`, or not at all.
+    """A `ResultFolder` that appears complete, with `put_in_place`, or not at all.
 
-    `path`: where it will be. Use it as a context: what is not in place at the end is removed.
-    Raises `InputError` where the folder cannot be used: another process writes into it, it holds
-    files of others, it is no folder, or its parent cannot be written into.
+    `path` is its final place. Use it as a context manager: a folder that is not in place at the end
+    is removed. Raises `InputError` where the folder cannot be used: another process writes into it,
+    it holds files of others, it is not a folder, or its parent cannot be written to.
     """
 
     def __init__(self, path: str | os.PathLike, command: str = "", overwrite: bool = False):
@@ -95,25 +95,25 @@ class RunFolder(ResultFolder):
         )
 
     def _refuse_places(self) -> None:
-        """Raise `InputError` where nothing can be put in place of the target."""
+        """Raise `InputError` where a finished run cannot replace the target."""
         target = self.target
         if os.path.lexists(target) and not target.is_dir():
             raise InputError(f"{str(self.path)!r}: is not a folder; choose another output folder")
         here = Path.cwd()
         what = None
         if target == here or target in here.parents:
-            what = "the current folder or one around it"
+            what = "the current folder or one above it"
         elif os.path.ismount(target) or str(target) in _mount_points():
             what = "a mount point"
         if what is not None:
             inside = self.path / (self.command or "run")
             raise InputError(
-                f"{str(self.path)!r}: is {what}, which a finished run cannot take the place of; "
-                f"name a folder inside, as {str(inside)!r}"
+                f"{str(self.path)!r}: is {what}, which a finished run cannot replace; name a "
+                f"folder inside it, for example {str(inside)!r}"
             )
 
     def _claim(self) -> None:
-        """Take the lock, remove what killed runs have left, look at what is there."""
+        """Take the lock, remove the remains of killed runs, and check the target."""
         try:
             self._lock = Lock(self._base.with_name(self._base.name + _SUFFIX))
         except TakenError as taken:
@@ -128,13 +128,13 @@ class RunFolder(ResultFolder):
             some = sorted(os.listdir(self.target))
             shown = ", ".join(some[:3]) + (", …" if len(some) > 3 else "")
             raise InputError(
-                f"{str(self.path)!r}: holds files that are not of an earlier run ({shown}); choose "
-                "another folder, or empty this one (--overwrite replaces earlier runs only)"
+                f"{str(self.path)!r}: holds files that do not belong to an earlier run ({shown}); "
+                "choose another folder, or empty this one (--overwrite replaces earlier runs only)"
             )
 
     def _clear(self) -> None:
-        """Finish what a killed run had nearly put in place; remove the rest of killed runs in the
-        parent folder."""
+        """Finish a killed run that was complete but not in place; remove the remains of other
+        killed runs in the parent folder."""
         for name in sorted(os.listdir(self.target.parent)):
             found = _STAGE.fullmatch(name)
             if found is None:
@@ -146,15 +146,15 @@ class RunFolder(ResultFolder):
                 else:
                     disk.discard_tree(left)
                 continue
-            with contextlib.suppress(InputError, OSError):  # of a run that goes on
+            with contextlib.suppress(InputError, OSError):  # belongs to a run in progress
                 other = Lock(self.target.parent / (found[1] + _SUFFIX))
                 if other.held and not _complete(left):
                     disk.discard_tree(left)
                 other.release()
 
     def _state(self) -> _State:
-        """What the target is: `ours`, an earlier run and nothing else; `more`, one with other files
-        beside its own."""
+        """Return the state of the target: `ours`: an earlier run and nothing else; `more`: an
+        earlier run with other files."""
         if not os.path.lexists(self.target):
             return "absent"
         if not self.target.is_dir():
@@ -171,12 +171,12 @@ class RunFolder(ResultFolder):
 
     @property
     def place(self) -> Path:
-        """Where files are for now."""
+        """Folder where files are written for now."""
         return self.stage
 
     def write_bytes(self, name: str, data: bytes) -> Path:
-        """Write `data` as `name`, which may lie in a subfolder (`figures/force.png`); return where
-        it will be."""
+        """Write `data` as `name`, which may include a subfolder (`figures/force.png`); return its
+        final path."""
         with self._busy, self._failing(name):
             file = self.stage / name
             disk.make_folders(file.parent, [])
@@ -187,16 +187,16 @@ class RunFolder(ResultFolder):
         return self.path / name
 
     def write_json(self, name: str, data: Any) -> Path:
-        """As `ResultFolder.write_json`; `result.json` is written last, with a list of all files."""
+        """Write as `ResultFolder.write_json`; `result.json` is written last, listing all files."""
         if name != RESULT:
             return super().write_json(name, data)
         self._result = data
         return self.path / name
 
     def put_in_place(self) -> list[str]:
-        """Give the folder its place; return what the user should know of that, a sentence each.
+        """Put the folder in its place; return what the user should know, one sentence each.
 
-        Raises `InputError` if that fails, and then the target is as it was."""
+        Raises `InputError` if that fails; the target is then unchanged."""
         with self._busy:
             files = sorted(self._written | {RESULT})
             run = {"run": {"command": self.command, "files": files}}
@@ -217,10 +217,10 @@ class RunFolder(ResultFolder):
                 disk.adopt_mode(self.stage, self.target)
             disk.move(self.stage, self.target)
             return []
-        if state == "foreign":  # It was not when the run began, and a long run is not thrown away.
+        if state == "foreign":  # It was not when the run started. Do not throw away a long run.
             self.target = self.path = self._free()
             disk.move(self.stage, self.target)
-            return [f"the folder asked for holds other files by now; this run is in {self.path}"]
+            return [f"the requested folder now holds other files; this run is in {self.path}"]
         disk.adopt_mode(self.stage, self.target)
         if self.overwrite and state == "ours":
             self._replace()
@@ -230,11 +230,11 @@ class RunFolder(ResultFolder):
         shown = self.path.with_name(aside.name)
         note = f"the earlier run is now in {shown}"
         if self.overwrite:
-            note += ", as there are files in it that are not its own"
+            note += ", because it holds files that are not its own"
         return [note]
 
     def _replace(self) -> None:
-        """Take the place of the run in the target, which vanishes."""
+        """Replace the run in the target, which is removed."""
         if disk.exchange(self.stage, self.target):
             older = self.stage
         else:
@@ -243,11 +243,11 @@ class RunFolder(ResultFolder):
         disk.discard_tree(older)
 
     def _push_aside(self, aside: Path) -> None:
-        """Take the place of the run in the target, which moves to `aside`."""
+        """Replace the run in the target, which moves to `aside`."""
         if not disk.can_exchange(self.stage):
             self._swap_by(aside)
             return
-        # Complete under that name, so that nothing is lost if the process ends in between.
+        # The run is complete under that name, so nothing is lost if the process ends in between.
         disk.move(self.stage, aside)
         try:
             if not disk.exchange(aside, self.target):
@@ -257,7 +257,7 @@ class RunFolder(ResultFolder):
             raise
 
     def _swap_by(self, older: Path) -> None:
-        """In two steps: the target to `older`, this run to the target."""
+        """Move the target to `older`, then this run to the target."""
         disk.move(self.target, older)
         try:
             disk.move(self.stage, self.target)
@@ -266,7 +266,7 @@ class RunFolder(ResultFolder):
             raise
 
     def _free(self) -> Path:
-        """The first of `NAME.1`, `NAME.2` … that does not exist."""
+        """Return the first of `NAME.1`, `NAME.2` … that does not exist."""
         number = 1
         while os.path.lexists(found := self.target.with_name(f"{self.target.name}.{number}")):
             number += 1
@@ -278,12 +278,12 @@ class RunFolder(ResultFolder):
             yield
         except OSError as error:
             raise InputError(
-                f"{str(self.path / name)!r}: cannot be written: {sources.reason(error)}; free the "
-                "place or choose another output folder"
+                f"{str(self.path / name)!r}: cannot be written: {sources.reason(error)}; make room "
+                "there or choose another output folder"
             ) from None
 
     def close(self) -> None:
-        """Remove what is not in place, and give the lock back; a second time does nothing."""
+        """Remove a folder that is not in place, release the lock; a second call does nothing."""
         with self._busy:
             if not self.placed and hasattr(self, "stage"):
                 disk.discard_tree(self.stage)
@@ -294,11 +294,11 @@ class RunFolder(ResultFolder):
                     disk.discard(folder)
 
     def abandon(self) -> str:
-        """As `close`, from another thread and for good: the run can write nothing any more. Return
-        what has become of the folder."""
+        """Close for good, from another thread: the run can write nothing more. Return what has
+        become of the folder."""
         if self._busy.acquire(timeout=_PATIENCE):
             self.close()
-        return f"{self.path} is {'complete' if self.placed else 'as it was'}"
+        return f"{self.path} is {'complete' if self.placed else 'unchanged'}"
 
     def __enter__(self) -> "RunFolder":
         return self
@@ -313,14 +313,14 @@ class RunFolder(ResultFolder):
 
 
 def _base(name: str) -> str:
-    """What the temporary names of a folder begin with."""
+    """Return the start of a folder's temporary names."""
     if len(os.fsencode(name)) > _LONGEST:
         name = hashlib.sha256(os.fsencode(name)).hexdigest()
     return f".{name}"
 
 
 def _files_in(folder: Path) -> set[str]:
-    """All files below a folder, by their names relative to it; empty folders too."""
+    """Return all files below a folder, by their relative names; empty folders too."""
     found: set[str] = set()
     for place, folders, files in os.walk(folder):
         inside = Path(place).relative_to(folder)
@@ -331,7 +331,7 @@ def _files_in(folder: Path) -> set[str]:
 
 
 def _listed(result: Path) -> set[str]:
-    """The files of a run by its result file; none where it does not say."""
+    """Return the files of a run as listed in its result file; empty if it has no list."""
     try:
         names = json.loads(result.read_bytes())["run"]["files"]
         return {name for name in names if isinstance(name, str)}
@@ -340,13 +340,13 @@ def _listed(result: Path) -> set[str]:
 
 
 def _complete(stage: Path) -> bool:
-    """Whether a run that was killed had written all its files."""
+    """Return whether a killed run had written all its files."""
     listed = _listed(stage / RESULT)
     return bool(listed) and _files_in(stage) == listed
 
 
 def _mount_points() -> set[str]:
-    """Folders that something is mounted on, also from the same file system (Linux)."""
+    """Return the folders on which something is mounted, also from the same file system (Linux)."""
     try:
         lines = Path("/proc/self/mountinfo").read_bytes().splitlines()
         places = [line.split()[4] for line in lines]

@@ -1,6 +1,6 @@
 """Tables for the terminal: one evaluation, one geometry, or optimised against baseline.
 
-Plain ASCII and no wider than 80 columns, so that they read the same in a pipe or a log.
+Plain ASCII, at most 80 columns wide, so that they look the same in a pipe or a log.
 """
 
 import math
@@ -46,9 +46,9 @@ def comparison_table(
     constraints: list[dict[str, Any]],
     improvement: Mapping[str, float],
 ) -> RenderableType:
-    """Optimised design against baseline, change in % of the baseline.
+    """Compare the optimised design with the baseline; changes are in % of the baseline.
 
-    A constraint is a row {name, baseline, optimized, limit, unit, sense, satisfied, active};
+    A constraint is a row {name, baseline, optimized, limit, unit, sense, satisfied, active}.
     `improvement` holds the reductions of objective, mean and peak as fractions.
     """
     table = _table("Optimised rotor against baseline", "baseline", "optimised", "change")
@@ -77,7 +77,7 @@ def comparison_table(
 
 
 def evaluation_table(evaluation: Evaluation) -> RenderableType:
-    """One design in one scene."""
+    """Show one design in one scene."""
     record = evaluation.record()
     table = _table("Simulation of the rotor pair", "value")
     _group(table, "design", _singles(record["design"]))
@@ -94,7 +94,7 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
 
 
 def sweep_table(rows: list[dict[str, Any]]) -> RenderableType:
-    """One design at many speeds, a row each; `rows` as `speeds.Part.row` gives them."""
+    """Show one design at many speeds, one row each, with `rows` from `speeds.Part.row`."""
     columns = "mean, N", "peak, N", "period", "multiplier", "status"
     table = _table("Contact force over speed", *columns)
     table.columns[0].header = Text("speed, rpm")
@@ -109,8 +109,11 @@ def speeds_table(
     optimized: list[dict[str, Any]] = (),  # type: ignore[assignment]
     objectives: list[dict[str, float]] = (),  # type: ignore[assignment]
 ) -> RenderableType:
-    """Optimised design against baseline at the speeds of the objective, a row each; without one
-    the baseline alone. Rows as in the result file's `speeds` and `objective_by_speed`."""
+    """Compare the optimised design with the baseline at the speeds of the objective, one row each.
+
+    Without an optimised design, show the baseline alone. Rows are those of the result file's
+    `speeds` and `objective_by_speed`.
+    """
     if not optimized:
         return sweep_table(baseline)
     columns = "mean, N", "opt.", "peak, N", "opt.", "objective", "status"
@@ -124,15 +127,18 @@ def speeds_table(
 
 
 def _word(row: Mapping[str, Any]) -> Text:
-    """The status of a row."""
+    """Return the status of a row."""
     usable = Status[row["status"].upper()].usable
     return Text(row["status"], style="bold green" if usable else "bold red")
 
 
 def attractor_table(rows: list[dict[str, Any]], lost: Mapping[str, float]) -> RenderableType:
-    """Motions that coexist, a column each; `rows` of {attractor, share, reached, status, ...} and
-    the shares of initial states from which there is none."""
-    table = _table("Motions that coexist", *(f"motion {row['attractor']}" for row in rows))
+    """Show coexisting motions, one column each.
+
+    `rows` holds {attractor, share, reached, status, ...}; `lost` the shares of initial states that
+    lead to none of them.
+    """
+    table = _table("Coexisting motions", *(f"motion {row['attractor']}" for row in rows))
     labels = {
         "share": "share of initial states",
         "reached": "reached from rest",
@@ -147,7 +153,7 @@ def attractor_table(rows: list[dict[str, Any]], lost: Mapping[str, float]) -> Re
 
 
 def geometry_table(record: Mapping[str, Any]) -> RenderableType:
-    """Geometry of one profile, from its result record."""
+    """Show the geometry of one profile, from its result record."""
     table = _table("Rotor profile", "value")
     _group(table, "design", _singles(record.get("design", {})))
     _group(table, "geometry", _singles(record.get("geometry", {})))
@@ -161,9 +167,9 @@ def geometry_table(record: Mapping[str, Any]) -> RenderableType:
 
 
 def likeness_table(rows: list[dict[str, Any]]) -> RenderableType:
-    """The nearest member of each family, nearest first; rows as in the result file's
+    """Show the nearest member of each family, nearest first; rows are those of the result file's
     `resembles`."""
-    table = _table("The optimised profile resembles", "away at most, um", "nearest member")
+    table = _table("The optimised profile resembles", "largest distance, um", "nearest member")
     for row in rows:
         design = ", ".join(f"{key} {_number(value)}" for key, value in row["design"].items())
         table.add_row(row["family"], _number(row["departure_um"]), design)
@@ -179,7 +185,7 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _group(table: Table, name: str, rows: _Rows) -> None:
-    """Add a heading and its rows; a dash where there are none."""
+    """Add a heading and its rows; dashes if there are no rows."""
     rows = list(rows) or [("none", *[DASH] * (len(table.columns) - 1))]
     table.add_section()
     table.add_row(Text(name, style="bold"))
@@ -202,7 +208,7 @@ def _pairs(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple[st
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The entries that are no tables of their own; these are in the result file only."""
+    """Return the entries that are not tables; tables are in the result file only."""
     tables = Mapping, list, tuple
     return {key: value for key, value in values.items() if not isinstance(value, tables)}
 
@@ -231,7 +237,7 @@ def _status(evaluation: Evaluation) -> Text:
 
 
 def _gradients(*gradients: Mapping[str, Mapping[str, float]]) -> list[tuple]:
-    """(heading, rows of each gradient): one heading for each response, or one empty group."""
+    """Return (heading, rows of each gradient) per response; one empty group if there are none."""
     found = dict.fromkeys(response for gradient in gradients for response in gradient)
     groups = []
     for response in found:
@@ -242,20 +248,22 @@ def _gradients(*gradients: Mapping[str, Mapping[str, float]]) -> list[tuple]:
 
 
 def _errors(*steady_states: Mapping[str, Any]) -> list[tuple]:
-    """As `_gradients`, of the standard errors, or nothing where there are none."""
+    """Return the same groups of the standard errors; empty if there are none."""
     errors = [steady.get("gradient_standard_error", {}) for steady in steady_states]
     groups = _gradients(*errors) if any(errors) else []
     return [(f"standard error of the {heading}", *rows) for heading, *rows in groups]
 
 
 def _per_unit(row: Mapping[str, float], unit: str) -> dict[str, float]:
-    """The row with labels such as "by pressure angle, N/deg"."""
+    """Label the row, for example "d/d(pressure angle), N/deg"."""
     labels = ((key, *_split(key)) for key in row)
-    return {f"by {name}, {f'{unit}/{per}' if per else unit}": row[key] for key, name, per in labels}
+    return {
+        f"d/d({name}), {f'{unit}/{per}' if per else unit}": row[key] for key, name, per in labels
+    }
 
 
 def _split(key: str) -> tuple[str, str]:
-    """Name in words and unit of a result key."""
+    """Return name in words and unit of a result key."""
     if key in _NAMES:
         return _NAMES[key]
     for suffix, unit in _UNITS.items():
@@ -287,7 +295,7 @@ def _change(first: Any, second: Any) -> str:
 
 
 def _number(value: Any) -> str:
-    """Five significant digits, exponents only far from one."""
+    """Format with five significant digits; exponents only far from one."""
     if value is None:
         return DASH
     if isinstance(value, bool | str):

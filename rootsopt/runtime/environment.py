@@ -1,9 +1,9 @@
-"""What environment variables and the machine may do to a command.
+"""Protect commands from environment variables that change results.
 
-A command owns its process: it computes in double precision with JAX's own defaults, whatever the
-environment says. Variables that only choose a device, a cache or a log are respected; those that
-change numbers, or stop a run on purpose, are set aside and named on stderr. What cannot work is an
-`InputError` before anything is computed: XLA ends the whole process at a flag it does not know.
+A command owns its process: it computes in double precision with JAX's own defaults. Variables that
+only choose a device, a cache or a log are respected. Variables that change numbers, or stop a run
+on purpose, are ignored and named on stderr. Settings that cannot work raise `InputError` before
+anything is computed, because XLA ends the whole process at a flag it does not know.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ _RESPECTED = (
     "JAX_ONEAPI_VISIBLE_DEVICES",
     "JAX_PJRT_CLIENT_CREATE_OPTIONS",
 )
-"""Beginnings of variables that choose a device, a cache or a log."""
+"""Prefixes of variables that choose a device, a cache or a log."""
 
 _REQUIRED = {
     "jax_enable_x64": True,
@@ -48,18 +48,18 @@ _REQUIRED = {
     "jax_no_tracing": False,
     "jax_no_execution": False,
 }
-"""Settings of JAX that every result relies on; NaN occurs on purpose inside of the programs."""
+"""Settings of JAX that every result relies on. The programs produce NaN on purpose."""
 
 _XLA_FLAGS = "XLA_FLAGS"
 _CHECKED = "ROOTSOPT_XLA_FLAGS_CHECKED"
-"""Holds the XLA_FLAGS that were tried, for the processes started from this one."""
+"""Holds the XLA_FLAGS that were tested, for processes started from this one."""
 
-# XLA compiles a loop on a CPU to one function if its buffers are small; else it calls one for
-# every operation of every turn, which here costs several times the arithmetic itself.
+# On a CPU, XLA compiles a loop to one function if its buffers are small. Otherwise it calls one
+# function per operation and iteration, which here costs several times the arithmetic itself.
 _LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 
 _UNSOUND = re.compile(r"--?(xla_cpu_enable_fast_math)(?:=(?:true|1|t|yes|y))?(?=\s|$)", re.I)
-"""Flags with which NaN and infinity are no longer told from numbers."""
+"""Flags that make the compiler assume that NaN and infinity never occur."""
 
 _TRIAL = """
 import sys
@@ -78,18 +78,18 @@ try:
 except (AttributeError, TypeError):
     pass
 """
-"""Compiles one operation, with no more of JAX than that needs."""
+"""Script that compiles one operation, with only the parts of JAX needed for that."""
 _TRIAL_SECONDS = 60.0
 _LOG_PREFIX = re.compile(r"^[IWEF]\d{4} \S+\s+\d+ \S+\] ")
 
 _NARROWEST = 40
-"""Columns below which a table would lose its numbers; COLUMNS is then not believed."""
+"""Columns below which a table would lose its numbers; COLUMNS is then ignored."""
 
 _noticed: set[str] = set()
 
 
 def say(text: str) -> None:
-    """One line on stderr, once in a process."""
+    """Print one line on stderr, once per process."""
     if text in _noticed:
         return
     _noticed.add(text)
@@ -98,16 +98,16 @@ def say(text: str) -> None:
 
 
 def shortened(value: str, longest: int = 80) -> str:
-    """A value for a message, with control characters escaped, and no longer than `longest`."""
+    """Return a value for a message, with control characters escaped, at most `longest` long."""
     text = repr(value)
     return text if len(text) <= longest else f"{text[: longest - 4]}...{text[-1]}"
 
 
 def own_process() -> None:
-    """Set aside what the environment says against a command; to be called before anything else.
+    """Override environment settings that would disturb a command. Call this first.
 
-    Warnings never become errors, tables are wide enough to be read, figures need no display,
-    checks of equinox are off. The variables of JAX are dealt with by `use_float64`.
+    Warnings never become errors, tables are wide enough to read, figures need no display, and
+    equinox checks are off. `use_float64` handles the variables of JAX.
     """
     if any(option.lower().startswith("e") for option in sys.warnoptions):
         for entry in [entry for entry in warnings.filters if entry[0] == "error"]:
@@ -128,9 +128,9 @@ def own_process() -> None:
 
 
 def use_float64() -> None:
-    """Import JAX and start its device in double precision, with all other settings as they must be.
+    """Import JAX and start its device in double precision, with all settings that results rely on.
 
-    Raises `InputError` where the environment lets JAX not start.
+    Raises `InputError` where the environment prevents JAX from starting.
     """
     aside = {} if "jax" in sys.modules else _without_settings()
     flags = os.environ.get(_XLA_FLAGS, "").strip()
@@ -141,17 +141,17 @@ def use_float64() -> None:
     use_compiled_loops()
     try:
         import jax
-    except Exception as error:  # also what JAX finds wrong with variables that are respected
+    except Exception as error:  # including JAX's own complaints about respected variables
         chosen = {name: value for name, value in os.environ.items() if name.startswith("JAX_")}
         said = ", ".join(f"{name}={shortened(value)}" for name, value in sorted(chosen.items()))
-        advice = f"correct or unset {said}" if said else "mend its installation"
+        advice = f"correct or unset {said}" if said else "repair its installation"
         raise InputError(f"JAX cannot be imported here: {_reason(error)}; {advice}") from error
     changed = _require(jax.config)
     known = jax.config.values
     named = []
     for name, value in aside.items():
         if name.lower() not in known:
-            os.environ[name] = value  # none of JAX's
+            os.environ[name] = value  # not a variable of JAX
         elif not _agrees(known[name.lower()], value):
             named.append(f"{name}={shortened(value)}")
     _set_aside(named + [f"{name} = {value!r}" for name, value in changed])
@@ -159,8 +159,8 @@ def use_float64() -> None:
 
 
 def use_compiled_loops() -> None:
-    """Have every loop compiled to a single function on CPUs; call it before JAX has
-    computed anything. What XLA_FLAGS says already stands."""
+    """Make XLA compile every loop to a single function on CPUs. Call this before JAX computes
+    anything. Existing XLA_FLAGS take precedence."""
     flags = os.environ.get(_XLA_FLAGS, "")
     if "xla_backend_extra_options" not in flags:
         checked = flags.strip() in ("", os.environ.get(_CHECKED))
@@ -172,7 +172,7 @@ def use_compiled_loops() -> None:
 
 @contextlib.contextmanager
 def explained() -> Iterator[None]:
-    """Turn a lack of memory, of XLA's too, into `InputError`."""
+    """Turn a lack of memory, also in XLA, into `InputError`."""
     try:
         yield
     except MemoryError:
@@ -194,13 +194,13 @@ _EXHAUSTED = "RESOURCE_EXHAUSTED"
 def _set_aside(named: list[str]) -> None:
     if named:
         say(
-            f"set aside: {', '.join(named)}; commands compute with JAX's own defaults in double "
-            "precision (unset it and this line is gone)"
+            f"ignored: {', '.join(named)}; commands compute with JAX's own defaults in double "
+            "precision (unset the variable to remove this line)"
         )
 
 
 def _without_settings() -> dict[str, str]:
-    """Remove the variables of JAX that are not respected from the environment; what they were."""
+    """Remove variables of JAX that are not respected from the environment; return them."""
     names = [
         name for name in os.environ if name.startswith("JAX_") and not name.startswith(_RESPECTED)
     ]
@@ -208,7 +208,7 @@ def _without_settings() -> dict[str, str]:
 
 
 def _agrees(setting: object, value: str) -> bool:
-    """Whether a variable says what is in force anyway."""
+    """Return whether a variable agrees with the setting in force."""
     words = {"1": "true", "t": "true", "yes": "true", "y": "true", "on": "true"}
     words |= {"0": "false", "f": "false", "no": "false", "n": "false", "off": "false", "": "false"}
     said, force = value.strip().lower(), str(getattr(setting, "value", setting)).lower()
@@ -216,7 +216,7 @@ def _agrees(setting: object, value: str) -> bool:
 
 
 def _require(config) -> list[tuple[str, object]]:
-    """Put what is required in force; names and values of what stood against it."""
+    """Put the required settings in force; return names and values of those that differed."""
     changed = []
     for name, needed in _REQUIRED.items():
         if name not in config.values:  # gone in this version of JAX
@@ -230,7 +230,7 @@ def _require(config) -> list[tuple[str, object]]:
 
 
 def _start_device(jax) -> None:
-    """Start the platform that JAX_PLATFORMS names, or the CPU. Raises `InputError`."""
+    """Start the platform named in JAX_PLATFORMS, or the CPU. Raises `InputError`."""
     chosen = os.environ.get("JAX_PLATFORMS")
     before = jax.config.values.get("jax_platforms")
     jax.config.update("jax_platforms", "cpu" if chosen is None else chosen)
@@ -246,20 +246,20 @@ def _start_device(jax) -> None:
             raise InputError(f"JAX cannot start on the CPU: {_reason(error)}") from error
         reason = "JAX finds no such device" if not str(error) else _reason(error)
         raise InputError(
-            f"environment variable JAX_PLATFORMS must name what JAX can compute on here, but is "
-            f"{shortened(chosen)}: {reason}; unset it to compute on the CPU"
+            f"environment variable JAX_PLATFORMS must name a platform that JAX can use here, but "
+            f"is {shortened(chosen)}: {reason}; unset it to compute on the CPU"
         ) from error
 
 
 def _reason(error: BaseException) -> str:
-    """The message of another library in one short line, without its advice in brackets."""
+    """Shorten another library's message to one line, without its advice in brackets."""
     text = re.sub(r"\s*\((?:set|you may need)\b[^)]*\)", "", str(error))
     text = " ".join(text.split()).rstrip(".")
     return text if len(text) <= 300 else f"{text[:297]}..."
 
 
 def _check_flags(flags: str) -> None:
-    """Try XLA_FLAGS in a process of its own. Raises `InputError`."""
+    """Test XLA_FLAGS in a separate process. Raises `InputError`."""
     if os.environ.get(_CHECKED) == flags:
         return
     advice = "correct the flag or unset XLA_FLAGS"
@@ -268,8 +268,8 @@ def _check_flags(flags: str) -> None:
         raise InputError(f"{shown}, but must be flags that begin with --; {advice}")
     if unsound := _UNSOUND.search(flags):
         raise InputError(
-            f"{shown}: with {unsound[1]} NaN and infinity are no longer told from numbers, and "
-            f"results may be wrong without notice; {advice}"
+            f"{shown}: {unsound[1]} assumes that neither NaN nor infinity occurs, and results may "
+            f"be wrong without notice; {advice}"
         )
     if not sys.executable:
         return
@@ -285,14 +285,14 @@ def _check_flags(flags: str) -> None:
     except subprocess.TimeoutExpired:
         raise InputError(f"{shown}: XLA does not start with it; {advice}") from None
     except OSError:
-        return  # There are no processes to be had; the flags may be good.
+        return  # No process could be started; the flags may be good.
     if done.returncode:
         raise InputError(f"{shown}: {_complaint(done.stderr.decode(errors='replace'))}; {advice}")
     os.environ[_CHECKED] = flags
 
 
 def _complaint(log: str) -> str:
-    """What XLA has against its flags, from what it wrote before it ended the process."""
+    """Extract XLA's complaint about its flags from the log of the process it ended."""
     lines = [line for line in log.splitlines() if line.strip()]
     marked = [line for line in lines if re.match(r"^[EF]\d{4} ", line)]
     options = [line for line in lines if line.startswith("xla: ")]

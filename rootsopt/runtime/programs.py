@@ -1,8 +1,8 @@
-"""Compiled programs: made ahead and side by side, and kept between processes.
+"""Compiled programs: made ahead, in parallel, and cached between processes.
 
-Tracing and compiling take longer than all else here. JAX's own cache keeps what has been
-compiled, but every process still traces and lowers a function to find it there; a `Program`
-finds it by name, source and kinds of arguments alone.
+Tracing and compiling take longer than everything else here. JAX's own cache stores compiled code,
+but every process still traces and lowers a function to find it there. A `Program` finds it by name,
+source and kinds of arguments alone.
 """
 
 import contextlib
@@ -49,20 +49,20 @@ _SETTINGS = (
 """Settings of JAX that change what is traced or compiled."""
 _VARIABLES = ("XLA_FLAGS", "EQX_ON_ERROR")
 OPTIONS: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
-"""Options of the compiler on CPUs: the older way of making code from fused operations takes two
-thirds of the time, and what it makes is as fast."""
+"""Compiler options on CPUs. The older code generator for fused operations compiles in two thirds of
+the time, and its code is as fast."""
 _PACKAGE = Path(__file__).parents[1]
 _store: Store | None = None
-# Tracing is Python's work: in turn, the first asked for comes first to the compiler, which works
-# side by side.
+# Tracing runs in Python, so it is done one function at a time, in the order of requests. The
+# compiler then works in parallel.
 _tracing = threading.RLock()
 
 
 def keep_in(folder: Path | None) -> str | None:
-    """Keep programs in `folder` from now on; None keeps none.
+    """Cache programs in `folder` from now on; `None` turns the cache off.
 
-    Nothing is kept where that cannot be done. Where it must not be done, as others could put
-    programs of theirs in place of these, the reason is returned.
+    A folder that cannot be used turns the cache off silently. If others could replace the programs
+    in it, the cache is off too, and the reason is returned.
     """
     global _store
     _store = None
@@ -78,8 +78,11 @@ def keep_in(folder: Path | None) -> str | None:
 
 
 class _Kind(NamedTuple):
-    """What a program is compiled for: structure of the arguments, (shape, dtype) of arrays and
-    None for other leaves, and those with their types."""
+    """What a program is compiled for.
+
+    tree: structure of the arguments; shapes: (shape, dtype) of each array, None for other leaves;
+    others: type and value of each other leaf.
+    """
 
     tree: Any
     shapes: tuple[tuple[tuple[int, ...], str] | None, ...]
@@ -87,16 +90,16 @@ class _Kind(NamedTuple):
 
 
 class _Made(NamedTuple):
-    """A compiled program, called with the arrays alone, and its result with shapes for arrays."""
+    """A compiled program, called with the arrays alone, and its result with structs for arrays."""
 
     call: Callable[..., Any]
     result_shape: Any
 
 
 class Program:
-    """A function of trees of arrays and other things, compiled once for each kind of arguments.
+    """A function of trees, compiled once for each kind of arguments.
 
-    As with `equinox.filter_jit` arrays are traced, and all else is static and must be hashable.
+    As with `equinox.filter_jit`, arrays are traced. Everything else is static and must be hashable.
     """
 
     def __init__(self, function: Callable[..., Any]):
@@ -106,7 +109,7 @@ class Program:
         self._lock = threading.Lock()
 
     def __call__(self, *args: Any) -> Any:
-        """The function's result; compiled before unless that has happened."""
+        """Return the function's result; compile it first if needed."""
         leaves, kind = _split(args)
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return self.function(*args)
@@ -118,15 +121,15 @@ class Program:
         return jax.tree.map(lambda x: next(results) if _is_array(x) else x, made.result_shape)
 
     def prepare(self, *args: Any) -> None:
-        """Compile for arguments like these, of which arrays may be `jax.ShapeDtypeStruct`, in
-        the background. If that fails, so does the call that needs it."""
+        """Compile in the background for arguments like these; arrays may be
+        `jax.ShapeDtypeStruct`. If that fails, the call that needs the program raises the error."""
         _, kind = _split(args)
         future, new = self._future(kind)
         if new:
             threading.Thread(target=self._make, args=(future, kind)).start()
 
     def result_shape(self, *args: Any) -> Any:
-        """The result with `jax.ShapeDtypeStruct` for arrays, known before it is compiled."""
+        """Return the result with `jax.ShapeDtypeStruct` for arrays, without compiling."""
         _, kind = _split(args)
         place = self._place(kind)
         kept = place is not None and place.kept
@@ -138,7 +141,7 @@ class Program:
         return jax.tree.map(_outline, eqx.filter_eval_shape(self.function, *args))
 
     def _future(self, kind: _Kind) -> tuple[Future[_Made], bool]:
-        """The program of a kind to come, and whether it is now the caller's task to make it."""
+        """Return the future program of a kind, and whether the caller must make it."""
         with self._lock:
             new = kind not in self._made
             return self._made.setdefault(kind, Future()), new
@@ -166,17 +169,17 @@ class Program:
             lowered = jax.jit(flat).lower(*structs)
         made = _Made(_finished(lowered), outlines[-1])
         if place is not None:
-            # Not being able to keep a program is no reason not to use it.
+            # A program that cannot be cached can still be used.
             with contextlib.suppress(Exception):
                 _save(place, made, len(structs))
         return made
 
     def _place(self, kind: _Kind) -> "_Place | None":
-        """Where a program of this kind is kept, if it is."""
+        """Return where a program of this kind is cached; `None`: it is not cached."""
         if _store is None or jax.default_backend() != "cpu":
             return None
         if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
-            return None  # What comes out of JAX's own cache cannot be kept a second time.
+            return None  # A program loaded from JAX's own cache cannot be serialised again.
         outside = outside_modules()
         sources = _sources({self.function.__module__, *_modules(kind), *outside})
         if sources is None:
@@ -184,13 +187,13 @@ class Program:
         name = f"{self.function.__module__}.{self.function.__qualname__}"
         words = [name, *map(repr, kind), *sources, *_machine(), *_versions(), *_settings()]
         if any(" at 0x" in word for word in words):
-            return None  # Known by its address, which is another one next time.
+            return None  # The text contains an address, which differs in the next process.
         purpose = hashlib.sha256("\0".join(words).encode()).hexdigest()
         return _Place(_store, f"{self.function.__name__}-{purpose[:32]}", purpose)
 
 
 class _Place(NamedTuple):
-    """An entry of a store: its name, and all that the program depends on, as a digest."""
+    """An entry of a store: its name, and a digest of everything the program depends on."""
 
     store: Store
     name: str
@@ -210,7 +213,7 @@ def _outline(leaf: Any) -> Any:
 
 
 def _split(args: tuple) -> tuple[list, _Kind]:
-    """The arrays among the leaves of `args`, and what kind of arguments these are."""
+    """Return the arrays among the leaves of `args`, and the kind of arguments."""
     leaves, tree = jax.tree.flatten(args)
     shapes = tuple(
         (x.shape, str(jax.dtypes.canonicalize_dtype(x.dtype))) if _is_array(x) else None
@@ -221,8 +224,8 @@ def _split(args: tuple) -> tuple[list, _Kind]:
 
 
 def _finished(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-    """The program compiled with those of `OPTIONS` that XLA_FLAGS says nothing of, or without them
-    where this compiler has none such."""
+    """Compile with those of `OPTIONS` that XLA_FLAGS does not set, or without options where this
+    compiler does not know them."""
     said = os.environ.get("XLA_FLAGS", "")
     options = {name: value for name, value in OPTIONS.items() if name not in said}
     if options and jax.default_backend() == "cpu":
@@ -232,7 +235,7 @@ def _finished(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
 
 
 def _joined(kind: _Kind, arrays: Iterator) -> tuple:
-    """The reverse of `_split`."""
+    """Reverse `_split`."""
     others = iter(kind.others)
     leaves = [next(arrays) if shape else next(others)[1] for shape in kind.shapes]
     return jax.tree.unflatten(kind.tree, leaves)
@@ -248,7 +251,7 @@ def _save(place: _Place, made: _Made, number: int) -> None:
 
 
 def _loaded(place: _Place | None) -> _Made | None:
-    """A kept program, or None if there is none that works."""
+    """Return a cached program, or `None` if there is no working one."""
     if place is None:
         return None
     try:
@@ -267,7 +270,7 @@ def _loaded(place: _Place | None) -> _Made | None:
 
 
 def _modules(kind: _Kind) -> set[str]:
-    """Modules that define the types in the arguments."""
+    """Return the modules that define the types in the arguments."""
     found = {of.__module__ for of, _ in kind.others}
     trees = [kind.tree]
     while trees:
@@ -279,8 +282,8 @@ def _modules(kind: _Kind) -> set[str]:
 
 
 def _sources(modules: set[str]) -> list[str] | None:
-    """Digests of this package's sources, and of the files of modules that are neither in it nor
-    in a package whose version is known; None where there is such a module without a file."""
+    """Return digests of this package's sources, and of the files of modules outside it and outside
+    packages with a known version; `None` if such a module has no file."""
     digests = [_package_digest()]
     for name in sorted(modules):
         top = name.partition(".")[0]
@@ -296,7 +299,7 @@ def _sources(modules: set[str]) -> list[str] | None:
 
 @functools.cache
 def _package_digest() -> str:
-    """Digest of every source file of this package; empty where there are none to be read."""
+    """Return a digest of every source file of this package; empty if none can be read."""
     digest, files = hashlib.sha256(), sorted(_PACKAGE.rglob("*.py"))
     for file in files:
         data = file.read_bytes()
@@ -307,7 +310,7 @@ def _package_digest() -> str:
 
 @functools.cache
 def _machine() -> list[str]:
-    """What the processor can do."""
+    """Describe the processor and its instructions."""
     try:
         lines = Path("/proc/cpuinfo").read_text("utf-8", errors="replace").splitlines()
         processor = next(line for line in lines if line.startswith(("flags", "Features")))
@@ -318,13 +321,13 @@ def _machine() -> list[str]:
 
 @functools.cache
 def _versions() -> list[str]:
-    """What traces and compiles."""
+    """Return the versions of everything that traces and compiles."""
     packages = [f"{name} {metadata.version(name)}" for name in _PACKAGES]
     return [platform.python_implementation(), platform.python_version(), *packages]
 
 
 def _settings() -> list[str]:
-    """Settings that change what is traced or compiled, as they are now."""
+    """Return the current settings that change what is traced or compiled."""
     variables = [f"{name}={os.environ.get(name, '')}" for name in _VARIABLES]
     variables.append(f"{sorted(OPTIONS.items())}")
     return variables + [f"{name}={getattr(jax.config, name, None)}" for name in _SETTINGS]

@@ -1,9 +1,9 @@
-"""Files of compiled programs: the user's own, signed, and within a limit of size.
+"""Files of compiled programs: owned by the user, signed, and limited in size.
 
-What is read here is executed, so that nobody else may have a hand in it. The folder, every file in
-it and every folder above must be out of the reach of others; and each entry is signed, under its
-name and what it was made for, with a key in the user's own state folder. An entry that is damaged,
-exchanged or signed by nobody is no entry.
+Programs read here are executed, so nobody else may be able to change them. The folder, every file
+in it and every folder above must be out of the reach of others. Each entry is signed under its name
+and purpose, with a key in the user's own state folder. An entry that is damaged, exchanged or not
+signed is ignored.
 """
 
 import contextlib
@@ -22,9 +22,9 @@ except ImportError:  # Windows
     fcntl = None
 
 MOST_BYTES = 200 * 2**20
-"""Bytes of all entries together above which the ones not used for longest are removed."""
+"""Total size (bytes) of all entries above which the least recently used are removed."""
 SUFFIX = ".program"
-"""Ending of the names of entries; other files in the folder are left alone."""
+"""Suffix of entry names; other files in the folder are left alone."""
 
 _KEY_NAME = "programs.key"
 _KEY_BYTES = 32
@@ -33,23 +33,23 @@ _MAC_BYTES = hashlib.sha256().digest_size
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _OTHERS_AT_ALL = stat.S_IRWXG | stat.S_IRWXO
 _NEW_SECONDS = 2.0
-"""Age (s) of an unfinished file up to which its process may not have locked it yet."""
-# What a symbolic link or a named pipe in a file's place cannot lead astray or hold up.
+"""Age (s) of an unfinished file below which its process may not have locked it yet."""
+# With these flags, a symbolic link is not followed and a named pipe does not block.
 _SAFELY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 _HAS_OWNERS = hasattr(os, "geteuid")
 _IN_FOLDER = {os.open, os.unlink, os.stat, os.rename} <= os.supports_dir_fd
 
 
 class UnsafeFolderError(Exception):
-    """A folder that others have a hand in; the message says which and what to change."""
+    """A folder that others can change; the message says which, and what to do."""
 
 
 class Folder:
-    """A folder of the user's own, made where it does not exist, and held open.
+    """A folder of the user's own, created if it does not exist, and held open.
 
-    Files are reached through the open folder and not by its path, which therefore may lead
-    elsewhere later. Raises `UnsafeFolderError` if others could write to it or exchange it,
-    `OSError` if it cannot be made or opened.
+    Files are reached through the open folder, not by its path, which may point elsewhere later.
+    Raises `UnsafeFolderError` if others could write to it or exchange it, `OSError` if it cannot be
+    created or opened.
     """
 
     def __init__(self, path: Path):
@@ -68,7 +68,7 @@ class Folder:
             raise
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Close the folder."""
         if self._open is not None:
             os.close(self._open)
             self._open = None
@@ -81,15 +81,15 @@ class Folder:
         return name if self._open is not None else os.fspath(self.path / name)
 
     def open(self, name: str, flags: int) -> int:
-        """A descriptor of a file in the folder; a new file is the user's alone."""
+        """Return a descriptor of a file in the folder; a new file is for the user alone."""
         return os.open(self._at(name), flags | _SAFELY, 0o600, dir_fd=self._open)
 
     def stat(self, name: str) -> os.stat_result:
-        """Of the file itself, not of what it may be a link to."""
+        """Return the status of the file itself, not of the target of a link."""
         return os.stat(self._at(name), dir_fd=self._open, follow_symlinks=False)
 
     def exists(self, name: str) -> bool:
-        """Whether there is such a file."""
+        """Return whether there is a regular file of this name."""
         try:
             return stat.S_ISREG(self.stat(name).st_mode)
         except OSError:
@@ -101,20 +101,23 @@ class Folder:
             os.unlink(self._at(name), dir_fd=self._open)
 
     def link(self, name: str, other: str) -> None:
-        """Give a file another name. Raises `FileExistsError` where that is taken."""
+        """Give a file a second name. Raises `FileExistsError` where that name is taken."""
         os.link(self._at(name), self._at(other), src_dir_fd=self._open, dst_dir_fd=self._open)
 
     def replace(self, name: str, other: str) -> None:
-        """Give a file the name of another, in one step."""
+        """Rename a file in one step; a file of the new name is replaced."""
         os.replace(self._at(name), self._at(other), src_dir_fd=self._open, dst_dir_fd=self._open)
 
     def names(self) -> list[str]:
-        """Of everything in the folder."""
+        """Return the names of everything in the folder."""
         return os.listdir(self.path if self._open is None else self._open)
 
     def read(self, name: str, most: int, forbidden: int = _OTHERS_WRITE) -> bytes | None:
-        """The content of a plain file of the user's own; None if it is anything else, larger
-        than `most` bytes, or gives others one of the `forbidden` permissions."""
+        """Return the content of a regular file of the user's own.
+
+        Return `None` for anything else, for a file larger than `most` bytes, and for one that gives
+        others a `forbidden` permission.
+        """
         try:
             file = self.open(name, os.O_RDONLY)
         except OSError:
@@ -137,9 +140,9 @@ class Folder:
 
     @contextlib.contextmanager
     def unfinished(self, name: str, data: bytes) -> Iterator[str]:
-        """A new file with `data` under a name of its own, removed afterwards if it still has it.
+        """Create a file with `data` under a temporary name; remove it afterwards if not renamed.
 
-        It is locked until then, so that `sweep` can tell it from one whose process has died.
+        The file is locked until then, so that `sweep` can tell it from one of a dead process.
         """
         own = f".{name}.{secrets.token_hex(8)}"
         file = self.open(own, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
@@ -170,14 +173,14 @@ class Folder:
                         self.unlink(name)
                 finally:
                     os.close(file)
-                self.unlink(name)  # On Windows this fails as long as a process has it open.
+                self.unlink(name)  # On Windows this fails while a process has it open.
 
 
 class Store:
     """Signed entries in a folder.
 
-    Raises `UnsafeFolderError` if others could change the entries or know the key, `OSError` if
-    the folder cannot be used.
+    Raises `UnsafeFolderError` if others could change the entries or know the key, `OSError` if the
+    folder cannot be used.
     """
 
     def __init__(self, path: Path):
@@ -189,7 +192,7 @@ class Store:
         return self._folder.exists(name + SUFFIX)
 
     def read(self, name: str, purpose: str) -> bytes | None:
-        """What was written under this name for this purpose, or None."""
+        """Return the data written under this name for this purpose, or `None`."""
         found = self._folder.read(name + SUFFIX, MOST_BYTES)
         if found is None:
             return None
@@ -200,7 +203,7 @@ class Store:
         return data
 
     def write(self, name: str, purpose: str, data: bytes) -> None:
-        """Write an entry, whole or not at all. Raises `OSError` if that fails."""
+        """Write an entry completely or not at all. Raises `OSError` if that fails."""
         signed = _HEADER + self._mac(name, purpose, data) + data
         target = name + SUFFIX
         with self._folder.unfinished(target, signed) as made:
@@ -215,10 +218,10 @@ class Store:
         return mac.digest()
 
     def _prune(self) -> None:
-        """Remove what was not used for longest, until the rest is small enough."""
+        """Remove the least recently used entries until the rest is below `MOST_BYTES`."""
         kept = []
         for name in self._folder.names():
-            # Only our own files: the folder may be one that holds others.
+            # Only our own files: the folder may hold others.
             if name.endswith(SUFFIX) and not name.startswith("."):
                 with contextlib.suppress(OSError):  # removed by another process
                     found = self._folder.stat(name)
@@ -233,14 +236,14 @@ class Store:
 
 
 def key_folder() -> Path:
-    """Where the key lies: the user's state folder, wherever the programs are."""
+    """Return the folder of the key: the user's state folder, wherever the programs are."""
     import platformdirs
 
     return Path(platformdirs.user_state_dir("rootsopt", appauthor=False))
 
 
 def _key() -> bytes:
-    """The user's key, made where there is none that is fit. Raises `UnsafeFolderError`."""
+    """Return the user's key; create one if there is no valid key. Raises `UnsafeFolderError`."""
     path = key_folder()
     try:
         if not path.is_absolute():
@@ -248,12 +251,12 @@ def _key() -> bytes:
         folder = Folder(path)
         folder.sweep(f"{_KEY_NAME}.")
         for _ in range(_ATTEMPTS):
-            there = _there(folder)  # Looked for first: what appears meanwhile is fit.
+            there = _there(folder)  # Checked first: a key that appears afterwards is valid.
             key = folder.read(_KEY_NAME, _KEY_BYTES, _OTHERS_AT_ALL)
             if key is not None and len(key) == _KEY_BYTES:
                 return key
-            # A key that others may have read, or that is damaged, gives way to a new one; what
-            # was signed with it is compiled anew.
+            # Replace a key that is damaged or that others may have read. Programs signed with it
+            # are compiled again.
             with folder.unfinished(_KEY_NAME, secrets.token_bytes(_KEY_BYTES)) as made:
                 if there:
                     folder.replace(made, _KEY_NAME)
@@ -261,7 +264,7 @@ def _key() -> bytes:
                 try:
                     folder.link(made, _KEY_NAME)
                 except FileExistsError:
-                    pass  # Another process was faster; its key is ours.
+                    pass  # Another process was faster; use its key.
                 except (OSError, NotImplementedError):  # a file system without links
                     folder.replace(made, _KEY_NAME)
         raise OSError("it cannot be read back")
@@ -269,7 +272,7 @@ def _key() -> bytes:
         said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise UnsafeFolderError(
             f"the key that compiled programs are signed with cannot be kept in "
-            f"{os.fspath(path)!r}: {said}; mend that, or name another folder with XDG_STATE_HOME"
+            f"{os.fspath(path)!r}: {said}; correct that, or set XDG_STATE_HOME to another folder"
         ) from None
 
 
@@ -285,7 +288,7 @@ def _there(folder: Folder) -> bool:
 
 
 def _make(path: Path) -> None:
-    """Make a folder and those above it, for the user alone."""
+    """Create a folder and those above it, for the user alone."""
     missing = []
     while not os.path.lexists(path):
         missing.append(path)
@@ -296,10 +299,9 @@ def _make(path: Path) -> None:
 
 
 def _check(path: Path, found: os.stat_result) -> None:
-    """Raise `UnsafeFolderError` if others own a folder, may change it, or may put another in its
-    place."""
+    """Raise `UnsafeFolderError` if others own a folder, can change it, or can replace it."""
     if not _HAS_OWNERS:
-        return  # Folders below the user's home are the user's there, by default.
+        return  # On such systems, folders below the user's home are the user's by default.
     me = os.geteuid()
     if found.st_uid != me:
         raise UnsafeFolderError(
@@ -308,7 +310,7 @@ def _check(path: Path, found: os.stat_result) -> None:
         )
     if found.st_mode & _OTHERS_WRITE:
         raise UnsafeFolderError(
-            f"others may write to {os.fspath(path)!r}; take that from them with chmod go-w, or "
+            f"others may write to {os.fspath(path)!r}; remove that permission with chmod go-w, or "
             "choose another folder"
         )
     for parent in path.parents:
@@ -316,11 +318,11 @@ def _check(path: Path, found: os.stat_result) -> None:
         if above.st_uid not in (0, me):
             raise UnsafeFolderError(
                 f"{os.fspath(parent)!r} above it belongs to another user (number {above.st_uid}), "
-                "who can exchange the folder; choose one in a folder of your own"
+                "who can replace the folder; choose one inside a folder of your own"
             )
-        # In a folder with the sticky bit, as /tmp, only owners rename what is theirs.
+        # In a folder with the sticky bit, such as /tmp, only owners can rename their files.
         if above.st_mode & _OTHERS_WRITE and not above.st_mode & stat.S_ISVTX:
             raise UnsafeFolderError(
-                f"others may write to {os.fspath(parent)!r}, and so exchange the folder in it; "
-                "take that from them with chmod go-w, or choose another folder"
+                f"others may write to {os.fspath(parent)!r}, and so replace the folder in it; "
+                "remove that permission with chmod go-w, or choose another folder"
             )

@@ -13,13 +13,13 @@ import numpy as np
 def on_all_cores(work: Callable[..., Any], *arrays: Any) -> Any:
     """Return `work(*arrays)`, with the leading axis (n,) divided among one thread per core.
 
-    All arrays, and all arrays of the result, have that axis. The parts have one size, so that they
+    All arrays, and all arrays of the result, have that axis. The parts have equal size, so they
     share a compiled program.
     """
     count = arrays[0].shape[0]
     workers = max(1, min(os.cpu_count() or 1, count))
     size = -(-count // workers)
-    # The last entry fills the last part up.
+    # The last part is padded with copies of the last entry.
     index = np.minimum(np.arange(workers * size), count - 1).reshape(workers, size)
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda rows: work(*(x[rows] for x in arrays)), index))

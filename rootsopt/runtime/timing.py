@@ -1,4 +1,4 @@
-"""How much of a run went into tracing and compiling."""
+"""Measure how much of a run is spent on tracing and compiling."""
 
 import time
 from types import TracebackType
@@ -13,10 +13,10 @@ _COMPILE_EVENTS = (
 
 
 class CompileClock:
-    """Time spent tracing, lowering and compiling (by JAX's own account) while it is entered.
+    """Time spent tracing, lowering and compiling while entered, as reported by JAX.
 
-    Programs are made side by side and traces are nested: what counts is how long at least one
-    of these went on, so that `seconds` is never more than has passed.
+    Programs compile in parallel and traces are nested. `seconds` counts the time during which at
+    least one of these was running, so it never exceeds the elapsed time.
     """
 
     def __init__(self) -> None:
@@ -25,7 +25,7 @@ class CompileClock:
 
     @property
     def seconds(self) -> float:
-        """Total so far (s)."""
+        """Return the total so far (s)."""
         total, reached = 0.0, float("-inf")
         for begin, end in sorted(self._spans):
             total += max(0.0, end - max(begin, reached))

@@ -156,7 +156,7 @@ def test_a_signal_stops_a_run_at_once(tmp_path, wait, number):
     assert time.monotonic() - began < 20
     assert process.returncode == 3
     name = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}[number]
-    assert told == f"rootsopt test: stopped by {name}; {tmp_path / 'run'} is as it was\n"
+    assert told == f"rootsopt test: stopped by {name}; {tmp_path / 'run'} is unchanged\n"
     assert os.listdir(tmp_path) == []
 
 

@@ -265,7 +265,7 @@ def test_comparison_table():
     assert _row(text, "peak force, N") == ["83.825", "41.912", "-50.00 %"]
     assert _row(text, "pressure angle, deg") == ["36.430", "36.430", "+0.00 %"]
     assert _row(text, "polar inertia, kg m^2")[0] == "0.0021007"
-    assert _row(text, "by pressure angle, N/deg") == ["-0.24457", "-0.24457", ""]
+    assert _row(text, "d/d(pressure angle), N/deg") == ["-0.24457", "-0.24457", ""]
     assert _row(text, "area efficiency >= 0.43446") == ["0.43446", "0.43446", "active"]
     assert _row(text, "undercut margin >= 0 mm") == ["7.4000", "-0.10000", "violated"]
     assert _row(text, "status") == ["periodic", "periodic", ""]
@@ -277,7 +277,7 @@ def test_comparison_table_without_a_usable_result():
     text = _render(tables.comparison_table(_evaluation(), failed, [], {"objective": float("nan")}))
     assert _row(text, "objective (baseline = 1)") == ["-", "-", "-"]
     assert _row(text, "mean force, N") == ["14.830", "-", "-"]
-    assert _row(text, "by pressure angle, N/deg") == ["-0.24457", "-", ""]
+    assert _row(text, "d/d(pressure angle), N/deg") == ["-0.24457", "-", ""]
     assert _row(text, "status") == ["periodic", "passed_through", ""]
     assert "passed through each other" in text
 
@@ -285,7 +285,7 @@ def test_comparison_table_without_a_usable_result():
 def test_evaluation_table():
     text = _render(tables.evaluation_table(_evaluation()))
     assert _row(text, "mean force, N") == ["14.830"]
-    assert _row(text, "by involute length, N/mm") == ["0.65000"]
+    assert _row(text, "d/d(involute length), N/mm") == ["0.65000"]
     assert _row(text, "period, mesh periods") == ["2"]
     assert _row(text, "status") == ["periodic"]
     empty = _render(tables.evaluation_table(_failed()))

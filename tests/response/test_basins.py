@@ -209,7 +209,7 @@ def test_command(tmp_path, capsys):
     """Table, result file, CSV of basins that agrees with it, picture; exit codes."""
     overrides = [f"--set={key}" for key in (*GRID, *COEXIST)]
     assert main(["attractors", "configs/cic.yaml", *overrides, "-o", str(tmp_path)]) == 0
-    assert "Motions that coexist" in capsys.readouterr().out
+    assert "Coexisting motions" in capsys.readouterr().out
     record = json.loads((tmp_path / "result.json").read_text())
     shares = [one["share"] for one in record["attractors"]]
     assert record["status"] == "periodic"

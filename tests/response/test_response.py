@@ -116,7 +116,10 @@ PARTS = {
         },
     ),
     "motor": (
-        ("scene.motor={slope_N_m_s_per_rad: 0.05, inertia_kg_m2: 2e-3}",),
+        (
+            "scene.drive=torque",
+            "scene.motor={slope_N_m_s_per_rad: 0.05, inertia_kg_m2: 2e-3}",
+        ),
         {
             "motor slope": lambda s: s.motor.slope,
             "motor inertia": lambda s: s.motor.inertia,

@@ -1,4 +1,4 @@
-"""Environment variables and machines: what is set aside, what is refused, what works."""
+"""Environment variables and machines: what is ignored, what is refused, what works."""
 
 import json
 import os
@@ -76,7 +76,7 @@ def test_a_command_computes_the_same_whatever_the_environment_says(tmp_path):
         named = set(re.findall(r"\b([A-Z][A-Z0-9_]+)=", done.stderr))
         assert named == set(variables) & set(SET_ASIDE), done.stderr
         lines = done.stderr.splitlines()
-        assert all(line.startswith("rootsopt: set aside: ") for line in lines), done.stderr
+        assert all(line.startswith("rootsopt: ignored: ") for line in lines), done.stderr
     assert answers[0]["response"] == answers[1]["response"]
     assert answers[0]["geometry"] == answers[1]["geometry"]
     assert len(tables[0]) >= 4

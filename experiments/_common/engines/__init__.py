@@ -1,9 +1,9 @@
 """Independent engines: the same scene simulated with other tools, for CIC rotors.
 
-`scipy_nodes` is SciPy with a node-to-segment contact, `numba_pair` is compiled by Numba. Both
-differentiate by central differences. Here are the scene in SI units, the constants of rotor and
-motion, and the result, which both share. `transient` is rootsopt's own integration without closed
-orbits.
+`scipy_nodes` is SciPy with node-to-segment contact. `numba_pair` is compiled by Numba. Both
+differentiate by central differences. This module holds what they share: the scene in SI units, the
+constants of rotor and motion, and the result. `transient` is rootsopt's own integration without
+closed orbits.
 """
 
 import dataclasses
@@ -24,16 +24,18 @@ Design = Sequence[float]
 
 FD_STEPS = (0.05, 0.025, 0.05)
 """Steps (deg, mm, deg) of the central differences. Around the paper's baseline their truncation
-error is 1e-4 of the gradient, at worst 1e-3; the noise of tolerances looser than 1e-7 asks for
-steps two to four times as long."""
+error is 1e-4 of the gradient, at worst 1e-3. Tolerances looser than 1e-7 are noisy and need steps
+two to four times as long."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Everything but the design (SI units): lobes, pitch radius (m), rotor length (m), density
-    (kg/m³); IMPACT stiffness (N/m^e), exponent, damping (N·s/m), depth of full damping (m),
-    smoothing (m), clearance (m); speed of rotor 1 (rad/s), load torque (N·m); timing gear
-    (stiffness 0: none) with half its backlash and the rounding of its edges (rad).
+    """Everything except the design, in SI units.
+
+    It holds lobes, pitch radius (m), rotor length (m), density (kg/m³). Contact: IMPACT stiffness
+    (N/m^e), exponent, damping (N·s/m), depth of full damping (m), smoothing (m), clearance (m).
+    Operation: speed of rotor 1 (rad/s), load torque (N·m). Timing gear: stiffness (0: no gear),
+    half its backlash and the rounding of its edges (rad).
     """
 
     lobes: int
@@ -55,15 +57,18 @@ class Scene:
 
     @classmethod
     def of(cls, config: Config) -> "Scene":
-        """Scene of a config. Raises `ValueError` unless its family is cic, and it has no other
-        parts than a constant load and a timing gear."""
+        """Return the scene of a config.
+
+        Raises `ValueError` unless its family is cic and its only parts are a constant load and a
+        timing gear.
+        """
         if config.profile.family != "cic":
             raise ValueError(f"`profile.family` must be 'cic', but is {config.profile.family!r}")
         contact, scene, gear = config.contact, config.scene, config.scene.timing_gear
         torque = scene.load.torque_N_m
         if config.needs_search or scene.motor or scene.phase_error_mrad or torque is None:
             raise ValueError(
-                "`scene` must hold a constant load and a timing gear alone; remove its other parts"
+                "`scene` must hold only a constant load and a timing gear; remove its other parts"
             )
         radius = config.profile.pitch_radius_mm * _MM
         return cls(
@@ -87,9 +92,11 @@ class Scene:
 
 
 class Rotor(NamedTuple):
-    """Constants of a CIC rotor (m, rad): the land ends and the arc begins at the normal angle
-    `land_end`, the arc of radius `arc_radius` about a centre at radius `arc_center` ends at
-    `arc_end`, the involute at `involute_end`. See `rootsopt.profiles.cic`.
+    """Constants of a CIC rotor (m, rad); see `rootsopt.profiles.cic`.
+
+    land_end: normal angle at which the land ends and the arc starts; arc_radius, arc_center: radius
+    of the arc, and radius at which its centre lies; arc_end, involute_end: normal angles at which
+    arc and involute end.
     """
 
     lobes: int
@@ -105,7 +112,7 @@ class Rotor(NamedTuple):
 
 
 def rotor_of(scene: Scene, design: Design) -> Rotor:
-    """Constants of the rotor of a design."""
+    """Return the constants of the rotor of a design."""
     alpha, length, tip = design[0] * _DEG, design[1] * _MM, design[2] * _DEG
     r, half = scene.pitch_radius, math.pi / (2 * scene.lobes)
     start = half - length / (r * math.sin(alpha))
@@ -125,9 +132,11 @@ def rotor_of(scene: Scene, design: Design) -> Rotor:
 
 
 class Motion(NamedTuple):
-    """Constants of the equation of motion. Time counts in mesh periods of `period` (s), ε in
-    units of `angle_scale` (rad), force in units of `force_scale` (N); `turn` is the rotation
-    (rad) of rotor 1 in a period, `agility` turns a torque (N·m) into scaled acceleration.
+    """Constants of the equation of motion.
+
+    period: mesh period (s), the unit of time; angle_scale: unit of ε (rad); force_scale: unit of
+    force (N); turn: rotation (rad) of rotor 1 in a period; agility: scaled acceleration per torque
+    (N·m).
     """
 
     period: float
@@ -151,7 +160,7 @@ class Motion(NamedTuple):
 
 
 def motion_of(scene: Scene, polar_area_moment: float) -> Motion:
-    """Constants of the motion of rotors with `polar_area_moment` (m⁴)."""
+    """Return the constants of the motion of rotors with `polar_area_moment` (m⁴)."""
     inertia = scene.density * scene.length * polar_area_moment
     period = 2 * math.pi / (scene.lobes * scene.speed)
     force = max(scene.load_torque, 1e-3) / scene.pitch_radius
@@ -173,7 +182,7 @@ def motion_of(scene: Scene, polar_area_moment: float) -> Motion:
         smoothing=scene.smoothing,
         clearance=scene.clearance,
         gear_stiffness=scene.gear_stiffness,
-        # The damping ratio is meant for the reduced inertia of two equal rotors.
+        # The damping ratio refers to the reduced inertia of two equal rotors.
         gear_damping=2 * scene.gear_damping_ratio * math.sqrt(scene.gear_stiffness * inertia / 2),
         half_backlash=scene.half_backlash,
         gear_rounding=scene.gear_rounding,
@@ -182,8 +191,10 @@ def motion_of(scene: Scene, polar_area_moment: float) -> Motion:
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """Mean, peak and RMS contact force (N) over the window, solver steps (rejected ones
-    included), evaluations of the right-hand side, and the largest |ε| (rad) of the window.
+    """Result of one simulation.
+
+    It holds mean, peak and RMS contact force (N) over the window, solver steps (including rejected
+    ones), evaluations of the right-hand side, and the largest |ε| (rad) in the window.
     """
 
     mean: float
@@ -195,28 +206,28 @@ class Result:
 
     @property
     def response(self) -> NDArray[np.float64]:
-        """(mean, peak, RMS) in N."""
+        """Return (mean, peak, RMS) in N."""
         return np.array([self.mean, self.peak, self.rms])
 
 
 class Simulator(Protocol):
-    """What both competitors offer."""
+    """Interface of both competitors."""
 
     def simulate(self, design: Design) -> Result:
-        """From ε = 0, dε/dt = 0 at φ = 0, settle, then average over the window."""
+        """Start from ε = 0, dε/dt = 0 at φ = 0, settle, then average over the window."""
         ...
 
     def gradient(
         self, design: Design, steps: Sequence[float] = FD_STEPS
     ) -> tuple[Result, NDArray[np.float64]]:
-        """The result and d(mean, peak, RMS) / d(design), N per config unit, (3, 3)."""
+        """Return the result and d(mean, peak, RMS) / d(design), N per config unit, (3, 3)."""
         ...
 
 
 def central_differences(
     simulate: Callable[[Design], Result], design: Design, steps: Sequence[float]
 ) -> tuple[Result, NDArray[np.float64]]:
-    """Result at `design` and its (3, 3) derivative from six more simulations."""
+    """Return the result at `design` and its (3, 3) derivative from six more simulations."""
     columns = []
     for i, step in enumerate(steps):
         ends = []

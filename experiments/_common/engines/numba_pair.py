@@ -1,10 +1,10 @@
 """Competitor (b): the rotor pair compiled by Numba, gradients by central differences.
 
-Scalar code throughout: CIC flanks in closed form, Tsitouras 5(4) with a PI controller,
-no array is allocated inside the time loop. Two contacts, as in rootsopt: `map`, the gap
-tabulated over roll coordinate × ε and interpolated by bicubic B-splines, and `search`,
-the closest approach at every right-hand side by Newton's method from the last root.
-Poses and signs are those of `rootsopt.contact.closest`.
+All code is scalar: CIC flanks in closed form, Tsitouras 5(4) with a PI controller. No array is
+allocated inside the time loop. There are two contacts, as in rootsopt. `map` tabulates the gap over
+roll coordinate × ε and interpolates it by bicubic B-splines. `search` finds the closest approach at
+every right-hand side by Newton's method from the last root. Poses and signs are those of
+`rootsopt.contact.closest`.
 """
 
 import dataclasses
@@ -28,14 +28,14 @@ from experiments._common.engines import (
     rotor_of,
 )
 
-# Division without a check for zero, and floating point that may be contracted and reordered
-# but keeps NaN and infinity.
+# Omit the check for division by zero. Floating point may be contracted and reordered, but keeps NaN
+# and infinity.
 _compiled = njit(error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
 
-# The cheapest settings that reach a relative error of 1e-3 in mean, peak and RMS force, and
-# (the last) in their gradients, found in configs/cic.yaml on designs around the baseline.
+# The cheapest settings that reach a relative error of 1e-3 in mean, peak and RMS force (the last
+# one also in their gradients). They were found in configs/cic.yaml on designs around the baseline.
 # A map needs `NumbaPair.fitted` first.
 SEARCH_1E3: dict[str, Any] = {"contact": "search", "rtol": 1e-5, "settle": 1}
 MAP_1E3: dict[str, Any] = {
@@ -52,7 +52,7 @@ SEARCH_GRADIENT_1E3: dict[str, Any] = {"contact": "search", "rtol": 1e-8, "settl
 
 @_compiled
 def _half_moment(rotor, start, stop, arc):
-    """∫ |P|² h dl / 4 (m⁴) over an addendum stretch and the dedendum that meshes with it."""
+    """Return ∫ |P|² h dl / 4 (m⁴) over a segment of the addendum and its mating dedendum."""
     r, c = rotor.radius, rotor.arc_center
     total = 0.0
     for i in range(_GAUSS_NODES.size):
@@ -74,7 +74,7 @@ def _half_moment(rotor, start, stop, arc):
 
 @_compiled
 def polar_area_moment(rotor):
-    """∫ r² dA (m⁴) of a rotor about its axis, by Green's theorem; exact to rounding."""
+    """Return ∫ r² dA (m⁴) of a rotor about its axis, by Green's theorem; exact to rounding."""
     reach = rotor.arc_radius + rotor.arc_center - rotor.radius
     lands = (rotor.radius + reach) ** 4 + (rotor.radius - reach) ** 4
     total = lands * rotor.land_end / 4
@@ -92,7 +92,7 @@ _INVOLUTE_NODES = 12
 
 @_compiled
 def _mate(rotor, normal):
-    """Facing angle of rotor 2's flank point ν2, its slope over ν2, lever and its slope."""
+    """Return facing angle and lever of rotor 2's flank point ν2, each followed by its slope."""
     if normal > rotor.arc_end:
         return math.pi - 2 * rotor.alpha - normal, -1.0, rotor.base_radius, 0.0
     turn = normal - rotor.land_end
@@ -105,7 +105,7 @@ def _mate(rotor, normal):
 
 @_compiled
 def _offset(rotor, normal, roll, relative):
-    """Tangential offset T (m) at ν2 and dT/dν2."""
+    """Return the tangential offset T (m) at ν2 and dT/dν2."""
     facing, turning, lever2, rise2 = _mate(rotor, normal)
     normal1 = facing + 2 * roll
     if normal1 > rotor.arc_end:
@@ -123,13 +123,13 @@ def _offset(rotor, normal, roll, relative):
 
 @_compiled
 def _contact_at(rotor, normal, roll, relative):
-    """Gap (m) and both levers (m) at ν2."""
+    """Return the gap (m) and both levers (m) at ν2."""
     facing, _, lever2, _ = _mate(rotor, normal)
     reach = rotor.radius * math.sin(rotor.alpha)
     if normal > rotor.arc_end:
         support = reach - rotor.base_radius * (rotor.involute_end - normal)
     else:
-        # r sin ψ + s₂ with s₂ = -s: twice r sin ψ less the addendum's own support.
+        # r sin ψ + s₂ with s₂ = -s: twice r sin ψ minus the addendum's own support.
         height = math.sqrt(rotor.radius**2 - lever2 * lever2)
         own = rotor.arc_center * math.cos(normal - rotor.land_end) + rotor.arc_radius
         support = 2 * height - own
@@ -147,8 +147,10 @@ def _contact_at(rotor, normal, roll, relative):
 
 @_compiled
 def _newton(rotor, roll, relative, low, high, guess):
-    """Root of T falling through zero in (low, high), where T has a root: Newton's method
-    kept inside a bracket that shrinks. NaN if it ends where T does not fall."""
+    """Return the root of T in (low, high) where T falls through zero.
+
+    Newton's method runs inside a shrinking bracket. NaN if it ends where T does not fall.
+    """
     normal = guess
     for _ in range(60):
         offset, slope = _offset(rotor, normal, roll, relative)
@@ -168,8 +170,11 @@ def _newton(rotor, roll, relative, low, high, guess):
 
 
 class Search(NamedTuple):
-    """Nodes (n, 5) on rotor 2's flank: ν2, facing angle, its sine and cosine, lever (m);
-    `root` (1,): the last root ν2, from which the next search starts."""
+    """Nodes and start of the search.
+
+    nodes (n, 5) on rotor 2's flank: ν2, facing angle, its sine and cosine, lever (m); root (1,):
+    the last root ν2, where the next search starts.
+    """
 
     nodes: NDArray[np.float64]
     root: NDArray[np.float64]
@@ -177,17 +182,17 @@ class Search(NamedTuple):
 
 @_compiled
 def search_of(rotor):
-    """The nodes for a rotor, with a start in the middle of the flank."""
+    """Return the nodes for a rotor; the search starts in the middle of the flank."""
     involute = rotor.involute_end - rotor.arc_end
     nodes = np.empty((_EDGE_NODES + _ARC_NODES + _INVOLUTE_NODES + 1, 5))
     for place in range(nodes.shape[0]):
-        # Beside the land, where the contact begins, each node at half the distance of the next.
+        # Next to the land, where the contact starts, the distance of nodes halves each time.
         near = 0 < place <= _EDGE_NODES
         i = 0.5 ** (_EDGE_NODES + 1 - place) if near else 1.0 * max(place - _EDGE_NODES, 0)
         if i < _ARC_NODES:
             normal = rotor.land_end + (rotor.arc_end - rotor.land_end) * i / _ARC_NODES
         else:
-            # Half an involute more: rotor 2 may touch a little beyond its pitch point.
+            # Extend the involute by half: rotor 2 may touch a little beyond its pitch point.
             normal = rotor.arc_end + 1.5 * involute * (i - _ARC_NODES) / _INVOLUTE_NODES
         facing, _, lever, _ = _mate(rotor, normal)
         nodes[place] = normal, facing, math.sin(facing), math.cos(facing), lever
@@ -196,9 +201,9 @@ def search_of(rotor):
 
 @_compiled
 def _scan(rotor, nodes, roll, relative):
-    """The deepest falling root of T, bracketed on the nodes; NaN if there is none."""
+    """Return the deepest falling root of T, bracketed on the nodes; NaN if there is none."""
     best, depth = math.nan, math.inf
-    # Sines of sums, so that a node costs no trigonometry.
+    # Use sines of sums, so that a node needs no trigonometry.
     sin, cos = math.sin(roll - relative / 2), math.cos(roll - relative / 2)
     arc_sin = rotor.arc_center * math.sin(2 * roll - rotor.land_end)
     arc_cos = rotor.arc_center * math.cos(2 * roll - rotor.land_end)
@@ -225,9 +230,9 @@ def _scan(rotor, nodes, roll, relative):
 
 @_compiled
 def closest(rotor, search, roll, relative):
-    """Gap (m), both levers (m) and whether the flanks have a common normal, by search.
+    """Search for the gap (m), both levers (m) and whether the flanks have a common normal.
 
-    Roll coordinate and ε in rad, ε ≤ 0.
+    Roll coordinate and ε are in rad, ε ≤ 0.
     """
     half = rotor.half_pitch
     centered = roll - half
@@ -239,8 +244,8 @@ def closest(rotor, search, roll, relative):
         return far, 0.0, 0.0, False
     last = search.nodes[-1, 0]
     root = math.nan
-    # At the hand-over, and while a whole arc meshes at one instant, there can be two roots
-    # or none; everywhere else there is one.
+    # There is one root, with two exceptions: at the hand-over, and while a whole arc meshes at one
+    # instant, there can be two roots or none.
     if folded > rotor.land_end + 0.01 - relative:
         root = _newton(rotor, folded, relative, rotor.land_end, last, search.root[0])
     if not rotor.land_end < root < last:
@@ -256,7 +261,7 @@ def closest(rotor, search, roll, relative):
 
 @_compiled
 def gaps(rotor, rolls, relatives):
-    """Gap and levers (n, 3) in m at many poses, NaN without a common normal."""
+    """Return gap and levers (n, 3) in m at many poses, NaN without a common normal."""
     search = Search(*search_of(rotor))
     out = np.full((rolls.size, 3), np.nan)
     for i in range(rolls.size):
@@ -285,8 +290,11 @@ NO_TABLE = Table(np.zeros((4, 4)), 0.0, 1.0, 0.0, 1.0)
 
 @_compiled
 def _spline(values, out):
-    """Cubic B-spline coefficients (n + 2) of values (n ≥ 8) at uniform knots, ends not-a-knot,
-    which fixes c₂ = (8 v₁ - v₀ - v₂) / 6; Thomas' algorithm for the interior."""
+    """Compute cubic B-spline coefficients (n + 2) of values (n ≥ 8) at uniform knots.
+
+    The ends are not-a-knot, which fixes c₂ = (8 v₁ - v₀ - v₂) / 6. Thomas' algorithm solves for the
+    interior.
+    """
     n = values.size
     out[2] = (8 * values[1] - values[0] - values[2]) / 6
     out[n - 1] = (8 * values[n - 2] - values[n - 1] - values[n - 3]) / 6
@@ -306,7 +314,7 @@ def _spline(values, out):
 
 @_compiled
 def tabulate(rotor, deepest, rolls, relatives):
-    """Table of the gap down to ε = `deepest` < 0 on `rolls` × `relatives` points."""
+    """Tabulate the gap down to ε = `deepest` < 0 on `rolls` × `relatives` points."""
     half = rotor.half_pitch
     first = -min(0.9 * half, 2 * math.sqrt(-deepest) + 0.02)
     roll_step = (half - first) / (rolls - 1 - _MARGIN)
@@ -319,7 +327,7 @@ def tabulate(rotor, deepest, rolls, relatives):
             relative = deepest + relative_step * j
             gap, _, _, found = closest(rotor, search, roll, relative)
             if not found:
-                # The land is passing: a parabola goes on from the gap at its end.
+                # The land is passing: extend the gap at its end by a parabola.
                 gap = rotor.radius * (roll - rotor.land_end - relative / 2) ** 2
             values[i, j] = gap
     half_way = np.empty((rolls, relatives + 2))
@@ -333,7 +341,7 @@ def tabulate(rotor, deepest, rolls, relatives):
 
 @_compiled
 def _weights(t):
-    """Weights of the four coefficients around a cell and their slopes."""
+    """Return the weights of the four coefficients around a cell and their slopes."""
     u = 1 - t
     early, late = (3 * t - 6) * t * t / 6 + 2 / 3, (3 * u - 6) * u * u / 6 + 2 / 3
     value = u * u * u / 6, early, late, t * t * t / 6
@@ -342,7 +350,7 @@ def _weights(t):
 
 @_compiled
 def mapped(half, table, roll, relative):
-    """Gap (m) and both levers (m) from the table; `half` is half the lobe's pitch angle."""
+    """Return gap (m) and both levers (m) from the table; `half` is half the lobe pitch angle."""
     centered = roll - half
     centered -= 4 * half * math.floor(centered / (4 * half) + 0.5)
     x = (half - abs(centered) - table.first_roll) / table.roll_step
@@ -364,7 +372,7 @@ def mapped(half, table, roll, relative):
         by_e += s * column
         by_x += v * (d0 * a + d1 * b + d2 * c + d3 * d)
     by_e /= table.relative_step
-    # Beyond the table the gap goes on linearly in ε.
+    # Beyond the table, extend the gap linearly in ε.
     gap += by_e * (e - held) * table.relative_step
     by_x /= 2 * table.roll_step
     if centered > 0:
@@ -393,21 +401,21 @@ def _smooth_step(x):
 
 @_compiled
 def _balanced_ramp(x, width):
-    """`_ramp` with the integral of max(0, x)."""
+    """Return `_ramp` with the integral of max(0, x)."""
     t = min(max(x, 0.0) / width, 1.0) if width > 0 else 1.0
     return max(x, 0.0) if t == 1 else width * t * t * (4.5 - 6 * t + 2.5 * t * t)
 
 
 @_compiled
 def _balanced_step(x):
-    """`_smooth_step` with the integral of a step at 0."""
+    """Return `_smooth_step` with the integral of a step at 0."""
     t = min(max(x, 0.0), 1.0)
     return t * t * (18 - 32 * t + 15 * t * t)
 
 
 @_compiled
 def _impact(motion, depth, rate):
-    """IMPACT force (N) at a penetration (m) that grows at `rate` (m/s)."""
+    """Return the IMPACT force (N) at a penetration (m) that grows at `rate` (m/s)."""
     if depth <= 0:
         return 0.0
     delta = _ramp(depth, motion.smoothing)
@@ -419,7 +427,7 @@ def _impact(motion, depth, rate):
 
 @_compiled
 def _slope(rotor, motion, table, search, tau, angle, rate):
-    """Scaled acceleration and contact force (N) at τ and the scaled state."""
+    """Return scaled acceleration and contact force (N) at τ and the scaled state."""
     relative = motion.angle_scale * angle
     speed2 = motion.angle_scale * rate / motion.period
     side = 1.0 if relative < 0 else -1.0
@@ -486,8 +494,10 @@ _STEPS_PER_PERIOD = 100_000
 
 @_compiled
 def _between(t, value, k, h):
-    """Solution at the share `t` of a step of length `h` that starts at `value` with the stage
-    slopes `k`: Tsitouras' interpolant."""
+    """Return the solution at the fraction `t` of a step, by Tsitouras' interpolant.
+
+    The step has the length `h`, starts at `value` and has the stage slopes `k`.
+    """
     q = t * t
     u = t * (t - 1.3299890189751412) * (q - 1.4364028541716351 * t + 0.7139816917074209)
     total = -1.0530884977290216 * u * k[0]
@@ -500,10 +510,10 @@ def _between(t, value, k, h):
     return value + h * total
 
 
-# Nine or more parameters: compiled code takes the scalars of a state one by one, without a tuple.
+# Nine or more parameters: compiled code passes the scalars of a state one by one, not in a tuple.
 @_compiled
 def _peak_in_step(rotor, motion, table, search, tau, h, angle, rate, ks):
-    """Greatest contact force (N) within a step: eight samples, then golden section."""
+    """Return the largest contact force (N) within a step: eight samples, then golden section."""
 
     def force(t):
         a, b = _between(t, angle, ks[0], h), _between(t, rate, ks[1], h)
@@ -530,14 +540,14 @@ def _peak_in_step(rotor, motion, table, search, tau, h, angle, rate, ks):
     return max(best, f_left, f_right)
 
 
-# Nine or more parameters: compiled code takes the scalars of a state one by one, without a tuple.
+# Nine or more parameters: compiled code passes the scalars of a state one by one, not in a tuple.
 @_compiled
 def integrate(rotor, motion, table, search, start, stop, angle, rate, rtol, statistics):
     """Integrate the scaled state from τ = `start` to `stop`.
 
-    Returns it with the integrals of force and force² (scaled; error-controlled with the
-    state if `statistics`), the peak force (N), the largest |ε| (scaled), steps and
-    evaluations of the right-hand side.
+    Returns the state with the integrals of force and force² (scaled; error-controlled with the
+    state if `statistics`), the peak force (N), the largest |ε| (scaled), steps and evaluations of
+    the right-hand side.
     """
     ks = np.empty((2, 7))
     fs = np.empty(7)
@@ -604,7 +614,7 @@ def integrate(rotor, motion, table, search, start, stop, angle, rate, rtol, stat
 
 @_compiled
 def _run(rotor, motion, table, settle, window, rtol):
-    """Settle, then gather statistics over the window."""
+    """Settle, then collect statistics over the window."""
     search = Search(*search_of(rotor))
     angle, rate, _, _, _, _, steps, calls = integrate(
         rotor, motion, table, search, 0.0, float(settle), 0.0, 0.0, rtol, False
@@ -620,12 +630,12 @@ def _run(rotor, motion, table, settle, window, rtol):
 
 @dataclasses.dataclass(frozen=True)
 class NumbaPair:
-    """Simulator of a scene, compiled.
+    """Compiled simulator of a scene.
 
-    `contact`: map or search; `rtol` also serves as absolute tolerance of the scaled state;
-    `settle`, `window` in mesh periods; `rolls`, `relatives`: points of the map (at least
-    8), `deepest` (rad < 0) its depth, by default ten static contact forces deep. A map
-    that the motion leaves is built again, deeper; `fitted` does that once and for all.
+    contact: map or search; rtol: relative tolerance, also the absolute one of the scaled state;
+    settle, window: mesh periods; rolls, relatives: points of the map (at least 8); deepest: its
+    depth (rad, < 0), by default ten static contact forces deep. A map that the motion leaves is
+    built again, deeper. `fitted` builds a map that is deep enough from the start.
     """
 
     scene: Scene
@@ -638,7 +648,7 @@ class NumbaPair:
     deepest: float | None = None
 
     def simulate(self, design: Design) -> Result:
-        """From ε = 0, dε/dt = 0 at φ = 0, settle, then average over the window."""
+        """Start from ε = 0, dε/dt = 0 at φ = 0, settle, then average over the window."""
         rotor = rotor_of(self.scene, design)
         motion = motion_of(self.scene, polar_area_moment(rotor))
         if self.contact == "search":
@@ -655,11 +665,11 @@ class NumbaPair:
     def gradient(
         self, design: Design, steps: Sequence[float] = FD_STEPS
     ) -> tuple[Result, NDArray[np.float64]]:
-        """The result and d(mean, peak, RMS) / d(design), N per config unit, (3, 3)."""
+        """Return the result and d(mean, peak, RMS) / d(design), N per config unit, (3, 3)."""
         return central_differences(self.simulate, design, steps)
 
     def fitted(self, design: Design) -> "NumbaPair":
-        """The same with the map just deep enough for the motion of a design."""
+        """Return a simulator with a map just deep enough for the motion of a design."""
         reached = self.simulate(design).reached
         return dataclasses.replace(self, deepest=-1.3 * reached)
 

@@ -1,11 +1,10 @@
 """Competitor (a): SciPy's `solve_ivp` with a node-to-segment contact in NumPy.
 
-The paper's Eq. 9: nodes of rotor 1's flank against the segments of its mate on rotor 2,
-straight or, which is as fast and far more accurate, bulging with the flank's curvature.
-Only one flank pair can touch at a pose, and on it the search is confined to a window
-around the last contact; a coarse look along the whole flank finds it when it is not there.
-Gradients by central differences. Poses and signs are those of `rootsopt.contact.closest`;
-points are complex numbers.
+Contact is the paper's Eq. 9: nodes of rotor 1's flank against the segments of its mate on rotor 2.
+Segments are straight, or bulge with the flank's curvature, which is as fast and far more accurate.
+Only one flank pair can touch at a pose. On it the search covers a window around the last contact; a
+coarse search along the whole flank finds a contact elsewhere. Gradients are central differences.
+Poses and signs are those of `rootsopt.contact.closest`; points are complex numbers.
 """
 
 import cmath
@@ -33,8 +32,8 @@ from experiments._common.engines import (
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
 
-# The cheapest settings found in configs/cic.yaml, on designs around the baseline, that reach a
-# relative error of 1e-3 in mean, peak and RMS force.
+# The cheapest settings with a relative error of 1e-3 in mean, peak and RMS force. They were found
+# in configs/cic.yaml on designs around the baseline.
 NODES_1E3: dict[str, Any] = {"method": "LSODA", "nodes": 800, "rtol": 3e-5, "settle": 1}
 
 # Rotor geometry
@@ -42,8 +41,11 @@ NODES_1E3: dict[str, Any] = {"method": "LSODA", "nodes": 800, "rtol": 3e-5, "set
 
 @dataclasses.dataclass(frozen=True)
 class _Addendum:
-    """Points of the addendum at normal angles: roll angle β, r sin ψ, r cos ψ, distance s from
-    the pitch point, and arc length per normal angle there and on the mating dedendum."""
+    """Points of the addendum at normal angles.
+
+    Fields: roll angle β, r sin ψ, r cos ψ, distance s from the pitch point, and arc length per
+    normal angle there and on the mating dedendum.
+    """
 
     beta: NDArray[np.float64]
     height: NDArray[np.float64]
@@ -67,7 +69,7 @@ def _addendum(rotor: Rotor, normal: NDArray[np.float64]) -> _Addendum:
 
 
 def polar_area_moment(rotor: Rotor) -> float:
-    """∫ r² dA (m⁴) of a rotor about its axis, by Green's theorem; exact to rounding."""
+    """Return ∫ r² dA (m⁴) of a rotor about its axis, by Green's theorem; exact to rounding."""
     r = rotor.radius
     reach = rotor.arc_radius + rotor.arc_center - r
     total = ((r + reach) ** 4 + (r - reach) ** 4) * rotor.land_end / 4
@@ -83,12 +85,15 @@ def polar_area_moment(rotor: Rotor) -> float:
 
 
 def _flank(rotor: Rotor, nodes: int) -> NDArray[np.complex128]:
-    """Flank (m) from the end of the tip land to that of the root land, an odd number of about
-    `nodes` points; the k-th from one end meshes with the k-th from the other."""
+    """Return the flank (m) from the end of the tip land to that of the root land.
+
+    It has an odd number of about `nodes` points. The k-th from one end meshes with the k-th from
+    the other.
+    """
     start, stop = rotor.land_end, rotor.involute_end
     fine = np.linspace(start, stop, 513)
     point = _addendum(rotor, (fine[1:] + fine[:-1]) / 2)
-    # As dense as the longer of the two mating elements asks for.
+    # Make it as dense as the longer of the two mating elements needs.
     speed = np.maximum(np.abs(point.speed), np.abs(point.mate_speed))
     length = np.concatenate([[0.0], np.cumsum(speed)])
     even = np.linspace(0, length[-1], nodes // 2 + 1)
@@ -104,16 +109,19 @@ def _flank(rotor: Rotor, nodes: int) -> NDArray[np.complex128]:
 # Contact
 
 _WINDOW = 8
-"""Nodes of the window on either side of the last contact."""
+"""Number of nodes in the window on either side of the last contact."""
 _COARSE = 64
-"""Nodes of the coarse look along the whole flank."""
+"""Number of nodes of the coarse search along the whole flank."""
 _PAD = 4
-"""Segments more than nodes on either side: how far the contact may slide at one call."""
+"""Segments in excess of nodes on either side: how far the contact may slide in one call."""
 
 
 class _Segments(NamedTuple):
-    """Segments: first corner, conjugate of the unit direction, length (m), and the curvature
-    (1/m, to the left positive) of the flank there, 0 for straight ones."""
+    """Segments of the flank.
+
+    Fields: first corner, conjugate of the unit direction, length (m), and the flank's curvature
+    there (1/m, positive to the left; 0 for straight segments).
+    """
 
     corners: NDArray[np.complex128]
     towards: NDArray[np.complex128]
@@ -131,7 +139,7 @@ def _segments(corners: NDArray[np.complex128], curved: bool) -> _Segments:
     lengths = np.abs(chords)
     bends = np.zeros(len(chords))
     if curved:
-        # A segment that leads from one arc into another takes the mean of both.
+        # A segment that leads from one arc into another takes the mean curvature of both.
         turns = np.angle(chords[1:] * np.conj(chords[:-1])) * 2 / (lengths[1:] + lengths[:-1])
         bends = (np.append(turns, turns[-1]) + np.append(turns[0], turns)) / 2
     towards = np.asarray(np.conj(chords) / lengths, dtype=np.complex128)
@@ -141,9 +149,9 @@ def _segments(corners: NDArray[np.complex128], curved: bool) -> _Segments:
 class NodeContact:
     """Gap of a flank of rotor 1 against its mate on rotor 2, each of about `nodes` nodes.
 
-    With `curved`, the segments bulge by the flank's curvature and the deepest point is that
-    of the parabola through three nodes, so that the gap errs by less and is smoother; else
-    straight segments and the deepest node count, as Eq. 9 has it.
+    With `curved`, the segments bulge by the flank's curvature, and the deepest point is that of the
+    parabola through three nodes. The gap is then more accurate and smoother. Otherwise segments are
+    straight and the deepest node counts, as in Eq. 9.
     """
 
     def __init__(self, rotor: Rotor, nodes: int, curved: bool = True):
@@ -161,7 +169,7 @@ class NodeContact:
         self.last: tuple[int, int] | None = None
 
     def __call__(self, roll: float, relative: float) -> tuple[float, float, float]:
-        """Gap (m, negative: penetration) and levers (m) about rotor 1 and rotor 2."""
+        """Return gap (m, negative: penetration) and levers (m) about rotor 1 and rotor 2."""
         half = self.rotor.half_pitch
         centered = (roll + half) % (4 * half) - 2 * half
         # Contact starts before the tip passes the line of centres, by about √|ε|.
@@ -169,15 +177,18 @@ class NodeContact:
             return 1.0, 0.0, 0.0
         roll = centered + half
         phi1, phi2 = -roll - relative / 2, -roll + relative / 2
-        # Rotor 1's nodes in rotor 2's frame, mirrored so that both flanks run alike.
+        # Rotor 1's nodes in rotor 2's frame, mirrored so that both flanks have one direction.
         onto = cmath.exp(1j * (phi2 + 2 * half))
         turn = onto * cmath.exp(1j * phi1)
         shift = 2 * self.rotor.radius * onto
         return self._search(shift, turn)
 
     def _search(self, shift: complex, turn: complex) -> tuple[float, float, float]:
-        """Gap and levers: near the last contact or, if it is not there, anywhere, with windows
-        that narrow down."""
+        """Return gap and levers.
+
+        Search near the last contact; if it is not there, search everywhere with windows that narrow
+        down.
+        """
         if self.last is not None:
             window = self._window(shift, turn, *self.last, 1)
             # On a land, or at an end of the window, the flank may be deeper elsewhere.
@@ -198,7 +209,7 @@ class NodeContact:
     def _window(
         self, shift: complex, turn: complex, node: int, segment: int, stride: int
     ) -> "_Window":
-        """Every `stride`-th node around `node` against the segments around `segment`."""
+        """Return every `stride`-th node around `node` and the segments around `segment`."""
         reach = _WINDOW * stride
         low = max(node - reach, 0)
         first = max(segment - reach - _PAD * stride, 0)
@@ -209,7 +220,7 @@ class NodeContact:
         return _Window(low + i * stride, i, first, nodes, gaps, nearest, feet)
 
     def _contact(self, window: "_Window", shift: complex) -> tuple[float, float, float]:
-        """Gap and levers at the deepest point of a window, which is remembered."""
+        """Return gap and levers at the deepest point of a window, and remember that point."""
         i, gap = window.i, window.gap
         if not gap < 1.0:
             self.last = None
@@ -228,7 +239,7 @@ class NodeContact:
         return gap, lever1, lever2
 
     def _levers(self, window: "_Window", i: int, shift: complex) -> tuple[float, float]:
-        """Distances of the normal at a node's foot from the two axes."""
+        """Return the distances of the normal at a node's foot from both axes."""
         segment, point = window.segment(i), complex(window.nodes[i])
         towards = complex(self.segments.towards[segment])
         if self.curved:
@@ -239,8 +250,11 @@ class NodeContact:
 
 
 class _Window(NamedTuple):
-    """Nodes looked at, seen from rotor 2; the deepest is the i-th, number `node` of the flank.
-    Their gaps (m), their nearest segments, counted from `first`, and their feet (m) on it."""
+    """Nodes of a window, seen from rotor 2.
+
+    The deepest is the i-th, number `node` of the flank. Fields: their gaps (m), their nearest
+    segments, counted from `first`, and their feet (m) on these.
+    """
 
     node: int
     i: int
@@ -256,7 +270,7 @@ class _Window(NamedTuple):
 
     @property
     def enclosed(self) -> bool:
-        """Whether there is a deepest node with neighbours that are not so deep."""
+        """Return whether the deepest node has neighbours that are less deep."""
         around = self.gaps[max(self.i - 1, 0) : self.i + 2]
         return len(around) == 3 and bool(around.max() < 1.0)
 
@@ -265,8 +279,10 @@ class _Window(NamedTuple):
 
 
 def _signed_distances(nodes, segments):
-    """Signed distance of each node to the nearest segment, which it is and the foot on it; inf
-    for a node whose foot would lie beyond either end of the segments."""
+    """Return each node's signed distance to the nearest segment, that segment and the foot on it.
+
+    The distance is inf for a node whose foot would lie beyond either end of the segments.
+    """
     local = (nodes[:, None] - segments.corners) * segments.towards
     along, height = local.real, local.imag
     feet = np.minimum(np.maximum(along, 0.0), segments.lengths)
@@ -298,19 +314,19 @@ def _smooth_step(x: float) -> float:
 
 
 def _balanced_ramp(x: float, width: float) -> float:
-    """`_ramp` with the integral of max(0, x)."""
+    """Return `_ramp` with the integral of max(0, x)."""
     t = min(max(x, 0.0) / width, 1.0) if width > 0 else 1.0
     return max(x, 0.0) if t == 1 else width * t * t * (4.5 - 6 * t + 2.5 * t * t)
 
 
 def _balanced_step(x: float) -> float:
-    """`_smooth_step` with the integral of a step at 0."""
+    """Return `_smooth_step` with the integral of a step at 0."""
     t = min(max(x, 0.0), 1.0)
     return t * t * (18 - 32 * t + 15 * t * t)
 
 
 def _impact(motion: Motion, depth: float, rate: float) -> float:
-    """IMPACT force (N) at a penetration (m) that grows at `rate` (m/s)."""
+    """Return the IMPACT force (N) at a penetration (m) that grows at `rate` (m/s)."""
     if depth <= 0:
         return 0.0
     delta = _ramp(depth, motion.smoothing)
@@ -321,7 +337,7 @@ def _impact(motion: Motion, depth: float, rate: float) -> float:
 
 
 def _gear(motion: Motion, relative: float, rate: float) -> float:
-    """Torque (N·m) of the timing gear that holds ε back."""
+    """Return the torque (N·m) of the timing gear against ε."""
     excess = abs(relative) - motion.half_backlash
     if excess <= 0:
         return 0.0
@@ -348,7 +364,7 @@ class _Equation:
         return [rate, acceleration, share, share * share]
 
     def slope(self, tau: float, angle: float, rate: float) -> tuple[float, float]:
-        """Scaled acceleration and contact force (N)."""
+        """Return scaled acceleration and contact force (N)."""
         motion = self.motion
         relative = motion.angle_scale * angle
         speed2 = motion.angle_scale * rate / motion.period
@@ -367,9 +383,8 @@ class _Equation:
 class ScipyNodes:
     """Simulator of a scene with SciPy.
 
-    `nodes` per flank and `curved`: see `NodeContact`; `method` of `solve_ivp`; `rtol` also
-    serves as absolute tolerance of the scaled state; `settle`, `window` and `max_step` in mesh
-    periods.
+    nodes (per flank), curved: see `NodeContact`; method: that of `solve_ivp`; rtol: relative
+    tolerance, also the absolute one of the scaled state; settle, window, max_step: mesh periods.
     """
 
     scene: Scene
@@ -382,7 +397,7 @@ class ScipyNodes:
     max_step: float = 0.1
 
     def simulate(self, design: Design) -> Result:
-        """From ε = 0, dε/dt = 0 at φ = 0, settle, then average over the window."""
+        """Start from ε = 0, dε/dt = 0 at φ = 0, settle, then average over the window."""
         rotor = rotor_of(self.scene, design)
         motion = motion_of(self.scene, polar_area_moment(rotor))
         equation = _Equation(motion, NodeContact(rotor, self.nodes, self.curved))
@@ -403,7 +418,7 @@ class ScipyNodes:
     def gradient(
         self, design: Design, steps: Sequence[float] = FD_STEPS
     ) -> tuple[Result, NDArray[np.float64]]:
-        """The result and d(mean, peak, RMS) / d(design), N per config unit, (3, 3)."""
+        """Return the result and d(mean, peak, RMS) / d(design), N per config unit, (3, 3)."""
         return central_differences(self.simulate, design, steps)
 
     def _solve(self, equation, periods, start, dense):
@@ -424,7 +439,7 @@ class ScipyNodes:
 
 
 def _peak(equation: _Equation, run) -> float:
-    """Greatest force (N) of the accepted motion: at the steps' ends, then between them."""
+    """Return the largest force (N) of the accepted motion: at the steps' ends, then between."""
 
     def forces(times):
         states = run.sol(times).T[:, :2].tolist()

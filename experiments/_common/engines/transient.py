@@ -1,7 +1,7 @@
 """The plain way to a steady state, for comparison with closed orbits.
 
-Integrates until the transient has passed, then averages over one more repetition. Derivatives are
-carried along all the way.
+It integrates until the transient has passed, then averages over one more repetition. Derivatives
+are carried along throughout.
 """
 
 from typing import Any
@@ -16,7 +16,7 @@ from rootsopt.dynamics.orbit import SAMPLES
 from rootsopt.scene import Scene
 
 _FEW = 64
-"""Samples of a mesh period whose peak is not needed."""
+"""Number of samples in a mesh period whose peak is not needed."""
 
 
 @eqx.filter_jit
