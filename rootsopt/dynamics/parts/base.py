@@ -84,7 +84,7 @@ class Part(eqx.Module):
 
     @property
     def free(self) -> bool:
-        """Whether the part sets rotor 1 free: the speed of rotor 1 is then a state of the motion."""
+        """Whether the part sets rotor 1 free, which makes the speed of rotor 1 a state."""
         return False
 
     @property
