@@ -59,8 +59,8 @@ class End(enum.Enum):
     SOLVER_FAILED = "The solver ran out of steps. Raise solver.max_steps_per_period."
     NON_FINITE = "The motion, or its derivative, is not finite."
     LOST_MESH = "The lobes pass through each other beyond this point."
-    TOO_DEEP = "The flanks penetrate beyond the validity of a contact law beyond this point."
-    OFF_THE_MAP = "The motion leaves the contact map. Use solver.fidelity search."
+    TOO_DEEP = "Beyond this point, the flanks penetrate too deep for a contact law to be valid."
+    OFF_THE_MAP = "The motion leaves the contact map. Set solver.fidelity to search."
     NO_GEOMETRY = "No valid profile lies beyond this point."
 
 
