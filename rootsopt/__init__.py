@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rootsopt.config import Config as Config
-    from rootsopt.config import load as load_config  # noqa: F401
+    from rootsopt.config import load_config as load_config
     from rootsopt.config.families import Family as Family
     from rootsopt.config.families import Parameter as Parameter
     from rootsopt.config.families import register_family as register_family
@@ -50,7 +50,7 @@ _PUBLIC = {
     "Status": "rootsopt.status:Status",
     "Term": "rootsopt.response.terms:Term",
     "evaluate": "rootsopt.response.evaluation:evaluate",
-    "load_config": "rootsopt.config:load",
+    "load_config": "rootsopt.config:load_config",
     "optimize_design": "rootsopt.optimize.design:optimize_design",
     "register_family": "rootsopt.config.families:register_family",
     "register_term": "rootsopt.response.terms:register_term",

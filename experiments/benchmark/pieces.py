@@ -162,7 +162,8 @@ def part_reverse(job: Job) -> dict[str, Any]:
     import jax
     import jax.numpy as jnp
 
-    from rootsopt.dynamics.flow import Integrator, flow
+    from rootsopt.dynamics.flow import flow
+    from rootsopt.dynamics.integrator import Integrator
     from rootsopt.scene import Scene
 
     contact = "linear" if job.quick else "search"

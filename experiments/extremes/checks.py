@@ -17,7 +17,8 @@ from experiments._common.simulation import pair_of_model, stacked
 from experiments.extremes.scenes import Kind
 from rootsopt.config import Config
 from rootsopt.contact.impact import force_rounding
-from rootsopt.dynamics.flow import Integrator, flow, strobe
+from rootsopt.dynamics.flow import flow, strobe
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.orbit import Shots, close_orbit
 from rootsopt.dynamics.window import no_tangents
 from rootsopt.response.batch import coarse, respond

@@ -9,11 +9,11 @@ from scipy.optimize import minimize
 from experiments._common.simulation import profile_of
 from rootsopt.config import Config
 from rootsopt.config.families import family_of
+from rootsopt.config.units import MM
 from rootsopt.design.space import Space, sobol
 from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import geometry
 from rootsopt.scene import Scene, design_keys
-from rootsopt.scene.families import MM
 
 BAND_MM = 1e-3
 """Clearance (mm) below the bore's radius up to which an outer radius fills it."""

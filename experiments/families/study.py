@@ -26,12 +26,13 @@ from experiments._common.scenes import FORCES
 from experiments._common.simulation import evaluate, objective, profile_of
 from experiments.families.reach import Reach, changed, in_housing, of_family, problem_of, reach
 from rootsopt.config import Config, load, parse
+from rootsopt.config.units import MM
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import Profile
 from rootsopt.profiles.departure import departure
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.scene import check_geometry, design_vector, outline_mm
-from rootsopt.scene.families import MM, classical, free_form_of, with_design
+from rootsopt.scene.families import classical, free_form_of, with_design
 
 Row = dict[str, Any]
 REFERENCES = ("configs/ee.yaml", "configs/cic.yaml")

@@ -17,10 +17,11 @@ from jax import lax
 
 from rootsopt.config import FAMILY_KEYS
 from rootsopt.config.families import family_of, parameters
+from rootsopt.config.units import DEG, MM
 from rootsopt.profiles import Curve, FreeForm, geometry
 from rootsopt.profiles.cic import CIC
 from rootsopt.profiles.validity import PURE, margins
-from rootsopt.scene.families import DEG, MM, profile_of
+from rootsopt.scene.families import profile_of
 
 Row = dict[str, Any]
 RADIUS_MM = 33.0

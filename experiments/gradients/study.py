@@ -20,7 +20,7 @@ import numpy as np
 from experiments._common.scenes import CIC, FORCES
 from experiments._common.simulation import evaluator_of
 from rootsopt.config import Config, load
-from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.orbit import Shots, agreement, close_orbit
 from rootsopt.dynamics.window import no_tangents
 from rootsopt.response.evaluation import Evaluation, Evaluator

@@ -20,13 +20,13 @@ from numpy.typing import ArrayLike, NDArray
 from experiments._common.scenes import FORCES, shipped
 from experiments._common.simulation import evaluator_of
 from rootsopt.config import Config
-from rootsopt.dynamics.flow import Integrator
+from rootsopt.config.units import MM
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.orbit import Shots, close_orbit
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_vector
-from rootsopt.scene.families import MM
 from rootsopt.status import Status
 
 

@@ -1,4 +1,4 @@
-"""Figure of the bias, the orbits closed and the errors of gradients over the smoothing length."""
+"""Figure of the bias and of the errors of gradients over the smoothing length."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -8,13 +8,14 @@ from experiments.smoothing.study import DEFAULT, LIMIT, WIDTHS, Measured
 
 ORDER = (BLUE, VERMILION, GREEN)
 COLORS: dict[str, str] = {"cic": BLUE, "ee": VERMILION, "pump": GREEN}
+NAMES = {"cic": "CIC", "ee": "EE", "pump": "pump"}
 MARKS = {"cic": "o", "ee": "s", "pump": "^"}
 
 
 def lengths(found: list[Measured]) -> Figure:
-    """Draw bias, orbits closed and gradient error over the smoothing length."""
-    made, axes = sheet(13, 4.4, 1, 3)
-    (left, middle, right) = axes[0]
+    """Draw the bias of the forces and the error of the gradients over the smoothing length."""
+    made, axes = sheet(12, 6, 1, 2)
+    (left, right) = axes[0]
     for measured in found:
         kind, color = measured.kind, COLORS[measured.kind]
         widths = np.array(sorted(set(measured.orbits) - {DEFAULT}))
@@ -25,15 +26,13 @@ def lengths(found: list[Measured]) -> Figure:
             name = "greatest" if share == 1 else "median"
             left.loglog(
                 beyond, np.maximum(level, 1e-13), style, marker=MARKS[kind], color=color,
-                label=f"{kind}: {name} of {len(measured.configs)}",
+                label=f"{NAMES[kind]}: {name} of {len(measured.configs)}",
             )  # fmt: skip
         own = [config.contact.rounding_mm for config in measured.configs]
         left.loglog(
             own, np.maximum(measured.bias(DEFAULT), 1e-13), MARKS[kind], color=color, mfc="none",
-            ms=5, label=f"{kind}: default, each scene",
+            ms=5, label=f"{NAMES[kind]}: default, each scene",
         )  # fmt: skip
-        closed = [100 * np.mean(measured.orbits[width].usable) for width in widths]
-        middle.semilogx(widths, closed, marker=MARKS[kind], color=color, label=kind)
         for number, name in enumerate(("mean", "peak", "RMS")):
             for width, off in measured.gradients.items():
                 values = off[:, number]
@@ -49,10 +48,9 @@ def lengths(found: list[Measured]) -> Figure:
                 )
     left.axhline(LIMIT, color="black", linestyle="--", linewidth=1, label="limit")
     left.set_ylabel(f"relative bias of the forces, against {WIDTHS[0]:g} mm")
-    middle.set(ylabel="orbits closed at 1e-10 (% of those that settle)", ylim=(0, 104))
-    right.set_ylabel("relative error of the gradient (cic)")
+    right.set_ylabel("relative error of the gradient (CIC scenes)")
     for ax in axes[0]:
         ax.set_xlabel("contact.smoothing_mm (mm)")
         grid_below(ax)
-        ax.legend(fontsize=8, frameon=False)
+        ax.legend(fontsize=8, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
     return made

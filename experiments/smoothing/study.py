@@ -23,12 +23,12 @@ from experiments._common.engines import FD_STEPS
 from experiments._common.scenes import shipped
 from experiments._common.simulation import stacked
 from rootsopt.config import Config
-from rootsopt.dynamics.flow import Integrator
+from rootsopt.config.units import MM
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.errors import InputError
 from rootsopt.response.batch import Batch, coarse, on_all_cores, respond
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, check_geometry, design_vector
-from rootsopt.scene.families import MM
 from rootsopt.status import Status
 
 Say = Callable[[str], None]

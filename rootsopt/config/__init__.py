@@ -11,6 +11,8 @@ from rootsopt.config.scene import ProfileConfig
 from rootsopt.config.study import EnsembleConfig, SolverConfig
 from rootsopt.config.units import hint
 
+load_config = load
+"""The public name of `load`."""
 DESIGN_KEYS = FAMILY_KEYS["cic"]
 """The design parameters of a CIC rotor, as named in the config."""
 
@@ -25,5 +27,6 @@ __all__ = [
     "describe_keys",
     "hint",
     "load",
+    "load_config",
     "parse",
 ]

@@ -2,6 +2,13 @@
 
 import math
 
+MM = 1e-3
+"""One millimetre (m)."""
+DEG = math.pi / 180
+"""One degree (rad)."""
+RPM = 2 * math.pi / 60
+"""One revolution per minute (rad/s)."""
+
 # Longest endings first: the first that fits is the unit. With each, the units that are often
 # written in its place, and what a number in one of them must be multiplied by.
 _UNITS: dict[str, tuple[str, dict[str, float]]] = {

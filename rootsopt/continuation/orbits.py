@@ -17,8 +17,10 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config, parse
+from rootsopt.config.units import MM, RPM
 from rootsopt.continuation.arclength import End, Look, Spot, StepSizes, StoppedError, corrected
-from rootsopt.dynamics.flow import Flow, Integrator, flow
+from rootsopt.dynamics.flow import Flow, flow
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import SAMPLES
 from rootsopt.dynamics.switches import with_switches
@@ -33,7 +35,6 @@ from rootsopt.scene import (
     families,
     integrators,
 )
-from rootsopt.scene.families import MM
 
 PLACES = {
     "speed_rpm": "scene.speed_rpm",
@@ -331,7 +332,7 @@ def _build(
         gear = eqx.tree_at(lambda g: g.half_backlash, gear, half)
     tuned = dataclasses.replace(
         scene,
-        speed=at["speed_rpm"] * (2 * jnp.pi / 60),
+        speed=at["speed_rpm"] * RPM,
         load_torque=at.get("torque_N_m", scene.load_torque),
         pressure=at.get("pressure_difference_Pa"),
         gear=gear,
@@ -348,7 +349,7 @@ def _unit(scene, names, values):
 
 
 @Program
-def _shoot(
+def _shoot(  # Eleven parameters: a compiled program is called with its arrays alone.
     scene: Scene,
     names: tuple[str, ...],
     values: Float[Array, " p"],

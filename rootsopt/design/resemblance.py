@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from rootsopt.config.families import family_of
+from rootsopt.config.units import MM
 from rootsopt.design.space import sobol
 from rootsopt.profiles import Profile
 from rootsopt.profiles.departure import departure
 from rootsopt.profiles.validity import PURE, margins
 from rootsopt.runtime.programs import Program
-from rootsopt.scene.families import MM, classical, profile_of
+from rootsopt.scene.families import classical, profile_of
 
 _NODES = 96
 """Nodes on either side of the pitch circle, in the search."""

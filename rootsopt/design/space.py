@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.families import Family, family_of
+from rootsopt.config.units import DEG, MM
 from rootsopt.design.bounds import bounds_of
 from rootsopt.profiles import Geometry, geometry
 from rootsopt.profiles.validity import Margins, margins
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
-from rootsopt.scene.families import DEG, MM
 
 _SOUND = (
     # name, margin, unit, limit, scale, factor

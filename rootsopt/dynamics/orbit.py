@@ -9,7 +9,7 @@ A *kink* is an instant at which the equation of motion is not smooth; grid steps
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -18,7 +18,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.flow import Flow, Integrator, flow
+from rootsopt.dynamics.flow import Flow, flow
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.linear import solved, spectral_radius
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
@@ -253,7 +254,7 @@ class _Closer(eqx.Module):
         # Residuals are comparable only on the same steps.
         best = jnp.where(renewed | ~now.repeat, jnp.inf, jnp.minimum(now.best, residual))
         return _Closing(
-            orbit=_choose(checking, compared, found),
+            orbit=choose(checking, compared, found),
             window=now.window,
             state=new,
             repeat=following | checking,
@@ -389,7 +390,8 @@ def orbit_or_window(
     ), found.window
 
 
-def _choose(condition, new, old):
+def choose(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
+    """Return `new` where the condition holds, else `old`, leaf by leaf."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
 
 

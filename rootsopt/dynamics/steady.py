@@ -15,9 +15,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.flow import Flow, Integrator
+from rootsopt.dynamics.flow import Flow
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
-from rootsopt.dynamics.orbit import SAMPLES, Orbit, Shots, orbit_or_window
+from rootsopt.dynamics.orbit import SAMPLES, Orbit, Shots, choose, orbit_or_window
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import Transient, settle, settled_within
 from rootsopt.dynamics.verdict import RESIDUAL, TOO_DEEP, UNRESOLVED, Verdict, verdict
@@ -181,7 +182,7 @@ class _Attempts(eqx.Module):
         )
         used = found.used + jnp.where(fresh, settled.periods, 0)
         steps = found.steps + jnp.where(fresh, settled.steps, 0)
-        settled = _choose(fresh, settled, found.settled)
+        settled = choose(fresh, settled, found.settled)
         failure = transient_status(self.pair, settled)
         # The transient is at its limit, but the motion nearly repeats. The rest may be noise of the
         # coarse steps; Newton's method decides.
@@ -210,11 +211,11 @@ class _Attempts(eqx.Module):
         status = jnp.where(lost, failure, jnp.where(taken, status, found.status))
         new = Steady(
             status=jnp.where(now.windowed, self._unsettled(window), status),
-            orbit=_choose(taken, orbit, found.orbit),
+            orbit=choose(taken, orbit, found.orbit),
             period=jnp.where(taken, period, found.period),
             rtol=jnp.where(taken, now.fine, found.rtol),
-            verdict=_choose(taken, judged, found.verdict),
-            window=_choose(now.windowed, window, found.window),
+            verdict=choose(taken, judged, found.verdict),
+            window=choose(now.windowed, window, found.window),
             settled=settled,
             used=used,
             steps=steps + jnp.where(now.windowed, 0, orbit.flow.steps),
@@ -336,10 +337,6 @@ def _first(*cases: tuple[Bool[Array, ""], Status], default: int) -> Int[Array, "
     """Return the status code of the first case that holds, or `default`."""
     conditions, statuses = zip(*cases, strict=True)
     return jnp.select(conditions, [jnp.asarray(s.code) for s in statuses], jnp.asarray(default))
-
-
-def _choose(condition, new, old):
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
 
 
 def steady_motion(

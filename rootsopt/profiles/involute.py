@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rootsopt.config.units import hint
+from rootsopt.config.units import DEG, hint
 from rootsopt.errors import InputError
 
 if TYPE_CHECKING:
     from rootsopt.config.scene import ProfileConfig
 
-DEG = math.pi / 180
 _ANGLE, _LENGTH, _TIP = "pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg"
 _OVERLENGTH = 0.02
 """How far u may exceed u_max, relative. Past u_max the roll angle turns back and two

@@ -16,7 +16,9 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
-from rootsopt.dynamics.flow import Integrator, strobe
+from rootsopt.config.units import MM
+from rootsopt.dynamics.flow import strobe
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import BLOCK, Transient, settle, settled_within
 from rootsopt.dynamics.steady import transient_status
@@ -267,7 +269,7 @@ def _axes(config: Config, pair: RotorPair) -> tuple[NDArray[np.float64], NDArray
     within a mesh period.
     """
     wanted = config.attractors
-    radius = config.profile.pitch_radius_mm * 1e-3
+    radius = config.profile.pitch_radius_mm * MM
     load = max(float(pair.load.torque), 1e-3)
     depth = float(pair.law.depth_at(jnp.asarray(load / radius)))
     play = (float(pair.clearance) + _DEPTHS * depth) / radius

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.steady import Solver, steady_motion
 from rootsopt.runtime.programs import Program
 from rootsopt.runtime.threads import on_all_cores

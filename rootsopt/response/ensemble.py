@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from rootsopt.config import EnsembleConfig
 from rootsopt.design.space import Space
-from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.verdict import TOO_DEEP
 from rootsopt.dynamics.window import PERIODS

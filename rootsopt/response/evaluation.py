@@ -13,19 +13,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config
+from rootsopt.config.units import MM, RPM
 from rootsopt.contact.size import size_map
 from rootsopt.dynamics.flow import Integrator
 from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
 from rootsopt.dynamics.orbit import Orbit, reverse_sensitivity
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import BLOCK
-from rootsopt.dynamics.steady import Steady, steady_motion, window_status
+from rootsopt.dynamics.steady import CLOSED, Steady, steady_motion, window_status
 from rootsopt.dynamics.window import Window, lyapunov
 from rootsopt.profiles import Geometry
 from rootsopt.response.terms import terms_of, values_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_keys, design_vector
-from rootsopt.scene.families import MM
 from rootsopt.status import Status
 
 if TYPE_CHECKING:
@@ -305,7 +305,7 @@ class Evaluator:
         response: dict[str, float] = {}
         gradient = self._gradient(design, found) if status is Status.PERIODIC else {}
         hint, motion, state = "", None, None
-        if status in _CLOSED:
+        if status in CLOSED:
             named = self.scene.solver.measures.named(orbit.response[:, None], period)
             response = {name: value for name, (value, _) in named.items()}
             steady = {"kind": "periodic"} | _closed(orbit, period)
@@ -325,11 +325,11 @@ class Evaluator:
                 motion = _window_series(pair, found.window) if series else None
             else:
                 hint = idle_hint(self.config, float(orbit.flow.depth))
-            if found.verdict.steady:
-                # The timing gear holds the pair. A pair that floats can rest anywhere.
-                steady |= _closed(orbit, period)
-                state = np.asarray(orbit.state, np.float64)
-                motion = _orbit_series(pair, orbit, period) if series else None
+                if found.verdict.steady:
+                    # The timing gear holds the pair. A pair that floats can rest anywhere.
+                    steady |= _closed(orbit, period)
+                    state = np.asarray(orbit.state, np.float64)
+                    motion = _orbit_series(pair, orbit, period) if series else None
         elif int(found.window.done):
             steady, response, motion = unsettled(pair, status, found.window, series)
         elif status is Status.SOLVER_FAILED and pair.timescales is not None:
@@ -391,20 +391,16 @@ class Evaluator:
         }
 
 
-_CLOSED = (Status.PERIODIC, Status.INACCURATE, Status.TOO_DEEP, Status.UNRESOLVED)
-"""Statuses of a closed orbit with contact."""
-
-
 def at_speed(scene: Scene, speed_rpm: float) -> Scene:
     """Return the `scene` at the speed `speed_rpm`."""
-    speed = jnp.asarray(speed_rpm * 2 * np.pi / 60)
+    speed = jnp.asarray(speed_rpm * RPM)
     return eqx.tree_at(lambda scene: scene.speed, scene, speed)
 
 
 def _reached(pair: RotorPair, found: Steady) -> float:
     """Return the largest |ε| (rad) of the steady motion, as far as it is known."""
     scale = float(pair.angle_scale)
-    if Status.of(found.status) in (*_CLOSED, Status.IDLE):
+    if Status.of(found.status) in (*CLOSED, Status.IDLE):
         return scale * float(np.max(np.abs(found.orbit.flow.states[:, 0])))
     if int(found.window.done):
         return scale * float(np.max(np.abs(found.window.states[..., 0])))

@@ -13,7 +13,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
-from rootsopt.dynamics.flow import Integrator, flow, strobe
+from rootsopt.dynamics.flow import flow, strobe
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.runtime.programs import Program
 from rootsopt.status import Status

@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rootsopt.config.units import MM
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
-from rootsopt.scene.families import MM
 
 
 class Forces(NamedTuple):

@@ -5,12 +5,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config
+from rootsopt.config.units import MM
 from rootsopt.errors import InputError
 from rootsopt.profiles import geometry, outline
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import families
 from rootsopt.scene.build import Scene
-from rootsopt.scene.families import MM
 from rootsopt.scene.reading import design_vector
 
 

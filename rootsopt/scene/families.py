@@ -1,7 +1,5 @@
 """Profile families by the names and units of the config: how they are made, and what is wrong."""
 
-import math
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -9,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from rootsopt.config import ProfileConfig
 from rootsopt.config.families import families, family_of
+from rootsopt.config.units import DEG, MM
 from rootsopt.config.words import shown
 from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import conjugacy
@@ -17,8 +16,6 @@ from rootsopt.profiles.departure import departure
 from rootsopt.profiles.validity import PURE, margins
 from rootsopt.runtime.programs import Program
 
-MM = 1e-3
-DEG = math.pi / 180
 _ROUNDING = 1e-9
 """Margin relative to its scale that counts as 0."""
 

@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rootsopt.config import Config
+from rootsopt.config.units import MM, RPM
 from rootsopt.contact.impact import ImpactLaw
-from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.parts import Friction, MotorDrive, Supports, TimingGear
 from rootsopt.dynamics.steady import Solver
 from rootsopt.scene import families
-from rootsopt.scene.families import MM
 
 _ORBIT_STEPS = 4
 """Steps allowed for a whole orbit, in units of those allowed for a mesh period."""
@@ -40,7 +40,7 @@ def quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
         "length": jnp.asarray(rotor.length_mm * MM),
         "density": jnp.asarray(rotor.density_kg_m3),
         "clearance": jnp.asarray(config.contact.clearance_mm * MM),
-        "speed": jnp.asarray(scene.speed_rpm * 2 * math.pi / 60),
+        "speed": jnp.asarray(scene.speed_rpm * RPM),
         "load_torque": jnp.asarray(config.load_torque),
         "gear_damping_ratio": jnp.asarray(0.0 if gear is None else gear.damping_ratio),
         "bore_radius": _optional(rotor.bore_mm, MM / 2),

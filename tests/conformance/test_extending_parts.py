@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from rootsopt.config import load
-from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.orbit import Shots, close_orbit
 from rootsopt.dynamics.parts import Context
 from rootsopt.dynamics.settle import settle, settled_within

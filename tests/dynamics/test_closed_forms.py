@@ -25,7 +25,8 @@ from rootsopt.continuation import orbits
 from rootsopt.continuation.arclength import StepSizes
 from rootsopt.design.space import sobol
 from rootsopt.dynamics import peak, window
-from rootsopt.dynamics.flow import Flow, Integrator
+from rootsopt.dynamics.flow import Flow
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.orbit import Shots, close_orbit
 from rootsopt.dynamics.pair import FlankForce, RotorPair

@@ -17,7 +17,8 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.spatial import cKDTree
 
 from rootsopt.config import load
-from rootsopt.dynamics.flow import Integrator, flow, strobe
+from rootsopt.dynamics.flow import flow, strobe
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.settle import settle
 from rootsopt.scene import Scene, design_vector, outline_mm
 

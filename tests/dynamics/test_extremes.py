@@ -12,7 +12,8 @@ from scipy.integrate import solve_ivp
 
 from rootsopt.config import load
 from rootsopt.contact.impact import ImpactLaw, force_rounding
-from rootsopt.dynamics.flow import Flow, Integrator, first_step
+from rootsopt.dynamics.flow import Flow
+from rootsopt.dynamics.integrator import Integrator, first_step
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.parts import TimingGear

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from rootsopt.config import load
-from rootsopt.dynamics.flow import Flow, Integrator
+from rootsopt.dynamics.flow import Flow
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.landing import LandingControl
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.orbit import Orbit, agreement, disagreement

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rootsopt.config import load
-from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.dynamics.orbit import Shots, close_orbit
 from rootsopt.dynamics.pair import RotorPair

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from rootsopt.config import DESIGN_KEYS, load
-from rootsopt.dynamics.flow import Integrator, flow, strobe
+from rootsopt.dynamics.flow import flow, strobe
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.dynamics.peak import BESIDE, one_sided
 from rootsopt.dynamics.window import no_tangents

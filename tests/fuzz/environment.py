@@ -7,6 +7,7 @@ refused, and runs `profile` with them.
 import json
 import os
 import random
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -138,8 +139,7 @@ def run(report: Report, seed: int) -> None:
 def _profile(folder: Path, variables: dict[str, str]):
     """Exit code, both outputs and the geometry in the result, if there is one."""
     out = folder / "out"
-    for old in [*out.glob("*.json")] if out.exists() else []:
-        old.unlink()
+    shutil.rmtree(out, ignore_errors=True)
     done = subprocess.run(
         [sys.executable, "-m", "rootsopt.profile", EE, "-o", str(out), *QUICK],
         capture_output=True,

@@ -19,6 +19,7 @@ _OF = {
     "contact/segments": "fidelities",
     "contact/size": "closed_forms accuracy",
     "dynamics/flow": "closed_forms dynamics steady measures gradients scene extremes",
+    "dynamics/integrator": "dynamics extremes",
     "dynamics/landing": "landing",
     "dynamics/linear": "steady measures",
     "dynamics/measures": "measures extremes",

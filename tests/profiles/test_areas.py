@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from experiments.geometry import study
 from rootsopt.config import FAMILY_KEYS
+from rootsopt.config.units import MM
 from rootsopt.profiles import geometry
-from rootsopt.scene.families import MM, profile_of
+from rootsopt.scene.families import profile_of
 
 ERROR = 1e-11
 """Relative; the study in experiments/geometry finds 1e-13."""

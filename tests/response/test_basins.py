@@ -10,7 +10,8 @@ import pytest
 
 from rootsopt.commands.console import main
 from rootsopt.config import load
-from rootsopt.dynamics.flow import Integrator, strobe
+from rootsopt.dynamics.flow import strobe
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.response.attractors import AttractorEvaluator, _Sorter, find
 from rootsopt.response.evaluation import Evaluator, evaluate
 from rootsopt.response.evaluators import evaluator_for

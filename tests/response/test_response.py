@@ -106,6 +106,102 @@ def test_derivatives_by_design_and_scene_are_those_of_differences(scene, known):
     )
 
 
+PARTS = {
+    "bore and phase error": (
+        ("rotor.bore_mm=20", "scene.phase_error_mrad=0.4"),
+        {
+            "bore radius": lambda s: s.bore_radius,
+            "phase error": lambda s: s.gear.offset,
+            "length": lambda s: s.length,
+        },
+    ),
+    "motor": (
+        ("scene.motor={slope_N_m_s_per_rad: 0.05, inertia_kg_m2: 2e-3}",),
+        {
+            "motor slope": lambda s: s.motor.slope,
+            "motor inertia": lambda s: s.motor.inertia,
+            "speed": lambda s: s.speed,
+        },
+    ),
+    "gas load": (
+        ("scene.load={pressure_difference_Pa: 20000}",),
+        {"pressure": lambda s: s.pressure, "pitch radius": lambda s: s.pitch_radius},
+    ),
+    "friction": (
+        (
+            "contact.friction={static: 0.12, kinetic: 0.08, stiction_speed_mm_s: 20, "
+            "friction_speed_mm_s: 40}",
+        ),
+        {
+            "kinetic friction": lambda s: s.friction.kinetic,
+            "static friction": lambda s: s.friction.static,
+            "stiction speed": lambda s: s.friction.stiction_speed,
+            "friction speed": lambda s: s.friction.friction_speed,
+        },
+    ),
+    "bearings": (
+        ("scene.supports={stiffness_N_per_mm: 20000, damping_N_s_per_mm: 2}",),
+        {
+            "bearing stiffness": lambda s: s.supports.stiffness,
+            "bearing damping": lambda s: s.supports.damping,
+        },
+    ),
+    "center distance": (
+        ("scene.center_distance_error_mm=0.02",),
+        {"center distance error": lambda s: s.center_distance_error},
+    ),
+}
+"""Scenes with single parts, and the quantities that come with them."""
+
+
+def ridders(function, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Derivative at 0 by central differences, extrapolated over six steps, and its error."""
+    table = [[(function(step) - function(-step)) / (2 * step)]]
+    best, error = table[0][0], np.full(table[0][0].shape, np.inf)
+    for row in range(1, 6):
+        h = step / 1.6**row
+        entries = [(function(h) - function(-h)) / (2 * h)]
+        for order, before in enumerate(table[-1], start=1):
+            factor = 1.6 ** (2 * order)
+            entries.append((factor * entries[-1] - before) / (factor - 1))
+            off = np.maximum(abs(entries[-1] - entries[-2]), abs(entries[-1] - before))
+            best = np.where(off < error, entries[-1], best)
+            error = np.minimum(off, error)
+        table.append(entries)
+    return best, error
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", PARTS)
+def test_derivatives_with_respect_to_quantities_of_parts(kind):
+    """To 1e-6 of the force's change with the relative change of a quantity, or the differences' own
+    error. With the quantities of the shipped scene they are more than twenty."""
+    overrides, gets = PARTS[kind]
+    _, scene = scene_of(*overrides)
+    values = [get(scene) for get in gets.values()]
+
+    @jax.jit
+    def found(values, start):
+        moved = eqx.tree_at(lambda s: [get(s) for get in gets.values()], scene, values)
+        response = steady_response(moved, DESIGN, start)
+        return jnp.stack([response.mean, response.rms]), response
+
+    known, response = found(values, None)
+    assert Status.of(response.status) is Status.PERIODIC
+    (jacobian,) = jax.jit(jax.jacfwd(lambda v: (found(v, None)[0],)))(values)
+    for k, (name, value) in enumerate(zip(gets, values, strict=True)):
+
+        def moved(step, k=k, value=value):
+            entries = [*values]
+            entries[k] = value * (1 + step)
+            return np.asarray(found(entries, response.state)[0])
+
+        slope, error = ridders(moved, 2e-3)
+        allowed = np.maximum(1e-6 * np.maximum(abs(slope), 1e-2 * known), error)
+        assert np.all(error < 1e-4 * abs(known)), name
+        assert np.all(abs(jacobian[k] * value - slope) <= allowed), name
+
+
 def test_forward_and_reverse_agree(known):
     _, found, values, jacobian = known
     arguments = jnp.asarray(DESIGN), *values

@@ -14,7 +14,8 @@ import pytest
 
 from rootsopt.commands import simulate
 from rootsopt.config import load
-from rootsopt.dynamics.flow import METHODS, Integrator, strobe
+from rootsopt.dynamics.flow import strobe
+from rootsopt.dynamics.integrator import METHODS, Integrator
 from rootsopt.response import choice
 from rootsopt.response.evaluation import Evaluator, _series
 from rootsopt.scene import Scene, design_vector

@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from rootsopt.config import load
-from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector

@@ -10,7 +10,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 
-from rootsopt.dynamics.flow import Integrator, flow
+from rootsopt.dynamics.flow import flow
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.orbit import SAMPLES
 from rootsopt.scene import Scene
 
