@@ -349,7 +349,7 @@ def _unit(scene, names, values):
 
 
 @Program
-def _shoot(  # Eleven parameters: a compiled program is called with its arrays alone.
+def _shoot(  # Eleven parameters, since a compiled program takes its arrays one by one.
     scene: Scene,
     names: tuple[str, ...],
     values: Float[Array, " p"],

@@ -391,7 +391,7 @@ def orbit_or_window(
 
 
 def choose(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
-    """Return `new` where the condition holds, else `old`, leaf by leaf."""
+    """Return `new` where the `condition` holds, else `old`, for each leaf of a tree."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
 
 
