@@ -37,7 +37,7 @@ from rootsopt.errors import InputError
 
 _HALVED = 0.004
 """Distance (in the unit of `StepSizes`) from the state half an orbit later, below which a branch
-that ends without another reason meets one of half the period."""
+that ends for no other reason counts as HALVED."""
 _SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
 """Distances (in the unit of `StepSizes`) from a period doubling at which the doubled orbit is
 searched for."""
@@ -122,8 +122,8 @@ def follow(
     value; and step sizes. A step of length 1 spans the range, or changes the scaled state by
     `SPAN`. `ways`: first along falling (-1) and then along rising (1) values, or only one of these.
 
-    Raises `InputError` for an unknown parameter, a value outside the limits, a wrong `period` or
-    `ways`, or single precision, and if there is no orbit to start from.
+    Raises `InputError` for an unknown parameter, a value outside the limits, single precision, or a
+    wrong `period` or `ways`; also if there is no orbit to start from.
     """
     value = value_of(config, parameter)
     if not limits.low <= value <= limits.high:

@@ -163,7 +163,7 @@ class _Shot(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """Data of an orbit at a look, beside residual and Jacobian.
+    """Data of an orbit at a look, in addition to residual and Jacobian.
 
     `statistics`: mean, peak and RMS force (N); `half_way`: distance (in the unit of `StepSizes`)
     from the state half an orbit later; the others: see `BranchPoint`.

@@ -442,9 +442,10 @@ def reverse_sensitivity(
 
     The derivatives go through diffrax's checkpointed adjoint. It cannot handle jumps of the
     contact; where these are possible, derivatives go through the steps themselves. `grid`: the
-    steps of the closed orbit; `top`: its peak (N). With cotangents v of a response and w of the end
-    state, the implicit function theorem requires (I - M)ᵀ w = R_zᵀ v and gives
-    dR/dp = R_pᵀ v + Φ_pᵀ w.
+    steps of the closed orbit; `top`: its peak (N).
+
+    Let v be the cotangent of a response and w that of the end state. By the implicit function
+    theorem, (I - M)ᵀ w = R_zᵀ v, and dR/dp = R_pᵀ v + Φ_pᵀ w.
     """
     count = state.shape[0]
     length = period.astype(state.dtype)

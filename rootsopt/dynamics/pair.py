@@ -102,8 +102,8 @@ class RotorPair(eqx.Module):
     `two_sided`: whether drive and coast flanks can touch at once. At the nominal centre distance
     they cannot. `parts`: all other parts. A part that is absent is None and costs nothing.
 
-    Raises InputError if two parts let the axes move, if a part lets them move and `two_sided` is
-    False, or if the pair is two-sided and the contact is not (see `Contact.two_sided`).
+    Raises InputError if two parts let the axes move; if a part lets them move but `two_sided` is
+    False; if the pair is two-sided but the contact is not (see `Contact.two_sided`).
     """
 
     lobes: int = eqx.field(static=True)
@@ -292,9 +292,9 @@ class RotorPair(eqx.Module):
     def _force(self, motion: Motion) -> FlankForce:
         """Return the contact of the flanks at a motion.
 
-        Unless the pair is two-sided, only the drive flank can touch when ε < 0 and only the coast
-        flank when ε > 0 (nominal centre distance, clearance not negative). One search is then
-        enough, and the force is exactly zero on both sides of ε = 0.
+        A pair that is not two-sided has the nominal centre distance and no negative clearance. Then
+        only the drive flank can touch when ε < 0, and only the coast flank when ε > 0. So one
+        search is enough, and the force is exactly zero on both sides of ε = 0.
         """
         if self.two_sided:
             sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)

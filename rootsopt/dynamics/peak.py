@@ -108,8 +108,8 @@ class Steps(NamedTuple):
         return _state(pair, swing, slope, (1 - x) * before[2:] + x * after[2:])
 
     def reaches(self, tau: Float[Array, ""], width: Float[Array, ""]) -> Bool[Array, ""]:
-        """Return whether `tau` is so close to an end of its step that the cubic of `motion` is as
-        accurate as a polynomial through samples a `width` apart."""
+        """Return whether `motion` at `tau` is as accurate as a polynomial through samples a `width`
+        (mesh periods) apart: `tau` is close enough to an end of its step."""
         _, step, x = self._place(tau)
         return x * (1 - x) * step**2 < width**2
 

@@ -1,9 +1,9 @@
 """Derivatives of a motion across an instant at which its equation jumps.
 
 Next to a cusp the gap of two flanks has two minima. Where the other minimum becomes the deeper one,
-the penetration is continuous, but the levers jump, and with them the contact force. The derivative
-of the motion then has a term from the moving instant t* of the jump, beside those of the steps
-before and after (saltation; P. C. Müller, Chaos, Solitons & Fractals 5 (1995) 1671-1681):
+the penetration is continuous, but the levers jump, and with them the contact force. The instant t*
+of the jump moves, which adds a term to the derivatives from the steps before and after (saltation;
+P. C. Müller, Chaos, Solitons & Fractals 5 (1995) 1671-1681):
 
     dy = (f₋ - f₊) dt*,        dt* = -d(δ₋ - δ₊) / (dδ₋/dτ - dδ₊/dτ).
 

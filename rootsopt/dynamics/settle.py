@@ -64,8 +64,8 @@ def settle(
     """Integrate from the scaled `state` until the stroboscopic states repeat with some period k.
 
     Settled means: the last k + 1 states differ from those k periods earlier by less than
-    `tolerance` (scaled), or by less than the noise of the steps if the states are large. k is the
-    smallest such period, at most `max_orbit` ≤ 8. After `_PATIENCE`, the steps are finer. After
+    `tolerance` (scaled). For large states, the noise of the steps is allowed if it is greater. k is
+    the smallest such period, at most `max_orbit` ≤ 8. After `_PATIENCE`, the steps are finer. After
     `max_periods` mesh periods, the transient is given up.
     """
     orders = jnp.arange(1, max_orbit + 1)

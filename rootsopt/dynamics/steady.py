@@ -38,8 +38,8 @@ its derivatives are uncertain."""
 class Solver(eqx.Module):
     """Settings for finding a steady motion.
 
-    `transient`, `orbit`: their integrators; `measures`: measures of the force beside mean and mean
-    square; `max_periods`: maximum length of the transient (mesh periods); `examine`: 1 to integrate
+    `transient`, `orbit`: their integrators; `measures`: averages of the force to compute;
+    `max_periods`: maximum length of the transient (mesh periods); `examine`: 1 to integrate
     a window of a motion that does not settle, 0 to give it up; `max_orbit`: longest period searched
     for (mesh periods), at most 8; `precision`: float64 or float32. `max_periods` and `examine` are
     floats, as are all leaves.

@@ -17,8 +17,8 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.peak import Steps, blended
 
 _LOOKS, _LONGEST = 252, 8
-"""Number of places per mesh period at which changes are searched for, beside the ends of the steps,
-and the maximum number of mesh periods."""
+"""Number of places per mesh period at which changes are searched for, in addition to the ends of
+steps, and the maximum number of mesh periods."""
 _CHANGES = 1024
 """Maximum number of changes found in one stretch of motion. A mesh period has about 20 to 100."""
 _LANES = 16

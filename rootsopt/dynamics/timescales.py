@@ -38,8 +38,8 @@ class Timescales(eqx.Module):
         """Return the timescales of a pair, without derivatives.
 
         `inertia` (kg·m²) of one rotor; `force` (N): static flank force at the pitch `radius` (m);
-        `clearance` (m) of the flanks. The contact stiffness is taken at the static depth, or at the
-        depth of an impact after a fall through the play if this is greater. The energy of the
+        `clearance` (m) of the flanks. The contact stiffness is taken at the greater of two depths:
+        the static one, and that of an impact after a fall through the play. The energy of the
         impact is the work of the load.
         """
         parts = tuple(parts)

@@ -27,8 +27,8 @@ _NO_LINE = 1e-9
 _DRAWN = 5
 """Maximum number of times that an infeasible point is moved half way towards a feasible one."""
 _ACTIVE = 1e-6
-"""Scaled violation of a constraint below which a point counts as feasible, and distance from a
-bound of the unit box below which the bound counts as active."""
+"""Scaled violation of a constraint below which a point counts as feasible. It is also the distance
+from a bound of the unit box below which the bound counts as active."""
 
 
 @Program

@@ -171,7 +171,7 @@ class EnsembleEvaluator(Wrapper):
             if states.shape != (self.settings.members, pair.states):
                 raise ValueError(
                     f"Argument `start` must be the states (members, n) of an ensemble, but has "
-                    f"shape {states.shape}; pass None to begin anew"
+                    f"shape {states.shape}; pass None to start from new states"
                 )
         runs = run_members([pair], states, settle, self.settings.periods, self.integrator)
         return _Outcome(pair, shape, runs)
