@@ -40,7 +40,7 @@ _LOOKS = 6
 """Maximum number of searches for kinks while an orbit is closed."""
 _DRIFT = 30.0, 1e-9, 1e-6
 """Distance (scaled) from the orbit of the last search for kinks, above which kinks are searched for
-again: in tolerances, and its limits. Kinks then lie as far outside their steps, which causes an
+again: in tolerances, and its limits. Kinks may lie this far outside their steps, which causes an
 error of first order."""
 _STRAIN = 10.0
 """Error of a repeated step, in tolerances, above which the solver steps are chosen anew."""

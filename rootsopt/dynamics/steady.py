@@ -68,7 +68,7 @@ class Solver(eqx.Module):
 class Steady(NamedTuple):
     """The steady motion that a state leads to.
 
-    `status`: code of a `Status`; `orbit`: the last one closed; `period`: its mesh periods; `rtol`:
+    `status`: code of a `Status`; `orbit`: the last one kept; `period`: its mesh periods; `rtol`:
     its tolerance; `verdict` on it; `window` of a motion that did not settle; `settled`: end of the
     transient; `used`: mesh periods of all transients; `steps`: solver steps of transients and
     orbits.
