@@ -1,8 +1,8 @@
-"""Errors a user can act on."""
+"""Errors that a user can correct."""
 
 
 class InputError(ValueError):
-    """Bad input: the message names the key or file, the value, and what to change.
+    """Invalid input. The message names the key or file, the value, and what to change.
 
-    The command line prints it and exits with 2.
+    The command line prints the message and exits with code 2.
     """

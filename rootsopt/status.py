@@ -1,4 +1,4 @@
-"""What can be said of a result. No number is reported without one of these."""
+"""Statuses of results. Every reported number comes with one of them."""
 
 import enum
 import operator
@@ -6,45 +6,48 @@ from typing import SupportsIndex
 
 
 class Status(enum.Enum):
-    """Outcome of a simulation; the value is the advice given to the user."""
+    """Outcome of a simulation or a search. The value is the explanation and advice for the user."""
 
     PERIODIC = "The pair settled on a stable periodic orbit."
     AVERAGED = (
-        "Averages over an ensemble of motions, with standard errors; the gradient is that of the "
-        "average over a neighbourhood of the design."
+        "The forces are averages over an ensemble of motions, with standard errors. The gradient "
+        "is that of the average over a neighbourhood of the design."
     )
     GEOMETRY_ONLY = "The profile is valid; nothing was simulated."
     OFF_MAP = (
-        "The motion left the contact map, which says nothing of the flanks there. Set "
-        "solver.fidelity to search, or make the scene with a lower `deepest`."
+        "The motion left the contact map, so its forces are not known. Set solver.fidelity to "
+        "search, or make the scene with a lower `deepest`."
     )
     CHAOTIC = (
-        "The motion is chaotic: mean and peak are averages over a finite window and have no "
-        "usable gradient. Set objective.motion to ensemble to optimise what an ensemble of motions "
-        "averages to; or lower the speed, load or backlash, or add damping."
+        "The motion is chaotic: mean and peak are those of a finite window and have no usable "
+        "gradient. Set objective.motion to ensemble to optimise averages over an ensemble of "
+        "motions. Or lower the speed, load or backlash, or add damping."
     )
-    NOT_SETTLED = "The transient has not passed. Raise solver.max_mesh_periods, or add damping."
+    NOT_SETTLED = (
+        "The motion has not settled within the allowed time. Raise solver.max_mesh_periods, or add "
+        "damping."
+    )
     PASSED_THROUGH = (
         "The lobes passed through each other: the flanks alone cannot hold this load. Add a "
-        "scene.timing_gear, lower the load or the backlash."
+        "scene.timing_gear, or lower the load or the backlash."
     )
     STALLED = (
         "The motor has stalled: it cannot carry the load. Raise scene.motor.torque_N_m or "
         "slope_N_m_s_per_rad, or lower the load."
     )
     TOO_DEEP = (
-        "The flanks penetrate beyond the validity of a contact law (2 % of the pitch radius). "
+        "The flanks penetrate too deep for a contact law to be valid (2 % of the pitch radius). "
         "Raise contact.stiffness_N_per_mm_e or lower the load."
     )
     UNRESOLVED = (
-        "The force is lost in errors: the flanks penetrate so little that rounding of the gap "
+        "The force is not resolved. Either the flanks penetrate so little that rounding of the gap "
         "changes its greatest value by more than 1 %, or the steps are too coarse for its impacts "
         "(mean, RMS and peak contradict each other). Set solver.precision to float64, or tighten "
         "solver.rtol."
     )
     INACCURATE = (
-        "The orbit is closed, but with the solver's steps halved it or its derivatives are others: "
-        "they are not known well enough to be reported. Tighten solver.rtol, or raise "
+        "The orbit is closed, but halving the solver's steps changes it or its derivatives: they "
+        "are not accurate enough to be reported. Tighten solver.rtol, or raise "
         "contact.smoothing_mm or solver.max_steps_per_period."
     )
     IDLE = (
@@ -56,12 +59,12 @@ class Status(enum.Enum):
         "constraints.area_efficiency_min, widen optimizer.bounds, or raise optimizer.screening."
     )
     INTERRUPTED = (
-        "The search was stopped before its end; what it had found by then is reported. Run it "
-        "again for the optimum."
+        "The search was stopped before its end; the best design found until then is reported. Run "
+        "the search again for the optimum."
     )
     SOLVER_FAILED = (
-        "The solver ran out of steps. Raise solver.max_steps_per_period (an explicit method takes "
-        "ten and more for each of statistics.swings_per_mesh_period), loosen solver.rtol, or use "
+        "The solver ran out of steps. Raise solver.max_steps_per_period (an explicit method needs "
+        "at least ten for each of statistics.swings_per_mesh_period), loosen solver.rtol, or use "
         "an implicit solver.method (kvaerno5)."
     )
     NON_FINITE = (
@@ -71,14 +74,14 @@ class Status(enum.Enum):
 
     @property
     def code(self) -> int:
-        """The number that stands for the status in arrays."""
+        """Number of the status in arrays."""
         return list(Status).index(self)
 
     @classmethod
     def of(cls, code: SupportsIndex) -> "Status":
         """Return the status with this `code`.
 
-        Raises ValueError for a number that is no code."""
+        Raises ValueError for a number that is not a code."""
         number = operator.index(code)
         if not 0 <= number < len(cls):
             raise ValueError(
@@ -88,10 +91,10 @@ class Status(enum.Enum):
 
     @property
     def usable(self) -> bool:
-        """Whether the numbers stand for a steady state with a gradient."""
+        """Whether the numbers describe a steady state with a gradient."""
         return self in (Status.PERIODIC, Status.AVERAGED)
 
     @property
     def label(self) -> str:
-        """The word used in result files and tables."""
+        """Name of the status in result files and tables."""
         return self.name.lower()

@@ -1,4 +1,4 @@
-"""Families of periodic orbits, followed along a parameter."""
+"""Continuation: families of periodic orbits, followed along a parameter."""
 
 from rootsopt.continuation.branch import Bifurcation as Bifurcation
 from rootsopt.continuation.branch import Branch as Branch

@@ -1,9 +1,11 @@
-"""A curve of solutions followed through its folds by pseudo-arclength.
+"""Follow a curve of solutions through its folds by pseudo-arclength continuation.
 
-n equations in n + 1 unknowns, the last of which is the parameter, have curves of solutions.
-From a point of one, the next is predicted along the tangent and brought back by Newton's
-method in the plane across it (Keller 1977), so that a fold, where the parameter turns back,
-is a point like any other. What the equations stand for is the caller's.
+n equations in n + 1 unknowns, the last of which is the parameter, have curves of solutions. From a
+point on a curve, the next one is predicted along the tangent. Newton's method in the plane normal
+to the tangent then corrects it (Keller 1977). So a fold, where the parameter turns back, is a point
+like any other. The caller gives the equations; this module does not know their meaning.
+
+One evaluation of the equations and their Jacobian is called a *look*.
 """
 
 import dataclasses
@@ -16,53 +18,54 @@ import numpy as np
 from numpy.typing import NDArray
 
 _TOLERANCE = 2e-11
-"""Residual of a point on the curve."""
+"""Residual up to which a point lies on the curve."""
 _NEAR = 1e-6
-"""Newton step from which on the equations are looked at in the same way again and again."""
+"""Newton step below which every look repeats the computation of the last one (`Look.memory`)."""
 _FARTHEST = 0.05
 """Longest Newton step."""
 _PATIENCE = 4
-"""Looks after which they are looked at with care."""
+"""Number of looks for one point after which looks are careful (see `SolutionCurve`)."""
 _MOST = 14
-"""Looks at the equations for one point."""
+"""Maximum number of looks for one point."""
 _TURN, _STRAIGHT = 0.9, 0.99
-"""Least cosine between the tangents of two successive points, and from which on the step grows."""
+"""Cosine between the tangents of two successive points: below the first a step is rejected, above
+the second the next step grows."""
 _ASTRAY = 0.5
-"""Greatest distance from prediction to point, in steps: what is farther is another curve."""
+"""Distance from prediction to point, in steps, above which the point lies on another curve."""
 _CORNER = 3e-5, 1e-4, 3e-4, 1e-3
-"""Distances at which the curve is looked for beyond a corner."""
+"""Distances at which the curve is searched for beyond a corner."""
 _SAME = 1e-6
-"""Distance within which two points are the same."""
+"""Distance below which two points are the same."""
 _CLOSING = 8
-"""Points after which the curve may come back to its first."""
+"""Number of points above which the curve may close at its first point."""
 
 
 CORNER = "CORNER"
-"""Name under which a corner of the curve stands among the crossings."""
+"""Name of a corner of the curve among the crossings of a `Path`."""
 
 
 class End(enum.Enum):
-    """Why a curve ends where it does; the value is the explanation given to the user."""
+    """Why a curve ends where it does. The value is the explanation for the user."""
 
-    START = "The branch was followed from here on, in one direction."
+    START = "The branch was started here and followed in one direction."
     RANGE_END = "The parameter reached the end of its range."
-    HALVED = "The orbit becomes one of half the period, where that doubles its period."
+    HALVED = "The branch ends where an orbit of half the period doubles its period."
     CLOSED = "The branch came back to its first point."
-    MAX_POINTS = "The branch has as many points as allowed. Raise `limits.points`."
+    MAX_POINTS = "The branch has reached the maximum number of points. Raise `limits.points`."
     STEP_TOO_SMALL = (
-        "Newton's method converges for no step longer than allowed: the orbits end here or change "
-        "too abruptly. Lower `limits.least`, or tighten solver.rtol."
+        "Newton's method does not converge, even for the smallest allowed step: the orbits end "
+        "here or change too abruptly. Lower `limits.least`, or tighten solver.rtol."
     )
     SOLVER_FAILED = "The solver ran out of steps. Raise solver.max_steps_per_period."
     NON_FINITE = "The motion, or its derivative, is not finite."
     LOST_MESH = "The lobes pass through each other beyond this point."
-    TOO_DEEP = "The flanks penetrate beyond the validity of a contact law beyond this point."
-    OFF_THE_MAP = "The motion leaves the contact map. Use solver.fidelity search."
+    TOO_DEEP = "Beyond this point, the flanks penetrate too deep for a contact law to be valid."
+    OFF_THE_MAP = "The motion leaves the contact map. Set solver.fidelity to search."
     NO_GEOMETRY = "No valid profile lies beyond this point."
 
 
 class StoppedError(Exception):
-    """A point cannot be had, for the reason `end`."""
+    """A point of the curve cannot be computed, for the reason `end`."""
 
     def __init__(self, end: End):
         super().__init__(end.value)
@@ -70,10 +73,12 @@ class StoppedError(Exception):
 
 
 class Look(NamedTuple):
-    """The equations at a place: `residual` (n,), `jacobian` (n, n + 1), and `data`.
+    """The equations evaluated at a place.
 
-    `memory`, given back to the curve, has it computed in exactly the same way (the steps of a
-    solver repeated, say), where the residual is a smooth function; None where it is one anyway.
+    `residual` (n,); `jacobian` (n, n + 1); `memory`: passed to the curve again, it makes the curve
+    repeat the same computation, such as the same solver steps. The residual is then a smooth
+    function. `memory` is None if the residual is smooth anyway. `data`: anything else the curve
+    returns.
     """
 
     residual: NDArray[np.float64]
@@ -83,13 +88,15 @@ class Look(NamedTuple):
 
 
 SolutionCurve = Callable[[NDArray[np.float64], Any, bool], Look]
-"""From a place (n + 1,), a memory or None, and whether to look with more care than usual, to a
-look; raises `StoppedError` where there is none."""
+"""Function that evaluates the equations: from a place (n + 1,), a memory or None, and whether to
+compute more carefully than usual, to a `Look`. It raises `StoppedError` where it has no result."""
 
 
 class Spot(NamedTuple):
-    """A point of the curve: `place` (n + 1,), unit `tangent` (n + 1,), the last `look`, and how
-    many looks it took."""
+    """A point of the curve.
+
+    `place` (n + 1,); `tangent` (n + 1,): unit vector; `look`: the last one; `looks`: their number.
+    """
 
     place: NDArray[np.float64]
     tangent: NDArray[np.float64]
@@ -99,8 +106,14 @@ class Spot(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class StepSizes:
-    """How far to follow: the parameter stays in `low` … `high`; `first`, `least` and `greatest`
-    step, in the length of the unknowns taken together; at most so many `points`."""
+    """Range and step sizes of a curve.
+
+    `low`, `high`: range of the parameter; `first`, `least`, `greatest`: steps, as Euclidean
+    distances of the unknowns; `points`: maximum number of points.
+
+    Raises ValueError if `low` is not less than `high`, if the steps are not positive and ascending,
+    or if `points` is less than 1.
+    """
 
     low: float
     high: float
@@ -125,7 +138,11 @@ class StepSizes:
 
 
 class Path(NamedTuple):
-    """Spots in order, those where a test vanishes as (index before, name, spot), and the end."""
+    """A followed curve.
+
+    `spots` in order; `crossings`: spots at which a test is zero or the curve has a corner, as
+    (index of the last spot before, name of the test, spot); `end`: why the curve ends.
+    """
 
     spots: list[Spot]
     crossings: list[tuple[int, str, Spot]]
@@ -138,8 +155,10 @@ def corrected(
     across: NDArray[np.float64],
     along: NDArray[np.float64],
 ) -> Spot:
-    """The point of the curve in the plane through `guess` normal to `across` (n + 1,), with the
-    tangent that points the way of `along`. Raises `StoppedError`."""
+    """Return the point of the curve in the plane through `guess` normal to `across` (n + 1,).
+
+    Its tangent points in the direction of `along` (n + 1,). Raises `StoppedError` if Newton's
+    method does not converge, or if the curve has no result."""
     place, memory, careful = guess, None, False
     last, grown = math.inf, 0
     for looks in range(1, _MOST + 1):
@@ -159,7 +178,7 @@ def corrected(
         if grown > 2:
             break
         last = size
-        if memory is not None and size > _NEAR:  # What is repeated has missed something.
+        if memory is not None and size > _NEAR:  # The repeated steps have missed something.
             memory, careful = None, True
         elif memory is None and size <= _NEAR:
             memory = look.memory
@@ -169,8 +188,7 @@ def corrected(
 
 
 def tangent(jacobian: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit vector (n + 1,) that `jacobian` (n, n + 1) takes to zero, pointing the way of
-    `along`."""
+    """Return the unit null vector (n + 1,) of `jacobian` (n, n + 1) in the direction of `along`."""
     found = np.linalg.svd(jacobian)[2][-1]
     return found if found @ along >= 0 else -found
 
@@ -181,10 +199,10 @@ def follow_curve(
     steps: StepSizes,
     tests: Mapping[str, Callable[[Spot], float]] | None = None,
 ) -> Path:
-    """The curve from `start` on, the way its tangent points, to a named end.
+    """Follow the curve from `start` in the direction of its tangent, and return the path.
 
     A step is halved until Newton's method converges and the tangent turns little. `tests`:
-    functions of a spot whose changes of sign are located.
+    functions of a spot, by name. Their zeros are located.
     """
     tests = tests or {}
     spots, crossings = [start], []
@@ -212,19 +230,21 @@ def follow_curve(
         spots.append(new)
         if _back_at_first(curve, spots):
             return Path(spots, crossings, End.CLOSED)
-        # Many looks are no reason to shrink: near a grazing touch every point takes as many.
+        # Many looks do not shrink the step: near a grazing contact every point needs as many.
         if new.tangent @ old.tangent > _STRAIGHT:
             step = min(1.5 * step, steps.greatest)
 
 
 def _leaves(spot: Spot, steps: StepSizes) -> bool:
-    """Whether the curve leaves the range here."""
+    """Return whether the curve leaves the range here."""
     value, way = float(spot.place[-1]), float(spot.tangent[-1])
     return (value <= steps.low and way < 0) or (value >= steps.high and way > 0)
 
 
 def _next(curve: SolutionCurve, old: Spot, step: float, steps: StepSizes) -> Spot:
-    """The spot after `old`, on the edge of the range at the farthest."""
+    """Return the spot after `old`, at most at the end of the range.
+
+    Raises `StoppedError` if there is none, or if it may lie on another curve."""
     new = None
     guess = old.place + step * old.tangent
     if steps.low <= guess[-1] <= steps.high:
@@ -239,16 +259,17 @@ def _next(curve: SolutionCurve, old: Spot, step: float, steps: StepSizes) -> Spo
         new.place[-1] = bound
     assert new is not None
     far = np.linalg.norm(new.place - guess) > _ASTRAY * step
-    # Along one curve the orientation changes nowhere but where another one crosses it.
+    # Along one curve the orientation changes only where another curve crosses it.
     if far or new.tangent @ old.tangent < _TURN or _orientation(new) != _orientation(old):
         raise StoppedError(End.STEP_TOO_SMALL)
     return new
 
 
 def _around_corner(curve: SolutionCurve, old: Spot, steps: StepSizes) -> Spot | None:
-    """A spot close to `old`, where the curve turns too sharply for a step to follow.
+    """Return a spot close to `old` beyond a corner too sharp for a step to follow, or None.
 
-    It lies ahead, not behind, if the tangent there, with the orientation kept, points away.
+    It must lie ahead of `old`, not behind. It does if the tangent there, with the same orientation,
+    points away from `old`.
     """
     for size in _CORNER:
         for across in np.vstack([np.eye(len(old.place)), -np.eye(len(old.place))]):
@@ -271,7 +292,7 @@ def _orientation(spot: Spot) -> float:
 
 
 def _back_at_first(curve: SolutionCurve, spots: list[Spot]) -> bool:
-    """Whether the first spot lies on the last step."""
+    """Return whether the first spot lies on the last step."""
     first, old, new = spots[0], spots[-2], spots[-1]
     chord = new.place - old.place
     share = (first.place - old.place) @ chord / (chord @ chord)
@@ -287,7 +308,7 @@ def _back_at_first(curve: SolutionCurve, spots: list[Spot]) -> bool:
 
 
 def _located(curve: SolutionCurve, old: Spot, new: Spot, test: Callable[[Spot], float]) -> Spot:
-    """The spot between two where `test` vanishes, by the Illinois variant of regula falsi."""
+    """Return the spot between two at which `test` is zero, by regula falsi (Illinois variant)."""
     chord = new.place - old.place
     across = chord / np.linalg.norm(chord)
     low, high = 0.0, 1.0

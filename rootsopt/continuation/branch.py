@@ -1,8 +1,8 @@
-"""Periodic orbits followed over a parameter, through folds, with their stability.
+"""Follow periodic orbits along a parameter, through folds, with their stability.
 
-A branch begins at an orbit found before (`Evaluation.state` and its period) and is followed
-by pseudo-arclength (`arclength`), as a curve of the equations in `orbits`.
-Unstable orbits, which no simulation shows, are followed like stable ones, and flagged.
+A branch begins at a known orbit (`Evaluation.state` and its period). It is a solution curve of the
+equations in `orbits`, followed by pseudo-arclength continuation (`arclength`). Unstable orbits,
+which a simulation does not show, are followed like stable ones, and flagged.
 """
 
 import dataclasses
@@ -36,25 +36,28 @@ from rootsopt.dynamics.verdict import RESIDUAL
 from rootsopt.errors import InputError
 
 _HALVED = 0.004
-"""Distance (as `StepSizes` counts) from the state half an orbit later, where a branch that ends for
-no other reason is about to meet one of half the period."""
+"""Distance (in the unit of `StepSizes`) from the state half an orbit later, below which a branch
+that ends for no other reason counts as HALVED."""
 _SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
-"""Distances from a bifurcation (as `StepSizes` counts) at which its doubled orbit is sought."""
+"""Distances (in the unit of `StepSizes`) from a period doubling at which the doubled orbit is
+searched for."""
 
 
 class Kind(enum.Enum):
-    """What happens to an orbit at a bifurcation."""
+    """Kinds of bifurcations. The value says what happens to the orbit."""
 
     FOLD = "Two orbits meet and vanish; a multiplier passes through +1."
     PERIOD_DOUBLING = "An orbit of twice the period is born; a multiplier passes through -1."
     NEIMARK_SACKER = "Quasi-periodic motion is born; two multipliers leave the unit circle."
-    CORNER = "A touch of the flanks or of the gear begins or ends; multipliers jump."
+    CORNER = "A contact of the flanks or of the gear begins or ends; multipliers jump."
 
 
 @dataclasses.dataclass(frozen=True)
 class Bifurcation:
-    """Where a branch changes: the orbit there, what it is, and the index of the branch's last
-    point before it."""
+    """A bifurcation of a branch.
+
+    `kind`; `point`: the orbit there; `after`: index of the branch's last point before it.
+    """
 
     kind: Kind
     point: BranchPoint
@@ -62,16 +65,17 @@ class Bifurcation:
 
     @property
     def value(self) -> float:
-        """The parameter there (config's unit)."""
+        """Value of the parameter at the bifurcation (config's unit)."""
         return self.point.value
 
 
 @dataclasses.dataclass(frozen=True)
 class Branch:
-    """Orbits of one period along `parameter`, in order; why they begin and end where they do.
+    """Orbits of one period along a parameter.
 
-    `config` is the one it was started with, `limits` (in the config's unit) those it was
-    followed within.
+    `config`: that of the start; `parameter`: its name; `period` (mesh periods); `points`: the
+    orbits, in order; `bifurcations`; `ends`: why the branch begins and ends where it does;
+    `limits`: range and steps (in the config's unit).
     """
 
     config: Config
@@ -83,8 +87,9 @@ class Branch:
     limits: StepSizes
 
     def at(self, value: float) -> list[BranchPoint]:
-        """All orbits of the branch at a value of the parameter, closed there; none where it
-        does not come by."""
+        """Return all orbits of the branch at a value of the parameter, each closed there.
+
+        The list is empty if the branch does not pass this value."""
         orbits = Orbits(self.config, self.parameter, self.period, self.limits)
         found = []
         for old, new in zip(self.points[:-1], self.points[1:], strict=True):
@@ -111,14 +116,14 @@ def follow(
     limits: StepSizes,
     ways: tuple[int, ...] = (-1, 1),
 ) -> Branch:
-    """Follow the orbit of `period` mesh periods near the scaled `state` over a parameter.
+    """Follow the orbit of `period` mesh periods near the scaled `state` (n,) along a parameter.
 
-    `limits`: range of the parameter in the config's unit, the config's own value within, and
-    steps, of which one of length 1 spans the range, or changes the scaled state by `SPAN`.
-    `ways`: first along falling (-1) and then rising (1) values, or one of these.
+    `limits`: range of the parameter in the config's unit, which must contain the config's own
+    value; and step sizes. A step of length 1 spans the range, or changes the scaled state by
+    `SPAN`. `ways`: first along falling (-1) and then along rising (1) values, or only one of these.
 
-    Raises `InputError` for an unknown parameter, a value outside the limits, single precision,
-    or where there is no orbit to start from.
+    Raises `InputError` for an unknown parameter, a value outside the limits, single precision, or a
+    wrong `period` or `ways`; also if there is no orbit to start from.
     """
     value = value_of(config, parameter)
     if not limits.low <= value <= limits.high:
@@ -128,7 +133,7 @@ def follow(
         )
     if not 1 <= period <= LONGEST or not set(ways) <= {-1, 1} or not ways:
         raise InputError(
-            f"Arguments `period` and `ways` must be 1 to {LONGEST} and among -1 and 1, but are "
+            f"Argument `period` must be 1 to {LONGEST}, and `ways` -1, 1 or both, but they are "
             f"{period} and {ways}"
         )
     for bound in (limits.low, limits.high):
@@ -140,8 +145,9 @@ def follow(
         start = corrected(orbits, place, fixed, fixed)
     except StoppedError as stop:
         raise InputError(
-            f"no orbit of {period} mesh periods is near the state at `{place_of(parameter)}` = "
-            f"{value:g}: {stop.end.value} Start from the state of a periodic Evaluation"
+            f"there is no orbit of {period} mesh periods near the state at "
+            f"`{place_of(parameter)}` = {value:g}: {stop.end.value} Start from the state of a "
+            "periodic Evaluation"
         ) from None
     branches = []
     for way in ways:
@@ -155,11 +161,13 @@ def follow(
 def follow_doubled(
     branch: Branch, bifurcation: Bifurcation, limits: StepSizes | None = None
 ) -> Branch | None:
-    """The branch of twice the period born at a period doubling of `branch`, from there on.
+    """Follow the branch of twice the period that is born at a period doubling of `branch`.
 
-    It begins a little away from the bifurcation, displaced along the eigenvector of the
-    multiplier -1. None where no orbit is found that is not the simple one, or where it is longer
-    than 8 mesh periods. Raises `ValueError` for another kind of bifurcation.
+    It begins a little away from the bifurcation, displaced along the eigenvector of the multiplier
+    -1. `limits`: by default those of `branch`. The result is None if only the orbit of single
+    period is found, or if twice the period exceeds 8 mesh periods.
+
+    Raises `ValueError` for another kind of bifurcation.
     """
     if bifurcation.kind is not Kind.PERIOD_DOUBLING:
         raise ValueError(
@@ -180,7 +188,8 @@ def follow_doubled(
         across = np.append(flipped / np.linalg.norm(flipped), 0.0)
     except StoppedError:
         return None
-    # Both ways lead to the one orbit, a mesh period apart: near a grazing touch one may fail.
+    # Both directions lead to the same orbit, shifted by `branch.period`. Near a grazing contact one
+    # of them may fail.
     for size, way in itertools.product(_SIZES, (1, -1)):
         aside = way * across
         try:
@@ -193,7 +202,7 @@ def follow_doubled(
 
 
 def _branch(orbits: Orbits, path: Path) -> Branch:
-    """The branch of a path."""
+    """Return the branch of a path."""
     end = path.end
     if end is End.STEP_TOO_SMALL and orbits.period % 2 == 0:
         half_way = path.spots[-1].look.data.half_way
@@ -201,7 +210,7 @@ def _branch(orbits: Orbits, path: Path) -> Branch:
     bifurcations = []
     for after, name, spot in path.crossings:
         kind, point = Kind[name], orbits.point(spot)
-        # Two real multipliers whose product is one make a neutral saddle.
+        # Two real multipliers with product 1 are a neutral saddle, no bifurcation.
         real = np.all(np.abs(point.multipliers.imag) < 1e-9)
         if kind is not Kind.NEIMARK_SACKER or not real:
             bifurcations.append(Bifurcation(kind, point, after))
@@ -217,7 +226,7 @@ def _branch(orbits: Orbits, path: Path) -> Branch:
 
 
 def _joined(falling: Branch, rising: Branch) -> Branch:
-    """One branch of two that begin at the same point, the first reversed."""
+    """Join two branches that begin at the same point, the first reversed."""
     count = len(falling.points) - 1
     points = tuple(
         dataclasses.replace(point, slope=-point.slope) for point in falling.points[:0:-1]

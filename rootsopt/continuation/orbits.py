@@ -1,8 +1,8 @@
-"""Periodic orbits as the zeros of equations in a state and a parameter.
+"""Periodic orbits as the solutions of equations in a state and a parameter.
 
-The unknowns are the state at φ1 = 0, in units that stay those of the first config, and the
-parameter; the equations say that the state comes back after k mesh periods, and their derivatives
-come with the motion, from its linearised steps. `rootsopt.continuation.branch` follows the curves.
+The unknowns are the state at φ1 = 0, always in the units of the first config, and the parameter.
+The equations require that the state returns after k mesh periods. Their derivatives come from the
+linearised steps of the motion. `rootsopt.continuation.branch` follows the curves.
 """
 
 import dataclasses
@@ -43,34 +43,33 @@ PLACES = {
     "backlash_mm": "scene.timing_gear.backlash_mm",
     "damping_ratio": "scene.timing_gear.damping_ratio",
 }
-"""Parameters that can be followed, in the config's units, and where they stand there, beside the
-design parameters, which are in `profile`."""
+"""Scene parameters that can be followed, in the config's units, and their config keys. Design
+parameters can be followed too; their keys are in `profile`."""
 _GEAR = ("backlash_mm", "damping_ratio")
 SPAN = 20.0
 """Change of the scaled state that counts as much as the whole range of the parameter."""
 _LOOKS = 504
-"""Uniform times at which contact is looked for."""
+"""Number of uniform times of an orbit at which contact is checked."""
 LONGEST = 8
 """Longest orbit (mesh periods)."""
 _STEP = 1 / 256
-"""Steps (mesh periods) are not much longer than this."""
+"""Target for the longest step (mesh periods). Steps may be slightly longer."""
 _SAME = 1e-5
-"""Distance (as `StepSizes` counts) from the state half an orbit later below which an orbit is of
-half the period (states between steps are interpolated)."""
+"""Distance (in the unit of `StepSizes`) from the state half an orbit later, below which an orbit is
+one of half the period. States between steps are interpolated, so it is not zero."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BranchPoint:
     """One periodic orbit.
 
-    `value` of the parameter (config's unit); `state` (n,) at φ1 = 0, scaled as the config with
-    that value scales it, so that an `Evaluator` can start there; `period` (mesh periods);
-    `mean`, `peak`, `rms` of the contact force (N); `multipliers` (n,): Floquet multipliers;
-    `residual`: greatest entry of Φ(z) - z, relative to that of z where this exceeds one;
-    `slope`: change of the parameter along the branch, as a share of its range and of arclength;
-    `gap_time`: longest time (mesh periods) in which neither flanks nor gear touch;
-    `depth`: greatest penetration (m); `reach`: greatest |ε| (rad); `looks`: integrations it
-    took.
+    `value` of the parameter (config's unit); `state` (n,) at φ1 = 0, scaled for the config with
+    that value, so that an `Evaluator` can start there; `period` (mesh periods); `mean`, `peak`,
+    `rms` of the contact force (N); `multipliers` (n,): Floquet multipliers; `residual`: greatest
+    entry of |Φ(z) - z|, relative to that of |z| if this exceeds one; `slope`: derivative of the
+    parameter, as a fraction of its range, with respect to arclength; `gap_time`: longest time (mesh
+    periods) in which neither flanks nor gear touch; `depth`: greatest penetration (m); `reach`:
+    greatest |ε| (rad); `looks`: number of integrations.
     """
 
     value: float
@@ -94,7 +93,7 @@ class BranchPoint:
 
 
 def parameters(config: Config) -> tuple[str, ...]:
-    """Names of the parameters that can be followed for `config`."""
+    """Return the names of the parameters that can be followed for `config`."""
     gear = _GEAR if config.scene.timing_gear is not None else ()
     gas = config.scene.load.pressure_difference_Pa is not None
     load = "pressure_difference_Pa" if gas else "torque_N_m"
@@ -102,7 +101,8 @@ def parameters(config: Config) -> tuple[str, ...]:
 
 
 def value_of(config: Config, parameter: str) -> float:
-    """Value of a parameter, in the config's unit. Raises `InputError` for an unknown one."""
+    """Return the value of a parameter, in the config's unit. Raises `InputError` for an unknown
+    parameter."""
     _check(config, parameter)
     keys = design_keys(config)
     if parameter in keys:
@@ -114,13 +114,14 @@ def value_of(config: Config, parameter: str) -> float:
 
 
 def place_of(parameter: str) -> str:
-    """Where a parameter stands in a config."""
+    """Return the config key of a parameter."""
     return PLACES.get(parameter, f"profile.{parameter}")
 
 
 def with_value(config: Config, parameter: str, value: float) -> Config:
-    """`config` with another value of a parameter. Raises `InputError` for an unknown
-    parameter, and for a value that is out of bounds."""
+    """Return `config` with another value of a parameter.
+
+    Raises `InputError` for an unknown parameter or a value out of bounds."""
     _check(config, parameter)
     if parameter in design_keys(config):
         return parse(_with_design(config, parameter, value).to_yaml())
@@ -128,7 +129,7 @@ def with_value(config: Config, parameter: str, value: float) -> Config:
 
 
 def _with_design(config: Config, parameter: str, value: float) -> Config:
-    """`config` with another value of a design parameter, of which nothing is checked."""
+    """Return `config` with another value of a design parameter, without any check."""
     design = np.asarray(design_vector(config)).copy()
     design[design_keys(config).index(parameter)] = value
     profile = families.with_design(config.profile, design)
@@ -147,9 +148,12 @@ def _check(config: Config, parameter: str) -> None:
 
 
 class _Shot(NamedTuple):
-    """k mesh periods from a state: `out`, its steps `grid` with ends where the equation is not
-    smooth, whether the mesh was lost, whether there is contact at uniform
-    times, and the `scale` (rad) of the config."""
+    """k mesh periods from a state.
+
+    `out`: the flow; `grid`: its steps, with ends added where the equation is not smooth; `lost`:
+    whether the mesh was lost; `touching`: whether there is contact, at uniform times; `scale`
+    (rad): angle scale of the config.
+    """
 
     out: Flow
     grid: Float[Array, " steps"]
@@ -159,7 +163,11 @@ class _Shot(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """What is known of an orbit at a look, beside residual and Jacobian."""
+    """Data of an orbit at a look, in addition to residual and Jacobian.
+
+    `statistics`: mean, peak and RMS force (N); `half_way`: distance (in the unit of `StepSizes`)
+    from the state half an orbit later; the others: see `BranchPoint`.
+    """
 
     monodromy: NDArray[np.float64]
     state: NDArray[np.float64]
@@ -172,7 +180,13 @@ class _Seen(NamedTuple):
 
 
 class Orbits:
-    """Orbits of k mesh periods as a curve: places are (state / `SPAN`, share of the range)."""
+    """Orbits of k mesh periods as a `SolutionCurve`.
+
+    A place (n + 1,) is the scaled state divided by `SPAN`, then the parameter as a fraction of its
+    range.
+
+    Raises `InputError` for single precision.
+    """
 
     def __init__(self, config: Config, parameter: str, period: int, limits: StepSizes):
         if config.solver.precision != "float64":
@@ -188,16 +202,16 @@ class Orbits:
         self.integrator = integrators(config)[1]
         self.width = limits.high - limits.low
         self.steps = dataclasses.replace(limits, low=0.0, high=1.0)
-        # Built once for its units: they stay those of the config while the parameter changes.
+        # The unit of ε is that of the first config, while the parameter changes.
         self.unit = float(_unit(self.scene, self.names, self.values))
 
     def value(self, place: NDArray[np.float64]) -> float:
-        """The parameter at a place, in the config's unit; exact at both ends of the range."""
+        """Return the parameter at a place (config's unit), exact at both ends of the range."""
         share = place[-1]
         return float(self.limits.high if share == 1 else self.limits.low + share * self.width)
 
     def place(self, state: ArrayLike, value: float) -> NDArray[np.float64]:
-        """Place of an orbit, from its state scaled as the config with that `value` scales it."""
+        """Return the place of an orbit, from its state as scaled for the config with `value`."""
         scale = float(_unit(self.scene, self.names, self._values(value)))
         share = (value - self.limits.low) / self.width
         return np.append(np.asarray(state) * (scale / self.unit / SPAN), share)
@@ -208,7 +222,9 @@ class Orbits:
         return values
 
     def closed(self, guess: NDArray[np.float64]) -> BranchPoint:
-        """The orbit near `guess` at its value of the parameter. Raises `StoppedError`."""
+        """Return the orbit near the place `guess`, at the same value of the parameter.
+
+        Raises `StoppedError` if there is none."""
         fixed = np.eye(len(guess))[-1]
         return self.point(corrected(self, guess, fixed, fixed))
 
@@ -216,7 +232,7 @@ class Orbits:
         self._check_design(self.value(place))
         shot = self._shot(place, memory, refine=memory is None)
         if careful and memory is None:
-            # Once more, on steps short enough to see the touches that those chosen step over.
+            # Integrate again, on steps short enough to see contacts that the chosen steps skip.
             shot = self._shot(place, shot.grid, refine=True)
         out: Flow = shot.out
         reach = self.unit * float(np.max(np.abs(out.states[:, 0])))
@@ -276,7 +292,7 @@ class Orbits:
                 raise StoppedError(End.NO_GEOMETRY) from None
 
     def point(self, spot: Spot) -> BranchPoint:
-        """The orbit at a spot."""
+        """Return the orbit at a spot."""
         seen: _Seen = spot.look.data
         mean, peak, rms = map(float, seen.statistics)
         return BranchPoint(
@@ -297,7 +313,7 @@ class Orbits:
 
 
 def _longest_gap(touching: NDArray[np.bool_]) -> float:
-    """Longest run of False around a cycle, as a share of it."""
+    """Return the longest run of False around a cycle, as a fraction of the cycle."""
     if not touching.any():
         return 1.0
     ends = np.flatnonzero(touching)
@@ -308,7 +324,7 @@ def _longest_gap(touching: NDArray[np.bool_]) -> float:
 def _build(
     scene: Scene, names: tuple[str, ...], values: Float[Array, " p"]
 ) -> tuple[RotorPair, Float[Array, ""]]:
-    """The pair with these values of the parameters (config's units), and its angle scale."""
+    """Return the pair with these parameter values (config's units), and its angle scale (rad)."""
     at = dict(zip(names, values, strict=True))
     gear = scene.gear
     if gear is not None:
@@ -333,7 +349,7 @@ def _unit(scene, names, values):
 
 
 @Program
-def _shoot(  # Eleven parameters: a compiled program is called with its arrays alone.
+def _shoot(  # Eleven parameters, since a compiled program takes its arrays one by one.
     scene: Scene,
     names: tuple[str, ...],
     values: Float[Array, " p"],
@@ -346,10 +362,11 @@ def _shoot(  # Eleven parameters: a compiled program is called with its arrays a
     repeat: Bool[Array, ""],
     refine: Bool[Array, ""],
 ) -> _Shot:
-    """Motion from a state in the fixed `unit` (rad), linearised in it and along `direction`.
+    """Integrate from a `state` in the fixed `unit` (rad), with derivatives.
 
-    On the steps of `grid` while `repeat`. With `refine` the grid returned has ends added where
-    the equation is not smooth.
+    These are with respect to the state and along `direction` (p,) of the parameters. If `repeat`,
+    the steps are those of `grid`. If `refine`, the returned grid has step ends added where the
+    equation is not smooth, and in long steps.
     """
 
     def build(values):
@@ -383,10 +400,10 @@ def _shoot(  # Eleven parameters: a compiled program is called with its arrays a
 
 
 def _without_long(grid: Float[Array, " steps"], period: Float[Array, ""]) -> Float[Array, " steps"]:
-    """`grid` with ends added in steps much longer than `_STEP`.
+    """Return `grid` with ends added in steps much longer than `_STEP`.
 
-    In free flight the error control takes steps so long that a short touch goes unseen, or not:
-    then the flow would jump from one state to the next.
+    In free flight, the error control takes steps so long that a short contact may or may not be
+    seen. The flow would then jump between neighbouring states.
     """
     ends = _STEP * jnp.arange(1, LONGEST / _STEP)
     after = jnp.searchsorted(grid, ends)

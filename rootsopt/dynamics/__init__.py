@@ -1,1 +1,1 @@
-"""The motion of a rotor pair: equation, integration, orbits and their derivatives."""
+"""Motion of a rotor pair: equation, integration, orbits and their derivatives."""

@@ -18,11 +18,14 @@ from rootsopt.dynamics.saltation import MARKS, marks, saltation
 from rootsopt.dynamics.tangent import Linear, linearized, one_step, propagated
 
 _SHORTEST = 1e-9
-"""Least time (mesh periods) between the beginning of a step and a peak inside it."""
+"""Minimum time (mesh periods) between the start of a step and a peak inside it."""
 
 
 class Strobe(NamedTuple):
-    """States at the end of successive mesh periods, and how the solver fared."""
+    """Scaled states at the end of successive mesh periods.
+
+    `states` (periods, n); `steps`: number of solver steps; `solved`: whether the solver succeeded.
+    """
 
     states: Float[Array, "periods n"]
     steps: Int[Array, ""]
@@ -30,17 +33,17 @@ class Strobe(NamedTuple):
 
 
 class Flow(NamedTuple):
-    """One stretch of motion over `periods` mesh periods.
+    """A stretch of motion over whole mesh periods, with scaled states.
 
-    `end`: final state; `mean`, `mean_square`, `peak` of the contact force (N, N², N);
-    `peak_time` (mesh periods); `depth`: greatest penetration (m; negative: least gap)
-    at the sampled times; `states` at uniform times, endpoint excluded; `grid`: ends
-    of the steps taken (mesh periods), inf beyond the last, and `corners` the states there; `steps`:
-    accepted and rejected solver steps; `solved`; `strain`: greatest error estimate of a repeated
-    step, in tolerances (0 where the contact is not `RotorPair.smooth`); `others`: the values of
-    `Measures` beside mean and mean square.
-    `slope`: derivatives of (end, mean, mean_square, peak, others) in the initial state (n columns)
-    and along the directions that were asked for (d more), or no columns at all.
+    `end`: final state; `mean` (N), `mean_square` (N²), `peak` (N) of the contact force;
+    `peak_time` (mesh periods); `depth`: greatest penetration at the sampled times (m; negative:
+    least gap); `states` at uniform times, without the end; `grid`: ends of the steps (mesh
+    periods), inf beyond the last; `corners`: states at these ends; `steps`: number of accepted and
+    rejected solver steps; `solved`: whether the solver succeeded; `strain`: greatest error estimate
+    of a repeated step, in tolerances (0 if the pair is not `smooth`); `others`: values of
+    `Measures` after mean and mean square; `slope`: derivatives of (`end`, `mean`, `mean_square`,
+    `peak`, `others`). Its columns are the n entries of the initial state and the d requested
+    directions, or there are none.
     """
 
     end: Float[Array, " n"]
@@ -62,7 +65,10 @@ class Flow(NamedTuple):
     def empty(
         cls, count: int, directions: int, samples: int, steps: int, measures: Measures, dtype: Any
     ) -> "Flow":
-        """A flow of `count` = n states that has not been integrated yet."""
+        """Return a flow that has not been integrated yet.
+
+        `count`: number n of states; `directions`: number d of parameter directions; `samples`:
+        number of uniform samples; `steps`: maximum number of solver steps."""
         nothing = jnp.zeros((), dtype)
         return cls(
             end=jnp.zeros(count, dtype),
@@ -83,17 +89,17 @@ class Flow(NamedTuple):
 
     @property
     def response(self) -> Float[Array, " r"]:
-        """(mean, mean square, peak, others) of the contact force."""
+        """Mean (N), mean square (N²), peak (N) and other measures of the contact force."""
         return jnp.append(jnp.stack([self.mean, self.mean_square, self.peak]), self.others)
 
 
 def strobe(
     pair: RotorPair, state: Float[Array, " n"], periods: int, integrator: Integrator
 ) -> Strobe:
-    """Integrate the bare states over `periods` mesh periods, from φ1 = 0.
+    """Integrate the scaled `state` (n,) alone over `periods` mesh periods, from φ1 = 0.
 
-    Steps land on the period ends: interpolated states would carry an error far above
-    the tolerance and hide that the motion repeats.
+    Steps end exactly at the end of each mesh period. Interpolated states would have an error far
+    above the tolerance, which could hide that the motion repeats.
     """
     number = state.dtype.type
     first, control = first_step(pair, state.dtype), integrator.controller(state.dtype, pair=pair)
@@ -126,10 +132,14 @@ def strobe(
 
 
 class _Equation(eqx.Module):
-    """The equation of motion together with the integrals of `measures`, in units of the solver.
+    """The equation of motion together with the integrals of the measures, in the solver's units.
 
-    y: the state (n,), the integrals, and the time where the speed of rotor 1 is a state. Functions
-    take the pair's numbers (`dynamic`) apart, as they are differentiated with respect to them.
+    The unknown y holds the state (n,), then the integrals, then the time if rotor 1 is free.
+    Methods take the numbers of the pair (`dynamic`) as an argument, to be differentiated with
+    respect to them.
+
+    `static`: the rest of the pair; `measures`; `force_unit` (N); `top`: roughly the greatest force,
+    in `force_unit`; `states`: their number n; `solver`: the method of integration.
     """
 
     static: Any = eqx.field(static=True)
@@ -140,21 +150,21 @@ class _Equation(eqx.Module):
     solver: diffrax.AbstractSolver
 
     def start(self, state: Float[Array, " n"], free: bool) -> Float[Array, " m"]:
-        """y at the start."""
+        """Return y at the start."""
         return jnp.pad(state, (0, self.measures.count + free))
 
     def derivative(self, tau, y, dynamic, marked: bool = False) -> Float[Array, " m"]:
-        """dy/dτ; with the marks of jumps of the force behind it if `marked`."""
+        """Return dy/dτ, followed by the `marks` of the contact if `marked`."""
         pair = eqx.combine(dynamic, self.static)
         slope, contact = pair.derivative(tau, y[: self.states])
         rates = self.measures.rates(tau, contact.total / self.force_unit, self.top)
         if pair.free:
-            # Averages are over time, which passes unevenly.
+            # Averages are over time, which is not proportional to rotation here.
             rates = pair.lapse(y[: self.states]) * jnp.append(rates, jnp.ones_like(self.force_unit))
         return jnp.concatenate([slope, rates, *([marks(contact)] if marked else [])])
 
     def advanced(self, begin, end, y, dynamic) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """y after one step, and its slope there; both depend on the instants of jumps."""
+        """Return y and its slope after one step, with derivatives that include moving jumps."""
         pair = eqx.combine(dynamic, self.static)
         term = diffrax.ODETerm(functools.partial(self.derivative, marked=pair.jumps))
         if not pair.jumps:
@@ -167,7 +177,7 @@ class _Equation(eqx.Module):
         return after[:-MARKS] + moved, slopes[-1, :-MARKS]
 
     def with_force(self, begin, end, y, dynamic) -> Float[Array, " rows"]:
-        """y after one step, and the contact force there (in units of the solver)."""
+        """Return y after one step, followed by the contact force there (in `force_unit`)."""
         after, slope = self.advanced(begin, end, y, dynamic)
         free = eqx.combine(dynamic, self.static).free
         force = slope[self.states]
@@ -175,8 +185,11 @@ class _Equation(eqx.Module):
 
 
 class _Recorded(NamedTuple):
-    """The steps of a solver: their ends as `Flow.grid`, y before and after each, y at the `end`,
-    the place of the `last`; sampled `states`; `strain`, count of `steps` and `solved` as `Flow`."""
+    """The steps that a solver has taken.
+
+    `before`, `after`: y before and after each step; `end`: y at the end; `last`: index of the last
+    step; `grid`, `states`, `strain`, `steps`, `solved`: as in `Flow`.
+    """
 
     grid: Float[Array, " steps"]
     before: Float[Array, "steps m"]
@@ -190,13 +203,16 @@ class _Recorded(NamedTuple):
 
     @property
     def begins(self) -> Float[Array, " steps"]:
-        """Times (mesh periods) at which the steps begin."""
+        """Start of each step (mesh periods)."""
         return jnp.concatenate([jnp.zeros_like(self.grid[:1]), self.grid[:-1]])
 
 
 class _Peak(NamedTuple):
-    """The instant of the peak: the step that `holds` it, its `time` (mesh periods), the instants
-    `beside` it (mesh periods later), and the rounding of forces there (`noise`, relative)."""
+    """The instant of the peak force.
+
+    `holds`: index of the step that contains it; `time` (mesh periods); `beside`: times relative to
+    it (mesh periods) at which the force is evaluated; `noise`: relative rounding of the force.
+    """
 
     holds: Int[Array, ""]
     time: Float[Array, ""]
@@ -204,7 +220,7 @@ class _Peak(NamedTuple):
     noise: Float[Array, ""]
 
 
-def flow(  # Eleven parameters: each of the three uses (search, repetition, reverse) needs its own.
+def flow(  # Eleven parameters: adaptive steps, repeated steps and reverse mode need different ones.
     pair: RotorPair,
     state: Float[Array, " n"],
     periods: Float[Array, ""],
@@ -217,15 +233,18 @@ def flow(  # Eleven parameters: each of the three uses (search, repetition, reve
     measures: Measures | None = None,
     top: Float[Array, ""] | None = None,
 ) -> Flow:
-    """Integrate over `periods` (traced) mesh periods with the force statistics.
+    """Integrate over `periods` mesh periods (may be traced), with statistics of the force.
 
-    Mean, mean square and what else `measures` names are integrated along with the motion, under
-    the same error control; `top` (N) is about the greatest force, for the p-norm. The peak is
-    located between `samples` uniform ones. With `tangents` (directions of the pair's parameters,
-    stacked along a leading axis; there may be none) every step is linearised, which gives `slope`.
-    Where the contact may jump, that includes the moving instant of a jump, and an `adjoint` only
-    says that the mode is reverse.
-    With `grid` the steps recorded there are repeated (while `repeat`), else they are chosen anew.
+    `state` (n,): scaled state at φ1 = 0; `measures`: further averages of the force, integrated
+    under the same error control as the motion; `top` (N): roughly the greatest force, for the
+    p-norm; `samples`: number of uniform samples, between which the peak is located.
+
+    `tangents`: directions of the pair's parameters, stacked along a leading axis (there may be
+    none). With them, every step is linearised, which gives `slope`. The derivatives include the
+    moving instants of contact jumps. `adjoint`: for reverse mode instead. Where the contact may
+    jump, it only selects reverse mode, and the steps themselves are differentiated.
+
+    `grid`: steps to repeat if `repeat`; otherwise steps are chosen adaptively.
     """
     count, dtype = state.shape[0], state.dtype
     measures = Measures() if measures is None else measures
@@ -241,15 +260,15 @@ def flow(  # Eleven parameters: each of the three uses (search, repetition, reve
         ends=ends,
         repeat=jnp.asarray(False if grid is None else repeat),
     )
-    # An adjoint of the solver knows nothing of jumps: then the steps are what is differentiated.
+    # The solver's adjoint ignores jumps. Where the contact may jump, differentiate the steps.
     retraced = pair.jumps and adjoint is not None
     mode = diffrax.ForwardMode() if adjoint is None or retraced else adjoint
     given = lax.stop_gradient((dynamic, start)) if retraced else (dynamic, start)
     taken = _solved(equation, *given, periods, control, integrator.max_steps, samples, mode)
     if retraced:
         taken = _retraced(equation, taken, start, dynamic)
-    # The step that holds the peak is taken once more, as far as the peak, and from there on short
-    # steps to both sides.
+    # The step that contains the peak is repeated up to the peak. Short steps from there give the
+    # force on both sides.
     steps = lax.stop_gradient(
         Steps(
             taken.begins,
@@ -316,7 +335,7 @@ def _solved(
     def whole(share, y, dynamic):
         return periods * equation.derivative(share * periods, y, dynamic)
 
-    # Over the unit interval: limits known when it is traced make a smaller program.
+    # Over the unit interval, since limits known at tracing give a smaller program.
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(whole),
         equation.solver,
@@ -361,7 +380,7 @@ def _solved(
 def _retraced(
     equation: _Equation, taken: _Recorded, start: Float[Array, " m"], dynamic: Any
 ) -> _Recorded:
-    """Take the recorded steps once more, such that reverse mode sees the instants of jumps."""
+    """Repeat the recorded steps, so that reverse mode includes the moving instants of jumps."""
 
     @jax.checkpoint
     def again(y, step):
@@ -378,7 +397,7 @@ def _retraced(
 def _peak_force(
     equation: _Equation, taken: _Recorded, peak: _Peak, dynamic: Any
 ) -> Float[Array, ""]:
-    """The peak force in units of the solver, differentiable in reverse mode."""
+    """Return the peak force (in `force_unit`), differentiable in reverse mode."""
     begin, y = taken.begins[peak.holds], taken.before[peak.holds]
     there = equation.with_force(begin, peak.time, y, dynamic)[:-1]
 
@@ -394,9 +413,9 @@ def _peak_force(
 def _linearized(
     equation: _Equation, taken: _Recorded, peak: _Peak, dynamic: Any, moved: Any
 ) -> tuple[Float[Array, "m columns"], Float[Array, ""], Float[Array, " columns"]]:
-    """Derivatives of y at the end, the peak force (in units of the solver) and its derivatives.
+    """Return the derivatives of y at the end, the peak force (in `force_unit`) and its derivatives.
 
-    Columns: the n entries of the initial state, then the directions `moved` of the parameters.
+    Columns are the n entries of the initial state, then the directions `moved` of the parameters.
     """
     count, size, sides = equation.states, taken.end.shape[0], peak.beside.shape[0]
 

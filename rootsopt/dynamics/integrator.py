@@ -1,4 +1,4 @@
-"""How the equation of motion is integrated: method, tolerance and steps."""
+"""Integration of the equation of motion: method, tolerance and steps."""
 
 from collections.abc import Callable
 from typing import Any
@@ -24,27 +24,27 @@ IMPLICIT = ("kvaerno3", "kvaerno5")
 
 
 _STAGES = 1e5
-"""Roundings to which the stages of an implicit method are known: the gap is the difference of
-lengths ten thousand times a penetration, and the force a power of it. Iterations that are asked for
-less never end, and a repeated step cannot be made shorter. (Each is a whole step of Newton's
-method, so that the last one gains more than was asked for.)"""
+"""Finest tolerance for the stages of an implicit method, in rounding errors. The gap is the
+difference of lengths ten thousand times a penetration, and the force is a power of the gap. With a
+finer tolerance, the iterations never end, and a repeated step cannot be made shorter. The last
+iteration gains more than requested, because each one is a full step of Newton's method."""
 _FIRST_STEP = 1e-3, 0.05
-"""First step: in mesh periods, and in units of the pair's quickest swing; the shorter counts. Too
-large a one is rejected by the error control."""
+"""First step: the shorter of the first number, in mesh periods, and the second, in `swing` of
+`Timescales`. The error control rejects a first step that is too long."""
 _LONGEST = 1 / 32, 1 / 8, 4.0
-"""Longest step: in mesh periods, and in units of a fall through the play; the shorter counts. In
-free flight the error control would let a step pass over a short touch of the gear without a stage
-inside it. But steps so long must not use up more than the last of these as a share (1 / x) of
-those allowed: an implicit method takes far longer ones where the pair does not fly."""
+"""Longest step: the shorter of the first number, in mesh periods, and the second, in times of a
+fall through the play. In free flight, the error control would let a step skip a short contact of
+the gear without a stage inside it. The limit from the fall is at least the third number, in mesh
+periods per `max_steps`: such steps alone use at most a quarter of the allowed number. An implicit
+method takes far longer steps where the pair does not fly."""
 
 
 class Integrator(eqx.Module):
-    """How the equation is integrated.
+    """Settings for integrating the equation of motion.
 
-    `method`: a key of `METHODS` (tsit5, dopri5, dopri8 explicit; kvaerno3, kvaerno5
-    implicit); `rtol`: relative tolerance, which is also the absolute one, the state
-    being scaled; `max_steps` for one mesh period. The precision is that of the state, and
-    the tolerance is never asked to be finer than some twenty roundings of it.
+    `method`: a key of `METHODS` (explicit: tsit5, dopri5, dopri8; implicit: kvaerno3, kvaerno5);
+    `rtol`: relative tolerance, also used as absolute tolerance, since states are scaled;
+    `max_steps`: maximum number of steps for one integration. The precision is that of the state.
     """
 
     method: str = eqx.field(static=True)
@@ -52,20 +52,22 @@ class Integrator(eqx.Module):
     max_steps: int = eqx.field(static=True)
 
     def tolerance(self, dtype: Any) -> Float[Array, ""]:
-        """Tolerance for states of type `dtype`."""
+        """Return `rtol` for states of type `dtype`, raised to at least 20 rounding errors."""
         floor = 20 * float(jnp.finfo(dtype).eps)
         return jnp.maximum(self.rtol, floor).astype(dtype)
 
     def solver(self, dtype: Any, loops: str = "lax") -> diffrax.AbstractSolver:
-        """The method for states of type `dtype`; `loops` over the stages of a step are
-        "lax" (forward mode only) or "bounded" (either mode)."""
+        """Return the method for states of type `dtype`.
+
+        `loops`: kind of loop over the stages of a step, "lax" (forward mode only) or "bounded"
+        (forward and reverse mode)."""
         method = METHODS[self.method]
         if self.method not in IMPLICIT:
             return method(scan_kind=loops)
         least = _STAGES * float(jnp.finfo(dtype).eps)
         rtol: Any = jnp.maximum(self.tolerance(dtype), least).astype(dtype)
-        # With a Jacobian for every iteration: one kept from the step's begin does not converge
-        # across a kink, and a repeated step cannot be made shorter.
+        # A new Jacobian for every iteration: with the one from the start of the step, iterations do
+        # not converge across a kink, and a repeated step cannot be made shorter.
         return method(scan_kind=loops, root_finder=optimistix.Newton(rtol=rtol, atol=rtol))
 
     def controller(
@@ -74,8 +76,10 @@ class Integrator(eqx.Module):
         periods: Float[Array, ""] | float = 1.0,
         pair: RotorPair | None = None,
     ) -> "diffrax.PIDController | LandingControl":
-        """Step size control of states of type `dtype` over an interval of `periods`, for `pair`
-        if that is known."""
+        """Return the step size control for states of type `dtype`.
+
+        `periods`: mesh periods per unit of the independent variable; `pair`: the rotor pair, whose
+        timescales limit the steps, if known."""
         rtol = self.tolerance(dtype)
         longest = _LONGEST[0]
         if pair is not None and pair.timescales is not None:
@@ -89,7 +93,7 @@ class Integrator(eqx.Module):
 
 
 def first_step(pair: RotorPair, dtype: Any) -> Float[Array, ""]:
-    """First step (mesh periods) to be tried."""
+    """Return the first step (mesh periods) to try."""
     longest, share = _FIRST_STEP
     if pair.timescales is None:
         return jnp.asarray(longest, dtype)
@@ -98,11 +102,11 @@ def first_step(pair: RotorPair, dtype: Any) -> Float[Array, ""]:
 
 
 class StepGrid(diffrax.AbstractAdaptiveStepSizeController):
-    """Adaptive steps, or a repetition of steps recorded before.
+    """Step size control with adaptive steps, or with recorded steps that are repeated.
 
-    On repeated steps the discrete flow is a smooth function of state and parameters, and
-    Newton's method converges to rounding. `ends`: ends of the recorded steps (inf beyond
-    the last), used where `repeat` is true.
+    On repeated steps the discrete flow is a smooth function of state and parameters, so Newton's
+    method converges to rounding. `pid`: control of adaptive steps; `ends`: ends of the recorded
+    steps (inf beyond the last); `repeat`: whether to repeat these.
     """
 
     pid: diffrax.PIDController | LandingControl
@@ -131,13 +135,13 @@ class StepGrid(diffrax.AbstractAdaptiveStepSizeController):
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state):  # pyright: ignore[reportIncompatibleMethodOverride]
         state, count, strain = state
-        # The choice of steps is no part of what is differentiated.
+        # The choice of steps is not differentiated.
         y0, y1_candidate, y_error = lax.stop_gradient((y0, y1_candidate, y_error))
         keep, start, stop, jump, state, result = self.pid.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, state
         )
         recorded = self.ends[jnp.minimum(count, self.ends.shape[0] - 1)]
-        # Nothing is rejected where steps are repeated; whether it would have been is remembered.
+        # Repeated steps are never rejected. Their greatest error estimate is recorded instead.
         unit = self.pid.atol + self.pid.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1_candidate))
         strain = jnp.maximum(strain, self.pid.norm(y_error / unit))
         return (

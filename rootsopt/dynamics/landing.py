@@ -1,10 +1,11 @@
 """Step size control that ends steps where a flank or the timing gear may begin to touch.
 
-In free flight the motion is a parabola, on which a method of high order sees no error: its steps
-grow until one passes over a whole touch between two stages, at any tolerance. Two integrations
-whose steps differ by a rounding then differ by the impulse of that touch. So a step ends where the
-parabola through the last step reaches an edge of free flight, and the next one begins short; a step
-that is found to have passed an edge far is taken again.
+In free flight the motion is a parabola, on which a high-order method sees no error. Its steps grow
+until one of them, between two stages, skips a whole contact, at any tolerance. Two integrations
+whose steps differ by rounding alone then differ by the impulse of that contact.
+
+Therefore a step ends where the parabola through the last step reaches an edge of free flight, and
+the next step starts short. A step that has passed an edge by too much is repeated.
 """
 
 import diffrax
@@ -15,24 +16,24 @@ from jaxtyping import Array, Float
 from rootsopt.dynamics.pair import RotorPair
 
 _BEYOND = 1e-4
-"""Time (mesh periods) by which a step is meant to pass an edge: a touch shorter than this may be
-missed."""
+"""Time (mesh periods) by which a step is meant to pass an edge. A shorter contact may be missed."""
 _LATE = 10.0
-"""The same by which it may pass an edge, in units of `_BEYOND`, without being taken again."""
+"""Time past an edge, in units of `_BEYOND`, above which a step is repeated."""
 _AFTER = 5.0
-"""First step behind an edge, in units of `_BEYOND`."""
+"""Longest first step after an edge, in units of `_BEYOND`."""
 _CLOSE = 0.05
-"""Distance from an edge (scaled ε) at a turn of the parabola with which a step ends there."""
+"""Distance (scaled ε) from an edge to the vertex of the parabola below which a step ends at the
+vertex."""
 _INSIDE = 1 / 128
-"""Longest step (mesh periods) where the instant at which a flank touches depends on the rotation:
-with a clearance taken up, or with displaced axes."""
+"""Longest step (mesh periods) where the instant of contact also depends on the rotation: with the
+clearance taken up, or with displaced axes."""
 
 
 class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
-    """The `base` control, with steps that end where free flight may.
+    """The step size control `base`, with steps that end where free flight may end.
 
-    `edges`: scaled ε at which a flank or the gear may begin to touch; `inside`: |ε| (scaled) beyond
-    which a flank may touch at any time; `unit`: mesh periods in a unit of the independent variable.
+    `edges`: scaled ε at which a flank or the gear may begin to touch; `inside`: scaled |ε| above
+    which a flank may touch at any time; `unit`: mesh periods per unit of the independent variable.
     """
 
     base: diffrax.PIDController
@@ -44,7 +45,9 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
     def of(
         cls, base: diffrax.PIDController, pair: RotorPair, unit: Float[Array, ""] | float
     ) -> "LandingControl":
-        """The control for a pair; `unit`: mesh periods in a unit of the independent variable."""
+        """Return the control for a `pair` whose `timescales` are known.
+
+        `unit`: mesh periods per unit of the independent variable."""
         assert pair.timescales is not None
         scale = pair.angle_scale
         play = pair.timescales.free / scale
@@ -85,7 +88,7 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         before, after = y0[:2], y1_candidate[:2]
         away, late = self._passed(before, after, step)
         again = keep & (late > _LATE * _BEYOND)
-        # To the edge by the secant, and a little beyond.
+        # Step to the edge, estimated by the secant, and a little beyond.
         shorter = jnp.maximum(step - late, 0.0) + _BEYOND
         most = jnp.where(away, _AFTER * _BEYOND, self._ahead(before, after, step))
         following = jnp.minimum(stop - start, most / self.unit)
@@ -96,15 +99,14 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         return keep, start, start + following, jump, new, result
 
     def _passed(self, before, after, step):
-        """Whether a step has passed an edge, and how long ago (mesh periods) that was at its
-        end."""
+        """Return whether a step has passed an edge, and how long (mesh periods) before its end."""
         passed = (before[0] - self.edges) * (after[0] - self.edges) < 0
         rate = jnp.maximum(jnp.abs(after[1]), jnp.abs(after[0] - before[0]) / step)
         ago = jnp.abs(after[0] - self.edges) / rate
         return jnp.any(passed), jnp.max(jnp.where(passed, ago, 0.0))
 
     def _ahead(self, before, after, step):
-        """Longest step (mesh periods) from here that ends by the next edge."""
+        """Return the longest step (mesh periods) from `after` that ends at the next edge."""
         place, rate = after
         bend = (rate - before[1]) / step
         away = place - self.edges
@@ -113,8 +115,8 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         roots = jnp.stack([half / _known(bend), 2 * away / _known(half)])
         meets = (roots > 0) & (square >= 0)
         times = jnp.where(meets, roots + _BEYOND, jnp.inf)
-        # A turn beside an edge: what is known of the parabola is not enough to tell whether it
-        # gets there.
+        # With its vertex this close to an edge, the parabola is not known well enough to tell
+        # whether the motion reaches the edge.
         turn = -rate / _known(bend)
         beside = jnp.min(jnp.abs(away + turn * (rate + bend * turn / 2))) < _CLOSE
         turning = beside & (turn > 2 * _BEYOND)
@@ -123,5 +125,5 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
 
 
 def _known(x):
-    """x, or infinity in place of 0."""
+    """Return x with zeros replaced by infinity."""
     return jnp.where(x == 0, jnp.inf, x)

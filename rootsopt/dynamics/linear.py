@@ -1,7 +1,7 @@
-"""Linear algebra of a few unknowns, in plain arithmetic.
+"""Linear algebra with a few unknowns, in plain arithmetic.
 
-A call into LAPACK costs more than the solution of two equations, and a program that holds one
-cannot be kept between processes.
+LAPACK is avoided for two reasons. A call costs more than solving two equations, and a compiled
+program that contains one cannot be stored for other processes.
 """
 
 import jax.numpy as jnp
@@ -9,13 +9,13 @@ from jax import lax
 from jaxtyping import Array, Complex, Float
 
 _SQUARINGS = 40
-"""Squarings of a matrix after which the choice of norm no longer shows in its growth."""
+"""Squarings of a matrix after which its growth no longer depends on the norm."""
 _SWEEPS = 40
-"""QR iterations allowed for each eigenvalue."""
+"""Maximum number of QR iterations per eigenvalue."""
 
 
 def solved(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """Solve a few linear equations by elimination with row pivoting."""
+    """Return the solution of a few linear equations, by elimination with row pivoting."""
     rows = jnp.concatenate([matrix, right], axis=1)
     count = matrix.shape[0]
     place = jnp.arange(count)
@@ -32,8 +32,8 @@ def solved(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Arr
 def spectral_radius(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
     """Return the greatest modulus of the eigenvalues, in real arithmetic.
 
-    Of two, from trace and determinant; of more, as the growth of the powers of the matrix, which
-    repeated squaring takes so far that nothing is left of the choice of norm.
+    For two rows it follows from trace and determinant. For more rows it is the growth rate of the
+    powers of the matrix. Repeated squaring takes the powers so far that the norm does not matter.
     """
     if matrix.shape[0] == 2:
         half = jnp.trace(matrix) / 2
@@ -47,7 +47,7 @@ def spectral_radius(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
         size = jnp.max(jnp.abs(power))
         scaled = power / jnp.where(size > 0, size, 1.0)
         growth = growth + share * jnp.log(size)
-        # Written as a sum: a matrix product this small costs more in its call.
+        # A sum: for matrices this small, calling a matrix product costs more.
         return jnp.sum(scaled[:, :, None] * scaled[None], axis=1), growth, share / 2
 
     start = matrix, jnp.zeros((), matrix.dtype), jnp.ones((), matrix.dtype)
@@ -55,11 +55,11 @@ def spectral_radius(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
 
 
 def eigenvalues(matrix: Float[Array, "n n"]) -> Complex[Array, " n"]:
-    """Return the eigenvalues, greatest modulus first, of conjugate pairs the positive imaginary
-    part first; NaN where the matrix is not finite.
+    """Return the eigenvalues, greatest modulus first; NaN if the matrix is not finite.
 
-    QR iteration with Wilkinson's shift and deflation (Golub and Van Loan, Matrix Computations,
-    section 7.5), on the full matrix: there are at most some twelve states.
+    In a conjugate pair, the value with positive imaginary part comes first. The method is QR
+    iteration with Wilkinson's shift and deflation (Golub and Van Loan, Matrix Computations, section
+    7.5). It works on the full matrix, because there are at most about twelve states.
     """
     count = matrix.shape[0]
     work = matrix.astype(jnp.result_type(matrix.dtype, jnp.complex64))
@@ -68,7 +68,8 @@ def eigenvalues(matrix: Float[Array, "n n"]) -> Complex[Array, " n"]:
     small = float(jnp.finfo(matrix.dtype).eps)
 
     def shift_of(work, size):
-        """The eigenvalue of the last two rows of the active part that is nearest to its corner."""
+        """Return that eigenvalue of the active part's last 2 x 2 block which is nearest to the
+        block's last entry."""
         low, high = size - 1, jnp.maximum(size - 2, 0)
         a, b, c, d = work[high, high], work[high, low], work[low, high], work[low, low]
         half = (a - d) / 2
@@ -85,7 +86,7 @@ def eigenvalues(matrix: Float[Array, "n n"]) -> Complex[Array, " n"]:
         work, size, turn = carry
         active = (place < size)[:, None] & (place < size)
         shift = shift_of(work, size)
-        # An exceptional shift now and then breaks cycles.
+        # An occasional exceptional shift breaks cycles.
         beside = jnp.max(jnp.where(place < size - 1, jnp.abs(work[size - 1]), 0.0))
         shift = jnp.where(turn % 8 == 7, shift + 0.7 * beside, shift)
         left, right = _orthogonal(jnp.where(active, work - shift * unit, unit))
@@ -101,7 +102,8 @@ def eigenvalues(matrix: Float[Array, "n n"]) -> Complex[Array, " n"]:
     if count == 2:
         values = _of_two(matrix).astype(work.dtype)
     values = jnp.where(jnp.all(jnp.isfinite(matrix)), values, jnp.nan)
-    # Rounding must not decide which of a conjugate pair comes first.
+    # Moduli that differ by rounding alone rank as equal, so that the imaginary part orders a
+    # conjugate pair.
     modulus = jnp.abs(values)
     rank = jnp.sum(modulus[None] > modulus[:, None] * (1 + 100 * small), axis=1)
     return values[jnp.lexsort((-values.imag, rank))]
@@ -113,7 +115,7 @@ def _of_two(matrix: Float[Array, "2 2"]) -> Complex[Array, " 2"]:
     square = half**2 - determinant
     root = jnp.sqrt(jnp.abs(square))
     first = half + jnp.where(half >= 0, root, -root)
-    # The lesser one from the product, where the difference would lose its digits.
+    # The smaller root follows from the product of both; the difference would cancel.
     second = determinant / jnp.where(first == 0, 1.0, first)
     real = lax.complex(jnp.stack([first, second]), jnp.zeros(2, matrix.dtype))
     pair = lax.complex(jnp.stack([half, half]), jnp.stack([root, -root]))
@@ -121,7 +123,7 @@ def _of_two(matrix: Float[Array, "2 2"]) -> Complex[Array, " 2"]:
 
 
 def _orthogonal(matrix: Complex[Array, "n n"]) -> tuple[Complex[Array, "n n"], ...]:
-    """Factors Q and R of a matrix, by Gram and Schmidt's method with a second pass."""
+    """Return the factors Q and R of a matrix, by the Gram-Schmidt method with a second pass."""
     count = matrix.shape[0]
     columns, right = [], jnp.zeros_like(matrix)
     for k in range(count):

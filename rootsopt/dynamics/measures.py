@@ -1,7 +1,7 @@
-"""Averages of the contact force over a motion, integrated along with it.
+"""Averages of the contact force over a motion, integrated along with the motion.
 
-Mean and mean square always; Fourier coefficients of spectral lines and a power of the force,
-from which its p-norm follows, where a scene asks for them.
+Mean and mean square are always computed. On request, so are the Fourier coefficients of spectral
+lines, and the average power of the force that gives its p-norm.
 """
 
 from typing import Any
@@ -17,11 +17,11 @@ def _no_orders() -> Float[np.ndarray, "0"]:
 
 
 class Measures(eqx.Module):
-    """What is averaged beside mean and mean square.
+    """The averages to compute in addition to mean and mean square.
 
-    `orders`: spectral lines, in multiples of the mesh frequency; they are lines of a motion of
-    k mesh periods where k times the order is whole. `norm`: p of the p-norm
-    (mean of F^p)^(1/p) ≤ max F, a smooth stand-in for the peak, or None.
+    `orders` (lines,): spectral lines, in multiples of the mesh frequency. A motion of k mesh
+    periods has the line if k times the order is a whole number. `norm`: p of the p-norm
+    (mean of F^p)^(1/p) ≤ max F, a smooth substitute for the peak; None: no p-norm.
     """
 
     orders: Float[Array, " lines"] | Float[np.ndarray, " lines"] = eqx.field(
@@ -31,14 +31,16 @@ class Measures(eqx.Module):
 
     @property
     def count(self) -> int:
-        """How many averages there are: q = 2 + two for every line, and one for the p-norm."""
+        """Number q of averages: 2, plus 2 for each line, plus 1 for the p-norm."""
         return 2 + 2 * self.orders.shape[0] + (self.norm is not None)
 
     def rates(
         self, tau: Float[Array, ""], force: Float[Array, ""], top: Float[Array, ""]
     ) -> Float[Array, " q"]:
-        """What to integrate at time `tau` (mesh periods) with the `force` in any unit; `top`:
-        about the greatest, in the same unit, so that no power is out of range."""
+        """Return the integrands of the averages at time `tau` (mesh periods).
+
+        `force`: the contact force, in any unit; `top`: roughly its greatest value, in the same
+        unit. It scales the powers of the force, so that none overflows."""
         rates = [jnp.stack([force, force**2])]
         if self.orders.shape[0]:
             angle = 2 * jnp.pi * jnp.asarray(self.orders, force.dtype) * tau
@@ -52,9 +54,11 @@ class Measures(eqx.Module):
     def values(
         self, averages: Float[Array, " q"], unit: Float[Array, ""], top: Float[Array, ""]
     ) -> tuple[Float[Array, " q"], Float[Array, " q"]]:
-        """Mean (N), mean square (N²), cosine and sine coefficients (N), p-norm (N) from the
-        averages of `rates`, and the factors by which derivatives of these become theirs. `unit`
-        (N) is that of the forces."""
+        """Return the measures from the averages of `rates`, and factors for their derivatives.
+
+        The measures are mean (N), mean square (N²), cosine and sine coefficients (N) and p-norm
+        (N). Derivatives of the averages times these factors are derivatives of the measures.
+        `unit` (N) and `top`: unit of the force in `rates`, and its greatest value there."""
         factors = jnp.full_like(averages, unit).at[1].set(unit**2)
         values = factors * averages
         if self.norm is not None:
@@ -67,9 +71,11 @@ class Measures(eqx.Module):
     def amplitudes(
         self, others: Any, slopes: Any, period: Any
     ) -> tuple[Float[Array, " lines"], list[Float[Array, " d"]]]:
-        """Amplitudes (N) of the lines of a closed orbit of `period` mesh periods and their
-        derivatives, from the values and derivatives behind mean, mean square and peak. An order
-        that is no line of the motion has amplitude 0."""
+        """Return the amplitudes (N) of the lines of a closed orbit, and their derivatives.
+
+        `others` and `slopes`: values and derivatives of the measures that follow mean, mean square
+        and peak; `period`: mesh periods of the orbit. The amplitude is 0 for an order that is not a
+        line of the motion."""
         sizes, rows = [], []
         for k, order in enumerate(self.orders):
             cos, sin = others[k], others[k + self.orders.shape[0]]
@@ -81,11 +87,12 @@ class Measures(eqx.Module):
         return jnp.stack(sizes) if sizes else jnp.zeros(0), rows
 
     def named(self, response: Any, period: int) -> dict[str, tuple[float, Any]]:
-        """Response of a closed orbit by the names of the result file.
+        """Return the response of a closed orbit, by the names used in the result file.
 
-        `response`: (mean, mean square, peak, then the other `values`) with derivatives behind, a
-        row each, (r, 1 + d); `period` k in mesh periods. Each name has its value (N) and its
-        derivatives (d,). An order that is no line of the motion has amplitude 0.
+        `response` (r, 1 + d): rows mean, mean square, peak, then the other `values`; the value is
+        in the first column, its derivatives in the others. `period`: k in mesh periods. Each name
+        maps to its value (N) and derivatives (d,). The amplitude is 0 for an order that is not a
+        line of the motion.
         """
         rows = np.asarray(response, np.float64)
         mean, square, peak, *others = rows
@@ -110,9 +117,9 @@ class Measures(eqx.Module):
 
 
 PEAK_NORM = "peak_norm_force_N"
-"""The p-norm in result files."""
+"""Name of the p-norm in result files."""
 
 
 def line_name(order: float) -> str:
-    """Name of a spectral line's amplitude in result files."""
+    """Return the name of a spectral line's amplitude in result files."""
     return f"line_{order:g}_force_N"

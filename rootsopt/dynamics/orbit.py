@@ -1,8 +1,11 @@
 """Close a periodic orbit by shooting, and differentiate it.
 
-Newton's method on the k-fold stroboscopic map closes the orbit, its monodromy matrix tells whether
+Newton's method on the k-fold stroboscopic map closes the orbit. Its monodromy matrix tells whether
 it is stable, and the implicit function theorem gives the derivatives. Where there is no orbit, the
 same loop integrates a window of the motion (`rootsopt.dynamics.window`).
+
+The solver steps of an orbit are recorded as a *grid*, and repeated once Newton's method is close.
+A *kink* is an instant at which the equation of motion is not smooth; grid steps end there.
 """
 
 from collections.abc import Callable
@@ -24,43 +27,45 @@ from rootsopt.dynamics.switches import halved, has_room, with_switches
 from rootsopt.dynamics.window import Window
 
 SAMPLES = 2520
-"""Uniform samples of an orbit; divisible by every period up to ten, so that a sample
-falls on the end of each mesh period."""
+"""Uniform samples of an orbit. All periods up to ten divide it, so that a sample falls on the end
+of each mesh period."""
 _NEWTON_STEPS = 24
+"""Default limit of integrations per orbit."""
 _CLOSED = 4000, 1e-3, 1e-10
-"""Residual (scaled) at which Newton stops: in roundings (1e-12 in double precision), or in
-tolerances of the motion up to a limit."""
+"""Residual (scaled) at which Newton's method stops. It is the larger of two: the first number, in
+rounding errors (1e-12 in double precision), and the second, in tolerances, limited by the third."""
 _KEPT = 4
-"""Integrations after which the steps are kept in any case."""
+"""Integrations after which the solver steps are kept, however large the Newton step is."""
 _LOOKS = 6
-"""Times that kinks are looked for while an orbit is closed, at most."""
+"""Maximum number of searches for kinks while an orbit is closed."""
 _DRIFT = 30.0, 1e-9, 1e-6
-"""Distance (scaled) that an orbit may have moved from where its kinks were looked for, in
-tolerances, but within these limits. The kinks lie that far outside their steps, which costs
-accuracy in first order."""
+"""Distance (scaled) from the orbit of the last search for kinks, above which kinks are searched for
+again: in tolerances, and its limits. Kinks may lie this far outside their steps, which causes an
+error of first order."""
 _STRAIN = 10.0
-"""Error of a repeated step, in tolerances, with which the steps are chosen anew."""
+"""Error of a repeated step, in tolerances, above which the solver steps are chosen anew."""
 _AFTER = 3
-"""Integrations that must be left for looking at kinks again, or choosing steps anew: an orbit that
-is closed is not given away."""
+"""Integrations that must remain before a new search for kinks or a new choice of steps. With fewer,
+an orbit that is already closed could be lost."""
 _AGREE = 10.0, 1e-3, 3e-2
-"""Disagreement of the derivatives on a grid and on one with its steps halved that is accepted: in
-square roots of the tolerance, but within these limits."""
+"""Largest accepted difference of the derivatives on a grid and on the same grid with halved steps:
+in square roots of the tolerance, and its limits."""
 _SMALL = 1e-9, 1e-3
-"""Newton step (scaled) from which on the solver's steps are kept: a thousand times its
-tolerance, but within these."""
+"""Limits of the Newton step (scaled) below which the solver steps are kept. Between them, it is a
+thousand tolerances."""
 
 
 class Orbit(NamedTuple):
     """A closed orbit of k mesh periods with first derivatives.
 
-    `state` at φ1 = 0; `flow` over the orbit; `residual` |Φ(z) - z| in scaled units;
-    `monodromy` dΦ/dz and `multiplier`, the greatest modulus of its eigenvalues; `response`:
-    (mean, mean square, peak, other measures); `sensitivity` (r, d): their derivatives along the
-    orbit family with respect to the design, and `moved` (n, d): those of the state;
-    `newton_steps`. `drift`: distance (scaled) from where
-    the kinks were looked for. `defect`: residual on a grid with every step halved, and
-    `disagreement` of the derivatives on both, relative to the greatest; 0 where there was no check.
+    `state`: scaled state at φ1 = 0; `flow` over the orbit; `residual`: |Φ(z) - z|, scaled;
+    `monodromy`: dΦ/dz; `multiplier`: greatest modulus of the Floquet multipliers, its eigenvalues;
+    `response`: mean (N), mean square (N²), peak (N) and the other measures; `sensitivity` (r, d):
+    derivatives of `response` with respect to the design, along the family of orbits; `moved`
+    (n, d): those of `state`; `newton_steps`: integrations for Newton's method; `drift`: distance
+    (scaled) from the orbit along which kinks were last searched for; `defect`: residual (scaled) on
+    a grid with halved steps; `disagreement`: relative difference of the derivatives on both grids.
+    The last two are 0 if there was no check.
     """
 
     state: Float[Array, " n"]
@@ -78,8 +83,9 @@ class Orbit(NamedTuple):
 
     @classmethod
     def empty(cls, state: Float[Array, " n"], directions: int, flow: Flow) -> "Orbit":
-        """An orbit from `state` that has not been integrated yet, with derivatives along d
-        `directions` of the design; `flow` is `Flow.empty`."""
+        """Return an orbit from `state` that has not been integrated yet.
+
+        `directions`: number d of design directions; `flow`: what `Flow.empty` returns."""
         count, dtype = state.shape[0], state.dtype
         infinite = jnp.asarray(jnp.inf, dtype)
         return cls(
@@ -99,13 +105,15 @@ class Orbit(NamedTuple):
 
 
 class _Closing(NamedTuple):
-    """An orbit that is being closed, or a window that is being integrated.
+    """State of the loop that closes an orbit or integrates a window.
 
-    `state` and `grid` of the next integration, whose steps are kept if `repeat`; `held`: whether
-    those of the last one were; `improving`: whether it came closer; `base`: the steps without those
-    made for kinks; `best` residual on this grid; kinks were looked for `looks` times, last along
-    the orbit from `looked`; `refined`: times the steps were halved because derivatives disagreed;
-    `checked`: whether the derivatives were compared.
+    `orbit`, `window`: results so far; `state` and `grid` of the next integration; `repeat`: whether
+    it repeats the steps of `grid`; `held`: whether the last one repeated its steps; `improving`:
+    whether the last one at least halved the residual, or the grid is new; `base`: the steps without
+    those added for kinks;
+    `best`: least residual on this grid; `looks`: searches for kinks so far; `looked`: initial state
+    of the orbit along which the last search was; `refined`: how often the steps were halved because
+    derivatives disagreed; `checked`: whether the derivatives were compared.
     """
 
     orbit: Orbit
@@ -124,7 +132,7 @@ class _Closing(NamedTuple):
 
 
 class _Closer(eqx.Module):
-    """What `close_orbit` was asked for; `start`, `go_on` and `step` are its loop."""
+    """Arguments of `orbit_or_window`. Its loop is `start`, `go_on` and `step`."""
 
     pair: RotorPair
     tangents: RotorPair
@@ -140,7 +148,7 @@ class _Closer(eqx.Module):
     periods: int = eqx.field(static=True)
 
     def start(self, state: Float[Array, " n"]) -> _Closing:
-        """Nothing known of the orbit near `state`."""
+        """Return the loop's state before the first integration, from the scaled `state`."""
         count, dtype = state.shape[0], state.dtype
         directions = jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
         steps = self.integrator.max_steps
@@ -163,14 +171,14 @@ class _Closer(eqx.Module):
         )
 
     def is_open(self, now: _Closing) -> Bool[Array, ""]:
-        """Whether Newton's method goes on."""
+        """Return whether Newton's method continues."""
         done = now.orbit.newton_steps
         left = (now.orbit.residual > self.closed) & ((done < 3) | now.improving)
-        # Chosen anew, the steps depend on the state, and that leaves a floor.
+        # Steps that are not repeated depend on the state, which leaves a floor under the residual.
         return (left | ~now.held) & (done < self.shots + now.refined * self.shots // 2)
 
     def go_on(self, now: _Closing) -> Bool[Array, ""]:
-        """Whether there is anything left to integrate."""
+        """Return whether anything is left to integrate."""
         sound = now.held & now.orbit.flow.solved & jnp.isfinite(now.orbit.residual)
         closing = self.is_open(now) | (sound & ~now.checked & self.check)
         alive = now.window.solved & jnp.all(jnp.isfinite(now.window.end))
@@ -178,8 +186,10 @@ class _Closer(eqx.Module):
         return jnp.where(self.windowed, window, closing)
 
     def step(self, now: _Closing) -> _Closing:
-        """One integration: of the orbit for Newton's method, of the orbit on halved steps for the
-        check, or of the window's next mesh period."""
+        """Integrate once and return the new state of the loop.
+
+        The integration is a Newton shot, the check of the orbit on halved steps, or the next mesh
+        period of the window."""
         checking = ~self.is_open(now) & ~self.windowed
         start = jnp.where(checking, now.orbit.state, now.state)
         start = jnp.where(self.windowed, now.window.end, start)
@@ -208,17 +218,19 @@ class _Closer(eqx.Module):
         )
 
     def _newton(self, now: _Closing, start, checking, out: Flow) -> _Closing:
-        """What follows from the flow `out` from `start`: the next state, and the next steps."""
+        """Return the loop's state after the flow `out` from `start`: the Newton step, and the grid
+        of the next integration."""
         count, dtype = start.shape[0], start.dtype
         monodromy = out.slope[:count, :count]
         miss = out.end - start
         residual = jnp.max(jnp.abs(miss))
         correction = solved(jnp.eye(count, dtype=dtype) - monodromy, miss[:, None])[:, 0]
-        # A pair that floats stays where the transient led to: any place is as good.
+        # A pair that floats (held by neither flanks nor gear) can rest anywhere: keep the state
+        # the transient led to.
         floats = jnp.all(jnp.isfinite(miss)) & ~jnp.all(jnp.isfinite(correction))
         correction = jnp.where(floats, 0.0, correction)
         size = jnp.max(jnp.abs(correction))
-        # Keep the first steps inside the neighbourhood the transient pointed to.
+        # Limit the Newton steps, to stay near the state the transient led to.
         new = start + correction * jnp.minimum(1.0, 0.5 / jnp.maximum(size, 1e-30))
         done = now.orbit.newton_steps + 1
         improving = residual < 0.5 * now.best
@@ -232,14 +244,14 @@ class _Closer(eqx.Module):
             drift=jnp.max(jnp.abs(start - now.looked)),
         )
         apart = disagreement(now.orbit.flow.slope, out.slope, count)
-        # Where not all steps can be divided nothing is compared.
+        # The comparison needs room to halve all steps.
         apart = jnp.where(has_room(now.orbit.flow.grid), apart, jnp.inf)
         compared = now.orbit._replace(defect=residual, disagreement=apart)
         finer = checking & (apart > agreement(self.tolerance)) & (apart < jnp.inf)
         finer &= now.refined < 1
         renewed = jnp.where(checking, finer, look)
         base, grid = self._steps(now, out, renewed, finer)
-        # Residuals compare on the same steps only.
+        # Residuals are comparable only on the same steps.
         best = jnp.where(renewed | ~now.repeat, jnp.inf, jnp.minimum(now.best, residual))
         return _Closing(
             orbit=choose(checking, compared, found),
@@ -258,26 +270,26 @@ class _Closer(eqx.Module):
         )
 
     def _kept(self, now: _Closing, start, out: Flow, size, residual, improving):
-        """Whether the steps of `out` are kept from now on, whether kinks are looked for along it,
-        and whether those that were kept are given up."""
+        """Return three flags: keep the steps of `out` from now on; search for kinks along `out`;
+        give up the steps kept so far."""
         done, smooth = now.orbit.newton_steps + 1, self.pair.smooth
         known = size < jnp.clip(1000 * self.tolerance, *_SMALL)
         following = now.repeat | known | (done >= jnp.minimum(self.shots // 3, _KEPT))
-        # Kinks are looked for again where the motion has moved them out of their steps.
+        # Search for kinks again where the motion has moved them out of their steps.
         few = now.looks < _LOOKS
         stalled = now.repeat & ~improving & (residual > self.closed) & few
         again = now.repeat & (residual <= self.closed) & few & (done + _AFTER <= self.shots)
-        # A jump that no switch tells stays where the steps have it.
+        # A jump without a switch stays at the same steps, so it cannot stray.
         far = jnp.clip(_DRIFT[0] * self.tolerance, *_DRIFT[1:])
         strayed = again & (jnp.max(jnp.abs(start - now.looked)) > far) & smooth
         strained = again & ~(out.strain <= _STRAIN)
-        # Steps of a solver that did not get through are none to be repeated.
+        # Do not repeat the steps of a solver that failed.
         following &= ~strained & (out.solved | now.repeat | ~jnp.all(jnp.isfinite(start)))
         look = following & (~now.repeat | stalled | strayed)
         return following, look, strayed | strained
 
     def _steps(self, now: _Closing, out: Flow, renewed, finer):
-        """The steps without those made for kinks, and the next grid."""
+        """Return the steps without those added for kinks, and the next grid."""
         base = jnp.where(now.repeat, now.base, out.grid)
         base = lax.cond(finer, lambda: halved(base), lambda: base)
         length = self.period.astype(out.end.dtype)
@@ -291,12 +303,12 @@ class _Closer(eqx.Module):
 
 
 class Shots(eqx.Module):
-    """How an orbit is closed.
+    """Settings for closing an orbit.
 
-    `integrator` in use, with what `measures` of the force; `count`: integrations allowed;
-    `closed`: residual (scaled) at which Newton's method may stop. `samples` of an orbit, a number
-    that its period divides. With `check`, orbit and derivatives are compared with those on a grid
-    with every step halved; where they disagree the orbit is closed once more, on that one.
+    `integrator`; `measures` of the force; `count`: maximum number of integrations; `closed`:
+    residual (scaled) at which Newton's method may stop; `samples`: number of samples of an orbit, a
+    multiple of its period; `check`: compare orbit and derivatives with those on a grid with halved
+    steps. If they disagree, the orbit is closed once more, on the finer grid.
     """
 
     integrator: Integrator
@@ -316,7 +328,7 @@ def close_orbit(
 ) -> Orbit:
     """Close the orbit of `period` mesh periods near the scaled `state`, and differentiate it.
 
-    As `orbit_or_window`, without windows.
+    This is `orbit_or_window` without the window.
     """
     return orbit_or_window(pair, tangents, state, period, shots)[0]
 
@@ -330,14 +342,17 @@ def orbit_or_window(
     windowed: Bool[Array, ""] | bool = False,
     periods: int = 0,
 ) -> tuple[Orbit, Window]:
-    """Newton shooting on Φ(z) = z, then the implicit function theorem for gradients; or, where
-    `windowed`, a window of so many mesh `periods` from `state`.
+    """Close and differentiate an orbit or, if `windowed`, integrate a window of `periods` mesh
+    periods from `state`.
 
-    `tangents` holds d pair / d design, stacked along a leading axis. Newton stops after
-    `shots.count` integrations, or at the residual `shots.closed` (at least some thousand roundings
-    and a thousandth of the tolerance). Once its steps are small those of the solver are kept, with
-    ends added where the equation is not smooth: so the map it solves is smooth and closes to
-    rounding, and its derivative is as accurate as the motion.
+    The orbit is the solution of Φ(z) = z near the scaled `state` (n,), where Φ is the flow over
+    `period` mesh periods. Newton shooting finds it, and the implicit function theorem gives its
+    derivatives. `tangents` holds d pair / d design, stacked along a leading axis.
+
+    Newton's method stops after `shots.count` integrations or at the residual `shots.closed`, but
+    not below `_CLOSED`. Once the Newton step is small, the solver steps are kept, with step ends
+    added at kinks. So the map is smooth and closes to rounding, and its derivative is as accurate
+    as the motion.
     """
     count, dtype = state.shape[0], state.dtype
     tolerance = shots.integrator.tolerance(dtype)
@@ -355,7 +370,8 @@ def orbit_or_window(
         tolerance=tolerance,
         windowed=jnp.asarray(windowed),
         samples=shots.samples,
-        # A contact that may jump anywhere has derivatives of the steps, not of the motion.
+        # No check where the contact may jump anywhere: there the derivatives are those of the
+        # steps, not of the motion.
         check=shots.check and pair.smooth,
         periods=periods,
     )
@@ -375,13 +391,13 @@ def orbit_or_window(
 
 
 def choose(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
-    """Return `new` where the condition holds, else `old`, leaf by leaf."""
+    """Return `new` where the `condition` holds, else `old`, for each leaf of a tree."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
 
 
 def agreement(tolerance: Float[Array, ""]) -> Float[Array, ""]:
-    """Largest `disagreement` with which derivatives of an orbit at a relative `tolerance` are
-    reported."""
+    """Return the largest `disagreement` at which derivatives of an orbit are still reported, for a
+    relative `tolerance`."""
     scale, least, most = _AGREE
     return jnp.clip(scale * jnp.sqrt(tolerance), least, most)
 
@@ -389,9 +405,11 @@ def agreement(tolerance: Float[Array, ""]) -> Float[Array, ""]:
 def disagreement(
     first: Float[Array, "rows columns"], second: Float[Array, "rows columns"], count: int
 ) -> Float[Array, ""]:
-    """Largest difference of two estimates of an orbit's derivatives, each kind relative to its
-    greatest: (I - M)⁻¹, and those of the state and of mean and mean square force with respect to
-    the design. `first` and `second`: `Flow.slope` of `count` states on two grids.
+    """Return the largest relative difference of two estimates of an orbit's derivatives.
+
+    Compared are (I - M)⁻¹ and the derivatives of the state, of the mean and of the mean square
+    force with respect to the design. Each kind is relative to its greatest entry in `first`.
+    `first` and `second`: `Flow.slope` on two grids; `count`: number of states.
     """
 
     def derivatives(slope):
@@ -420,12 +438,14 @@ def reverse_sensitivity(
     measures: Measures | None = None,
     top: Float[Array, ""] | None = None,
 ) -> Float[Array, "r d"]:
-    """The same sensitivity by reverse mode, through diffrax's checkpointed adjoint (where the
-    contact may jump, which that knows nothing of, through the steps themselves).
+    """Return `Orbit.sensitivity` (r, d) computed by reverse mode.
 
-    On the steps `grid` of the closed orbit, whose peak is `top` (N). With cotangents v of a
-    response and w of the end state, the implicit function theorem asks for
-    (I - M)ᵀ w = R_zᵀ v and gives dR/dp = R_pᵀ v + Φ_pᵀ w.
+    The derivatives go through diffrax's checkpointed adjoint. It cannot handle jumps of the
+    contact; where these are possible, derivatives go through the steps themselves. `grid`: the
+    steps of the closed orbit; `top`: its peak (N).
+
+    Let v be the cotangent of a response and w that of the end state. By the implicit function
+    theorem, (I - M)ᵀ w = R_zᵀ v, and dR/dp = R_pᵀ v + Φ_pᵀ w.
     """
     count = state.shape[0]
     length = period.astype(state.dtype)

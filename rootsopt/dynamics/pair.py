@@ -1,10 +1,11 @@
 """The rotor pair as an ordinary differential equation.
 
-The smallest scene has two states, ε = φ2 - φ1 and its rate. A part that sets rotor 1 free adds the
-speed of rotor 1 as a third, and every part its own states behind these, in the order of the parts.
-The equation is counted in mesh periods τ of rotor 1's rotation (one lobe pitch), so that it is
-periodic whatever the speed does, ε in units of `angle_scale`, so that a solver sees numbers of
-order one.
+The smallest scene has two states: ε = φ2 - φ1 and its rate. A part that sets rotor 1 free adds the
+speed of rotor 1 as a third state. Every part appends its own states, in the order of the parts.
+
+The independent variable τ is the rotation of rotor 1 in mesh periods (lobe pitches), so the
+equation is periodic even if the speed varies. ε is measured in `angle_scale`, so that the solver
+works with numbers of order one.
 """
 
 from collections.abc import Iterable
@@ -36,14 +37,17 @@ from rootsopt.dynamics.timescales import Timescales
 from rootsopt.errors import InputError
 
 STALLED = 0.05
-"""Share of the drive's speed below which a motor counts as stalled."""
+"""Speed of rotor 1, as a fraction of the drive's speed, below which the motor counts as stalled."""
 
 
 class FlankForce(NamedTuple):
-    """Contact at an instant or several: normal force (N) by flank, greatest penetration (m;
-    negative: gap) with its rate (m/s) and the levers (m) of that flank, torques on the rotors
-    (N·m), each positive in its rotor's sense of rotation, and, where there are supports, the force
-    on rotor 2 (N); that on rotor 1 is opposite."""
+    """Contact of the flanks at one or several instants.
+
+    `drive`, `coast`: normal force (N) on each flank; `depth`: greatest penetration (m; negative:
+    gap); `closing`: its rate (m/s); `lever1`, `lever2`: levers (m) of the deeper flank; `torque1`,
+    `torque2`: torques (N·m) on the rotors, each positive in its rotor's sense of rotation; `push`:
+    force (N) on rotor 2, None if no part lets the axes move. Rotor 1 feels the opposite force.
+    """
 
     drive: Float[Array, "*n"]
     coast: Float[Array, "*n"]
@@ -62,8 +66,11 @@ class FlankForce(NamedTuple):
 
 
 class _Sliding(NamedTuple):
-    """What friction and supports need of a contact: its place, the speed (m/s) at which rotor 1
-    slides on rotor 2, and, where there are supports, normal and tangent."""
+    """What friction and supports need to know of a contact.
+
+    `point`: its place; `speed` (m/s) at which rotor 1 slides on rotor 2; `normal` and `tangent`:
+    unit vectors, None if no part lets the axes move.
+    """
 
     point: ContactPoint
     speed: Float[Array, ""]
@@ -72,8 +79,11 @@ class _Sliding(NamedTuple):
 
 
 class _Touch(NamedTuple):
-    """A flank at a pose: penetration (m) and its rate (m/s), roll coordinate (rad), what the
-    contact says of the pose; `sliding` where a part asks for it."""
+    """A flank at a pose.
+
+    `depth`: penetration (m); `closing`: its rate (m/s); `roll`: roll coordinate (rad); `approach`:
+    what the contact found at the pose; `sliding`: None unless a part needs it.
+    """
 
     depth: Float[Array, ""]
     closing: Float[Array, ""]
@@ -88,12 +98,12 @@ class RotorPair(eqx.Module):
     `contact`: gap and levers at a pose; `law`: contact force; `clearance` (m) added to
     every flank gap; `inertia` of one rotor (kg·m²); `drive`, `load`, `gear`, `friction`,
     `supports`: parts that the scene names; `angle_scale` (rad) and `force_scale` (N): units the
-    solver works in; `timescales`: how quickly it can change, None if unknown.
-    `two_sided`: whether drive and coast flanks can touch at once, which they cannot at the nominal
-    centre distance. `parts`: any others. A part that is absent is None and costs nothing.
+    solver works in; `timescales`: how quickly the pair can change, None if unknown.
+    `two_sided`: whether drive and coast flanks can touch at once. At the nominal centre distance
+    they cannot. `parts`: all other parts. A part that is absent is None and costs nothing.
 
-    Raises InputError where two parts let the axes move, or where both flanks can touch and the
-    contact does not know of flanks turned away from each other.
+    Raises InputError if two parts let the axes move; if a part lets them move but `two_sided` is
+    False; if the pair is two-sided but the contact is not (see `Contact.two_sided`).
     """
 
     lobes: int = eqx.field(static=True)
@@ -144,15 +154,14 @@ class RotorPair(eqx.Module):
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """Names of the states, with the units that they have before they are scaled."""
+        """Names of the states, with their units before scaling."""
         first = ("relative rotation (rad)", "relative speed (rad/s)")
         speed = ("excess of the speed of rotor 1 over the drive's (rad/s)",) * self.free
         return (*first, *speed, *(name for part in self.all_parts for name in part.states))
 
     @property
     def states(self) -> int:
-        """How many states there are: ε, its rate, rotor 1's speed if that is free, those of the
-        parts."""
+        """Number of states: ε, its rate, rotor 1's speed if it is free, and those of the parts."""
         return 2 + self.free + sum(len(part.states) for part in self.all_parts)
 
     @property
@@ -162,8 +171,10 @@ class RotorPair(eqx.Module):
 
     @property
     def angle_limit(self) -> float:
-        """|ε| (rad) beyond which the lobes count as having passed through each other: a
-        quarter of the angle from a lobe's axis to its flank at the pitch circle."""
+        """|ε| (rad) above which the lobes count as having passed through each other.
+
+        It is a quarter of the angle from a lobe's axis to its flank at the pitch circle.
+        """
         return jnp.pi / (8 * self.lobes)
 
     @property
@@ -177,26 +188,31 @@ class RotorPair(eqx.Module):
         return self.contact.jumps
 
     def rounding(self, depth: Float[Array, ""]) -> Float[Array, ""]:
-        """Relative error of the force at a `depth` (m) by the rounding of the gap alone."""
+        """Return the relative error of the force at a `depth` (m) that rounding of the gap causes.
+
+        It is 0 if the contact has no `length_scale`."""
         length = self.contact.length_scale
         if length is None:
             return jnp.zeros_like(depth)
         return force_rounding(depth, self.law.exponent, length)
 
     def at_start(self, first: Float[np.ndarray, "*k 2"]) -> Float[np.ndarray, "*k n"]:
-        """Scaled states with the scaled ε and dε/dt in `first` and all others as a motion begins
-        with."""
+        """Return scaled states (…, n) from the scaled ε and dε/dt in `first` (…, 2).
+
+        All other states have their value at the start of a motion."""
         return np.pad(first, [(0, 0)] * (first.ndim - 1) + [(0, self.states - 2)])
 
     def speed(self, state: Float[Array, "*k n"]) -> Float[Array, "*#k"]:
-        """Angular speed of rotor 1 (rad/s) in a scaled state."""
+        """Return the angular speed of rotor 1 (rad/s) in a scaled state."""
         if not self.free:
             return self.drive.speed
         return self.drive.speed + self.angle_scale / self.mesh_period * state[..., 2]
 
     def lapse(self, state: Float[Array, "*k n"]) -> Float[Array, "*#k"]:
-        """Time (s) that a mesh period of rotation takes at a scaled state, relative to
-        `mesh_period`. A motor that has stalled is taken to creep on."""
+        """Return the time that a mesh period of rotation takes at a scaled state, relative to
+        `mesh_period`.
+
+        A stalled motor is taken to creep on at half the speed below which it counts as stalled."""
         creep = STALLED / 2 * self.drive.speed
         return self.drive.speed / jnp.maximum(self.speed(state), creep)
 
@@ -205,11 +221,11 @@ class RotorPair(eqx.Module):
         return Units(self.angle_scale, self.mesh_period)
 
     def own_states(self, state: Float[Array, "*k n"]) -> list[Float[Array | np.ndarray, "*k _"]]:
-        """Own states (SI) of each of `all_parts` in a scaled state."""
+        """Return the own states (SI units) of each of `all_parts` in a scaled state."""
         found, place = [], 2 + self.free
         for part in self.all_parts:
             count = len(part.states)
-            # Of no states nothing is traced.
+            # A part without states adds nothing to the traced program: NumPy, not JAX.
             own = np.zeros((*state.shape[:-1], 0), state.dtype)
             if count:
                 own = part.scales(self._units) * state[..., place : place + count]
@@ -220,12 +236,12 @@ class RotorPair(eqx.Module):
         return found
 
     def motion(self, tau: Float[Array, "*k"], state: Float[Array, "*k n"]) -> Motion:
-        """Position and velocity from rotation in mesh periods and scaled state, in the precision
-        of the pair whatever theirs is."""
+        """Return position and velocity (SI units) at rotation `tau` (mesh periods) and scaled
+        `state`, in the pair's precision."""
         return self._moving(tau, state)[0]
 
     def _moving(self, tau, state):
-        """`motion`, and the parts with their own states (SI)."""
+        """Return `motion`, and the parts with their own states (SI units)."""
         tau, state = (jnp.asarray(x, self.angle_scale.dtype) for x in (tau, state))
         relative = self.angle_scale * state[..., 0]
         rate = self.angle_scale * state[..., 1] / self.mesh_period
@@ -244,7 +260,7 @@ class RotorPair(eqx.Module):
         return jnp.concatenate([*first, *self.own_states(state)])
 
     def scaled(self, state: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return the scaled state of one in the units of `state_names`."""
+        """Return the scaled form of a state given in the units of `state_names`."""
         nothing = jnp.zeros(self.states, self.angle_scale.dtype)
         start = self.in_si(nothing)
         return ((state - start) / (self.in_si(nothing + 1) - start)).astype(start.dtype)
@@ -252,14 +268,17 @@ class RotorPair(eqx.Module):
     def physical(
         self, tau: Float[Array, "*k"], state: Float[Array, "*k n"]
     ) -> tuple[Float[Array, "*k"], Float[Array, "*k"], Float[Array, "*k"]]:
-        """φ1 (rad), ε (rad), dε/dt (rad/s) from rotation in mesh periods and scaled state."""
+        """Return φ1 (rad), ε (rad) and dε/dt (rad/s) at rotation `tau` (mesh periods) and scaled
+        `state`."""
         return self.motion(tau, state)[:3]
 
     def contact_force(
         self, phi: Float[Array, ""], relative: Float[Array, ""], rate: Float[Array, ""]
     ) -> FlankForce:
-        """Flank contact at rotor 1's angle `phi` (rad), ε and dε/dt, at the drive's speed and
-        with both axes in their places."""
+        """Return the flank contact at φ1 = `phi` (rad), ε = `relative` (rad) and dε/dt = `rate`
+        (rad/s).
+
+        Rotor 1 turns at the drive's speed, and neither axis is displaced."""
         motion = Motion(phi, relative, rate, self.drive.speed)
         if any(part.displaces for part in self.all_parts):
             rest = jnp.zeros((2, 2), self.angle_scale.dtype)
@@ -267,15 +286,15 @@ class RotorPair(eqx.Module):
         return self._force(motion)
 
     def contact_at(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> FlankForce:
-        """Flank contact at rotation `tau` (mesh periods) and scaled `state`."""
+        """Return the flank contact at rotation `tau` (mesh periods) and scaled `state`."""
         return self._force(self.motion(tau, state))
 
     def _force(self, motion: Motion) -> FlankForce:
-        """Contact force of a motion.
+        """Return the contact of the flanks at a motion.
 
-        With no negative clearance at the nominal centre distance, only the drive flank
-        can touch when ε < 0 and only the coast flank when ε > 0, so one search is
-        enough; the force is exactly zero on both sides of ε = 0.
+        A pair that is not two-sided has the nominal centre distance and no negative clearance. Then
+        only the drive flank can touch when ε < 0, and only the coast flank when ε > 0. So one
+        search is enough, and the force is exactly zero on both sides of ε = 0.
         """
         if self.two_sided:
             sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)
@@ -298,7 +317,7 @@ class RotorPair(eqx.Module):
         )
 
     def _flank_force(self, side: Float[Array, ""], motion: Motion) -> FlankForce:
-        """Force of the flanks of one side (1 drive, -1 coast), as that of the drive flank."""
+        """Return the contact on one side (1 drive, -1 coast), its force in the field `drive`."""
         touch = self._touch(side, motion)
         force = self.law(touch.depth, touch.closing)
         _, lever1, lever2, _ = touch.approach
@@ -328,12 +347,12 @@ class RotorPair(eqx.Module):
         )
 
     def _touch(self, side: Float[Array, ""], motion: Motion) -> _Touch:
-        """The flanks of one side (1 drive, -1 coast).
+        """Return the pose of the flanks of one side (1 drive, -1 coast).
 
-        In the frame with the drive side's normal n from rotor 1 to rotor 2 and the tangent t a
-        quarter turn ahead, rotor 1 slides along rotor 2 with ω1 h1 - ω2 h2 + (v1 - v2)·t; the
-        coast side is the mirror image. Displaced axes are a pair at another centre distance,
-        turned by the angle θ of its line of centres: φ1 - θ and φ2 + θ.
+        Let n be the drive side's normal from rotor 1 to rotor 2, and the tangent t a quarter turn
+        ahead of it. Rotor 1 slides along rotor 2 at the speed ω1 h1 - ω2 h2 + (v1 - v2)·t. The
+        coast side is the mirror image. With displaced axes, the pair is one at another centre
+        distance, turned by the angle θ of its line of centres: φ1 - θ and φ2 + θ.
         """
         contact, line, relative = self.contact, None, motion.relative
         if motion.shift is not None:
@@ -367,9 +386,12 @@ class RotorPair(eqx.Module):
     def switches(
         self, tau: Float[Array, ""], state: Float[Array, " n"]
     ) -> tuple[Bool[Array, " s"], Bool[Array, " s"]]:
-        """On which of its smooth pieces the equation is, at rotation `tau` (mesh periods) and
-        scaled `state`: side and pieces of the flanks, of the contact law, of every part. And a
-        mask of the flags that matter (flanks out of contact are excluded)."""
+        """Return flags that tell on which smooth piece the equation is, and a mask of those that
+        matter.
+
+        A flag changes where the equation has a kink or a jump: in the side of contact, the piece of
+        the flank, the contact law or a part. The mask excludes flanks out of contact. Both are
+        taken at rotation `tau` (mesh periods) and scaled `state`."""
         motion, acting = self._moving(tau, state)
 
         def of_flank(side):
@@ -397,7 +419,8 @@ class RotorPair(eqx.Module):
     def derivative(
         self, tau: Float[Array, ""], state: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], FlankForce]:
-        """d(state)/dτ and the contact it comes from."""
+        """Return d(state)/dτ and the flank contact, at rotation `tau` (mesh periods) and scaled
+        `state`."""
         motion, acting = self._moving(tau, state)
         contact = self._force(motion)
         loads = self._loads(motion, acting, contact)
@@ -418,12 +441,12 @@ class RotorPair(eqx.Module):
         slope = jnp.concatenate(slopes)
         if self.free:
             slope = self.lapse(state) * slope
-        # A pair that has lost its mesh stands still rather than run to infinity; the
-        # caller reports it.
+        # A pair that has lost its mesh is held still, so that it does not run to infinity. The
+        # caller reports the loss.
         return jnp.where(lax.stop_gradient(self._lost(state, acting)), 0.0, slope), contact
 
     def _loads(self, motion: Motion, acting, contact: FlankForce) -> Loads:
-        """All that acts on the rotors, `acting` parts with their own states."""
+        """Return all loads on the rotors; `acting`: the parts with their own states."""
         torque1 = axes = None
         if self.free:
             torques = (part.torque_on_1(motion, own) for part, own in acting)
@@ -437,12 +460,14 @@ class RotorPair(eqx.Module):
         return Loads(torque1, torque2, axes)
 
     def lost(self, state: Float[Array, " n"]) -> Bool[Array, ""]:
-        """Whether a scaled state is no longer one of a running mesh: lobes have passed through
-        each other, a part says so (an axis has left its place), or the motor has stalled."""
+        """Return whether a scaled state is no longer that of a running pair.
+
+        The lobes have passed through each other, the motor has stalled, or a part reports a loss
+        (an axis displaced too far)."""
         return self._lost(state, zip(self.all_parts, self.own_states(state), strict=True))
 
     def _lost(self, state, acting) -> Bool[Array, ""]:
-        """`lost`, with the parts and their own states at hand."""
+        """Return `lost`, from the parts and their own states."""
         lost = ~(jnp.abs(self.angle_scale * state[0]) < self.angle_limit)
         for part, own in acting:
             gone = part.lost(own)
@@ -450,14 +475,15 @@ class RotorPair(eqx.Module):
         return lost | self.stalled(state) if self.free else lost
 
     def stalled(self, state: Float[Array, " n"]) -> Bool[Array, ""]:
-        """Whether a motor has come to a halt, all but."""
+        """Return whether the motor has stalled: rotor 1 turns slower than `STALLED` of the drive's
+        speed."""
         if not self.free:
             return jnp.zeros((), bool)
         return self.speed(state) < STALLED * self.drive.speed
 
 
 def _sum(terms: Iterable[Array | None]) -> Array | None:
-    """Sum of those that are not None, None if there are none."""
+    """Return the sum of the terms that are not None; None if there are none."""
     total = None
     for term in terms:
         if term is not None:

@@ -1,4 +1,4 @@
-"""The greatest contact force of a motion: where it is, and how it changes with the design."""
+"""The greatest contact force of a motion: its instant, and its derivatives."""
 
 from typing import NamedTuple
 
@@ -10,24 +10,28 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.pair import RotorPair
 
 _RIVALS, _CLOSER, _ROUNDS = 4, 16, 10
-"""Maxima of samples and of ends of steps whose neighbourhoods are looked at, places in each, and
-how many times ever more closely."""
+"""Refinement of the peak: number of maxima refined (of the samples, and of the ends of steps),
+number of places tried around each, and number of rounds."""
 _INNER = 2 * _RIVALS * _CLOSER - 2
-"""Samples or ends looked at together: as many places, less one beside them to either side."""
+"""Samples or ends of steps that one turn scans: the number of places, less one neighbour on either
+side."""
 _WIDE = 64
+"""Distance of the outermost times in `BESIDE`."""
 BESIDE = (0.0, -1.0, -2.0, 1.0, 2.0, -_WIDE, _WIDE)
 """Times just before and after a peak, in units of `BESIDE_UNIT`."""
 BESIDE_UNIT = {8: 2e-8, 4: 1e-3}
-"""Mesh periods, by bytes of a number."""
+"""Unit of `BESIDE` (mesh periods), by bytes per number."""
 _FARTHEST = {8: 32.0, 4: 1 / 16}
-"""Distance of the vertex from the located peak that is believed, in units of `_WIDE`: where the
-states between the samples bend, the peak is located no better than to some 1e-5."""
+"""Distance from the located peak to the vertex of the parabola, in units of `_WIDE`, above which
+the vertex is rejected. Where the states bend between samples, the peak is located only to about
+1e-5."""
 _ROUNDINGS = 1e5
-"""Bend of the force over `_WIDE` that is more than rounding, in roundings of the force."""
+"""Bend of the force over `_WIDE`, in rounding errors of the force, above which it is real."""
 _NOISES = 10.0
-"""The same in times the noise of the force, and scatter of the forces beside a smooth peak."""
+"""The same limit in multiples of the force's noise. It is also the allowed scatter of the forces
+beside a smooth peak."""
 _LEAST = 1e-9
-"""Fall of the force beside a corner, relative to it; what is less may be rounding."""
+"""Relative fall of the force beside a corner below which the fall may be rounding."""
 
 
 def motion(
@@ -36,8 +40,10 @@ def motion(
     place: Float[Array, ""],
     width: Float[Array, ""],
 ) -> Float[Array, " n"]:
-    """State at a `place` counted in samples, a `width` apart (mesh periods): ε by the quintic
-    through the three nearest and their rates, others by the quartic through the five nearest."""
+    """Return the state between uniform samples a `width` (mesh periods) apart.
+
+    `place`: position, counted in samples. ε comes from the quintic through the three nearest
+    samples and their rates, the other states from the quartic through the five nearest samples."""
     middle = jnp.clip(jnp.round(place).astype(int), 2, states.shape[0] - 3)
     near = lax.dynamic_slice_in_dim(states, middle - 2, 5)
     three = near[1:4]
@@ -59,7 +65,7 @@ def motion(
 
 
 def _slope(pair: RotorPair, states: Float[Array, "*k n"]) -> Float[Array, "*k"]:
-    """dε/dτ (scaled) at scaled states."""
+    """Return dε/dτ (scaled) at scaled states."""
     return states[..., 1] * pair.lapse(states) if pair.free else states[..., 1]
 
 
@@ -69,14 +75,17 @@ def _state(
     slope: Float[Array, ""],
     others: Float[Array, " m"],
 ) -> Float[Array, " n"]:
-    """The scaled state with this ε and dε/dτ."""
+    """Return the scaled state with ε = `swing`, dε/dτ = `slope` and the `others`."""
     state = jnp.concatenate([jnp.stack([swing, slope]), others])
     return state.at[1].divide(pair.lapse(state)) if pair.free else state
 
 
 class Steps(NamedTuple):
-    """Steps of a solver: where they begin and end (mesh periods; inf beyond the last), the states
-    there, and how many there are."""
+    """Steps that a solver has taken.
+
+    `begins`, `ends`: start and end of each step (mesh periods; inf beyond the last); `before`,
+    `after`: scaled states there; `count`: number of steps.
+    """
 
     begins: Float[Array, " steps"]
     ends: Float[Array, " steps"]
@@ -85,8 +94,10 @@ class Steps(NamedTuple):
     count: Int[Array, ""]
 
     def motion(self, pair: RotorPair, tau: Float[Array, ""]) -> Float[Array, " n"]:
-        """State (scaled) at time `tau` (mesh periods): ε and dε/dτ by the cubic through both at
-        the ends of the step, others in proportion."""
+        """Return the scaled state at time `tau` (mesh periods), interpolated within its step.
+
+        ε and dε/dτ come from the cubic through their values at both ends of the step. The other
+        states are linear."""
         k, step, x = self._place(tau)
         before, after = self.before[k], self.after[k]
         rate, last = step * _slope(pair, jnp.stack([before, after]))
@@ -97,13 +108,13 @@ class Steps(NamedTuple):
         return _state(pair, swing, slope, (1 - x) * before[2:] + x * after[2:])
 
     def reaches(self, tau: Float[Array, ""], width: Float[Array, ""]) -> Bool[Array, ""]:
-        """Whether that cubic is at `tau` as good as a polynomial through samples a `width` apart:
-        close enough to an end of the step."""
+        """Return whether `motion` at `tau` is as accurate as a polynomial through samples a `width`
+        (mesh periods) apart: `tau` is close enough to an end of its step."""
         _, step, x = self._place(tau)
         return x * (1 - x) * step**2 < width**2
 
     def _place(self, tau):
-        """The step at `tau`, its length, and the share of it that has passed."""
+        """Return the index of the step at `tau`, its length, and the fraction of it completed."""
         k = jnp.clip(jnp.searchsorted(self.ends, tau), 0, self.count - 1)
         step = self.ends[k] - self.begins[k]
         return k, step, (tau - self.begins[k]) / step
@@ -116,10 +127,11 @@ def blended(
     tau: Float[Array, ""],
     width: Float[Array, ""],
 ) -> Float[Array, " n"]:
-    """State at `tau` (mesh periods) from the `states` at times a `width` apart and the `steps`.
+    """Return the state at `tau` (mesh periods) from samples and solver steps.
 
-    A polynomial through samples to both sides of a corner does not know of it; the steps are short
-    there, and their cubics count where they are as good."""
+    `states`: samples a `width` (mesh periods) apart. A polynomial through samples on both sides of
+    a corner smooths it away. Solver steps are short there, so their cubics are used wherever they
+    are as accurate."""
     sampled = motion(pair, states, tau / width, width)
     return jnp.where(steps.reaches(tau, width), steps.motion(pair, tau), sampled)
 
@@ -127,15 +139,16 @@ def blended(
 def locate_peak(
     pair: RotorPair, states: Float[Array, "samples n"], length: Float[Array, ""], steps: Steps
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Time (mesh periods) of the greatest force, and the greatest penetration (m) that was seen,
-    from the `states` at uniform times over `length` mesh periods and the `steps` of the solver.
+    """Return the time (mesh periods) of the greatest force, and the greatest penetration (m) seen.
 
-    An impact's peak can be narrower than the sampling, with a corner where the damping
-    saturates: the greatest of the samples' maxima are enclosed by looking ever more closely around
-    each, as the greatest sample need not lie by the greatest peak. An impact can also fall between
-    two samples: the same is done around the maxima at the ends of the steps. Inside a step the
-    state is known less well where that is long; it is looked at there only if the steps are about
-    as close as the samples, or the motion can swing between samples.
+    `states`: samples at uniform times over `length` mesh periods; `steps`: those of the solver.
+
+    An impact's peak can be narrower than the sampling, and has a corner where the damping
+    saturates. The greatest sample need not be next to the greatest peak, so several maxima of the
+    samples are refined, by ever closer scans around each. An impact can also fall between two
+    samples, so the maxima at the ends of steps are refined as well. Inside a long step the state is
+    less accurate. Places there count only if steps are about as dense as samples, or if the motion
+    can oscillate between samples.
     """
     last = jnp.stack([jnp.asarray(states.shape[0]), steps.count]) - 1  # of samples, of steps
     width = length / states.shape[0]
@@ -154,9 +167,9 @@ def locate_peak(
         known = ~by_steps | inside | steps.reaches(tau, width)
         return jnp.where(known, found.total, -jnp.inf), found.depth
 
-    # One loop for all, so that the contact is compiled once: the samples, the ends of the steps,
-    # and rounds about the rivals. Of each: its force, place (in samples), and the ends of the
-    # interval that it is in; of the samples, and of the ends.
+    # One loop does everything, so that the contact is compiled once. It scans the samples, then the
+    # ends of steps, then refines the rivals in rounds. `rivals`: force, place (in samples) and ends
+    # of the enclosing interval of each rival, for the samples and for the ends of steps.
     def look(i, carry):
         rivals, depth = carry
         scanning = i < scans + by_ends
@@ -174,7 +187,7 @@ def locate_peak(
 
         beside = jnp.maximum(jnp.roll(force, 1), jnp.roll(force, -1))
         maximum = (force >= beside) & (k <= last[way])
-        maximum = maximum.at[jnp.array([0, -1])].set(False)  # Those are of the next blocks.
+        maximum = maximum.at[jnp.array([0, -1])].set(False)  # These belong to the next blocks.
         found = jnp.stack([jnp.where(maximum, force, -jnp.inf), place, low, high])
         listed = jnp.concatenate([rivals[:, way], found], axis=1)
         scanned = rivals.at[:, way].set(listed[:, lax.top_k(listed[0], _RIVALS)[1]])
@@ -195,22 +208,27 @@ def locate_peak(
 def one_sided(
     forces: Float[Array, "7"], noise: Float[Array, ""] | float = 0.0
 ) -> tuple[Float[Array, ""], Float[Array, "7"]]:
-    """The peak from the forces at the times `BESIDE` it, known but for a relative `noise` and
-    rounding, and with which weights their derivatives make up that of the peak.
+    """Return the peak, and the weights with which the derivatives of `forces` sum to its own.
 
-    Where the force is smooth at its peak, it is the derivative at the fixed instant (envelope
-    theorem), at the vertex of the parabola through the forces: rounding hides where exactly the
-    greatest is. Where the force has a corner, the peak stays on the corner as that moves, and of
-    the derivatives on both sides the mean counts for which the force is stationary in time. Where
-    it jumps (contact by `linear`, say), rounding decides on which side of the jump the instant
-    lies: the higher side counts.
+    `forces`: contact force at the times `BESIDE` the located peak; `noise`: their relative error
+    beyond rounding. There are three cases:
+
+    Smooth peak: the derivative of the peak is that at a fixed instant (envelope theorem). The
+    instant is the vertex of the parabola through the forces, because rounding hides the exact
+    maximum.
+
+    Corner: the peak moves with the corner. Its derivative is that weighted mean of the derivatives
+    on both sides for which the force is stationary in time.
+
+    Jump (such as with the `linear` contact): rounding decides on which side of the jump the located
+    instant lies. The higher side counts.
     """
     here, before, earlier, after, later, left, right = forces
     none, one = jnp.zeros_like(here), jnp.ones_like(here)
-    # Each slope from its own side: the corner is not known as well as that.
+    # Each slope is taken on one side only: the place of the corner is not known well enough.
     rise, fall = before - earlier, after - later
     drop = rise + fall
-    # Next to a corner the force falls as fast as farther away, on a parabola a third as fast.
+    # Next to a corner the force falls as fast as farther away; on a parabola, a third as fast.
     sharp = (2 * here - before - after > 0.6 * drop) & (drop > _LEAST * here)
     continuous = jnp.abs(before - after) <= 2 * drop
     corner = (rise > 0) & (fall > 0) & sharp & continuous
@@ -219,7 +237,7 @@ def one_sided(
     bend = 2 * here - left - right
     rounding = float(jnp.finfo(forces.dtype).eps) * here
     noise = _NOISES * noise * here
-    # A jump stands out from the slope that it makes over the wide distance.
+    # A jump stands out from the straight line through the forces at the wide distance.
     line = here + (right - left) / (2 * _WIDE) * jnp.asarray(BESIDE[:5], forces.dtype)
     smooth = jnp.max(jnp.abs(forces[:5] - line)) < bend / (8 * _WIDE) + 100 * rounding + noise
     bent = bend > jnp.maximum(_ROUNDINGS * rounding, noise)

@@ -1,14 +1,14 @@
 """Derivatives of a motion across an instant at which its equation jumps.
 
-Next to a cusp the gap of two flanks has two minima. Where the deeper of them changes, the
-penetration is continuous but its levers are not, and with them the contact force. Beside
-what the steps before and after contribute, the motion then changes with the instant at
-which that happens (saltation; P. C. Müller, Chaos, Solitons & Fractals 5 (1995) 1671-1681):
+Next to a cusp the gap of two flanks has two minima. Where the other minimum becomes the deeper one,
+the penetration is continuous, but the levers jump, and with them the contact force. The instant t*
+of the jump moves, which adds a term to the derivatives from the steps before and after (saltation;
+P. C. Müller, Chaos, Solitons & Fractals 5 (1995) 1671-1681):
 
-    dy = (f₋ - f₊) dt*,        dt* = -d(δ₋ - δ₊) / (dδ₋/dτ - dδ₊/dτ),
+    dy = (f₋ - f₊) dt*,        dt* = -d(δ₋ - δ₊) / (dδ₋/dτ - dδ₊/dτ).
 
-f the equation of motion and δ the penetration, before and after. Integrals over the motion
-are entries of y like any other.
+f is the right-hand side of the equation of motion and δ the penetration, before (₋) and after (₊)
+the jump. Integrals over the motion are entries of y like the states.
 """
 
 import jax.numpy as jnp
@@ -18,22 +18,22 @@ from jaxtyping import Array, Float
 from rootsopt.dynamics.pair import FlankForce
 
 LONGEST = 4e-6
-"""Longest step (mesh periods) that is looked into: all that are made around a change are
-shorter."""
+"""Length of a step (mesh periods) above which it is not searched for a jump. All steps made around
+a switch are shorter."""
 _FASTER = 20.0
-"""Change of a lever per mesh period, in pitch radii, that only a jump makes: along a flank of EE it
-is at most 2π, with any number of lobes."""
+"""Lever change (pitch radii per mesh period) above which it is a jump. Along a flank of the EE
+family it is at most 2π, for any number of lobes."""
 _ROUNDINGS = 300
-"""Roundings of a lever that are no jump."""
+"""Lever changes below this many rounding errors are not jumps."""
 _ALIKE = 0.05
-"""Share of a jump by which the levers on one side of it may differ: of a lever that changes fast,
-but all the way, some stage of the step is in between."""
+"""Difference of the levers on one side of a jump, as a fraction of the jump, above which it is not
+a jump. If a lever changes fast but continuously, some stages of the step lie in between."""
 MARKS = 4
-"""Numbers that tell a jump, beside the slope of a motion."""
+"""Number of `marks`, by which a jump is recognised, appended to the slope of a motion."""
 
 
 def marks(contact: FlankForce) -> Float[Array, "4"]:
-    """Penetration (m), its rate (m/s), and levers (m)."""
+    """Return penetration (m), its rate (m/s), and both levers (m)."""
     return jnp.stack([contact.depth, contact.closing, contact.lever1, contact.lever2])
 
 
@@ -43,13 +43,13 @@ def saltation(
     period: Float[Array, ""],
     length: Float[Array, ""] | None,
 ) -> Float[Array, " rows-4"]:
-    """Zero, with the derivative that a jump inside a step adds to y after it.
+    """Return zero, with the derivative that a jump inside a step adds to y after the step.
 
-    `step`: its length (mesh periods); `slopes`: the slope of y with the `marks` behind, at the
-    stages of the step, its begin first and its end last; `period`: the time (s) by which y is
-    counted; `length` (m): the size of levers. Exact but for the length of the step.
+    `step`: length of the step (mesh periods); `slopes`: slope of y followed by the `marks`, at the
+    stages of the step, from its start to its end; `period` (s): duration of a mesh period at this
+    state; `length` (m): typical size of the levers. The error is of the order of the step length.
 
-    Raises ValueError where the contact that jumps does not say the size of its levers.
+    Raises ValueError if `length` is None: a contact that jumps must state the size of its levers.
     """
     if length is None:
         raise ValueError("A contact that `jumps` must have a `length_scale`, but it is None.")

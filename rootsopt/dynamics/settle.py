@@ -1,7 +1,7 @@
-"""Let the transient pass, and check that it has.
+"""Simulate the transient until the motion repeats.
 
-The pair is forced with the mesh period. After a transient the states at the end of each mesh
-period (the stroboscopic map) settle on a cycle of k points.
+The pair is forced with the mesh period. After a transient, the states at the end of each mesh
+period (the stroboscopic states) settle on a cycle of k points.
 """
 
 import dataclasses
@@ -17,24 +17,23 @@ from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 
 BLOCK = 4
-"""Mesh periods integrated between two looks at the transient."""
+"""Mesh periods integrated between two checks of the transient."""
 _MEMORY = 20
-"""Stroboscopic states remembered; more than twice the longest period looked for."""
+"""Number of stroboscopic states stored: more than twice the longest cycle searched for."""
 _PATIENCE = 32, 1e-5
-"""Mesh periods after which a transient that has not settled goes on with steps at this tolerance
-at most: their noise hides that the motion repeats."""
+"""Mesh periods after which an unsettled transient continues with finer steps, and the largest
+tolerance of these. The noise of coarser steps can hide that the motion repeats."""
 NOISE = 100.0
-"""Noise that adaptive steps give the stroboscopic states, in tolerances and relative to them."""
+"""Noise of the stroboscopic states from adaptive steps, in tolerances, relative to the states."""
 
 
 class Transient(NamedTuple):
     """End of a transient.
 
-    `state`: last stroboscopic state; `period`: its cycle length k in mesh periods, 0 if
-    it has not settled; `nearest`: the k with which the last states repeat best, and
-    `spread` the scaled difference that leaves; `periods`: mesh periods simulated; `lost`:
-    `RotorPair.lost`; `solved`: whether the solver got through; `steps`:
-    solver steps.
+    `state`: last stroboscopic state (scaled); `period`: its cycle length k in mesh periods, 0 if
+    not settled; `nearest`: the k with which the last states repeat best; `spread`: their scaled
+    difference for that k; `periods`: mesh periods simulated; `lost`: see `RotorPair.lost`;
+    `solved`: whether the solver succeeded; `steps`: number of solver steps.
     """
 
     state: Float[Array, " n"]
@@ -48,8 +47,9 @@ class Transient(NamedTuple):
 
 
 def settled_within(rtol: Float[Array, ""]) -> Float[Array, ""]:
-    """Scaled difference below which states count as repeating, for a transient integrated
-    at `rtol`: the noise of adaptive steps is some hundred times the tolerance."""
+    """Return the scaled difference below which states count as repeating, at the tolerance `rtol`.
+
+    The noise of adaptive steps is about a hundred times the tolerance."""
     return jnp.clip(1000 * rtol, 3e-3, 3e-2)
 
 
@@ -61,23 +61,24 @@ def settle(
     max_periods: Int[Array, ""],
     max_orbit: int,
 ) -> Transient:
-    """Integrate block by block until the last states repeat with some period k.
+    """Integrate from the scaled `state` until the stroboscopic states repeat with some period k.
 
-    What has not settled after `_PATIENCE` goes on in finer steps. Settled means: the last k + 1
-    states differ from those k periods earlier by less than `tolerance` (scaled units; or the noise
-    of steps in states far from 0), for the smallest such k ≤ `max_orbit` ≤ 8.
+    Settled means: the last k + 1 states differ from those k periods earlier by less than
+    `tolerance` (scaled). For large states, the noise of the steps is allowed if it is greater. k is
+    the smallest such period, at most `max_orbit` ≤ 8. After `_PATIENCE`, the steps are finer. After
+    `max_periods` mesh periods, the transient is given up.
     """
     orders = jnp.arange(1, max_orbit + 1)
     age = jnp.arange(_MEMORY)[::-1]
 
     def cycle(states, rtol):
-        # Of states far from 0 the noise of adaptive steps is in proportion to them.
+        # In large states, the noise of adaptive steps is proportional to the state.
         noise = jnp.maximum(1.0, NOISE * rtol * jnp.abs(states) / tolerance)
         noise = jnp.where(jnp.isfinite(noise), noise, 1.0)
 
         def spread(k):
             change = jnp.max(jnp.abs(states - jnp.roll(states, k, axis=0)) / noise, axis=1)
-            # Before the start the memory holds inf, and inf - inf is no difference.
+            # Before the start the memory holds inf; inf - inf would be NaN.
             change = jnp.where(jnp.isnan(change), jnp.inf, change)
             return jnp.max(jnp.where(age <= k, change, 0.0))
 

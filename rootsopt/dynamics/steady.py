@@ -1,9 +1,9 @@
 """The steady motion that a state leads to, with its status and derivatives, as a pure function.
 
-A transient is let pass (`settle`), the cycle it ends on is closed and differentiated
-(`close_orbit`) and judged (`verdict`). What does not hold is tried again more closely. Where there
-is no orbit, a window of the motion tells chaos from a long transient. All attempts are turns of one
-loop, so that a program holds one copy of every part.
+The transient is simulated (`settle`). The cycle it ends on is closed and differentiated
+(`orbit_or_window`), then checked (`verdict`). If a check fails, the next attempt is finer. Where
+there is no orbit, a window of the motion tells chaos from a long transient. All attempts are turns
+of one loop, so that the compiled program holds one copy of every part.
 """
 
 import dataclasses
@@ -26,26 +26,28 @@ from rootsopt.dynamics.window import PERIODS, Window
 from rootsopt.status import Status
 
 _NEARLY = 0.05
-"""Scaled difference below which states are near enough to repeating for Newton's method to tell,
-and an orbit may be one of a shorter period."""
+"""Scaled difference below which states nearly repeat. Newton's method then decides whether there is
+an orbit, or an orbit of a shorter period."""
 _CLOSEST = 1e-12
-"""Scaled difference below which states repeat exactly: a closer look would show no more."""
+"""Scaled difference below which states repeat exactly: finer attempts would show no more."""
 _TRUSTED = 1e-8
-"""Tolerance down to which an orbit is integrated more finely than asked for, where it does not
-close or its derivatives are not known."""
+"""Finest tolerance to which an orbit is refined beyond the one requested, if it does not close or
+its derivatives are uncertain."""
 
 
 class Solver(eqx.Module):
-    """How a steady motion is found.
+    """Settings for finding a steady motion.
 
-    `transient` and `orbit`: how they are integrated; `measures` of the force beside mean and mean
-    square; `max_periods`: mesh periods that the transient may take; `examine`: 1 to look at a
-    window of a motion that does not settle, 0 to give it up (both floats, so that all leaves are);
-    `max_orbit`: longest period looked for, at most 8; `precision`: float64 or float32.
+    `transient`, `orbit`: their integrators; `measures`: averages of the force to compute;
+    `max_periods`: maximum length of the transient (mesh periods); `examine`: 1 to integrate
+    a window of a motion that does not settle, 0 to give it up; `max_orbit`: longest period searched
+    for (mesh periods), at most 8; `precision`: float64 or float32. `max_periods` and `examine` are
+    floats, as are all leaves.
 
-    For coarse surveys of many designs: `shots` allowed for closing an orbit, which is closed to
-    `closed` tolerances; `samples` of it; `check` of the derivatives on halved steps; number of
-    `attempts`; `windows`: mesh periods of a window (a multiple of 16, or 0 for none at all).
+    Coarse surveys of many designs change the others. `shots`: maximum number of integrations to
+    close an orbit; `closed`: residual, in tolerances, at which it may count as closed; `samples`:
+    number of its samples; `check`: compare the derivatives with those on halved steps; `attempts`:
+    maximum number of attempts; `windows`: mesh periods of a window, a multiple of 16; 0: no window.
     """
 
     transient: Integrator
@@ -64,11 +66,12 @@ class Solver(eqx.Module):
 
 
 class Steady(NamedTuple):
-    """What a state leads to.
+    """The steady motion that a state leads to.
 
-    `status`: code of a `Status`; `orbit` of `period` mesh periods, as it was closed last at the
-    tolerance `rtol`, and the `verdict` on it; `window` of a motion that did not settle;
-    `settled`: end of the transient; mesh periods `used` by transients and solver `steps` of all.
+    `status`: code of a `Status`; `orbit`: the last one kept; `period`: its mesh periods; `rtol`:
+    its tolerance; `verdict` on it; `window` of a motion that did not settle; `settled`: end of the
+    transient; `used`: mesh periods of all transients; `steps`: solver steps of transients and
+    orbits.
     """
 
     status: Int[Array, ""]
@@ -83,8 +86,10 @@ class Steady(NamedTuple):
 
     @property
     def forces(self) -> Float[Array, " r"]:
-        """Mean (N), mean square (N²), peak (N) and the other measures: of the orbit, of the window
-        where there is one (NaN for the others), 0 without contact, else NaN."""
+        """Mean (N), mean square (N²), peak (N) and the other measures of the force.
+
+        They are those of the orbit, or of the window if there is one (other measures NaN). They are
+        0 without contact, and NaN in all other cases."""
         closed = self.orbit.response
         unknown = jnp.full_like(closed, jnp.nan)
         found = jnp.where(among(self.status, CLOSED), closed, unknown)
@@ -96,7 +101,7 @@ class Steady(NamedTuple):
 
     @property
     def sensitivity(self) -> Float[Array, "r d"]:
-        """Derivatives of `forces` along the directions asked for; NaN unless periodic."""
+        """Derivatives of `forces` along the requested directions; NaN unless periodic."""
         return jnp.where(self.status == Status.PERIODIC.code, self.orbit.sensitivity, jnp.nan)
 
 
@@ -105,16 +110,17 @@ CLOSED = (Status.PERIODIC, Status.INACCURATE, Status.TOO_DEEP, Status.UNRESOLVED
 
 
 def among(code: Int[Array, "*n"], statuses: tuple[Status, ...]) -> Bool[Array, "*n"]:
-    """Return whether a status code is that of one of the `statuses`."""
+    """Return whether a status code belongs to one of the `statuses`."""
     return jnp.any(jnp.stack([code == status.code for status in statuses]), axis=0)
 
 
 class _Search(NamedTuple):
-    """Where the attempts stand: what is known (`found`), and what comes next.
+    """State of the loop over attempts: the result so far, and the next turn.
 
-    A `shorter` period to be tried (0: none), a window (`windowed`), or else a transient from
-    `state` at tolerances `coarse`, until it repeats `within` some scaled distance, and an orbit at
-    `fine`. `tries`: attempts made; `over`: nothing comes next.
+    `found`: result so far; `shorter`: period to try next (0: none); `windowed`: whether a window is
+    next. Otherwise a transient and its orbit are next: from `state`, at the tolerances `coarse`
+    (transient) and `fine` (orbit), until states repeat `within` a scaled distance. `tries`:
+    refinements made; `over`: whether the loop ends.
     """
 
     found: Steady
@@ -129,7 +135,7 @@ class _Search(NamedTuple):
 
 
 class _Attempts(eqx.Module):
-    """What `steady_motion` was asked for; `start` and `step` are its loop."""
+    """Arguments of `steady_motion`. Its loop is `start` and `step`."""
 
     pair: RotorPair
     tangents: RotorPair
@@ -137,7 +143,7 @@ class _Attempts(eqx.Module):
     radius: Float[Array, ""]
 
     def start(self, state: Float[Array, " n"]) -> _Search:
-        """Nothing known of the motion from the scaled `state`."""
+        """Return the loop's state before the first attempt, from the scaled `state`."""
         solver, dtype, count = self.solver, state.dtype, state.shape[0]
         directions = jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
         steps = solver.orbit.max_steps
@@ -160,7 +166,9 @@ class _Attempts(eqx.Module):
         return _Search(found, state, coarse, fine, within, zero, no, zero, no)
 
     def step(self, now: _Search) -> _Search:
-        """One turn: a transient and its orbit, an orbit of a shorter period, or a window."""
+        """Make one turn and return the new state of the loop.
+
+        A turn is a transient and its orbit, an orbit of a shorter period, or a window."""
         solver, found = self.solver, now.found
         shorter = now.shorter > 0
         fresh = ~shorter & ~now.windowed
@@ -176,8 +184,8 @@ class _Attempts(eqx.Module):
         steps = found.steps + jnp.where(fresh, settled.steps, 0)
         settled = choose(fresh, settled, found.settled)
         failure = transient_status(self.pair, settled)
-        # Time is out, but the motion nearly repeats: noise of the coarse transient may be all that
-        # is left. Newton's method tells.
+        # The transient is at its limit, but the motion nearly repeats. The rest may be noise of the
+        # coarse steps; Newton's method decides.
         nearly = (failure == Status.NOT_SETTLED.code) & (settled.spread < _NEARLY) & fresh
         within = jnp.where(nearly, settled.spread, now.within)
         settled = settled._replace(period=jnp.where(nearly, settled.nearest, settled.period))
@@ -197,7 +205,7 @@ class _Attempts(eqx.Module):
             self.pair, self.tangents, start, period, shots, now.windowed, solver.windows
         )
         judged, status = self._judged(orbit, start, now.fine, within)
-        # An orbit of a shorter period whose derivatives are not known is the motion all the same.
+        # An orbit of a shorter period is the motion even if its derivatives are uncertain.
         holds = among(status, (Status.PERIODIC, Status.INACCURATE))
         taken = jnp.where(shorter, holds, ~lost) & ~now.windowed
         status = jnp.where(lost, failure, jnp.where(taken, status, found.status))
@@ -215,13 +223,13 @@ class _Attempts(eqx.Module):
         return self._next(now, new, within, lost, taken & shorter)
 
     def _next(self, now: _Search, new: Steady, within, lost, shortened) -> _Search:
-        """What comes after an attempt that has left `new`."""
+        """Return the loop's state after an attempt with the result `new`."""
         solver = self.solver
         candidate = self._shorter(new, now.shorter)
         looks = (new.status == Status.PERIODIC.code) & ~shortened & ~now.windowed & ~lost
-        # Newton left the neighbourhood or found an unstable orbit, or one whose derivatives are
-        # not known: it was not the steady state yet, or too coarse an image of it. Go on, and look
-        # more closely.
+        # Newton's method left the neighbourhood, or found an orbit that is unstable or has
+        # uncertain derivatives. The motion was not steady yet, or known too coarsely: continue the
+        # transient with finer tolerances.
         late = (new.used >= solver.max_periods) | (within < _CLOSEST)
         late |= now.tries + 1 >= solver.attempts
         weak = among(new.status, (Status.NOT_SETTLED, Status.INACCURATE)) & ~now.windowed
@@ -245,8 +253,9 @@ class _Attempts(eqx.Module):
         )
 
     def _judged(self, orbit: Orbit, start, fine, within) -> tuple[Verdict, Int[Array, ""]]:
-        """The verdict on an orbit integrated at the tolerance `fine`, and its status as a motion;
-        whether its forces are known is asked at the end."""
+        """Return the verdict on an orbit integrated at the tolerance `fine`, and its status.
+
+        The accuracy of its forces is checked later, in `final`."""
         pair, solver, dtype = self.pair, self.solver, start.dtype
         closing = dataclasses.replace(solver.orbit, rtol=fine)
         rtols = solver.transient.tolerance(dtype), closing.tolerance(dtype)
@@ -258,7 +267,7 @@ class _Attempts(eqx.Module):
             (~orbit.flow.solved, Status.SOLVER_FAILED),
             (found.idle, Status.IDLE),
             (~jnp.all(jnp.isfinite(numbers)), Status.NON_FINITE),
-            # Of what multiplies errors no derivative is known either.
+            # Before the derivatives: an orbit that amplifies errors has no known derivative.
             (~found.steady, Status.NOT_SETTLED),
             (~jnp.all(jnp.isfinite(orbit.sensitivity)), Status.NON_FINITE),
             (~found.certain, Status.INACCURATE),
@@ -267,8 +276,10 @@ class _Attempts(eqx.Module):
         return found, status
 
     def _shorter(self, found: Steady, beyond) -> Int[Array, ""]:
-        """Least period above `beyond` that divides that of the orbit and after which the orbit
-        nearly repeats, or 0: noise of the transient can hide that a motion repeats sooner."""
+        """Return a shorter period after which the orbit nearly repeats, or 0.
+
+        It is the least such period above `beyond` that divides the period of the orbit. Noise of
+        the transient can hide that a motion repeats sooner."""
         periods = jnp.arange(1, max(self.solver.max_orbit // 2, 1) + 1)
         place = periods * self.solver.samples // found.period
         states = found.orbit.flow.states[jnp.minimum(place, self.solver.samples - 1)]
@@ -278,13 +289,14 @@ class _Attempts(eqx.Module):
         return jnp.where(jnp.any(fits), periods[jnp.argmax(fits)], 0)
 
     def _unsettled(self, window: Window) -> Int[Array, ""]:
-        """Code of the status of a motion that has not settled, from a window of it."""
+        """Return the status code of a motion that has not settled, from a window of it."""
         if not self.solver.windows:
             return jnp.asarray(Status.NOT_SETTLED.code)
         return window_status(self.pair, window)
 
     def final(self, found: Steady) -> Steady:
-        """`found`, with the forces of its orbit looked at."""
+        """Return `found`, with its status changed if the forces of its orbit are not valid: the
+        flanks penetrate too deep, or errors are too large."""
         orbit, judged = found.orbit, found.verdict
         closed = among(found.status, (Status.PERIODIC, Status.INACCURATE))
         deep = orbit.flow.depth > TOO_DEEP * self.radius
@@ -294,7 +306,7 @@ class _Attempts(eqx.Module):
 
 
 def transient_status(pair: RotorPair, settled: Transient) -> Int[Array, ""]:
-    """Code of the status of a transient that leads to no orbit, or -1."""
+    """Return the status code of a transient that leads to no orbit, or -1 if it has settled."""
     return _first(
         (~settled.solved, Status.SOLVER_FAILED),
         (~jnp.all(jnp.isfinite(settled.state)), Status.NON_FINITE),
@@ -306,7 +318,7 @@ def transient_status(pair: RotorPair, settled: Transient) -> Int[Array, ""]:
 
 
 def window_status(pair: RotorPair, window: Window) -> Int[Array, ""]:
-    """Code of the status of a motion that has not settled, from a `window` of it."""
+    """Return the status code of a motion that has not settled, from a `window` of it."""
     finite = jnp.all(jnp.isfinite(window.response)) & jnp.isfinite(window.exponent)
     lost = pair.lost(window.end)
     least = float(jnp.finfo(window.end.dtype).eps) * pair.force_scale
@@ -322,7 +334,7 @@ def window_status(pair: RotorPair, window: Window) -> Int[Array, ""]:
 
 
 def _first(*cases: tuple[Bool[Array, ""], Status], default: int) -> Int[Array, ""]:
-    """Code of the status of the first case that holds."""
+    """Return the status code of the first case that holds, or `default`."""
     conditions, statuses = zip(*cases, strict=True)
     return jnp.select(conditions, [jnp.asarray(s.code) for s in statuses], jnp.asarray(default))
 
@@ -334,10 +346,10 @@ def steady_motion(
     radius: Float[Array, ""],
     solver: Solver,
 ) -> Steady:
-    """Find the steady motion of `pair` from the scaled `state` at φ1 = 0, with derivatives along
-    the directions `tangents` of its parameters (stacked along a leading axis).
+    """Find the steady motion of `pair` that the scaled `state` (n,) at φ1 = 0 leads to.
 
-    `radius`: pitch radius (m), beside which penetrations are judged.
+    `tangents`: directions of the pair's parameters, stacked along a leading axis, for the
+    derivatives; `radius`: pitch radius (m), to which penetrations are compared.
     """
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     attempts = _Attempts(pair, tangents, solver, radius)

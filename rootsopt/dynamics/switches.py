@@ -1,8 +1,10 @@
-"""Steps that end where the equation of motion is not smooth.
+"""Solver steps that end where the equation of motion is not smooth.
 
-A method of high order sees a kink of the equation as an error of low order, and a jump of
-its derivatives (where the contact moves on to the next piece of a flank) costs the
-linearised motion far more than the motion itself.
+Inside a step, a kink of the equation reduces a high-order method to low order. A jump of the
+equation's derivatives (where contact moves to the next flank segment) harms the linearised motion
+far more than the motion itself.
+
+A *change* below is an instant at which a flag of `RotorPair.switches` changes.
 """
 
 import jax
@@ -15,31 +17,35 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.peak import Steps, blended
 
 _LOOKS, _LONGEST = 252, 8
-"""Places in a mesh period where changes are looked for, beside the ends of the steps, and mesh
-periods that there are places for."""
+"""Number of places per mesh period at which changes are searched for, in addition to the ends of
+steps, and the maximum number of mesh periods."""
 _CHANGES = 1024
-"""Changes found in one stretch of motion, at most; a mesh period has some 20 to 100."""
+"""Maximum number of changes found in one stretch of motion. A mesh period has about 20 to 100."""
 _LANES = 16
-"""Places looked at together."""
+"""Number of places evaluated together."""
 _HALVINGS = 26
+"""Number of bisections that locate a change."""
 _BRIEF, _PARTS = 0.05, 8
-"""Changes less than `_BRIEF` mesh periods apart have `_PARTS` steps between them."""
+"""Distance of two changes (mesh periods) below which the second number of steps lies between them.
+"""
 _ASIDE = 1e-9, 1e-6
-"""Half a step (mesh periods) that holds a change: so many times the tolerance of the motion as
-`_LOOSE`, but within these. What it does to the gradients is in proportion to it."""
+"""Limits of half the step (mesh periods) that holds a change. Between them it is `_LOOSE` times the
+tolerance of the motion. The error of the gradients is proportional to it."""
 _LOOSE = 1e3
 _ROUNDINGS = 16.0
-"""The same in roundings of the time, at least: in single precision that is the longest of these."""
+"""Minimum of the same half step, in rounding errors of the time. It governs in single precision."""
 _SHARE = 1e-4
-"""The same as a share of the time to the next change, at most: beside a change of curvature in a
-rounding layer the error of the gradients is in proportion to the square of this share."""
+"""Maximum of the same half step, as a fraction of the time to the next change. Where the curvature
+changes inside a rounded corner, the error of the gradients is proportional to the square of this
+fraction."""
 _GRADES = 8.0, 64.0
-"""Further ends beside a change, in units of that half step: a change that lies a little outside its
-step is still in a short one."""
+"""Distances of further step ends from a change, in units of that half step. They keep the steps
+short around a change that lies slightly outside its step."""
 _HOLDS = 2.5
-"""Steps up to this length, in units of the longest half step that holds a change, stay whole."""
+"""Length of a step, in units of the longest half step that holds a change, up to which it is never
+halved."""
 _APART = 1e-10
-"""Ends of steps closer than this (mesh periods) are one."""
+"""Distance (mesh periods) below which two step ends are merged."""
 
 
 def with_switches(
@@ -49,9 +55,10 @@ def with_switches(
     tolerance: Float[Array, ""],
     base: Float[Array, " steps"] | None = None,
 ) -> Float[Array, " steps"]:
-    """The grid `base` (default: that of `out`) with steps that end where the equation changes from
-    one smooth piece to another along `out`, integrated over `periods` mesh periods at a relative
-    `tolerance`."""
+    """Return the grid `base` with step ends added at the changes along `out`.
+
+    `out`: the motion, integrated over `periods` mesh periods at a relative `tolerance`; `base`: by
+    default its own grid."""
     width = periods / out.states.shape[0]
     before = jnp.concatenate([out.states[:1], out.corners[:-1]])
     begins = jnp.concatenate([jnp.zeros_like(out.grid[:1]), out.grid[:-1]])
@@ -67,15 +74,15 @@ def with_switches(
         return pair.switches(tau, blended(pair, out.states, steps, tau, width))
 
     def changes(seen, counts):
-        """Where switches change that count on either side: how many, and of each the switch, its
-        value before, and the ends of the interval."""
+        """Return the number of changes, and for each one its flag, the flag's value before, and
+        both ends of the interval. Flags count if they matter on either side."""
         differ = (seen[1:] != seen[:-1]) & (counts[1:] | counts[:-1])
         differ &= (jnp.arange(1, places.shape[0]) < known)[:, None]
         interval, which = jnp.nonzero(differ, size=_CHANGES, fill_value=0)
         number = jnp.minimum(jnp.sum(differ), _CHANGES)
         return number, which, seen[interval, which], places[interval], places[interval + 1]
 
-    # Looking and halving in one loop, so that the switches are compiled once.
+    # Scan and bisect in one loop, so that the switches are compiled once.
     def go_on(carry):
         turn, (number, *_), *_ = carry
         return (turn <= blocks) | (turn < blocks + _HALVINGS * -(-number // _LANES))
@@ -104,31 +111,31 @@ def with_switches(
     listed = lax.while_loop(go_on, look, (jnp.zeros((), int), nothing, unseen, unseen))[1]
     number, *_, high = listed
     found = jnp.sort(jnp.where(jnp.arange(_CHANGES) < number, high, jnp.inf))
-    # Between two changes close together the contact crosses a whole piece of the flank.
+    # Between two close changes the contact crosses a whole flank segment: short steps there.
     brief = jnp.diff(found, append=jnp.inf)
     share = jnp.arange(1, _PARTS, dtype=found.dtype) / _PARTS
     inside = found[:, None] + jnp.where(brief < _BRIEF, brief, jnp.inf)[:, None] * share
-    # A change lies inside a step too short to matter: no stage is evaluated beside it, where
-    # rounding would decide on which side.
+    # Each change lies inside a step too short to matter. No stage is evaluated right at it, where
+    # rounding would decide the side.
     apart = jnp.minimum(brief, jnp.diff(found, prepend=-jnp.inf))
     aside = jnp.minimum(jnp.clip(_LOOSE * tolerance, *_ASIDE), _SHARE * apart)
-    # Of two changes at almost the same instant each would be at an end of a step of no length.
+    # A minimum length: two changes at almost the same instant would give steps of zero length.
     least = jnp.maximum(_ASIDE[0], _ROUNDINGS * float(jnp.finfo(found.dtype).eps) * periods)
     aside = jnp.maximum(aside, least)
     beside = [sign * grade * aside for grade in (1.0, *_GRADES) for sign in (-1, 1)]
     added = [*(found + apart for apart in beside), inside.ravel()]
     merged = jnp.sort(jnp.concatenate([out.grid if base is None else base, *added]))
-    # Nearly equal ends would make steps of no length.
+    # Nearly equal ends would give steps of zero length.
     close = jnp.diff(merged, prepend=-jnp.inf) < _APART
     close |= ~((merged > 0) & (merged <= periods))
     return jnp.sort(jnp.where(close, jnp.inf, merged))[: out.grid.shape[0]]
 
 
 def halved(grid: Float[Array, " steps"]) -> Float[Array, " steps"]:
-    """The grid with its steps divided in two; where there is no room for all, the longest.
+    """Return the grid with its steps halved; if there is no room for all, only the longest ones.
 
-    Steps that hold a change stay as they are: their middle is the change itself, where rounding
-    decides on which side of it the derivatives are taken.
+    Steps that hold a change stay whole: the change is at their middle, and there rounding would
+    decide on which side the derivatives are taken.
     """
     lengths, whole = _lengths(grid)
     taken = grid < jnp.inf
@@ -140,13 +147,13 @@ def halved(grid: Float[Array, " steps"]) -> Float[Array, " steps"]:
 
 
 def has_room(grid: Float[Array, " steps"]) -> Bool[Array, ""]:
-    """Whether `halved` divides all steps that it is to divide."""
+    """Return whether the grid has room for `halved` to halve all steps that hold no change."""
     lengths, whole = _lengths(grid)
     return jnp.sum(grid < jnp.inf) + jnp.sum(lengths > whole) <= grid.shape[0]
 
 
 def _lengths(grid):
-    """Lengths of the steps, and that up to which a step may hold a change."""
+    """Return the lengths of the steps, and the length up to which a step may hold a change."""
     taken = grid < jnp.inf
     begins = jnp.concatenate([jnp.zeros_like(grid[:1]), grid[:-1]])
     lengths = jnp.where(taken, grid - jnp.where(taken, begins, 0.0), 0.0)

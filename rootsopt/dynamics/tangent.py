@@ -1,9 +1,9 @@
 """Derivatives of a motion from the steps a solver has taken.
 
-Once the steps of a motion are known, each can be linearised apart from the others: many at
-a time, as arrays, rather than one after another beside the motion. What is left in
-sequence is a product of small matrices. The result is the derivative of the discrete motion
-on these steps, exact to rounding (the variational equation under the same method).
+Once the steps of a motion are known, each can be linearised independently. Many are linearised
+together, as arrays, instead of one after another along with the motion. Only the product of the
+small matrices is sequential. The result is the derivative of the discrete motion on these steps,
+exact to rounding: the variational equation, solved by the same method.
 """
 
 from collections.abc import Callable
@@ -16,9 +16,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-# Steps linearised together: enough to work at vector speed, few enough not to waste much
-# where the motion ends inside a chunk.
 _CHUNK = 32
+"""Number of steps linearised together: enough for vector speed, few enough to waste little where
+the motion ends inside a chunk."""
 
 
 def one_step(
@@ -29,21 +29,22 @@ def one_step(
     y: Float[Array, " m"],
     args: Any,
 ) -> tuple[Float[Array, " m"], Float[Array, "stages m"]]:
-    """State after one step of `solver` from `begin` to `end`, and dy/dτ at its stages: at `begin`
-    first, at `end` last."""
+    """Take one step of `solver` and return y at its end, and dy/dτ at its stages.
+
+    The step goes from `begin` to `end`. The first stage is at `begin`, the last at `end`."""
     if not isinstance(solver, diffrax.AbstractERK):
         memory = solver.init(term, begin, end, y, args)
         after = solver.step(term, begin, end, y, args, memory, made_jump=False)[0]
         return after, jnp.stack([term.vf(begin, y, args), term.vf(end, after, args)])
-    # The same sums as the solver's own step, without its error estimate and the machinery
-    # for everything a step can be: several times cheaper to compile.
+    # The same sums as in the solver's own step, without error estimate and special cases: several
+    # times cheaper to compile.
     tableau = solver.tableau
     assert isinstance(tableau, diffrax.ButcherTableau)
     stages = int(np.max(np.nonzero(tableau.b_sol))) + 1
     lower = np.zeros((stages + 1, stages))
     for row, entries in enumerate(tableau.a_lower[: stages - 1], start=1):
         lower[row, :row] = entries
-    # The end as one stage more, so that the equation is compiled once.
+    # The end is one more stage, so that the equation is compiled once.
     lower[stages] = tableau.b_sol[:stages]
     times = np.concatenate([[0.0], tableau.c])[:stages]
     lower, times = (jnp.asarray(x, y.dtype) for x in (lower, np.append(times, 1.0)))
@@ -63,16 +64,19 @@ def one_step(
 
 
 class Linear(NamedTuple):
-    """Values with their derivatives in the n entries of a state and along d directions of the
-    parameters."""
+    """Values with their derivatives.
+
+    `value` (rows,); `by_state` (rows, n): with respect to the n entries of a state;
+    `by_parameters` (rows, d): along d directions of the parameters.
+    """
 
     value: Float[Array, " rows"]
     by_state: Float[Array, "rows n"]
     by_parameters: Float[Array, "rows d"]
 
     def after(self, before: Float[Array, "n columns"]) -> Float[Array, "rows columns"]:
-        """Derivatives by the n + d columns, from those of the state."""
-        # Written as a sum: a matrix product this small costs more in its call.
+        """Return the derivatives along the n + d columns, given those of the state (`before`)."""
+        # A sum: for matrices this small, calling a matrix product costs more.
         moved = jnp.sum(self.by_state[:, :, None] * before[None], axis=1)
         return moved.at[:, self.by_state.shape[1] :].add(self.by_parameters)
 
@@ -84,9 +88,11 @@ def linearized(
     directions: Any,
     count: int,
 ) -> Linear:
-    """Value of `function(y, parameters)` with its derivatives in the first `count` = n
-    entries of y and along the `directions` of the parameters (stacked, maybe none)."""
-    # All directions in one pass, so that what they share is computed once.
+    """Return the value of `function(y, parameters)` with its derivatives.
+
+    They are with respect to the first `count` = n entries of y, and along the `directions` of the
+    parameters (stacked along a leading axis; there may be none)."""
+    # All directions in one pass, so that common terms are computed once.
     number = jax.tree.leaves(directions)[0].shape[0]
     unit = jnp.eye(count + number, y.shape[0], dtype=y.dtype).at[count:].set(0.0)
     moved = jax.tree.map(
@@ -107,14 +113,17 @@ def propagated(
     branch: Int[Array, ""],
     aside: int,
 ) -> tuple[Float[Array, "m columns"], Float[Array, "n columns"], Linear]:
-    """Derivatives of y along the n unit directions of the initial state and d parameters after
-    the step `last`; and what happens aside of the motion.
+    """Return derivatives after a sequence of linearised steps, and at side steps from one of them.
 
-    `linear_step(k, there)` linearises step k: rows are y, of which the entries beyond the n of
-    the state are integrals that feed back on nothing, then whatever else is of interest. Step -1
-    branches off before the step `branch`, and its end is given as `there` (zero before that) to
-    `aside` more steps, -2, -3 …. `start`: derivatives before the first step. Returned are the
-    derivatives of y at the end, those of the state after step -1, and the steps aside (stacked).
+    `linear_step(k, there)` linearises step k. Its rows are y, then any further values. y holds the
+    n entries of the state, then integrals, on which no row depends. `start`: derivatives of y
+    before the first step (m, n + d), along n directions of the initial state and d parameters.
+
+    Side steps do not belong to the motion. Step -1 starts where the step `branch` starts. `aside`
+    more steps, numbered -2, -3 …, start at its end, which they get as `there` (zero until then).
+
+    The results are the derivatives of y after the step `last`, those of the state after step -1,
+    and the side steps -2, -3 … (stacked).
     """
     shape = jax.eval_shape(linear_step, last, start[:, 0])
     count = shape.by_state.shape[1]
@@ -126,7 +135,7 @@ def propagated(
         moved = step.after(y[:count])[: y.shape[0]].at[count:].add(y[count:])
         return (jnp.where((k >= 0) & (k <= last), moved, y), held), None
 
-    # Step -1 is the first of all; the others aside follow when it is known.
+    # Step -1 comes first. The other side steps follow once it is known.
     lanes = jnp.arange(_CHUNK)
 
     def chunk(carry):

@@ -1,4 +1,4 @@
-"""How quickly a rotor pair can change, from which first and longest steps of a solver follow."""
+"""Timescales of a rotor pair, from which the solver's first and longest steps follow."""
 
 from collections.abc import Iterable
 
@@ -12,11 +12,11 @@ from rootsopt.dynamics.parts import Part
 
 
 class Timescales(eqx.Module):
-    """Times (s) of the quickest swing and of free flight.
+    """Timescales of the fastest oscillation and of free flight.
 
-    `swing`: in which the phase of rotor 2's swing on flank and timing gear, or that of any other
-    part, advances by one radian; `fall`: from one end of the gear's play to the other under the
-    load, infinite where the play is less than the static penetration and the pair never flies.
+    `swing`: 1/ω (s) of the fastest oscillation: of rotor 2 on flank and timing gear, or of another
+    part; `fall`: time (s) from one end of the gear's play to the other under the load. It is
+    infinite if the play is less than the static penetration, since the pair then never flies.
     `free`: |ε| (rad) below which the clearance keeps the flanks apart at the nominal centre
     distance.
     """
@@ -35,10 +35,12 @@ class Timescales(eqx.Module):
         radius: Float[Array, ""],
         clearance: Float[Array, ""],
     ) -> "Timescales":
-        """Timescales of a pair whose flanks carry the static `force` (N) at the pitch `radius` (m).
+        """Return the timescales of a pair, without derivatives.
 
-        The contact is as stiff as at the static depth, or at that of an impact after a fall
-        through the play if this is deeper (its energy is the work of the load).
+        `inertia` (kg·m²) of one rotor; `force` (N): static flank force at the pitch `radius` (m);
+        `clearance` (m) of the flanks. The contact stiffness is taken at the greater of two depths:
+        the static one, and that of an impact after a fall through the play. The energy of the
+        impact is the work of the load.
         """
         parts = tuple(parts)
         play = jnp.zeros_like(force)

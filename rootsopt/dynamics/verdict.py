@@ -1,6 +1,6 @@
-"""What there is to say of a closed orbit: whether it is a motion, and whether its forces are known.
+"""Checks of a closed orbit: whether it is the steady motion, and whether its forces are known.
 
-The same for one design at a time and for batches.
+The checks are the same for single designs and for batches.
 """
 
 from typing import NamedTuple
@@ -16,26 +16,30 @@ from rootsopt.dynamics.settle import NOISE
 RESIDUAL = {"float64": 1e-9, "float32": 1e-3}
 """Largest residual (scaled) of an orbit that counts as closed, by precision."""
 TOO_DEEP = 0.02
-"""Penetration in pitch radii beyond which no contact law holds."""
+"""Penetration (pitch radii) above which no contact law holds."""
 UNRESOLVED = 1e-2
-"""Relative error of the greatest force by rounding of the gap, beyond which it is no result."""
+"""Relative error of the greatest force, from rounding of the gap, above which it is unresolved."""
 _UNKNOWN = 0.1
-"""Error of an orbit (scaled) beyond which nothing is known of it."""
+"""Estimated error of an orbit (scaled) above which the orbit is rejected."""
 _FREE = 1e-6
-"""Distance of a Floquet multiplier from 1 that is none."""
+"""Distance of a Floquet multiplier from 1 below which it counts as 1."""
 _DEFECT = 1e3
-"""Residual of an orbit on halved steps, in tolerances and relative to the greatest entry of its
-monodromy matrix, with which it is no result."""
+"""Residual on halved steps above which an orbit's derivatives are uncertain: in tolerances, times
+the greatest entry of the monodromy matrix."""
 _DRIFT = 1e3, 1e-5
-"""Distance (scaled) from where kinks were looked for, in tolerances but at least the second, beyond
-which the derivatives of an orbit are not known: some kinks lie inside long steps."""
+"""Distance (scaled) from the orbit of the last search for kinks, above which derivatives are
+uncertain: the first in tolerances, but at least the second. Some kinks then lie inside long steps.
+"""
 _STRAINED = 100.0
-"""Error of a repeated step, in tolerances, with which an orbit on these steps is none."""
+"""Reject an orbit if a replayed step's error exceeds this many tolerances."""
 
 
 class Verdict(NamedTuple):
-    """What there is to say of a closed orbit: `is_idle`, `judged` steady, relative error
-    by `force_rounding` of the greatest force, `is_consistent`, `is_certain`."""
+    """Results of the checks of a closed orbit.
+
+    `idle`: see `is_idle`; `steady`: see `judged`; `rounding`: relative error of the greatest force
+    (see `force_rounding`); `consistent`: see `is_consistent`; `certain`: see `is_certain`.
+    """
 
     idle: Bool[Array, ""]
     steady: Bool[Array, ""]
@@ -52,8 +56,10 @@ def verdict(
     residual: Float[Array, ""] | float,
     scales: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]],
 ) -> Verdict:
-    """The verdict on an orbit; arguments as of `judged`, and the `scales` exponent of the contact
-    law, pitch radius (m), force unit (N)."""
+    """Return the verdict on an orbit.
+
+    `scales`: exponent of the contact law, pitch radius (m), unit of force (N). The other arguments
+    are those of `judged`."""
     exponent, radius, force = scales
     rounding = force_rounding(orbit.flow.depth, exponent, radius)
     steady = judged(orbit, state, within, rtols, residual)
@@ -69,11 +75,12 @@ def verdict(
 def is_idle(
     orbit: Orbit, least: Float[Array, ""] | float = 0.0, steady: Bool[Array, ""] | bool = False
 ) -> Bool[Array, ""]:
-    """Whether no flank ever touches, but for forces up to the `least` (N) of rounding.
+    """Return whether no flank ever touches. Forces up to `least` (N) count as rounding.
 
-    Either the orbit is `steady`: the timing gear holds the pair. Or nothing brings the pair back
-    when it is moved: it can rest anywhere, and neither Newton's method nor a derivative has an
-    answer. Without contact, an orbit that is neither says nothing of the motion.
+    Such a pair is idle in two cases. Either the orbit is `steady`: the timing gear holds the pair.
+    Or nothing brings a displaced pair back: it can rest anywhere, and neither Newton's method nor a
+    derivative has an answer. In any other case, an orbit without contact says nothing about the
+    motion.
     """
     free = jnp.isnan(orbit.multiplier) | (orbit.multiplier > 1 - _FREE)
     return (orbit.flow.mean <= least) & (orbit.flow.peak <= least) & (free | steady)
@@ -86,13 +93,16 @@ def judged(
     rtols: tuple[Float[Array, ""] | float, Float[Array, ""] | float],
     residual: Float[Array, ""] | float,
 ) -> Bool[Array, ""]:
-    """Whether an orbit is the stable motion that a transient led to, both integrated at `rtols`
-    (transient, orbit).
+    """Return whether an orbit is the stable motion that a transient led to.
 
-    It is closed to a `residual` on steps that a solver would have taken, its Floquet multipliers
-    lie inside the unit circle, errors of the size of its tolerance do not add up to anything in it
-    (I - M is far enough from singular), and it is beside the `state` that repeated `within` some
-    distance (all scaled, and relative to states beyond 1).
+    `rtols`: tolerances of transient and orbit; `state` (n,): end of the transient, which repeated
+    `within` some distance; `residual`: limit for a closed orbit. All are scaled, and relative to
+    states greater than 1. There are four conditions:
+
+    - The orbit closes to `residual`, on steps that the solver would accept.
+    - Its Floquet multipliers lie inside the unit circle.
+    - It does not amplify errors of the size of its tolerance too much: I - M is far from singular.
+    - It lies near `state`.
     """
     size = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.state)))
     multiplier = orbit.multiplier
@@ -106,11 +116,10 @@ def judged(
 
 
 def is_consistent(orbit: Orbit, least: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether the mean force is no greater than the root of the mean square, and that no greater
-    than the peak, but for 1 % and forces of the size `least` (N).
+    """Return whether mean ≤ RMS ≤ peak force, within 1 % and forces of the size `least` (N).
 
-    This holds for every force. Steps too coarse for short impacts break it: the mean square they
-    add up to may even be negative.
+    This holds for every force. Steps too coarse for short impacts violate it: their mean square can
+    even be negative.
     """
     mean, square, peak = orbit.response[:3]
     ordered = (square + least**2 >= 0.98 * mean**2) & (peak**2 + least**2 >= 0.98 * square)
@@ -118,9 +127,10 @@ def is_consistent(orbit: Orbit, least: Float[Array, ""]) -> Bool[Array, ""]:
 
 
 def is_certain(orbit: Orbit, rtol: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether the derivatives of an orbit integrated at `rtol` hold what they promise: on halved
-    steps the orbit closes as the tolerance says and the derivatives agree, and its kinks lie where
-    they were looked for."""
+    """Return whether the derivatives of an orbit integrated at `rtol` are reliable.
+
+    On halved steps, the orbit must close as well as the tolerance promises, and the derivatives
+    must agree. The kinks must lie where they were searched for."""
     size = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.state)))
     gain = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.monodromy)))
     closes = orbit.defect <= _DEFECT * rtol * size * gain

@@ -1,7 +1,7 @@
 """A window of a motion that has not settled: its forces, and its largest Lyapunov exponent.
 
-The exponent tells chaos from a long transient (Benettin et al., Meccanica 15 (1980) 9-20: growth of
-a tangent vector that is renormalised every mesh period).
+The exponent tells chaos from a long transient. It is the growth of a tangent vector that is
+renormalised every mesh period (Benettin et al., Meccanica 15 (1980) 9-20).
 """
 
 from typing import Any, NamedTuple
@@ -19,26 +19,26 @@ from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 
 PERIODS = 128
-"""Mesh periods of a window."""
+"""Length of a window (mesh periods)."""
 _BATCHES = 16
-"""Batches of a window, whose means give the standard error of the exponent."""
+"""Number of batches of a window, whose means give the standard error of the exponent."""
 _KEPT = 105
-"""States kept of each mesh period."""
+"""Number of states stored per mesh period."""
 _SAMPLES = 630
-"""Uniform samples of a mesh period among which its peak is looked for; a multiple of `_KEPT`."""
+"""Uniform samples of a mesh period from which its peak is located; a multiple of `_KEPT`."""
 
 _Arrays = Array | np.ndarray
-"""Arrays of JAX, or of NumPy where a window has left the device."""
+"""JAX arrays, or NumPy arrays once a window has left the device."""
 
 
 class Window(NamedTuple):
     """A motion over p mesh periods, of which the first `done` are known.
 
-    `growth` (p,): logarithm of the factor by which a tangent vector grew in each; `response`
-    (p, 3): mean (N), mean square (N²) and peak (N) of the contact force; `states` (p, s, n):
-    uniform samples, scaled; `depth` (m): greatest penetration, negative: least gap; `solved`:
-    whether the solver got through; `end`: last scaled state, and the unit tangent vector
-    `direction` there.
+    `growth` (p,): logarithm of the tangent vector's growth factor in each mesh period; `response`
+    (p, 3): mean (N), mean square (N²) and peak (N) of the contact force in each; `states`
+    (p, s, n): uniform samples, scaled; `depth`: greatest penetration (m; negative: least gap);
+    `solved`: whether the solver succeeded; `end` (n,): last scaled state; `direction` (n,): unit
+    tangent vector there.
     """
 
     growth: Float[Array, " p"]
@@ -52,7 +52,7 @@ class Window(NamedTuple):
 
     @classmethod
     def empty(cls, state: Float[Array, " n"], periods: int) -> "Window":
-        """Return the window of a motion from the scaled `state` before its first period."""
+        """Return a window from the scaled `state` (n,), of which no period is known yet."""
         count, dtype = state.shape[0], state.dtype
         return cls(
             growth=jnp.zeros(periods, dtype),
@@ -66,7 +66,7 @@ class Window(NamedTuple):
         )
 
     def after(self, out: Flow) -> "Window":
-        """Return the window with one more mesh period, of which `out` is the flow."""
+        """Return the window extended by one mesh period; `out`: its flow."""
         count = self.end.shape[0]
         moved = out.slope[:count, :count] @ self.direction
         size = jnp.linalg.norm(moved)
@@ -91,7 +91,7 @@ class Window(NamedTuple):
 
     @property
     def error(self) -> Float[_Arrays, ""]:
-        """Standard error of `exponent`, from the means of batches."""
+        """Standard error of `exponent`, from the means of `_BATCHES` batches."""
         xp = _numpy_of(self.growth)
         batches = xp.mean(self.growth.reshape(_BATCHES, -1), axis=1)
         return xp.asarray(xp.std(batches, ddof=1) / _BATCHES**0.5)
@@ -105,7 +105,7 @@ class Window(NamedTuple):
 
 
 def _numpy_of(array: Any) -> Any:
-    """NumPy for arrays that have left the device, so that nothing is compiled for them."""
+    """Return NumPy for NumPy arrays, so that nothing is compiled for them, else jax.numpy."""
     return np if isinstance(array, np.ndarray) else jnp
 
 
@@ -124,7 +124,8 @@ def lyapunov(
 
 
 def no_tangents(pair: RotorPair) -> RotorPair:
-    """Return no directions of the parameters of `pair`, stacked: derivatives in the state only."""
+    """Return an empty stack of parameter directions for `pair`, so that a flow has derivatives with
+    respect to the state only."""
     return jax.tree.map(
         lambda x: jnp.zeros((0, *x.shape), x.dtype), eqx.filter(pair, eqx.is_inexact_array)
     )

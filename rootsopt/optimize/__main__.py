@@ -1,4 +1,4 @@
-"""`python -m rootsopt.optimize CONFIG`: an optimised design against the baseline."""
+"""Run `python -m rootsopt.optimize CONFIG`: optimise a design and compare it with the baseline."""
 
 from rootsopt.commands.door import leave
 from rootsopt.commands.optimize import main

@@ -1,4 +1,4 @@
-"""The main job as a function."""
+"""The main job as a function: optimise a design and compare it with the baseline."""
 
 from collections.abc import Callable
 
@@ -11,14 +11,14 @@ from rootsopt.scene import check_geometry
 def optimize_design(
     config: Config, progress: Callable[[int, int, float], None] | None = None
 ) -> Optimization:
-    """Search the design with the least objective of a `config`, and compare it with the baseline.
+    """Find the design that minimises the objective of a `config`, and compare it with the baseline.
 
     `progress` is called with (evaluations done, evaluations expected, best objective). The result
-    has `baseline` and `optimized` as `Evaluation` (`None` where no better design held up),
-    `improvement`, `constraints`, `history` and a `status`.
+    has `baseline` and `optimized` as `Evaluation` (`optimized` is None if no better design was
+    confirmed), `improvement`, `constraints`, `history` and a `status`.
 
-    Raises `InputError` for a config that cannot be optimised, RuntimeError where JAX is not set to
-    the precision it asks for.
+    Raises `InputError` for a config that cannot be optimised; RuntimeError if JAX is not set to the
+    precision of the config.
 
     >>> found = rootsopt.optimize_design(rootsopt.load_config("configs/cic.yaml"))
     >>> found.optimized.design, found.improvement["mean_force_N"]

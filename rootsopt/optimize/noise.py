@@ -1,10 +1,9 @@
-"""What a search owes to the noise of its objective, where that is an average over an ensemble.
+"""Verify the result of a search whose objective is an average over an ensemble.
 
-The best of many noisy objectives is best in part by luck. So what the search promises
-counts for nothing in the verdict: a few candidates are averaged again, over an ensemble of
-other motions and several times as many; the best of them and the baseline once more, over
-yet another; and it is accepted only if it is better by more than `SIGNIFICANT` combined
-standard errors.
+The best of many noisy objectives is best partly by luck. So the objectives of the search do not
+count in the decision. A few candidates are averaged again, over a larger ensemble of other motions.
+The best of them and the baseline are then averaged over yet another ensemble. The design is
+accepted only if it is better by more than `SIGNIFICANT` combined standard errors.
 """
 
 import dataclasses
@@ -20,13 +19,18 @@ from rootsopt.response.ensemble import ERRORS, SIGNIFICANT, EnsembleEvaluator
 from rootsopt.response.evaluation import Evaluation
 
 _NEAR = 0.1
-"""Distance in the unit box up to which trials count as one candidate."""
+"""Distance in the unit box below which trials count as one candidate."""
 _CANDIDATES = 3
+"""Maximum number of candidates that are averaged again."""
 
 
 class Verification(NamedTuple):
-    """Outcome of a verification: `problem` relative to the `baseline` as averaged anew,
-    `optimized` if a design held up, and the `record` for the result file."""
+    """Outcome of a verification.
+
+    `baseline`: evaluation by the last ensemble; `problem`: relative to it; `optimized`: evaluation
+    of the design, None if it was not accepted; `record`: entries for the result file. Without a
+    usable candidate, `problem` and `baseline` are those of the search.
+    """
 
     problem: Problem
     baseline: Evaluation
@@ -35,11 +39,10 @@ class Verification(NamedTuple):
 
 
 def standard_error(problem: Problem, evaluation: Evaluation) -> float:
-    """Standard error of the objective of an evaluation, that of the baseline aside; NaN for
-    one that is not usable.
+    """Return the standard error of the objective of an evaluation; NaN if it is not usable.
 
-    The weighted sum of those of the responses: an upper bound, and close to it, since mean
-    and peak rise together.
+    The error of the baseline is not included. The value is the weighted sum of the responses'
+    standard errors. This is an upper bound, and a close one, since mean and peak rise together.
     """
     steady = evaluation.steady_state
     errors = {name: steady.get(key, float("nan")) for name, key in ERRORS.items()}
@@ -47,14 +50,15 @@ def standard_error(problem: Problem, evaluation: Evaluation) -> float:
 
 
 def add_errors(rows: list[dict[str, Any]], trials: Sequence, problem: Problem) -> None:
-    """Give the rows of a history, one a trial, the standard error of their objective."""
+    """Add the standard error of the objective to the rows of a history, one row per trial."""
     for row, trial in zip(rows, trials, strict=True):
         row["objective_standard_error"] = standard_error(problem, trial.evaluation)
 
 
 def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> Verification:
-    """Choose among the best candidates by one larger ensemble, and compare the one chosen with
-    the baseline by another. Gradients are from ensembles of the search's size."""
+    """Choose the best candidate by one larger ensemble; compare it with the baseline by another.
+
+    Gradients come from ensembles of the search's size."""
     chooser, judge = (evaluator.independent(k).without_gradient() for k in (1, 2))
     settings = judge.settings
     record: dict[str, Any] = {
@@ -99,7 +103,7 @@ def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> 
 
 
 def _with_gradient(evaluation: Evaluation, other: Evaluation) -> Evaluation:
-    """`evaluation` with the gradient of the `other` one, and its standard error."""
+    """Return `evaluation` with the gradient of the `other` one and its standard error."""
     key = "gradient_standard_error"
     errors = {key: other.steady_state[key]} if key in other.steady_state else {}
     steady = evaluation.steady_state | errors
@@ -107,13 +111,13 @@ def _with_gradient(evaluation: Evaluation, other: Evaluation) -> Evaluation:
 
 
 def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[np.float64]]]:
-    """The most promising points of the unit box, apart from each other, each with the
-    objective that the trials near it give on average.
+    """Return the most promising points of the unit box, each with an averaged objective.
 
-    Ranked by that average plus its standard error: one lucky trial among worse ones is no
-    candidate.
+    The points are at least `_NEAR` apart. The objective is the average over the trials near a
+    point. Points are ranked by this average plus its standard error, so a single lucky trial among
+    worse ones does not rank high.
     """
-    # A start repeats the screening's trial, noise and all.
+    # The first trial of a descent repeats a screening trial, with the same noise: count it once.
     usable = {tuple(trial.point): trial for trial in trials if trial.candidate}
     points = np.array(list(usable)).reshape(len(usable), -1)
     objectives = np.array([trial.objective for trial in usable.values()])
@@ -134,7 +138,7 @@ def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[
 
 
 def most_promising(problem: Problem, trials: Sequence) -> Any:
-    """The trial at the best of the `candidates`, or None."""
+    """Return the trial at the best of the `candidates`, or None."""
     found = candidates(problem, trials)
     if not found:
         return None
@@ -143,8 +147,9 @@ def most_promising(problem: Problem, trials: Sequence) -> Any:
 
 
 def message(record: dict[str, Any]) -> str:
-    """What to tell of a verification over an ensemble that no design passed; nothing for
-    another one."""
+    """Return the message for a verification over an ensemble that no design has passed.
+
+    It is empty if the verification was not over an ensemble."""
     if "required_standard_errors" not in record:
         return ""
     advice = (
@@ -153,10 +158,10 @@ def message(record: dict[str, Any]) -> str:
     )
     found, error = record.get("verified_objective"), record.get("combined_standard_error")
     if found is None or not np.isfinite(found):
-        return f"No design promised to be better than the baseline beyond the noise. {advice}"
+        return f"The search found no design better than the baseline beyond the noise. {advice}"
     return (
-        f"The difference to the baseline is within the noise: averaged over an independent "
-        f"ensemble, the best design has an objective of {found:.4g} against 1, with a combined "
-        f"standard error of {error:.2g}, and {record['required_standard_errors']:g} of these are "
-        f"asked for. {advice}"
+        f"The difference from the baseline is within the noise: averaged over an independent "
+        f"ensemble, the best design has an objective of {found:.4g} against 1. The combined "
+        f"standard error is {error:.2g}, and the difference must exceed "
+        f"{record['required_standard_errors']:g} of these. {advice}"
     )

@@ -23,22 +23,23 @@ from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 
 _NO_LINE = 1e-9
-"""Amplitude of a spectral line, relative to the mean force, that counts as none."""
+"""Amplitude of a spectral line, relative to the mean force, below which there is no line."""
 _DRAWN = 5
-"""How often a point that cannot be made feasible is drawn half way towards one that is."""
+"""Maximum number of times that an infeasible point is moved half way towards a feasible one."""
 _ACTIVE = 1e-6
-"""Scaled distance from its limit at which a constraint counts as active."""
+"""Scaled violation of a constraint below which a point counts as feasible. It is also the distance
+from a bound of the unit box below which the bound counts as active."""
 
 
 @Program
 def _nearest(space: Space, design):
-    """Point of the unit box nearest to a design."""
+    """Return the point of the unit box nearest to a design."""
     return space.point(design)
 
 
 @Program
 def _ranges(space: Space, design):
-    """Ranges of parameters that depend on the others at a design, bounds aside."""
+    """Return the ranges of the parameters whose range depends on the others, without bounds."""
     return space.ranges(design)
 
 
@@ -47,7 +48,11 @@ _slacks_of = Program(Space.slacks_of)
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """A config's design problem against its evaluated baseline."""
+    """A config's design problem, relative to its evaluated baseline.
+
+    `config`; `baseline`: its evaluation; `space`: unit box of the design parameters, with the
+    constraints. A *point* below is a point (d,) of this box.
+    """
 
     config: Config
     baseline: Evaluation
@@ -55,10 +60,10 @@ class Problem:
 
     @classmethod
     def of(cls, config: Config, scene: Scene, baseline: Evaluation) -> "Problem":
-        """The problem whose floors are those of the config or of the `baseline`.
+        """Return the problem with the constraint limits of the config or of the `baseline`.
 
-        Raises `InputError` where a measure is to fall that is 0 for the baseline: nothing is
-        relative to that."""
+        Raises `InputError` if a measure in the objective is 0 for the baseline, since measures are
+        relative to the baseline's."""
         orders = {line_name(order): order for order in config.objective.line_weights}
         counting = [part for part in at_speeds(baseline) if part.share > 0]
         for name, part in itertools.product(objective_weights(config), counting):
@@ -82,15 +87,18 @@ class Problem:
         return cls(config, baseline, Space.of(config, scene, baseline.geometry["area_efficiency"]))
 
     def objective(self, evaluation: Evaluation) -> float:
-        """Weighted measures of the force relative to the baseline's (1 at the baseline), over the
-        speeds that count; NaN for a design without a usable steady state."""
+        """Return the objective: the weighted measures relative to the baseline's, over all speeds.
+
+        It is 1 at the baseline, and NaN for a design without a usable steady state."""
         if not evaluation.usable:
             return float("nan")
         return sum(share * self._value(*pair) for share, *pair in self._counted(evaluation))
 
     def by_speed(self, evaluation: Evaluation) -> list[dict[str, float]]:
-        """The objective at each speed by itself, if there are several; NaN where the baseline's is
-        relative to nothing, which no speed with a share is."""
+        """Return the objective at each speed by itself; empty unless there are several speeds.
+
+        It is NaN where a measure of the baseline is 0, which occurs only at a speed without share.
+        """
         parts = zip(at_speeds(evaluation), at_speeds(self.baseline), strict=True)
         return [
             {
@@ -103,7 +111,7 @@ class Problem:
         ]
 
     def look(self, point) -> tuple[NDArray[np.float64], ...]:
-        """Design at a point of the unit box, its Jacobian, slacks, and their Jacobian."""
+        """Return design, its Jacobian, slacks of the constraints, and their Jacobian at a point."""
         return self._look_at(tuple(np.asarray(point, dtype=np.float64)))
 
     @functools.cached_property
@@ -111,11 +119,11 @@ class Problem:
         def look(point):
             return tuple(map(np.asarray, slacks_and_slopes(self.space, np.asarray(point))))
 
-        # The same point is asked about several times over.
+        # The same point is requested several times.
         return functools.lru_cache(maxsize=1024)(look)
 
     def slope(self, evaluation: Evaluation, point) -> NDArray[np.float64]:
-        """Gradient of the objective in the unit box."""
+        """Return the gradient of the objective with respect to the point (d,)."""
         _, jacobian, _, _ = self.look(point)
         by_design = np.zeros(len(self.space.lower))
         for share, one, baseline in self._counted(evaluation):
@@ -127,31 +135,31 @@ class Problem:
         return counted(self.config, evaluation, self.baseline, self._value)
 
     def _value(self, evaluation: Evaluation, baseline: Evaluation) -> float:
-        """Weighted measures of the force at one speed relative to the baseline's there."""
+        """Return the weighted measures of the force at one speed, relative to the baseline's."""
         return sum(w * evaluation.response[k] for k, w in self._weights(baseline).items())
 
     def _weights(self, baseline: Evaluation) -> dict[str, float]:
-        """Weights (1/N) of the measures of one speed, NaN for one that is 0 for the baseline."""
+        """Return the weights (1/N) of the measures at one speed, NaN where the baseline's is 0."""
         weights = objective_weights(self.config)
         forces = {key: baseline.response[key] or math.nan for key in weights}
         return {key: weight / forces[key] for key, weight in weights.items()}
 
     def point(self, design) -> NDArray[np.float64]:
-        """The nearest point of the unit box to a design in config units."""
+        """Return the point of the unit box nearest to a design (d,) in config units."""
         return np.asarray(_nearest(self.space, np.asarray(design, dtype=np.float64)))
 
     def design(self, point) -> Float[Array, " d"]:
-        """Design in config units at a point of the unit box."""
+        """Return the design (d,) in config units at a point."""
         return jnp.asarray(self.look(point)[0])
 
     def feasible(self, point) -> bool:
-        """Whether a point of the unit box satisfies every constraint."""
+        """Return whether a point satisfies every constraint."""
         return bool(np.min(self.look(point)[2]) >= -_ACTIVE)
 
     def project(self, point) -> NDArray[np.float64]:
-        """A feasible point near `point`: Gauss-Newton steps on the violated constraints.
+        """Return a feasible point near `point`, by Gauss-Newton steps on the violated constraints.
 
-        The result may still be infeasible where the constraints contradict the bounds.
+        The result can still be infeasible if the constraints contradict the bounds.
         """
         point = np.clip(np.asarray(point, dtype=np.float64), 0.0, 1.0)
         for _ in range(30):
@@ -159,8 +167,8 @@ class Problem:
             violated = slack < 0
             if not violated.any():
                 break
-            # Aim a hair inside, so that rounding leaves the constraint satisfied. A
-            # coordinate already held by its bound takes no part.
+            # Aim slightly inside, so that the constraint holds despite rounding. Coordinates held
+            # by their bound do not move.
             rows, want = jacobian[violated], 1e-7 - slack[violated]
             push = rows.T @ want
             held = ((point <= 0) & (push < 0)) | ((point >= 1) & (push > 0))
@@ -169,8 +177,10 @@ class Problem:
         return np.asarray(point, dtype=np.float64)
 
     def toward(self, point, inside) -> NDArray[np.float64]:
-        """As `project`; where that finds nothing feasible and no limits say what is sound, so that
-        perhaps a profile cannot even be made, the point is drawn towards `inside`, a feasible one,
+        """Return a feasible point near `point`, as `project` does, with a fallback to `inside`.
+
+        In a family without limits on its parameters, a profile may not even exist at `point`. If
+        `project` then finds nothing feasible, the point moves towards `inside`, a feasible point,
         until it does."""
         found = self.project(point)
         if self.space.family.by_limits:
@@ -182,11 +192,11 @@ class Problem:
         return found
 
     def descent(self, point, slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The slope less what active constraints and box faces forbid.
+        """Return the part of `slope` (d,) that active constraints and bounds allow.
 
-        -slope is projected onto the cone of feasible directions: the closest direction
-        that leaves no active constraint (a non-negative least-squares problem). It
-        vanishes exactly at a Karush-Kuhn-Tucker point.
+        The negative slope is projected onto the cone of feasible directions: the closest direction
+        that violates no active constraint (a non-negative least-squares problem). The result is
+        zero exactly at a Karush-Kuhn-Tucker point.
         """
         _, _, slack, jacobian = self.look(point)
         point = np.asarray(point)
@@ -201,7 +211,7 @@ class Problem:
         return np.asarray(slope - multipliers @ normals, dtype=np.float64)
 
     def constraint_rows(self, optimized: Evaluation) -> list[dict]:
-        """Every constraint with its values, for report and result file."""
+        """Return one row per constraint, with its values, for the report and the result file."""
         rows = []
         keys = {
             "area_efficiency": "area_efficiency",
@@ -224,12 +234,12 @@ class Problem:
         return rows + self._range_rows(optimized)
 
     def _slacks(self, evaluation: Evaluation) -> NDArray[np.float64]:
-        """Scaled slack of every constraint for a design that was evaluated."""
+        """Return the scaled slack of every constraint for an evaluated design."""
         design = np.asarray(list(evaluation.design.values()), dtype=np.float64)
         return np.asarray(_slacks_of(self.space, design))
 
     def _range_rows(self, optimized: Evaluation) -> list[dict]:
-        """The upper ends of ranges that depend on the other parameters."""
+        """Return rows for the upper limits of parameters whose range depends on the others."""
         design = np.asarray(list(optimized.design.values()), dtype=np.float64)
         rows = []
         for key, (_, most) in _ranges(self.space, design).items():

@@ -1,11 +1,11 @@
 """The search: screening, optax descent with projection, verification.
 
-Screening places the starts on a Sobol sample of feasible designs. From each start an
-optax update rule walks in the unit box: the gradient is stripped of what active
-constraints forbid, the step is projected back onto the feasible set. The last orbit is
-the first guess for the next. Best-so-far is kept; the winner is simulated again from rest
-at a tighter tolerance before it is reported. A search may be stopped at any time (`stop`), and then
-goes on to that last step with what it has.
+Screening chooses the starts from a Sobol sample of feasible designs. From each start, an optax
+update rule descends in the unit box. The gradient is first projected onto the directions that
+active constraints allow; each step is projected back onto the feasible set. The last orbit is the
+first guess for the next. The best design so far is kept, and simulated again from rest at a tighter
+tolerance before it is reported. A search can be stopped at any time (`stop`). It then verifies the
+best design found so far.
 """
 
 import dataclasses
@@ -39,12 +39,15 @@ RULES: dict[str, Callable[..., optax.GradientTransformation]] = {
     "sgd": optax.sgd,
 }
 _PATIENCE = 4
+"""Number of steps without a gain above which a descent ends."""
 _GAIN = 1e-4
+"""Relative decrease of the best objective below which a step counts as no gain."""
 _STATIONARY = 1e-3
+"""Norm of the projected gradient in the unit box below which a descent ends."""
 _HOLDS_UP = 0.01
-"""Relative change of the objective in the verification that still counts as holding up."""
+"""Relative change of the objective in the verification above which a design is rejected."""
 _POLL = 0.05
-"""Time (s) after which a wait looks whether the search is to stop."""
+"""Interval (s) at which a waiting thread checks whether to stop."""
 
 Progress = Callable[[int, int, float], None]
 """Called with (evaluations done, evaluations expected, best objective)."""
@@ -52,8 +55,12 @@ Progress = Callable[[int, int, float], None]
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """One evaluated design: `point` of the unit box, `start` it was reached from (-1: screening)
-    and after how many steps; `objective` (NaN without a usable steady state)."""
+    """One evaluated design of a search.
+
+    `point` (d,) of the unit box; `start`: number of the descent (-1: screening); `iteration`: steps
+    from its start; `evaluation`; `objective`: NaN without a usable steady state; `feasible`:
+    whether all constraints are satisfied.
+    """
 
     point: NDArray[np.float64]
     start: int
@@ -64,7 +71,7 @@ class Trial:
 
     @property
     def candidate(self) -> bool:
-        """Whether the design may be what is looked for."""
+        """Whether the design may be the result: feasible, with a known objective."""
         return self.feasible and not np.isnan(self.objective)
 
 
@@ -72,10 +79,11 @@ class Trial:
 class Optimization:
     """Outcome of a search.
 
-    `problem` is None where the baseline has no usable steady state, `optimized` also when no
-    design better than the baseline held up. `verification` says what the search promised and
-    what the tight simulation from rest gave; its `holds_up` is None for the best design of a
-    search that was `interrupted` before it could be simulated again.
+    `problem`: None if the baseline has no usable steady state; `baseline`: its evaluation;
+    `optimized`: evaluation of the best design, None if no design better than the baseline was
+    confirmed; `history`: one row per trial; `verification`: objective in the search and in the
+    verification; `interrupted`: whether the search was stopped. `verification["holds_up"]` is None
+    if the search was stopped before the best design could be verified.
     """
 
     problem: Problem | None
@@ -87,7 +95,7 @@ class Optimization:
 
     @property
     def status(self) -> Status:
-        """What can be said of the search as a whole."""
+        """Status of the search as a whole."""
         if self.interrupted:
             return Status.INTERRUPTED
         if not self.baseline.usable:
@@ -107,21 +115,27 @@ class Optimization:
 
     @property
     def constraints(self) -> list[dict[str, Any]]:
-        """The constraints at the optimum, a row each."""
+        """Constraints at the optimum, one row each."""
         if self.problem is None or self.optimized is None:
             return []
         return self.problem.constraint_rows(self.optimized)
 
     @property
     def objective_by_speed(self) -> list[dict[str, float]]:
-        """The objective at the optimum at each of several speeds, a row each."""
+        """Objective at the optimum at each of several speeds, one row each."""
         if self.problem is None or self.optimized is None:
             return []
         return self.problem.by_speed(self.optimized)
 
 
 class Search:
-    """One optimisation run of a config, until it has ended or the event `stop` is set."""
+    """One optimisation run of a config.
+
+    `progress` is called with (evaluations done, evaluations expected, best objective). `stop`: an
+    event that another thread can set to end the search early.
+
+    Raises InputError for a profile family without design parameters.
+    """
 
     def __init__(
         self,
@@ -142,7 +156,7 @@ class Search:
             self.settings.iterations + 1
         )
         self.exact = evaluator_for(config)
-        # Where every objective has its noise, not to have found a better one says little.
+        # If every objective is noisy, steps without a gain are no reason to end a descent.
         self.noisy = config.objective.motion == "ensemble"
         self.patience = np.inf if self.noisy else _PATIENCE
         self.stop = threading.Event() if stop is None else stop
@@ -152,16 +166,21 @@ class Search:
         self._baseline: Evaluation | None = None
 
     def run(self) -> Optimization:
-        """Baseline, screening, descents, verification. After `stop`, what was found before it,
-        verified too unless that takes ensembles."""
+        """Evaluate the baseline, screen, descend from the starts and verify; return the outcome.
+
+        After `stop`, the outcome is the best design found before. It is verified, unless the
+        objective is an average over an ensemble.
+
+        Raises InputError if no design is feasible, or if the objective is not defined for the
+        baseline."""
         exact = self.exact.prepare(design_vector(self.config))
         Space.of(self.config, exact.scene, 0.0).prepare()
         exact, baseline = exact.fit()
         if not baseline.usable:
             return Optimization(None, baseline, None, [], {}, self.stop.is_set())
-        # What the forces of motions that coexist are relative to.
+        # Forces of coexisting motions are compared relative to the baseline's.
         self.exact = exact = exact.relative_to(baseline)
-        # The search needs a gradient and an order of designs, not the last digits.
+        # The search needs gradients and a ranking of designs, not the last digits.
         self.fast = exact.at_tolerance(max(1e-6, self.config.solver.rtol)).surveying()
         self.problem = Problem.of(self.config, exact.scene, baseline)
         self._baseline = baseline
@@ -191,8 +210,10 @@ class Search:
         return Optimization(*settled, self.stop.is_set())
 
     def so_far(self) -> Optimization | None:
-        """What the search has found up to now, without verification; None before the baseline was
-        simulated. Callable from another thread while it runs."""
+        """Return what the search has found so far, without verification.
+
+        It is None until the baseline has been simulated. Another thread can call this during the
+        search."""
         if self._baseline is None:
             return None
         trials = self._in_order()
@@ -219,14 +240,15 @@ class Search:
         return Optimization(self.problem, self._baseline, best.evaluation, rows, verification, True)
 
     def _in_order(self) -> list[Trial]:
-        """All trials up to now; screening first, then start by start."""
+        """Return all trials so far: screening first, then descent by descent."""
         with self._lock:
             return sorted(self._trials, key=lambda trial: (trial.start, trial.iteration))
 
     def _side_by_side(self, work: Callable[..., list[Trial]], tasks: Sequence) -> list[Trial]:
-        """The trials of `work(*task)` for every task, in their order.
+        """Return the trials of `work(*task)` for all tasks, in the order of the tasks.
 
-        After `stop` none, and nobody waits for the evaluations that go on."""
+        If `stop` is set before all tasks end, the result is empty, and nobody waits for evaluations
+        that still run."""
         pool = ThreadPoolExecutor(os.cpu_count())
         tasks = tasks if not self.stop.is_set() else []
         done = [pool.submit(work, *task) for task in tasks]
@@ -241,7 +263,9 @@ class Search:
             pool.shutdown(wait=not self.stop.is_set(), cancel_futures=True)
 
     def _feasible(self, baseline_point) -> list[NDArray[np.float64]]:
-        """The baseline's neighbourhood and a Sobol sample, as far as they can be made feasible."""
+        """Return the baseline's point and a Sobol sample, made feasible; drop the infeasible ones.
+
+        Raises InputError if no point is feasible."""
         start = self.problem.project(baseline_point)
         count, seed = self.settings.screening, self.settings.seed
         sample = sobol(count, seed, len(baseline_point))
@@ -261,7 +285,7 @@ class Search:
         return [self._evaluate(self.fast.without_gradient(), point, start=-1, iteration=0)]
 
     def _starts(self, trials: list[Trial]) -> list[NDArray[np.float64]]:
-        """The best of the screened designs that are apart from each other."""
+        """Return the points of the best screened designs, at least 0.15 apart in the unit box."""
         chosen: list[NDArray[np.float64]] = []
         for trial in sorted(filter(_candidate, trials), key=_objective):
             apart = all(np.linalg.norm(trial.point - p) > 0.15 for p in chosen)
@@ -270,7 +294,7 @@ class Search:
         return chosen
 
     def _descend(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
-        """Local descent from `point`."""
+        """Descend from `point` and return the trials; `number`: that of the descent."""
         settings = self.settings
         rule = settings.method, settings.learning_rate, settings.iterations
         state = _init(*rule, point)
@@ -284,7 +308,7 @@ class Search:
             trial = self._evaluate(self.fast, point, number, iteration, orbit)
             trials.append(trial)
             if np.isnan(trial.objective):
-                # No steady state there: go half way back to the last good design.
+                # No usable steady state: go half way back to the last good design.
                 if last is None:
                     break
                 point = self.problem.toward((point + last.point) / 2, last.point)
@@ -314,7 +338,9 @@ class Search:
         return trial
 
     def _verify(self, trials: list[Trial]) -> tuple[Evaluation | None, dict[str, Any]]:
-        """Simulate the best designs again, from rest and tightly, until one holds up."""
+        """Simulate the best designs again, from rest at a tight tolerance, until one is confirmed.
+
+        Return its evaluation, or None, and the record for the result file."""
         ranked = sorted(filter(_candidate, trials), key=_objective)
         tried: list[np.ndarray] = []
         failures = []
@@ -341,9 +367,11 @@ class Search:
 
 
 def until_stopped(work: Callable[[], T], stop: threading.Event, patience: float) -> T | None:
-    """`work()`, done in a thread of its own, whatever compiled code that is in; None if it has not
-    ended `patience` (s) after `stop` was set. A `KeyboardInterrupt` sets `stop`, a second one ends
-    the wait."""
+    """Run `work()` in its own thread and return its result; return None if it does not end in time.
+
+    The thread makes the wait interruptible even during compiled code. `stop`: an event that asks
+    `work` to end; it then has `patience` (s) left. A `KeyboardInterrupt` sets `stop`; a second one
+    is raised."""
     future: Future[T] = Future()
 
     def do() -> None:
@@ -375,18 +403,18 @@ def _rule(method: str, learning_rate: float, iterations: int) -> optax.GradientT
 
 @Program
 def _init(method, learning_rate, iterations, point):
-    """State of an update rule at its first point."""
+    """Return the state of an update rule at its first point."""
     return _rule(method, learning_rate, iterations).init(point)
 
 
 @Program
 def _update(method, learning_rate, iterations, slope, state):
-    """Step of an update rule, and its next state."""
+    """Return the step of an update rule, and its next state."""
     return _rule(method, learning_rate, iterations).update(slope, state)
 
 
 def _near(point: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> bool:
-    """Whether a point of the unit box is as good as the same as one of the others."""
+    """Return whether a point of the unit box practically coincides with one of the others."""
     return any(np.linalg.norm(point - other) < 0.02 for other in others)
 
 
@@ -395,7 +423,7 @@ _objective = operator.attrgetter("objective")
 
 
 def _history(trials: list[Trial]) -> list[dict[str, Any]]:
-    """The rows of the history, with the best objective so far."""
+    """Return the rows of the history, with the best objective so far."""
     rows, best = [], float("nan")
     for number, trial in enumerate(trials, start=1):
         if trial.candidate:

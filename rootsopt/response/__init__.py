@@ -1,1 +1,1 @@
-"""What a design comes to in a scene: forces, their derivatives, and how far they can be trusted."""
+"""Response of a design in a scene: forces, their derivatives, and how far to trust them."""

@@ -1,8 +1,8 @@
-"""Motions that coexist: which stable ones there are, and which initial states lead to them.
+"""Coexisting stable motions (attractors), and which initial states lead to them (basins).
 
 Quiet and noisy motions of a Roots pair can exist side by side (Mason, Homer, Wilson, J. Sound
-Vib. 308 (2007) 431-440). A grid of initial states (ε, dε/dt) is simulated until each has settled;
-those that end on the same cycle are put together, and each cycle is closed and reported once.
+Vib. 308 (2007) 431-440). A grid of initial states (ε, dε/dt) is simulated until each has settled.
+States that end on the same cycle are grouped, and each cycle is closed and reported once.
 """
 
 import dataclasses
@@ -30,22 +30,25 @@ from rootsopt.scene import design_vector
 from rootsopt.status import Status
 
 _LONGEST = 8
-"""Longest cycle looked for, in mesh periods."""
+"""Longest cycle searched for, in mesh periods."""
 _APART = 0.3
-"""Scaled distance beyond which two motions are never the same."""
+"""Scaled distance above which two motions are never the same."""
 _TRIES = 24
-"""Motions looked at closely, at most."""
+"""Maximum number of motions that are evaluated."""
 _DEPTHS = 3.0
-"""The grid reaches so many static penetrations into the flanks."""
+"""Depth of the grid into the flanks, in static penetrations."""
 _LOST = (Status.PASSED_THROUGH, Status.STALLED, Status.SOLVER_FAILED, Status.NON_FINITE)
-"""Of initial states from which there is no motion to describe."""
+"""Statuses of initial states that lead to no motion."""
 _GONE = tuple(status.code for status in _LOST)
 
 
 @dataclasses.dataclass(frozen=True)
 class Attractor:
-    """One motion: its `evaluation`, the `share` of initial states on the grid that lead to it,
-    whether it is the one `reached` from rest, and its stroboscopic states (k, n), scaled."""
+    """One of several coexisting motions.
+
+    `evaluation` of the motion; `share` of the grid's initial states that lead to it; `reached`:
+    whether it is the motion from rest; `cycle` (k, n): its stroboscopic states, scaled.
+    """
 
     evaluation: Evaluation
     share: float
@@ -55,14 +58,14 @@ class Attractor:
 
 @dataclasses.dataclass(frozen=True)
 class Basins:
-    """What a grid of initial states leads to.
+    """The motions that a grid of initial states leads to.
 
     `relative` (rad) and `rate` (rad/s): axes of the grid; `leads_to` (rates, relatives): index of
-    the attractor, or -1 where the motion is lost; `attractors`: greatest share first, the last
-    ones maybe chaotic or not settled, as their status says; `rest`: evaluation from rest; `lost`:
-    shares of initial states from which there is no motion, or none that was told from the others
-    (`not_settled`), by the label of the status; `angle_scale` (rad), `mesh_period` (s): units of
-    scaled states.
+    the attractor, or -1 where the motion is lost; `attractors`: closed orbits first, then chaotic
+    or unsettled motions (see their status), each kind by falling share; `rest`: evaluation
+    from rest; `lost`: shares of initial states that lead to no motion, by status label. The label
+    `not_settled` is for motions that could not be told from the others. `angle_scale` (rad),
+    `mesh_period` (s): units of scaled states.
     """
 
     relative: NDArray[np.float64]
@@ -76,8 +79,8 @@ class Basins:
 
     @property
     def status(self) -> Status:
-        """Periodic if every initial state leads to a stable periodic motion, and some to one with
-        contact; else what stands against it."""
+        """PERIODIC if every initial state leads to a stable periodic motion, and at least one of
+        these has contact; else the status that prevents it."""
         for status in _LOST:
             if self.lost.get(status.label):
                 return status
@@ -89,14 +92,14 @@ class Basins:
         return Status.NOT_SETTLED if any(self.lost.values()) else Status.PERIODIC
 
     def records(self) -> list[dict[str, Any]]:
-        """The attractors for the result file."""
+        """Return the attractors for the result file."""
         return [
             {"share": one.share, "reached": one.reached} | one.evaluation.record()
             for one in self.attractors
         ]
 
     def summary(self) -> list[dict[str, Any]]:
-        """The attractors in a line each."""
+        """Return one table row per attractor."""
         rows = []
         for one in self.attractors:
             steady, response = one.evaluation.steady_state, one.evaluation.response
@@ -120,11 +123,11 @@ def find(
     known: Iterable[NDArray[np.float64]] = (),
     series: bool = False,
 ) -> Basins:
-    """Attractors of `design` (config units; default: the config's own) and their basins.
+    """Find the attractors of `design` (config units; default: the config's own) and their basins.
 
-    The grid is that of the config's `attractors` section. `known`: scaled states (n,) on motions
-    of a neighbouring design, which may have too small a basin for the grid. The numbers of the
-    attractors are those of `evaluator`, with their `series` if asked for.
+    The config's `attractors` section sets the grid. `known`: further initial states (n,), scaled,
+    on motions of a neighbouring design, whose basins the grid may miss. `evaluator` evaluates the
+    attractors, with their `series` on request.
     """
     return find_fitted(evaluator, design, known, series)[1]
 
@@ -135,7 +138,7 @@ def find_fitted(
     known: Iterable[NDArray[np.float64]] = (),
     series: bool = False,
 ) -> tuple[Evaluator, Basins]:
-    """`find`, which also returns another evaluator, fitted to the motion from rest."""
+    """Return what `find` returns, and before it an evaluator fitted to the motion from rest."""
     config = evaluator.config
     design = design_vector(config) if design is None else jnp.asarray(design)
     evaluator, rest = evaluator.fit(design, None, series)
@@ -175,13 +178,17 @@ def find_fitted(
 
 
 def closed(evaluation: Evaluation) -> bool:
-    """Whether the motion is a closed orbit, be it without contact (`idle`)."""
+    """Return whether the motion is a closed orbit, with contact or without (`idle`)."""
     idle = evaluation.status is Status.IDLE and evaluation.state is not None
     return evaluation.usable or idle
 
 
 class _Sorter:
-    """Puts ends of transients to the motions they have led to."""
+    """Assigns each transient to the motion it has led to.
+
+    `evaluations` and `cycles`: the known motions; `numbers` and `lost`: for each transient the
+    number of its motion, or -1 and the label of its failure.
+    """
 
     def __init__(self, evaluator: Evaluator, design, series: bool):
         self.evaluator, self.design, self.series = evaluator, design, series
@@ -195,7 +202,7 @@ class _Sorter:
         return closed(self.evaluations[number])
 
     def add(self, evaluation: Evaluation, end) -> int:
-        """Number of the motion of an evaluation that began at `end`: a known one or a new one."""
+        """Return the number of the motion of an evaluation that began at `end`, new or known."""
         cycle = np.atleast_2d(end)
         if closed(evaluation):
             pair = self.evaluator.pair(self.design)
@@ -211,7 +218,7 @@ class _Sorter:
         return len(self.evaluations) - 1
 
     def place(self, end: Transient, failure: int) -> None:
-        """Note the motion that a transient has led to; `failure`: its `transient_status`."""
+        """Record the motion that a transient has led to; `failure`: its `transient_status`."""
         number, label = -1, ""
         if failure in _GONE:
             label = Status.of(failure).label
@@ -234,7 +241,8 @@ class _Sorter:
         return (-1, status.label) if status in _LOST else (number, "")
 
     def _same(self, state) -> int | None:
-        """The known cycle that `state` is on, as far as a transient can tell."""
+        """Return the number of the known cycle that `state` is on, within the accuracy of a
+        transient; None: a new one."""
         tolerance = float(settled_within(self.evaluator.scene.solver.transient.rtol))
         best, number = np.inf, None
         for i in filter(self.periodic, range(len(self.evaluations))):
@@ -246,7 +254,7 @@ class _Sorter:
         return number
 
     def _like(self, status: Status) -> int | None:
-        """The known motion without a cycle that has this status."""
+        """Return the number of the known motion without a cycle that has this status, or None."""
         for i, evaluation in enumerate(self.evaluations):
             if evaluation.status is status and not self.periodic(i):
                 return i
@@ -254,10 +262,11 @@ class _Sorter:
 
 
 def _axes(config: Config, pair: RotorPair) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Initial ε (rad) and dε/dt (rad/s) of the grid.
+    """Return the initial ε (rad) and dε/dt (rad/s) of the grid.
 
-    By default ε covers the play and some penetration, and dε/dt twice the speed at which the load
-    closes the play, or at which the play is crossed within a mesh period.
+    By default ε covers the play and `_DEPTHS` static penetrations. |dε/dt| goes up to twice the
+    greater of two speeds: that at which the load closes the play, and that which crosses the play
+    within a mesh period.
     """
     wanted = config.attractors
     radius = config.profile.pitch_radius_mm * MM
@@ -275,13 +284,14 @@ def _axes(config: Config, pair: RotorPair) -> tuple[NDArray[np.float64], NDArray
 
 
 def _spread(low: float, high: float, count: int) -> NDArray[np.float64]:
-    """So many numbers from `low` to `high`; a single one in the middle."""
+    """Return `count` equidistant numbers from `low` to `high`; a single one is in the middle."""
     return np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
 
 
 def _settled(evaluator: Evaluator, pair: RotorPair, starts) -> tuple[Transient, Any]:
-    """Ends of the transients from scaled states (m, n), with a leading axis (m,), and what
-    `transient_status` says of each."""
+    """Return the ends of the transients from scaled states (m, n), and their `transient_status`.
+
+    Both have a leading axis (m,)."""
     integrator = evaluator.scene.solver.transient
     dtype = pair.angle_scale.dtype
     limit = np.asarray(max(evaluator.config.solver.max_mesh_periods // 4, 8 * BLOCK))
@@ -313,33 +323,38 @@ def _together(pair, states, *settings):
 
 @Program
 def _cycle(pair: RotorPair, state, integrator: Integrator):
-    """The states at the begin of `_LONGEST` mesh periods."""
+    """Return the states at the start of each of `_LONGEST` mesh periods."""
     return jnp.concatenate([state[None], strobe(pair, state, _LONGEST - 1, integrator).states])
 
 
 @dataclasses.dataclass(frozen=True)
 class AttractorEvaluator(Wrapper):
-    """Evaluates what all coexisting motions of a design come to.
+    """Evaluates a design by all its coexisting motions.
 
-    With `objective.motion` `worst`, the motion counts whose weighted sum of the measures in the
-    objective is greatest, each relative to the `reference` of the evaluator of one motion (a
-    response, usually the baseline's; by default the greatest among the motions). With `weighted`,
-    response and gradient are averages with the shares of initial states as weights; how these
-    change with the design is not in the gradient. A motion without contact beside others has force
-    0 and gradient 0. A design from which some initial states lead to no stable periodic motion has
-    the status of what they lead to, and no gradient.
+    With `objective.motion: worst`, the motion with the greatest weighted sum of the objective's
+    measures counts. Each measure is relative to the `reference` of `single`: a response, usually
+    the baseline's. The default reference is the greatest value among the motions.
+
+    With `weighted`, response and gradient are averages, weighted by the shares of initial states.
+    The gradient treats these shares as constant. A motion without contact contributes force 0 and
+    gradient 0.
+
+    If some initial states lead to no stable periodic motion, the design has the status of that
+    motion, and no gradient.
     """
 
     single: Evaluator
 
     def fit(self, design=None, start=None, series=True) -> tuple["AttractorEvaluator", Evaluation]:
-        """As `Evaluator.fit`; `start`: scaled states (m, n) on motions of a neighbouring design."""
+        """Evaluate a design, and return another evaluator too, as `Evaluator.fit` does.
+
+        `start`: scaled states (m, n) on motions of a neighbouring design."""
         known = () if start is None else tuple(np.atleast_2d(start))
         single, basins = find_fitted(self.single, design, known, series)
         return dataclasses.replace(self, single=single), self._of(basins)
 
     def _of(self, basins: Basins) -> Evaluation:
-        """The evaluation that the motions come to."""
+        """Return the evaluation that combines the motions."""
         usable = [a for a in basins.attractors if a.evaluation.usable]
         if not usable:
             return basins.rest
@@ -364,16 +379,17 @@ class AttractorEvaluator(Wrapper):
 
         def badness(attractor: Attractor) -> float:
             found = attractor.evaluation.response
-            # A measure that is 0 in the reference is refused as soon as that is the baseline's.
+            # Skip a measure that is 0 in the reference. If the reference is the baseline's,
+            # `Problem.of` has rejected it.
             return sum(w * found[k] / reference[k] for k, w in weights.items() if reference[k] > 0)
 
         return badness
 
 
 def _averaged(one: Evaluation, attractors: list[Attractor]) -> Evaluation:
-    """`one` with response and gradient averaged over the attractors by share."""
+    """Return `one` with response and gradient averaged over the attractors by share."""
     shares = np.array([a.share for a in attractors])
-    # On a coarse grid the only motion may be one that was known before.
+    # On a coarse grid, the `known` states may be the only ones that lead to an orbit.
     shares = shares / shares.sum() if shares.sum() > 0 else np.ones(len(shares)) / len(shares)
     found = [a.evaluation for a in attractors]
 
@@ -381,7 +397,7 @@ def _averaged(one: Evaluation, attractors: list[Attractor]) -> Evaluation:
         return float(shares @ values)
 
     def slope(evaluation: Evaluation, name: str, key: str) -> float:
-        # Where nothing touches, nothing changes with the design.
+        # Without contact the force is 0 for all neighbouring designs.
         return evaluation.gradient[name][key] if evaluation.usable else 0.0
 
     return dataclasses.replace(

@@ -1,9 +1,9 @@
-"""Many designs at once: one compiled program over a batch, of the same function that a single
+"""Many designs at once: one compiled program over a batch, from the same function that a single
 evaluation uses.
 
-A batch is for surveys: one attempt at each design, no check of the derivatives on halved steps, and
-orbits closed to a tenth of the tolerance. A design that needs more is reported as not settled or
-inaccurate, and can be given to an `Evaluator`.
+A batch is for surveys. Each design gets one attempt, its orbit is closed to a tenth of the
+tolerance, and its derivatives are not checked on halved steps. A design that needs more is reported
+as not settled or inaccurate; give it to an `Evaluator`.
 """
 
 import dataclasses
@@ -22,17 +22,18 @@ from rootsopt.scene import Scene
 from rootsopt.status import Status
 
 SAMPLES = 840
-"""Uniform samples of an orbit, among which the peak is looked for; divisible by all
-periods up to eight."""
+"""Uniform samples of an orbit, from which the peak is located. All periods up to eight divide it.
+"""
 
 
 class Batch(NamedTuple):
-    """Outcome of n designs with d parameters; NaN where there is no periodic orbit.
+    """Responses of n designs with d parameters.
 
-    `response` (n, 3): mean, peak and RMS force (N); `gradient` (n, 3, d) per config unit;
+    `response` (n, 3): mean, peak and RMS force (N); `gradient` (n, 3, d) of these per config unit;
     `state` (n, s): scaled state of the orbit at φ1 = 0, a start for neighbouring designs;
-    `period` (mesh periods), largest Floquet `multiplier`, `residual` of the closed orbit;
-    `deepest`: least ε (rad) on the orbit; `steps` of the solver; `status`: codes of `Status`.
+    `period` (mesh periods); `multiplier`: greatest modulus of the Floquet multipliers; `residual`
+    of the closed orbit; `deepest`: least ε (rad) on the orbit; `steps` of the solver; `status`:
+    codes of `Status`. `response` and `gradient` are NaN where there is no periodic orbit.
     """
 
     response: Float[Array, "*n 3"]
@@ -47,7 +48,7 @@ class Batch(NamedTuple):
 
     @property
     def usable(self) -> Bool[Array, "*n"]:
-        """Where the pair settled on a stable periodic orbit."""
+        """Whether the pair settled on a stable periodic orbit, for each design."""
         return self.status == Status.PERIODIC.code
 
 
@@ -58,7 +59,10 @@ def coarse(
     max_periods: int = 64,
     max_orbit: int = 8,
 ) -> Solver:
-    """Return how a batch finds the steady motions of a `scene`."""
+    """Return the settings with which a batch finds the steady motions of a `scene`.
+
+    `transient`, `orbit`: their integrators; `max_periods`: maximum length of the transient (mesh
+    periods); `max_orbit`: longest period searched for (mesh periods)."""
     return dataclasses.replace(
         scene.solver,
         transient=transient,
@@ -119,10 +123,10 @@ def respond_many(
     solver: Solver,
     gradient: bool = True,
 ) -> Batch:
-    """`respond` over designs (n, d) in config units, each from its own scaled state.
+    """Return the responses of designs (n, d) in config units, from their own scaled states (n, s).
 
-    On CPUs a thread for each core takes the designs one by one: stepping many together, each
-    would wait for the slowest at every turn. On other devices all are stepped together.
+    On CPUs one thread per core takes the designs one by one. If designs were stepped together, each
+    would wait for the slowest at every turn. On other devices they are stepped together.
     """
     if jax.default_backend() != "cpu":
         return _together(scene, designs, states, solver, gradient)

@@ -1,12 +1,13 @@
-"""`solver.fidelity: auto`: the cheapest settings that meet a stated error.
+"""`solver.fidelity: auto`: choose the cheapest settings that meet a stated error.
 
-The configured design is simulated from rest with the reference, contact by search at a
-tolerance far below the error asked for. Then cheaper settings are tried, cheapest first,
-and the first whose mean and peak force agree with the reference is kept: for every
-further design of the run, and in the resolved config. With several speeds in the objective,
-they agree at every one; `rootsopt sweep` takes what is chosen so for all its speeds. An
-estimate that is a measured difference holds where a rule of thumb about tolerances would not,
-and costs two or three simulations of one design.
+The config's design is first simulated from rest with the reference settings: contact by search, at
+a tolerance far below the requested error. Then cheaper settings are tried, cheapest first. The
+first whose mean and peak force agree with the reference are kept, for every further design of the
+run and in the resolved config. With several speeds in the objective, they must agree at every
+speed. `rootsopt sweep` uses the chosen settings at all its speeds.
+
+The error is a measured difference, which holds where a rule of thumb about tolerances would not. It
+costs two or three simulations of one design.
 """
 
 import dataclasses
@@ -20,18 +21,18 @@ from rootsopt.status import Status
 
 _JUDGED = ("mean_force_N", "peak_force_N")
 _LONG = 64
-"""Transient (mesh periods) from which on a map pays."""
+"""Length of the transient (mesh periods) above which a contact map saves time."""
 _MARGIN = 0.5
-"""Share of the requested error that a measured difference may use up."""
+"""Largest accepted difference from the reference, as a fraction of the requested error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """Chosen settings, as a config without `auto`, and the error they were seen to leave.
+    """Chosen settings and their measured error.
 
-    `error`: largest relative difference of mean and peak force to the reference, None where
-    the scene has no periodic steady state to compare on. `tried`: every candidate with its
-    error.
+    `config`: the config with the settings in place of `auto`; `requested`: requested error;
+    `error`: largest relative error of mean and peak force, None if the scene has no periodic steady
+    state to compare; `tried`: every candidate with its difference from the reference.
     """
 
     config: Config
@@ -40,7 +41,7 @@ class Choice:
     tried: list[dict[str, Any]]
 
     def record(self) -> dict[str, Any]:
-        """For the result file."""
+        """Return the record for the result file."""
         solver = self.config.solver
         return {
             "requested_error": self.requested,
@@ -55,15 +56,15 @@ class Choice:
 
 
 def choose(config: Config) -> Choice:
-    """Settings for `config`, whose fidelity is `auto`, that meet `solver.accuracy`.
+    """Choose settings for `config`, whose fidelity is `auto`, that meet `solver.accuracy`.
 
-    Where nothing cheaper agrees (as where a coarser simulation ends on another of several
-    coexisting orbits), or where the reference itself finds no periodic orbit, the
-    reference's settings are chosen.
+    The reference's settings are chosen if no cheaper ones agree with it, or if the reference itself
+    finds no periodic orbit. Coarser simulations may disagree because they end on another of several
+    coexisting orbits.
     """
     wanted = config.solver.accuracy
     tried: list[dict[str, Any]] = []
-    # Noise of the steps can keep a motion from settling, or stir it up: then more closely.
+    # Noise of the steps can keep a motion from settling or excite it: then try a finer tolerance.
     for share in (1e-4, 1e-6):
         reference = _with(config, fidelity="search", rtol=share * wanted)
         truth = _evaluations(reference)
@@ -82,19 +83,20 @@ def choose(config: Config) -> Choice:
         settings = {"fidelity": solver.fidelity, "rtol": solver.rtol}
         tried.append(settings | {"error": error, "status": status.label})
         if error is not None and error <= _MARGIN * wanted:
-            # The reference is itself off by about its tolerance's share.
+            # Add the error of the reference itself, about its tolerance.
             return Choice(candidate, wanted, error + 0.01 * wanted, tried)
     return Choice(reference, wanted, 0.01 * wanted, tried)
 
 
 def _evaluations(config: Config) -> list[Evaluation]:
-    """The config's own design at every speed of its objective."""
+    """Return evaluations of the config's own design at every speed of its objective."""
     return [Evaluator.of(alone(config, speed))(series=False) for speed in shares(config)]
 
 
 def resolve(config: Config) -> tuple[Config, dict[str, Any]]:
-    """`config` without `auto`, and what the result file says of the choice (nothing where
-    there was none to make)."""
+    """Return `config` without `auto`, and the choice for the result file.
+
+    The latter is empty if the config's fidelity is not `auto`."""
     if config.solver.fidelity != "auto":
         return config, {}
     choice = choose(config)
@@ -102,7 +104,9 @@ def resolve(config: Config) -> tuple[Config, dict[str, Any]]:
 
 
 def _candidates(config: Config, wanted: float, long: bool) -> Iterator[Config]:
-    """Cheapest first. A map costs more to build than it saves, unless the transient is long."""
+    """Yield the candidates, cheapest first.
+
+    A contact map saves more time than it costs only if the transient is `long`."""
     loose, tight = 1e-2 * wanted, 1e-3 * wanted
     searched = bool(config.needs_search)
     if wanted >= 3e-3 and not searched:
@@ -119,7 +123,7 @@ def _with(config: Config, fidelity: str, rtol: float, map_error: float = 1e-4) -
         "rtol": rtol,
         "transient_rtol": min(rtol, 1e-6),
         "map_error": min(max(map_error, 1e-6), 0.1),
-        # Of the explicit methods the one with the least work at this tolerance.
+        # The explicit method with the least work at this tolerance.
         "method": "dopri8" if rtol < 1e-9 else "tsit5",
     }
     solver = SolverConfig.model_validate(config.solver.model_dump() | changes)
@@ -127,7 +131,8 @@ def _with(config: Config, fidelity: str, rtol: float, map_error: float = 1e-4) -
 
 
 def difference(found: Evaluation, truth: Evaluation) -> float | None:
-    """Largest relative difference of mean and peak force, None unless both are periodic."""
+    """Return the largest relative difference of mean and peak force; None unless both evaluations
+    are usable."""
     if not (found.usable and truth.usable):
         return None
     pairs = ((found.response[key], truth.response[key]) for key in _JUDGED)

@@ -1,4 +1,4 @@
-"""An evaluation as labelled arrays."""
+"""Evaluations as labelled arrays (`xarray.Dataset`)."""
 
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ _COLUMNS = {
     "force": ("contact_force_N", "N", "contact force: sum of the normal forces", 1.0),
     "depth": ("penetration_m", "m", "greatest penetration; negative: least gap", 1.0),
 }
-"""Fields of a series: name as in the response's CSV file, unit, long name, factor from SI."""
+"""Fields of a series: name as in the response's CSV file, unit, long name, factor from SI units."""
 
 
 def dataset(evaluation: "Evaluation") -> xarray.Dataset:

@@ -1,12 +1,13 @@
-"""One design in one scene by an ensemble of motions: what a chaotic scene leaves to optimise.
+"""One design in one scene, averaged over an ensemble of motions: for chaotic scenes.
 
-In a chaotic scene a single motion tells nothing of its neighbours: its average over any
-finite window jumps between designs that hardly differ, and its derivative grows with the
-window. What still means something is the average over many motions, known to a standard
-error. An `EnsembleEvaluator` starts `ensemble.members` motions at different initial
-states, lets each settle and averages the contact force over all. The gradient is that of
-the average over a Gaussian neighbourhood of the design: the least-squares slope through
-pairs of opposite neighbours, with a standard error of its own.
+In a chaotic scene, a single motion is no basis for optimisation. Its average over a finite window
+jumps between designs that hardly differ, and its derivative grows with the window. The average over
+many motions is meaningful; it is known to a standard error.
+
+An `EnsembleEvaluator` starts `ensemble.members` motions from different initial states, lets each
+settle and averages the contact force over all of them. The gradient is that of the average over a
+Gaussian neighbourhood of the design. It is the least-squares slope through pairs of opposite
+neighbours, with a standard error of its own.
 """
 
 import dataclasses
@@ -53,17 +54,17 @@ from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 
 _RTOL = 1e-6
-"""Finest tolerance worth its time: the standard errors of an ensemble are far coarser than
-what the steps leave (docs/chaos.md)."""
+"""Finest tolerance used. The standard errors of an ensemble are far larger than the error of such
+steps (docs/chaos.md)."""
 _AGAIN = 4
-"""Motions that begin where those of a neighbouring design ended settle in this part of
-`ensemble.settle_periods`."""
+"""Divisor of `ensemble.settle_periods` for motions that start where those of a neighbouring design
+ended."""
 _MAPS = 5
-"""Contact maps tried for one ensemble, at most."""
+"""Maximum number of contact maps tried for one ensemble."""
 VERIFYING = 4
-"""Times as many members verify a search's winner."""
+"""Factor on the number of members for the verification of a search's winner."""
 SIGNIFICANT = 3.0
-"""Combined standard errors that a difference must exceed to count."""
+"""Difference, in combined standard errors, above which it is significant."""
 ERRORS = {name: name.replace("_N", "_standard_error_N") for name in RESPONSES}
 """Keys of the standard errors in `steady_state`, by response."""
 
@@ -72,24 +73,26 @@ ERRORS = {name: name.replace("_N", "_standard_error_N") for name in RESPONSES}
 class EnsembleEvaluator(Wrapper):
     """Evaluates designs by an ensemble of motions in the scene of `single`.
 
-    `start` (members, n) of a call: scaled states to begin from, such as the `state` of a
-    neighbouring design's evaluation; by default they are spread over the play.
+    A call takes `start` (members, n): scaled states to begin from, such as the `state` of a
+    neighbouring design's evaluation. By default they are spread over the play. `differentiate`:
+    whether to compute the gradient, which takes most of the time.
 
-    An evaluation that is AVERAGED has as `response` averages over members and mesh
-    periods: `mean_force_N`, `rms_force_N`, and as `peak_force_N` the **mean of the peak of
-    every mesh period**. (The greatest force of all grows with the window and has no limit
-    to average to; it is `steady_state["greatest_force_N"]`.) `steady_state` holds their
-    standard errors (`ERRORS`), `kind` (chaotic if a member has a positive Lyapunov exponent,
-    periodic if all repeat, else transient), `gradient_standard_error` (as `gradient`, per
-    config unit), the size of the ensemble, and `mean_force_drift_N` within the window with its
-    standard error: far from zero, `ensemble.settle_periods` is too short, or motions of
-    several kinds coexist and members still pass from one to another. `state` (members, n):
-    their last scaled states, the `start` of a neighbouring design. `series` is that of one
-    member.
+    An evaluation with the status AVERAGED holds:
 
-    The orbit tolerance is not used: averages need no closed orbit. In a survey the Lyapunov
-    exponent is not looked for. Without `differentiate` there is no gradient, which takes most of
-    the time.
+    - `response`: averages over members and mesh periods. `peak_force_N` is the **mean of the peaks
+      of all mesh periods**. The greatest force of all grows with the window and has no limit; it is
+      `steady_state["greatest_force_N"]`.
+    - `steady_state`: standard errors of the response (keys in `ERRORS`); `kind`: periodic if all
+      members repeat, chaotic if a member has a positive Lyapunov exponent, else transient;
+      `gradient_standard_error` (as `gradient`, per config unit); the size of the ensemble;
+      `mean_force_drift_N` within the window, with its standard error. If this drift is far from
+      zero, `ensemble.settle_periods` is too short, or members still pass between coexisting motions
+      of several kinds.
+    - `state` (members, n): last scaled states, a `start` for a neighbouring design.
+    - `series`: that of one member.
+
+    The orbit tolerance is not used, since averages need no closed orbit. A survey does not compute
+    the Lyapunov exponent.
     """
 
     single: Evaluator
@@ -97,7 +100,7 @@ class EnsembleEvaluator(Wrapper):
 
     @property
     def integrator(self) -> Integrator:
-        """How the motions are integrated."""
+        """Integrator of the motions: that of the transient, but no finer than `_RTOL`."""
         transient = self.scene.solver.transient
         return dataclasses.replace(transient, rtol=jnp.maximum(transient.rtol, _RTOL))
 
@@ -107,12 +110,14 @@ class EnsembleEvaluator(Wrapper):
         return self.config.ensemble
 
     def without_gradient(self) -> "EnsembleEvaluator":
-        """Return another evaluator, which leaves out the gradient."""
+        """Return another evaluator that does not compute the gradient."""
         return dataclasses.replace(self, differentiate=False)
 
     def independent(self, number: int) -> "EnsembleEvaluator":
-        """Return the `number`-th of those with another seed and `VERIFYING` times as many members,
-        to judge what was chosen by this one; it shares the scene, and the compiled programs."""
+        """Return another evaluator to judge a design that this one has chosen.
+
+        It has the seed increased by `number` and `VERIFYING` times as many members. It shares the
+        scene and the compiled programs."""
         settings = self.settings
         larger = {"members": VERIFYING * settings.members, "seed": settings.seed + number}
         ensemble = settings.model_copy(update=larger)
@@ -120,7 +125,9 @@ class EnsembleEvaluator(Wrapper):
         return self._around(dataclasses.replace(self.single, config=config, survey=False))
 
     def prepare(self, design=None, series: bool = True) -> "EnsembleEvaluator":
-        """Compile, in the background, what evaluating `design` (config units) takes."""
+        """Compile the programs for evaluating `design` (config units) in the background.
+
+        Return another evaluator, with a contact map sized for the design."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now = self._around(self.single._sized(design))
         pair, _ = _pair.result_shape(now.scene, design)
@@ -132,7 +139,9 @@ class EnsembleEvaluator(Wrapper):
         return now
 
     def fit(self, design=None, start=None, series=True) -> tuple["EnsembleEvaluator", Evaluation]:
-        """As `Evaluator.fit`; `start` (members, n): see above."""
+        """Evaluate a design, and return another evaluator too, as `Evaluator.fit` does.
+
+        `start` (members, n): initial states, see the class. Raises ValueError for another shape."""
         began = time.perf_counter()
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now, outcome = self._fitted(design, lambda now: now._attempt(design, start))
@@ -141,8 +150,7 @@ class EnsembleEvaluator(Wrapper):
     def _fitted(
         self, design, attempt: Callable[["EnsembleEvaluator"], "_Outcome"]
     ) -> tuple["EnsembleEvaluator", "_Outcome"]:
-        """The outcome of `attempt`, again as long as it asks for another contact map, and the
-        evaluator it was made with."""
+        """Repeat `attempt` until its contact map fits; return the last evaluator and outcome."""
         now, single = self, self.single._sized(design)
         for _ in range(_MAPS):
             now = self._around(single)
@@ -163,7 +171,7 @@ class EnsembleEvaluator(Wrapper):
             if states.shape != (self.settings.members, pair.states):
                 raise ValueError(
                     f"Argument `start` must be the states (members, n) of an ensemble, but has "
-                    f"shape {states.shape}; pass None to begin anew"
+                    f"shape {states.shape}; pass None to start from new states"
                 )
         runs = run_members([pair], states, settle, self.settings.periods, self.integrator)
         return _Outcome(pair, shape, runs)
@@ -209,7 +217,7 @@ class EnsembleEvaluator(Wrapper):
                     for rows in slopes
                 )
             else:
-                # A neighbour fails: what is left stands for no neighbourhood.
+                # A neighbour has failed: the results do not represent a neighbourhood.
                 response, steady, series, state = {}, {"kind": "transient"}, None, None
         return Evaluation(
             design=dict(zip(self.single.keys, map(float, design), strict=True)),
@@ -229,9 +237,9 @@ class EnsembleEvaluator(Wrapper):
         )
 
     def _kind(self, pair, members: Members, with_series):
-        """What kind of motion it is, and the series of one member.
+        """Return the kind of motion, for `steady_state`, and the series of one member.
 
-        A member that does not repeat is asked for its Lyapunov exponent, if there is one.
+        The Lyapunov exponent is that of a member that does not repeat, if there is one.
         """
         every = np.all(members.repeats, axis=0)
         kind: dict[str, Any] = {"kind": "transient"}
@@ -248,10 +256,10 @@ class EnsembleEvaluator(Wrapper):
         return steady | (kind if every.any() else {}), series
 
     def _slopes(self, design, members: Members) -> tuple[Status, NDArray[np.float64] | None]:
-        """A status, and (2, 3, d): gradient of each response per config unit and its standard
-        error.
+        """Return a status, and the gradients of the responses and their standard errors (2, 3, d).
 
-        The neighbours begin where the members of the design ended, all at the same states.
+        Both are per config unit; they are None unless the status is AVERAGED. All neighbours start
+        from the same states, where the members of the design ended.
         """
         space = self._space(design)
         points, steps = neighbours(np.asarray(_point(space, design)), self.settings)
@@ -275,7 +283,7 @@ class EnsembleEvaluator(Wrapper):
         return Status.AVERAGED, np.stack(found)
 
     def _space(self, design) -> Space:
-        """The unit box of the search, made larger where the design lies outside."""
+        """Return the unit box of the search, extended where the design lies outside."""
         space = Space.of(self.config, self.scene, 0.0)
         lower, upper = np.minimum(space.lower, design), np.maximum(space.upper, design)
         bounds = jnp.asarray(lower), jnp.asarray(upper)
@@ -284,7 +292,10 @@ class EnsembleEvaluator(Wrapper):
 
 @dataclasses.dataclass(frozen=True)
 class _Outcome:
-    """The members of every design, and pair and geometry of the first."""
+    """Outcome of one or several designs.
+
+    `pair`, `shape`: rotor pair and geometry of the first design; `runs`: members of every design.
+    """
 
     pair: RotorPair
     shape: Geometry
@@ -292,7 +303,7 @@ class _Outcome:
 
     @property
     def status(self) -> Status:
-        """The first failure, or AVERAGED."""
+        """First failure, or AVERAGED."""
         statuses = (run.status for run in self.runs)
         return next((s for s in statuses if s is not Status.AVERAGED), Status.AVERAGED)
 
@@ -305,12 +316,12 @@ class _Outcome:
 def neighbours(
     point: NDArray[np.float64], settings: EnsembleConfig
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points (2n, d) of the unit box in opposite pairs, n first and their n opposites, and the
-    n steps (n, d) from the middle.
+    """Return points of the unit box in opposite pairs, and the steps between them and the middle.
 
-    Steps are normal with standard deviation `spread`, and shortened where a pair would leave
-    the box. The middle is `point`, but at least one standard deviation inside the box: right
-    at a bound there are no opposite neighbours.
+    The points (2n, d) are the middle plus the n steps (n, d), then the middle minus the steps. The
+    steps are normally distributed with standard deviation `spread`, and shortened where a pair
+    would leave the box. The middle is `point`, moved to at least one standard deviation inside the
+    box, since at a bound there are no opposite neighbours.
     """
     from scipy.stats import norm, qmc
 
@@ -322,20 +333,19 @@ def neighbours(
     room = np.minimum(middle, 1 - middle)
     steps *= np.minimum(1.0, np.min(room / np.maximum(np.abs(steps), 1e-12), axis=1))[:, None]
     points = np.concatenate([middle + steps, middle - steps])
-    return np.clip(points, 0.0, 1.0), steps  # Nothing but rounding is clipped.
+    return np.clip(points, 0.0, 1.0), steps  # Only rounding is clipped.
 
 
 def fitted_slope(
     values: NDArray[np.float64], steps: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slopes (r, d) of r responses and their covariances (r, d, d) from the `values` (2n, r)
-    at n opposite pairs at ± `steps` (n, d).
+    """Return the slopes (r, d) of r responses and their covariances (r, d, d).
 
-    Least squares through the differences of the pairs: exact for responses up to quadratic,
-    and for any response it tends to the gradient of its average over the neighbourhood as
-    pairs are added (Stein's identity: E[δδᵀ]⁻¹ E[δ f] = ∇E[f] for normal δ). The covariance
-    is that of the residuals between pairs, so that it contains the noise of the values and
-    what is not linear.
+    `values` (2n, r): responses at n opposite pairs at ± `steps` (n, d). The slopes are a
+    least-squares fit to the differences of the pairs, exact for responses up to quadratic. As pairs
+    are added, the slope tends to the gradient of the average over the neighbourhood (Stein's
+    identity: E[δδᵀ]⁻¹ E[δ f] = ∇E[f] for normal δ). The covariance comes from the residuals of the
+    pairs. So it contains the noise of the values and their nonlinearity.
     """
     count = len(steps)
     differences = (values[:count] - values[count:]) / 2
@@ -349,8 +359,10 @@ def fitted_slope(
 def per_config_unit(
     slope: NDArray[np.float64], covariance: NDArray[np.float64], jacobian: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slopes (r, d) per config unit and their standard errors (r, d), from slopes (r, d) and their
-    covariances (r, d, d) in the unit box, and the `jacobian` (d, d) of the design in the box."""
+    """Return slopes (r, d) per config unit and their standard errors (r, d).
+
+    `slope` (r, d) and `covariance` (r, d, d): those in the unit box; `jacobian` (d, d): derivatives
+    of the design with respect to the point of the box."""
     inverse = np.linalg.inv(jacobian)
     spread = np.einsum("ik,rij,jl->rkl", inverse, covariance, inverse)
     return slope @ inverse, np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
@@ -361,13 +373,13 @@ _pair = Program(Scene.pair_and_shape)
 
 @Program
 def _point(space: Space, design):
-    """Point of the unit box nearest to a design."""
+    """Return the point of the unit box nearest to a design."""
     return space.point(design)
 
 
 @Program
 def _around(space: Space, design, points):
-    """Designs at `points` of the unit box, and the Jacobian of the design in the box."""
+    """Return the designs at `points` of the unit box, and the Jacobian of the design in the box."""
     return jax.vmap(space.design)(points), jax.jacfwd(space.design)(space.point(design))
 
 

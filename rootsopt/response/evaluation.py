@@ -33,13 +33,17 @@ if TYPE_CHECKING:
 
 RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 _MAPS = 5
-"""Contact maps tried for one motion, at most."""
+"""Maximum number of contact maps tried for one motion."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Series:
-    """Motion, force and penetration (negative: gap) over the reported window, uniform in
-    time (SI units, numpy)."""
+    """Motion, force and penetration over the reported window, as NumPy arrays (samples,).
+
+    `time` (s): uniform unless rotor 1 is free; `rotation` of rotor 1 (rad), uniform; `relative`: ε
+    (rad); `rate`: dε/dt (rad/s); `drive_force`, `coast_force`: normal force (N) on each flank;
+    `depth`: greatest penetration (m; negative: gap).
+    """
 
     time: NDArray[np.float64]
     rotation: NDArray[np.float64]
@@ -51,7 +55,7 @@ class Series:
 
     @property
     def force(self) -> NDArray[np.float64]:
-        """Contact force (N): sum of the normal forces."""
+        """Contact force (N): sum of the normal forces on both flanks."""
         return self.drive_force + self.coast_force
 
 
@@ -59,9 +63,12 @@ class Series:
 class Evaluation:
     """Everything known about one design in one scene.
 
-    `response` and `gradient` use the result file's keys (N, N per config unit);
-    `gradient` is empty where there is none to trust. `steady_state` says what kind of
-    motion it is. `series` covers whole orbits, at least one revolution.
+    `design`: parameters in config units; `geometry`, `response` (N), `gradient` (N per config
+    unit): by the result file's keys. `gradient` is empty unless it can be trusted. `steady_state`:
+    kind of motion and its properties; `status` and `message`: outcome and advice; `statistics`:
+    effort and accuracy; `series`: whole orbits over at least one revolution, or a window of a
+    motion that does not settle; `state`: `start` for a neighbouring design, None if not known. For
+    one motion it is the scaled state of the orbit at φ1 = 0 (n,).
     """
 
     design: dict[str, float]
@@ -77,14 +84,15 @@ class Evaluation:
 
     @property
     def usable(self) -> bool:
-        """Whether the numbers stand for a steady state with a gradient."""
+        """Whether the numbers describe a steady state with a gradient."""
         return self.status.usable
 
     def to_dataset(self) -> "xarray.Dataset":
-        """Return the reported window as an `xarray.Dataset` over time, with units and long names;
-        design, geometry, response and status are attributes.
+        """Return the series as an `xarray.Dataset` over time, with units and long names.
 
-        Raises ValueError where there is no window to report."""
+        Design, geometry, response and status are its attributes.
+
+        Raises ValueError if the evaluation has no series."""
         if self.series is None:
             raise ValueError(
                 f"An evaluation must have a series to become a dataset, but this one is "
@@ -95,7 +103,7 @@ class Evaluation:
         return dataset(self)
 
     def record(self) -> dict[str, Any]:
-        """The record of the result file."""
+        """Return the record for the result file."""
         return {
             "design": self.design,
             "geometry": self.geometry,
@@ -110,12 +118,14 @@ class Evaluation:
 
 @dataclasses.dataclass(frozen=True)
 class Evaluator:
-    """Evaluates designs of one config in its `scene`; compiled programs are shared between designs.
+    """Evaluates designs of one config in its `scene`. All designs share compiled programs.
 
-    Nothing of it changes: what returns "another" evaluator leaves this one as it is. `reference`:
-    the response that the forces in the objective are relative to, where motions are compared.
-    `fitted`: whether the contact map has been fitted to a motion. `survey`: give up a design that
-    does not settle within a quarter of the allowed transient.
+    An evaluator is immutable: methods that return "another evaluator" leave this one unchanged.
+
+    `survey`: whether to give up a design that does not settle within a quarter of the allowed
+    transient; `reference`: response to which forces are relative where motions are compared;
+    `fitted`: whether the contact map has been fitted to a motion; `map_error`: error of the contact
+    map, relative to the static penetration, NaN if unknown.
     """
 
     config: Config
@@ -127,7 +137,9 @@ class Evaluator:
 
     @classmethod
     def of(cls, config: Config, rtol: float | None = None, survey: bool = False) -> "Evaluator":
-        """Return the evaluator of a `config`; `rtol` overrides its orbit tolerance."""
+        """Return the evaluator of a `config`; `rtol` overrides its orbit tolerance.
+
+        Raises InputError for an unknown objective term or a scene that cannot be simulated."""
         terms_of([*config.objective.terms])
         found = cls(config, Scene.from_config(config))
         if rtol is not None:
@@ -135,12 +147,13 @@ class Evaluator:
         return found.surveying() if survey else found
 
     def at_tolerance(self, rtol: float) -> "Evaluator":
-        """Return another evaluator, with this orbit tolerance."""
+        """Return another evaluator with the orbit tolerance `rtol`."""
         return self._solving(lambda solver: solver.orbit.rtol, jnp.asarray(rtol))
 
     def surveying(self) -> "Evaluator":
-        """Return another evaluator for a search over many designs, which need a gradient and an
-        order, not the last digits."""
+        """Return another evaluator for a search over many designs.
+
+        A search needs gradients and a ranking, not the last digits."""
         least = max(self.config.solver.max_mesh_periods // 4, 8 * BLOCK)
         hasty = self._solving(
             lambda solver: (solver.max_periods, solver.examine),
@@ -153,17 +166,16 @@ class Evaluator:
         return dataclasses.replace(self, scene=scene)
 
     def relative_to(self, baseline: Evaluation) -> "Evaluator":
-        """Return another evaluator, whose motions are compared by their forces relative to those
-        of the `baseline`."""
+        """Return another evaluator that compares motions by their forces relative to those of the
+        `baseline`."""
         return dataclasses.replace(self, reference=baseline.response)
 
     def at_speed(self, speed_rpm: float) -> "Evaluator":
-        """Return another evaluator, at this speed."""
+        """Return another evaluator at the speed `speed_rpm`."""
         return dataclasses.replace(self, scene=at_speed(self.scene, speed_rpm))
 
     def without_gradient(self) -> "Evaluator":
-        """Return another evaluator that leaves out the gradient where that takes most of the time:
-        here it does not."""
+        """Return an evaluator that skips a costly gradient: this one, whose gradient is cheap."""
         return self
 
     @property
@@ -179,8 +191,8 @@ class Evaluator:
     ) -> Evaluation:
         """Evaluate `design` (config units; default: the config's own).
 
-        `start` is the scaled state to begin from, such as the orbit of a neighbouring design; by
-        default the contract's ε = 0, dε/dt = 0 at φ = 0.
+        `start` (n,): scaled state at φ1 = 0 to begin from, such as the `state` of a neighbouring
+        design; by default at rest (ε = 0, dε/dt = 0). `series`: whether to compute the series.
         """
         return self.fit(design, start, series)[1]
 
@@ -190,8 +202,10 @@ class Evaluator:
         start: NDArray[np.float64] | None = None,
         series: bool = True,
     ) -> tuple["Evaluator", Evaluation]:
-        """Evaluate as a call does; also return another evaluator, for neighbouring designs, whose
-        contact map has the size and the reach that this design's motion takes."""
+        """Evaluate a design, and return another evaluator too, for neighbouring designs.
+
+        Arguments are those of a call. The other evaluator's contact map has the size and the range
+        that this design's motion needs."""
         began = time.perf_counter()
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now = other = self._sized(design)
@@ -216,14 +230,15 @@ class Evaluator:
         return _build(self.scene, jnp.asarray(design))[0]
 
     def prepare(self, design: ArrayLike | None = None, series: bool = True) -> "Evaluator":
-        """Compile, in the background, what evaluating `design` (config units) takes; return another
-        evaluator with the contact map that takes."""
+        """Compile the programs for evaluating `design` (config units) in the background.
+
+        Return another evaluator, with a contact map sized for the design."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now = self._sized(design)
         pair, tangents, _ = _build.result_shape(now.scene, design)
         dtype = pair.angle_scale.dtype
         state = jax.ShapeDtypeStruct((pair.states,), dtype)
-        # The one that takes longest first.
+        # The slowest compilation starts first.
         _motion.prepare(pair, tangents, state, now.scene.pitch_radius, now.scene.solver)
         _build.prepare(now.scene, design)
         if series:
@@ -233,11 +248,10 @@ class Evaluator:
         return now
 
     def _sized(self, design) -> "Evaluator":
-        """Another evaluator, whose contact map is large enough for `design`, where the config
-        leaves its size open.
+        """Return another evaluator whose contact map is large enough for `design`.
 
-        It only grows, so that neighbouring designs share a program. A survey keeps the size it was
-        given.
+        A size that the config sets is kept. An open size only grows, so that neighbouring designs
+        share a program. A survey keeps the size it has.
         """
         solver, scene = self.config.solver, self.scene
         given = solver.map_rolls, solver.map_relatives
@@ -252,18 +266,20 @@ class Evaluator:
         return dataclasses.replace(self, scene=scene, map_error=wanted.error / depth)
 
     def _refitted(self, pair: RotorPair, found: Steady) -> "Evaluator | None":
-        """Another evaluator with a contact map that fits the motion, or None if this one does.
+        """Return another evaluator with a contact map that fits the motion; None if this one fits.
 
-        A motion that left the map is not described by it; one that uses a small part of it wastes
-        its resolution (looked at once, so that neighbouring designs share a map).
+        A motion that leaves the map is not described by it. A motion that uses a small part of the
+        map wastes its resolution. The latter is checked only once, so that neighbouring designs
+        share a map.
         """
         status, reached = Status.of(found.status), _reached(pair, found)
         return self.reaching(reached, status is Status.PERIODIC, pair.angle_limit)
 
     def reaching(self, reached: float, steady: bool, most: Any) -> "Evaluator | None":
-        """Another evaluator with a contact map for motions that reach |ε| = `reached` (rad), at
-        most `most`; None where the map fits, or there is none. Whether it is too large is asked of
-        a `steady` motion."""
+        """Return another evaluator with a contact map for motions that reach |ε| = `reached` (rad).
+
+        The map covers at most `most` (rad). The result is None if this evaluator's map fits, or if
+        it has no map. The map shrinks only for a `steady` motion."""
         covered = -float(self.scene.deepest)
         if self.scene.fidelity != "map" or not np.isfinite(reached):
             return None
@@ -275,7 +291,9 @@ class Evaluator:
         return dataclasses.replace(self, scene=scene, fitted=True)
 
     def _report(self, design, built, found: Steady, began: float, series: bool) -> Evaluation:
-        """The evaluation that a motion which was looked for since `began` comes to."""
+        """Return the evaluation of the motion `found`.
+
+        `built`: rotor pair and geometry; `began`: start time of the evaluation."""
         seconds = time.perf_counter() - began
         (pair, shape), status, orbit = built, Status.of(found.status), found.orbit
         period = int(found.period)
@@ -308,7 +326,7 @@ class Evaluator:
             else:
                 hint = idle_hint(self.config, float(orbit.flow.depth))
                 if found.verdict.steady:
-                    # Held by the timing gear; a pair that floats can rest anywhere.
+                    # The timing gear holds the pair. A pair that floats can rest anywhere.
                     steady |= _closed(orbit, period)
                     state = np.asarray(orbit.state, np.float64)
                     motion = _orbit_series(pair, orbit, period) if series else None
@@ -331,8 +349,9 @@ class Evaluator:
         )
 
     def _terms(self, design, response, gradient):
-        """Values of the further terms that the objective names, and their gradients (NaN where
-        those of the forces are not known)."""
+        """Return the values of the objective's further terms, and their gradients.
+
+        The gradients are NaN where those of the forces are not known."""
         names = [name for name in self.config.objective.terms if name not in response]
         if not names:
             return {}, {}
@@ -348,7 +367,7 @@ class Evaluator:
         }
 
     def _map_statistics(self) -> dict[str, int | float]:
-        """Size and error of the contact map, if there is one."""
+        """Return size and error of the contact map, if there is one."""
         if self.scene.fidelity != "map":
             return {}
         rolls, relatives = self.scene.map_size
@@ -356,7 +375,7 @@ class Evaluator:
         return found if np.isnan(self.map_error) else found | {"map_error": self.map_error}
 
     def _gradient(self, design, found: Steady) -> dict[str, dict[str, float]]:
-        """Gradient of a closed orbit in the result file's keys."""
+        """Return the gradient of a closed orbit, by the result file's keys."""
         if not self.keys:
             return {}
         orbit, solver = found.orbit, self.scene.solver
@@ -373,13 +392,13 @@ class Evaluator:
 
 
 def at_speed(scene: Scene, speed_rpm: float) -> Scene:
-    """Return the `scene` at another speed."""
+    """Return the `scene` at the speed `speed_rpm`."""
     speed = jnp.asarray(speed_rpm * RPM)
     return eqx.tree_at(lambda scene: scene.speed, scene, speed)
 
 
 def _reached(pair: RotorPair, found: Steady) -> float:
-    """Largest |ε| (rad) of the steady motion, as far as known."""
+    """Return the largest |ε| (rad) of the steady motion, as far as it is known."""
     scale = float(pair.angle_scale)
     if Status.of(found.status) in (*CLOSED, Status.IDLE):
         return scale * float(np.max(np.abs(found.orbit.flow.states[:, 0])))
@@ -389,7 +408,7 @@ def _reached(pair: RotorPair, found: Steady) -> float:
 
 
 def _orbit_statistics(found: Steady) -> dict[str, int | float]:
-    """How a closed orbit was found, and how well it is known."""
+    """Return the effort for a closed orbit and its accuracy."""
     orbit = found.orbit
     statistics: dict[str, int | float] = {
         "newton_steps": int(orbit.newton_steps),
@@ -398,13 +417,13 @@ def _orbit_statistics(found: Steady) -> dict[str, int | float]:
         "orbit_defect": float(orbit.defect),
         "force_rounding": float(found.verdict.rounding),
     }
-    if np.isfinite(orbit.disagreement):  # else there was no room for a comparison
+    if np.isfinite(orbit.disagreement):  # Infinite: there was no room for a comparison.
         statistics["gradient_disagreement"] = float(orbit.disagreement)
     return statistics
 
 
 def _closed(orbit: Orbit, period: int) -> dict[str, Any]:
-    """What the result file says of a closed orbit."""
+    """Return the result file's entries for a closed orbit."""
     return {
         "period": period,
         "floquet_multiplier": float(orbit.multiplier),
@@ -414,11 +433,11 @@ def _closed(orbit: Orbit, period: int) -> dict[str, Any]:
 
 
 def idle_hint(config: Config, depth: float) -> str:
-    """Advice for flanks that never touch: which clearance brings them together.
+    """Return advice for flanks that never touch: which clearance or backlash lets them touch.
 
-    `depth` (m): greatest penetration, less than 0 by the least gap. The motion does not depend on
-    the clearance as long as nothing touches, so that the flanks touch where the clearance falls by
-    more than the least gap."""
+    `depth` (m): greatest penetration, the negative of the least gap. The motion does not depend on
+    the clearance as long as nothing touches. So the flanks touch once the clearance falls by more
+    than the least gap. The advice is empty if the gap is not known or too large."""
     gap, clearance = -depth / MM, config.contact.clearance_mm
     if not (np.isfinite(gap) and 0 < gap < 0.9 * config.profile.pitch_radius_mm):
         return ""
@@ -435,7 +454,7 @@ def idle_hint(config: Config, depth: float) -> str:
 
 
 def geometry_record(scene: Scene, shape: Geometry) -> dict[str, float]:
-    """Geometry in the result file's keys and units."""
+    """Return the geometry, by the result file's keys and in its units."""
     return {
         "outer_radius_mm": float(shape.outer_radius) / MM,
         "root_radius_mm": float(shape.root_radius) / MM,
@@ -454,7 +473,7 @@ unsettled_status = Program(window_status)
 
 
 def objective_weights(config: Config) -> dict[str, float]:
-    """Weights of the responses in the objective, by name; they add up to 1."""
+    """Return the weights of the responses in the objective, by name; their sum is 1."""
     wanted = config.objective
     peak = PEAK_NORM if wanted.peak_norm is not None else "peak_force_N"
     shares = {
@@ -470,8 +489,9 @@ def objective_weights(config: Config) -> dict[str, float]:
 
 
 def floquet(monodromy) -> list[list[float]]:
-    """Floquet multipliers, the eigenvalues of a monodromy matrix (n, n), as [real, imaginary] and
-    greatest first."""
+    """Return the Floquet multipliers, as [real, imaginary], greatest modulus first.
+
+    They are the eigenvalues of the `monodromy` matrix (n, n)."""
     values = np.linalg.eigvals(np.asarray(monodromy, np.float64))
     ordered = sorted(values, key=lambda z: (-abs(z), -z.imag))
     return [[float(z.real), float(z.imag)] for z in ordered]
@@ -502,12 +522,12 @@ def _contact_series(pair: RotorPair, tau, states):
 
 
 def _series(pair: RotorPair, tau, states) -> Series:
-    # Within a turn of the rotor: single precision resolves late times as well as early ones.
+    # Reduce to one turn of the rotor, so that single precision resolves late times as well.
     turn = np.mod(tau, pair.lobes)
     period, lapse, (relative, rate), contact = _contact_series(pair, turn, states)
     time = period * tau
     if pair.free:
-        from scipy.integrate import cumulative_simpson  # Half a second, for motors alone.
+        from scipy.integrate import cumulative_simpson  # Slow import (0.5 s), only for motors.
 
         time = period * cumulative_simpson(lapse, x=tau, initial=0.0)
     double = functools.partial(np.asarray, dtype=np.float64)
@@ -523,7 +543,7 @@ def _series(pair: RotorPair, tau, states) -> Series:
 
 
 def _orbit_series(pair: RotorPair, orbit: Orbit, period: int) -> Series:
-    """The orbit repeated over at least one revolution, in whole cycles."""
+    """Return the series of the orbit, repeated in whole cycles over at least one revolution."""
     samples = orbit.flow.states.shape[0]
     cycles = -(-pair.lobes // period)
     tau = period * np.arange(cycles * samples) / samples
@@ -533,8 +553,9 @@ def _orbit_series(pair: RotorPair, orbit: Orbit, period: int) -> Series:
 def unsettled(
     pair: RotorPair, status: Status, window: Window, series: bool
 ) -> tuple[dict[str, Any], dict[str, float], Series | None]:
-    """Return the steady state, the response and, if asked for, the series of a motion that has not
-    settled, from a `window` of it with this `status`."""
+    """Return steady state, response and, on request, series of a motion that has not settled.
+
+    `window`: a window of the motion; `status`: its status."""
     steady = {"kind": _KINDS.get(status, "transient")} | _of_window(window)
     if status not in (Status.CHAOTIC, Status.NOT_SETTLED, Status.IDLE):
         return steady, {}, None
@@ -548,7 +569,7 @@ _KINDS = {Status.CHAOTIC: "chaotic", Status.IDLE: "idle"}
 
 
 def _of_window(window: Window) -> dict[str, Any]:
-    """What the result file says of a window."""
+    """Return the result file's entries for a window."""
     known = bool(np.all(np.isfinite(window.response)) and np.isfinite(window.exponent))
     return {
         "lyapunov_exponent_per_mesh_period": float(window.exponent) if known else None,
@@ -566,8 +587,10 @@ def _window_series(pair: RotorPair, window: Window) -> Series:
 def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) -> Evaluation:
     """Evaluate one design of a config: response, gradient, steady state and series.
 
-    `design` (d,) in config units; by default the config's own. Raises `InputError` for a scene that
-    cannot be simulated, `RuntimeError` where JAX is not set to the precision it asks for.
+    `design` (d,): in config units; by default the config's own.
+
+    Raises `InputError` for a scene that cannot be simulated; `RuntimeError` if JAX is not set to
+    the precision of the config.
 
     >>> config = rootsopt.load_config("configs/cic.yaml")
     >>> rootsopt.evaluate(config).response["mean_force_N"]

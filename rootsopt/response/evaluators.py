@@ -1,5 +1,5 @@
-"""Which evaluator a config asks for: of one motion, of all that coexist, or of an ensemble; at one
-speed or over several."""
+"""Choose the evaluator that a config needs: for one motion, for all coexisting motions or for an
+ensemble; at one speed or over several."""
 
 from rootsopt.config import Config
 from rootsopt.response.evaluation import Evaluator
@@ -7,7 +7,7 @@ from rootsopt.response.wrapper import Evaluates
 
 
 def evaluator_for(config: Config) -> Evaluates:
-    """Return the evaluator that `objective.motion` and `objective.speeds_rpm` ask for."""
+    """Return the evaluator that `objective.motion` and `objective.speeds_rpm` select."""
     single = Evaluator.of(config)
     found: Evaluates = single
     if config.objective.motion == "ensemble":

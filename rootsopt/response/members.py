@@ -1,4 +1,4 @@
-"""Motions of one design from different initial states, and what they come to on average."""
+"""Motions of one design from different initial states, and their averages."""
 
 import functools
 import os
@@ -20,23 +20,24 @@ from rootsopt.runtime.programs import Program
 from rootsopt.status import Status
 
 _SAMPLES = 63
-"""Samples of a mesh period among which its peak is looked for."""
+"""Uniform samples of a mesh period from which its peak is located."""
 _MEMBERS = 4
-"""Members in one call of the compiled program."""
+"""Number of members in one call of the compiled program."""
 _MEMORY = 17
-"""Stroboscopic states remembered, to tell a motion that repeats."""
+"""Number of stroboscopic states stored, to recognise a motion that repeats."""
 _REPEATS = 1e-2
 """Scaled difference below which a motion repeats."""
 
 
 class Members(NamedTuple):
-    """What m motions of one design came to.
+    """Results of m motions of one design.
 
-    `means` (m, 3): mean, mean square (N²) and mean over the mesh periods of the greatest
-    force in each; `drift`: mean force in the second half of the window less that in the
-    first (N); `greatest` force (N), `reach` |ε| (rad) and penetration `depth` (m; least
-    gap if negative) of all; `states`: last scaled state; `repeats` (m, 8): whether the last
-    states repeat after 1 … 8 mesh periods; `lost`, `stalled` (see `RotorPair`), `solved`.
+    `means` (m, 3): mean force (N), mean square (N²) and mean of the peaks of the mesh periods (N);
+    `drift`: mean force in the second half of the window minus that in the first (N); `greatest`:
+    greatest force (N); `reach`: greatest |ε| (rad); `depth`: greatest penetration (m; negative:
+    least gap); `states` (m, n): last scaled states; `repeats` (m, 8): whether the last states
+    repeat after 1 … 8 mesh periods; `lost`, `stalled`: see `RotorPair`; `solved`: whether the
+    solver succeeded.
     """
 
     means: Float[Array, "m 3"]
@@ -52,7 +53,7 @@ class Members(NamedTuple):
 
     @property
     def status(self) -> Status:
-        """The first failure among the members, or AVERAGED."""
+        """First failure among the members, or AVERAGED."""
         if not np.all(self.solved):
             return Status.SOLVER_FAILED
         if not np.all(np.isfinite(self.means)):
@@ -63,10 +64,10 @@ class Members(NamedTuple):
 
     @property
     def responses(self) -> NDArray[np.float64]:
-        """(3, 2): mean, peak, RMS force (N) and their standard errors.
+        """Mean, peak and RMS force (N) in rows, with their standard errors, (3, 2).
 
-        The members being independent, the standard error is that of the mean of their
-        means; of the RMS, to first order.
+        The members are independent, so each standard error is that of the mean over members. For
+        the RMS it is correct to first order.
         """
         values, errors = mean_and_error(np.asarray(self.means, np.float64))
         mean, square, peak = values
@@ -76,17 +77,16 @@ class Members(NamedTuple):
 
 
 def mean_and_error(values: NDArray[np.float64]):
-    """Mean over the first axis of independent values, and its standard error."""
+    """Return the mean of independent values over the first axis, and its standard error."""
     spread = np.std(values, axis=0, ddof=1)
     return np.mean(values, axis=0), spread / np.sqrt(len(values))
 
 
 def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float64]:
-    """Scaled states (members, n), a scrambled Sobol sequence over the play of the pair and
-    the speeds at which the load crosses it.
+    """Return scaled states (members, n): a scrambled Sobol sequence of ε and dε/dt.
 
-    |ε| ≤ `angle_scale`, play and static penetration; |dε/dt| up to that of a fall under the
-    load through the whole of it.
+    |ε| goes up to `angle_scale` (play and static penetration), |dε/dt| up to the speed after a fall
+    under the load through that whole range.
     """
     from scipy.stats import qmc
 
@@ -99,7 +99,8 @@ def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float
 
 
 def prepare_members(pair: RotorPair, integrator: Integrator) -> None:
-    """Compile, in the background, what `run_members` takes on CPUs for pairs like this one."""
+    """Compile the program that `run_members` needs on CPUs for pairs like this one, in the
+    background."""
     states = jax.ShapeDtypeStruct((_MEMBERS, pair.states), pair.angle_scale.dtype)
     count = jax.ShapeDtypeStruct((), int)
     _in_turn.prepare(pair, states, count, count, integrator)
@@ -112,11 +113,11 @@ def run_members(
     periods: int,
     integrator: Integrator,
 ) -> list[Members]:
-    """The `Members` of each of `pairs`, all from the same scaled `states` (m, 2), over
-    `periods` mesh periods after `settle` others.
+    """Return the `Members` of each of `pairs`, all from the same scaled `states` (m, n).
 
-    On CPUs a thread for each core takes a few members at a time: stepping many together, each
-    would wait for the slowest at every turn. On other devices all are stepped together.
+    `settle`: mesh periods before the window; `periods`: mesh periods of the window. On CPUs one
+    thread per core takes a few members at a time. If all were stepped together, each would wait for
+    the slowest at every turn. On other devices they are stepped together.
     """
     states = np.asarray(states, pairs[0].angle_scale.dtype)
     counts = np.asarray(settle), np.asarray(periods)
@@ -124,7 +125,7 @@ def run_members(
         stacked = jax.tree.map(lambda *x: jnp.stack(x), *pairs)
         together = jax.device_get(_together(stacked, states, *counts, integrator))
         return [jax.tree.map(lambda x, i=i: x[i], together) for i in range(len(pairs))]
-    # Parts of one size share a compiled program; the last member fills the last part up.
+    # Parts of equal size share a compiled program. The last part is filled with the last member.
     count = len(states)
     parts = -(-count // _MEMBERS)
     rows = np.minimum(np.arange(parts * _MEMBERS), count - 1).reshape(parts, _MEMBERS)
@@ -144,7 +145,9 @@ def run_members(
 def member(
     pair: RotorPair, state: Float[Array, " n"], settle: Any, periods: Any, integrator: Integrator
 ) -> Members:
-    """One motion from the scaled `state`, as a pure function; leaves without the axis m."""
+    """Return the result of one motion from the scaled `state` (n,), without the axis m.
+
+    This is a pure function. `settle`, `periods`: as in `run_members`."""
     dtype = state.dtype
     one, none, low = jnp.ones((), dtype), jnp.zeros((), dtype), jnp.full((), -jnp.inf, dtype)
 

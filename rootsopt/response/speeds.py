@@ -1,6 +1,6 @@
 """One design at several speeds: for `objective.speeds_rpm`, and for `rootsopt sweep`.
 
-The speed is a number of the model, so that every speed is evaluated by the same compiled programs.
+The speed is an array of the model, so all speeds share the same compiled programs.
 """
 
 import dataclasses
@@ -28,14 +28,17 @@ _STEADY = (
 
 
 class AtSpeed(NamedTuple):
-    """The `evaluation` at one speed, and the `share` of that speed in the objective."""
+    """The evaluation at one speed.
+
+    `speed_rpm` (rpm); `share` of this speed in the objective; `evaluation`.
+    """
 
     speed_rpm: float
     share: float
     evaluation: Evaluation
 
     def row(self) -> dict[str, Any]:
-        """In a line, for tables: speed, forces, kind of motion, status; not the share."""
+        """Return a table row: speed, forces, kind of motion and status, without the share."""
         response, steady = self.evaluation.response, self.evaluation.steady_state
         return {
             "speed_rpm": self.speed_rpm,
@@ -47,10 +50,11 @@ class AtSpeed(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SpeedsEvaluation(Evaluation):
-    """An `Evaluation` at the scene's own speed, with the `parts` at every speed simulated.
+    """An `Evaluation` at the scene's own speed, with the evaluations at all speeds simulated.
 
-    `status` is that of the first part that is not usable, and then there is no gradient. `state`
-    (m, 1 + n): number of the part and scaled state, a row for each motion known.
+    `parts`: one for each speed; `status`: that of the first part that is not usable. There is then
+    no gradient. `state` (m, 1 + n): one row for each known motion, the number of its part followed
+    by the scaled state.
     """
 
     parts: tuple[AtSpeed, ...] = ()
@@ -63,23 +67,26 @@ class SpeedsEvaluation(Evaluation):
 
 @dataclasses.dataclass(frozen=True)
 class SpeedsEvaluator(Wrapper):
-    """Evaluates designs at every speed of `objective.speeds_rpm` and at the scene's own, by the
-    evaluator `single` for each.
+    """Evaluates designs at every speed of `objective.speeds_rpm` and at the scene's own.
 
-    The scene's speed is what the response is reported at. If it is not one of those of the
-    objective, it has no share in that, but its status counts. `baseline`: the parts of the
-    evaluation that forces at each speed are relative to.
+    `single`: the evaluator for each speed; `baseline`: per-speed parts of the evaluation to which
+    the forces at each speed are relative.
+
+    The response is reported at the scene's speed. If this is not a speed of the objective, it has
+    no share in the objective, but its status counts.
     """
 
     baseline: tuple["AtSpeed", ...] = ()
 
     def relative_to(self, baseline: Evaluation) -> "SpeedsEvaluator":
-        """Return another evaluator, whose forces at each speed are compared relative to those of
-        the `baseline` at that speed."""
+        """Return another evaluator that compares motions at each speed by their forces relative to
+        those of the `baseline` at that speed."""
         return dataclasses.replace(self, baseline=at_speeds(baseline))
 
     def fit(self, design=None, start=None, series=True) -> tuple["SpeedsEvaluator", Evaluation]:
-        """As `Evaluator.fit`; `start`: the `state` of a neighbouring design's evaluation."""
+        """Evaluate a design, and return another evaluator too, as `Evaluator.fit` does.
+
+        `start`: the `state` of a neighbouring design's evaluation."""
         config, now = self.config, self.single
         own = config.scene.speed_rpm
         parts = []
@@ -95,7 +102,7 @@ class SpeedsEvaluator(Wrapper):
 
 
 def together(parts: Sequence["AtSpeed"], own: float) -> SpeedsEvaluation:
-    """Return the evaluation at several speeds, reported at the speed `own` (rpm)."""
+    """Combine the evaluations at several speeds into one, reported at the speed `own` (rpm)."""
     (head,) = (part.evaluation for part in parts if part.speed_rpm == own)
     status, message = overall(parts)
     seconds = sum(part.evaluation.statistics["seconds"] for part in parts)
@@ -126,7 +133,7 @@ def _rows(start: NDArray[np.float64], number: int) -> NDArray[np.float64]:
 
 
 def alone(config: Config, speed_rpm: float | None = None) -> Config:
-    """`config` at one speed, by default the scene's own, with no others in its objective."""
+    """Return `config` with a single speed (rpm), by default the scene's own."""
     speed = config.scene.speed_rpm if speed_rpm is None else speed_rpm
     none = {"speeds_rpm": (), "speed_weights": (), "over_speeds": "weighted"}
     return config.model_copy(
@@ -138,8 +145,9 @@ def alone(config: Config, speed_rpm: float | None = None) -> Config:
 
 
 def shares(config: Config) -> dict[float, float]:
-    """Speeds (rpm) that a config's objective takes to be simulated, ascending, with their shares
-    in it; the scene's own is among them, with the share 0 if it is not one of the objective's."""
+    """Return the speeds (rpm) that a config's objective needs, ascending, with their shares.
+
+    The scene's own speed is included. Its share is 0 if it is not a speed of the objective."""
     objective = config.objective
     speeds = objective.speeds_rpm or (config.scene.speed_rpm,)
     weights = objective.speed_weights or (1.0,) * len(speeds)
@@ -149,7 +157,7 @@ def shares(config: Config) -> dict[float, float]:
 
 
 def at_speeds(evaluation: Evaluation) -> tuple[AtSpeed, ...]:
-    """The parts of an evaluation at several speeds; of another one, itself."""
+    """Return the per-speed parts of an evaluation; a single-speed evaluation is its only part."""
     if isinstance(evaluation, SpeedsEvaluation):
         return evaluation.parts
     return (AtSpeed(math.nan, 1.0, evaluation),)
@@ -161,9 +169,10 @@ def counted(
     baseline: Evaluation,
     value: Callable[[Evaluation, Evaluation], float],
 ) -> list[tuple[float, Evaluation, Evaluation]]:
-    """(share, evaluation, baseline) at every speed that counts in the objective; the shares add
-    up to 1. Where the worst speed counts, that is the one of the greatest `value(evaluation,
-    baseline)`."""
+    """Return (share, evaluation, baseline) at every speed that counts in the objective.
+
+    The shares add up to 1. With `objective.over_speeds: worst`, only the speed with the greatest
+    `value(evaluation, baseline)` counts."""
     pairs = [
         (part.share, part.evaluation, base.evaluation)
         for part, base in zip(at_speeds(evaluation), at_speeds(baseline), strict=True)
@@ -176,7 +185,7 @@ def counted(
 
 
 def swept_speeds(config: Config) -> list[float]:
-    """Speeds (rpm) of the config's sweep, ascending."""
+    """Return the speeds (rpm) of the config's sweep, ascending."""
     wanted = config.sweep.speed_rpm
     if wanted is None and config.objective.speeds_rpm:
         return sorted(config.objective.speeds_rpm)
@@ -192,10 +201,10 @@ def sweep(
     design: Any = None,
     progress: Callable[[int, int], None] = lambda done, expected: None,
 ) -> tuple[AtSpeed, ...]:
-    """`design` (config units; default: the config's own) at each of the speeds, every one from
-    rest; equal shares.
+    """Evaluate `design` (config units; default: the config's own) at each of the speeds, from rest.
 
-    `evaluator`: one that looks at a single speed. `progress` is called with (speeds done, all).
+    `evaluator`: one for a single speed. `progress` is called with (speeds done, all). All parts of
+    the result have equal shares.
     """
     parts: list[AtSpeed] = []
 
@@ -211,7 +220,8 @@ def sweep(
 
 
 def overall(parts: Sequence[AtSpeed]) -> tuple[Status, str]:
-    """The status of the first part that is not usable, and its message; else of them all."""
+    """Return status and message of the first part that is not usable; if all are usable, those of
+    the first part."""
     for part in parts:
         if not part.evaluation.usable:
             return part.evaluation.status, f"At {part.speed_rpm:g} rpm: {part.evaluation.message}"

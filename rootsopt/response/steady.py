@@ -1,9 +1,9 @@
-"""The steady response as a pure function of scene and design, differentiable in both.
+"""The steady response as a pure function, differentiable with respect to scene and design.
 
-The derivative of an orbit is that of the implicit function theorem: the search for it is never
-differentiated through. All derivatives asked for are columns of one matrix, which is found with the
-orbit; a transformation of JAX only multiplies with it. So forward and reverse mode agree to
-rounding, and what is not asked for is not computed.
+The derivative of an orbit comes from the implicit function theorem: JAX never differentiates
+through the search for the orbit. All requested derivatives are columns of one matrix, computed with
+the orbit. JAX transformations only multiply with this matrix. So forward and reverse mode agree to
+rounding, and derivatives that are not requested are not computed.
 """
 
 from typing import Any, NamedTuple
@@ -27,18 +27,19 @@ from rootsopt.status import Status
 
 
 class Response(NamedTuple):
-    """The steady response of one design in one scene; with leading axes where it was mapped.
+    """The steady response of one design in one scene; with leading axes if it was mapped.
 
-    `mean`, `peak`, `rms` of the contact force (N); amplitudes `lines` (N) of the spectral lines
-    that the scene asks for, in their order (0: no line of this motion); `peak_norm` (N), or None
-    where the scene asks for none. `period` of the motion in mesh periods; Floquet `multipliers`,
-    greatest modulus first; `residual`: scaled distance by which the orbit does not close; `status`:
-    code of a `Status` (`Status.of(code)`); `state` at φ1 = 0 in SI units: ε (rad), dε/dt (rad/s),
-    then those of parts, such as a motor's speed beside the scene's (rad/s).
+    `mean`, `peak`, `rms`: contact force (N); `lines` (lines,): amplitudes (N) of the spectral lines
+    that the scene requests, in their order (0 if the motion does not have the line); `peak_norm`:
+    p-norm (N), None unless the scene requests it; `period`: mesh periods of the orbit;
+    `multipliers` (n,): Floquet multipliers, greatest modulus first; `residual`: distance (scaled)
+    by which the orbit does not close; `status`: code of a `Status` (`Status.of(code)`); `state`
+    (n,) at φ1 = 0 in SI units: ε (rad), dε/dt (rad/s), then the states of parts, such as the excess
+    of a motor's speed over the scene's (rad/s).
 
-    Forces are those of the orbit; 0 without contact; for a motion that does not settle those of a
-    window of 128 mesh periods; else NaN. Of a motion that is not periodic, period is 0 and
-    multipliers and residual are NaN.
+    The forces are those of the orbit, or 0 without contact. For a motion that does not settle, they
+    are those of a window of 128 mesh periods. Otherwise they are NaN. If the motion is not
+    periodic, `period` is 0, and `multipliers` and `residual` are NaN.
     """
 
     mean: Float[Array, ""]
@@ -61,13 +62,14 @@ def steady_response(
     `start` (n,): state at φ1 = 0 from which the motion begins (SI units, as `Response.state`); by
     default at rest. The response does not depend on it, as long as it leads to the same motion.
 
-    A pure function: it works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and `jacrev` with respect
-    to the design and to every physical quantity of the scene. Derivatives of forces and `state` are
-    those of the orbit by the implicit function theorem, and NaN where the status is not periodic.
-    Multipliers and residual are constants to JAX: their derivatives are not computed, and are 0.
+    This is a pure function. It works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and `jacrev`,
+    with respect to the design and to every physical quantity of the scene. The derivatives of
+    forces and `state` are those of the orbit, by the implicit function theorem. They are NaN unless
+    the status is periodic. `multipliers` and `residual` are constants to JAX, with derivative 0.
+    Only first derivatives are available.
 
-    Raises ValueError for a design of another size; RuntimeError where JAX is not set to the
-    precision of the scene.
+    Raises ValueError for a design of another size; RuntimeError if JAX is not set to the precision
+    of the scene.
 
     >>> config = rootsopt.load_config("configs/cic.yaml")
     >>> scene = rootsopt.Scene.from_config(config)
@@ -101,7 +103,7 @@ def _response_jvp(primals, tangents):
     response, slopes = _solved(scene, design, start, tuple(at for at, _ in moved))
     flat = [jnp.ravel(tangent) for _, tangent in moved]
     vector = jnp.concatenate(flat) if flat else jnp.zeros(0, design.dtype)
-    # What nobody differentiates with respect to has no derivative to give.
+    # Leaves that cannot be differentiated make every derivative NaN.
     unknown = jnp.nan * sum((jnp.sum(tangent) for tangent in without), start=jnp.sum(vector))
     values = slopes @ vector + (unknown if without else 0.0)
     mean, peak, rms, lines, norm, state = _split(values, response)
@@ -111,8 +113,10 @@ def _response_jvp(primals, tangents):
 
 
 def _moved(scene: Any, design: Any) -> tuple[list[tuple[int, Array]], list[Array]]:
-    """Tangents that are not zero, with the numbers of their leaves in `_leaves`; and those of
-    leaves that describe a measured outline, with respect to which nothing is differentiated."""
+    """Return the tangents that are not None (zero), in two lists.
+
+    The first has those of differentiable leaves, each with the number of its leaf in `_leaves`. The
+    second has those of a measured outline, with respect to which there are no derivatives."""
     numbers, leaves = [], []
     for number, (path, leaf) in enumerate(_leaves((scene, design))):
         if leaf is None:
@@ -128,25 +132,26 @@ def _moved(scene: Any, design: Any) -> tuple[list[tuple[int, Array]], list[Array
 
 
 _SETTINGS = ("solver", "deepest")
-"""Fields of a scene that no response depends on."""
+"""Fields of a scene on which the response does not depend, so that their tangents are ignored."""
 
 
 def _leaves(tree: Any) -> list[tuple[Any, Any]]:
-    """All leaves with their places, None among them."""
+    """Return all leaves with their paths, including those that are None."""
     return jax.tree_util.tree_flatten_with_path(tree, is_leaf=lambda x: x is None)[0]
 
 
 def _split(values, response: Response):
-    """The entries of `values` that belong to each differentiated field of a `response`: mean, peak,
-    RMS, lines, p-norm, state."""
+    """Split `values` into the differentiated fields of a `response`: mean, peak, RMS, lines,
+    p-norm, state."""
     lines, states = response.lines.shape[0], response.state.shape[0]
     norm = None if response.peak_norm is None else values[3 + lines]
     return *values[:3], values[3 : 3 + lines], norm, values[-states:]
 
 
 def _solved(scene: Scene, design, start, along: tuple[int, ...]) -> tuple[Response, Array]:
-    """The response, and the derivatives (rows, m) of its differentiated fields along the m entries
-    of the leaves numbered `along`."""
+    """Return the response, and the derivatives (rows, m) of its differentiated fields.
+
+    They are with respect to the m entries of the leaves numbered `along`."""
     arguments = scene, design, start, along
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
         return _inline(*arguments)
@@ -174,15 +179,16 @@ def _solve(scene: Scene, design, start, numbers: tuple[int, ...]) -> tuple[Respo
 
 
 def _on_map(scene: Scene, pair: RotorPair, found: Steady) -> Steady:
-    """The motion, whose status says so where it has left the contact map."""
+    """Return the motion, with the status OFF_MAP if it has left the contact map."""
     reached = pair.angle_scale * jnp.max(jnp.abs(found.orbit.flow.states[:, 0]))
     left = among(found.status, CLOSED) & (reached > -scene.deepest)
     return found._replace(status=jnp.where(left, Status.OFF_MAP.code, found.status))
 
 
 def _state(pair: RotorPair, tangents: RotorPair, found: Steady):
-    """State (n,) in SI units of the orbit, or of the end of a motion without one; and derivatives
-    (n, m) of the orbit's."""
+    """Return the state (n,) in SI units and the derivatives (n, m) of the orbit's state.
+
+    The state is that of the orbit or, without an orbit, that at the end of the transient."""
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
 
     def in_si(dynamic, state):
@@ -198,7 +204,7 @@ def _state(pair: RotorPair, tangents: RotorPair, found: Steady):
 
 
 def _basis(leaves: list[Array]) -> list[Array]:
-    """Unit directions of all entries of the `leaves`, stacked along a leading axis."""
+    """Return the unit directions of all entries of the `leaves`, stacked along a leading axis."""
     sizes = [leaf.size for leaf in leaves]
     unit, begin, rows = np.eye(sum(sizes)), 0, []
     for leaf, size in zip(leaves, sizes, strict=True):
@@ -209,7 +215,7 @@ def _basis(leaves: list[Array]) -> list[Array]:
 
 
 def _named(measures: Measures, pair: RotorPair, tangents: RotorPair, found: Steady):
-    """The response of a motion, and the derivatives of its differentiated fields."""
+    """Return the response of a motion, and the derivatives of its differentiated fields."""
     orbit, period = found.orbit, found.period
     closed = among(found.status, CLOSED)
     mean, square, peak, *others = found.forces
@@ -256,7 +262,7 @@ def _once_jvp(primals, tangents):
     del primals, tangents
     raise NotImplementedError(
         "The steady response has first derivatives only: differentiate it once, and use a method "
-        "that needs no second ones (BFGS, Gauss-Newton)"
+        "that needs no second derivatives (BFGS, Gauss-Newton)"
     )
 
 

@@ -1,8 +1,8 @@
-"""Terms of the objective: what of a design and its motion is to be small.
+"""Terms of the objective: quantities of a design and its motion to be minimised.
 
-A term is an object found through one table, the package's own as any other. Its gradient follows
-from its formula: what it takes of the profile is differentiated, what it takes of the forces is
-chained with their gradients.
+All terms, built-in or your own, are registered in one table. The gradient of a term follows from
+its formula. JAX differentiates the dependence on the profile, and the chain rule adds the gradients
+of the forces.
 """
 
 import abc
@@ -22,7 +22,7 @@ from rootsopt.scene import Scene
 
 
 class Forces(NamedTuple):
-    """Mean, peak and RMS of the contact force (N)."""
+    """Mean, peak and RMS of the contact force (N), in the fields `mean`, `peak`, `rms`."""
 
     mean: Float[Array, ""]
     peak: Float[Array, ""]
@@ -30,23 +30,24 @@ class Forces(NamedTuple):
 
 
 class Term(eqx.Module):
-    """Something to be small: `objective.terms` names it with its weight.
+    """A quantity to be minimised, named with its weight in `objective.terms`.
 
-    Write `value`; numbers are fields that hold arrays or are static. In the objective a term counts
-    relative to its value for the baseline, so it must be greater than 0 there.
+    To add a term, write `value`. Store numbers in fields that hold arrays or are static. The
+    objective uses a term relative to its value for the baseline, which must be greater than 0.
     """
 
     @abc.abstractmethod
     def value(
         self, scene: Scene, profile: Profile, shape: Geometry, forces: Forces
     ) -> Float[Array, ""]:
-        """Return the term for one design, by operations that JAX can differentiate.
+        """Return the term for one design, computed by operations that JAX can differentiate.
 
-        `profile` and its `shape` (SI units), `forces` of its steady motion in the `scene`."""
+        `profile` and `shape`: the design's profile and its geometry (SI units); `forces`: those of
+        its steady motion in the `scene`."""
 
 
 class GeometryTerm(Term):
-    """A field of `Geometry`, in units of `unit`."""
+    """The field named `field` of `Geometry`, divided by `unit`."""
 
     field: str = eqx.field(static=True)
     unit: float = eqx.field(static=True)
@@ -65,7 +66,7 @@ class InertiaTerm(Term):
 
 
 class ForceTerm(Term):
-    """One of the `Forces` (N)."""
+    """The field named `field` of `Forces` (N)."""
 
     field: str = eqx.field(static=True)
 
@@ -78,9 +79,9 @@ _terms: dict[str, Term] = {}
 
 
 def register_term(name: str, term: Term) -> None:
-    """Let `objective.terms` name a `term`.
+    """Register a `term` under a `name` for `objective.terms`.
 
-    Raises ValueError for a name that is no word or is taken."""
+    Raises ValueError for a name that is not an identifier or is taken."""
     if not name.isidentifier():
         raise ValueError(
             f"Argument `name` must be a word of letters, digits and _, but is {name!r}"
@@ -94,7 +95,7 @@ def register_term(name: str, term: Term) -> None:
 
 
 def terms_of(names: Sequence[str]) -> tuple[Term, ...]:
-    """Return the terms of these `names`; raises `InputError` for a name that none has."""
+    """Return the terms registered under `names`. Raises `InputError` for an unknown name."""
     for name in names:
         if name not in _terms:
             raise InputError(
@@ -112,8 +113,9 @@ def values_of(
     forces: Float[Array, "3"],
     slopes: Float[Array, "3 d"],
 ) -> tuple[Float[Array, " t"], Float[Array, "t d"]]:
-    """Return the values of `terms` for a `design` in config units and their gradients, from the
-    `forces` (mean, peak, RMS; N) and their `slopes`."""
+    """Return the values (t,) of `terms` for a `design` in config units, and their gradients (t, d).
+
+    `forces` (3,): mean, peak and RMS force (N); `slopes` (3, d): their gradients."""
 
     def every(design, forces):
         profile = scene.profile(design)

@@ -1,4 +1,4 @@
-"""What every evaluator can do, and the base of those that wrap another one."""
+"""The protocol of all evaluators, and the base class of those that wrap another evaluator."""
 
 import dataclasses
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -11,22 +11,22 @@ from rootsopt.response.evaluation import Evaluation
 from rootsopt.scene import Scene
 
 W = TypeVar("W", bound="Wrapper")
-"""The kind of a wrapper, which stays the same. (Not `Self`: types of single methods are checked at
-run time.)"""
+"""Class of a wrapper, which its methods return. (Not `Self`: tests check the types of single
+methods at run time.)"""
 
 
 @runtime_checkable
 class Evaluates(Protocol):
-    """Evaluates designs of one config, and changes nothing of itself (see `Evaluator`)."""
+    """Evaluates designs of one config. An evaluator is immutable (see `Evaluator`)."""
 
     @property
     def config(self) -> Config:
-        """The config whose designs are evaluated."""
+        """Config whose designs are evaluated."""
         ...
 
     @property
     def scene(self) -> Scene:
-        """The scene they are evaluated in."""
+        """Scene in which designs are evaluated."""
         ...
 
     def __call__(
@@ -38,11 +38,11 @@ class Evaluates(Protocol):
     def fit(
         self, design: Any = None, start: NDArray | None = None, series: bool = True
     ) -> tuple["Evaluates", Evaluation]:
-        """Evaluate a design; also return an evaluator fitted to its motion."""
+        """Evaluate a design, and return another evaluator too, fitted to its motion."""
         ...
 
     def prepare(self, design: Any = None, series: bool = True) -> "Evaluates":
-        """Compile in the background what a design takes; return an evaluator sized for it."""
+        """Compile the programs for a design in the background; return an evaluator sized for it."""
         ...
 
     def pair(self, design: ArrayLike) -> RotorPair:
@@ -50,43 +50,43 @@ class Evaluates(Protocol):
         ...
 
     def at_speed(self, speed_rpm: float) -> "Evaluates":
-        """Return another evaluator, at this speed."""
+        """Return another evaluator at the speed `speed_rpm`."""
         ...
 
     def at_tolerance(self, rtol: float) -> "Evaluates":
-        """Return another evaluator, with this orbit tolerance."""
+        """Return another evaluator with the orbit tolerance `rtol`."""
         ...
 
     def surveying(self) -> "Evaluates":
-        """Return another evaluator, for a search over many designs."""
+        """Return another evaluator for a search over many designs."""
         ...
 
     def relative_to(self, baseline: Evaluation) -> "Evaluates":
-        """Return another evaluator, whose motions are compared relative to a baseline."""
+        """Return another evaluator that compares motions by their forces relative to a baseline."""
         ...
 
     def without_gradient(self) -> "Evaluates":
-        """Return another evaluator without the gradient where that takes most of the time."""
+        """Return an evaluator that skips the gradient if it takes most of the time."""
         ...
 
 
 @dataclasses.dataclass(frozen=True)
 class Wrapper:
-    """An evaluator of what the evaluations of another one, `single`, come to.
+    """An evaluator that combines evaluations of another one, `single`.
 
-    What is asked of it is asked of `single`; a wrapper of its own kind writes `fit`.
+    All methods pass on to `single`. A subclass writes `fit`.
     """
 
     single: Evaluates
 
     @property
     def config(self) -> Config:
-        """The config whose designs are evaluated."""
+        """Config whose designs are evaluated."""
         return self.single.config
 
     @property
     def scene(self) -> Scene:
-        """The scene they are evaluated in."""
+        """Scene in which designs are evaluated."""
         return self.single.scene
 
     def __call__(self, design=None, start=None, series=True) -> Evaluation:
@@ -94,7 +94,7 @@ class Wrapper:
         return self.fit(design, start, series)[1]
 
     def fit(self: W, design=None, start=None, series=True) -> tuple[W, Evaluation]:
-        """Evaluate a design; also return an evaluator fitted to its motion."""
+        """Evaluate a design, and return another evaluator too, fitted to its motion."""
         raise NotImplementedError
 
     def pair(self, design: ArrayLike) -> RotorPair:
@@ -102,27 +102,27 @@ class Wrapper:
         return self.single.pair(design)
 
     def prepare(self: W, design=None, series=True) -> W:
-        """Compile in the background what a design takes; return an evaluator sized for it."""
+        """Compile the programs for a design in the background; return an evaluator sized for it."""
         return self._around(self.single.prepare(design, series))
 
     def at_speed(self: W, speed_rpm: float) -> W:
-        """Return another evaluator, at this speed."""
+        """Return another evaluator at the speed `speed_rpm`."""
         return self._around(self.single.at_speed(speed_rpm))
 
     def at_tolerance(self: W, rtol: float) -> W:
-        """Return another evaluator, with this orbit tolerance."""
+        """Return another evaluator with the orbit tolerance `rtol`."""
         return self._around(self.single.at_tolerance(rtol))
 
     def surveying(self: W) -> W:
-        """Return another evaluator, for a search over many designs."""
+        """Return another evaluator for a search over many designs."""
         return self._around(self.single.surveying())
 
     def relative_to(self: W, baseline: Evaluation) -> W:
-        """Return another evaluator, whose motions are compared relative to a `baseline`."""
+        """Return another evaluator that compares motions by forces relative to a `baseline`."""
         return self._around(self.single.relative_to(baseline))
 
     def without_gradient(self: W) -> W:
-        """Return another evaluator without the gradient where that takes most of the time."""
+        """Return an evaluator that skips the gradient if it takes most of the time."""
         return self._around(self.single.without_gradient())
 
     def _around(self: W, single: Evaluates) -> W:

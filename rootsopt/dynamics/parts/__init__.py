@@ -1,4 +1,4 @@
-"""What may act on a rotor pair. A scene holds the parts it needs and no others."""
+"""Parts that can act on a rotor pair. A scene holds only the parts it needs."""
 
 from rootsopt.dynamics.parts.base import Context, Loads, Motion, Own, Part, Units
 from rootsopt.dynamics.parts.drive import Drive, MotorDrive, PrescribedDrive

@@ -1,4 +1,4 @@
-"""What every part of a scene is to the rotor pair, and what the pair tells a part."""
+"""The base class of all parts of a scene, and the data that the rotor pair gives a part."""
 
 from typing import NamedTuple, TypeVar
 
@@ -9,13 +9,17 @@ from jaxtyping import Array, Bool, Float
 
 _Part = TypeVar("_Part", bound="Part")
 Own = Float[Array, " m"] | Float[np.ndarray, " m"]
-"""A part's own states (SI); of none an empty array of NumPy, which a program does not see."""
+"""A part's own states (SI units). A part without states gets an empty NumPy array, which adds
+nothing to a compiled program."""
 
 
 class Motion(NamedTuple):
-    """Position and velocity of the pair at an instant (SI units): angle φ1 and angular speed of
-    rotor 1, ε and its rate; with displaced axes, displacements of both (rotor, x and y) and their
-    velocities."""
+    """Position and velocity of the pair at one or several instants.
+
+    `phi`: angle φ1 of rotor 1 (rad); `relative`: ε (rad); `rate`: dε/dt (rad/s); `speed`: angular
+    speed of rotor 1 (rad/s); `shift` (rotor, x and y): displacements of the axes (m); `drift`:
+    their velocities (m/s). The last two are None if no part lets the axes move.
+    """
 
     phi: Float[Array, "*n"]
     relative: Float[Array, "*n"]
@@ -26,9 +30,12 @@ class Motion(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """What acts in sum at an instant, contact included: torques (N·m) on rotor 1 and rotor 2, each
-    in its rotor's sense of rotation, and forces (N) on both axes (rotor, x and y). On rotor 1 None
-    where its speed is prescribed, on the axes None where they are in rigid bearings."""
+    """Sums of all loads at an instant, contact included.
+
+    `torque1`, `torque2`: torques (N·m) on the rotors, each positive in its rotor's sense of
+    rotation; `axes` (rotor, x and y): forces (N) on the axes. `torque1` is None where the speed of
+    rotor 1 is prescribed. `axes` is None where the bearings are rigid.
+    """
 
     torque1: Float[Array, ""] | None
     torque2: Float[Array, ""]
@@ -36,7 +43,7 @@ class Loads(NamedTuple):
 
 
 class Units(NamedTuple):
-    """What the solver counts in: `angle` (rad), in which ε is of order one, and `time` (s), a mesh
+    """Units of the solver: `angle` (rad), in which ε is of order one, and `time` (s), one mesh
     period at the drive's speed."""
 
     angle: Float[Array, ""]
@@ -44,9 +51,11 @@ class Units(NamedTuple):
 
 
 class Context(NamedTuple):
-    """The scene that a part is prepared for: `inertia` (kg·m²) and `mass` (kg) of one rotor,
-    `pitch_radius` (m), `angle` (rad; unit of ε), `load_torque` (N·m; mean on rotor 2) and `speed`
-    (rad/s) of the drive."""
+    """The scene that a part is prepared for.
+
+    `inertia` (kg·m²) and `mass` (kg) of one rotor; `pitch_radius` (m); `angle` (rad): unit of ε;
+    `load_torque` (N·m): mean on rotor 2; `speed` (rad/s) of the drive.
+    """
 
     inertia: Float[Array, ""]
     mass: Float[Array, ""]
@@ -57,128 +66,140 @@ class Context(NamedTuple):
 
 
 class Part(eqx.Module):
-    """Something that acts on a rotor pair, by torques, by forces on the axes or by drag at the
-    flanks, and that may have states of its own.
+    """Something that acts on a rotor pair: by torques, by forces on the axes or by drag at the
+    flanks. It can have states of its own.
 
-    Override what the part has. What it leaves alone adds no state and no operation. All its numbers
-    are fields that hold arrays: a response is differentiable with respect to them. Quantities are
-    in SI units; torques, speeds and angles are positive in the rotor's own sense of rotation.
+    Override the methods that apply to your part. A method you leave out costs nothing: no state, no
+    computation. Store every number in a field that holds an array: a response is differentiable
+    with respect to these fields. Quantities are in SI units; torques, speeds and angles are
+    positive in the rotor's own sense of rotation.
     """
 
-    # What it is
+    # Properties of the part.
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Names of its own states, with units."""
+        """Names of the part's own states, with units."""
         return ()
 
     @property
     def free(self) -> bool:
-        """Whether it sets rotor 1 free: its speed is then a state of the motion."""
+        """Whether the part sets rotor 1 free, which makes the speed of rotor 1 a state."""
         return False
 
     @property
     def displaces(self) -> bool:
-        """Whether it lets the axes move: see `axes`. One part of a scene may."""
+        """Whether the part lets the axes move (see `axes`). At most one part of a scene may."""
         return False
 
     @property
     def rubs(self) -> bool:
-        """Whether it acts against the sliding of the flanks: see `drag`."""
+        """Whether the part acts against the sliding of the flanks (see `drag`)."""
         return False
 
     @property
     def added_inertia(self) -> Float[Array, ""] | None:
-        """Inertia (kg·m²) that turns with rotor 1."""
+        """Inertia (kg·m²) that the part adds to rotor 1; None: no inertia."""
         return None
 
     def prepare(self: _Part, context: Context) -> _Part:
-        """Return the part with what it needs of the scene filled in, differentiable."""
+        """Return the part with the values it needs from the scene; keep them differentiable."""
         del context
         return self
 
-    # Its own states. They are m numbers, in SI units; the solver counts them from `start`, in
-    # units of `scales`, and a motion begins at `start`.
+    # The part's own states: m numbers in SI units. A motion begins at `start`. The solver works
+    # with the difference from `start`, divided by `scales`.
 
     def scales(self, units: Units) -> Float[Array, " m"]:
-        """Sizes of its own states, such that they are of order one in these units."""
+        """Return the typical size of each of the part's own states, which the solver divides it by.
+
+        Raises NotImplementedError for a part that has states but does not override this."""
         raise NotImplementedError(f"`{type(self).__name__}` has states, but no `scales`")
 
     def start(self, units: Units) -> Float[Array, " m"] | None:
-        """Its own states at the start of a motion; None: zero."""
+        """Return the part's own states at the start of a motion; None: zero."""
         del units
         return None
 
     def rates(self, motion: Motion, own: Own, loads: Loads) -> Float[Array, " m"]:
-        """Time derivatives of its own states `own`."""
+        """Return the time derivatives of the part's own states `own`.
+
+        Raises NotImplementedError for a part that has states but does not override this."""
         raise NotImplementedError(f"`{type(self).__name__}` has states, but no `rates`")
 
     def axes(
         self, own: Float[Array, "*k m"] | Float[np.ndarray, "*k m"]
     ) -> tuple[Float[Array, "*k 2 2"], Float[Array, "*k 2 2"]]:
-        """Displacements (m) of the axes and their velocities (m/s), of a part that `displaces`."""
+        """Return the displacements (m) of the axes and their velocities (m/s) (rotor, x and y).
+
+        Raises NotImplementedError for a part that `displaces` but does not override this."""
         raise NotImplementedError(f"`{type(self).__name__}` displaces the axes, but has no `axes`")
 
     def lost(self, own: Own) -> Bool[Array, ""] | None:
-        """Whether these states are no longer those of a running pair; None: they always are."""
+        """Return whether a pair with these states no longer runs; None: it always runs."""
         del own
         return None
 
-    # What it does. None: nothing.
+    # Loads from the part. None: no load.
 
     def torque_on_1(self, motion: Motion, own: Own) -> Float[Array, ""] | None:
-        """Torque (N·m) on rotor 1; asked for only where rotor 1 is free."""
+        """Return the torque (N·m) on rotor 1. It is called only where rotor 1 is free."""
         del motion, own
         return None
 
     def torque_on_2(self, motion: Motion, own: Own) -> Float[Array, ""] | None:
-        """Torque (N·m) on rotor 2."""
+        """Return the torque (N·m) on rotor 2."""
         del motion, own
         return None
 
     def force_on_axes(self, motion: Motion, own: Own) -> Float[Array, "2 2"] | None:
-        """Forces (N) on the axes (rotor, x and y); asked for only where a part `displaces` them."""
+        """Return the forces (N) on the axes (rotor, x and y).
+
+        It is called only where a part `displaces` the axes."""
         del motion, own
         return None
 
     def drag(self, force: Float[Array, ""], sliding: Float[Array, ""]) -> Float[Array, ""]:
-        """Tangential force (N) at a contact with the normal `force` (N), with the sign of the speed
-        `sliding` (m/s) at which rotor 1 slides on rotor 2; of a part that `rubs`."""
+        """Return the tangential force (N) at a contact with the normal `force` (N).
+
+        It has the sign of `sliding`, the speed (m/s) at which rotor 1 slides on rotor 2.
+
+        Raises NotImplementedError for a part that `rubs` but does not override this."""
         raise NotImplementedError(f"`{type(self).__name__}` rubs, but has no `drag`")
 
-    # Where its equations are not smooth: one flag for every kink or jump, which changes there. An
-    # integral is as accurate as promised, and a derivative is right, only if none is missing.
+    # Flags of the smooth piece that the part's equations are on. One flag changes at each kink or
+    # jump. If a flag is missing, integrals lose accuracy and derivatives are wrong.
 
     def switches(self, motion: Motion, own: Own) -> Bool[Array, " s"]:
-        """On which of their smooth pieces torques, forces and rates are."""
+        """Return flags of the smooth piece that the torques, forces and rates are on."""
         del motion, own
         return jnp.zeros(0, bool)
 
     def drag_switches(self, sliding: Float[Array, ""]) -> Bool[Array, " s"]:
-        """On which of its smooth pieces the drag is at a sliding speed (m/s)."""
+        """Return flags of the smooth piece that the drag is on at the speed `sliding` (m/s)."""
         del sliding
         return jnp.zeros(0, bool)
 
-    # What the steps of a solver follow from.
+    # Data from which the solver chooses its steps.
 
     @property
     def play(self) -> Float[Array, ""] | None:
-        """Half the range of ε (rad) in which it does not hold the rotors, of a part that does so
-        beyond."""
+        """Half the range of ε (rad) over which the part leaves the rotors loose; None for a part
+        that never holds them."""
         return None
 
     @property
     def edges(self) -> tuple[Float[Array, ""], ...]:
-        """ε (rad) at which it begins to hold the rotors: a step of the solver ends there."""
+        """Values of ε (rad) at which the part begins to hold the rotors. Solver steps end there."""
         return ()
 
     @property
     def holding_stiffness(self) -> Float[Array, ""] | None:
-        """Stiffness (N·m/rad) with which it holds ε."""
+        """Stiffness (N·m/rad) with which the part holds ε; None: no stiffness."""
         return None
 
     def quickest(self, inertia: Float[Array, ""]) -> Float[Array, ""] | None:
-        """Time (s) in which its quickest swing advances by one radian, 1/ω, on rotors of this
-        `inertia` (kg·m²)."""
+        """Return 1/ω (s) of the part's fastest oscillation, on rotors of this `inertia` (kg·m²);
+        None: it has no oscillation of its own."""
         del inertia
         return None

@@ -1,4 +1,4 @@
-"""What turns rotor 1."""
+"""Drives: the parts that turn rotor 1."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -7,16 +7,17 @@ from rootsopt.dynamics.parts.base import Part
 
 
 class Drive(Part):
-    """Turns rotor 1, at the angular speed `speed` (rad/s) or about it.
+    """A part that turns rotor 1, at or near the angular speed `speed` (rad/s).
 
-    Unless a part of the scene is `free`, rotor 1 turns at just that speed, whatever the torque.
+    Unless a part of the scene is `free`, rotor 1 turns at exactly this speed, whatever the torque.
     """
 
     speed: eqx.AbstractVar[Float[Array, ""]]
 
 
 class PrescribedDrive(Drive):
-    """Rotor 1 turns at the constant angular speed `speed` (rad/s) whatever the torque."""
+    """A drive that turns rotor 1 at the constant angular speed `speed` (rad/s), whatever the
+    torque."""
 
     speed: Float[Array, ""]
 
@@ -24,8 +25,8 @@ class PrescribedDrive(Drive):
 class MotorDrive(Drive):
     """A motor on rotor 1 with a straight torque-speed line.
 
-    It gives `torque` (N·m) at `speed` (rad/s), and `slope` (N·m·s/rad) less for every rad/s
-    above. `inertia` (kg·m²) of its own is added to that of rotor 1.
+    `torque` (N·m) at `speed` (rad/s); `slope` (N·m·s/rad): loss of torque for each rad/s above
+    `speed`; `inertia` (kg·m²) of the motor, which is added to that of rotor 1.
     """
 
     speed: Float[Array, ""]
@@ -46,5 +47,5 @@ class MotorDrive(Drive):
         return self.torque_at(motion.speed)
 
     def torque_at(self, speed: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Torque (N·m) at the angular `speed` (rad/s) of rotor 1."""
+        """Return the torque (N·m) at the angular `speed` (rad/s) of rotor 1."""
         return self.torque - self.slope * (speed - self.speed)

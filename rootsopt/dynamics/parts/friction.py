@@ -8,11 +8,11 @@ from rootsopt.dynamics.parts.base import Part
 
 
 class Friction(Part):
-    """Coefficient of friction over the sliding speed, as multibody programs have it.
+    """Coefficient of friction as a function of the sliding speed, as in multibody programs.
 
-    It rises from -`static` to `static` between -`stiction_speed` and `stiction_speed` (m/s) and
-    falls to `kinetic` at `friction_speed`, by cubic steps: continuously differentiable, so that
-    rest is a slow creep.
+    It rises from -`static` to `static` between -`stiction_speed` and `stiction_speed` (m/s). It
+    falls to `kinetic` at `friction_speed` (m/s). Both changes are cubic steps, so the coefficient
+    is continuously differentiable. The price: flanks never stick, they creep slowly.
     """
 
     static: Float[Array, ""]
@@ -21,7 +21,7 @@ class Friction(Part):
     friction_speed: Float[Array, ""]
 
     def __call__(self, sliding: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Coefficient with the sign of the `sliding` speed (m/s)."""
+        """Return the coefficient, with the sign of the `sliding` speed (m/s)."""
         rise = 2 * smooth_step((sliding / self.stiction_speed + 1) / 2) - 1
         span = self.friction_speed - self.stiction_speed
         fall = smooth_step((jnp.abs(sliding) - self.stiction_speed) / span)
@@ -35,6 +35,6 @@ class Friction(Part):
         return self(sliding) * force
 
     def drag_switches(self, sliding: Float[Array, ""]) -> Bool[Array, "4"]:
-        """On which of its smooth pieces the coefficient is."""
+        """Return flags of the smooth piece that the coefficient is on."""
         speeds = jnp.stack([self.stiction_speed, self.friction_speed])
         return sliding > jnp.concatenate([speeds, -speeds])

@@ -10,12 +10,12 @@ from rootsopt.dynamics.parts.base import Motion, Part
 class TimingGear(Part):
     """Timing gear between the rotors: backlash, stiffness, damping.
 
-    The torque vanishes for |ε| ≤ `half_backlash` (rad); beyond, it is `stiffness`
-    (N·m/rad) times the excess plus `damping` (N·m·s/rad) times dε/dt. Both ends of the
-    backlash are rounded over the first `rounding` (rad) of the excess. There the torque keeps its
-    integral over ε: a motion that crosses it loses the same energy to the spring, and the same
-    momentum to the damper, as at a sharp edge. `offset`
-    (rad): ε at the middle of the backlash, where the gear was mounted out of phase; None: in phase.
+    The torque is zero for |ε| ≤ `half_backlash` (rad). Beyond that, it is `stiffness` (N·m/rad)
+    times the excess plus `damping` (N·m·s/rad) times dε/dt. Both ends of the backlash are rounded
+    over the first `rounding` (rad) of the excess. The rounding keeps the integral of the torque
+    over ε: a motion that crosses it loses the same energy to the spring, and the same momentum to
+    the damper, as at a sharp edge. `offset` (rad): ε at the middle of the backlash, for a gear
+    mounted out of phase; None: no offset.
     """
 
     stiffness: Float[Array, ""]
@@ -25,7 +25,7 @@ class TimingGear(Part):
     offset: Float[Array, ""] | None = None
 
     def __call__(self, relative: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
-        """Torque (N·m) that holds ε back, at ε = `relative` (rad), dε/dt = `rate` (rad/s)."""
+        """Return the torque (N·m) against ε, at ε = `relative` (rad), dε/dt = `rate` (rad/s)."""
         relative = self._from_middle(relative)
         excess = jnp.abs(relative) - self.half_backlash
         engaged = jnp.where(
@@ -58,7 +58,7 @@ class TimingGear(Part):
         return self.stiffness
 
     def switches(self, motion: Motion, own) -> Bool[Array, "2"]:
-        """On which of its smooth pieces the gear is: engaged, beyond the rounding."""
+        """Return flags of the smooth piece that the gear is on: engaged, beyond the rounding."""
         del own
         excess = jnp.abs(self._from_middle(motion.relative)) - self.half_backlash
         return excess > jnp.stack([jnp.zeros_like(self.rounding), self.rounding])

@@ -1,4 +1,4 @@
-"""What opposes the rotors."""
+"""Loads: the parts that oppose the rotation."""
 
 import abc
 
@@ -11,22 +11,24 @@ from rootsopt.dynamics.parts.base import Part
 from rootsopt.profiles.base import Profile
 
 _BRIEF = 0.01
-"""Roll angle (rad) in which a stretch of the flank takes at least to pass the seal on."""
+"""Minimum roll angle (rad) over which the seal crosses one flank segment."""
 
 
 class Load(Part):
-    """Torques against the rotors at rotor 1's angle φ1; `torque` (N·m) is the mean of that
-    against rotor 2."""
+    """Torques against the rotors as functions of rotor 1's angle φ1.
+
+    `torque` (N·m): mean torque against rotor 2.
+    """
 
     torque: eqx.AbstractVar[Float[Array, ""]]
 
     @abc.abstractmethod
     def torque1(self, phi: Float[Array, ""]) -> Float[Array, ""] | None:
-        """Torque (N·m) against rotor 1 at φ1 = `phi` (rad); None: no torque at any angle."""
+        """Return the torque (N·m) against rotor 1 at φ1 = `phi` (rad); None: zero at any angle."""
 
     @abc.abstractmethod
     def torque2(self, phi: Float[Array, ""]) -> Float[Array, ""]:
-        """Torque (N·m) against rotor 2 at φ1 = `phi` (rad)."""
+        """Return the torque (N·m) against rotor 2 at φ1 = `phi` (rad)."""
 
     @property
     @abc.abstractmethod
@@ -62,22 +64,22 @@ class ConstantLoad(Load):
 
 
 class GasLoad(Load):
-    """Gas at a pressure difference across the pair.
+    """Gas torque from a pressure difference across the pair.
 
-    The chambers on both sides are parted by the tips at the housing, at the outer radius, and
-    by the contact between the rotors, at radii ρ1 and ρ2 about their axes. Each rotor is a vane
-    from ρ to the outer radius, so the torques against the rotors are
+    The tips at the housing and the contact between the rotors separate the two chambers. The tips
+    are at the outer radius r_a, the contact at the radii ρ1 and ρ2 about the axes. Each rotor acts
+    as a vane from ρ to r_a, so the torque against it is
 
         T = Δp L (r_a² - ρ²) / 2.
 
-    ρ is that of perfect rolling at φ1 (what ε changes of it is of the order of ε). The mean
-    over a turn is, for both rotors together, the displaced volume times Δp / 2π: exactly, but
-    where a tip arc meshes all at once (a canonical CIC). Its jump of ρ is spread over `_BRIEF`,
-    since gas at a wide gap does not jump, and a jump that moves with the design would have to be
-    followed for its derivatives.
+    ρ is that of perfect rolling at φ1; ε would change it only by terms of order ε. Averaged over a
+    turn, the torques on both rotors together equal the displaced volume times Δp / 2π. This is
+    exact unless a whole tip arc meshes at one instant (a canonical CIC profile). There ρ jumps, and
+    the jump is spread over `_BRIEF`. The pressure at a wide gap does not jump, and the derivatives
+    of a jump that moves with the design would need separate treatment.
 
-    `pressure` Δp (Pa) times the rotor's length L: `pressure_length` (N/m); `profile`;
-    `outer_radius` r_a (m); `torque`: mean against one rotor (N·m).
+    `pressure_length` (N/m): pressure difference Δp (Pa) times the rotor's length L (m); `profile`;
+    `outer_radius` r_a (m); `torque`: mean torque against one rotor (N·m).
     """
 
     pressure_length: Float[Array, ""]
@@ -96,7 +98,8 @@ class GasLoad(Load):
         return 2 * self.torque
 
     def _roll(self, phi):
-        """Roll angle at which the pair touches: a tip of rotor 1 at 0, one of rotor 2 at π/N."""
+        """Return the roll angle (rad) at which the pair touches: 0 at a tip of rotor 1, π/N at a
+        tip of rotor 2."""
         pitch = 2 * jnp.pi / self.profile.lobes
         return jnp.abs(phi - pitch * jnp.round(phi / pitch))
 

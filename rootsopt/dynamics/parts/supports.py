@@ -1,4 +1,4 @@
-"""Bearings that give way."""
+"""Elastic bearings of the rotors."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -7,14 +7,17 @@ from jaxtyping import Array, Bool, Float
 from rootsopt.dynamics.parts.base import Context, Loads, Motion, Part, Units
 
 _DISPLACED = 0.1
-"""Displacement of an axis, relative to the centre distance, beyond which the mesh is lost."""
+"""Displacement of an axis, relative to the centre distance, above which the mesh is lost."""
 
 
 class Supports(Part):
-    """Each rotor, of `mass` (kg), on bearings with `stiffness` (N/m) and `damping` (N·s/m) in
-    every direction across its axis, both bearings together. `radius` (m): the pitch radius;
-    displacements are counted in its product with the unit of ε. Mass and radius are those of the
-    scene."""
+    """Elastic bearings that let the axes of both rotors move.
+
+    `stiffness` (N/m) and `damping` (N·s/m) of a rotor's two bearings together, the same in every
+    direction across the axis; `mass` (kg) of one rotor; `radius` (m): the pitch radius. Mass and
+    radius come from the scene (`prepare`). The solver's unit of displacement is `radius` times the
+    unit of ε.
+    """
 
     stiffness: Float[Array, ""]
     damping: Float[Array, ""]
@@ -62,5 +65,6 @@ class Supports(Part):
     def force(
         self, displacement: Float[Array, "*n"], velocity: Float[Array, "*n"]
     ) -> Float[Array, "*n"]:
-        """Forces (N) on the rotors at displacements (m) and velocities (m/s) of their axes."""
+        """Return the forces (N) on the rotors at displacements (m) and velocities (m/s) of their
+        axes."""
         return -self.stiffness * displacement - self.damping * velocity
