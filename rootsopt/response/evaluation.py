@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from rootsopt.config import Config
 from rootsopt.config.units import MM, RPM
 from rootsopt.contact.size import size_map
-from rootsopt.dynamics.flow import Integrator
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
 from rootsopt.dynamics.orbit import Orbit, reverse_sensitivity
 from rootsopt.dynamics.pair import RotorPair
