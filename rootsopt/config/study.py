@@ -214,7 +214,8 @@ class AttractorsConfig(Section):
         None, description="(low, high) of the relative rotation; absent: backlash and contact"
     )
     rate_range_rad_s: _Rates | None = Field(
-        None, description="(low, high) of the relative speed; absent: up to twice the speed of impacts"
+        None,
+        description="(low, high) of the relative speed; absent: up to twice the speed of impacts",
     )
 
     @model_validator(mode="before")
