@@ -122,7 +122,8 @@ _OWN = (
         maker="rootsopt.profiles.arc_families:arc",
         parameters=(ARC_CENTER,),
         example={"arc_center_mm": 29.7},
-        remedy="move the centre: it must lie inside the pitch circle, and too far out undercuts",
+        remedy="move the centre: it must lie inside the pitch circle, and undercut starts if it "
+        "is too far out",
     ),
     Family(
         name="arcs_epicycloid",

@@ -225,8 +225,8 @@ def _unknown(_, node):
 
 
 _KINDS = {
-    "bool": "choice of true and false",
-    "null": "way to write nothing",
+    "bool": "truth value (true or false)",
+    "null": "way to write an empty value (null or ~)",
     "int": "whole number that can be read",
     "float": "number that can be read",
 }

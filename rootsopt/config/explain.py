@@ -64,7 +64,7 @@ def _split(model: type[BaseModel], location: tuple) -> tuple[list[Any], list[Any
 def _branch(first, problems, place):
     """Return the problem to report for a key that takes a word or a number.
 
-    For a number, this is the problem of the number, not that it is no such word."""
+    If its value is a number, report what is wrong with the number, not that it is not a word."""
     if first["type"] != "literal_error" or not _is_number(first.get("input")):
         return first
     size = len(place)

@@ -13,10 +13,10 @@ common direction
     G = E sin λ - h1(ν1) - h2(ν2)      normal gap (negative: penetration),
 
 q the levers, h the support functions, E the centre distance. The closest approach is
-the root of T. Newton's method searches for it from the point of perfect rolling. Where Newton does
-not converge, or might find another root, the search brackets the root on a fixed set of nodes and
-refines it inside its bracket. It then cannot lose the root where curvature jumps or the flanks
-conform. A root at which T falls with growing ν2 is a minimum of the gap. By the envelope theorem
+the root of T. Newton's method searches for it from the point of perfect rolling. It may not
+converge, or might find another root. The search then brackets the root on a fixed set of nodes and
+refines it inside its bracket. It cannot lose the root where curvature jumps or the flanks conform.
+A root at which T falls with growing ν2 is a minimum of the gap. By the envelope theorem
 ∂G/∂φ1 = -q1 and ∂G/∂φ2 = q2, which is also the virtual work of a unit contact force.
 
 Bracketing on all nodes needs no trigonometric function per node and pose. The pose turns every
@@ -49,7 +49,8 @@ _GUARDED_STEPS = 60
 _DONE = 8
 # ε (rad) below which a converged Newton search from perfect rolling is not trusted. Down to it, and
 # at the nominal centre distance, tests show that Newton finds the closest approach and no other
-# common normal. Except: a fraction of the flank, about √|ε|, next to a cusp at the pitch point.
+# common normal. The exception is a fraction of the flank, about √|ε|, next to a cusp at the pitch
+# crossing.
 _USUAL = -5e-3
 # Distance (rad) before a cusp below which a contact belongs to the cusp. It lies between the two
 # minima, which are several |ε| apart.

@@ -10,9 +10,9 @@ segments agree. The gap is therefore continuous over the pose, its derivatives a
 forces come from a potential. The levers jump from segment to segment: their error is of first order
 in the node spacing, that of the gap of second order.
 
-With a = x + ε/2 for rotor 1 and a = π/N - x + ε/2 for rotor 2, a point z of one flank
-(its own rotor's frame, tip on +x) lies at R(a) (E - R(-a′) z) in the frame of the other,
-E the centre distance. Exchanging the rotors only exchanges a and a′.
+Let a = x + ε/2 for rotor 1, a = π/N - x + ε/2 for rotor 2, and E the centre distance. A point z of
+one flank, in its own rotor's frame with a tip on +x, lies at R(a) (E - R(-a′) z) in the frame of
+the other. Exchanging the rotors only exchanges a and a′.
 """
 
 import equinox as eqx
@@ -64,8 +64,9 @@ class NodeContact(Contact):
     def of(cls, profile: Profile, nodes: int) -> "NodeContact":
         """Place `nodes` (at least 16) per flank, half of them on the addendum.
 
-        They are evenly spaced in the longer of the two mating arc elements plus a constant, which
-        resolves the sharp spot at the pitch crossing of EE. Raises `ValueError` for fewer nodes.
+        They are evenly spaced in the longer of the two mating arc elements plus a constant. The
+        constant resolves the sharp spot at the pitch crossing of EE. Raises `ValueError` for fewer
+        nodes.
         """
         if nodes < 16:
             raise ValueError(f"Argument `nodes` must be at least 16, but is {nodes}.")
@@ -148,8 +149,8 @@ def _facing(
 
     The distance is inf if no segment does. The second result is the segment's index. It is found by
     bisection over the nodes. A point near the flank is ahead of the bisectors on the tip's side of
-    its segment and behind all others, because the chord between any two nodes of a flank stays
-    within a right angle of the tangents at both.
+    its segment, and behind all others. The reason is that the chord between any two nodes of a
+    flank stays within a right angle of the tangents at both.
     """
     x, y = points[:, 0], points[:, 1]
     offset = jnp.sum(nodes * tangent, axis=1)

@@ -68,8 +68,8 @@ def imported(
     counter-clockwise and turned until a lobe's axis is on +x. The phase of the N-th moment
     ∬ z^N dA gives that axis.
 
-    Raises `InputError` where the loop is no rotor with this number of lobes, or cannot be
-    simulated.
+    Raises `InputError` where the loop does not have this number of lobes, or where such a rotor
+    cannot be simulated.
     """
     if smoothing_mm > _OFF * pitch_radius_mm:
         raise InputError(
@@ -129,7 +129,7 @@ def _imported(loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: floa
 def _check_lobes(points, lobes, radius):
     away = InputError(
         "`profile.outline_file` must hold an outline around the rotor's axis, the origin, but "
-        "it does not go round it once; move the outline there"
+        "it does not go round the origin once; move the outline there"
     )
     least, most = np.min(np.abs(points)), np.max(np.abs(points))
     if not radius / _FAR < most < radius * _FAR:

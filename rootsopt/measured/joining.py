@@ -21,8 +21,8 @@ def joined(chains: list[Loop], layer: str, name: str) -> Loop:
     A chain given twice counts once. Chains that lead to a dead end, such as centre lines, belong to
     no loop. `layer`: layer named in messages; `name`: the drawing's name.
 
-    Raises `InputError` where there is no closed loop, where open chains would enclose more than the
-    largest loop, or where more than two ends meet in a possible outline.
+    Raises `InputError` where there is no closed loop, or where open chains would enclose more than
+    the largest loop. It also does where more than two ends meet in a possible outline.
     """
     remedy = f"join them in the drawing, on a layer {layer}"
     ends = np.array([chain.points[[0, -1]] for chain in chains]).reshape(-1, 2)

@@ -1,8 +1,9 @@
 """The roll-angle core: one description of a conjugate flank for every profile family.
 
 Two identical rotors with `N` lobes roll 1:1 on pitch circles of radius `r`. A family
-describes only the *addendum* of one flank, as a function of the normal angle `nu` (the
-polar angle of the outward normal in the rotor frame, measured from the lobe's axis):
+describes only the *addendum* of one flank, as a function of the normal angle `nu`. This is the
+polar angle of the outward normal in the rotor frame, measured from the lobe's axis. The family
+defines two functions:
 
 - `roll_angle(nu)` is β, the polar angle, on the rotor, of the pitch point at the moment
   the flank point is in contact;
@@ -12,9 +13,9 @@ The pressure angle is then ψ = β + π/2 - ν, the flank point
 
     P = R(β) [r + s sin ψ, s cos ψ],      ds/dβ = -r cos ψ   (law of gearing),
 
-and the dedendum follows by symmetry: β → π/N - β, ψ → ψ, s → -s. The normal angle is
-used as parameter, rather than β, because a tip arc centred on the pitch circle keeps β
-constant over the whole arc (all of it meshes at one instant), while ν stays regular.
+and the dedendum follows by symmetry: β → π/N - β, ψ → ψ, s → -s. The parameter is the normal
+angle and not β, because all of a tip arc centred on the pitch circle meshes at one instant. β is
+constant over such an arc, while ν stays regular.
 
 Words used for all profiles: the *pitch crossing* is the flank point on the pitch circle; the
 *lever* is the moment arm of a contact normal about the rotor's axis; the *support function* is the

@@ -20,6 +20,6 @@ def check(profile: "ProfileConfig") -> None:
     if edge < least:
         raise InputError(
             f"`profile.edge_radius_mm` must be at least {least:g} ({_SHARPEST:g} pitch radii), but "
-            f"is {edge:g}: a sharp edge has no contact law; round it"
+            f"is {edge:g}: the contact law does not apply to a sharp edge; round it"
             + hint("edge_radius_mm", edge, 0.01 * profile.pitch_radius_mm, profile.pitch_radius_mm)
         )

@@ -1,4 +1,4 @@
-"""Margins that tell how far a profile is from being unsound."""
+"""Margins that measure how far a profile is from being unsound."""
 
 from typing import NamedTuple
 
