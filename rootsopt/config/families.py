@@ -1,7 +1,7 @@
 """The table of profile families: names, parameters, limits, default bounds and help of each.
 
-A family is one `Family` object. `register_family` adds it to the table; the built-in ones
-(`rootsopt.config.catalogue`) take the same way. The table determines config keys, `--help`,
+A family is one `Family` object. `register_family` adds it to the table, also for the built-in
+families (`rootsopt.config.catalogue`). The table determines config keys, `--help`,
 messages, the optimiser's bounds and the checks that a profile is sound. Nothing here needs JAX: a
 function that makes profiles may be named as "module:function" and is loaded when first needed.
 """
@@ -343,7 +343,7 @@ def _check(family: Family) -> None:
     if taken := next((one for one in _families if bare(one) == bare(name)), None):
         raise ValueError(
             f"Argument `family` must have a new name, but {taken} is taken; choose another one, or "
-            "restart Python to change a family: compiled programs are kept by its name"
+            "restart Python to change a family: compiled programs are kept under its name"
         )
     for parameter in family.parameters:
         _check_parameter(parameter)

@@ -67,7 +67,7 @@ class Config(Section):
 
     @property
     def design(self) -> NDArray[np.float64]:
-        """The design parameters as an array (d,), in the units of `design_keys`."""
+        """Design parameters as an array (d,), in the units of `design_keys`."""
         return self.profile.design
 
     @property
@@ -106,9 +106,9 @@ class Config(Section):
 
     @property
     def load_torque(self) -> float:
-        """Torque against rotor 2 (N·m); for a gas load a rough mean, used only to scale.
+        """Torque against rotor 2 (N·m); for a gas load an estimate of its mean, only to set scales.
 
-        The gas load assumes an outer radius of 1.4 pitch radii and an area efficiency of 0.45."""
+        The estimate assumes an outer radius of 1.4 pitch radii and an area efficiency of 0.45."""
         load = self.scene.load
         if load.torque_N_m is not None:
             return load.torque_N_m

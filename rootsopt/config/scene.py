@@ -186,7 +186,7 @@ def _none_for_auto(value: Any) -> Any:
 
 
 class ContactConfig(Section):
-    """The IMPACT contact law."""
+    """The IMPACT contact law, clearance and friction of the flanks."""
 
     stiffness_N_per_mm_e: Annotated[float, between(1, 1e11)] = Field(
         description="K of K·δ^e, δ in mm"
@@ -274,7 +274,7 @@ class TimingGearConfig(Section):
 
 
 class SceneConfig(Section):
-    """What drives and loads the pair."""
+    """Drive, load, timing gear and bearings of the pair, and its mounting errors."""
 
     speed_rpm: Speed = Field(
         description="speed of rotor 1; with a motor, the speed at which it gives its torque_N_m"

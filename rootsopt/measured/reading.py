@@ -14,8 +14,8 @@ from rootsopt.measured.table import from_csv
 __all__ = ["Loop", "read", "signed_area"]
 
 _WIDEST = 5.0
-"""Distance from the last point to the first (longest other step) above which a loop is rejected as
-open."""
+"""Distance from the last point to the first (multiple of the longest other step) above which a loop
+is rejected as open."""
 _BYTES = 50_000_000
 """Size of a file (bytes) above which it is rejected unread."""
 _POINTS = 500_000
