@@ -1,4 +1,4 @@
-"""The scene: everything except the design from which a rotor pair is built.
+"""The scene: everything except the design. It builds a rotor pair from a design.
 
 A design is a vector of the config's design parameters in the config's own units. Gradients are
 therefore per config unit. A family without parameters (EE) has an empty design.

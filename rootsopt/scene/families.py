@@ -100,7 +100,7 @@ def outline(config: ProfileConfig) -> Outline | None:
 
 
 def check(config: ProfileConfig) -> None:
-    """Raise `InputError` unless the profile is sound."""
+    """Raise `InputError` unless the profile is sound, or as an outline from a file can mesh."""
     if (given := outline(config)) is not None:
         conjugacy(given)
         return
