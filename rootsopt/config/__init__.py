@@ -1,8 +1,8 @@
 """Configuration: YAML in, typed settings out.
 
-The only place that knows file formats. Keys carry their units; conversion to SI happens
-in `rootsopt.scene`. Anything wrong with a file, a key or a value raises `InputError`
-with one message that names the key, the value and what is allowed.
+Only this package knows the config's file format. Each key carries its unit; `rootsopt.scene`
+converts to SI. Raises `InputError` for a wrong file, key or value: one message that names the key,
+the value and what is allowed.
 """
 
 from rootsopt.config.families import FAMILY_KEYS
@@ -14,7 +14,7 @@ from rootsopt.config.units import hint
 load_config = load
 """The public name of `load`."""
 DESIGN_KEYS = FAMILY_KEYS["cic"]
-"""The design parameters of a CIC rotor, as named in the config."""
+"""Config keys of the design parameters of a CIC rotor."""
 
 __all__ = [
     "DESIGN_KEYS",

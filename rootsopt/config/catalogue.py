@@ -1,4 +1,4 @@
-"""The package's own profile families, registered as any other."""
+"""The built-in profile families, registered like any other."""
 
 import dataclasses
 import math
@@ -11,14 +11,16 @@ if TYPE_CHECKING:
     from rootsopt.config.scene import ProfileConfig
 
 _LONGEST = 5e4
+"""Greatest length (mm) that a config may give."""
 _SHARES = 0.002, 10.0
 """Least and greatest length of a profile, in pitch radii."""
 _NO_FLOOR = 0.0, 10.0
+"""The same, for a length that may be as small as its key allows."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _LandAngle(Parameter):
-    """Half angle of a tip land, which leaves a quarter of the lobe pitch at most."""
+    """Half angle of a tip land, always less than a quarter of the lobe pitch."""
 
     def usually(self, pitch_radius_mm: float, lobes: int) -> Pair:
         return 0.0, 45.0 / lobes
@@ -33,7 +35,7 @@ class _LandAngle(Parameter):
 
 
 class _Dependent(Parameter):
-    """A length that nothing bounds but a range which depends on the other parameters."""
+    """Length whose only bounds are a range that depends on the other parameters."""
 
     def bounds(self, profile: "ProfileConfig") -> Pair:
         del profile
@@ -69,7 +71,7 @@ TIP_ARC_ANGLE = _LandAngle(
     bounds_limits=(0.0, 44.0),
 )
 ARC_CENTER = _length("arc_center_mm", "distance of the arc's centre from the axis", (0.5, 0.999))
-# The family itself has a floor for the radius of an edge.
+# The family `arcs_epicycloid` sets its own floor for the edge radius.
 EDGE_RADIUS = _length(
     "edge_radius_mm", "radius of the edge between tip land and arc", radii=_NO_FLOOR
 )
@@ -81,7 +83,8 @@ OUTER_RADIUS = _length("outer_radius_mm", "radius of the tip land", (1.1, 1.7))
 ROLLING_RADIUS = _length("rolling_radius_mm", "radius of the rolling circle")
 TROCHOID_RATIO = Parameter(
     "trochoid_ratio",
-    "distance of the drawing point from the rolling circle's centre at the tip, in its radii",
+    "distance of the tracing point from the rolling circle's centre at the tip, in radii of that "
+    "circle",
     *(1e-3, 10),
 )
 ELLIPSE_CENTER = _length(
@@ -90,8 +93,8 @@ ELLIPSE_CENTER = _length(
 ELLIPSE_HEIGHT = _length("ellipse_height_mm", "semi-axis along the lobe", (0.2, 1.5))
 COEFFICIENTS = Parameter(
     "coefficients",
-    "fall of the pressure angle per turn of the normal, from tip to pitch circle, 3 to 64 numbers "
-    "up to 1 (arc about a pitch point); 0: involute, down to -1",
+    "decrease of the pressure angle per turn of the normal, from tip to pitch circle; 3 to 64 "
+    "numbers from -1 to 1 (0: involute, 1: arc about a pitch point)",
     *(-1, 1),
     usual=(-1.0, 1.0),
     count=(3, 64),
@@ -110,7 +113,7 @@ _OWN = (
     ),
     Family(
         name="ee",
-        help="epicycloid on hypocycloid; it has no design parameter",
+        help="epicycloid on hypocycloid, without design parameters",
         maker="rootsopt.profiles.ee:EE",
     ),
     Family(
@@ -119,17 +122,18 @@ _OWN = (
         maker="rootsopt.profiles.arc_families:arc",
         parameters=(ARC_CENTER,),
         example={"arc_center_mm": 29.7},
-        remedy="move the centre: it must lie inside the pitch circle, and too far out undercuts",
+        remedy="move the centre: it must lie inside the pitch circle, and undercut starts if it "
+        "is too far out",
     ),
     Family(
         name="arcs_epicycloid",
-        help="the single arc cut off by a tip land, with a rounded edge between",
+        help="a single arc cut off by a tip land, with a rounded edge between them",
         maker="rootsopt.profiles.arc_families:arcs_epicycloid",
         parameters=(ARC_CENTER, TIP_ARC_ANGLE, EDGE_RADIUS),
         example={"arc_center_mm": 27.0, "tip_arc_angle_deg": 8.0, "edge_radius_mm": 1.0},
-        remedy="widen the land, move the arc's centre inwards, or round the edge more (an edge is "
-        "sharper than its arc)",
-        # An edge outside of the pitch circle meshes twice.
+        remedy="widen the land, move the arc's centre inwards, or round the edge more (its radius "
+        "must be smaller than the arc's)",
+        # An edge outside the pitch circle meshes twice.
         inherent=frozenset({"rolling"}),
         limits="rootsopt.profiles.edge:check",
     ),
@@ -174,7 +178,7 @@ _OWN = (
     ),
     Family(
         name="hypo_epicycloid",
-        help="whole half arches of hypocycloid and epicycloid, with a land at tip and root",
+        help="complete half arches of hypocycloid and epicycloid, with a land at tip and root",
         maker="rootsopt.profiles.epicycloid:hypo_epicycloid",
         parameters=(TIP_ARC_ANGLE,),
         example={"tip_arc_angle_deg": 4.0},
@@ -198,13 +202,13 @@ _OWN = (
     ),
     Family(
         name="free_form",
-        help="tip land and a B-spline of any number of coefficients",
+        help="tip land and a B-spline with any number of coefficients",
         maker="rootsopt.profiles.freeform:FreeForm",
         parameters=(TIP_ARC_ANGLE, COEFFICIENTS),
         example={"tip_arc_angle_deg": 4.0, "coefficients": (0.8, 0.7, 0.75)},
-        remedy="change the coefficients, or begin with `rootsopt profile --project`",
+        remedy="change the coefficients, or start from `rootsopt profile --project`",
     ),
-    Family(name="outline", help="from a file, as drawn or measured", maker=None),
+    Family(name="outline", help="drawn or measured outline, read from a file", maker=None),
 )
 for _family in _OWN:
     register_family(_family)

@@ -1,9 +1,8 @@
-"""One YAML document as plain data, read within limits.
+"""Reads one YAML document as plain data, within size limits.
 
-YAML 1.1 as PyYAML reads it, but for what surprises in a config: `1e5` is a number, `1:30`,
-`2020-01-01`, `yes` and `off` are words, `010` is ten, a key may stand once, and no tag makes
-anything but plain data. Anchors, aliases and merge keys work, as long as what they expand to is
-small.
+The language is YAML 1.1 as PyYAML reads it, without its surprises in a config. `1e5` is a number;
+`1:30`, `2020-01-01`, `yes` and `off` are words; `010` is ten. A key may appear once in a section.
+Tags yield plain data only. Anchors, aliases and merge keys work while their expansion is small.
 """
 
 import re
@@ -18,25 +17,26 @@ from rootsopt.config.words import clipped, named, sentence, shown
 from rootsopt.errors import InputError
 
 MOST_BYTES = 128 * 1024
-"""Largest text; a config has some 2000 bytes."""
+"""Text size (bytes) above which a document is rejected; a config has some 2000 bytes."""
 _MOST_NODES = 5000
-"""Most keys, values, lists and sections, with everything that aliases stand for."""
+"""Number of keys, values, lists and sections, aliases expanded, above which it is rejected."""
 _DEEPEST = 32
-"""Most sections and lists inside each other."""
+"""Levels of nested sections and lists above which it is rejected."""
 _LONGEST_VALUE = 4096
-"""Longest scalar (characters)."""
+"""Length of a scalar (characters) above which it is rejected."""
 _MOST_DIGITS = 400
-"""Longest number (characters); a double has at most 309 digits before its point."""
+"""Length of a number (characters) above which it is rejected; a double has at most 309 digits
+before its point."""
 
 _TAG = "tag:yaml.org,2002:"
 _MERGE = _TAG + "merge"
 
 
 def read_document(text: str, source: str) -> Any:
-    """Dictionaries, lists and plain values of a YAML text; `source` names it in messages.
+    """Return a YAML text as dictionaries, lists and plain values.
 
-    No two places of the result share a dictionary or a list. Raises `InputError` for whatever is
-    wrong with the text."""
+    `source` names the text in messages. No dictionary or list appears twice in the result.
+    Raises `InputError` where the text is too large or not valid."""
     if len(text.encode("utf-8", "surrogatepass")) > MOST_BYTES:
         raise InputError(
             f"{source}: must have at most {MOST_BYTES} bytes, but has more; is that a config?"
@@ -44,13 +44,13 @@ def read_document(text: str, source: str) -> Any:
     try:
         loader = _Loader(text)
         return _unshared(loader.get_single_data())
-    # The one place where the reader runs: whatever it fails with is the text's fault.
+    # The reader runs only here, so any exception is caused by the text.
     except Exception as error:
         raise InputError(sentence(f"{source}: is not valid YAML{_told(error)}")) from None
 
 
 def _told(error: Exception) -> str:
-    """Line and problem of what the reader failed with."""
+    """Return the line and the problem of an error of the reader, for a message."""
     mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
     place = f" (line {mark.line + 1})" if mark is not None else ""
     problem = getattr(error, "problem", None)
@@ -66,7 +66,7 @@ def _told(error: Exception) -> str:
 
 
 def _unshared(data: Any) -> Any:
-    """A copy without anything shared, so that an override changes what it names and no more."""
+    """Return a copy that shares nothing, so that an override changes only the key it names."""
     if isinstance(data, dict):
         return {key: _unshared(value) for key, value in data.items()}
     if isinstance(data, list):
@@ -75,14 +75,14 @@ def _unshared(data: Any) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader with limits and words of its own, checked while the nodes are made."""
+    """SafeLoader with its own limits and messages, checked while nodes are composed."""
 
     yaml_implicit_resolvers = {}  # noqa: RUF012
     yaml_constructors = {}  # noqa: RUF012
 
     def __init__(self, text: str):
         super().__init__(text)
-        # (nodes, height) so far of each node that is not complete, and of complete anchors.
+        # (nodes, height): of each open node so far, and of each complete anchored node.
         self._open: list[tuple[int, int]] = []
         self._anchored: dict[str, tuple[int, int]] = {}
 
@@ -91,12 +91,12 @@ class _Loader(yaml.SafeLoader):
         mark, anchor = event.start_mark, event.anchor
         if isinstance(event, yaml.AliasEvent):
             if anchor in self.anchors and anchor not in self._anchored:
-                raise _wrong(f"the alias *{named(anchor)} stands inside what it names", mark)
+                raise _wrong(f"the alias *{named(anchor)} is inside the node it names", mark)
             node = super().compose_node(parent, index)
             self._count(*self._anchored[anchor], mark)
             return node
         if len(self._open) >= _DEEPEST:
-            raise _wrong(f"there are more than {_DEEPEST} levels inside each other", mark)
+            raise _wrong(f"there are more than {_DEEPEST} nested levels", mark)
         self._open.append((1, 1))
         node = super().compose_node(parent, index)
         extent = self._open.pop()
@@ -106,16 +106,16 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def _count(self, nodes: int, height: int, mark) -> None:
-        """Add a node and all in it to what it stands in."""
+        """Add a complete node of this size to the node that holds it."""
         if len(self._open) + height > _DEEPEST:
-            raise _wrong(f"there are more than {_DEEPEST} levels inside each other", mark)
+            raise _wrong(f"there are more than {_DEEPEST} nested levels", mark)
         if not self._open:
             return
         before, highest = self._open[-1]
         self._open[-1] = before + nodes, max(highest, 1 + height)
         if before + nodes > _MOST_NODES:
             raise _wrong(
-                f"there are more than {_MOST_NODES} values, with those that aliases stand for",
+                f"there are more than {_MOST_NODES} values once aliases are expanded",
                 mark,
             )
 
@@ -144,7 +144,7 @@ class _Loader(yaml.SafeLoader):
                 key = self._key(key_node)
             if key in seen:
                 more = "; give it a list, as <<: [*a, *b]" if key_node.tag == _MERGE else ""
-                raise _wrong(f"the key {shown(key)} stands twice{more}", key_node.start_mark)
+                raise _wrong(f"the key {shown(key)} is given twice{more}", key_node.start_mark)
             seen.add(key)
         return node
 
@@ -158,12 +158,12 @@ class _Loader(yaml.SafeLoader):
 
 
 def _check_merge(node: Node) -> None:
-    """Raise unless a merge key takes a section or a list of sections."""
+    """Reject a merge key whose value is not a section or a list of sections."""
     parts = node.value if isinstance(node, SequenceNode) else [node]
     for part in parts:
         if not isinstance(part, MappingNode):
             raise _wrong(
-                "the merge key << must be given sections that stand elsewhere, as <<: *name or "
+                "the merge key << must be given sections from elsewhere, as <<: *name or "
                 f"<<: [*a, *b], but is given {shown(part.value) if part.value else 'nothing'}",
                 node.start_mark,
             )
@@ -205,7 +205,7 @@ def _real(text: str) -> float:
 
 
 def _scalar(kind: str, read: Callable[[str], Any]) -> None:
-    """Have scalars of a kind read by a function that raises `ValueError` or `KeyError`."""
+    """Read scalars of this kind with `read`, which raises `ValueError` or `KeyError`."""
 
     def construct(loader, node):
         text = loader.construct_scalar(node)
@@ -225,8 +225,8 @@ def _unknown(_, node):
 
 
 _KINDS = {
-    "bool": "choice of true and false",
-    "null": "way to write nothing",
+    "bool": "truth value (true or false)",
+    "null": "way to write an empty value (null or ~)",
     "int": "whole number that can be read",
     "float": "number that can be read",
 }

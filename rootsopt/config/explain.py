@@ -1,4 +1,4 @@
-"""What is wrong with a config, and what its keys are, in words."""
+"""Turns validation errors into one-sentence messages, and lists the config's keys for `--help`."""
 
 import difflib
 import types
@@ -13,11 +13,13 @@ from rootsopt.config.units import hint, unit_of
 from rootsopt.config.words import named, shown
 
 _MOST_NAMES = 12
-"""Most keys listed as valid ones."""
+"""Number of valid keys that a message lists at most."""
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """One sentence for the first, most telling problem of a config of type `model`."""
+    """Return one sentence on the most telling problem of a config of type `model`.
+
+    An unknown key comes first, then pydantic's first problem."""
     problems = error.errors(include_url=False)
     first = next((p for p in problems if p["type"] in _UNKNOWN), problems[0])
     place, rest = _split(model, first["loc"])
@@ -25,7 +27,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         return _unknown(model, place)
     field = field_of(model, place)
     first = _branch(first, problems, place)
-    # Behind a key, pydantic names places of lists, keys of dictionaries, and types.
+    # After a key, pydantic lists positions in lists, keys of dictionaries, and types.
     mapping = field is not None and "dict[" in str(field.annotation)
     within = [part for k, part in enumerate(rest) if isinstance(part, int) or (mapping and k == 0)]
     key = ".".join(map(named, place + within))
@@ -47,7 +49,7 @@ _UNKNOWN = ("extra_forbidden", "invalid_key")
 
 
 def _split(model: type[BaseModel], location: tuple) -> tuple[list[Any], list[Any]]:
-    """The keys of a location, and what else pydantic names behind the last of them."""
+    """Split a location into the config's keys and what pydantic adds after the last of them."""
     place: list[Any] = []
     inner: type[BaseModel] | None = model
     for number, part in enumerate(location):
@@ -60,7 +62,9 @@ def _split(model: type[BaseModel], location: tuple) -> tuple[list[Any], list[Any
 
 
 def _branch(first, problems, place):
-    """Of a value that may be a word or a number, what is wrong with it as a number if it is one."""
+    """Return the problem to report for a key that takes a word or a number.
+
+    If its value is a number, report what is wrong with the number, not that it is not a word."""
     if first["type"] != "literal_error" or not _is_number(first.get("input")):
         return first
     size = len(place)
@@ -73,7 +77,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_real(field: FieldInfo | None) -> bool:
-    """Whether a key's numbers need not be whole."""
+    """Return whether a key takes numbers that need not be whole."""
     return field is not None and "float" in str(field.annotation)
 
 
@@ -82,7 +86,7 @@ def _count(field: FieldInfo | None, context: dict) -> str:
         return f"at least {context['min_length']} numbers"
     if field is not None and "..." in str(field.annotation).replace("Ellipsis", "..."):
         return f"at most {context['max_length']} numbers"
-    return "two numbers, as [1, 2]"
+    return "two numbers, as in [1, 2]"
 
 
 def _allowed(kind: str, value: Any, context: dict, message: str, field: FieldInfo | None) -> str:
@@ -96,8 +100,8 @@ def _allowed(kind: str, value: Any, context: dict, message: str, field: FieldInf
         "finite_number": "a finite number",
         "model_type": "a section with keys of its own",
         "string_type": "a word",
-        "dict_type": "keys with values, as {a: 1, b: 2}",
-        "tuple_type": "a list of numbers, as [1, 2]",
+        "dict_type": "keys with values, as in {a: 1, b: 2}",
+        "tuple_type": "a list of numbers, as in [1, 2]",
     }
     if kind in words:
         return words[kind]
@@ -116,7 +120,7 @@ def _allowed(kind: str, value: Any, context: dict, message: str, field: FieldInf
 
 
 def _advice(place: list, kind: str, value: Any, field: FieldInfo | None) -> str:
-    """What was probably meant, or nothing."""
+    """Return a hint at what was probably meant; "" if there is none."""
     if field is None:
         return ""
     if kind in ("greater_than_equal", "less_than_equal", "less_than") and _is_number(value):
@@ -125,7 +129,7 @@ def _advice(place: list, kind: str, value: Any, field: FieldInfo | None) -> str:
     if kind == "literal_error" and isinstance(value, str):
         near = difflib.get_close_matches(value[:80].casefold(), choices(field.annotation), n=1)
         if not near and place == ["profile", "family"]:
-            return "; if that is a family of your own, name its file by `--import`"
+            return "; if that is a family of your own, give its file with `--import`"
         return f"; did you mean {near[0]}?" if near else ""
     if kind == "float_type" and isinstance(value, str) and len(value) < 20:
         try:
@@ -154,7 +158,7 @@ def _model_of(annotation: Any) -> type[BaseModel] | None:
 
 
 def field_of(model: type[BaseModel], place: list) -> FieldInfo | None:
-    """The field of a `model` at a place, given as a list of keys."""
+    """Return the field of `model` at `place`, a list of keys; `None` if there is none."""
     section = _section(model, place[:-1])
     return section.model_fields.get(place[-1]) if section is not None and place else None
 
@@ -176,7 +180,7 @@ def _unknown(model: type[BaseModel], place: list) -> str:
 
 
 def all_keys(model: type[BaseModel], prefix: str = ""):
-    """Dotted names of all sections and keys of a `model`."""
+    """Yield the dotted names of all sections and keys of a `model`."""
     for name, field in model.model_fields.items():
         inner = _model_of(field.annotation)
         yield f"{prefix}{name}"
@@ -185,7 +189,7 @@ def all_keys(model: type[BaseModel], prefix: str = ""):
 
 
 class Limits(NamedTuple):
-    """Range of a number; None where there is no such end."""
+    """Range of a number: at least `ge`, above `gt`, at most `le`, below `lt`; `None`: no limit."""
 
     ge: float | None = None
     gt: float | None = None
@@ -194,14 +198,14 @@ class Limits(NamedTuple):
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Least and greatest value, an excluded end among them."""
+        """(low, high), infinite where there is no limit; an end may itself be excluded."""
         low = self.ge if self.ge is not None else self.gt
         high = self.le if self.le is not None else self.lt
         return (float("-inf") if low is None else low, float("inf") if high is None else high)
 
 
 def limits_of(annotation: Any, metadata: Any = ()) -> Limits:
-    """The range of a number, of each number of a list, or of a dictionary's values."""
+    """Return the range of a number, of each number of a list, or of a dictionary's values."""
     found: dict[str, Any] = {}
     for mark in metadata:
         for inner in mark.metadata if isinstance(mark, FieldInfo) else (mark,):
@@ -222,7 +226,7 @@ def limits_of(annotation: Any, metadata: Any = ()) -> Limits:
 
 
 def _range(field: FieldInfo) -> str:
-    """The range of a key's numbers in words, or nothing."""
+    """Return the range of a key's numbers in words; "" if there is none."""
     limits = limits_of(field.annotation, field.metadata)
     words = []
     if limits.ge is not None or limits.gt is not None:
@@ -233,7 +237,7 @@ def _range(field: FieldInfo) -> str:
 
 
 def describe(model: type[BaseModel]) -> str:
-    """One line per key with meaning, unit, choices or range, and default, for `--help`."""
+    """Return one line per key for `--help`: meaning, unit, choices or range, and default."""
     lines = []
     for key in all_keys(model):
         field = field_of(model, key.split("."))

@@ -1,9 +1,9 @@
 """The table of profile families: names, parameters, limits, default bounds and help of each.
 
-A family is one `Family` object, and `register_family` is the only way into the table, for the
-package's own (`rootsopt.config.catalogue`) as for any other. Config keys, `--help`, messages, the
-optimiser's box and the checks of soundness all follow from the table. Nothing here needs JAX: what
-makes a profile may be named as "module:function" and is then loaded when first needed.
+A family is one `Family` object. `register_family` adds it to the table, also for the built-in
+families (`rootsopt.config.catalogue`). The table determines config keys, `--help`,
+messages, the optimiser's bounds and the checks that a profile is sound. Nothing here needs JAX: a
+function that makes profiles may be named as "module:function" and is loaded when first needed.
 """
 
 import contextlib
@@ -34,34 +34,34 @@ if TYPE_CHECKING:
 MARGINS = (
     *("turning", "convexity", "reach", "fall", "rolling", "order", "undercut", "star", "root"),
 )
-"""What the soundness of a profile is judged by; `rootsopt.profiles.validity` has the meanings."""
+"""Margins that must be positive in a sound profile; `rootsopt.profiles.validity` defines them."""
 ENTRY_POINTS = "rootsopt.families"
-"""Group of entry points by which an installed package offers families, each under its name."""
+"""Entry-point group in which an installed package offers families, each under its name."""
 _ANY_LENGTH, _ANY_ANGLE, _ANY_NUMBER = (0.01, 1.5), (0.0, 90.0), (0.0, 2.0)
-"""Where a parameter of which nothing else is said usually lies; lengths in pitch radii."""
+"""Usual range of a parameter without `usual`: length (pitch radii), angle (°) and number."""
 _AROUND = (0.5, 1.5)
-"""Default bounds of such a parameter, in units of the config's own value."""
+"""Default bounds of such a parameter, as multiples of the config's own value."""
 _WORD = re.compile(r"[a-z][a-z0-9_]*")
 
 Pair = tuple[float, float]
 Hook = Callable[..., Any] | str
-"""A function, or where to find it: "module:function"."""
+"""A function, or the name to import it by: "module:function"."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """A design parameter as a config has it, shared by all families that name it.
+    """A design parameter in the config, shared by all families that name it.
 
     `key`: name in the config; its ending is the unit, `_mm`, `_deg` or none.
     `help`: meaning, a few words.
-    `lowest`, `highest`: the values a config may give; `below`: whether `highest` itself is out.
-    `radii`: for a length that goes with the rotor's size, the values allowed in pitch radii.
-    `usual`: where values usually lie, in pitch radii if `radii` is given; the default bounds of an
-    optimisation. `None`: half to one and a half of the config's own value.
-    `default_bounds`: default bounds that every config writes out, in place of `usual`.
-    `bounds_limits`: limits of bounds where they are narrower than those of the value.
-    `bounds_note`: what the help says of default bounds, if the above does not say it.
-    `count`: least and greatest length of a list of such parameters; `None`: one number.
+    `lowest`, `highest`: least and greatest value in a config; `below`: exclude `highest` itself.
+    `radii`: for a length that scales with the rotor, its least and greatest value in pitch radii.
+    `usual`: usual range, in pitch radii if `radii` is given; also the default bounds of an
+    optimisation. `None`: those are 0.5 to 1.5 times the config's own value.
+    `default_bounds`: default bounds that replace `usual` and are written out in every config.
+    `bounds_limits`: limits of the bounds, where narrower than `lowest` and `highest`.
+    `bounds_note`: text on the default bounds for `--help`, instead of the generated one.
+    `count`: least and greatest length if the key holds a list of parameters; `None`: one number.
     """
 
     key: str
@@ -78,7 +78,7 @@ class Parameter:
 
     @property
     def argument(self) -> str:
-        """Name of the parameter as an argument of a family's maker: the key without its unit."""
+        """Name of the matching argument of a family's maker: the key without its unit."""
         return self.key.removesuffix("_mm").removesuffix("_deg")
 
     @property
@@ -87,13 +87,13 @@ class Parameter:
         return si_unit(self.key)
 
     def limits(self, pitch_radius_mm: float) -> Pair | None:
-        """Least and greatest value for a rotor of this size; `None` where that does not matter."""
+        """Return the least and greatest value for a rotor of this size; `None`: no such limit."""
         if self.radii is None:
             return None
         return self.radii[0] * pitch_radius_mm, self.radii[1] * pitch_radius_mm
 
     def usually(self, pitch_radius_mm: float, lobes: int) -> Pair:
-        """(low, high) between which values for a rotor of this size usually lie, in key units."""
+        """Return the usual range (low, high) for a rotor of this size, in the key's unit."""
         del lobes
         if self.usual is not None and self.radii is None:
             return self.usual
@@ -103,17 +103,17 @@ class Parameter:
         return _ANY_ANGLE if self.key.endswith("_deg") else _ANY_NUMBER
 
     def bounds(self, profile: "ProfileConfig") -> Pair:
-        """Bounds of an optimisation of this profile where its config gives none."""
+        """Return the bounds for optimising this profile if its config gives none."""
         if self.usual is not None:
             return self.usually(profile.pitch_radius_mm, profile.lobes)
         value = abs(getattr(profile, self.key))
         return _AROUND[0] * value, _AROUND[1] * value
 
     def check_bounds(self, bounds: Pair, lobes: int) -> None:
-        """Raise `InputError` for bounds that no rotor with so many lobes can have."""
+        """Raise `InputError` for bounds that are impossible with this number of lobes."""
 
     def field(self, families: list[str]) -> tuple[Any, Any]:
-        """Annotation and pydantic field of the key, with the names of the families that take it."""
+        """Return annotation and pydantic field of the key; its help names the `families`."""
         limits = between(self.lowest, self.highest)
         if self.below:
             limits = Field(ge=self.lowest, lt=self.highest)
@@ -125,7 +125,7 @@ class Parameter:
         return kind | None, Field(None, description=f"{', '.join(families)}: {self.help}")
 
     def bounds_field(self) -> tuple[Any, Any]:
-        """Annotation and pydantic field of the key's bounds."""
+        """Return annotation and pydantic field of the key's bounds."""
         least, most = self.bounds_limits or (self.lowest, self.highest)
         note = f"{self._bounds_words()}; from {least:g} to {most:g}"
         kind: Any = Pair if self.default_bounds is not None else Pair | None
@@ -136,29 +136,29 @@ class Parameter:
             return self.bounds_note
         pair = self.default_bounds or self.usual
         if pair is None:
-            return "default: half to one and a half of the config's own"
+            return "default: 0.5 to 1.5 times the config's own value"
         size = " pitch radii" if self.radii is not None and self.default_bounds is None else ""
-        each = "of each of them; " if self.count is not None else ""
+        each = "of each number; " if self.count is not None else ""
         return f"{each}default: {pair[0]:g} to {pair[1]:g}{size}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Family:
-    """A profile family: what a config may say of it, and how its profiles are made.
+    """A profile family: its config keys and how its profiles are made.
 
-    `name`: the word in `profile.family`; `help`: one line on what its addendum is made of.
-    `maker`: makes a `Profile` of `lobes`, `pitch_radius` (m) and the parameters in SI units, each
-    under its key without the unit: `maker(lobes, pitch_radius, arc_center=0.03)`. `None`: the
-    profile is in a file.
+    `name`: the word in `profile.family`; `help`: one line on the curves of its addendum.
+    `maker`: makes a `Profile` from `lobes`, `pitch_radius` (m) and the parameters in SI units.
+    Each argument is a key without its unit: `maker(lobes, pitch_radius, arc_center=0.03)`.
+    `None`: the profile is in a file.
     `parameters`: design parameters in the order of a design; a list comes last.
     `example`: a sound design for three lobes and a pitch radius of 33 mm, by key.
-    `remedy`: what to change where a profile is not sound, as an advice without a full stop.
+    `remedy`: what to change if a profile is not sound; completes a message, without a full stop.
     `inherent`: those of `MARGINS` that may be negative in this family.
-    `limits`: called with the `ProfileConfig`; raises `InputError` for what limits in closed form
-    forbid. `by_limits`: whether these say all there is of soundness, so that margins need no look.
+    `limits`: called with the `ProfileConfig`; raises `InputError` where a closed-form limit is
+    violated. `by_limits`: these limits ensure a sound profile, so the margins are not checked.
     `ranges`: called with `lobes`, `pitch_radius_mm` and the values by key; returns (low, high) by
-    key for parameters whose range depends on the others. Within its bounds such a parameter is
-    searched as a share of this range.
+    key for parameters whose range depends on the others. The optimiser searches such a parameter
+    as a fraction of this range, within its bounds.
 
     A subclass may override `make`, `check` and `dependent` instead of giving functions.
     """
@@ -180,27 +180,27 @@ class Family:
         return tuple(parameter.key for parameter in self.parameters)
 
     def split(self, design: Any) -> list[Any]:
-        """The values of a design (d,) by parameter: numbers, and a slice of it for a list."""
+        """Split a design (d,) into one value per parameter: a number, or a slice for a list."""
         places = enumerate(self.parameters)
         return [design[k] if one.count is None else design[k:] for k, one in places]
 
     @property
     def classical(self) -> bool:
-        """Whether profiles are made from a few numbers, each with a name."""
+        """Whether every design parameter is one named number: neither a list nor a file."""
         lists = any(parameter.count is not None for parameter in self.parameters)
         return self.maker is not None and not lists
 
     def make(self, lobes: int, pitch_radius: Any, **parameters: Any) -> Any:
-        """The `Profile` of these parameters, in SI units."""
+        """Return the `Profile` of these parameters, in SI units."""
         return _found(self.maker)(lobes, pitch_radius, **parameters)
 
     def check(self, profile: "ProfileConfig") -> None:
-        """Raise `InputError` where limits in closed form forbid a profile."""
+        """Raise `InputError` where a profile violates a closed-form limit."""
         if self.limits is not None:
             _found(self.limits)(profile)
 
     def dependent(self, lobes: int, pitch_radius_mm: Any, **values: Any) -> Mapping[str, Any]:
-        """(low, high) by key of parameters whose range depends on the others, in key units."""
+        """Return (low, high) by key, in the key's unit, of parameters that depend on the others."""
         if self.ranges is None:
             return {}
         return _found(self.ranges)(lobes, pitch_radius_mm, **values)
@@ -211,14 +211,14 @@ _origins: dict[str, str] = {}
 _parameters: dict[str, Parameter] = {}
 _followers: list[Callable[[], None]] = []
 FAMILY_KEYS: dict[str, tuple[str, ...]] = {}
-"""Registered families with the keys of their design parameters, kept by `register_family`."""
+"""Keys of the design parameters of each registered family; `register_family` updates it."""
 
 
 def register_family(family: Family) -> Family:
-    """Enter a family into the table; configs, commands and the optimiser know it from then on.
+    """Add a family to the table, for configs, commands and the optimiser, and return it.
 
-    Returns the family. Raises `ValueError` where it is not complete or contradicts another one:
-    names are taken once, and a key has one meaning in all families.
+    Raises `ValueError` where the family is incomplete, its name is taken, or one of its keys has
+    another meaning in another family.
     """
     _check(family)
     _families[family.name] = family
@@ -228,40 +228,40 @@ def register_family(family: Family) -> Family:
 
 
 def families() -> dict[str, Family]:
-    """All registered families by name."""
+    """Return all registered families by name."""
     return dict(_families)
 
 
 def family_of(name: str) -> Family:
-    """The registered family of this name."""
+    """Return the registered family of this name."""
     return _families[name]
 
 
 def parameters() -> dict[str, Parameter]:
-    """The parameters of all registered families by key."""
+    """Return the parameters of all registered families by key."""
     return dict(_parameters)
 
 
 def is_list(key: str) -> bool:
-    """Whether a key holds a list of design parameters."""
+    """Return whether a key holds a list of design parameters."""
     return key in _parameters and _parameters[key].count is not None
 
 
 def users_of(key: str) -> list[str]:
-    """Names of the families that take a key."""
+    """Return the names of the families that take a key."""
     return [family.name for family in _families.values() if key in family.keys]
 
 
 def follow(update: Callable[[], None]) -> None:
-    """Call `update` whenever the table has changed, in the order in which this is called."""
+    """Call `update` after each change of the table, in the order of registration."""
     _followers.append(update)
 
 
 @contextlib.contextmanager
 def for_a_time() -> Iterator[None]:
-    """Take families that are registered in a `with` block out of the table at its end, for tests.
+    """Remove, at the end of a `with` block, the families registered in it; for tests.
 
-    Programs that were compiled for them stay in memory: do not use their names again."""
+    Programs compiled for these families stay in memory: do not use their names again."""
     before = dict(_families)
     try:
         yield
@@ -275,7 +275,7 @@ def for_a_time() -> Iterator[None]:
 
 def find_installed(name: str) -> None:
     """Load the installed package that offers a family under this `name`, if there is one."""
-    from importlib.metadata import entry_points  # Looks at every installed package.
+    from importlib.metadata import entry_points  # Slow: scans all installed packages.
 
     for point in entry_points(group=ENTRY_POINTS):
         if bare(point.name) == bare(name):
@@ -284,10 +284,10 @@ def find_installed(name: str) -> None:
 
 
 def outside_modules() -> set[str]:
-    """Names of the modules on which what families from outside the package make may depend.
+    """Return the names of modules outside this package that profiles may depend on.
 
-    These are the modules that register them or define their makers, and all that have been
-    imported from the same folder."""
+    These are the modules that register families or define their makers, and all modules imported
+    from the same folders."""
     names = set(_origins.values())
     for family in _families.values():
         for hook in (family.maker, family.limits, family.ranges, type(family)):
@@ -332,7 +332,7 @@ def _found(hook: Hook | None) -> Callable[..., Any]:
         module, _, name = hook.partition(":")
         return getattr(importlib.import_module(module), name)
     if hook is None:
-        raise TypeError("a family whose profiles are in files makes none from parameters")
+        raise TypeError("a family that reads its profiles from files cannot make one")
     return hook
 
 
@@ -342,8 +342,8 @@ def _check(family: Family) -> None:
         raise _wrong("name", "be lower-case letters, digits and _", name)
     if taken := next((one for one in _families if bare(one) == bare(name)), None):
         raise ValueError(
-            f"Argument `family` must have a name of its own, but {taken} is taken; choose another "
-            "one, or start Python anew to change a family: compiled programs go by its name"
+            f"Argument `family` must have a new name, but {taken} is taken; choose another one, or "
+            "restart Python to change a family: compiled programs are kept under its name"
         )
     for parameter in family.parameters:
         _check_parameter(parameter)
@@ -356,7 +356,7 @@ def _check(family: Family) -> None:
     if family.maker is None:
         return
     if not family.by_limits and not family.remedy and keys:
-        raise _wrong("remedy", "say what to change where a profile is not sound", "empty")
+        raise _wrong("remedy", "say what to change if a profile is not sound", "empty")
     if {*family.example} != {*keys}:
         raise _wrong("example", f"have the keys {', '.join(keys)}", ", ".join(family.example))
     for parameter in family.parameters:
@@ -405,7 +405,7 @@ def _wrong(argument: str, wanted: str, found: Any) -> ValueError:
 
 
 def replace_fields(model: Any, fields: Mapping[str, Any]) -> None:
-    """Give a pydantic `model` these fields, made or as (annotation, field), and no others."""
+    """Replace all fields of a pydantic `model`; a field is ready or (annotation, field)."""
     new = {name: field for name, field in fields.items() if not isinstance(field, FieldInfo)}
     made = create_model("Fields", **new).model_fields
     found = {name: made.get(name, field) for name, field in fields.items()}
@@ -415,9 +415,9 @@ def replace_fields(model: Any, fields: Mapping[str, Any]) -> None:
 
 
 def import_named(name: str) -> None:
-    """Import a module by name, or run a Python file by path, once; it may register families.
+    """Import a module by name, or a Python file by path, once; it may register families.
 
-    Raises `InputError` where that fails."""
+    Raises `InputError` where the import fails."""
     with _explained(f"`--import` {placed(name)}"):
         if not (name.endswith(".py") or Path(name).is_file()):
             importlib.import_module(name)
@@ -439,10 +439,10 @@ def import_named(name: str) -> None:
 
 @contextlib.contextmanager
 def _explained(what: str) -> Iterator[None]:
-    """Turn what a module from outside fails with into one line."""
+    """Turn any error of an outside module into a one-line `InputError`."""
     try:
         yield
-    # Whatever it is, it is that module's fault.
+    # Any exception here is caused by that module.
     except Exception as error:
         kind = type(error).__name__
         frames = traceback.extract_tb(error.__traceback__)

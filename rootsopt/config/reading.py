@@ -1,4 +1,4 @@
-"""The whole config, read from YAML."""
+"""The whole config, and the functions that read it from YAML."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -42,11 +42,11 @@ from rootsopt.config.words import named, placed, sentence, shown
 from rootsopt.errors import InputError
 
 _MOST_PARTS = 8
-"""Most keys of an override; no key of a config lies deeper than 3."""
+"""Number of dotted keys above which an override is rejected; config keys have at most 3."""
 
 
 class Config(Section):
-    """Everything a run needs."""
+    """A complete config: everything that a run needs."""
 
     profile: ProfileConfig
     rotor: RotorConfig
@@ -67,7 +67,7 @@ class Config(Section):
 
     @property
     def design(self) -> NDArray[np.float64]:
-        """The design parameters as an array (d,), in the units of `design_keys`."""
+        """Design parameters as an array (d,), in the units of `design_keys`."""
         return self.profile.design
 
     @property
@@ -93,7 +93,9 @@ class Config(Section):
 
     @property
     def needs_search(self) -> tuple[str, ...]:
-        """Keys that need what only a search has: the place of contact, any pair of flanks."""
+        """Keys set in this config that need fidelity `search`.
+
+        They need the place of contact, or any pair of flanks, which only the search has."""
         parts = {
             "contact.friction": self.contact.friction,
             "scene.supports": self.scene.supports,
@@ -104,8 +106,9 @@ class Config(Section):
 
     @property
     def load_torque(self) -> float:
-        """Torque against rotor 2 (N·m); of a gas load about the mean, for units alone: with an
-        outer radius of 1.4 pitch radii and an area efficiency of 0.45."""
+        """Torque against rotor 2 (N·m); for a gas load an estimate of its mean, only to set scales.
+
+        The estimate assumes an outer radius of 1.4 pitch radii and an area efficiency of 0.45."""
         load = self.scene.load
         if load.torque_N_m is not None:
             return load.torque_N_m
@@ -136,7 +139,7 @@ class Config(Section):
         if self.needs_search and fidelity not in ("search", "auto"):
             raise ValueError(
                 f"`solver.fidelity` must be search (or auto) with `{self.needs_search[0]}`, which "
-                f"needs what only a search has, but is {fidelity}"
+                f"no other fidelity supports, but is {fidelity}"
             )
         return self
 
@@ -157,7 +160,7 @@ class Config(Section):
         return self
 
     def to_yaml(self) -> str:
-        """The resolved config, every default written out."""
+        """Return the resolved config as YAML, with every default written out."""
         data = self.model_dump(mode="json", exclude_none=True)
         return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
 
@@ -168,7 +171,7 @@ follow(lambda: replace_fields(Config, dict(Config.model_fields)))
 def load(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Config:
     """Read a config file and apply `dotted.key=value` overrides.
 
-    Raises `InputError` for anything wrong with file, keys or values.
+    Raises `InputError` where the file, a key or a value is wrong.
     """
     return parse(_read(Path(path)), overrides, source=str(path), folder=Path(path).parent)
 
@@ -179,8 +182,10 @@ def parse(
     source: str = "config",
     folder: str | Path = ".",
 ) -> Config:
-    """Like `load`, from YAML text. Files that it names are relative to `folder`, those that
-    `overrides` name to the current folder; the config has absolute paths."""
+    """Read a config from YAML text, otherwise like `load`; `source` names it in messages.
+
+    Paths in the text are relative to `folder`, paths in `overrides` to the current folder. The
+    returned config has absolute paths. Raises `InputError` as `load` does."""
     name = placed(source)
     data = read_document(text, name)
     if data is None:
@@ -202,7 +207,7 @@ def parse(
 
 
 def _find_family(data: dict) -> None:
-    """Load the installed package that offers the family of a config, if none is registered."""
+    """Load the installed package that offers the config's family, unless it is registered."""
     profile = data.get("profile")
     name = profile.get("family") if isinstance(profile, dict) else None
     if isinstance(name, str) and bare(name) not in map(bare, families()):
@@ -210,7 +215,7 @@ def _find_family(data: dict) -> None:
 
 
 def _place_files(data: dict, folder: Path) -> None:
-    """Make paths of files absolute that are relative to `folder`."""
+    """Make the path of the outline file absolute, in place, if it is relative to `folder`."""
     profile = data.get("profile")
     if isinstance(profile, dict) and isinstance(profile.get("outline_file"), str):
         profile["outline_file"] = str((folder / profile["outline_file"]).absolute())
@@ -230,7 +235,7 @@ def _read(path: Path) -> str:
     except ValueError:  # A path with a null character.
         raise InputError(f"{name}: is not a path; give that of a config file") from None
     try:
-        # What is too long may be cut within a character, and is refused for its length.
+        # Text that is too long may be cut inside a character; `read_document` rejects its length.
         return data.decode("utf-8", "strict" if len(data) <= MOST_BYTES else "replace")
     except UnicodeDecodeError as error:
         raise InputError(
@@ -245,7 +250,7 @@ def _override(data: dict, override: str) -> None:
     if not equals or not all(parts):
         raise InputError(f"{name}: must be dotted.key=value, as in scene.speed_rpm=1500")
     if len(parts) > _MOST_PARTS:
-        raise InputError(f"{name}: has more than {_MOST_PARTS} keys, dotted; no key lies as deep")
+        raise InputError(f"{name}: has more than {_MOST_PARTS} dotted keys; no key is that deep")
     target = data
     for i, part in enumerate(parts[:-1]):
         inner = target.get(part)
@@ -259,10 +264,10 @@ def _override(data: dict, override: str) -> None:
 
 
 def describe_keys() -> str:
-    """One line per key with meaning, unit, choices or range, and default, for `--help`."""
+    """Return one line per key for `--help`: meaning, unit, choices or range, and default."""
     return describe(Config)
 
 
 def describe_families() -> str:
-    """One line per registered family with its name and what it is made of, for `--help`."""
+    """Return one line per registered family for `--help`: its name and its curves."""
     return "\n".join(f"  {name:<18} {family.help}" for name, family in families().items())

@@ -1,4 +1,4 @@
-"""Sections of a config that say what is simulated: profile, rotor, contact, scene."""
+"""Config sections that define what is simulated: profile, rotor, contact, scene."""
 
 from typing import Annotated, Any, Literal
 
@@ -20,33 +20,35 @@ from rootsopt.config.units import hint
 from rootsopt.config.words import shown
 
 _USUAL = 0.01, 2.0
-"""Least and greatest length of a profile of usual size, in pitch radii."""
+"""Usual range of a profile's lengths (pitch radii), beyond which a message asks for the unit."""
 
 
 class ProfileConfig(Section):
     """The rotor profile.
 
-    Beside these keys it has those of all registered families' parameters, each `None` unless it
-    belongs to the config's own `family`."""
+    The parameters of all registered families are further keys. Each is `None` unless it belongs to
+    the config's own `family`."""
 
-    family: str = Field(description="profile family; outline: from a file")
+    family: str = Field(description="profile family; outline: read from a file")
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
-    pitch_radius_mm: Radius = Field(description="pitch radius; centre distance is twice that")
+    pitch_radius_mm: Radius = Field(description="pitch radius, half the centre distance")
     outline_file: str | None = Field(
         None, description="outline: CSV or DXF file, relative to the config's folder"
     )
     outline_smoothing_mm: Annotated[float, between(0, 10)] | None = Field(
-        None, description="outline: scatter (RMS) of measured points; absent: 0, through them"
+        None,
+        description="outline: scatter (RMS) of measured points; absent: 0, the curve passes "
+        "through them",
     )
 
     @property
     def parameters(self) -> dict[str, float | tuple[float, ...]]:
-        """The design parameters of the config's family by key, in the units of the keys."""
+        """Design parameters of the config's family by key, in the units of the keys."""
         return {key: getattr(self, key) for key in family_of(self.family).keys}
 
     @property
     def design(self) -> NDArray[np.float64]:
-        """The design parameters as an array (d,), in the units of `design_keys`."""
+        """Design parameters as an array (d,), in the units of `design_keys`."""
         return np.hstack([*self.parameters.values(), ()]).astype(float)
 
     @property
@@ -60,7 +62,7 @@ class ProfileConfig(Section):
 
     @property
     def from_file(self) -> bool:
-        """Whether the profile is in a file, and not made from parameters."""
+        """Whether the profile is read from a file rather than made from parameters."""
         return family_of(self.family).maker is None
 
     @model_validator(mode="before")
@@ -126,7 +128,7 @@ _FIELDS = dict(ProfileConfig.model_fields)
 
 
 def _derive() -> None:
-    """Give `ProfileConfig` the families and keys of the table."""
+    """Give `ProfileConfig` the families and keys of the table of families."""
     first, last = (
         {name: field for name, field in _FIELDS.items() if name.startswith("outline") is behind}
         for behind in (False, True)
@@ -142,7 +144,7 @@ follow(_derive)
 
 
 class RotorConfig(Section):
-    """The rotor as a body."""
+    """The rotor as a rigid body: length, density, bore, helix."""
 
     length_mm: Annotated[float, between(1, 2e4)] = Field(description="axial length")
     density_kg_m3: Annotated[float, between(50, 3e4)] = Field(description="density")
@@ -150,12 +152,13 @@ class RotorConfig(Section):
         None, description="diameter of the bore; absent: none"
     )
     helix_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
-        0.0, description="twist over the length, for CAD; only straight rotors are simulated"
+        0.0, description="twist over the length, for CAD only: the simulated rotors are straight"
     )
 
 
 class FrictionConfig(Section):
-    """Coulomb friction between the flanks, with the transitions of multibody programs."""
+    """Coulomb friction between the flanks, with the stiction and friction transition speeds of
+    multibody programs."""
 
     static: Annotated[float, Field(ge=0, le=2)] = Field(0.2, description="static coefficient")
     kinetic: Annotated[float, Field(ge=0, le=2)] = Field(0.1, description="kinetic coefficient")
@@ -163,7 +166,7 @@ class FrictionConfig(Section):
         100.0, description="sliding speed at which the static coefficient is reached"
     )
     friction_speed_mm_s: Annotated[float, between(1e-3, 1e7)] = Field(
-        1000.0, description="sliding speed from which on the coefficient is the kinetic one"
+        1000.0, description="sliding speed above which the coefficient is the kinetic one"
     )
 
     @model_validator(mode="after")
@@ -178,12 +181,12 @@ class FrictionConfig(Section):
 
 
 def _none_for_auto(value: Any) -> Any:
-    """None for the word `auto`."""
+    """Return `None` for the word `auto`, and any other value unchanged."""
     return None if value == "auto" else value
 
 
 class ContactConfig(Section):
-    """The IMPACT contact law."""
+    """The IMPACT contact law, clearance and friction of the flanks."""
 
     stiffness_N_per_mm_e: Annotated[float, between(1, 1e11)] = Field(
         description="K of K·δ^e, δ in mm"
@@ -200,24 +203,25 @@ class ContactConfig(Section):
         Annotated[float, between(0, 1)] | None, BeforeValidator(_none_for_auto)
     ] = Field(
         None,
-        description="rounding of the corners of law and gear; 0: as they stand; absent or auto: "
-        "1e-4, or less where the load twists the gear or dents the flanks little",
+        description="length that rounds the corners of contact law and timing gear; 0: no "
+        "rounding; absent or auto: 1e-4, or less where gear or flanks deflect little under the "
+        "load",
     )
     friction: FrictionConfig | None = Field(None, description="absent: frictionless flanks")
 
     @property
     def rounding_mm(self) -> float:
-        """The smoothing length of a whole config, in which none is left open."""
+        """Smoothing length (mm); a complete config always has one."""
         assert self.smoothing_mm is not None
         return self.smoothing_mm
 
 
 class LoadConfig(Section):
-    """What opposes the rotors: a constant torque on rotor 2, or gas on both."""
+    """The load: a constant torque on rotor 2, or gas pressure on both rotors."""
 
     torque_N_m: Torque | None = Field(None, description="constant torque against rotor 2")
     pressure_difference_Pa: Annotated[float, between(0, 1e8)] | None = Field(
-        None, description="instead of a constant torque: gas pressure across the pair"
+        None, description="gas pressure across the pair, instead of a constant torque"
     )
 
     @model_validator(mode="after")
@@ -231,27 +235,27 @@ class LoadConfig(Section):
 
 
 class MotorConfig(Section):
-    """Motor on rotor 1, with a straight torque-speed line, for `drive: torque`."""
+    """Motor on rotor 1 with a linear torque-speed characteristic, for `drive: torque`."""
 
     torque_N_m: Torque | None = Field(
-        None, description="torque at scene.speed_rpm; absent: what the load takes there"
+        None, description="torque at scene.speed_rpm; absent: equal to the load there"
     )
     slope_N_m_s_per_rad: Annotated[float, between(1e-6, 1e6)] = Field(
-        description="torque lost for every rad/s above scene.speed_rpm"
+        description="loss of torque per rad/s above scene.speed_rpm"
     )
     inertia_kg_m2: Annotated[float, between(0, 1e5)] = Field(
-        0.0, description="added to that of rotor 1"
+        0.0, description="moment of inertia, added to that of rotor 1"
     )
 
 
 class SupportsConfig(Section):
-    """Bearings that give way, the same for both rotors."""
+    """Elastic bearings, the same for both rotors."""
 
     stiffness_N_per_mm: Annotated[float, between(1, 1e9)] = Field(
-        description="of a rotor in its housing, any way"
+        description="radial stiffness of a rotor in its housing, equal in all directions"
     )
     damping_N_s_per_mm: Annotated[float, between(0, 1e6)] = Field(
-        description="damping of the same motion"
+        description="radial damping, equal in all directions"
     )
 
 
@@ -262,29 +266,31 @@ class TimingGearConfig(Section):
         description="torsional stiffness"
     )
     damping_ratio: Annotated[float, between(0, 100)] = Field(
-        0.0, description="ζ on the two rotors' inertia"
+        0.0, description="damping ratio ζ, with the two rotors' inertia"
     )
     backlash_mm: Annotated[float, between(0, 50)] = Field(
-        description="total play at the pitch radius"
+        description="total backlash at the pitch radius"
     )
 
 
 class SceneConfig(Section):
-    """What drives and loads the pair."""
+    """Drive, load, timing gear and bearings of the pair, and its mounting errors."""
 
-    speed_rpm: Speed = Field(description="speed of rotor 1; of a motor, that of its torque_N_m")
+    speed_rpm: Speed = Field(
+        description="speed of rotor 1; with a motor, the speed at which it gives its torque_N_m"
+    )
     drive: Literal["prescribed", "torque"] = Field(
-        "prescribed", description="how rotor 1 is driven: at its speed, or by scene.motor"
+        "prescribed", description="how rotor 1 is driven: at constant speed, or by scene.motor"
     )
     motor: MotorConfig | None = Field(None, description="belongs to drive torque")
     load: LoadConfig
-    timing_gear: TimingGearConfig | None = Field(None, description="absent: flanks alone")
+    timing_gear: TimingGearConfig | None = Field(None, description="absent: no timing gear")
     supports: SupportsConfig | None = Field(None, description="absent: rigid bearings")
     center_distance_error_mm: Annotated[float, Field(ge=-1, le=1)] | None = Field(
-        None, description="centre distance beyond twice the pitch radius"
+        None, description="centre distance minus twice the pitch radius"
     )
     phase_error_mrad: Annotated[float, Field(ge=-100, le=100)] | None = Field(
-        None, description="relative rotation at the middle of the timing gear's backlash"
+        None, description="relative rotation at the centre of the timing gear's backlash"
     )
 
     @model_validator(mode="after")
@@ -294,11 +300,12 @@ class SceneConfig(Section):
                 "`scene.motor` is missing; `scene.drive` = torque needs it, with "
                 "`slope_N_m_s_per_rad`"
                 if self.motor is None
-                else "`scene.motor` belongs to `scene.drive` = torque; remove it or set that"
+                else "`scene.motor` belongs to `scene.drive` = torque; remove `scene.motor` or set "
+                "`scene.drive`"
             )
         if self.phase_error_mrad is not None and self.timing_gear is None:
             raise ValueError(
-                "`scene.phase_error_mrad` is an error of mounting `scene.timing_gear`; add that "
-                "or remove it"
+                "`scene.phase_error_mrad` is a mounting error of `scene.timing_gear`, which is "
+                "missing; add the gear or remove the error"
             )
         return self

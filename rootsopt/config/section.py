@@ -1,4 +1,4 @@
-"""What the sections of a config are made of."""
+"""Base class and number types of the config's sections."""
 
 import re
 import types
@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 def between(low: float, high: float) -> Any:
-    """What a number must lie within, both ends allowed."""
+    """Return the pydantic limits of a finite number from `low` to `high`, ends included."""
     return Field(ge=low, le=high, allow_inf_nan=False)
 
 
@@ -17,7 +17,7 @@ Speed = Annotated[float, between(1e-2, 1e6)]
 Radius = Annotated[float, between(1, 5000)]
 """Radius of a rotor, mm."""
 Weight = Annotated[float, between(0, 1e6)]
-"""Weight in a sum; 0 leaves out what it belongs to."""
+"""Weight in a sum; 0 leaves its term out."""
 Order = Annotated[float, between(1e-2, 1e3)]
 """Order of a spectral line, in mesh frequencies."""
 Torque = Annotated[float, between(0, 1e7)]
@@ -25,10 +25,10 @@ Torque = Annotated[float, between(0, 1e7)]
 
 
 class Section(BaseModel):
-    """A section: no keys but its own, no value of another type, none changed later.
+    """A config section: frozen, without unknown keys or type conversion.
 
-    Words to choose from are taken in any case and with any of space, `-`, `_` between their
-    parts; what is kept is the word as it is listed."""
+    A word from a list of choices may be in any case, with spaces, `-` or `_` between its parts.
+    The section stores the word as listed."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -50,7 +50,7 @@ class Section(BaseModel):
 
 
 def choices(annotation: Any) -> tuple[str, ...]:
-    """The words that a value, or a key of a value, may be chosen from; () for none."""
+    """Return the words that a value, or a key of a dictionary, may be; () if it is no choice."""
     if get_origin(annotation) is Literal:
         return get_args(annotation)
     if get_origin(annotation) in (Union, types.UnionType, Annotated, dict):
@@ -59,19 +59,19 @@ def choices(annotation: Any) -> tuple[str, ...]:
 
 
 def bare(word: str) -> str:
-    """A word without case, spaces, `-` and `_`, as choices are compared."""
+    """Return a word in lower case without spaces, `-` and `_`, to compare choices."""
     return re.sub(r"[-_\s]", "", word.casefold())
 
 
 def tuples(data: Any) -> Any:
-    """Keys of a section with tuples for lists: YAML has no tuples."""
+    """Return a section's data with lists turned into tuples, which YAML lacks."""
     if isinstance(data, dict):
         return {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
     return data
 
 
 def number(key: Any) -> Any:
-    """A number for a word that is one."""
+    """Convert a numeric string to float; return anything else unchanged."""
     try:
         return float(key) if isinstance(key, str) else key
     except ValueError:

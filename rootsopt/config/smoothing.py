@@ -1,18 +1,20 @@
-"""The smoothing length that follows the scene, where the config leaves it open."""
+"""Default of the smoothing length, chosen from the scene where the config gives none."""
 
 import math
 
 _LONGEST = 1e-4
-"""Smoothing length (mm) of a scene with nothing small in it."""
+"""Greatest smoothing length (mm), used unless a limit of `_SHARES` is smaller."""
 _SHARES = {"twist": 0.05, "depth": 0.02, "damping": 0.1}
-"""Greatest smoothing length in units of: the gear's deflection at the pitch radius under the whole
-load, the flanks' penetration under it, and the depth of full damping. A gear that rests inside its
-rounded edge is another gear."""
+"""Greatest smoothing length as a fraction of three lengths.
+
+`twist`: the timing gear's deflection at the pitch radius under the full load; beyond the limit, the
+gear rests inside its rounded edge and has another stiffness. `depth`: the flanks' penetration under
+the full load. `damping`: the depth of full damping."""
 _LEAST = {"float64": 1e-6, "float32": 1e-5}
 """Least smoothing length (mm), by precision. A shorter one costs solver steps and accuracy of the
-gradient; in single precision the gap itself is known to some 4e-6 mm only."""
+gradient. In single precision the rounding of the gap is about 4e-6 mm."""
 _LEAST_LOAD = 1e-3
-"""Load (N·m) below which the smoothing length no longer follows it."""
+"""Load (N·m) below which the smoothing length no longer depends on the load."""
 
 
 def following_mm(
@@ -22,11 +24,12 @@ def following_mm(
     contact: tuple[float, float, float],
     precision: str,
 ) -> float:
-    """Smoothing length (mm) of a scene with a `load_torque` (N·m) on rotor 2, and a timing gear of
-    `gear_stiffness` (N·m/rad) if there is one.
+    """Return the smoothing length (mm) for this scene, with two significant digits.
 
-    `contact`: stiffness (N/mm^e), exponent and depth of full damping (mm) of the flanks. Chosen so
-    that rounding changes no force by 1e-4 of itself (`python -m experiments.smoothing`).
+    `load_torque` (N·m): torque on rotor 2. `gear_stiffness` (N·m/rad): of the timing gear, `None`
+    without one. `contact`: stiffness (N/mm^e), exponent and depth of full damping (mm) of the
+    flanks. The length changes every force by less than 1e-4 of its value
+    (`python -m experiments.smoothing`).
     """
     torque = max(load_torque, _LEAST_LOAD)
     stiffness, exponent, full = contact
@@ -39,5 +42,5 @@ def following_mm(
     if gear_stiffness is not None:
         lengths.append(_SHARES["twist"] * torque / gear_stiffness * pitch_radius_mm)
     shortest = max(min(lengths), _LEAST[precision])
-    # Two digits: a config is read by people.
+    # Two digits keep the written config readable.
     return float(f"{shortest:.1e}") if math.isfinite(shortest) else _LONGEST

@@ -1,4 +1,4 @@
-"""Files that a user names: whether they can be read, and why not."""
+"""Checks that files named by the user can be read, and gives the reason where they cannot."""
 
 import os
 import stat
@@ -8,7 +8,7 @@ from rootsopt.errors import InputError
 
 
 def reason(error: Exception) -> str:
-    """What the system says of a failure, for the middle of a sentence."""
+    """Return the system's text for an error, in lower case for the middle of a sentence."""
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return text[:1].lower() + text[1:]
 
@@ -23,8 +23,10 @@ _KINDS = (
 
 
 def regular_file(path: str | os.PathLike, what: str) -> Path:
-    """`path`, if reading it comes to an end: not a pipe, a device, a folder or a socket. A missing
-    file passes, for the reader to say so. Raises `InputError`."""
+    """Return `path`, rejecting everything whose reading may never end.
+
+    A missing file passes: the reader reports it. Raises `InputError` for a folder, pipe, device or
+    socket."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Sections of a config that say how it is solved, and what is asked of it."""
+"""Config sections that define solver, objective, reports, sweep, constraints and optimiser."""
 
 from typing import Annotated, Literal
 
@@ -11,58 +11,61 @@ from rootsopt.config.words import shown
 
 _Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 _LEAST_WEIGHT = 1e-6
-"""Sum of weights below which they are none."""
+"""Sum of the objective's weights below which it is rejected as empty."""
 _MOST_LINES = 32
+"""Number of spectral lines above which an objective is rejected."""
 
 
 class SolverConfig(Section):
-    """How the scene is solved."""
+    """Fidelity, integration method, tolerances and limits with which the scene is solved."""
 
     fidelity: Literal["search", "map", "linear", "nodes", "auto"] = Field(
         "search",
-        description="contact: search at every call (reference), C² map of the gap, linear in "
-        "the relative rotation, the paper's nodes against segments, or auto: these settings "
-        "as accuracy needs",
+        description="contact model: search at every call (reference), C² map of the gap, gap "
+        "linear in the relative rotation, the paper's nodes against segments, or auto: the "
+        "cheapest of these that meets `accuracy`",
     )
     accuracy: Annotated[float, Field(ge=1e-6, le=0.1)] = Field(
-        1e-3, description="relative error of mean and peak force that auto may leave"
+        1e-3, description="relative error of mean and peak force that auto accepts"
     )
     nodes: Annotated[int, Field(ge=16, le=20_000)] = Field(
         400, description="nodes per flank of fidelity nodes"
     )
     map_error: Annotated[float, Field(ge=1e-6, le=0.1)] = Field(
-        1e-4, description="error of the map's penetration, relative to the static one"
+        1e-4, description="error of the map's penetration, relative to the static penetration"
     )
     map_rolls: Annotated[int, Field(ge=16, le=4096)] | None = Field(
-        None, description="map points over the roll angle; absent: as map_error needs"
+        None, description="map points over the roll angle; absent: as many as map_error needs"
     )
     map_relatives: Annotated[int, Field(ge=12, le=1024)] | None = Field(
-        None, description="map points over the relative rotation; absent: as map_error needs"
+        None,
+        description="map points over the relative rotation; absent: as many as map_error needs",
     )
     method: Literal["tsit5", "dopri5", "dopri8", "kvaerno3", "kvaerno5"] = Field(
         "tsit5", description="explicit: tsit5, dopri5, dopri8; implicit: kvaerno3, kvaerno5"
     )
     rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] = Field(
         1e-8,
-        description="tolerance on the orbit and its statistics; finer where it does not close",
+        description="tolerance on the orbit and its statistics; refined where the orbit does not "
+        "close",
     )
     transient_rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] = Field(
-        1e-7, description="tolerance while the transient passes"
+        1e-7, description="tolerance during the transient"
     )
     max_steps_per_period: Annotated[int, Field(ge=64, le=10**6)] = Field(
         4096, description="solver steps allowed per mesh period"
     )
     max_mesh_periods: Annotated[int, Field(ge=16, le=10**6)] = Field(
-        640, description="how long the transient may last"
+        640, description="longest transient, in mesh periods"
     )
     max_orbit_periods: Annotated[int, Field(ge=1, le=8)] = Field(
-        8, description="longest periodic orbit looked for, in mesh periods"
+        8, description="longest periodic orbit to find, in mesh periods"
     )
     gradient: Literal["forward", "reverse"] = Field(
         "forward", description="differentiation mode; both give the same gradient"
     )
     precision: Literal["float64", "float32"] = Field(
-        "float64", description="of the integration; float32 holds tolerances down to 2e-6"
+        "float64", description="of the integration; float32 reaches tolerances down to 2e-6"
     )
 
 
@@ -78,33 +81,34 @@ class ObjectiveConfig(Section):
     )
     terms: dict[str, Weight] = Field(
         default_factory=dict,
-        description="weights of further terms by their names, as {outer_radius_mm: 0.2}; those of "
-        "the package and those registered from outside",
+        description="weights of further terms by name, as {outer_radius_mm: 0.2}: built-in or "
+        "registered terms",
     )
     motion: Literal["reached", "worst", "weighted", "ensemble"] = Field(
         "reached",
         description="motion that counts: the one reached from rest, the worst of those that "
-        "coexist, all weighted by their share of initial states, or an average over an "
-        "ensemble, which a chaotic scene needs",
+        "coexist, all weighted by their share of initial states, or the average over an "
+        "ensemble, for chaotic scenes",
     )
     peak_norm: Annotated[float, Field(ge=4, le=64)] | None = Field(
-        None, description="p of the p-norm that stands for the peak in the search; absent: the peak"
+        None,
+        description="p of the p-norm that replaces the peak in the search; absent: the peak itself",
     )
     speeds_rpm: tuple[Speed, ...] = Field(
-        (), description="speeds the objective is taken over, as [2000, 3000]; none: the scene's"
+        (), description="speeds of the objective, as [2000, 3000]; empty: scene.speed_rpm"
     )
     speed_weights: tuple[Annotated[float, between(1e-6, 1e6)], ...] = Field(
-        (), description="weights of these speeds in the objective; none: equal ones"
+        (), description="weights of these speeds in the objective; empty: equal weights"
     )
     over_speeds: Literal["weighted", "worst"] = Field(
-        "weighted", description="what these speeds come to: their weighted mean or the worst"
+        "weighted", description="how these speeds are combined: weighted mean, or worst speed"
     )
 
     @model_validator(mode="before")
     @classmethod
     def _orders(cls, data):
         data = tuples(data)
-        # The name of a key that `--set` gives, and of one in JSON, is a word.
+        # A key given by `--set` or in JSON is a string.
         if isinstance(data, dict) and isinstance(given := data.get("line_weights"), dict):
             lines = {number(k): v for k, v in given.items()}
             return data | {"line_weights": lines if len(lines) == len(given) else given}
@@ -149,8 +153,8 @@ class ObjectiveConfig(Section):
         if not speeds and (weights or worst):
             key = "speed_weights" if weights else "over_speeds"
             raise ValueError(
-                f"`objective.{key}` belongs to `objective.speeds_rpm`, which has no speed; add "
-                "some or remove it"
+                f"`objective.{key}` belongs to `objective.speeds_rpm`, which is empty; add speeds "
+                f"or remove `objective.{key}`"
             )
         if weights and len(weights) != len(speeds):
             raise ValueError(
@@ -159,20 +163,20 @@ class ObjectiveConfig(Section):
             )
         if weights and worst:
             raise ValueError(
-                "`objective.speed_weights` belongs to `objective.over_speeds` weighted, but that "
-                "is worst; remove one of them"
+                "`objective.speed_weights` belongs to `objective.over_speeds` = weighted, but "
+                "`over_speeds` is worst; remove one of them"
             )
         if speeds and self.motion == "ensemble":
             raise ValueError(
                 "`objective.speeds_rpm` must be empty for `objective.motion` ensemble, but is "
-                f"{shown([*speeds])}: the noise of an average is judged at one speed; optimise at "
-                "one, and look at the others with `rootsopt sweep`"
+                f"{shown([*speeds])}: the noise of an average is estimated at one speed; optimise "
+                "at one, and check the others with `rootsopt sweep`"
             )
         return self
 
 
 class ResponseConfig(Section):
-    """What is reported beside mean, peak and RMS of the contact force."""
+    """Quantities reported besides mean, peak and RMS of the contact force."""
 
     lines: tuple[Order, ...] = Field(
         (), description="spectral lines of the force, orders in mesh frequencies, as [1, 2]"
@@ -198,7 +202,7 @@ _Rates = tuple[Annotated[float, between(-1e6, 1e6)], Annotated[float, between(-1
 
 
 class AttractorsConfig(Section):
-    """Initial states tried to find the motions that coexist."""
+    """Initial states from which coexisting motions are searched."""
 
     relatives: Annotated[int, Field(ge=1, le=1000)] = Field(
         12, description="initial relative rotations tried"
@@ -207,10 +211,11 @@ class AttractorsConfig(Section):
         9, description="initial relative speeds tried"
     )
     relative_range_mrad: _Milliradians | None = Field(
-        None, description="(low, high) of the relative rotation; absent: the play and contact"
+        None, description="(low, high) of the relative rotation; absent: backlash and contact"
     )
     rate_range_rad_s: _Rates | None = Field(
-        None, description="(low, high) of the relative speed; absent: as impacts reach"
+        None,
+        description="(low, high) of the relative speed; absent: up to twice the speed of impacts",
     )
 
     @model_validator(mode="before")
@@ -230,24 +235,24 @@ class AttractorsConfig(Section):
 
 
 class EnsembleConfig(Section):
-    """Motions averaged over where a single one means nothing."""
+    """Ensemble of motions that are averaged where a single motion is not representative (chaos)."""
 
     members: Annotated[int, Field(ge=4, le=100_000)] = Field(
         16, description="motions from different initial states, per design"
     )
     settle_periods: Annotated[int, Field(ge=0, le=10**6)] = Field(
-        64, description="mesh periods before a motion counts"
+        64, description="mesh periods of a motion before averaging starts"
     )
     periods: Annotated[int, Field(ge=1, le=10**6)] = Field(
-        64, description="mesh periods of a motion that count"
+        64, description="mesh periods of a motion that are averaged"
     )
     designs: Annotated[int, Field(ge=12, le=4096)] = Field(
-        32, description="designs around one, in pairs, from which its gradient is estimated"
+        32, description="designs around the current one, in pairs, that estimate its gradient"
     )
     spread: Annotated[float, Field(gt=0, le=0.5)] = Field(
         0.1,
-        description="standard deviation of these designs, as a share of the bounds, which they "
-        "stay within",
+        description="standard deviation of these designs, as a fraction of the bounds; designs "
+        "stay within the bounds",
     )
     seed: _Seed = Field(0, description="seed of states and designs")
 
@@ -259,8 +264,8 @@ class SweepConfig(Section):
         dict[Literal["from", "to", "points"], Annotated[float, between(1e-2, 1e6)]] | None
     ) = Field(
         None,
-        description="{from: 300, to: 6000, points: 39}; absent: `objective.speeds_rpm`, and "
-        "without these 39 from a tenth of to twice the scene's speed",
+        description="{from: 300, to: 6000, points: 39}; absent: `objective.speeds_rpm`, or if "
+        "empty 39 speeds from 0.1 to 2 times `scene.speed_rpm`",
     )
 
     @model_validator(mode="after")
@@ -283,16 +288,16 @@ _Outer = Annotated[float, between(1, 1e4)]
 
 
 class ConstraintsConfig(Section):
-    """What an optimised design must satisfy."""
+    """Constraints that an optimised design must satisfy."""
 
     area_efficiency_min: Literal["baseline"] | Annotated[float, Field(ge=0, lt=1)] = Field(
         "baseline", description="floor of the area efficiency"
     )
     undercut_margin_min_mm: _Floor = Field(0.0, description="floor of the undercut margin")
-    seal_width_min_mm: _Floor = Field(0.0, description="floor of the tip land's whole arc length")
+    seal_width_min_mm: _Floor = Field(0.0, description="floor of the tip land's full arc length")
     outer_radius_min_mm: _Outer | None = Field(None, description="floor of the outer radius")
     outer_radius_max_mm: _Outer | None = Field(
-        None, description="ceiling of the outer radius: that of the housing's bore"
+        None, description="ceiling of the outer radius: radius of the housing's bore"
     )
 
     @model_validator(mode="after")
@@ -307,9 +312,9 @@ class ConstraintsConfig(Section):
 
 
 class BoundsConfig(Section):
-    """Box of the search, (low, high) for each design parameter of the family.
+    """Bounds of the search, (low, high) for each design parameter of the family.
 
-    Its keys are those of all registered families' parameters."""
+    The keys are the parameters of all registered families."""
 
     @model_validator(mode="before")
     @classmethod
@@ -331,7 +336,7 @@ class BoundsConfig(Section):
 
 
 def _derive() -> None:
-    """Give `BoundsConfig` the keys of the table."""
+    """Give `BoundsConfig` the keys of the table of families."""
     made = {key: parameter.bounds_field() for key, parameter in parameters().items()}
     replace_fields(BoundsConfig, made)
 
@@ -341,16 +346,18 @@ follow(_derive)
 
 
 class OptimizerConfig(Section):
-    """How the design is searched."""
+    """Update rule, starts and bounds of the search for a design."""
 
     method: Literal["adam", "rmsprop", "sgd"] = Field(
         "adam", description="optax update rule: adam, rmsprop, sgd"
     )
     learning_rate: Annotated[float, between(1e-6, 10)] = Field(
-        0.05, description="step in the unit box of the bounds"
+        0.05, description="step, in bounds scaled to the unit box"
     )
-    iterations: Annotated[int, Field(ge=1, le=10000)] = Field(40, description="per start")
-    starts: Annotated[int, Field(ge=1, le=64)] = Field(2, description="local searches")
+    iterations: Annotated[int, Field(ge=1, le=10000)] = Field(
+        40, description="iterations per start"
+    )
+    starts: Annotated[int, Field(ge=1, le=64)] = Field(2, description="number of local searches")
     screening: Annotated[int, Field(ge=0, le=4096)] = Field(
         48, description="designs screened to place the starts; 0 starts at the baseline only"
     )

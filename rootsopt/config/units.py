@@ -1,4 +1,4 @@
-"""Units as the names of keys have them, and values that seem to be in another one."""
+"""Units in the names of keys, and hints where a value seems to be in another unit."""
 
 import math
 
@@ -9,8 +9,8 @@ DEG = math.pi / 180
 RPM = 2 * math.pi / 60
 """One revolution per minute (rad/s)."""
 
-# Longest endings first: the first that fits is the unit. With each, the units that are often
-# written in its place, and what a number in one of them must be multiplied by.
+# Ending of a key: (unit, {unit often written by mistake: factor to the right unit}). The first
+# ending that fits counts, so the longest come first.
 _UNITS: dict[str, tuple[str, dict[str, float]]] = {
     "_N_s_per_mm": ("N·s/mm", {"N·s/m": 1e-3}),
     "_N_per_mm_e": ("N/mm^e", {}),
@@ -31,20 +31,21 @@ _UNITS: dict[str, tuple[str, dict[str, float]]] = {
 
 
 def unit_of(key: str) -> str:
-    """The unit in the name of a key; "" for none."""
+    """Return the unit in the name of a key; "" if it has none."""
     return next((unit for end, (unit, _) in _UNITS.items() if key.endswith(end)), "")
 
 
 def si_unit(key: str) -> float:
-    """SI value of one unit of a design parameter's key: of millimetres, degrees, or none."""
+    """Return the SI value of one unit of a design parameter's key (mm, degrees or none)."""
     if key.endswith("_deg"):
         return math.pi / 180
     return 1e-3 if key.endswith("_mm") else 1.0
 
 
 def hint(key: object, value: float, low: float, high: float) -> str:
-    """A question whether `value`, which does not lie within `low` and `high`, is in a unit in which
-    it does; "" if there is none."""
+    """Return a question whether an out-of-range `value` is in another unit; "" if none fits.
+
+    A unit fits if the converted value lies between `low` and `high`."""
     name = str(key)
     for end, (_, others) in _UNITS.items():
         if name.endswith(end):

@@ -1,16 +1,16 @@
-"""Words for messages: values, names and whole messages, each of bounded length and one line."""
+"""Formats values, names and whole messages as one line of bounded length."""
 
 import reprlib
 from typing import Any
 
 LONGEST = 500
-"""Longest message about a config (characters)."""
+"""Greatest length (characters) of a message about a config."""
 _VALUE, _NAME, _PATH = 80, 60, 160
-"""Longest value, key and path in a message."""
+"""Greatest length (characters) of a value, key and path in a message."""
 
 
 class _Bounded(reprlib.Repr):
-    """`repr` that never looks at more of a value than it shows."""
+    """`repr` that reads no more of a value than it shows."""
 
     def __init__(self):
         super().__init__()
@@ -28,25 +28,25 @@ _repr = _Bounded().repr
 
 
 def shown(value: Any) -> str:
-    """A value as a message shows it: as Python writes it, shortened."""
+    """Return a value for a message: its `repr`, shortened."""
     return clipped(_repr(value), 2 * _VALUE)
 
 
 def named(part: Any) -> str:
-    """A key as a message shows it."""
+    """Return a key for a message: shortened and printable."""
     text = clipped(part if isinstance(part, str) else shown(part), _NAME)
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
 def placed(path: Any) -> str:
-    """A path as a message shows it: its end, if it is long."""
+    """Return a path for a message: printable, and only its end if it is long."""
     text = str(path)
     text = text if len(text) <= _PATH else "..." + text[3 - _PATH :]
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
 def clipped(text: str, longest: int = LONGEST) -> str:
-    """A text of at most `longest` characters, with its middle left out if it has more."""
+    """Shorten a text to at most `longest` characters by leaving out its middle."""
     if len(text) <= longest:
         return text
     tail = longest // 3
@@ -54,5 +54,5 @@ def clipped(text: str, longest: int = LONGEST) -> str:
 
 
 def sentence(text: str) -> str:
-    """A message of one line and bounded length."""
+    """Return a message as one line of bounded length."""
     return clipped(" ".join(text[: 100 * LONGEST].split()))

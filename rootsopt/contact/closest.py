@@ -13,18 +13,17 @@ common direction
     G = E sin λ - h1(ν1) - h2(ν2)      normal gap (negative: penetration),
 
 q the levers, h the support functions, E the centre distance. The closest approach is
-the root of T. Newton's method looks for it from the point of perfect rolling; where it
-does not converge, or might find another root, the root is bracketed on a fixed set of
-nodes and refined inside its bracket, so that it cannot be lost where curvature jumps or
-the flanks conform. A root at which T falls with growing ν2 is a minimum of the gap. By the
-envelope theorem ∂G/∂φ1 = -q1 and ∂G/∂φ2 = q2, which is also the virtual work of a unit
-contact force.
+the root of T. Newton's method searches for it from the point of perfect rolling. It may not
+converge, or might find another root. The search then brackets the root on a fixed set of nodes and
+refines it inside its bracket. It cannot lose the root where curvature jumps or the flanks conform.
+A root at which T falls with growing ν2 is a minimum of the gap. By the envelope theorem
+∂G/∂φ1 = -q1 and ∂G/∂φ2 = q2, which is also the virtual work of a unit contact force.
 
-Bracketing on all nodes needs no trigonometric function per node and pose: the pose turns
-every node by the same angle, so sines and cosines follow by the addition theorem.
+Bracketing on all nodes needs no trigonometric function per node and pose. The pose turns every
+node by the same angle, so that sines and cosines follow from the addition theorem.
 
-Exchanging the rotors maps x to π/N - x, so only the half with rotor 1's addendum in
-rotor 2's dedendum is searched. Coast flanks follow from mirror symmetry, x → -x, ε → -ε.
+Exchanging the rotors maps x to π/N - x. The search therefore covers only the half with rotor 1's
+addendum in rotor 2's dedendum. Coast flanks follow from mirror symmetry, x → -x, ε → -ε.
 """
 
 from typing import NamedTuple
@@ -39,37 +38,41 @@ from jaxtyping import Array, Bool, Float
 
 from rootsopt.profiles.base import Profile
 
-# Newton steps from the point of perfect rolling, at most (two or three are usual). The last
-# one must be so short that the next would be lost in rounding, even across a kink of T.
+# Greatest number of Newton steps from the point of perfect rolling; two or three are usual.
 _NEWTON_STEPS = 5
+# Length (rad) of the last step below which Newton's method has converged, by bytes of a number.
+# The next step would then be less than rounding, even across a kink of T.
 _CONVERGED = {8: 1e-8, 4: 1e-3}
-# Steps inside a bracket, at most: halving alone needs about fifty.
+# Greatest number of steps inside a bracket; halving alone needs about fifty.
 _GUARDED_STEPS = 60
 # Added to the number of attempts when the closest approach has been found.
 _DONE = 8
-# ε (rad) down to which the tests have shown that at the nominal centre distance Newton's
-# method, where it converges, finds the closest approach and no other common normal (but for
-# a share of the flank, about √|ε|, next to a cusp at the pitch point).
+# ε (rad) below which a converged Newton search from perfect rolling is not trusted. Down to it, and
+# at the nominal centre distance, tests show that Newton finds the closest approach and no other
+# common normal. The exception is a fraction of the flank, about √|ε|, next to a cusp at the pitch
+# crossing.
 _USUAL = -5e-3
-# Distance (rad) before a cusp within which a contact belongs to it: between the two minima, which
-# are several |ε| apart.
+# Distance (rad) before a cusp below which a contact belongs to the cusp. It lies between the two
+# minima, which are several |ε| apart.
 _NEAR_CUSP = 1e-3
-# Gap (pitch radii) below which flanks that are not conjugate cannot touch.
+# Penetration (pitch radii) above which a pair of points on flanks that are not conjugate is
+# ignored.
 _DEEPEST = 0.1
 # Rounding of T relative to the pitch radius, by bytes of a number.
 _SLACK = {8: 1e-13, 4: 1e-6}
-# Nodes between the edge of a land and the next node, each at half the distance of the next.
+# Nodes between the edge of a land and the next node; their distance from the edge doubles.
 _CROWD = 12
 
 
 class ClosestApproach(NamedTuple):
     """Result of one search.
 
-    `gap` (m, negative when the flanks penetrate); `lever1`, `lever2` (m): moment arms of
-    the common normal about rotor 1 and rotor 2, so that d gap = -lever1 dφ1 + lever2 dφ2;
-    `normal1`, `normal2` (rad): ν1 and ν2; `found`: whether a common normal was
-    found (otherwise the gap is a pitch radius and the levers are zero). It is not looked for
-    where the flanks cannot touch yet, see `contact_begins`.
+    `gap`: gap (m), negative when the flanks penetrate.
+    `lever1`, `lever2`: moment arms (m) of the common normal about rotor 1 and rotor 2, so that
+    d gap = -lever1 dφ1 + lever2 dφ2.
+    `normal1`, `normal2`: ν1 and ν2 (rad).
+    `found`: whether a common normal was found. Otherwise the gap is a pitch radius and the levers
+    are zero. The search is skipped where the flanks cannot touch yet, see `contact_begins`.
     """
 
     gap: Float[Array, ""]
@@ -81,11 +84,15 @@ class ClosestApproach(NamedTuple):
 
 
 class FlankNodes(NamedTuple):
-    """Where T is sampled: normal angles ν2 with what does not depend on the pose.
+    """Nodes at which T is sampled, with the quantities that do not depend on the pose.
 
-    `facing` is the direction of the common normal at x = 0, `direction` its cosine and
-    sine; `turned` the cosine and sine of `Profile.turn_ratio` times it; `lever` and, where
-    more than two minima of the gap are to be told apart, `support` those of rotor 2's point.
+    `normal` (n,): normal angles ν2 (rad).
+    `facing` (n,): direction (rad) of the common normal at x = 0.
+    `direction` (2, n): cosine and sine of `facing`.
+    `turned` (2, n): cosine and sine of `Profile.turn_ratio` times `facing`.
+    `lever` (n,): lever (m) of rotor 2's point.
+    `support` (n,): support function (m) of rotor 2's point; `None` for conjugate flanks, whose gap
+    has at most two minima.
     """
 
     normal: Float[Array, " n"]
@@ -99,10 +106,11 @@ class FlankNodes(NamedTuple):
 class FlankPair(eqx.Module):
     """A flank of rotor 1 against its mate on rotor 2.
 
-    `profile`: both rotors' profile, `frozen` the same without derivative, for the search;
-    `nodes`: see `FlankNodes`; `center_distance` E (m); `rolling`: whether E is that of
-    perfect rolling.
     Build it with `FlankPair.of(profile)` outside any time loop.
+
+    `profile`: both rotors' profile; `frozen`: the same without derivatives, for the search;
+    `nodes`: see `FlankNodes`; `center_distance`: E (m); `rolling`: whether the flanks are conjugate
+    and E is the distance of perfect rolling.
     """
 
     profile: Profile
@@ -118,11 +126,11 @@ class FlankPair(eqx.Module):
         center_distance: Float[Array, ""] | None = None,
         two_sided: bool = False,
     ) -> "FlankPair":
-        """Prepare the search for `profile`; the nodes carry no derivative.
+        """Prepare the search for `profile`; the nodes carry no derivatives.
 
-        `center_distance` (m) is by default that of perfect rolling, 2r. With `two_sided`, drive and
-        coast flanks are looked at side by side, as they can touch at once away from that: lands
-        are then searched too, up to the lobe's axis, where the other side takes over.
+        `center_distance` (m) is by default that of perfect rolling, 2r. At other distances, drive
+        and coast flanks can touch at the same time: set `two_sided` then. The search covers lands
+        too, up to the lobe's axis, beyond which the other side covers them.
         """
         frozen = lax.stop_gradient(profile)
         segments = [s for s in frozen.segments() if two_sided or not s.land]
@@ -130,13 +138,13 @@ class FlankPair(eqx.Module):
         fraction = jnp.arange(count) / count
         pieces = [s.start + (s.stop - s.start) * fraction for s in segments[:-1]]
         if not (two_sided or frozen.segments()[0].land):
-            # A rounded tip: at the hand-over the contact slides over its top. (A land
-            # carries no torque, and contact just ends where it begins.)
+            # On a rounded tip, contact slides over the top when the next lobe takes over. (A land
+            # carries no torque; contact ends at its edge.)
             first = segments[0]
             pieces.insert(0, first.start - 0.5 * (first.stop - first.start) * fraction[:0:-1])
-        # Nodes crowd around the pitch point, where a family with ψ = 0 (EE) has zero
-        # radius of curvature. Rotor 2 may touch beyond its pitch point by about ε, so a
-        # piece of its addendum is searched too, reflected about the pitch normal.
+        # Nodes crowd around the pitch crossing, where a family with ψ = 0 (EE) has zero
+        # radius of curvature. Rotor 2 may touch beyond its pitch crossing by about ε. The search
+        # therefore includes a piece of its addendum, reflected about the pitch normal.
         start, stop = segments[-1].start, segments[-1].stop
         crowd = 0.5 ** jnp.arange(1, 8) / count
         near = jnp.concatenate([fraction, 1 - crowd, jnp.ones(1), 1 + crowd[::-1]])
@@ -144,8 +152,8 @@ class FlankPair(eqx.Module):
         pieces.append(start + (stop - start) * jnp.concatenate([near, beyond]))
         tip = frozen.segments()[0]
         if tip.land:
-            # Beside a land the contact begins on a stretch of the flank that grows from nothing:
-            # its ends are where the point of rotor 1 and that of rotor 2 are at the land's edge.
+            # Beside a land, contact starts on a part of the flank that grows from zero length. At
+            # its ends, the point of rotor 1 or that of rotor 2 is at the land's edge.
             after = frozen.segments()[1]
             step = (after.stop - after.start) / count
             pieces.append(tip.stop + step * 0.5 ** jnp.arange(_CROWD, 0, -1))
@@ -166,11 +174,11 @@ class FlankPair(eqx.Module):
         return cls(profile, eqx.combine(dynamic, static), nodes, distance, rolling)
 
     def __call__(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> ClosestApproach:
-        """Closest approach at roll coordinate x = `roll` and ε = `relative` (rad).
+        """Return the closest approach at roll coordinate x = `roll` and ε = `relative` (rad).
 
-        `roll` is reduced to one mesh period around the middle of the flank, so any angle
-        may be given. Differentiable to any order in both, in the profile and in the
-        centre distance; the search itself is never differentiated.
+        Any angle may be given: `roll` is reduced to one mesh period around the middle of the flank.
+        The result is differentiable to any order with respect to both angles, the profile and the
+        centre distance. The search itself is never differentiated.
         """
         folded, mirrored = self.folded(roll)
         found = self._closest(folded, relative)
@@ -180,16 +188,17 @@ class FlankPair(eqx.Module):
         )
 
     def folded(self, roll: Float[Array, ""]) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-        """x in the half that is searched, and whether the rotors have changed places."""
+        """Return x (rad) in the half that is searched, and whether the rotors are exchanged."""
         half = self.profile.half_pitch
         centered = roll - half
         centered = centered - 4 * half * jnp.round(centered / (4 * half))
         return half - jnp.abs(centered), centered > 0
 
     def switches(self, roll: Float[Array, ""], found: ClosestApproach) -> Bool[Array, " s"]:
-        """Which pieces of the flanks are closest in the approach `found` at `roll`: where an
-        entry changes, derivatives of the gap jump (its second ones in the pose, the first ones
-        of the levers in the design)."""
+        """Return flags (s,) for the pieces of the flanks that are closest in `found` at `roll`.
+
+        Where a flag changes, derivatives of the gap jump: second derivatives with respect to the
+        pose, and first derivatives of the levers with respect to the design."""
         ends = jnp.stack([segment.stop for segment in self.frozen.segments()[:-1]] or [0.0])
         normals = jnp.stack([found.normal1, found.normal2])
         beyond = (normals[:, None] > ends).ravel()
@@ -202,11 +211,11 @@ class FlankPair(eqx.Module):
         return jnp.concatenate([jnp.stack(pieces), beyond])
 
     def _closest(self, roll, relative) -> ClosestApproach:
-        """Closest approach for a folded `roll`, with its derivatives.
+        """Return the closest approach for a folded `roll`, with its derivatives.
 
         With θ the pose and the design, dG = ∂G/∂θ dθ at the root held fixed (envelope
         theorem) and dν2 = -(∂T/∂θ dθ) / (∂T/∂ν2) (implicit function theorem). The rule is
-        itself differentiable, so second derivatives are those of the true gap.
+        itself differentiable, so that second derivatives are those of the true gap.
         """
         dynamic, static = eqx.partition(self, eqx.is_inexact_array)
 
@@ -227,7 +236,7 @@ class FlankPair(eqx.Module):
 
             _, turned = jax.jvp(lambda nu: mesh(dynamic, nu, *pose), (normal2,), (unit,))
             _, moved = jax.jvp(mesh, (dynamic, normal2, *pose), (by_dynamic, still, *by_pose))
-            # At a point that is no minimum (no root, or flat conformity) it stays put.
+            # At a point that is not a minimum (no root, or conforming flanks) ν2 does not move.
             falls = turned[0] < 0
             normal2_dot = jnp.where(falls, -moved[0] / jnp.where(falls, turned[0], -1.0), 0.0)
             normal1_dot, lever1_dot, lever2_dot = (
@@ -245,14 +254,14 @@ class FlankPair(eqx.Module):
         return closest(dynamic, roll, relative)
 
     def reach(self, normal1, normal2, roll, relative):
-        """Support functions (m) of both points on the common normal, and the part of the normal
-        along the line of centres, at a folded `roll`."""
+        """Return both points' support functions (m), and the cosine between common normal and line
+        of centres, at a folded `roll`."""
         mate = self.profile.mate(normal2)
         direction = mate.facing + roll - relative / 2
         return self.profile.support(normal1), mate.support, jnp.cos(direction)
 
     def _mesh(self, normal2, roll, relative):
-        """T, G, ν1, q1, q2 at `normal2`, from the definition."""
+        """Return T, G, ν1, q1, q2 at `normal2`, from the definition."""
         profile = self.profile
         mate = profile.mate(normal2)
         normal1 = mate.facing + 2 * roll
@@ -264,20 +273,20 @@ class FlankPair(eqx.Module):
         return offset, gap, normal1, lever1, mate.lever
 
     def _offset(self, normal2, roll, relative):
-        """T alone, with as little work as possible."""
+        """Return T alone, with as little work as possible."""
         mate = self.profile.mate(normal2, support=False)
         reach = self.center_distance * jnp.sin(mate.facing + roll - relative / 2)
         return reach - self.profile.lever(mate.facing + 2 * roll) - mate.lever
 
     def _search(self, roll, relative, attempt=0):
-        """Closest approach at a folded `roll`, and the attempts it took.
+        """Return the closest approach at a folded `roll`, and the number of attempts.
 
-        Attempt 0 is Newton's method from the point of perfect rolling. Where it cannot be relied
-        on, attempts 1 and 2 follow: two minima occur away from the nominal centre distance and
-        next to a cusp, and are the last and the first interval of the nodes where T falls
-        through zero; the deeper counts. Flanks that are not conjugate may have more of them, of
-        which the two that the nodes show to be deepest are looked at. (One loop for all, so that
-        it is compiled once.)
+        Attempt 0 is Newton's method from the point of perfect rolling. Where its result is not
+        reliable, attempts 1 and 2 follow. Two minima occur away from the nominal centre distance
+        and next to a cusp. They lie in the last and the first interval of nodes where T falls
+        through zero; the deeper one is returned. Flanks that are not conjugate may have more
+        minima; the attempts then try the two that are deepest at the nodes. All attempts share one
+        loop, which is compiled once.
         """
         nothing = jnp.zeros_like(roll)
         none = ClosestApproach(
@@ -316,32 +325,34 @@ class FlankPair(eqx.Module):
         return attempts % _DONE, best
 
     def _bracket(self, attempt, roll, relative):
-        """Interval between nodes where T falls through zero, the last (`attempt` 1) or the first,
-        of flanks that are not conjugate the deepest or the second: (low, high), first guess,
-        whether there is one, whether there is but one."""
+        """Return an interval between nodes where T falls through zero.
+
+        It is the last (`attempt` 1) or the first one; for flanks that are not conjugate, the
+        deepest or the second deepest. The result is (low, high), the first guess, whether there is
+        such an interval, and whether there is only one."""
         profile, nodes = self.profile, self.nodes
         turned = _rotate(nodes.turned, 2 * profile.turn_ratio * roll)
         normal1 = nodes.facing + 2 * roll
         lever1 = profile.lever_from(normal1, turned[0], turned[1])
         cos, sin = _rotate(nodes.direction, roll - relative / 2)
         offset = self.center_distance * sin - lever1 - nodes.lever
-        # The tolerance is for a root on a node: a compiled program may round T[i] one way as the
-        # end of one interval and another way as the start of the next.
+        # The tolerance keeps a root on a node. A compiled program may round T[i] differently as the
+        # end of one interval and as the start of the next.
         slack = _SLACK[offset.dtype.itemsize] * profile.pitch_radius
         falling = (offset[:-1] >= -slack) & (offset[1:] < slack)
         if nodes.support is None:
-            # Whole numbers, whose greatest is found at vector speed; an arg-minimum is not.
+            # The maximum of integers is vectorised, an arg-minimum is not.
             place = jnp.arange(falling.shape[0])
             last = jnp.max(jnp.where(falling, place, -1))
             first = jnp.min(jnp.where(falling, place, place.shape[0]))
             present, single = last >= 0, first >= last
             index = jnp.where(present, jnp.where(attempt == 1, last, first), 0)
         else:
-            # The gap of parallel tangents changes by -T for every angle that they turn.
+            # The derivative of the gap between parallel tangents with respect to their angle is -T.
             gap = self.center_distance * cos - profile.support(normal1) - nodes.support
             share = _share(offset[:-1], offset[1:])
             least = gap[:-1] - jnp.diff(nodes.facing) * share * offset[:-1] / 2
-            # A pair this deep has come through the lobe from its other flank.
+            # A pair this deep belongs to the other flank of the lobe.
             falling &= least > -_DEEPEST * profile.pitch_radius
             least = jnp.where(falling, least, jnp.inf)
             present, single = jnp.any(falling), jnp.sum(falling) < 2
@@ -352,11 +363,11 @@ class FlankPair(eqx.Module):
         return (low, high), low + (high - low) * share, present, single
 
     def _root(self, bracket, guess, guarded, roll, relative):
-        """Root of T by Newton's method from `guess`, and whether it converged.
+        """Return the root of T by Newton's method from `guess`, and whether it converged.
 
-        `guarded`: T falls through zero in the bracket, and the bracket shrinks around the root;
-        it is halved where Newton's step leaves it or is no shorter than half the last one. (T has
-        a kink where ν1 crosses a segment's end.)
+        `guarded`: T falls through zero in the bracket, which shrinks around the root. It is halved
+        where Newton's step leaves it or is longer than half the last one. This is needed because T
+        has a kink where ν1 crosses a segment's end.
         """
         tolerance = _CONVERGED[guess.dtype.itemsize]
         limit = jnp.where(guarded, _GUARDED_STEPS, _NEWTON_STEPS)
@@ -387,8 +398,10 @@ class FlankPair(eqx.Module):
 
 
 def _search_one_by_one(pair: FlankPair, roll, relative):
-    """`FlankPair._search` on the frozen profile. On a CPU many poses are searched one after the
-    other: hardly any of them needs the nodes, all of them together nearly always do."""
+    """Run `FlankPair._search` on the frozen profile.
+
+    On a CPU many poses are searched one by one. A single pose rarely needs the nodes, but a batch
+    of poses nearly always does."""
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
 
     def search(dynamic, roll, relative):
@@ -402,15 +415,18 @@ def _search_one_by_one(pair: FlankPair, roll, relative):
 
 
 def contact_begins(relative: Float[Array, ""]) -> Float[Array, ""]:
-    """Roll coordinate (rad) before which flanks turned into each other by ε ≤ 0 (rad) cannot
-    touch: contact starts before the tip passes the line of centres, by about √|ε|."""
+    """Return the roll coordinate (rad) below which flanks that overlap by ε ≤ 0 (rad) cannot touch.
+
+    Contact starts about √|ε| before the tip passes the line of centres."""
     return -(2 * jnp.sqrt(jnp.maximum(-relative, 0.0)) + 0.02)
 
 
 def _materialized(tree, true):
-    """`tree` as it is, kept from being merged with its uses: XLA would compute sines of the
-    nodes anew at every pose. (It drops optimisation barriers on CPUs, but must run a loop
-    whose length it does not know.) `true`: always true, but not known to the compiler."""
+    """Return `tree` unchanged, but keep XLA from fusing it with its uses.
+
+    Otherwise XLA would recompute sines of the nodes at every pose. On CPUs it drops optimisation
+    barriers, but it must run a loop of unknown length. `true`: a value that is always true, which
+    the compiler does not know."""
 
     def copy(carry):
         return carry[0] + 1, tree
@@ -420,17 +436,17 @@ def _materialized(tree, true):
 
 
 def _circle(angle):
-    """Cosine and sine, stacked."""
+    """Return cosine and sine, stacked."""
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
 def _share(before, after):
-    """Share of an interval at which a function, linear in it, falls through zero."""
+    """Return the fraction of an interval at which a linear function falls through zero."""
     fall = before - after
     return jnp.clip(before / jnp.where(fall > 0, fall, 1.0), 0.0, 1.0)
 
 
 def _rotate(directions, angle):
-    """Cosines and sines (2, n) of angles turned by one common `angle`."""
+    """Return cosines and sines (2, n) of angles turned by one common `angle` (rad)."""
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     return cos * directions[0] - sin * directions[1], cos * directions[1] + sin * directions[0]

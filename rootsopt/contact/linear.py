@@ -1,13 +1,13 @@
-"""First order in the relative rotation, in closed form: the cheapest rung.
+"""Contact to first order in the relative rotation, in closed form: the cheapest fidelity.
 
 In perfect rolling (ε = 0) the pair touches at roll angle β = x, where the common normal
 has the moment arm r cos ψ(x) about both axes. To first order in ε the gap is therefore
 
     G = r cos ψ(x) · ε,
 
-exact for involute on involute. Levers are the derivatives of this very gap, so forces
-come from a potential. The error is of second order in ε over the smooth stretches; it
-grows towards a tip arc centred on the pitch circle, which all meshes at one instant.
+exact for involute on involute. Levers are the derivatives of this gap, so that forces
+come from a potential. The error is of second order in ε over the smooth segments. It
+grows towards a tip arc centred on the pitch circle, all of which meshes at one instant.
 """
 
 import jax
@@ -30,28 +30,28 @@ class LinearContact(Contact):
 
     @property
     def smooth(self) -> bool:
-        """False: its levers jump, which no switch tells."""
+        """False: its levers jump without a change of `switches`."""
         return False
 
     @classmethod
     def of(cls, profile: Profile) -> "LinearContact":
-        """The contact of `profile`; there is nothing to prepare."""
+        """Return the contact of `profile`; nothing is precomputed."""
         return cls(profile)
 
     def __call__(
         self, roll: Float[Array, ""], relative: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """Gap (m) and the levers about rotor 1 and rotor 2 (m).
+        """Return the gap (m) and the levers (m) about rotor 1 and rotor 2.
 
-        Contact begins with the first point of the flank that can carry torque (the end of
-        the tip land): before it there is none, the gap is the pitch radius and the levers
+        Contact starts with the first point of the flank that can carry torque (the end of
+        the tip land). Before it there is no contact: the gap is the pitch radius and the levers
         are zero. The depth starts from zero there, unless the whole tip arc meshes at once.
         """
         profile = self.profile
         half = profile.half_pitch
         centered = roll - half
         centered = centered - 4 * half * jnp.round(centered / (4 * half))
-        # Beyond the pitch point the rotors have changed places; the lever, r cos ψ, is even.
+        # Beyond the pitch crossing the rotors are exchanged; the lever, r cos ψ, is even.
         mirror = jnp.where(centered > 0, -1.0, 1.0)
         folded = half - jnp.abs(centered)
         first = profile.segments()[0]

@@ -1,9 +1,9 @@
-"""C² map of the flank gap over the pose: the fast rung.
+"""C² map of the flank gap over the pose: the fast fidelity.
 
 The gap of `closest.FlankPair` is tabulated once per design on a uniform grid over roll
-coordinate and relative rotation and interpolated by bicubic B-splines. Levers are the
-derivatives of the interpolated gap itself, so forces still come from a potential. The
-design derivative enters at the grid points, by the envelope theorem.
+coordinate and relative rotation, and interpolated by bicubic B-splines. Levers are the
+derivatives of the interpolated gap itself, so that forces still come from a potential.
+Derivatives with respect to the design enter at the grid points, by the envelope theorem.
 """
 
 import functools
@@ -20,21 +20,22 @@ from rootsopt.contact.closest import FlankPair, contact_begins
 from rootsopt.contact.gap import Contact
 from rootsopt.profiles.base import Profile
 
-# Grid cells of ε beyond zero, so that the spline is in its interior where contact starts.
+# Grid cells beyond ε = 0, and beyond the middle of the flank. They keep the spline in its interior
+# where contact starts.
 MARGIN = 3
 
 
 def first_roll(deepest: Float[Array, ""] | float, half_pitch: float) -> Float[Array, ""]:
-    """Roll (rad) at which a map down to ε = `deepest` begins."""
+    """Return the roll (rad) at which a map down to ε = `deepest` (rad) starts."""
     return jnp.maximum(-0.9 * half_pitch, contact_begins(jnp.asarray(deepest)))
 
 
 def continued_gap(
     pair: FlankPair, roll: Float[Array, ""], relative: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Gap (m) with a continuation where the flanks have no common normal.
+    """Return the gap (m), continued where the flanks have no common normal.
 
-    There the tip land is passing; a parabola continues the gap that its end leaves.
+    There the tip land is passing. A parabola continues the gap from the land's end.
     """
     contact = pair(roll, relative)
     away = roll - lax.stop_gradient(_land_end(pair.profile)) - relative / 2
@@ -43,12 +44,12 @@ def continued_gap(
 
 @functools.lru_cache(maxsize=32)
 def _interpolation_matrix(count: int) -> NDArray[np.float64]:
-    """Matrix (count + 2, count) from values at uniform knots to cubic B-spline
+    """Return the matrix (count + 2, count) from values at uniform knots to cubic B-spline
     coefficients, with not-a-knot ends."""
     system = np.zeros((count + 2, count + 2))
     for i in range(count):
         system[i + 1, i : i + 3] = [1 / 6, 4 / 6, 1 / 6]
-    # Third derivative continuous across the second and the last but one knot.
+    # The third derivative is continuous across the second and the second-last knot.
     jump = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
     system[0, :5] = jump
     system[-1, -5:] = jump
@@ -58,7 +59,7 @@ def _interpolation_matrix(count: int) -> NDArray[np.float64]:
 
 
 def _weights(t):
-    """B-spline weights of the four coefficients around a cell, with two derivatives."""
+    """Return B-spline weights of the four coefficients around a cell, and two derivatives."""
     u = 1 - t
     value = jnp.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]) / 6
     slope = jnp.stack([-(u**2), 3 * t**2 - 4 * t, -3 * u**2 + 4 * u, t**2]) / 2
@@ -70,8 +71,11 @@ class MapContact(Contact):
     """Gap and levers of a flank pair at a pose, from a spline map.
 
     Call it with roll coordinate and ε (rad); see `FlankPair` for their meaning. Below
-    ε = `deepest` the gap goes on linearly in ε, which keeps a simulation alive long
-    enough to see that the map must be larger.
+    ε = `deepest` the gap continues linearly in ε. A simulation then goes on, so that the caller can
+    see that the map must be larger.
+
+    `coefficients` (m, n): of the B-spline (m); `first_roll`, `deepest`: roll and ε (rad) of the
+    first grid point; `roll_step`, `relative_step`: grid steps (rad); `half_pitch`: π/2N (rad).
     """
 
     coefficients: Float[Array, "m n"]
@@ -85,13 +89,14 @@ class MapContact(Contact):
     def of(
         cls, profile: Profile, deepest: Float[Array, ""], rolls: int, relatives: int
     ) -> "MapContact":
-        """Tabulate `profile` down to ε = `deepest` < 0 (rad) on `rolls` × `relatives`
-        points (both at least 8)."""
+        """Tabulate `profile` down to ε = `deepest` < 0 (rad).
+
+        The grid has `rolls` × `relatives` points, both at least 8."""
         pair = FlankPair.of(profile)
         half = float(profile.half_pitch)
         first = first_roll(deepest, half)
-        # Past the middle of the flank the map is continued by symmetry, so that the
-        # spline is in its interior there as well.
+        # Symmetry continues the map beyond the middle of the flank, so that the spline is in
+        # its interior there as well.
         roll_step = (half - first) / (rolls - 1 - MARGIN)
         relative_step = -deepest / (relatives - 1 - MARGIN)
         roll = first + roll_step * jnp.arange(rolls)
@@ -109,7 +114,7 @@ class MapContact(Contact):
     def __call__(
         self, roll: Float[Array, ""], relative: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """Gap (m) and the levers about rotor 1 and rotor 2 (m)."""
+        """Return the gap (m) and the levers (m) about rotor 1 and rotor 2."""
         half = self.half_pitch
         centered = roll - half
         centered = centered - 4 * half * jnp.round(centered / (4 * half))
@@ -129,15 +134,15 @@ class MapContact(Contact):
 
 @jax.custom_jvp
 def _bicubic(coefficients, x, y):
-    """Spline value and its derivatives ∂x, ∂y, ∂x∂y at a position counted in cells."""
+    """Return the spline's value and its derivatives ∂x, ∂y, ∂x∂y at a position in cells."""
     i, j = (lax.stop_gradient(jnp.floor(t)).astype(jnp.int32) for t in (x, y))
     return _sums(_local(coefficients, i, j), _weights(x - i), _weights(y - j))
 
 
 @_bicubic.defjvp
 def _(primals, tangents):
-    # Written out, because a derivative along many directions shares nearly all of it: the
-    # second derivatives are taken once, and only the table's own change is per direction.
+    # Written by hand, because derivatives along many directions share nearly all of this. The
+    # second derivatives are computed once; only the table's own change is per direction.
     coefficients, x, y = primals
     changed, x_dot, y_dot = tangents
     i, j = (lax.stop_gradient(jnp.floor(t)).astype(jnp.int32) for t in (x, y))
@@ -155,9 +160,10 @@ def _local(coefficients, i, j):
 
 
 def _sums(local, across, along):
-    """Σ c w(x) v(y) with (w, v) the values and first derivatives in `across` and `along`:
-    f, ∂x f, ∂y f, ∂x∂y f. Sums of products, which the compiler merges; a matrix product
-    would be a call."""
+    """Return f, ∂x f, ∂y f, ∂x∂y f as sums Σ c w(x) v(y).
+
+    (w, v) are the values and first derivatives in `across` and `along`. The compiler fuses such
+    sums, while a matrix product would be a library call."""
     value, slope = (jnp.sum(local * w, axis=1) for w in along[:2])
     return (
         jnp.sum(across[0] * value),

@@ -1,8 +1,8 @@
-"""Node-against-segment gap of two outlines: the paper's Eq. 9, and the reference.
+"""Node-against-segment gap of two outlines: the paper's Eq. 9, and the reference for tests.
 
-This is the slow, assumption-free way: it sees two closed outlines and a pose, knows
-nothing of roll angles or conjugacy, and is what the fast search is checked against.
-NumPy and SciPy only; nothing here is differentiated.
+This method is slow but free of assumptions, and checks the fast search. It uses only two closed
+outlines and a pose, not roll angles or conjugacy. It needs NumPy and SciPy only, and nothing here
+is differentiated.
 """
 
 import numpy as np
@@ -20,11 +20,11 @@ def _rotate(points: Points, angle: float) -> Points:
 def place_pair(
     outline: Points, lobes: int, center_distance: float, phi1: float, phi2: float
 ) -> tuple[Points, Points]:
-    """Both rotors in the fixed frame: rotor 1 at the origin, rotor 2 at (E, 0).
+    """Return both outlines (n, 2) in the fixed frame: rotor 1 at the origin, rotor 2 at (E, 0).
 
-    `outline` (n, 2), closed, a lobe tip on +x; angles in rad, each positive in its own
-    rotor's sense, so rotor 2 is the mirror image. At φ1 = φ2 = 0 a lobe of rotor 1
-    points at a valley of rotor 2.
+    `outline` (n, 2) is closed, with a lobe tip on +x. Angles (rad) are positive in each rotor's own
+    direction of rotation, so that rotor 2 is the mirror image. At φ1 = φ2 = 0 a lobe of rotor 1
+    points at a valley of rotor 2. The unit of length is the outline's.
     """
     first = _rotate(outline, phi1)
     second = _rotate(outline, phi2 + np.pi / lobes) * [-1.0, 1.0]
@@ -32,12 +32,11 @@ def place_pair(
 
 
 def signed_distance(nodes: Points, outline: Points, refine: bool = True) -> NDArray[np.float64]:
-    """Signed distance (n,) from `nodes` to a closed counter-clockwise `outline`.
+    """Return the signed distance (n,) from `nodes` to a closed counter-clockwise `outline`.
 
-    Positive outside. Without `refine`, the distance to the nearest straight segment
-    (Eq. 9). With it, the nearest segment is replaced by the cubic through its two ends
-    with the outline's own tangents, which takes the error below the node spacing from
-    second to fourth order.
+    It is positive outside. Without `refine` it is the distance to the nearest straight segment
+    (Eq. 9). With `refine`, a cubic through the segment's two ends, with the outline's own tangents,
+    replaces that segment. The error is then of fourth order in the node spacing, not second.
     """
     corners = outline[:-1] if np.allclose(outline[0], outline[-1], atol=0) else outline
     count = len(corners)
@@ -59,7 +58,7 @@ def signed_distance(nodes: Points, outline: Points, refine: bool = True) -> NDAr
 
 
 def _tangents(corners):
-    """Unit tangents from the circle through each node and its two neighbours."""
+    """Return unit tangents (n, 2) of the circle through each node and its two neighbours."""
     before = corners - np.roll(corners, 1, axis=0)
     after = np.roll(corners, -1, axis=0) - corners
     weight = np.linalg.norm(before, axis=1)[:, None], np.linalg.norm(after, axis=1)[:, None]
@@ -68,7 +67,7 @@ def _tangents(corners):
 
 
 def _project(nodes, corners, start, stop, tangents):
-    """Foot points on the segments start → stop, and the direction of the curve there."""
+    """Return foot points on the segments start → stop, and the direction of the curve there."""
     a = corners[start]
     chord = corners[stop] - a
     length2 = np.einsum("ij,ij->i", chord, chord)
@@ -100,10 +99,10 @@ def pair_gap(
     reach: float | None = None,
     refine: bool = True,
 ) -> float:
-    """Least signed distance between the two rotors at one pose, in the outline's unit.
+    """Return the least signed distance between the two rotors at one pose, in the outline's unit.
 
-    `reach` limits the nodes of rotor 1 to those within that distance of rotor 2's
-    outer circle (default: all that can touch).
+    `reach`: distance from rotor 2's outer circle beyond which nodes of rotor 1 are ignored; by
+    default 0.05 outer radii, which keeps all that can touch.
     """
     first, second = place_pair(outline, lobes, center_distance, phi1, phi2)
     outer = np.max(np.hypot(outline[:, 0], outline[:, 1]))

@@ -1,4 +1,4 @@
-"""Where on the flanks the closest approach is: what friction and supports need beside the gap."""
+"""Place of the closest approach on the flanks, for friction and elastic supports."""
 
 from typing import NamedTuple
 
@@ -11,9 +11,10 @@ from rootsopt.contact.closest import ClosestApproach, FlankPair
 class ContactPoint(NamedTuple):
     """Place and direction of a flank contact.
 
-    With the common normal n from rotor 1 to rotor 2 and the axes at O1, O2: `support1`,
-    `support2` (m) are the distances of the contact from the axes along n, (P - O1)·n and
-    (O2 - P)·n; `radial` is the part of n along the line of centres.
+    n is the common normal from rotor 1 to rotor 2, O1 and O2 are the axes.
+    `support1`: (P - O1)·n (m), distance of the contact P from axis 1 along n.
+    `support2`: (O2 - P)·n (m), distance from axis 2 along n.
+    `radial`: component of n along the line of centres.
     """
 
     support1: Float[Array, ""]
@@ -24,7 +25,7 @@ class ContactPoint(NamedTuple):
 def contact_point(
     pair: FlankPair, roll: Float[Array, ""], relative: Float[Array, ""], found: ClosestApproach
 ) -> ContactPoint:
-    """The place of the closest approach `found` at x = `roll` and ε = `relative` (rad)."""
+    """Return the place of the closest approach `found` at x = `roll` and ε = `relative` (rad)."""
     folded, mirrored = pair.folded(roll)
     support1, support2, radial = pair.reach(found.normal1, found.normal2, folded, relative)
     return ContactPoint(

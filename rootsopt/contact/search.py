@@ -1,4 +1,4 @@
-"""Contact by a search for the closest approach at every call: the reference."""
+"""Contact by a search for the closest approach at every call: the reference fidelity."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +13,8 @@ from rootsopt.profiles.base import Profile
 class SearchContact(Contact):
     """Gap and levers by a search for the closest approach at every call: the reference.
 
-    `pair`: the flanks; with `sides` = 2 the search also covers flanks turned away from each other.
+    `pair`: the flanks; `sides`: 1, or 2 if the search also covers flanks turned away from each
+    other.
     """
 
     pair: FlankPair
@@ -26,12 +27,12 @@ class SearchContact(Contact):
         center_distance: Float[Array, ""] | None = None,
         two_sided: bool = False,
     ) -> "SearchContact":
-        """Prepare the search for `profile`; arguments as of `FlankPair.of`."""
+        """Prepare the search for `profile`; arguments as for `FlankPair.of`."""
         return cls(FlankPair.of(profile, center_distance, two_sided), 1 + two_sided)
 
     @property
     def jumps(self) -> bool:
-        """Whether the levers may jump, from one minimum of the gap to another as deep."""
+        """Whether the levers may jump from one minimum of the gap to another of equal depth."""
         return self.pair.profile.cusp or not self.pair.rolling
 
     @property

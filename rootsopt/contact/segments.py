@@ -1,18 +1,18 @@
 """Node against straight segment: the paper's own contact, its Eq. 9.
 
-Each flank is a polyline from tip to root, and the gap is the least (p - q) · n over the
-nodes p of one flank and the segments (q, n) of the other that face them. The paper tests
-the nodes of rotor 2 only; here either flank is node and segment in turn, so that the
-result does not change when the rotors are exchanged.
+Each flank is a polyline from tip to root. The gap is the least (p - q) · n over the nodes p of one
+flank and the segments (q, n) of the other that face them. The paper tests the nodes of rotor 2
+only. Here the nodes of both flanks are tested against the other's segments, so that the result does
+not change when the rotors are exchanged.
 
-A segment faces the nodes between the bisectors at its two ends. There the distances to
-neighbouring segments agree, so the gap is continuous over the pose, its derivatives are
-the levers, and forces come from a potential. The levers jump from segment to segment:
-their error is of first order in the node spacing, that of the gap of second order.
+A segment faces the nodes between the bisectors at its two ends. On a bisector the distances to both
+segments agree. The gap is therefore continuous over the pose, its derivatives are the levers, and
+forces come from a potential. The levers jump from segment to segment: their error is of first order
+in the node spacing, that of the gap of second order.
 
-With a = x + ε/2 for rotor 1 and a = π/N - x + ε/2 for rotor 2, a point z of one flank
-(its own rotor's frame, tip on +x) lies at R(a) (E - R(-a′) z) in the frame of the other,
-E the centre distance: exchanging the rotors exchanges a and a′, nothing else.
+Let a = x + ε/2 for rotor 1, a = π/N - x + ε/2 for rotor 2, and E the centre distance. A point z of
+one flank, in its own rotor's frame with a tip on +x, lies at R(a) (E - R(-a′) z) in the frame of
+the other. Exchanging the rotors only exchanges a and a′.
 """
 
 import equinox as eqx
@@ -24,27 +24,29 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.contact.gap import Contact
 from rootsopt.profiles.base import Profile
 
-# Shares of the addendum's nodes that a flank is continued by: beyond the pitch point,
-# where the other half of the flank touches near the middle of the mesh, and, on a rounded
-# tip, over its top, so that the first contact is not at an end. More of it would bend the
-# flank of EE too far for the bisection in `_facing`.
+# Fractions of the addendum's nodes by which a flank is continued. Beyond the pitch crossing, the
+# other half of the flank touches near the middle of the mesh. Over the top of a rounded tip, the
+# continuation keeps the first contact away from an end. A longer one would bend the flank of EE too
+# far for the bisection in `_facing`.
 _BEYOND_PITCH = 0.15
 _OVER_TIP = 0.03
-# Points per segment of the table that node spacing is read from.
+# Points per segment in the table from which the nodes are spaced.
 _TABLE = 64
-# A node this deep (in pitch radii) has come through the lobe from its other flank.
+# Penetration (pitch radii) above which a node belongs to the other flank of its lobe and is
+# ignored.
 _DEEPEST = 0.1
 
 
 class NodeContact(Contact):
     """Gap and levers of a flank pair at a pose, from two polylines.
 
-    Call it with roll coordinate and ε (rad); see `FlankPair` for their meaning. In the
-    order rotor 1, rotor 2: `nodes` (m), `tangent` (unit, of the bisectors at the nodes)
-    and `normal` (unit, outward, of the segments), each in its own rotor's frame.
+    Call it with roll coordinate and ε (rad); see `FlankPair` for their meaning. Fields have rotor 1
+    first, rotor 2 second, each in its own rotor's frame. `nodes` (2, n, 2): in m; `tangent`
+    (2, n, 2): unit tangents at the nodes, normal to the bisectors; `normal` (2, n - 1, 2): outward
+    unit normals of the segments; `pitch_radius`: r (m); `half_pitch`: π/2N (rad).
 
-    Tip lands carry no torque and have no nodes. Of rotor 1 only the addendum and a
-    little more is kept and of rotor 2 its mate: the rest of the mesh follows by exchange.
+    Tip lands carry no torque and have no nodes. The flank of rotor 1 is its addendum and a little
+    more, that of rotor 2 its mate. The rest of the mesh follows by exchange of the rotors.
     """
 
     nodes: Float[Array, "2 n 2"]
@@ -55,15 +57,16 @@ class NodeContact(Contact):
 
     @property
     def smooth(self) -> bool:
-        """False: its levers jump, which no switch tells."""
+        """False: its levers jump without a change of `switches`."""
         return False
 
     @classmethod
     def of(cls, profile: Profile, nodes: int) -> "NodeContact":
         """Place `nodes` (at least 16) per flank, half of them on the addendum.
 
-        They are spread evenly in arc length, the longer of the two mating elements, with a
-        share for turning, so that the sharp spot at the pitch point of EE is resolved.
+        They are evenly spaced in the longer of the two mating arc elements plus a constant. The
+        constant resolves the sharp spot at the pitch crossing of EE. Raises `ValueError` for fewer
+        nodes.
         """
         if nodes < 16:
             raise ValueError(f"Argument `nodes` must be at least 16, but is {nodes}.")
@@ -88,10 +91,10 @@ class NodeContact(Contact):
     def __call__(
         self, roll: Float[Array, ""], relative: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """Gap (m) and the levers about rotor 1 and rotor 2 (m).
+        """Return the gap (m) and the levers (m) about rotor 1 and rotor 2.
 
-        The derivative is that at the pair of node and segment which is deepest. Where no
-        node faces a segment the gap is the pitch radius and the levers are zero.
+        The derivative is that of the deepest pair of node and segment. Where no node faces a
+        segment, the gap is the pitch radius and the levers are zero.
         """
         half = self.half_pitch
         centered = roll - half
@@ -115,11 +118,11 @@ class NodeContact(Contact):
         )
 
     def _center(self, angle):
-        """The other rotor's axis in the frame of a rotor at `angle`."""
+        """Return the other rotor's axis (2,) in m, in the frame of a rotor at `angle`."""
         return 2 * self.pitch_radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
     def _transfer(self, points, angle, other_angle):
-        """`points` (..., 2) of the other rotor's flank in the frame of a rotor at `angle`."""
+        """Return the other rotor's `points` (..., 2) in the frame of a rotor at `angle`."""
         turn = angle - other_angle
         cos, sin = jnp.cos(turn), jnp.sin(turn)
         return self._center(angle) - points @ jnp.array([[cos, sin], [-sin, cos]])
@@ -127,7 +130,7 @@ class NodeContact(Contact):
     def _search(
         self, angles: Float[Array, " 2"]
     ) -> tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""], Bool[Array, ""]]:
-        """Deepest pair: (rotor of the segment, node, segment, whether there is any)."""
+        """Return the deepest pair: (rotor of the segment, node, segment, whether one exists)."""
         points = jax.vmap(self._transfer)(self.nodes[::-1], angles, angles[::-1])
         gap, segment = jax.vmap(_facing)(points, self.nodes, self.tangent, self.normal)
         gap = jnp.where(gap > -_DEEPEST * self.pitch_radius, gap, jnp.inf)
@@ -142,12 +145,12 @@ def _facing(
     tangent: Float[Array, "n 2"],
     normal: Float[Array, "n-1 2"],
 ) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
-    """Signed distance (m) of each of `points` to the segment that faces it (inf if none),
-    and that segment's index.
+    """Return the signed distance (m) of each of `points` to the segment that faces it.
 
-    By bisection over the nodes: a point near the flank is ahead of the bisectors on the
-    tip's side of its segment and behind all others, because the chord between any two
-    nodes of a flank keeps within a right angle of the tangents at both.
+    The distance is inf if no segment does. The second result is the segment's index. It is found by
+    bisection over the nodes. A point near the flank is ahead of the bisectors on the tip's side of
+    its segment, and behind all others. The reason is that the chord between any two nodes of a
+    flank stays within a right angle of the tangents at both.
     """
     x, y = points[:, 0], points[:, 1]
     offset = jnp.sum(nodes * tangent, axis=1)
@@ -159,7 +162,7 @@ def _facing(
     last = len(nodes) - 1
     low = jnp.zeros(len(nodes), dtype=jnp.int32)
 
-    # A traced loop: unrolled, the compiler fuses the steps and repeats them, at twice the time.
+    # Use a traced loop. Unrolled, the compiler fuses and repeats the steps, which doubles the time.
     def halve(step, low):
         middle = low + jnp.left_shift(1, last.bit_length() - 1 - step).astype(low.dtype)
         passed = (middle < last) & ahead(jnp.minimum(middle, last))
@@ -171,7 +174,8 @@ def _facing(
 
 
 def _spread(profile: Profile, count: int) -> Float[Array, " n"]:
-    """Normal angles (rad) of nodes on the addendum, tip (or land's end) to pitch point."""
+    """Return normal angles (n,) in rad of nodes on the addendum, from the tip (or the land's end)
+    to the pitch crossing."""
     segments = [s for s in profile.segments() if not s.land]
     share = jnp.arange(_TABLE, dtype=profile.pitch_radius.dtype) / _TABLE
     ends = [s.start + (s.stop - s.start) * share for s in segments]

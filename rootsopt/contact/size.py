@@ -1,9 +1,9 @@
-"""How large a contact map must be for a stated error.
+"""Finds the size that a contact map needs for a stated error.
 
-The gap is computed by search along a few lines through the map, finely, and the map's
-spline is fitted to it at every size of a ladder (SciPy, one dimension at a time). The
-error is that of the penetration where the flanks overlap. A ladder rather than any size,
-because every size is a program of its own to compile.
+The gap is computed by search along a few fine lines through the map. The map's spline is fitted to
+it at each of a fixed list of sizes (SciPy, one dimension at a time). The error is that of the
+penetration where the flanks overlap. The list is fixed because every size needs its own compiled
+program.
 """
 
 from typing import NamedTuple
@@ -21,13 +21,16 @@ from rootsopt.runtime.programs import Program
 ROLLS = (96, 128, 192, 256, 384, 512, 768, 1024, 1536)
 RELATIVES = (16, 24, 32, 48)
 _FINE = 3073, 193
+"""Points on a line along the roll, and on a line along ε."""
 _LINES = 5, 33
 """Lines along the roll, at geometrically spaced ε; lines along ε, at uniform rolls."""
 
 
 class MapSize(NamedTuple):
-    """Points over roll and over ε, the `error` of the penetration (m) they leave, and
-    whether that is within what was asked."""
+    """Size of a contact map.
+
+    `rolls`, `relatives`: points over roll and over ε; `error`: error (m) of the penetration;
+    `enough`: whether that is within the requested error."""
 
     rolls: int
     relatives: int
@@ -36,9 +39,9 @@ class MapSize(NamedTuple):
 
 
 def size_map(profile: Profile, deepest: float, error: float) -> MapSize:
-    """Smallest map down to ε = `deepest` (rad) with an error of penetration ≤ `error` (m).
+    """Return the smallest map down to ε = `deepest` (rad) with a penetration error ≤ `error` (m).
 
-    Where even the largest falls short, the smallest that is nearly as good.
+    If even the largest map exceeds that error, return the smallest one that is nearly as good.
     """
     along_roll, along_relative = _probe(profile, jnp.asarray(deepest))
     half = float(profile.half_pitch)
@@ -51,7 +54,7 @@ def size_map(profile: Profile, deepest: float, error: float) -> MapSize:
 
 @Program
 def _probe(profile, deepest):
-    """Gap (lines, points) on fine lines along the roll and along ε, with the points."""
+    """Return points and gap (lines, points) on fine lines along the roll, then along ε."""
     pair = FlankPair.of(profile)
     half = profile.half_pitch
     first = first_roll(deepest, half)
@@ -70,12 +73,13 @@ def _smallest(
     probed: tuple[Array, Array],
     error: float,
 ) -> tuple[int, float]:
-    """Smallest number of points of the ladder that keeps within `error`, and its error."""
-    from scipy.interpolate import CubicSpline  # Half a second, for maps alone.
+    """Return the smallest number of points in `ladder` with at most this `error` (m), and its
+    error."""
+    from scipy.interpolate import CubicSpline  # Imported for maps only: it takes 0.5 s.
 
     points, lines = map(np.asarray, probed)
     inside = lines < 0
-    # Not the cells next to where contact begins: beyond lies what is only continued.
+    # Exclude the cells next to the start of contact, beyond which the gap is only a continuation.
     for shift in (-1, 1):
         inside &= np.roll(lines, shift, axis=1) < 0
     errors: list[float] = []

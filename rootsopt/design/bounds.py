@@ -1,13 +1,13 @@
-"""Bounds of the design parameters where the config sets none."""
+"""Bounds of the design parameters, from the config or by default."""
 
 from rootsopt.config import Config
 from rootsopt.config.families import Parameter, family_of
 
 
 def bounds_of(config: Config) -> list[tuple[float, float]]:
-    """(low, high) of every design parameter of a config, in its units.
+    """Return (low, high) of every design parameter of a config, in its units.
 
-    Raises `InputError` where a tip land could be wider than the lobe."""
+    Raises `InputError` where a bound is impossible, such as a tip land wider than the lobe."""
     found = []
     for parameter in family_of(config.profile.family).parameters:
         values = getattr(config.profile, parameter.key)

@@ -1,4 +1,4 @@
-"""Which of the named families a profile resembles, and how far it departs from that."""
+"""Finds the classical family that a profile resembles most, and its distance from that."""
 
 import functools
 import math
@@ -21,29 +21,32 @@ from rootsopt.runtime.programs import Program
 from rootsopt.scene.families import classical, profile_of
 
 _NODES = 96
-"""Nodes on either side of the pitch circle, in the search."""
+"""Nodes on each side of the pitch circle in the search."""
 _SAMPLE = 128
-"""Members of a family that are tried; the best of them begin a search."""
+"""Members of a family that are sampled; searches start from the best of them."""
 _STARTS = 3
+"""Number of searches per family."""
 _PROGRAMS, _LONGEST, _SHORTEST = 80, 0.2, 1e-9
-"""Linear programs of a search, at most, and the longest and shortest of their steps, as a share of
-where the parameters usually lie."""
+"""Greatest number of linear programs in a search; their longest and shortest step, as a fraction of
+the parameters' usual ranges."""
 _UNSOUND_WEIGHT = 10.0
-"""Of a negative margin against distance."""
+"""Weight of a negative margin (relative to its scale) against distance (pitch radii)."""
 _UNSOUND = 1e-6
-"""Negative margin, relative to its scale, with which a member of a family is none."""
+"""Size of a negative margin (relative to its scale) above which a member of a family is unsound."""
 
 
 class Likeness(NamedTuple):
-    """The member of a `family` that is nearest to a profile: its `design` in config units, and the
-    greatest distance (m) of the outlines."""
+    """The nearest member of a family to a profile.
+
+    `family`: its name; `design`: its parameters by key, in config units; `departure`: greatest
+    distance (m) between the outlines."""
 
     family: str
     design: dict[str, float]
     departure: float
 
     def record(self) -> dict[str, Any]:
-        """The record of the result file."""
+        """Return the record for the result file."""
         return {
             "family": self.family,
             "design": self.design,
@@ -52,10 +55,11 @@ class Likeness(NamedTuple):
 
 
 def likenesses(profile: Profile) -> list[Likeness]:
-    """The nearest member of every classical family to `profile`, nearest first.
+    """Return the nearest member of every classical family to `profile`, nearest first.
 
-    Nearest is where the greatest distance of the outlines is least, looked for from the best of a
-    Sobol sample: a nearer member may be left unfound. Families without a sound one are left out.
+    The nearest member has the least greatest distance between the outlines. The search starts from
+    the best of a Sobol sample, so that it may miss a nearer member. Families without a sound member
+    are left out.
     """
     found = []
     for family in classical():
@@ -87,8 +91,11 @@ def _nearest(profile: Profile, family: str) -> Likeness | None:
 
 
 class _Seen(NamedTuple):
-    """Distances (n,) of a member's outline, in pitch radii, its margins (m,) relative to their
-    scales, and the derivatives of both by the design."""
+    """A member of a family compared with the profile.
+
+    `distance` (n,): distances of the outlines (pitch radii); `margin` (m,): margins relative to
+    their scales; `distance_slope` (n, d), `margin_slope` (m, d): derivatives of both with respect
+    to the design."""
 
     distance: NDArray[np.float64]
     margin: NDArray[np.float64]
@@ -97,15 +104,17 @@ class _Seen(NamedTuple):
 
     @property
     def finite(self) -> bool:
+        """Whether all numbers are finite."""
         return all(np.all(np.isfinite(part)) for part in self)
 
     @property
     def sound(self) -> bool:
+        """Whether the member is a sound profile."""
         return self.finite and bool(np.min(self.margin) >= -_UNSOUND)
 
     @property
     def fault(self) -> float:
-        """What a search is to make small: the greatest distance, and negative margins."""
+        """Value that a search minimises: the greatest distance plus the weighted worst margin."""
         if not self.finite:
             return math.inf
         lacking = max(0.0, -float(np.min(self.margin)))
@@ -113,12 +122,12 @@ class _Seen(NamedTuple):
 
     @property
     def away(self) -> float:
-        """Greatest distance; of what is not sound, beyond every other."""
+        """Greatest distance (pitch radii); infinite for an unsound member."""
         return float(np.max(np.abs(self.distance))) if self.sound else math.inf
 
 
 class _Look:
-    """Members of a `family` as seen from a `profile`."""
+    """Compares members of a `family` with a `profile`; results are cached by design."""
 
     def __init__(self, profile: Profile, family: str):
         self.family, self.lobes, self.radius = family, profile.lobes, profile.pitch_radius
@@ -135,8 +144,10 @@ class _Look:
 
 
 def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
-    """The design near `start` with the least greatest distance, by a sequence of linear programs:
-    each finds the step, at most `size` of the `width`, that the derivatives promise most of."""
+    """Return the design near `start` with the least greatest distance.
+
+    A sequence of linear programs finds it. Each finds the best step to first order, of at most
+    `size` times `width`."""
     design, size = start, _LONGEST
     for _ in range(_PROGRAMS):
         seen = look(design)
@@ -151,8 +162,10 @@ def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
 
 
 def _promising(seen: _Seen, width, size: float) -> NDArray[np.float64]:
-    """The step, in `width`, with the least fault to first order: minimise the bound t on all
-    distances plus the weighted bound u on negative margins."""
+    """Return the step, in units of `width`, with the least fault to first order.
+
+    The linear program minimises a bound t on all distances plus a weighted bound u on negative
+    margins."""
     count, distances, soundness = len(width), len(seen.distance), len(seen.margin)
     by_step = np.concatenate([seen.distance_slope, -seen.distance_slope, -seen.margin_slope])
     one, none = np.ones((2 * distances, 1)), np.zeros((2 * distances, 1))
@@ -168,8 +181,9 @@ def _promising(seen: _Seen, width, size: float) -> NDArray[np.float64]:
 
 @Program
 def _target(profile: Profile):
-    """Normal angles (n,), and of addendum and dedendum points (m) and outward normals there,
-    (2, n, 2) each."""
+    """Return normal angles (n,) in rad, and points (m) and outward normals there.
+
+    Points and normals are (2, n, 2), of addendum and dedendum."""
     nu = profile.pitch_normal * jnp.linspace(0.0, 1.0, _NODES)
     points = [side(nu) for side in (profile.addendum, profile.dedendum)]
     places = jnp.stack([profile.position(point) for point in points])
@@ -179,8 +193,10 @@ def _target(profile: Profile):
 
 @Program
 def _compared(family: str, lobes: int, radius: Float[Array, ""], target, design):
-    """Distances along the normals of the `target` at equal normal angles of the addendum, which
-    are distances of the outlines but for what is of second order; margins; slopes of both."""
+    """Return distances from the `target` along its normals, margins, and derivatives of both.
+
+    Points with equal normal angles of the addendum are compared. To first order these distances
+    are those between the outlines."""
     nu, places, normals = target
 
     def both(design):

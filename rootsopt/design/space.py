@@ -1,9 +1,9 @@
 """The unit box of the design parameters, and the constraints in it.
 
-Design parameters map linearly from their bounds onto the sides of the box, but for those whose
-range depends on the others: these are a share of it. Constraints depend on geometry alone and are
-cheap; where no limits of the parameters say whether a profile is sound, the margins of
-`rootsopt.profiles.validity` are constraints like the others.
+Design parameters map linearly from their bounds onto the sides of the box. A parameter whose range
+depends on the others is a fraction of that range instead. Constraints depend on geometry alone and
+are cheap. For families whose closed-form limits do not ensure a sound profile, the margins of
+`rootsopt.profiles.validity` are further constraints.
 """
 
 import importlib
@@ -36,14 +36,15 @@ _SOUND = (
     ("star shape", "star", "mm", 0.0, MM, MM),
     ("root above the axis", "root", "mm", 0.0, MM, MM),
 )
-"""What makes a profile sound, beside its undercut margin."""
+"""Margins of a sound profile, besides its undercut margin."""
 
 
 class Constraint(eqx.Module):
-    """value ≥ limit, or ≤ where it is a `ceiling`, scaled by `scale` to order one.
+    """A constraint: value ≥ limit, or value ≤ limit for a `ceiling`.
 
-    `quantity`: a field of `Geometry`, or one of `Margins` where `margin`; `factor` turns SI into
-    the reported `unit`.
+    `name`: in reports; `quantity`: a field of `Geometry`, or of `Margins` if `margin` is true;
+    `limit`: in SI units; `scale`: divides the slack, to make it of order one; `unit`: reported
+    unit; `factor`: SI value of one such unit.
     """
 
     name: str = eqx.field(static=True)
@@ -61,13 +62,17 @@ class Constraint(eqx.Module):
         return -1.0 if self.ceiling else 1.0
 
     def slack(self, shape: Geometry, found: Margins | None = None) -> Float[Array, ""]:
-        """Scaled distance to the limit, ≥ 0 where satisfied."""
+        """Return the scaled distance to the limit, ≥ 0 where satisfied."""
         value = getattr(found if self.margin else shape, self.quantity)
         return self.sign * (value - self.limit) / self.scale
 
 
 class Space(eqx.Module):
-    """The unit box of d design parameters and the constraints in it."""
+    """The unit box of d design parameters and the constraints in it.
+
+    `scene`: builds profiles; `lower`, `upper` (d,): bounds in config units; `constraints`: m of
+    them.
+    """
 
     scene: Scene
     lower: Float[Array, " d"]
@@ -76,8 +81,9 @@ class Space(eqx.Module):
 
     @classmethod
     def of(cls, config: Config, scene: Scene, area_efficiency: float) -> "Space":
-        """Bounds and floors of a config whose baseline has this `area_efficiency`; raises
-        `InputError` where they leave no design."""
+        """Return the space of a config whose baseline has this `area_efficiency`.
+
+        Raises `InputError` where its bounds leave no design."""
         limits, family = config.constraints, family_of(config.profile.family)
         rows = bounds_of(config)
         floor = limits.area_efficiency_min
@@ -85,7 +91,7 @@ class Space(eqx.Module):
             floor = area_efficiency
         margin = limits.undercut_margin_min_mm * MM
         sound = not family.by_limits
-        # Looked at in more places where that decides whether the profile is sound.
+        # If undercut decides whether the profile is sound, use the margin that checks more points.
         undercut = "undercut" if sound else "undercut_margin"
         constraints = (
             _constraint("area efficiency", "area_efficiency", "", floor, 0.01, 1.0),
@@ -108,11 +114,11 @@ class Space(eqx.Module):
 
     @property
     def family(self) -> Family:
-        """The profile family whose designs these are."""
+        """Profile family of the designs."""
         return family_of(self.scene.family)
 
     def design(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
-        """Design in config units at `point` of the unit box."""
+        """Return the design in config units at `point` of the unit box."""
         limits = zip(self.lower, self.upper, point, strict=True)
         values = [low + (high - low) * share for low, high, share in limits]
         for place, least, most in self._within(values):
@@ -120,7 +126,7 @@ class Space(eqx.Module):
         return jnp.stack(values)
 
     def point(self, design: Float[Array, " d"]) -> Float[Array, " d"]:
-        """The nearest point of the unit box to a design."""
+        """Return the point of the unit box nearest to a design in config units."""
         values = jnp.clip(design, self.lower, self.upper)
         limits = zip(self.lower, self.upper, values, strict=True)
         shares = [(value - low) / (high - low) for low, high, value in limits]
@@ -129,13 +135,14 @@ class Space(eqx.Module):
         return jnp.clip(jnp.stack(shares), 0.0, 1.0)
 
     def ranges(self, values) -> dict[str, tuple[Float[Array, ""], Float[Array, ""]]]:
-        """(low, high) by key of parameters whose range depends on the other `values` (d,)."""
+        """Return (low, high) by key of parameters whose range depends on other `values` (d,)."""
         radius = self.scene.pitch_radius / MM
         named = dict(zip(self.family.keys, self.family.split(values), strict=True))
         return dict(self.family.dependent(self.scene.lobes, radius, **named))
 
     def _within(self, values):
-        """Place in the design, least and greatest value of these parameters within bounds."""
+        """Yield index in the design, least and greatest value of the parameters in `ranges`, within
+        the bounds."""
         for key, (least, most) in self.ranges(values).items():
             place = self.family.keys.index(key)
             most = jnp.minimum(most, self.upper[place])
@@ -143,26 +150,26 @@ class Space(eqx.Module):
             yield place, least, most
 
     def slacks(self, point: Float[Array, " d"]) -> Float[Array, " m"]:
-        """Scaled slack of every constraint."""
+        """Return the scaled slack of every constraint at `point` of the unit box."""
         return self.slacks_of(self.design(point))
 
     def slacks_of(self, design: Float[Array, " d"]) -> Float[Array, " m"]:
-        """Scaled slack of every constraint at a design in config units."""
+        """Return the scaled slack of every constraint at a design in config units."""
         profile = self.scene.profile(design)
         shape = geometry(profile)
         found = margins(profile) if any(c.margin for c in self.constraints) else None
         return jnp.stack([c.slack(shape, found) for c in self.constraints])
 
     def prepare(self) -> None:
-        """Compile in the background what a search in this space takes."""
-        # Half a second to import, and only needed here.
+        """Compile in the background what a search in this space needs."""
+        # Import in advance: it takes 0.5 s.
         threading.Thread(target=importlib.import_module, args=("scipy.stats.qmc",)).start()
         slacks_and_slopes.prepare(self, jax.ShapeDtypeStruct(self.lower.shape, self.lower.dtype))
 
 
 @Program
 def slacks_and_slopes(space: Space, point):
-    """Design, its Jacobian, slacks of the constraints, and theirs."""
+    """Return design (d,), its Jacobian (d, d), slacks (m,) and their Jacobian (m, d)."""
 
     def both(point):
         values = space.design(point), space.slacks(point)
@@ -180,7 +187,7 @@ def _constraint(
 
 
 def sobol(count: int, seed: int, dimension: int = 3) -> NDArray[np.float64]:
-    """`count` points (n, `dimension`) of a scrambled Sobol sequence in the unit box."""
+    """Return `count` points (count, dimension) of a scrambled Sobol sequence in the unit box."""
     from scipy.stats import qmc
 
     sampler = qmc.Sobol(dimension, rng=np.random.default_rng(seed))

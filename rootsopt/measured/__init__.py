@@ -1,1 +1,1 @@
-"""Import of a measured or foreign outline: reading it, checking it, making a profile of it."""
+"""Import of a drawn or measured outline: read it, check it, make a profile from it."""

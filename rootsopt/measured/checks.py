@@ -1,19 +1,24 @@
-"""What an imported outline departs from: symmetry, axis, conjugacy."""
+"""Deviations of an imported outline from symmetry, from its axis and from its fitted curve."""
 
 import dataclasses
 
 
 @dataclasses.dataclass(frozen=True)
 class Checks:
-    """How an outline was found (lengths in µm unless said otherwise).
+    """Deviations and margins of an imported outline.
 
-    `points` in the file; `turned_deg`: turn that put a lobe on +x; `reversed`: whether it ran
-    clockwise; `axis_offset_um`: distance of its centroid from the origin; `lobe_deviation_um`:
-    greatest normal distance of a flank from the same flank of the mean lobe; `flank_deviation_um`:
-    of the mean trailing flank from the leading one, mirrored; `fit_deviation_um`: RMS distance of
-    the leading flank's points from the curve through them (0: it goes through them);
-    `star_margin_mm`: least distance of a tangent from the axis; `convexity_margin_mm`: least radius
-    of curvature of the addendum.
+    `points`: number of points in the file.
+    `turned_deg`: rotation (°) that put a lobe on +x.
+    `reversed`: whether the points ran clockwise.
+    `axis_offset_um`: distance of the centroid from the origin (µm).
+    `lobe_deviation_um`: greatest normal distance of a flank from the same flank of the mean lobe
+    (µm).
+    `flank_deviation_um`: greatest normal distance of the mean trailing flank, mirrored, from the
+    mean leading one (µm).
+    `fit_deviation_um`: RMS distance of the leading flank's points from the fitted curve (µm); 0 if
+    the curve passes through them.
+    `star_margin_mm`: least distance of a tangent from the axis (mm).
+    `convexity_margin_mm`: least radius of curvature of the addendum (mm).
     """
 
     points: int
@@ -27,5 +32,5 @@ class Checks:
     convexity_margin_mm: float
 
     def record(self) -> dict[str, float | int | bool]:
-        """For the result file."""
+        """Return the fields for the result file."""
         return dataclasses.asdict(self)

@@ -1,4 +1,4 @@
-"""How far the flanks of a profile are from conjugate: the gap that rolling leaves."""
+"""Measures how far the flanks of a profile are from conjugate, by their gap in pure rolling."""
 
 import dataclasses
 
@@ -15,16 +15,17 @@ from rootsopt.runtime.programs import Program
 
 _MICRON = 1e-6
 _POSES = 361
+"""Roll angles at which the gap is measured."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Conjugacy:
-    """Gap of a pair rolling at ε = 0 and the nominal centre distance.
+    """Gap of a pair that rolls at relative rotation ε = 0 and nominal centre distance.
 
-    `roll` (rad): angle of rotor 1 from where its tip passes the line of centres, over a quarter of
-    a lobe pitch (the rest is alike, rotors or flanks having changed places); `gap` (m) of the drive
-    or the coast flanks, whichever is less: negative where they overlap, NaN where no points of the
-    flanks face each other.
+    `roll` (n,): angle (rad) of rotor 1 from where its tip passes the line of centres, over a
+    quarter of a lobe pitch. The rest repeats it with rotors or flanks exchanged.
+    `gap` (n,): gap (m) of the drive or the coast flanks, whichever is less. It is negative where
+    flanks overlap, NaN where no points of the flanks face each other.
     """
 
     roll: Float64[np.ndarray, " n"]
@@ -32,15 +33,19 @@ class Conjugacy:
 
     @property
     def least(self) -> float:
+        """Least gap (m)."""
         return float(np.nanmin(self.gap))
 
     @property
     def most(self) -> float:
+        """Greatest gap (m)."""
         return float(np.nanmax(self.gap))
 
     def record(self) -> dict[str, float]:
-        """For the result file. `interference_um`: greatest overlap; `backlash_um`: twice the least
-        gap, the normal play of the lobe between both of its neighbours."""
+        """Return the gap's statistics for the result file.
+
+        `interference_um`: greatest overlap (µm); `backlash_um`: twice the least gap (µm), which is
+        the normal backlash of a lobe between both of its neighbours."""
         return {
             "mesh_gap_min_um": self.least / _MICRON,
             "mesh_gap_min_at_deg": float(np.degrees(self.roll[np.nanargmin(self.gap)])),
@@ -52,15 +57,16 @@ class Conjugacy:
 
 
 def conjugacy(profile: Profile) -> Conjugacy:
-    """The gap of `profile` through a mesh. Raises `InputError` where the flanks never face each
-    other."""
+    """Return the gap of `profile` through a mesh.
+
+    Raises `InputError` where the flanks never face each other."""
     roll = float(profile.half_pitch) * (np.arange(_POSES) + 0.5) / _POSES
     gap, found = map(np.asarray, _gaps(profile, jnp.asarray(roll)))
     found = found & np.isfinite(gap)
     if not np.any(found):
         raise InputError(
             "`profile.pitch_radius_mm` must be half the centre distance at which the rotors mesh, "
-            "but their flanks do not face each other there; check it and the outline's units"
+            "but their flanks do not face each other there; check this key and the outline's units"
         )
     return Conjugacy(roll, np.where(found, gap, np.nan))
 
@@ -75,5 +81,5 @@ def _gaps(profile, roll):
 
 
 def gaps_um(found: Conjugacy) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Roll angle (deg) and gap (µm), to be drawn."""
+    """Return roll angle (deg) and gap (µm), each (n,), for a figure."""
     return np.degrees(found.roll), found.gap / _MICRON

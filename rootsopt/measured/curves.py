@@ -1,8 +1,8 @@
-"""Smooth curves through the points of a flank, in pieces where its curvature jumps.
+"""Smooth curves through the points of a flank, split into pieces where its curvature jumps.
 
-Points are complex numbers x + iy (mm). The parameter is the length of the polygon plus a share of
-its turning, so that it stays regular where a radius of curvature vanishes (EE at the pitch
-circle); through measured points, whose turning is noise, it is the length alone.
+Points are complex numbers x + iy (mm). The parameter combines the polygon's length with its
+turning, so that it stays regular where a radius of curvature vanishes (EE at the pitch circle).
+For measured points, whose turning is noise, the parameter is the length alone.
 """
 
 import dataclasses
@@ -17,38 +17,43 @@ from rootsopt.errors import InputError
 from rootsopt.measured.guard import guarded
 
 _TURNING = 0.3
-"""Length that a turn of 1 rad counts as much as, in pitch radii."""
+"""Length (pitch radii) that weighs as much in the parameter as a turn of 1 rad."""
 _JUMP, _ABOVE = 0.02, 20.0
-"""A jump of curvature is one of at least so much of it, and so many times its usual change from
-point to point around there."""
+"""Change of curvature above which it is a jump: as a fraction of the curvature, and as a multiple
+of the median change at the points around it. Both must be exceeded."""
 _BESIDE, _AROUND = 3, 12
-"""Points on either side that a joint shows at, and among which its surroundings are."""
+"""Points on each side that a joint affects; points on each side from which the median is taken."""
 _WINDING = 7.0
-"""Sum of the angles (rad) between the steps along a flank past which its points are scattered."""
+"""Sum of the turns (rad) between successive steps along a flank above which its points are rejected
+as scattered."""
 _SHORTEST = 4
-"""Intervals of a piece, at least."""
+"""Least number of intervals of a piece."""
 _MOST_KNOTS, _NO_ROOM = 500, 1
-"""Number of knots above which a smoothing spline follows the noise, and FITPACK's word for it."""
+"""Number of knots above which a smoothing spline follows the noise; FITPACK's flag for reaching it.
+"""
 _KEY = "`profile.outline_file`"
 _UNEVEN = "remove points that are much closer together than others"
 _CUSP, _SPARED = 2e-2, 2
-"""Speed at the end of a piece, relative to its mean, below which it is a cusp, and knots next to it
-that are spared, as is what lies before the curve has that speed."""
+"""Speed at the end of a piece (fraction of its mean) below which the end is a cusp; number of knot
+intervals next to a cusp that are not sampled. The curve is not sampled either up to where it
+reaches that speed."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MeasuredCurve:
-    """A curve z(t) in `pieces` that follow each other, each from the `ends` to the next."""
+    """A curve z(t) (mm) of successive spline pieces.
+
+    `ends` (k,): parameters of the pieces' ends; `pieces`: k - 1 splines, one between two ends."""
 
     ends: Float64[np.ndarray, " k"]
     pieces: tuple[BSpline, ...]
 
     def derivatives(self, t: NDArray[np.float64], place: int) -> NDArray[np.complex128]:
-        """z, z′, z″, z‴ (4, n) on a piece."""
+        """Return z, z′, z″, z‴ (4, n) on the piece with index `place`."""
         return np.stack([self.pieces[place](t, order) for order in range(4)])
 
     def __call__(self, t: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """z, z′, z″, z‴ (4, n) at any t."""
+        """Return z, z′, z″, z‴ (4, n) at any t."""
         place = np.clip(np.searchsorted(self.ends, t, side="right") - 1, 0, len(self.pieces) - 1)
         found = np.empty((4, len(t)), complex)
         for k in map(int, np.unique(place)):
@@ -56,7 +61,7 @@ class MeasuredCurve:
         return found
 
     def between(self, start: float, stop: float) -> list[tuple[int, float, float]]:
-        """The pieces that meet (start, stop), with the part of each inside."""
+        """Return the index of each piece inside (start, stop), with the part of it inside."""
         parts = []
         for k, (low, high) in enumerate(zip(self.ends[:-1], self.ends[1:], strict=True)):
             low, high = max(low, start), min(high, stop)
@@ -67,8 +72,10 @@ class MeasuredCurve:
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """A curve at some places, travelled from the tip towards the root: point `z` (mm), unit
-    tangent, `speed` |z′|, `turning` (rad per parameter)."""
+    """Points of a curve with direction, from the tip towards the root.
+
+    `z` (n,): points (mm); `tangent` (n,): unit tangents; `speed` (n,): |z′| (mm per parameter);
+    `turning` (n,): turn of the tangent (rad per parameter)."""
 
     z: NDArray[np.complex128]
     tangent: NDArray[np.complex128]
@@ -84,10 +91,10 @@ class Frame:
 def stretch(
     curve: MeasuredCurve, place: int, low: float, high: float, count: int
 ) -> tuple[NDArray[np.float64], Frame]:
-    """`count` places from `low` to `high` on a piece, and the curve there.
+    """Return `count` parameters from `low` to `high` on a piece, and the curve there.
 
-    At a cusp, where z′ vanishes, the last intervals of the points say little of it; there is no
-    place between them, and tangent and turning are continued from before.
+    At a cusp, where z′ vanishes, the points of the last intervals hardly determine the curve. These
+    intervals are not sampled, and tangent and turning are extrapolated to the cusp.
     """
     ends = np.array([low, high])
     speed = np.abs(curve.derivatives(np.linspace(low, high, count), place)[1])
@@ -118,10 +125,10 @@ def through(
     pitch_radius: float,
     smoothing: float,
 ) -> MeasuredCurve:
-    """The curve through `points`, or at an RMS distance `smoothing` (mm) from them.
+    """Return the curve through `points`, or at an RMS distance `smoothing` (mm) from them.
 
-    Without smoothing it is a quintic spline between `joints` and between places where the
-    points' own curvature jumps. Raises `InputError` for too few points.
+    Without smoothing it is a quintic spline between `joints`, and between points where the
+    polygon's own curvature jumps. Raises `InputError` where points are too few or scattered.
     """
     if len(points) < 8:
         raise InputError(
@@ -131,8 +138,8 @@ def through(
     if smoothing == 0 and turned > _WINDING:
         raise InputError(
             "`profile.outline_smoothing_mm` must be the scatter (RMS) of the points, but is 0: "
-            f"from point to point a flank turns by {turned:.3g} rad in all, a smooth one by 4; "
-            "set it"
+            f"from point to point a flank turns by {turned:.3g} rad in total, a smooth one by 4; "
+            "set this key"
         )
     if smoothing > 0:
         return _smoothed(points, smoothing)
@@ -154,12 +161,12 @@ def through(
 
 
 def _smoothed(points: NDArray[np.complex128], smoothing: float) -> MeasuredCurve:
-    """The smoothest spline at an RMS distance `smoothing` from the points."""
+    """Return the smoothest spline at an RMS distance `smoothing` (mm) from the points."""
     t = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points)))])
     sides = [np.real(points), np.imag(points)]
     squares = len(points) * smoothing**2
     with guarded(_KEY, "its points cannot be smoothed", "check `profile.outline_smoothing_mm`"):
-        # FITPACK's own takes a hundredth of the time to find out that there are too many knots.
+        # `splprep` detects too many knots in a hundredth of the time that `make_splprep` needs.
         *_, flag, _ = splprep(
             sides, u=t, k=5, s=squares, nest=_MOST_KNOTS, full_output=True, quiet=True
         )
@@ -176,9 +183,11 @@ def _smoothed(points: NDArray[np.complex128], smoothing: float) -> MeasuredCurve
 
 
 def _parameter(points: NDArray[np.complex128], weight: float) -> NDArray[np.float64]:
-    """Parameters of the points of a smooth piece, from 0, a turn of 1 rad being of `weight`."""
+    """Return parameters (n,) of the points of a smooth piece, from 0.
+
+    `weight`: length (mm) that weighs as much as a turn of 1 rad."""
     bend, lengths = _curvature(points)
-    # Beyond an end, where the next piece turns otherwise, as before it.
+    # Extrapolate the curvature to the ends, as the next piece turns differently.
     first, last = 2 * bend[0] - bend[1], 2 * bend[-1] - bend[-2]
     bend = np.concatenate([[first], bend, [last]])
     mean = weight * (bend[1:] + bend[:-1]) / 2
@@ -186,24 +195,24 @@ def _parameter(points: NDArray[np.complex128], weight: float) -> NDArray[np.floa
 
 
 def _curvature(points: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Curvature of a polygon at its inner corners, and the lengths of its sides."""
+    """Return a polygon's curvature (1/mm) at its inner corners, and its side lengths (mm)."""
     steps = np.diff(points)
     lengths = np.abs(steps)
     return 2 * np.angle(steps[1:] / steps[:-1]) / (lengths[1:] + lengths[:-1]), lengths
 
 
 def _jumps(points: NDArray[np.complex128]) -> NDArray[np.bool_]:
-    """Where curvature jumps, at a point or near it."""
+    """Return a mask (n,) of the points at or near which the curvature jumps."""
     found = np.zeros(len(points), bool)
     if len(points) < 2 * _AROUND:
         return found
-    # Entry i is that of point i + 1.
+    # Entry i belongs to point i + 1.
     curvature, _ = _curvature(points)
     before, after = (
         2 * curvature[1:-3] - curvature[:-4],
         2 * curvature[3:-1] - curvature[4:],
     )
-    # Entry i is that of point i + 3.
+    # Entry i belongs to point i + 3.
     jump = np.abs(before - after)
     size = np.abs(curvature[1:-3]) + np.abs(curvature[3:-1])
     # At a cusp between convex and concave, curvature grows without bound on both sides.

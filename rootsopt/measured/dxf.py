@@ -1,4 +1,4 @@
-"""Outlines from DXF drawings, text or binary: entities out of the file, points on them."""
+"""Reads outlines from DXF drawings, text or binary: their entities, and points on these."""
 
 import io
 from collections import Counter
@@ -12,26 +12,26 @@ from rootsopt.measured.guard import each, guarded, short, silenced
 from rootsopt.measured.joining import joined
 from rootsopt.measured.loop import Loop
 
-with silenced():  # It announces itself in the log.
+with silenced():  # Importing ezdxf writes to its log.
     from ezdxf import recover
     from ezdxf.document import Drawing
     from ezdxf.lldxf import types
     from ezdxf.lldxf.tagger import binary_tags_loader
 
 _SPACING = 1 / 400
-"""Distance between points on arcs and splines, relative to the drawing's size."""
+"""Distance between points on arcs and splines, as a fraction of the drawing's size."""
 _LAYER = "OUTLINE"
 _KINDS = ("LINE", "ARC", "SPLINE", "ELLIPSE", "LWPOLYLINE", "POLYLINE")
 _CURVES = ("LINE", "ARC", "SPLINE", "ELLIPSE")
 _PARTS = ("VERTEX", "INSERT")
 _ENTITIES = 100_000
-"""Number of entities (vertices of a POLYLINE counted) above which a drawing is refused."""
+"""Number of entities (vertices of a POLYLINE included) above which a drawing is rejected."""
 _POINTS = 500_000
-"""Number of points on all entities above which a drawing is refused."""
+"""Number of points on all entities above which a drawing is rejected."""
 _DEEPEST = 8
-"""Depth of blocks in blocks above which a drawing is refused."""
+"""Depth of nested blocks above which a drawing is rejected."""
 _LARGEST = 1e9
-"""Size of a number in an entity (drawing units) above which it is damaged."""
+"""Magnitude of a number in an entity (drawing units) above which it is rejected as damaged."""
 _BINARY = b"AutoCAD Binary DXF\r\n\x1a\x00"
 _NOT = "is not a DXF file that can be read"
 _AGAIN = "export it again (DXF R2000 or newer) or save the outline as CSV"
@@ -60,11 +60,13 @@ _UNITS = {
     23: 3 * _SURVEY_FOOT,
     24: 5280 * _SURVEY_FOOT,
 }
-"""Length (mm) of each unit that $INSUNITS may name; astronomical ones (17 to 20) are refused."""
+"""Length (mm) of each unit that $INSUNITS may name; astronomical units (17 to 20) are rejected."""
 
 
 def from_dxf(data: bytes, name: str) -> Loop:
-    """The closed loop of the largest area in a drawing. Raises `InputError`."""
+    """Return the closed loop of the largest area in a drawing; `name` names it in messages.
+
+    Raises `InputError` where the drawing cannot be read or holds no such loop."""
     binary = data.startswith(_BINARY)
     counted = _check_tags(data, binary, name)
     with guarded(name, _NOT, _AGAIN):
@@ -78,11 +80,11 @@ def from_dxf(data: bytes, name: str) -> Loop:
         reasons = [str(fix.message) for fix in auditor.fixes]
     for kind in _CURVES:
         if kept[kind] < counted[kind]:
-            # The library has taken them out: what is left may be another outline.
+            # The library has removed entities, so the rest may be another outline.
             reason = next((text for text in reasons if kind in text), "damaged")
             raise InputError(
-                f"{name}: {counted[kind] - kept[kind]} of {counted[kind]} {kind} make no sense "
-                f"({short(reason, 100)}); mend or remove them in the drawing"
+                f"{name}: {counted[kind] - kept[kind]} of {counted[kind]} {kind} are not valid "
+                f"({short(reason, 100)}); repair or remove them in the drawing"
             )
     scale = _UNITS.get(unit) if isinstance(unit, int) else None
     if scale is None:
@@ -116,10 +118,11 @@ def from_dxf(data: bytes, name: str) -> Loop:
 
 
 def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
-    """Number of entities of each kind. Raises `InputError` unless the file is whole and the numbers
-    of its entities are sound.
+    """Return the number of entities of each kind.
 
-    The library reads "1,5" as 1, and a number that the end of the file cut off as what is left.
+    Raises `InputError` unless the file is complete and the numbers of its entities are valid. This
+    check is needed because the library reads "1,5" as 1, and accepts a number cut off by the end of
+    the file.
     """
     tags = binary_tags_loader(data) if binary else recover.bytes_loader(io.BytesIO(data))
     counted: Counter[str] = Counter()
@@ -142,7 +145,7 @@ def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
                 where = f"tag {number}" if binary else f"line {2 * number}"
                 raise InputError(
                     f"{name}, {where}: a number of {kind} must be finite and at most "
-                    f"{_LARGEST:g}, but is {short(_raw(value).decode('latin-1'))!r}; mend or "
+                    f"{_LARGEST:g}, but is {short(_raw(value).decode('latin-1'))!r}; repair or "
                     "remove the entity, or export the drawing again"
                 )
     count = sum(counted[kind] for kind in (*_KINDS, *_PARTS))
@@ -153,7 +156,7 @@ def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
         )
     if not ended:
         raise InputError(
-            f"{name}: must end with the mark EOF of a whole drawing, but does not; {_AGAIN}"
+            f"{name}: must end with the mark EOF of a complete drawing, but does not; {_AGAIN}"
         )
     return counted
 
@@ -163,8 +166,9 @@ def _raw(value: Any) -> bytes:
 
 
 def _chosen(document: Drawing, name: str) -> list[Any]:
-    """Entities that may be the outline: those on its layer, else those drawn directly, else those
-    of blocks."""
+    """Return the entities that may be the outline.
+
+    These are the ones on the layer OUTLINE, else those drawn directly, else those in blocks."""
     with guarded(name, _NOT, _AGAIN):
         everything = list(document.modelspace())
     direct = [e for e in everything if e.dxftype() in _KINDS]
@@ -192,7 +196,7 @@ def _on_layer(entities: list[Any], name: str) -> list[Any]:
 
 
 def _exploded(inserts: list[Any], name: str) -> list[Any]:
-    """The entities of blocks where they are inserted, and of blocks in those."""
+    """Return the entities of inserted blocks, nested ones included, at their place."""
     found: list[Any] = []
     stack = [(insert, 1) for insert in reversed(inserts)]
     handled = 0
@@ -201,26 +205,26 @@ def _exploded(inserts: list[Any], name: str) -> list[Any]:
         if entity.dxftype() in _KINDS:
             raise InputError(
                 f"{name}: {entity.dxftype()} in a block cannot be placed: {short(reason)}; "
-                "dissolve the blocks in the drawing"
+                "explode the blocks in the drawing"
             )
 
     while stack:
         insert, depth = stack.pop()
-        with guarded(name, "holds a block that cannot be read", "dissolve the blocks"):
+        with guarded(name, "holds a block that cannot be read", "explode the blocks"):
             repeated = insert.mcount
             own = []
             if depth <= _DEEPEST and repeated == 1:
                 own = list(insert.virtual_entities(skipped_entity_callback=skipped))
             layer = insert.dxf.layer
             for entity in own:
-                if entity.dxf.layer == "0":  # By the rules of CAD it takes that of the insert.
+                if entity.dxf.layer == "0":  # In CAD, layer 0 means the insert's own.
                     entity.dxf.layer = layer
         handled += 1 + len(own)
         if depth > _DEEPEST or repeated != 1 or handled > _ENTITIES:
             raise InputError(
-                f"{name}: blocks must be inserted singly, at most {_DEEPEST} in each other, with "
-                f"at most {_ENTITIES} entities in all, but these are not; dissolve the blocks in "
-                "the drawing"
+                f"{name}: blocks must be inserted singly, nested at most {_DEEPEST} deep, with at "
+                f"most {_ENTITIES} entities in total, but these are not; explode the blocks in the "
+                "drawing"
             )
         found += [e for e in own if e.dxftype() in _KINDS]
         stack += [(e, depth + 1) for e in reversed(own) if e.dxftype() == "INSERT"]

@@ -1,7 +1,7 @@
 """Points on the entities of a drawing (mm, as x + iy).
 
 An entity is a chain of segments: corners joined by straight lines, arcs, ellipses, splines. Each
-tells how many intervals it needs before it is sampled, so that no array is made without a bound.
+segment gives its number of intervals before it is sampled, so that every array has a bounded size.
 """
 
 import abc
@@ -19,42 +19,42 @@ from rootsopt.measured.guard import guarded, short
 from rootsopt.measured.loop import Loop
 
 _FEWEST = 24
-"""Intervals of an arc or spline, at least."""
+"""Least number of intervals of an arc or spline."""
 _MOST = 100_000
-"""Intervals of an arc or spline, at most."""
+"""Greatest number of intervals of an arc or spline."""
 _PER_SPAN = 4
-"""Intervals between two knots of a spline, at least."""
+"""Least number of intervals between two knots of a spline."""
 _DEGREES = 25
-"""Degree above which a spline is refused."""
+"""Degree above which a spline is rejected."""
 _FITTED = 5_000
-"""Points of a spline through points, at most."""
+"""Number of fit points above which a spline without control points is rejected."""
 _SAME_KNOT = 1e-9
-"""Difference of knots, relative to their range, below which they are one."""
+"""Difference of knots (fraction of their range) below which they are one knot."""
 _FULL = 1e-9
-"""Sweep (rad) of an ellipse below which it is a full one."""
+"""Sweep (rad) of an ellipse below which it is a full ellipse."""
 _STRAIGHT = 1e-12
 """Bulge below which a side of a polyline is straight."""
 _FRAME = 16
-"""Flag of a vertex that only guides a polyline which CAD has fitted."""
+"""Flag of a control vertex of a spline-fitted polyline; it is not on the curve."""
 _TILT = 1e-6
-"""Tilt (rad) of an entity's plane above which it does not lie in that of the drawing."""
+"""Tilt (rad) of an entity's plane against the drawing's above which the entity is rejected."""
 
 
 class Stroke(abc.ABC):
-    """Part of an entity."""
+    """One segment of an entity."""
 
     curved: bool
     """Whether its ends are joints."""
     least: int
-    """The fewest intervals that show its extent."""
+    """Least number of intervals from which its extent can be measured."""
 
     @abc.abstractmethod
     def intervals(self, spacing: float) -> int:
-        """Number of intervals for a distance of points (mm)."""
+        """Return the number of intervals for points at a distance of `spacing` (mm)."""
 
     @abc.abstractmethod
     def points(self, count: int) -> NDArray[np.complex128]:
-        """Points from end to end, at least `count` + 1 on a curve."""
+        """Return points (mm) from end to end, at least `count` + 1 on a curve."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +76,7 @@ class _Corners(Stroke):
 
 @dataclasses.dataclass(frozen=True)
 class _Ellipse(Stroke):
-    """center + major cos t + minor sin t for t from start over sweep; an arc is one, too."""
+    """Elliptic or circular arc: center + major cos t + minor sin t for t from start over sweep."""
 
     center: complex
     major: complex
@@ -96,7 +96,7 @@ class _Ellipse(Stroke):
 
 @dataclasses.dataclass(frozen=True)
 class _Spline(Stroke):
-    """A spline in homogeneous coordinates (x, y, weight), evenly divided between its knots."""
+    """A spline in homogeneous coordinates (x, y, weight), sampled evenly between its knots."""
 
     curve: BSpline
     knots: NDArray[np.float64]
@@ -122,7 +122,7 @@ def _bounded(count: float) -> int:
 
 
 def chain(parts: list[Stroke], spacing: float) -> Loop:
-    """Points of the segments of one entity; the ends of its curves are joints."""
+    """Return points on the segments of one entity; the ends of its curves are joints."""
     points, joints = [], []
     for segment in parts:
         own = segment.points(segment.intervals(spacing))
@@ -138,7 +138,10 @@ def chain(parts: list[Stroke], spacing: float) -> Loop:
 
 @dataclasses.dataclass(frozen=True)
 class Entity:
-    """What a drawing says of an entity: `data` for its maker; `normal` of its plane."""
+    """An entity as a drawing states it.
+
+    `kind`: its DXF type; `what`: its name in messages; `normal`: normal of its plane; `data`:
+    arguments of the function that makes its segments."""
 
     kind: str
     what: str
@@ -147,18 +150,18 @@ class Entity:
 
     @classmethod
     def of(cls, entity: Any, name: str) -> "Entity":
-        """From the library's object. Raises `InputError`."""
+        """Build the entity from the library's object; raises `InputError` if it is unreadable."""
         kind = entity.dxftype()
-        with guarded(name, f"{kind} cannot be read", "mend or remove it in the drawing"):
+        with guarded(name, f"{kind} cannot be read", "repair or remove it in the drawing"):
             handle = short(entity.dxf.handle or "unknown", 20)
             normal = tuple(float(x) for x in entity.dxf.get("extrusion", (0, 0, 1)))
             data = _KINDS[kind][0](entity)
         return cls(kind, f"{name}: {kind} (handle {handle})", normal, data)
 
     def segments(self, scale: float) -> list[Stroke]:
-        """Its segments, `scale` mm for a drawing unit; none if it has no extent.
+        """Return its segments, with `scale` mm per drawing unit; none if it has no extent.
 
-        Raises `InputError` for an entity that makes no sense.
+        Raises `InputError` for an entity that is not valid.
         """
         fault, across = _Fault(self.what), abs(self.normal[2])
         if self.kind not in _SPATIAL and math.hypot(*self.normal[:2]) > _TILT * across:
@@ -173,32 +176,33 @@ class Entity:
 
 @dataclasses.dataclass(frozen=True)
 class _Plane:
-    """Where an entity lies: `scale` mm for a drawing unit, seen from above or `below`."""
+    """An entity's plane: `scale` mm per drawing unit, seen from above or from `below`."""
 
     scale: float
     below: bool
 
     def __call__(self, z: Any) -> Any:
-        """A point or vector of the entity's own plane in that of the drawing: x, y stand for -x, y
-        if it is seen from below, as CAD leaves what was mirrored."""
+        """Convert a point or vector from the entity's plane to the drawing's (mm).
+
+        In a plane seen from below, which CAD uses for mirrored entities, x and y mean -x and y."""
         return self.scale * (-np.conj(z) if self.below else z)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Fault:
-    """Makes the errors of an entity."""
+    """Makes the error messages of an entity, named `what`."""
 
     what: str
 
     def __call__(self, must: str, but: str) -> InputError:
         return InputError(
-            f"{self.what} must {must}, but {but}; mend or remove it in the drawing, or draw the "
+            f"{self.what} must {must}, but {but}; repair or remove it in the drawing, or draw the "
             "outline alone on a layer OUTLINE"
         )
 
 
 def _plain(points: Iterable[Any]) -> NDArray[np.complex128]:
-    """Points of the library, without their z."""
+    """Return the library's points as x + iy, without z."""
     rows = np.array([(p[0], p[1]) for p in points], float).reshape(-1, 2)
     return rows[:, 0] + 1j * rows[:, 1]
 
@@ -271,7 +275,7 @@ def _spline(controls, degree, knots, weights, plane, fault) -> list[Stroke]:
         raise fault(f"have {count} weights above 0 or none", "has others")
     if np.any(np.diff(knots) < 0):
         raise fault("have knots in rising order", "has not")
-    # Knots that only rounding has parted are one.
+    # Knots that differ by rounding only are one knot.
     first = np.append(0, np.cumsum(np.diff(knots) > _SAME_KNOT * np.ptp(knots)))
     knots = knots[np.unique(first, return_index=True)[1]][first]
     domain = knots[degree : count + 1]
@@ -290,7 +294,7 @@ def _read_polyline(entity: Any):
         return _plain(rows), _floats(row[2] for row in rows), bool(entity.closed), False
     if not (entity.is_2d_polyline or entity.is_3d_polyline):
         return _plain([]), _floats([]), False, False  # A mesh.
-    # The frame of a polyline that CAD has fitted is not drawn.
+    # Control vertices of a spline-fitted polyline are not on the curve.
     vertices = [v for v in entity.vertices if not int(v.dxf.flags) & _FRAME]
     flat = bool(entity.is_2d_polyline)
     bulges = _floats(v.dxf.get("bulge", 0.0) if flat else 0.0 for v in vertices)
@@ -299,7 +303,7 @@ def _read_polyline(entity: Any):
 
 
 def _polyline(corners, bulges, closed, spatial, plane, fault) -> list[Stroke]:
-    """Straight runs and arcs; a bulge is the tangent of a quarter of an arc's angle."""
+    """Return straight runs and arcs; a bulge is the tangent of a quarter of an arc's angle."""
     del fault
     corners = plane.scale * corners if spatial else plane(corners)
     bulges = -bulges if plane.below and not spatial else bulges
@@ -321,7 +325,7 @@ def _polyline(corners, bulges, closed, spatial, plane, fault) -> list[Stroke]:
 
 
 _SPATIAL = ("LINE", "SPLINE")
-"""Kinds whose plane does not matter."""
+"""Kinds whose plane is ignored."""
 _KINDS = {
     "LINE": (_read_line, _line),
     "ARC": (_read_arc, _arc),
@@ -330,4 +334,5 @@ _KINDS = {
     "LWPOLYLINE": (_read_polyline, _polyline),
     "POLYLINE": (_read_polyline, _polyline),
 }
-"""What reads an entity, inside the guard, and what makes segments of it."""
+"""Per kind: the function that reads an entity's data, called inside the guard, and the function
+that makes segments from it."""

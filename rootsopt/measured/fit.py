@@ -1,4 +1,4 @@
-"""A profile from the loop of an outline."""
+"""Makes a profile from the closed loop of an outline."""
 
 import dataclasses
 
@@ -16,24 +16,25 @@ from rootsopt.profiles.outline import Outline, Table
 
 _MM = 1e-3
 NODES = 1536
-"""Nodes of either table, so that one compiled program serves all outlines."""
+"""Nodes of each table. The number is fixed, so that one compiled program serves all outlines."""
 _PIECES = NODES // 4
-"""Smooth pieces of an addendum or dedendum, at most."""
+"""Number of smooth pieces of an addendum or dedendum above which an outline is rejected."""
 _BEYOND = 0.3
-"""Share of a flank by which its points go on beyond tip and root."""
+"""Polar angle by which a flank's points extend beyond tip and root (fraction of the flank's)."""
 _SHARES = 400
-"""Places at which flanks are compared."""
+"""Points at which flanks are compared."""
 _FOLD = 1e-3
-"""Angle (rad) that the outline may turn back, seen from the axis: noise and rounding."""
+"""Angle (rad), seen from the axis, above which an outline that turns back is rejected. Less is
+noise and rounding."""
 _OFF = 0.02
-"""Deviation of flanks from each other, in pitch radii, past which they are not those of one
-rotor."""
+"""Deviation between flanks (pitch radii) above which they are not those of one rotor."""
 _LAND = 1e-3, 0.5 * np.pi / 180
-"""A land's normals miss the axis by less than the first (pitch radii) over more than the second."""
+"""A land's normals miss the axis by less than the first number (pitch radii). They do so over an
+angle of more than the second (rad)."""
 _CORNER = 1e-2
-"""Angle (rad) at a joint from which on it is a corner."""
+"""Angle (rad) at a joint above which it is a corner."""
 _AT = 1e-6
-"""Distance (pitch radii) from the pitch circle within which a joint is on it."""
+"""Distance (pitch radii) from the pitch circle below which a joint is on it."""
 _FAR = 1e3
 """Ratio of an outline's greatest radius to the pitch radius above which units are wrong."""
 _GAUSS = np.polynomial.legendre.leggauss(12)
@@ -41,8 +42,10 @@ _GAUSS = np.polynomial.legendre.leggauss(12)
 
 @dataclasses.dataclass(frozen=True)
 class _Flank:
-    """A flank in its own lobe's frame, tip on +x, mirrored if it is a trailing one: its curve, and
-    where (parameter) it passes tip, pitch circle and root; `off`: RMS distance of the points."""
+    """A flank in its own lobe's frame, tip on +x, mirrored if it is a trailing one.
+
+    `curve`: its curve; `tip`, `pitch`, `root`: parameters at tip, pitch circle and root; `off`: RMS
+    distance of the points from the curve (mm)."""
 
     curve: MeasuredCurve
     tip: float
@@ -51,28 +54,29 @@ class _Flank:
     off: float
 
     def at(self, share: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """z, z′, z″, z‴ (4, n) at shares 0 to 1 of the parameter from tip to root."""
+        """Return z, z′, z″, z‴ (4, n) at fractions 0 to 1 of the parameter from tip to root."""
         return self.curve(self.tip + (self.root - self.tip) * share)
 
 
 def imported(
     loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: float
 ) -> tuple[Outline, Checks]:
-    """The profile of an outline, and what was found of it.
+    """Return the profile of an outline, and its deviations.
 
-    It is made of one flank, the leading one of the lobe next to +x (rotors turning
-    counter-clockwise); the others are compared with it. The loop is run through counter-clockwise
-    and turned until a lobe's axis, the phase of its N-th moment ∬ z^N dA, is on +x.
+    The profile is made from one flank: the leading one of the lobe next to +x, for a rotor that
+    turns counter-clockwise. The other flanks are compared with it. The loop is first made
+    counter-clockwise and turned until a lobe's axis is on +x. The phase of the N-th moment
+    ∬ z^N dA gives that axis.
 
-    Raises `InputError` where there is no rotor of so many lobes in the file, or none that can be
-    simulated.
+    Raises `InputError` where the loop does not have this number of lobes, or where such a rotor
+    cannot be simulated.
     """
     if smoothing_mm > _OFF * pitch_radius_mm:
         raise InputError(
             "`profile.outline_smoothing_mm` must be the scatter (RMS) of the points in mm, at most "
             f"{_OFF:g} of the pitch radius, but is {smoothing_mm:g}; lower it"
         )
-    # What overflows or divides by zero all the same is found in the outcome.
+    # Overflow and division by zero are detected in the result.
     with np.errstate(all="ignore"):
         outline, checks = _imported(loop, lobes, pitch_radius_mm, smoothing_mm)
     found = [*jax.tree.leaves(outline), *checks.record().values()]
@@ -103,7 +107,7 @@ def _imported(loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: floa
         raise InputError(
             f"`profile.outline_file` must hold a rotor of {lobes} equal lobes with equal flanks, "
             f"but they differ by up to {worst:.4g} mm (lobes {lobe_off:.4g}, flanks "
-            f"{flank_off:.4g}); only rotors of symmetrical lobes are known here, with the axis at "
+            f"{flank_off:.4g}); only rotors of symmetrical lobes are supported, with the axis at "
             "the origin"
         )
     outline, star, convexity = _outline(own, lobes, pitch_radius_mm)
@@ -125,26 +129,26 @@ def _imported(loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: floa
 def _check_lobes(points, lobes, radius):
     away = InputError(
         "`profile.outline_file` must hold an outline around the rotor's axis, the origin, but "
-        "it does not go round it once; move it there"
+        "it does not go round the origin once; move the outline there"
     )
     least, most = np.min(np.abs(points)), np.max(np.abs(points))
     if not radius / _FAR < most < radius * _FAR:
         raise InputError(
             f"`profile.pitch_radius_mm` = {radius:g} must fit the outline, but the outline's "
-            f"greatest radius is {most:.5g} mm; mend the key or the file's units"
+            f"greatest radius is {most:.5g} mm; correct the key or the file's units"
         )
     if not least > most / _FAR**2:
         raise away
     around = np.angle(np.roll(points, -1) / points)
     if round(np.sum(around) / (2 * np.pi)) != 1:
         raise away
-    # Noise may turn back and go on: what counts is how far behind the farthest it comes.
+    # Noise may turn back a little. Measure how far the angle falls behind its maximum so far.
     angle = np.cumsum(around)
     back = np.max(np.maximum.accumulate(angle) - angle)
     if back > _FOLD:
         raise InputError(
             "`profile.outline_file` must hold an outline that does not fold back, seen from the "
-            f"axis, but it does, by {np.degrees(back):.3g} deg; only such rotors are known here"
+            f"axis, but it does, by {np.degrees(back):.3g} deg; other rotors are not supported"
         )
     inside = np.abs(points) < radius
     crossings = int(np.sum(inside != np.roll(inside, 1)))
@@ -153,12 +157,12 @@ def _check_lobes(points, lobes, radius):
             f"`profile.lobes` = {lobes} and `profile.pitch_radius_mm` = {radius:g} must fit the "
             f"outline: it crosses the pitch circle {crossings} times, and {lobes} lobes do so "
             f"{2 * lobes} times (its radii: {np.min(np.abs(points)):.5g} to "
-            f"{np.max(np.abs(points)):.5g} mm); mend the key that is wrong, or the file's units"
+            f"{np.max(np.abs(points)):.5g} mm); correct the wrong key, or the file's units"
         )
 
 
 def _moment(points, order):
-    """∬ z^order dA of a polygon, exact: by Green's theorem ∮ z̄ z^order dz / 2i."""
+    """Return ∬ z^order dA of a polygon, exact: by Green's theorem ∮ z̄ z^order dz / 2i."""
     start, step = points, np.roll(points, -1) - points
     nodes, weights = np.polynomial.legendre.leggauss(order // 2 + 2)
     z = start[:, None] + step[:, None] * (1 + nodes) / 2
@@ -166,12 +170,14 @@ def _moment(points, order):
 
 
 def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
-    """The leading (`side` 1) or trailing flank of a lobe, smoothed with those beside it."""
+    """Return the leading (`side` 1) or trailing (-1) flank of a lobe.
+
+    Its curve also takes in points beyond tip and root, where the neighbouring flanks start."""
     local = points * np.exp(-2j * np.pi * lobe / lobes)
     if side < 0:
         local, joints = np.conj(local)[::-1], joints[::-1]
     half = np.pi / lobes
-    # Opposite the flank, the loop can be opened.
+    # Open the loop opposite the flank.
     angle = np.angle(local * np.exp(-0.5j * half))
     start = np.argmin(angle)
     local, joints, angle = (np.roll(x, -start) for x in (local, joints, angle + half / 2))
@@ -210,7 +216,7 @@ def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
         np.where(inside, np.abs(z) - radius, np.where(scan <= tip, 1.0, -1.0)),
         lambda t: abs(point(t)) - radius,
     )
-    # At a cusp on the pitch circle (EE) the radius hardly tells where it is.
+    # At a cusp on the pitch circle (EE) the radius hardly determines the parameter.
     near = curve.ends[np.abs(np.abs(curve(curve.ends)[0]) - radius) < _AT * radius]
     pitch = next((float(t) for t in near if tip < t < end), pitch)
     if not tip < pitch < end:
@@ -223,12 +229,12 @@ def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
 
 
 def _distances(flank: _Flank, own: _Flank) -> NDArray[np.float64]:
-    """Normal distance (mm, positive outside) of a flank from another at places along it."""
+    """Return the normal distance (mm, positive outside) of a flank from `own` along it."""
     share = np.linspace(0.0, 1.0, _SHARES)
     place = flank.at(share)[0]
     for _ in range(4):
         z, slope = own.at(share)[:2]
-        # The foot of the perpendicular; the curve has no speed at a cusp.
+        # Find the foot of the perpendicular. The speed is 0 at a cusp, so it has a floor.
         speed = np.maximum(np.abs(slope), 1e-3 * np.mean(np.abs(slope)))
         step = np.real((place - z) * np.conj(slope)) / speed**2 / (own.root - own.tip)
         share = np.clip(share + np.clip(step, -0.01, 0.01), 0.0, 1.0)
@@ -238,13 +244,14 @@ def _distances(flank: _Flank, own: _Flank) -> NDArray[np.float64]:
 
 
 def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray[np.float64], Frame]]:
-    """`NODES` places from `start` to `stop`, each joint twice, in their pieces."""
+    """Return `NODES` parameters from `start` to `stop` by piece, each joint twice, with the curve
+    there."""
     parts = flank.curve.between(start, stop)
     if len(parts) > _PIECES:
         raise InputError(
             f"`profile.outline_file` must have flanks of at most {_PIECES} smooth pieces, but one "
             f"has {len(parts)}; if the points are measured, set `profile.outline_smoothing_mm` to "
-            "their scatter, else draw the flank with longer arcs or one spline"
+            "their scatter, otherwise draw the flank with longer arcs or one spline"
         )
     lengths = np.array([high - low for _, low, high in parts])
     counts = 2 + np.floor((NODES - 2 * len(parts)) * lengths / lengths.sum()).astype(int)
@@ -256,7 +263,7 @@ def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray[np.
 
 
 def _outline(flank: _Flank, lobes: int, radius: float) -> tuple[Outline, float, float]:
-    """The profile of a flank, its star margin and that of convexity (mm)."""
+    """Return the profile of a flank, its star margin and its convexity margin (mm)."""
     upper = _stretch(flank, flank.tip, flank.pitch)
     lower = _stretch(flank, flank.pitch, flank.root)
     t, z, direction, speed, turning = (
@@ -315,8 +322,9 @@ def _row(part: tuple[NDArray[np.float64], Frame]) -> tuple[NDArray, ...]:
 
 
 def _agreed(t: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Directions of the normal, on both sides of a joint their mean if they all but agree; else
-    it is a corner."""
+    """Return the directions of the normal (rad), averaged over both sides of a joint.
+
+    A joint with a larger difference is a corner and stays as it is."""
     joint = np.flatnonzero((np.diff(t) == 0) & (np.abs(np.diff(direction)) < _CORNER))
     agreed = direction.copy()
     agreed[joint] = agreed[joint + 1] = (direction[joint] + direction[joint + 1]) / 2
@@ -328,7 +336,7 @@ def _table(node: NDArray, value: NDArray, slope: NDArray) -> Table:
 
 
 def _land(nu, lever, curvature_radius, radius) -> float:
-    """Arc length (mm) of the whole tip land, 0 if there is none."""
+    """Return the arc length (mm) of the whole tip land, 0 if there is none."""
     miss, turn = _LAND
     beyond = np.flatnonzero(np.abs(lever) > miss * radius)
     end = beyond[0] if len(beyond) else len(nu) - 1
@@ -338,7 +346,7 @@ def _land(nu, lever, curvature_radius, radius) -> float:
 
 
 def _integrals(flank: _Flank, lobes: int) -> tuple[float, float]:
-    """Area (mm²) and polar moment of area (mm⁴) of the rotor made of a flank."""
+    """Return area (mm²) and polar moment of area (mm⁴) of the rotor made from a flank."""
     nodes, weights = _GAUSS
     area = moment = 0.0
     for place, low, high in flank.curve.between(flank.tip, flank.root):

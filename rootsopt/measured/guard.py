@@ -1,7 +1,7 @@
-"""The boundary around libraries that read other people's files.
+"""Boundary around libraries that read files from outside.
 
-Whatever a library raises inside becomes one `InputError`. What it logs or warns of stays off the
-console. Only calls of the library stand inside, so that a mistake of this package stays visible.
+Any exception of a library becomes one `InputError`. Its log records and warnings stay off the
+console. Put only calls of the library inside, so that errors of this package stay visible.
 """
 
 import contextlib
@@ -16,11 +16,11 @@ from rootsopt.errors import InputError
 
 _LOGGER = "ezdxf"
 _REASON = 120
-"""Characters of a library's own message that are shown."""
+"""Greatest length (characters) of a library's own message that is shown."""
 
 
 def short(value: object, width: int = 60) -> str:
-    """A value on one line of at most `width` characters or so."""
+    """Return a value as one line of about `width` characters at most."""
     text = value if isinstance(value, str) else str(value)
     size = len(text)
     text = text[:width] if size > width else text
@@ -31,10 +31,10 @@ def short(value: object, width: int = 60) -> str:
 
 @contextlib.contextmanager
 def silenced() -> Iterator[None]:
-    """Keep log records, warnings and floating-point complaints of a library off the console."""
+    """Keep log records, warnings and floating-point warnings of a library off the console."""
     logger = logging.getLogger(_LOGGER)
     level = logger.level
-    if level > logging.CRITICAL:  # Inside another; entering is slow for thousands of entities.
+    if level > logging.CRITICAL:  # Nested: entering again is slow for thousands of entities.
         yield
         return
     logger.setLevel(logging.CRITICAL + 1)
@@ -48,8 +48,10 @@ def silenced() -> Iterator[None]:
 
 @contextlib.contextmanager
 def guarded(name: str, fault: str, remedy: str) -> Iterator[None]:
-    """Call a library inside. Raises `InputError` "`name`: `fault`: (its message); `remedy`" for
-    any exception, out of memory and too deep a recursion among them."""
+    """Call a library inside this block.
+
+    Raises `InputError` "`name`: `fault`: (its message); `remedy`" for any exception, including
+    `MemoryError` and `RecursionError`."""
     try:
         with silenced():
             yield
@@ -60,7 +62,9 @@ def guarded(name: str, fault: str, remedy: str) -> Iterator[None]:
 
 
 def each(items: Iterator[Any], name: str, fault: str, remedy: str) -> Iterator[Any]:
-    """The items of a library's iterator, behind the same guard; what is done with them is not."""
+    """Yield the items of a library's iterator under the same guard.
+
+    The code that uses the items is not guarded."""
     while True:
         try:
             item = next(items)

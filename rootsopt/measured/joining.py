@@ -1,4 +1,4 @@
-"""Joining a drawing's entities to closed loops."""
+"""Joins a drawing's entities to closed loops."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,18 +10,19 @@ from rootsopt.errors import InputError
 from rootsopt.measured.loop import Loop, place, signed_area
 
 TOGETHER = 1e-3
-"""Ends of entities closer than this (mm) are one point."""
+"""Distance (mm) below which ends of entities are one point."""
 _CROWDED = 50
-"""Neighbours within `TOGETHER` (mean of all ends) above which a drawing is refused."""
+"""Mean number of ends within `TOGETHER` of an end above which a drawing is rejected."""
 
 
 def joined(chains: list[Loop], layer: str, name: str) -> Loop:
-    """The closed loop of the largest area that `chains` make, each in either direction.
+    """Return the closed loop of the largest area that `chains` form, each in either direction.
 
-    A chain that stands twice counts once. Chains that lead to a dead end, such as center lines,
-    belong to no loop. Raises `InputError` if there is no closed loop, if chains that are not closed
-    would enclose more than the largest loop does, or if more than two ends meet in a point of what
-    may be the outline.
+    A chain given twice counts once. Chains that lead to a dead end, such as centre lines, belong to
+    no loop. `layer`: layer named in messages; `name`: the drawing's name.
+
+    Raises `InputError` where there is no closed loop, or where open chains would enclose more than
+    the largest loop. It also does where more than two ends meet in a possible outline.
     """
     remedy = f"join them in the drawing, on a layer {layer}"
     ends = np.array([chain.points[[0, -1]] for chain in chains]).reshape(-1, 2)
@@ -48,15 +49,15 @@ def joined(chains: list[Loop], layer: str, name: str) -> Loop:
             at = ends.ravel()[np.flatnonzero(vertex.ravel() == branches[0])[0]]
             meeting = np.count_nonzero(vertex[members] == branches[0])
             raise InputError(
-                f"{name}: an outline must go on in one way from point to point, but {meeting} ends "
-                f"meet at {place(complex(at))}; remove the entities that do not belong to it, or "
-                f"draw it on a layer {layer}"
+                f"{name}: an outline must not branch, but {meeting} ends meet at "
+                f"{place(complex(at))}; remove the entities that do not belong to it, or draw it "
+                f"on a layer {layer}"
             )
     dead = np.setdiff1d(links, inner)
     if best is None:
         gap, at = _widest_gap(ends, vertex, links if len(links) else np.arange(len(chains)))
         raise InputError(
-            f"{name}: the outline must be closed within {TOGETHER:g} mm, but the entities make no "
+            f"{name}: the outline must be closed within {TOGETHER:g} mm, but the entities form no "
             f"closed loop (widest gap {gap:.4g} mm, at {place(at)}); {remedy}"
         )
     for group in _groups(vertex[dead]):
@@ -79,7 +80,7 @@ def _where(chains: list[Loop], which: NDArray) -> list[Loop]:
 
 
 def _closing(joints: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Joints of a chain whose last point is its first."""
+    """Return the joints of a chain whose last point is its first, without that last point."""
     joints = joints.copy()
     joints[0] |= joints[-1]
     return joints[:-1]
@@ -90,10 +91,10 @@ def _extent(points: NDArray[np.complex128]) -> float:
 
 
 def _clusters(points: NDArray[np.complex128], name: str) -> NDArray[np.intp]:
-    """Number of the cluster of each point: points linked by steps below `TOGETHER`."""
+    """Return the cluster number of each point; points closer than `TOGETHER` share a cluster."""
     unique, which = np.unique(points, return_inverse=True)
     tree = KDTree(np.stack([unique.real, unique.imag], axis=1))
-    # Counted before they are listed: there may be n² of them.
+    # Count the pairs before listing them: there may be n².
     if tree.count_neighbors(tree, TOGETHER) > (1 + _CROWDED) * len(unique):
         raise InputError(
             f"{name}: ends of entities must be farther apart than {TOGETHER:g} mm, but many are "
@@ -109,7 +110,9 @@ def _components(pairs: NDArray[np.intp], count: int) -> NDArray[np.intp]:
 
 
 def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> NDArray[np.intp]:
-    """Places of the chains without those that repeat another: same ends, same places between."""
+    """Return the indices of the chains, without those that repeat another one.
+
+    A repeated chain has the same ends and the same points between."""
     if not chains:
         return np.zeros(0, np.intp)
     quarters = np.array(
@@ -124,7 +127,7 @@ def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> N
 
 
 def _quarters(points: NDArray[np.complex128], backwards: bool) -> NDArray[np.complex128]:
-    """Points at a quarter, half and three quarters of the length."""
+    """Return the points at a quarter, half and three quarters of the length."""
     points = points[::-1] if backwards else points
     if len(points) == 2:
         return points[0] + (points[1] - points[0]) * np.array([0.25, 0.5, 0.75])
@@ -133,7 +136,7 @@ def _quarters(points: NDArray[np.complex128], backwards: bool) -> NDArray[np.com
 
 
 def _in_loops(vertex: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Places of the links that remain once those at dead ends are taken away, again and again."""
+    """Return the indices of the links that remain after repeatedly removing those at dead ends."""
     at: dict[int, set[int]] = {}
     for link, (a, b) in enumerate(vertex.tolist()):
         at.setdefault(a, set()).add(link)
@@ -152,7 +155,7 @@ def _in_loops(vertex: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def _groups(vertex: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Places of the links of each connected part, in their order."""
+    """Return the indices of the links of each connected part, in order."""
     if not len(vertex):
         return []
     _, which = np.unique(vertex, return_inverse=True)
@@ -166,7 +169,7 @@ def _groups(vertex: NDArray[np.intp]) -> list[NDArray[np.intp]]:
 def _walked(
     chains: list[Loop], members: NDArray[np.intp], vertex: NDArray[np.intp]
 ) -> tuple[NDArray[np.complex128], NDArray[np.bool_]]:
-    """Points and joints of links that make one loop or one open way, from end to end."""
+    """Return points and joints of links that form one loop or one open path, from end to end."""
     at: dict[int, list[int]] = {}
     for link in members.tolist():
         for v in vertex[link].tolist():
@@ -180,7 +183,7 @@ def _walked(
         way = slice(None) if a == start else slice(None, None, -1)
         start = b if a == start else a
         own, marks = chains[link].points[way], chains[link].joints[way]
-        # The end that two links share stands once, as a joint if it is one of either.
+        # Keep the point that two links share once, as a joint if either link has it as a joint.
         if joints:
             joints[-1][-1] |= marks[0]
             own, marks = own[1:], marks[1:]
@@ -193,7 +196,7 @@ def _walked(
 def _widest_gap(
     ends: NDArray[np.complex128], vertex: NDArray[np.intp], links: NDArray[np.intp]
 ) -> tuple[float, complex]:
-    """The widest of the ways from each dead end to the nearest other, and where."""
+    """Return the greatest distance (mm) from a dead end to the nearest other one, and its point."""
     places = ends[links].ravel()
     numbers = vertex[links].ravel()
     single = np.flatnonzero(np.bincount(numbers)[numbers] == 1)

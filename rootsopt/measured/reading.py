@@ -1,4 +1,4 @@
-"""Outlines from files: CSV and DXF in, one closed loop of points out (mm, as x + iy)."""
+"""Reads outlines from CSV and DXF files as one closed loop of points (mm, as x + iy)."""
 
 import os
 import stat
@@ -14,16 +14,16 @@ from rootsopt.measured.table import from_csv
 __all__ = ["Loop", "read", "signed_area"]
 
 _WIDEST = 5.0
-"""The way from the last point to the first, relative to the longest step between others, with which
-a loop that does not repeat its first point counts as closed."""
+"""Distance from the last point to the first (multiple of the longest other step) above which a loop
+is rejected as open."""
 _BYTES = 50_000_000
-"""Size of a file (bytes) above which it is refused unread."""
+"""Size of a file (bytes) above which it is rejected unread."""
 _POINTS = 500_000
-"""Number of points above which an outline is refused: each takes some 20 µs to read and fit."""
+"""Number of points above which an outline is rejected: each takes some 20 µs to read and fit."""
 _SIZES = 0.1, 1e5
 """Sizes of an outline (mm) below and above which its units must be wrong."""
 _SAME = 1e-9
-"""Points closer than this, relative to the outline's size, are one."""
+"""Distance (fraction of the outline's size) below which two points are one."""
 _NOT_FILES = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a pipe"),
@@ -33,15 +33,17 @@ _NOT_FILES = (
 
 
 def read(path: Path) -> Loop:
-    """The outline in a CSV or DXF file.
+    """Return the outline in a CSV or DXF file.
 
-    CSV: x and y in mm (columns `x_mm` and `y_mm` if the header names them, else the first two),
-    with or without a header, split by commas, semicolons, tabs or blanks. DXF, text or binary: the
-    closed loop of the largest area out of LINE, ARC, ELLIPSE, SPLINE, LWPOLYLINE and POLYLINE on
-    the layer OUTLINE, or on all layers if there is none of that name, in the units the file states
-    (mm if none). The ends of a LINE and the corners of a polyline are taken as points of a curve.
+    CSV: x and y in mm, split by commas, semicolons, tabs or blanks, with or without a header. The
+    columns are `x_mm` and `y_mm` if the header names them, else the first two.
 
-    Raises `InputError` for a file that cannot be read or holds no closed outline.
+    DXF, text or binary: the closed loop of the largest area formed by LINE, ARC, ELLIPSE, SPLINE,
+    LWPOLYLINE and POLYLINE. Only the layer OUTLINE counts, or all layers if it does not exist.
+    Units are those the file states, mm if none. The ends of a LINE and the corners of a polyline
+    are points of a smooth curve.
+
+    Raises `InputError` where the file cannot be read or holds no closed outline.
     """
     name, kind = short(path.name), path.suffix.lower()
     if kind not in (".csv", ".txt", ".dxf"):
@@ -51,14 +53,14 @@ def read(path: Path) -> Loop:
         )
     data = _bytes(path, name)
     if kind == ".dxf":
-        from rootsopt.measured.dxf import from_dxf  # A quarter of a second, for drawings alone.
+        from rootsopt.measured.dxf import from_dxf  # Imported for drawings only: it takes 0.25 s.
 
         return _closed(from_dxf(data, name), name)
     return _closed(from_csv(data, name), name)
 
 
 def _bytes(path: Path, name: str) -> bytes:
-    """The file's content. Nothing but a regular file of limited size is opened."""
+    """Return the file's content; open only a regular file of limited size."""
     try:
         found = path.stat()
         kind = next((what for test, what in _NOT_FILES if test(found.st_mode)), None)
@@ -67,7 +69,7 @@ def _bytes(path: Path, name: str) -> bytes:
                 f"`profile.outline_file` must be a file, but {name!r} is {kind}; give the path of "
                 "a .csv, .txt or .dxf file"
             )
-        # A pipe that took the file's place meanwhile must not be waited for.
+        # Do not wait for a pipe that has replaced the file in the meantime.
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
         with open(os.open(path, flags), "rb") as file:
             data = file.read(_BYTES + 1) or b""
@@ -78,7 +80,7 @@ def _bytes(path: Path, name: str) -> bytes:
         raise InputError(
             "`profile.outline_file` must be a file that can be read, but is "
             f"{short(str(path), 120)!r}: {short(reason.lower())}; a path in a config is relative "
-            "to the config's folder, one given with --set to the current folder"
+            "to the config's folder, a path given with --set to the current folder"
         ) from None
     if len(data) > _BYTES:
         raise InputError(
@@ -91,7 +93,9 @@ def _bytes(path: Path, name: str) -> bytes:
 
 
 def _closed(loop: Loop, name: str) -> Loop:
-    """The loop without repeated points. Raises `InputError` unless it is closed and of a size."""
+    """Return the loop without repeated points.
+
+    Raises `InputError` unless it is closed, and number of points and size are within limits."""
     points = loop.points
     if len(points) > _POINTS:
         raise InputError(
@@ -102,7 +106,7 @@ def _closed(loop: Loop, name: str) -> Loop:
             f"{name}: must hold the points of an outline, but has {len(points)}; add the rest"
         )
     low, high = _SIZES
-    # The greatest coordinate first, since the difference of large ones may overflow.
+    # Check the greatest coordinate first, as the difference of large ones may overflow.
     x, y = np.real(points), np.imag(points)
     reach = float(max(np.max(np.abs(x)), np.max(np.abs(y))))
     size = float(max(np.ptp(x), np.ptp(y))) if reach <= high else reach
@@ -119,7 +123,7 @@ def _closed(loop: Loop, name: str) -> Loop:
             f"{name}: the outline must be closed, but its last point is {gap:.4g} mm from its "
             f"first (longest step between others: {np.max(steps):.4g} mm); add what is missing"
         )
-    # Of points in one place the last is kept, and is a joint if any of them is one.
+    # Keep the last of coincident points; it is a joint if any of them is one.
     kept = np.flatnonzero(np.append(steps, gap) > _SAME * reach)
     owner = np.searchsorted(kept, np.flatnonzero(loop.joints)) % len(kept)
     joints = np.zeros(len(kept), bool)

@@ -1,4 +1,4 @@
-"""What the commands say of an imported outline."""
+"""Report of the commands on an imported outline."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,9 @@ if TYPE_CHECKING:
 
 
 def record(config: Config) -> dict[str, Any]:
-    """`outline` of the result file: checks and conjugacy; nothing for other families."""
+    """Return the entry `outline` of the result file: checks and conjugacy.
+
+    The result is empty for a profile that is not read from a file."""
     if not config.profile.from_file:
         return {}
     from rootsopt.measured.source import outline_of
@@ -20,7 +22,7 @@ def record(config: Config) -> dict[str, Any]:
 
 
 def say(config: Config, out: "Console") -> None:
-    """Print what must be known of the flank that stands for all, if there is anything."""
+    """Print a note if the flanks of an imported outline differ notably."""
     if not config.profile.from_file:
         return
     from rootsopt.measured.source import note, outline_of

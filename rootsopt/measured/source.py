@@ -1,4 +1,4 @@
-"""The profile a config's outline file holds, read and fitted once."""
+"""Reads and fits the profile of a config's outline file, once per file."""
 
 import functools
 from pathlib import Path
@@ -13,18 +13,19 @@ if TYPE_CHECKING:
     from rootsopt.config.scene import ProfileConfig
 
 _NOTABLE = 1.0
-"""Deviation (µm) from which on there is a note."""
+"""Deviation between flanks (µm) above which the user gets a note."""
 
 
 def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
-    """The profile of family outline, and what was found of it. Raises `InputError` where the file
-    does not hold one."""
+    """Return the profile of family `outline`, and its deviations.
+
+    Raises `InputError` where the file does not hold one."""
     path = Path(config.outline_file or "")
     try:
         found = path.stat()
         stamp = found.st_mtime_ns, found.st_size, found.st_ino
     except (OSError, ValueError):
-        stamp = ()  # Reading it says what is wrong.
+        stamp = ()  # `read` reports what is wrong.
     smoothing = config.outline_smoothing_mm or 0.0
     return _kept(path, stamp, config.lobes, config.pitch_radius_mm, smoothing)
 
@@ -36,12 +37,14 @@ def _kept(path: Path, stamp: tuple[int, ...], lobes: int, radius: float, smoothi
 
 
 def note(checks: Checks) -> str | None:
-    """What a user must know of the flank that stands for all of them, if there is anything."""
+    """Return a note for the user if the flanks differ notably, else `None`.
+
+    One flank represents all of them."""
     worst = max(checks.lobe_deviation_um, checks.flank_deviation_um)
     if worst < _NOTABLE:
         return None
     return (
-        "outline: all flanks are taken to be the leading one next to +x, but lobes differ by up to "
-        f"{checks.lobe_deviation_um:.3g} um and the trailing flank from it by up to "
+        "outline: the leading flank next to +x represents all flanks, but lobes differ by up to "
+        f"{checks.lobe_deviation_um:.3g} um and the trailing flank differs from it by up to "
         f"{checks.flank_deviation_um:.3g} um"
     )

@@ -1,4 +1,4 @@
-"""Points from a text table (CSV)."""
+"""Reads points from a text table (CSV)."""
 
 import codecs
 import csv
@@ -13,15 +13,17 @@ from rootsopt.measured.guard import guarded, short
 from rootsopt.measured.loop import Loop
 
 _LONGEST = 100_000
-"""Length of a line (characters) above which it is refused."""
-_REMEDY = "save the points as x,y in mm, one pair a line, as UTF-8 text"
+"""Length of a line (characters) above which it is rejected."""
+_REMEDY = "save the points as x,y in mm, one pair per line, as UTF-8 text"
 _HEADER = r"[\s_/]*(?:\(mm\)|\[mm\]|mm)?"
 _NAMES = tuple(re.compile(f"{axis}{_HEADER}", re.IGNORECASE) for axis in "xy")
 _WIDE = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 
 
 def from_csv(data: bytes, name: str) -> Loop:
-    """The points of a table, in the order of its lines. Raises `InputError`."""
+    """Return the points of a table in the order of its lines; `name` names it in messages.
+
+    Raises `InputError` where the table cannot be read or a line is not a point."""
     text = _text(data, name)
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
     lines = [(n, line) for n, line in lines if not line.lstrip().startswith("#")]
@@ -45,7 +47,7 @@ def from_csv(data: bytes, name: str) -> Loop:
         if x is None or y is None or not (math.isfinite(x) and math.isfinite(y)):
             raise InputError(
                 f"{name}, line {number}: must hold x and y in mm, but is "
-                f"{short(', '.join(row))!r}; mend or remove the line"
+                f"{short(', '.join(row))!r}; correct or remove the line"
             )
         points[k] = complex(x, y)
     return Loop(points, np.zeros(len(points), bool))
@@ -74,7 +76,9 @@ def _cells(line: str, split: str | None) -> list[str]:
 
 
 def _number(cell: str, split: str | None) -> float | None:
-    """A cell's number. A decimal comma counts where commas do not part the cells."""
+    """Return a cell's number, `None` if it is none.
+
+    A decimal comma is read unless commas separate the cells."""
     cell = cell.strip()
     if split != "," and cell.count(",") == 1 and "." not in cell:
         cell = cell.replace(",", ".")
@@ -85,7 +89,7 @@ def _number(cell: str, split: str | None) -> float | None:
 
 
 def _columns(header: list[str]) -> tuple[int, int]:
-    """Columns of x and y: those named so, if one is named x and one y, else the first two."""
+    """Return the columns of x and y: those with these names if unique, else the first two."""
     names = [cell.strip() for cell in header]
     found = [[k for k, cell in enumerate(names) if test.fullmatch(cell)] for test in _NAMES]
     if all(len(places) == 1 for places in found):

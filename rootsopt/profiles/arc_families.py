@@ -1,7 +1,7 @@
 """Families of tangent circular arcs: one, four, five and an edge, with their conjugate envelopes.
 
-The sources' own formulas for all but the single arc were not at hand: what is made of them here
-is a derivation from their names and descriptions, stated with each.
+Except for the single arc, the sources' own formulas were not available. Each construction is a
+derivation from the family's name and description, stated in its docstring.
 """
 
 import jax.numpy as jnp
@@ -12,8 +12,10 @@ from rootsopt.profiles.arcs import Arcs
 
 
 def arc(lobes: int, pitch_radius: Float[ArrayLike, ""], arc_center: Float[ArrayLike, ""]) -> Arcs:
-    """The lobe is one circular arc through both pitch crossings, with its `arc_center` b (m) on the
-    lobe's axis: its radius is √(r² + b² - 2 r b cos π/2N). (The single arc of the literature.)"""
+    """Return a lobe of one circular arc through both pitch crossings, the literature's single arc.
+
+    Its `arc_center` b (m) is the centre's distance from the rotor axis, on the lobe's axis. Its
+    radius is √(r² + b² - 2 r b cos π/2N)."""
     return Arcs.chain(lobes, pitch_radius, arc_center, (), (), ("arc",))
 
 
@@ -24,11 +26,11 @@ def four_arcs(
     tip_arc_radius: Float[ArrayLike, ""],
     tip_arc_turn: Float[ArrayLike, ""],
 ) -> Arcs:
-    """Four curves a flank: two tangent arcs on the addendum, and their conjugates.
+    """Return a flank of four curves: two tangent arcs on the addendum, and their conjugates.
 
     The tip arc has its `arc_center` b (m) on the lobe's axis and the radius `tip_arc_radius` ρ (m).
-    It ends at the normal angle `tip_arc_turn` (rad). The flank arc goes on from there through the
-    pitch crossing, which gives its radius. With ρ that of `arc` the two are one.
+    It ends at the normal angle `tip_arc_turn` (rad). The flank arc continues to the pitch crossing,
+    which determines its radius. If ρ is the radius of `arc`, both arcs are one.
     """
     names = ("tip arc", "flank arc")
     return Arcs.chain(lobes, pitch_radius, arc_center, (tip_arc_radius,), (tip_arc_turn,), names)
@@ -42,11 +44,11 @@ def five_arcs(
     tip_arc_radius: Float[ArrayLike, ""],
     tip_arc_turn: Float[ArrayLike, ""],
 ) -> Arcs:
-    """Five arcs a lobe: a tip land, and on either side a tip arc and a flank arc, all tangent.
+    """Return a lobe of five tangent arcs: a tip land, and on each side a tip arc and a flank arc.
 
     The land of half angle `tip_arc_angle` θ1 (rad) lies at the `outer_radius` (m). The tip arc has
     the radius `tip_arc_radius` (m) and ends at the normal angle `tip_arc_turn` (rad). The flank arc
-    goes on through the pitch crossing.
+    continues through the pitch crossing.
     """
     names = ("tip land", "tip arc", "flank arc")
     radii, joints = (outer_radius, tip_arc_radius), (tip_arc_angle, tip_arc_turn)
@@ -60,21 +62,23 @@ def arcs_epicycloid(
     tip_arc_angle: Float[ArrayLike, ""],
     edge_radius: Float[ArrayLike, ""],
 ) -> Arcs:
-    """Circular arcs joined with a conjugate epicycloid: a single arc cut off by a tip land.
+    """Return circular arcs joined by a conjugate epicycloid: a single arc cut off by a tip land.
 
     The lobe is the arc of `arc` around its `arc_center` b (m), of radius ρ, and a land of half
-    angle `tip_arc_angle` θ1 (rad). The edge between them is an arc of radius `edge_radius` e (m)
-    tangent to both, its centre on the ray θ1 at the distance
-    d = b cos θ1 ± √((ρ - e)² - b² sin² θ1) from the axis, and the outer radius d + e; an edge
-    flatter than the arc (-, e > ρ) would have to turn back. On
-    the partner the edge traces the curve at the distance e from the extended epicycloid that its
-    centre describes (the epicycloid itself for e = 0); it joins the mates of land and arc.
+    angle `tip_arc_angle` θ1 (rad). The edge between them is an arc of radius `edge_radius` e (m),
+    tangent to both. Its centre lies on the ray θ1 at the distance
+    d = b cos θ1 ± √((ρ - e)² - b² sin² θ1) from the axis, so that the outer radius is d + e. With
+    e > ρ (sign -) the outline would turn back.
 
-    From an edge with its centre outside of the pitch circle (d > r) the contact moves backwards:
+    The centre of the edge traces an extended epicycloid on the partner. The edge generates the
+    parallel curve at the distance e (for e = 0 that epicycloid itself). This curve joins the
+    conjugates of land and arc.
+
+    If the centre of the edge lies outside the pitch circle (d > r), its contact moves backwards:
     sin(ν - β) = (d / r) sin(ν - θ1) gives dβ/dν = 1 - d cos(ν - θ1) / (r sin ψ) < 0. The dedendum
-    stays sound, as its arc length, (r sin ψ - 2 s) dβ/dν + s, grows. But edge and arc are then in
-    mesh at once, which carries what is shut in between them over to the other side. An edge with
-    d ≤ r has no such carryover: its radius must be a share of the tip's height over the pitch
+    stays sound, as its arc length, (r sin ψ - 2 s) dβ/dν + s, grows. But edge and arc then mesh at
+    the same time, and carry the gas trapped between them over to the other side. An edge with
+    d ≤ r has no such carryover; its radius is then at least the tip's height above the pitch
     circle. (Derivation.)
     """
     r = jnp.asarray(pitch_radius)

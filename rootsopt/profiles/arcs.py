@@ -12,15 +12,15 @@ from rootsopt.profiles.base import Profile, Segment
 
 
 class Arcs(Profile):
-    """An addendum of n circular arcs, and the envelope it leaves on the partner.
+    """An addendum of n circular arcs, and the envelope it generates on the partner.
 
-    The point of the arc with centre C and radius ρ whose normal has the direction ν is C + ρ n(ν),
-    so its support function is C·n + ρ and the lever of its normal C × n. The normal meets the
-    pitch circle where sin(ν - β) = lever / r, and s = support - r cos(ν - β).
+    On the arc with centre C and radius ρ, the point with normal direction ν is C + ρ n(ν). Its
+    support function is C·n + ρ, and the lever of its normal is C × n. The normal meets the pitch
+    circle where sin(ν - β) = lever / r, and s = support - r cos(ν - β).
 
-    `center` (n, 2) and `radius` (n,) in m, in the rotor frame with the lobe's axis on +x; `joints`
-    (n + 1,): normal angles (rad) from the tip, 0, to the pitch crossing; `names` of the arcs, of
-    which the first is a `land` if it is centred on the rotor's axis.
+    `center` (n, 2) and `radius` (n,): centres and radii of the arcs (m), in the rotor frame with
+    the lobe's axis on +x. `joints` (n + 1,): normal angles (rad) from the tip, 0, to the pitch
+    crossing. `names`: of the arcs; `land`: whether the first arc is centred on the rotor's axis.
     """
 
     lobes: int = eqx.field(static=True)
@@ -41,9 +41,11 @@ class Arcs(Profile):
         joints: Sequence[Float[ArrayLike, ""]],
         names: Sequence[str],
     ) -> "Arcs":
-        """Arcs from the tip to the pitch crossing: the first has its `center` (m) on the lobe's
-        axis (None: it is a land), all but the last have `radii` (m) and end at the `joints` (rad);
-        the radius of the last makes it pass through the pitch crossing."""
+        """Return tangent arcs from the tip to the pitch crossing.
+
+        The first arc has its `center` (m) on the lobe's axis (`None`: it is a land). All arcs but
+        the last have the `radii` (m) and end at the `joints` (rad). The last one gets the radius
+        with which it passes through the pitch crossing."""
         r = jnp.asarray(pitch_radius)
         half = jnp.pi / (2 * lobes)
         crossing = r * jnp.stack([jnp.cos(half), jnp.sin(half)])
@@ -52,7 +54,7 @@ class Arcs(Profile):
         for k, joint in enumerate(joints):
             normal = jnp.stack([jnp.cos(joint), jnp.sin(joint)])
             if k + 1 == len(radii):
-                # |X - C| = ρ for the last, with C on the normal of the joint.
+                # The last arc: |X - C| = ρ at the crossing X, with C on the normal of the joint.
                 to = crossing - centers[-1] - found[-1] * normal
                 found.append(-jnp.dot(to, to) / (2 * jnp.dot(to, normal)))
             centers.append(centers[-1] + (found[k] - found[k + 1]) * normal)
@@ -80,13 +82,13 @@ class Arcs(Profile):
     def stretches(self) -> tuple[Segment, ...]:
         parts: list[Segment] = []
         for segment, (x, y) in zip(self.segments(), self.center, strict=True):
-            # The lever C × n is greatest where n is at right angles to C.
+            # The lever C × n is greatest where n is perpendicular to C.
             place = jnp.arctan2(lax.stop_gradient(x), -lax.stop_gradient(y)) % jnp.pi
             parts += (segment,) if segment.land else self._cut(segment, place)
         return tuple(parts)
 
     def _arc(self, nu):
-        """Index of the arc with the normal `nu`; the first and the last go on beyond their ends."""
+        """Return the index of the arc at `nu`; the first and last arc extend beyond their ends."""
         return jnp.sum(nu[..., None] > self.joints[1:-1], axis=-1)
 
     def lever(self, nu):
@@ -112,7 +114,7 @@ class Arcs(Profile):
 
     def normal_at(self, roll_angle):
         # The normals of an arc pass through its centre and the pitch point. Where the roll angle
-        # turns back, the last arc that begins before is the nearest to the pitch point.
+        # turns back, the last arc that starts before `roll_angle` is nearest to the pitch point.
         begins = self.roll_angle(self.joints[1:-1])
         places = jnp.arange(1, begins.shape[0] + 1)
         begun = roll_angle[..., None] > begins
@@ -120,7 +122,8 @@ class Arcs(Profile):
         r = self.pitch_radius
         pitch = r * jnp.stack([jnp.cos(roll_angle), jnp.sin(roll_angle)], axis=-1)
         reach = pitch - self.center[arc]
-        # From a corner outside of the pitch circle the normal points away from the pitch point.
+        # If the arc's centre is outside the pitch circle, the normal points away from the pitch
+        # point.
         outside = jnp.sum(self.center[arc] ** 2, axis=-1) > r**2
         reach = jnp.where(outside[..., None], -reach, reach)
         x, y = jnp.moveaxis(reach, -1, 0)

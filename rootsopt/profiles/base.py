@@ -1,8 +1,9 @@
 """The roll-angle core: one description of a conjugate flank for every profile family.
 
 Two identical rotors with `N` lobes roll 1:1 on pitch circles of radius `r`. A family
-describes only the *addendum* of one flank, as a function of the normal angle `nu` (the
-polar angle of the outward normal in the rotor frame, measured from the lobe's axis):
+describes only the *addendum* of one flank, as a function of the normal angle `nu`. This is the
+polar angle of the outward normal in the rotor frame, measured from the lobe's axis. The family
+defines two functions:
 
 - `roll_angle(nu)` is β, the polar angle, on the rotor, of the pitch point at the moment
   the flank point is in contact;
@@ -12,11 +13,15 @@ The pressure angle is then ψ = β + π/2 - ν, the flank point
 
     P = R(β) [r + s sin ψ, s cos ψ],      ds/dβ = -r cos ψ   (law of gearing),
 
-and the dedendum follows by symmetry: β → π/N - β, ψ → ψ, s → -s. The normal angle is
-used as parameter, rather than β, because a tip arc centred on the pitch circle keeps β
-constant over the whole arc (all of it meshes at one instant), while ν stays regular.
+and the dedendum follows by symmetry: β → π/N - β, ψ → ψ, s → -s. The parameter is the normal
+angle and not β, because all of a tip arc centred on the pitch circle meshes at one instant. β is
+constant over such an arc, while ν stays regular.
 
-Lengths are in metres, angles in radians. Everything is differentiable in the design.
+Words used for all profiles: the *pitch crossing* is the flank point on the pitch circle; the
+*lever* is the moment arm of a contact normal about the rotor's axis; the *support function* is the
+distance of a point's tangent from that axis; a *land* is an arc centred on that axis.
+
+Lengths are in metres, angles in radians. Everything is differentiable with respect to the design.
 """
 
 import abc
@@ -29,13 +34,13 @@ from jax import lax
 from jaxtyping import Array, Float
 
 _BRACKETS = 16
-"""Intervals of a segment between which the normal angle at a roll angle is searched."""
+"""Intervals per segment that bracket the normal angle at a roll angle."""
 _STEPS = 10
-"""Guarded Newton steps of this search; each at least halves the bracket where Newton's fails."""
+"""Safeguarded Newton steps of this search; a step that leaves the bracket is a bisection."""
 _POLISH = 3
-"""Plain Newton steps after these, with as many derivatives."""
+"""Plain Newton steps after these; they carry derivatives up to that order."""
 _FLAT = 1e-9
-"""Least dβ/dν in these steps: on an arc centred on the pitch circle it is 0."""
+"""Least dβ/dν used in these steps; it is 0 on an arc centred on the pitch circle."""
 
 
 class RollPoint(NamedTuple):
@@ -51,10 +56,11 @@ class RollPoint(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """A stretch of the addendum between two normal angles, smooth inside.
+    """A smooth part of the addendum between two normal angles.
 
-    `land` marks a stretch concentric with the rotor (ψ = π/2), which carries no torque
-    and therefore takes no part in the search for flank contact.
+    `name`: for figures and messages; `start`, `stop`: normal angles (rad); `land`: whether the
+    segment is concentric with the rotor (ψ = π/2). A land transmits no torque, so that the search
+    for flank contact skips it.
     """
 
     name: str
@@ -64,9 +70,10 @@ class Segment(NamedTuple):
 
 
 class Quadrature(NamedTuple):
-    """How integrals over a stretch of a profile are taken: `nodes` of Gauss and Legendre, on an
-    even scale or (`graded`) crowding towards both ends, and how many further places `between` are
-    looked at for undercut."""
+    """Rule for integrals over one stretch of a profile.
+
+    `nodes`: number of Gauss-Legendre nodes; `graded`: whether they crowd towards both ends;
+    `between`: number of equal intervals whose ends are also checked for undercut."""
 
     nodes: int
     graded: bool
@@ -74,8 +81,10 @@ class Quadrature(NamedTuple):
 
 
 class Mate(NamedTuple):
-    """A point of the partner's flank: `facing`, the direction (rad) of its outward normal from
-    the axis of the valley; `lever` and `support` (m) of that normal."""
+    """A point of the partner's flank.
+
+    `facing`: direction (rad) of its outward normal, from the axis of the valley between two lobes;
+    `lever`, `support`: of that normal (m)."""
 
     facing: Float[Array, "*n"]
     lever: Float[Array, "*n"]
@@ -85,10 +94,10 @@ class Mate(NamedTuple):
 class Profile(eqx.Module):
     """One flank of a conjugate Roots rotor; see the module's docstring.
 
-    Subclasses give `segments`, `roll_angle` and `contact_distance` on 0 ≤ ν ≤ `pitch_normal`,
-    continued analytically beyond the pitch point and, unless the first segment is a land, over
-    the tip (β odd and s even in ν). All else follows. `normal_at`, `lever` and `support` may be
-    given where there is a closed form, which is quicker and more exact.
+    Subclasses define `segments`, `roll_angle` and `contact_distance` on 0 ≤ ν ≤ `pitch_normal`.
+    They continue them analytically beyond the pitch crossing and, unless the first segment is a
+    land, over the tip (β odd and s even in ν). This class derives the rest. A subclass may override
+    `normal_at`, `lever` and `support` with a closed form, which is faster and more exact.
     """
 
     lobes: eqx.AbstractVar[int]
@@ -96,59 +105,63 @@ class Profile(eqx.Module):
 
     @abc.abstractmethod
     def segments(self) -> tuple[Segment, ...]:
-        """The smooth stretches of the addendum, from the tip to the pitch point."""
+        """Return the smooth segments of the addendum, from the tip to the pitch crossing."""
 
     def stretches(self) -> tuple[Segment, ...]:
-        """The segments, cut for quadrature: where they are smooth to a few derivatives only, and
-        where the pressure angle is least inside of one.
+        """Return the stretches for quadrature: the segments, cut where an integrand is not smooth.
 
-        There a normal may all but touch the pitch circle, where ψ has a root."""
+        A segment is cut where only a few derivatives are continuous, and where the pressure angle
+        has a minimum inside it. There a normal may almost touch the pitch circle, where ψ has a
+        square-root singularity."""
         return self.segments()
 
     @property
     def quadrature(self) -> Quadrature:
-        """How integrals over each of the `stretches` are taken.
+        """Rule for integrals over each of the `stretches`.
 
-        By default nodes crowd towards the ends, and resolve a root of ψ there to rounding even if
-        it lies 1e-4 of the stretch beyond."""
+        By default nodes crowd towards the ends. They resolve a square-root singularity of ψ to
+        rounding, even 1e-4 of the stretch beyond an end."""
         return Quadrature(64, True, 128)
 
     def _cut(self, segment: Segment, place: Float[Array, ""]) -> tuple[Segment, Segment]:
-        """A segment in two parts; one of them is empty if `place` lies outside."""
+        """Split a segment at `place` (rad); one part is empty if `place` is outside."""
         name, start, stop, land = segment
         middle = jnp.clip(lax.stop_gradient(place), start, stop)
         return Segment(name, start, middle, land), Segment(name, middle, stop, land)
 
     @abc.abstractmethod
     def roll_angle(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """β(ν) in rad, non-decreasing for a profile free of interference."""
+        """Return β(ν) in rad; it must not decrease in a profile free of interference."""
 
     @abc.abstractmethod
     def contact_distance(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """s(ν) in m."""
+        """Return s(ν) in m."""
 
     def normal_at(self, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """ν(β) in rad: the inverse of `roll_angle` up to the pitch point.
+        """Return ν(β) in rad, the inverse of `roll_angle` up to the pitch crossing.
 
-        Where several points mesh at one instant, or the roll angle turns back, it is the
-        one nearest to the pitch point. By default it is searched, with the derivatives of the
-        implicit function; a closed form is quicker.
+        Where several points mesh at one instant, or the roll angle turns back, return the point
+        nearest to the pitch crossing. The default is a numerical search, differentiated as an
+        implicit function; a closed form is faster.
         """
         return _inverse(self, roll_angle)
 
     def lever(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Moment arm r cos ψ (m) of the contact normal about the rotor's axis."""
+        """Return the moment arm r cos ψ (m) of the contact normal about the rotor's axis."""
         return self.pitch_radius * jnp.sin(nu - self.roll_angle(nu))
 
     def support(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Support function P·n = r sin ψ + s (m) of the addendum; its slope is -lever."""
+        """Return the support function P·n = r sin ψ + s (m) of the addendum.
+
+        Its derivative with respect to ν is -lever."""
         arm = self.pitch_radius * jnp.cos(nu - self.roll_angle(nu))
         return arm + self.contact_distance(nu)
 
     def mate(self, nu: Float[Array, "*n"], support: bool = True) -> Mate:
-        """The partner's point that meshes with the addendum point `nu`; beyond the pitch normal
-        that of the partner's addendum, reflected there. Without `support` that is not computed
-        (and 0)."""
+        """Return the partner's point that meshes with the addendum point `nu`.
+
+        Beyond the pitch normal it is a point of the partner's addendum, reflected at that normal.
+        `support` False: do not compute the support function, and return 0 for it."""
         pitch = self.pitch_normal
         beyond = nu > pitch
         nu = jnp.where(beyond, 2 * pitch - nu, nu)
@@ -165,37 +178,40 @@ class Profile(eqx.Module):
 
     @property
     def conjugate(self) -> bool:
-        """Whether the flanks touch all through the mesh in perfect rolling, by construction."""
+        """Whether the flanks touch throughout the mesh at perfect rolling, by construction."""
         return True
 
     @property
     def search_nodes(self) -> int:
-        """Nodes per segment that the closest approach is bracketed with; they only have to
-        separate its candidates."""
+        """Nodes per segment that bracket the closest approach.
+
+        They only need to separate its candidates."""
         return 32
 
     @property
     def turn_ratio(self) -> float:
-        """κ: `arms` may use the cosine and sine of κ ν, which a search over many poses
-        has at no cost."""
+        """Factor κ: `lever_from` receives the cosine and sine of κ ν.
+
+        A search over many poses has both at no cost."""
         return 1.0
 
     @property
     def cusp(self) -> bool:
-        """Whether the flank's radius of curvature vanishes at the pitch crossing (ψ = 0),
-        where two minima of the gap may then be almost equally deep."""
+        """Whether the flank's radius of curvature vanishes at the pitch crossing (ψ = 0).
+
+        Two minima of the gap may then be almost equally deep there."""
         return True
 
     def lever_from(
         self, nu: Float[Array, "*n"], cos: Float[Array, "*n"], sin: Float[Array, "*n"]
     ) -> Float[Array, "*n"]:
-        """`lever` (m) at `nu`, given cos κν and sin κν."""
+        """Return `lever` (m) at `nu`, given cos κν and sin κν."""
         del cos, sin
         return self.lever(nu)
 
     @property
     def half_pitch(self) -> float:
-        """π/2N: the polar angle between a lobe's axis and its pitch crossing (rad)."""
+        """Polar angle π/2N between a lobe's axis and its pitch crossing (rad)."""
         return jnp.pi / (2 * self.lobes)
 
     @property
@@ -204,17 +220,17 @@ class Profile(eqx.Module):
         return self.segments()[-1].stop
 
     def addendum(self, nu: Float[Array, "*n"]) -> RollPoint:
-        """The addendum point with normal angle `nu`."""
+        """Return the addendum point with normal angle `nu`."""
         beta = self.roll_angle(nu)
         return RollPoint(beta, beta + jnp.pi / 2 - nu, self.contact_distance(nu))
 
     def dedendum(self, nu: Float[Array, "*n"]) -> RollPoint:
-        """The dedendum point that meshes with the partner's addendum point `nu`."""
+        """Return the dedendum point that meshes with the partner's addendum point `nu`."""
         point = self.addendum(nu)
         return RollPoint(jnp.pi / self.lobes - point.beta, point.psi, -point.s)
 
     def position(self, point: RollPoint) -> Float[Array, "*n 2"]:
-        """Cartesian coordinates (m) in the rotor frame, lobe tip on +x."""
+        """Return Cartesian coordinates (m) in the rotor frame, with a lobe tip on +x."""
         beta, psi, s = point
         radial = self.pitch_radius + s * jnp.sin(psi)
         tangential = s * jnp.cos(psi)
@@ -224,40 +240,40 @@ class Profile(eqx.Module):
         )
 
     def roll_rate(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """dβ/dν, between 0 (tip arc centred on the pitch circle) and 1 (involute)."""
+        """Return dβ/dν, between 0 (tip arc centred on the pitch circle) and 1 (involute)."""
         return jax.jvp(self.roll_angle, (nu,), (jnp.ones_like(nu),))[1]
 
     def speeds(
         self, nu: Float[Array, "*n"]
     ) -> tuple[RollPoint, Float[Array, "*n"], Float[Array, "*n"]]:
-        """The addendum's point, and arc length per normal angle (m/rad) on the addendum and on
-        the dedendum that meshes with it."""
+        """Return the addendum point and the arc length per normal angle (m/rad) of two curves: the
+        addendum, and the dedendum that meshes with it."""
         point, rate = self.addendum(nu), self.roll_rate(nu)
         sliding = self.pitch_radius * jnp.sin(point.psi)
         return point, sliding * rate + point.s, (sliding - 2 * point.s) * rate + point.s
 
     def addendum_speed(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Arc length per normal angle (m/rad) on the addendum: its radius of curvature."""
+        """Return arc length per normal angle (m/rad) on the addendum: its radius of curvature."""
         return self.speeds(nu)[1]
 
     def dedendum_speed(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Arc length on the dedendum per normal angle of the partner (m/rad).
+        """Return arc length on the dedendum per normal angle of the partner (m/rad).
 
         On an involute or land this is the tangential speed r sin ψ + s (1 - ψ′) of the
-        contact point per roll angle; zero is a cusp and a negative value is undercut.
+        contact point per roll angle. Zero means a cusp, a negative value undercut.
         """
         return self.speeds(nu)[2]
 
     def dedendum_curvature_radius(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Signed radius of curvature of the dedendum (m): positive convex, negative concave."""
+        """Return the signed radius of curvature of the dedendum (m), positive where convex."""
         turning = 2 * self.roll_rate(nu) - 1
         return self.dedendum_speed(nu) / turning
 
 
 def _inverse(profile: Profile, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The greatest normal angle (rad) at which `profile` has a roll angle, by safeguarded Newton.
+    """Return the greatest normal angle (rad) with this roll angle, by safeguarded Newton.
 
-    The search is not differentiated. Plain Newton steps at its end carry the derivatives with
+    The search is not differentiated. The plain Newton steps after it carry the derivatives with
     respect to roll angle and design, and continue the flank analytically beyond its ends."""
     fixed, want = jax.tree.map(lax.stop_gradient, (profile, roll_angle))
 

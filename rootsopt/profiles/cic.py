@@ -14,25 +14,25 @@ def arc_involute(
     pressure_angle: Float[ArrayLike, ""],
     involute_length: Float[ArrayLike, ""],
 ) -> "CIC":
-    """A CIC rotor without a tip land: arc and involute. Arguments as those of `CIC`."""
+    """Return a CIC rotor without a tip land: arc and involute. Arguments as for `CIC`."""
     return CIC(lobes, pitch_radius, pressure_angle, involute_length, 0.0)
 
 
 class CIC(Profile):
     """The CIC rotor: tip land, tip arc, involute, and their conjugates.
 
-    The involute is the paper's Eq. 2: ψ = α, s = ℓ cot α for -u ≤ ℓ ≤ u. A tip land of
-    half angle θ1 (Eq. 1) is joined to the involute's end B by one arc tangent to both:
-    centre C on the ray θ1 at radius c = r cos α / cos(α - δ), with δ = β_u - θ1 and
-    β_u = π/2N - u/(r sin α), and radius ρ = |B - C|. Hence (α, u, θ1) are independent
-    and the outer radius c + ρ follows from them. For u = `longest_involute` the arc is
-    centred on the pitch circle (c = r), the textbook CIC.
+    The involute is the paper's Eq. 2: ψ = α, s = ℓ cot α for -u ≤ ℓ ≤ u. One arc joins the tip
+    land of half angle θ1 (Eq. 1) to the involute's end B, tangent to both. Its centre C lies on the
+    ray θ1 at radius c = r cos α / cos(α - δ), with δ = β_u - θ1 and β_u = π/2N - u/(r sin α). Its
+    radius is ρ = |B - C|. Hence (α, u, θ1) are independent, and the outer radius c + ρ follows from
+    them. For u = `longest_involute` the arc is centred on the pitch circle (c = r), the textbook
+    CIC.
 
-    `longest_involute` u_max = r sin α (π/2N - θ1) (m): beyond it the roll angle turns back;
-    `base_radius` r cos α (m); `involute_start` β_u (rad); `arc_center_radius` c and
-    `arc_radius` ρ (m); `arc_end`, `involute_end`: normal angles (rad) at which the arc
-    meets the involute and the involute the pitch circle; `tip_direction`: cosine and sine
-    of θ1.
+    `longest_involute`: u_max = r sin α (π/2N - θ1) (m), above which the roll angle turns back.
+    `base_radius`: r cos α (m). `involute_start`: β_u (rad). `arc_center_radius`: c (m).
+    `arc_radius`: ρ (m). `arc_end`: normal angle (rad) at which the arc meets the involute.
+    `involute_end`: normal angle (rad) at which the involute meets the pitch circle.
+    `tip_direction`: cosine and sine of θ1.
     """
 
     lobes: int = eqx.field(static=True)
@@ -50,8 +50,10 @@ class CIC(Profile):
     tip_direction: Float[Array, "2"]
 
     def __init__(self, lobes, pitch_radius, pressure_angle, involute_length, tip_arc_angle):
-        """`lobes` N; `pitch_radius` r (m), `pressure_angle` α (rad), `involute_length` u
-        (m) and `tip_arc_angle` θ1 (rad, half the angle of the tip land), scalars."""
+        """Build the rotor from `lobes` N and scalars.
+
+        The scalars are `pitch_radius` r (m), `pressure_angle` α (rad), `involute_length` u (m) and
+        `tip_arc_angle` θ1 (rad, half the angle of the tip land)."""
         self.lobes = lobes
         r = self.pitch_radius = jnp.asarray(pitch_radius)
         alpha = self.pressure_angle = jnp.asarray(pressure_angle)
@@ -80,16 +82,17 @@ class CIC(Profile):
 
     def stretches(self) -> tuple[Segment, ...]:
         land, arc, involute = self.segments()
-        # The normals of a short involute's arc come nearest to the pitch circle inside of it.
+        # With a short involute, the arc's normals come nearest to the pitch circle inside the arc.
         return (land, *self._cut(arc, self.tip_arc_angle + jnp.pi / 2), involute)
 
     def _arc_slide(self, turn):
-        """Signed distance from the pitch point to the arc's centre along the normal."""
+        """Return the signed distance (m) from the pitch point to the arc's centre, along the
+        normal."""
         c, r = self.arc_center_radius, self.pitch_radius
         return c * jnp.cos(turn) - jnp.sqrt(r**2 - (c * jnp.sin(turn)) ** 2)
 
     def _arc_turn(self, nu):
-        """Normal angle from the arc's start, kept inside the arc."""
+        """Return the normal angle (rad) from the arc's start, clipped to the arc."""
         return jnp.clip(nu, self.tip_arc_angle, self.arc_end) - self.tip_arc_angle
 
     def roll_angle(self, nu):
@@ -104,10 +107,10 @@ class CIC(Profile):
 
     def normal_at(self, roll_angle):
         # The normals of the arc pass through its centre and the pitch point. With c ≥ r (u at
-        # or past the longest) the involute takes over from the land and the arc is skipped.
+        # least the longest) the involute follows the land directly and the arc is skipped.
         involute = roll_angle >= self.involute_start
         on_arc = (roll_angle > self.tip_arc_angle) & ~involute
-        # Off the arc any turn will do that keeps the pitch point away from the centre.
+        # Off the arc, use any turn that keeps the pitch point away from the centre.
         turn = jnp.where(on_arc, roll_angle - self.tip_arc_angle, jnp.pi / 2)
         r, c = self.pitch_radius, self.arc_center_radius
         arc = self.tip_arc_angle + jnp.arctan2(r * jnp.sin(turn), r * jnp.cos(turn) - c)
@@ -121,8 +124,8 @@ class CIC(Profile):
         return jnp.where(nu > self.arc_end, involute, arc)
 
     def lever(self, nu):
-        # The normals of the land, arc and involute pass through the axis, through the
-        # arc's centre, and touch the base circle: no roll angle is needed.
+        # Normals of the land pass through the axis, those of the arc through its centre, and
+        # those of the involute touch the base circle. No roll angle is needed.
         arc = self.arc_center_radius * jnp.sin(self._arc_turn(nu))
         return jnp.where(nu > self.arc_end, self.base_radius, arc)
 
@@ -139,7 +142,7 @@ class CIC(Profile):
         return False
 
     def lever_from(self, nu, cos, sin):
-        # As `lever`, with ν turned by θ1 by the addition theorem.
+        # Like `lever`, with sin(ν - θ1) from the addition theorem.
         tip_cos, tip_sin = self.tip_direction
         arc = self.arc_center_radius * (sin * tip_cos - cos * tip_sin)
         beyond_land = jnp.where(nu > self.arc_end, self.base_radius, arc)

@@ -1,4 +1,4 @@
-"""Addenda given as a curve: the meshing condition by its normals, the conjugate by the core."""
+"""Addenda given as curves: their normals give the meshing condition, `Profile` the conjugate."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -15,16 +15,18 @@ from jaxtyping import Array, Float
 from rootsopt.profiles.base import Profile, Quadrature, Segment
 
 INTERVALS = 48
-"""Intervals of a piece: the quintic between their ends misses a smooth curve by some 1e-11 r."""
+"""Intervals per piece; one quintic per interval deviates from a smooth curve by about 1e-11 r."""
 _STEPS = 4
-"""Newton steps for the normal angle at a roll angle, from a table good to some 1e-4."""
+"""Newton steps for the normal angle at a roll angle, from a table accurate to about 1e-4."""
 _GAUSS = np.polynomial.legendre.leggauss(4)
-"""Quadrature over an interval at most, to rounding."""
+"""Quadrature over one interval or a part of it, exact to rounding."""
 
 
 class Piece(NamedTuple):
-    """A stretch of an addendum as a curve: `position(t)` (2,) in m for t from 0 to 1, from the tip
-    towards the pitch crossing, convex: the normal turns with t. `land` as in `Segment`."""
+    """A convex part of an addendum, given as a curve.
+
+    `name`: of its segment; `position`: function of t to the point (2,) in m, for t from 0 to 1 from
+    the tip towards the pitch crossing; `land`: as in `Segment`."""
 
     name: str
     position: Callable[[Float[Array, ""]], Float[Array, "2"]]
@@ -32,8 +34,11 @@ class Piece(NamedTuple):
 
 
 class RollPiece(NamedTuple):
-    """A stretch of an addendum by roll and pressure angle: `roll(t)` gives (β, ψ) in rad for t from
-    0 to 1, as `Piece` does. It may end in a cusp (ψ = 0), where a curve has no tangent."""
+    """A part of an addendum, given by its roll and pressure angle.
+
+    `name`: of its segment; `roll`: function of t to (β, ψ) in rad, for t from 0 to 1 as in `Piece`;
+    `land`: as in `Segment`. Use it for a part that ends in a cusp (ψ = 0), where a curve has no
+    tangent."""
 
     name: str
     roll: Callable[[Float[Array, ""]], Float[Array, "2"]]
@@ -43,16 +48,16 @@ class RollPiece(NamedTuple):
 class Curve(Profile):
     """An addendum of given curves, each tangent to the next.
 
-    Stored is the pressure angle ψ by the normal angle ν: quintics between nodes, which join its
-    values and two derivatives there. From it follow β = ν - π/2 + ψ, the lever r cos ψ, and the
-    support function by quadrature from the pitch crossing, so that the law of gearing holds for
-    the quintics themselves, whatever they miss of the curve.
+    The profile stores the pressure angle ψ as a function of the normal angle ν: quintics between
+    nodes that match its value and two derivatives there. From ψ follow β = ν - π/2 + ψ, the lever
+    r cos ψ, and the support function by quadrature from the pitch crossing. The law of gearing
+    therefore holds for the quintics themselves, even where they deviate from the given curve.
 
-    `node` (n,) in rad; `series` (n, 6): coefficients of ψ (rad) by powers of the distance from the
-    last node; `value` (n,): the support function (m); `ends` (m,): joints (rad) between the pieces,
-    from 0 to the pitch crossing. Nodes of pieces follow each other; a joint has one node of either
-    piece, as dψ/dν may jump there. Beyond the pitch crossing ψ goes on as a parabola, over the tip
-    by symmetry.
+    `names`, `lands`: of the pieces; `sharp`: whether the last piece ends in a cusp; `node` (n,):
+    normal angles (rad); `series` (n, 6): coefficients of ψ (rad) in powers of the distance from the
+    node; `value` (n,): support function (m) at the node; `ends` (m,): joints (rad) between the
+    pieces, from 0 to the pitch crossing. A joint has one node of each piece, as dψ/dν may jump
+    there. Beyond the pitch crossing ψ continues as a parabola, over the tip by symmetry.
     """
 
     lobes: int = eqx.field(static=True)
@@ -74,8 +79,10 @@ class Curve(Profile):
         intervals: int = INTERVALS,
         sharp: bool = False,
     ) -> "Curve":
-        """The addendum made of `pieces`, which reach from the lobe's axis to the pitch crossing
-        and have one normal where they meet. `sharp`: the last ends in a cusp."""
+        """Return the addendum made of `pieces`, with `intervals` quintics each.
+
+        The pieces extend from the lobe's axis to the pitch crossing and have the same normal where
+        they meet. `sharp`: whether the last one ends in a cusp."""
         r = jnp.asarray(pitch_radius)
         t = jnp.arange(intervals + 1, dtype=r.dtype) / intervals
         turning = [functools.partial(_turning, _rolling(piece, r)) for piece in pieces]
@@ -92,7 +99,7 @@ class Curve(Profile):
             value=jnp.zeros_like(node),
             ends=jnp.append(node[:: intervals + 1], node[-1]),
         )
-        # With zeros for the support function at the nodes: what it falls by over each interval.
+        # The nodes' support function is still 0 here, so this is its decrease over each interval.
         start = jnp.arange(node.shape[0] - 1)
         fall = -curve._support(start, jnp.diff(node))
         value = r * jnp.sin(psi[-1]) + jnp.cumsum(fall[::-1])[::-1]
@@ -116,8 +123,9 @@ class Curve(Profile):
         return Quadrature(6, False, 4)
 
     def _place(self, nu):
-        """The last node before `nu`, which is none at the end of a piece but the last, and the
-        distance from it."""
+        """Return the index of the last node before `nu` and the distance (rad) from it.
+
+        The end node of a piece is skipped, except that of the last piece."""
         last = self.node.shape[0] - 1
         count = (last + 1) // len(self.names)
         k = jnp.clip(jnp.searchsorted(self.node, nu, side="right") - 1, 0, last)
@@ -125,7 +133,7 @@ class Curve(Profile):
         return k, nu - self.node[k]
 
     def _psi(self, k, away):
-        """ψ at a distance `away` from node k."""
+        """Return ψ (rad) at a distance `away` (rad) from node k."""
         series = self.series[k]
         psi = series[..., 5]
         for power in (4, 3, 2, 1, 0):
@@ -133,14 +141,17 @@ class Curve(Profile):
         return psi
 
     def _support(self, k, away):
-        """Support function (m) at a distance `away` from node k: its slope is -r cos ψ."""
+        """Return the support function (m) at a distance `away` (rad) from node k; its slope is
+        -r cos ψ."""
         shares, weights = (jnp.asarray(part, away.dtype) for part in _GAUSS)
         inside = away[..., None] * (1 + shares) / 2
         mean = jnp.sum(jnp.cos(self._psi(k[..., None], inside)) * weights, axis=-1) / 2
         return self.value[k] - self.pitch_radius * mean * away
 
     def _mirrored(self, nu):
-        """ν on this side of the lobe's axis, and which side it was. (A land goes on itself.)"""
+        """Return |ν|, and whether ν was on the other side of the lobe's axis.
+
+        If the first piece is a land, ν is unchanged: the land itself continues over the tip."""
         over = jnp.zeros(nu.shape, bool) if self.lands[0] else nu < 0
         return jnp.where(over, -nu, nu), over
 
@@ -176,8 +187,8 @@ class Curve(Profile):
 
 
 def _quintics(node, psi, slope, bend):
-    """Coefficients (n, 6) by powers of the distance from each node; a parabola at the last of a
-    piece."""
+    """Return coefficients (n, 6) in powers of the distance from each node; at the last node of a
+    piece they are those of a parabola."""
     here = node, psi, slope, bend
     following = (jnp.append(row[1:], row[-1:]) for row in here)
 
@@ -199,14 +210,14 @@ def _quintics(node, psi, slope, bend):
 
 
 def _rolling(piece, pitch_radius):
-    """t → (β, ψ) of a piece."""
+    """Return the function t → (β, ψ) in rad of a piece."""
     if isinstance(piece, RollPiece):
         return piece.roll
 
     def roll(t):
         place, speed = jax.jvp(piece.position, (t,), (jnp.ones_like(t),))
         tangent = speed / jnp.sqrt(jnp.sum(speed**2))
-        # The outward normal is a quarter turn behind the direction of travel from the tip.
+        # The outward normal is the tangent from tip to pitch crossing, turned by -90°.
         lever = -jnp.dot(place, tangent)
         psi = jnp.arctan2(jnp.sqrt((pitch_radius - lever) * (pitch_radius + lever)), lever)
         nu = jnp.arctan2(-tangent[0], tangent[1])
@@ -216,7 +227,7 @@ def _rolling(piece, pitch_radius):
 
 
 def _turning(roll, t):
-    """ν, ψ, dψ/dν and d²ψ/dν² at t."""
+    """Return ν, ψ (rad), dψ/dν and d²ψ/dν² at t."""
     one = jnp.ones_like(t)
 
     def angles(t):

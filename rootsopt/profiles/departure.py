@@ -1,4 +1,4 @@
-"""How far one profile departs from another."""
+"""Measures the greatest distance between the flanks of two profiles."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,18 +9,19 @@ from rootsopt.profiles.base import Profile
 from rootsopt.runtime.programs import Program
 
 _NODES = 400
-"""Nodes of a flank, so that its chords stay within some 1e-7 r of it."""
+"""Nodes per side of the pitch circle; the chords then deviate from the flank by about 1e-7 r."""
 
 
 def departure(profile: Profile, other: Profile, nodes: int = _NODES) -> float:
-    """Greatest distance (m) of the flank of one profile from that of the other, from tip to root
-    and both ways; `nodes` on either side of the pitch circle."""
+    """Return the greatest distance (m) between two flanks from tip to root, measured both ways.
+
+    `nodes`: nodes on each side of the pitch circle."""
     first, second = (flank_points(one, nodes) for one in (profile, other))
     return float(max(distances(first, second).max(), distances(second, first).max()))
 
 
 def flank_points(profile: Profile, nodes: int = _NODES) -> NDArray[np.float64]:
-    """Points (n, 2) in m from tip to root, dense where the normal turns."""
+    """Return points (n, 2) in m from tip to root, dense where the normal turns."""
     stop = float(profile.pitch_normal)
     ends = [float(s.stop) for s in profile.segments()]
     return np.asarray(_points(profile, np.union1d(np.linspace(0, stop, nodes), ends)))
@@ -35,7 +36,7 @@ def _points(profile: Profile, nu):
 def distances(
     points: Float[np.ndarray, "n 2"], line: Float[np.ndarray, "m 2"]
 ) -> NDArray[np.float64]:
-    """Distance of each of the `points` from a polygonal `line`, in their unit."""
+    """Return the distance (n,) of each of the `points` from a polygonal `line`, in their unit."""
     start, step = line[:-1], np.diff(line, axis=0)
     squares = np.maximum(np.sum(step**2, axis=1), np.finfo(float).tiny)
     away = points[:, None] - start

@@ -9,17 +9,17 @@ if TYPE_CHECKING:
     from rootsopt.config.scene import ProfileConfig
 
 _SHARPEST = 0.002
-"""Least radius of an edge in pitch radii: less is a corner, along which the outline's and the
-contact's nodes fall together."""
+"""Radius of an edge (pitch radii) below which the edge is rejected as a corner. On a corner the
+nodes of outline and contact coincide."""
 
 
 def check(profile: "ProfileConfig") -> None:
-    """Raise `InputError` for an edge that is a corner."""
+    """Raise `InputError` where the edge radius is too small."""
     edge: Any = profile.parameters["edge_radius_mm"]
     least = _SHARPEST * profile.pitch_radius_mm
     if edge < least:
         raise InputError(
             f"`profile.edge_radius_mm` must be at least {least:g} ({_SHARPEST:g} pitch radii), but "
-            f"is {edge:g}: a sharp edge has no contact law; round it"
+            f"is {edge:g}: the contact law does not apply to a sharp edge; round it"
             + hint("edge_radius_mm", edge, 0.01 * profile.pitch_radius_mm, profile.pitch_radius_mm)
         )

@@ -10,15 +10,15 @@ from rootsopt.profiles.base import Profile, Segment
 class EE(Profile):
     """The EE rotor: rolling radius r/2N, ψ = N |π/2N - β|, s = (r/N) sin(N(π/2N - β)).
 
-    The paper's Eqs. 7 and 8 with their misprints mended (sine and cosine of Eq. 7 are
-    swapped, the undefined τ of Eq. 8 is γ). It has no design parameter but its size.
+    These are the paper's Eqs. 7 and 8 with two misprints corrected: sine and cosine of Eq. 7 are
+    swapped, and the undefined τ of Eq. 8 is γ. The size is the only parameter.
     """
 
     lobes: int = eqx.field(static=True)
     pitch_radius: Float[Array, ""]
 
     def __init__(self, lobes, pitch_radius):
-        """`lobes` N; `pitch_radius` r (m), a scalar."""
+        """Build the rotor from `lobes` N and `pitch_radius` r (m), a scalar."""
         self.lobes = lobes
         self.pitch_radius = jnp.asarray(pitch_radius)
 

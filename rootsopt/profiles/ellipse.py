@@ -13,10 +13,11 @@ def ellipse(
     ellipse_center: Float[ArrayLike, ""],
     ellipse_height: Float[ArrayLike, ""],
 ) -> Curve:
-    """The lobe is an arc of an ellipse through both pitch crossings: its `ellipse_center` b (m) and
-    the semi-axis `ellipse_height` A (m) lie along the lobe's axis; the other one, B, follows from
-    the crossings, (r cos π/2N - b)² / A² + (r sin π/2N)² / B² = 1. With A = B it is the single
-    arc."""
+    """Return a lobe that is an arc of an ellipse through both pitch crossings.
+
+    Its `ellipse_center` b (m) and the semi-axis `ellipse_height` A (m) lie along the lobe's axis.
+    The other semi-axis B follows from the crossings:
+    (r cos π/2N - b)² / A² + (r sin π/2N)² / B² = 1. With A = B it is the single arc."""
     center, height = ellipse_center, ellipse_height
     r, half = jnp.asarray(pitch_radius), jnp.pi / (2 * lobes)
     x, y = (r * jnp.cos(half) - center) / height, r * jnp.sin(half)

@@ -12,16 +12,16 @@ class TippedEpicycloid(Profile):
     """An epicycloid from the pitch crossing to a joint, and a circular arc over the tip.
 
     On the epicycloid of rolling radius r_e, with κ = r / 2 r_e, the pressure angle is
-    ψ = κ (π/2N - β) and s = 2 r_e sin ψ, so that ds/dβ = -r cos ψ; its mate is the hypocycloid of
-    the same circle. EE has r_e = r / 2N, where ψ reaches π/2 on the lobe's axis. The tip arc is
-    tangent to it at the joint and has its centre C on the lobe's axis: at the distance
-    c = r cos ψ / sin ν from the rotor's, for a joint with the normal ν and the pressure angle ψ.
-    No epicycloid with r_e < r undercuts: its mate's arc length per ν is
-    4 r_e (r - r_e) sin ψ / (r + 2 r_e). (Derivation; no source of the formulas was at hand.)
+    ψ = κ (π/2N - β) and s = 2 r_e sin ψ, so that ds/dβ = -r cos ψ. Its conjugate is the hypocycloid
+    of the same circle. EE has r_e = r / 2N, with which ψ reaches π/2 on the lobe's axis. The tip
+    arc is tangent to the epicycloid at the joint, and its centre C lies on the lobe's axis. With
+    normal ν and pressure angle ψ at the joint, C is c = r cos ψ / sin ν from the rotor's axis.
+    No epicycloid with r_e < r is undercut: the arc length of its conjugate per ν is
+    4 r_e (r - r_e) sin ψ / (r + 2 r_e). (Derivation; no source of the formulas was available.)
 
-    `rolling_radius` r_e (m); `joint`: normal angle (rad) at which the arc ends;
-    `arc_center_radius` c and `arc_radius` (m); `land`: whether the arc is one about the rotor's
-    axis (c = 0).
+    `rolling_radius`: r_e (m). `joint`: normal angle (rad) at which the arc ends.
+    `arc_center_radius`: c (m). `arc_radius`: radius of the tip arc (m). `land`: whether the arc is
+    centred on the rotor's axis (c = 0).
     """
 
     lobes: int = eqx.field(static=True)
@@ -33,7 +33,8 @@ class TippedEpicycloid(Profile):
     arc_radius: Float[Array, ""]
 
     def __init__(self, lobes, pitch_radius, rolling_radius, joint, land=False):
-        """`lobes` N; `pitch_radius` r (m), `rolling_radius` r_e (m) and `joint` (rad), scalars."""
+        """Build the rotor from `lobes` N and the scalars `pitch_radius` r (m), `rolling_radius` r_e
+        (m) and `joint` (rad). `land`: make the tip arc a land."""
         self.lobes, self.land = lobes, land
         r = self.pitch_radius = jnp.asarray(pitch_radius)
         self.rolling_radius = jnp.asarray(rolling_radius)
@@ -61,7 +62,7 @@ class TippedEpicycloid(Profile):
         return self.half_pitch + jnp.pi / 2
 
     def _psi(self, nu):
-        """ψ on the epicycloid."""
+        """Return ψ (rad) on the epicycloid."""
         r, rolling = self.pitch_radius, self.rolling_radius
         return (self._stop - nu) * r / (r + 2 * rolling)
 
@@ -72,12 +73,12 @@ class TippedEpicycloid(Profile):
         return (self.pitch_radius + 2 * self.rolling_radius) * jnp.sin(self._psi(nu))
 
     def _on_arc(self, nu):
-        """Whether the arc has the normal `nu`, and that normal, or another one where not."""
+        """Return whether `nu` is on the arc, and `nu` itself there, 0 elsewhere."""
         on_arc = nu < self.joint
         return on_arc, jnp.where(on_arc, nu, 0.0)
 
     def _tilt(self, nu):
-        """ν - β of the arc's normals."""
+        """Return ν - β (rad) of the arc's normals."""
         return jnp.arcsin(self.arc_center_radius * jnp.sin(nu) / self.pitch_radius)
 
     def roll_angle(self, nu):
@@ -115,21 +116,22 @@ def circle_epicycloid(
     rolling_radius: Float[ArrayLike, ""],
     tip_arc_turn: Float[ArrayLike, ""],
 ) -> TippedEpicycloid:
-    """A tip arc centred on the lobe's axis, and an epicycloid of `rolling_radius` (m).
+    """Return a tip arc centred on the lobe's axis with an epicycloid of `rolling_radius` r_e (m).
 
-    The arc ends at the normal angle `tip_arc_turn` (rad). With the joint on the lobe's axis, that
-    is ν = π/2 - π r / 4N r_e, the arc is centred on the pitch circle and meshes all at once."""
+    The arc ends at the normal angle `tip_arc_turn` (rad). If β = 0 at the joint, that is
+    ν = π/2 - π r / 4N r_e, the arc is centred on the pitch circle and all of it meshes at one
+    instant."""
     return TippedEpicycloid(lobes, pitch_radius, rolling_radius, tip_arc_turn)
 
 
 def hypo_epicycloid(
     lobes: int, pitch_radius: Float[ArrayLike, ""], tip_arc_angle: Float[ArrayLike, ""]
 ) -> TippedEpicycloid:
-    """Whole half arches of hypocycloid and epicycloid, with a land at tip and root.
+    """Return complete half arches of hypocycloid and epicycloid, with a land at tip and root.
 
-    The land has the half angle `tip_arc_angle` θ1 (rad). Both arches, for identical rotors at 1:1,
-    are rolled by one circle, and ψ must reach π/2 where
-    the land begins: r_e = r (π/2N - θ1) / π. Without a land this is EE. (Derivation.)
+    The land has the half angle `tip_arc_angle` θ1 (rad). For identical rotors at 1:1 one circle
+    rolls both arches. ψ must reach π/2 where the land starts: r_e = r (π/2N - θ1) / π. Without a
+    land this is EE. (Derivation.)
     """
     rolling = jnp.asarray(pitch_radius) * (1 / (2 * lobes) - jnp.asarray(tip_arc_angle) / jnp.pi)
     return TippedEpicycloid(lobes, pitch_radius, rolling, tip_arc_angle, land=True)

@@ -1,4 +1,4 @@
-"""Free form: the fall of the pressure angle as a B-spline, from which all else follows."""
+"""Free form: a flank given by a B-spline of how fast its pressure angle falls."""
 
 import functools
 import itertools
@@ -14,42 +14,44 @@ from rootsopt.profiles.base import Profile, Quadrature, Segment
 from rootsopt.runtime.programs import Program
 
 _DEGREE = 2
+"""Degree of the B-spline."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _STEPS = 8
-"""Guarded Newton steps for the normal angle at a roll angle; each at least halves the bracket."""
+"""Safeguarded Newton steps for the normal angle at a roll angle; a step that leaves the bracket is
+a bisection."""
 _POLISH = 3
-"""Plain Newton steps after these, with as many derivatives."""
+"""Plain Newton steps after these; they carry derivatives up to that order."""
 _SAMPLES = 40
-"""Places in a knot span at which a free form is fitted."""
+"""Points per knot span at which a free form is fitted."""
 _FIRMLY = 1e3
 """Weight of the pitch crossing in the fit."""
 _FLAT = 1e-9
-"""Least dβ/dν in these steps: on an arc centred on the pitch circle it is 0."""
+"""Least dβ/dν used in these steps; it is 0 on an arc centred on the pitch circle."""
 
 
 class FreeForm(Profile):
-    """A tip land and a free addendum, with as many coefficients as one likes.
+    """A tip land and a free addendum, with any number of coefficients.
 
-    The turn of the normal dν is shared between the roll angle, dβ = (1 - τ) dν, and the pressure
-    angle, dψ = -τ dν. The share τ(ν) is a quadratic B-spline with even knots from the end of the
-    land to the pitch crossing, and ψ(ν), which begins at π/2, a cubic one. Coefficients of at most
-    1 (an arc centred on the pitch circle) keep the roll angle from turning back; with none below 0
-    (an involute) ψ falls steadily, and it rises where τ < 0, as towards the pitch circle in a
-    single arc. They are N / (1 + N) throughout in an EE rotor without a land. The length of the
-    spline follows from the roll angle of the pitch crossing,
+    A turn of the normal dν changes the roll angle by dβ = (1 - τ) dν and the pressure angle by
+    dψ = -τ dν. The rate τ(ν) is a quadratic B-spline with even knots from the end of the land to
+    the pitch crossing. ψ(ν) starts at π/2 and is a cubic one.
+
+    If no coefficient exceeds 1 (an arc centred on the pitch circle), the roll angle does not turn
+    back. If none is below 0 (an involute), ψ falls steadily. Where τ < 0 it rises, as it does
+    towards the pitch circle in a single arc. In an EE rotor without a land all coefficients are
+    N / (1 + N). The length of the spline follows from the roll angle of the pitch crossing,
 
         (ν_p - θ1) (1 - mean of τ) = π/2N - θ1,
 
     and the support function from h′ = -lever = -r cos ψ, h(ν_p) = r sin ψ(ν_p), by Gauss-Legendre
-    quadrature inside each knot span, to rounding: the law of gearing holds for any coefficients.
+    quadrature inside each knot span, exact to rounding. Thus the law of gearing holds for any
+    coefficients. The spline is a function of ν, not of β, because ψ(β) jumps on an arc centred on
+    the pitch circle.
 
-    The parameter is ν, as for every family, and not β, in which an arc centred on the pitch circle
-    would be a jump of ψ.
-
-    `tip_arc_angle` θ1 (rad), half the angle of the land; `coefficients` (n,), n ≥ 3, from the land
-    to the pitch crossing; `width` (rad) of a knot span; `turn` (n - 2, 4): coefficients of ψ (rad)
-    in powers of the share of a span; `beyond` (n - 2,): the support function (m) at the end of
-    each.
+    `tip_arc_angle`: θ1 (rad), half the angle of the land. `coefficients` (n,), n ≥ 3: of τ, from
+    the land to the pitch crossing. `width`: of a knot span (rad). `turn` (n - 2, 4): coefficients
+    of ψ (rad) in each span, in powers of the fraction of the span. `beyond` (n - 2,): support
+    function (m) at the end of each span.
     """
 
     lobes: int = eqx.field(static=True)
@@ -61,14 +63,14 @@ class FreeForm(Profile):
     beyond: Float[Array, " k"]
 
     def __init__(self, lobes, pitch_radius, tip_arc_angle, coefficients):
-        """`lobes` N; `pitch_radius` r (m), `tip_arc_angle` θ1 (rad), scalars; `coefficients`
-        (n,)."""
+        """Build the rotor from `lobes` N, the scalars `pitch_radius` r (m) and `tip_arc_angle` θ1
+        (rad), and `coefficients` (n,)."""
         self.lobes = lobes
         r = self.pitch_radius = jnp.asarray(pitch_radius)
         self.tip_arc_angle = jnp.asarray(tip_arc_angle)
         self.coefficients = jnp.asarray(coefficients)
         share = jnp.asarray(_powers(self.coefficients.shape[0])) @ self.coefficients
-        # The integral over each span, and over all before it.
+        # Integral of τ over each span (`whole`), and over all spans before it (`before`).
         gone = share / jnp.arange(1, 2 + _DEGREE)
         whole = jnp.sum(gone, axis=1)
         before = jnp.cumsum(whole) - whole
@@ -101,22 +103,23 @@ class FreeForm(Profile):
 
     @property
     def quadrature(self) -> Quadrature:
-        # Inside of a knot span ψ is a cubic.
+        # ψ is a cubic inside a knot span.
         return Quadrature(24, False, 128)
 
     def _place(self, nu):
-        """Knot span at `nu`, and the share of it; the first and the last go on."""
+        """Return the knot span at `nu` and the fraction of it; the first and last span extend
+        beyond their ends."""
         x = (nu - self.tip_arc_angle) / self.width
         span = jnp.clip(jnp.floor(lax.stop_gradient(x)), 0, self._spans - 1).astype(int)
         return span, x - span
 
     def _psi(self, span, share):
-        """ψ at a share of a span."""
+        """Return ψ (rad) at a fraction of a span."""
         c = jnp.moveaxis(self.turn[span], -1, 0)
         return c[0] + share * (c[1] + share * (c[2] + share * c[3]))
 
     def _within(self, span, share):
-        """∫ r cos ψ dν (m) from a share of a span to its end."""
+        """Return ∫ r cos ψ dν (m) from a fraction of a span to its end."""
         nodes, weights = (jnp.asarray(x, self.width.dtype) for x in (_NODES, _WEIGHTS))
         rest = (1 - share)[..., None]
         at = share[..., None] + rest * (1 + nodes) / 2
@@ -150,7 +153,7 @@ class FreeForm(Profile):
         want = roll_angle - starts[span]
 
         def short(c, width, want, share):
-            """β beyond the one wanted, and its slope, at a share of the span."""
+            """Return β minus the wanted one (rad), and its slope, at a fraction of the span."""
             rise = share * (width + c[1] + share * (c[2] + share * c[3]))
             slope = width + c[1] + share * (2 * c[2] + 3 * share * c[3])
             return rise - want, jnp.maximum(slope, _FLAT * width)
@@ -171,12 +174,12 @@ class FreeForm(Profile):
 
 
 def project(profile: Profile, count: int) -> FreeForm:
-    """The free form of `count` coefficients nearest to a `profile`, its tip land kept.
+    """Return the free form of `count` coefficients nearest to a `profile`, with the same tip land.
 
-    Least squares of the pressure angle over the normal angle, which are linear in the coefficients;
-    these stay between -1 and 1, and the length of the spline is that of the addendum.
+    It is the least-squares fit of the pressure angle over the normal angle, which is linear in the
+    coefficients. These stay between -1 and 1. The spline is as long as the addendum.
     """
-    from scipy.optimize import lsq_linear  # A fifth of a second, and only needed here.
+    from scipy.optimize import lsq_linear  # Imported here only: it takes 0.2 s.
 
     first, last = profile.segments()[0], profile.segments()[-1]
     start = float(first.stop) if first.land else 0.0
@@ -186,10 +189,10 @@ def project(profile: Profile, count: int) -> FreeForm:
     share = np.arange(1, _SAMPLES * spans + 1) / (_SAMPLES * spans)
     psi = np.asarray(_pressure_angles(profile, start + length * share))
     rows, want = fall(share), (np.pi / 2 - psi) / length
-    # The last row is the pitch crossing, where the spline ends.
+    # The last row is the pitch crossing, at the end of the spline.
     rows[-1], want[-1] = rows[-1] * _FIRMLY, want[-1] * _FIRMLY
     found = lsq_linear(rows, want, (-1.0, 1.0), method="bvls")
-    # BVLS may pass a bound by a rounding.
+    # BVLS may exceed a bound by a rounding error.
     shares = jnp.asarray(np.clip(found.x, -1.0, 1.0))
     return FreeForm(profile.lobes, profile.pitch_radius, jnp.asarray(start), shares)
 
@@ -200,7 +203,9 @@ def _pressure_angles(profile: Profile, nu):
 
 
 def _integrals(count: int):
-    """∫ of every B-spline from 0 to shares (n,) of the whole length: a function to (n, count)."""
+    """Return a function that integrates each B-spline from 0 to fractions (n,) of the length.
+
+    It returns an array (n, count), in units of the whole length."""
     powers = _powers(count) / np.arange(1, 2 + _DEGREE)[:, None]
     spans = len(powers)
     before = np.cumsum(powers.sum(axis=1), axis=0) - powers.sum(axis=1)
@@ -216,14 +221,14 @@ def _integrals(count: int):
 
 @functools.cache
 def _powers(count: int) -> NDArray[np.float64]:
-    """(spans, 3, count): coefficients of each B-spline in powers of the share of a knot span.
+    """Return coefficients (spans, 3, count) of each B-spline in powers of the fraction of a span.
 
-    By Cox and de Boor's recursion on polynomials; knots are the ends of spans, those of the whole
-    repeated."""
+    They come from the Cox-de Boor recursion on polynomials. Knots are the ends of the spans; the
+    first and the last knot are repeated."""
     spans = count - _DEGREE
     knots = np.clip(np.arange(-_DEGREE, spans + _DEGREE + 1.0), 0, spans)
     basis = np.zeros((spans, _DEGREE + 1, count + _DEGREE))
-    # Of the splines of degree 0 one is 1 in each span.
+    # Exactly one spline of degree 0 is 1 in each span.
     basis[np.arange(spans), 0, np.arange(spans) + _DEGREE] = 1
     for degree in range(1, _DEGREE + 1):
         lower, basis = basis, np.zeros_like(basis)
@@ -235,7 +240,7 @@ def _powers(count: int) -> NDArray[np.float64]:
                 (lower[..., k + 1], -1.0, fall, knots[k + degree + 1]),
             ):
                 if width > 0:
-                    # Times ±(span + share - zero) / width.
+                    # Multiply by ±(span + fraction - zero) / width.
                     away = (np.arange(spans) - zero)[:, None]
                     basis[..., k] += sign / width * (away * part)
                     basis[:, 1:, k] += sign / width * part[:, :-1]

@@ -14,17 +14,19 @@ from rootsopt.profiles.outline import Outline
 from rootsopt.runtime.programs import Program
 
 _GRADING = 4.0
-"""Nodes that crowd are even ones by the hyperbolic tangent of a scale this long to either side. Of
-powers, hyperbolic tangents and double exponentials with 32 to 96 nodes this one had the least
-error on a root 0.3 to 1e-4 of the length beyond an end: 1e-13."""
+"""Factor g of graded nodes: Gauss-Legendre nodes x become tanh(g x) / tanh(g).
+
+Powers, hyperbolic tangents and double exponentials with 32 to 96 nodes were compared on a square
+root that starts 0.3 to 1e-4 of the length beyond an end. This one had the least error, 1e-13."""
 
 
 class Geometry(eqx.Module):
-    """Geometry of one rotor, per unit length where a length is not given (SI units).
+    """Geometry of one rotor's cross-section (SI units).
 
-    `outer_radius`, `root_radius` (m); `area` (m²); `area_efficiency` 1 - A/(π r_a²);
-    `polar_area_moment` ∫r² dA about the axis (m⁴); `undercut_margin` (m per rad), least
-    `Profile.dedendum_speed`; `seal_width` (m), arc length of the whole tip land.
+    `outer_radius`, `root_radius`: greatest and least distance of the outline from the axis (m).
+    `area`: A (m²). `area_efficiency`: 1 - A/(π r_a²). `polar_area_moment`: ∫r² dA about the axis
+    (m⁴). `undercut_margin`: least `Profile.dedendum_speed` (m per rad). `seal_width`: arc length of
+    the whole tip land (m).
     """
 
     outer_radius: Float[Array, ""]
@@ -37,10 +39,10 @@ class Geometry(eqx.Module):
 
 
 def geometry(profile: Profile) -> Geometry:
-    """Area and inertia by Green's theorem on the roll-angle form; exact to rounding.
+    """Return the `Geometry` of a profile, with area and inertia exact to rounding.
 
-    With the support function h = P·n and arc length element dl, dA = h dl / 2 and
-    ∫r² dA = ∫ |P|² h dl / 4 over the outline.
+    They follow from Green's theorem on the roll-angle form. With the support function h = P·n and
+    arc length element dl, dA = h dl / 2 and ∫r² dA = ∫ |P|² h dl / 4 over the outline.
     """
     if isinstance(profile, Outline):
         return _given(profile)
@@ -65,10 +67,10 @@ def geometry(profile: Profile) -> Geometry:
     reach = profile.contact_distance(jnp.zeros_like(r))
     outer_radius = r + reach
     seal_angle = sum(2 * (s.stop - s.start) for s in segments if s.land)
-    # An absent segment (no tip land, say) sets no limit.
+    # An empty segment, such as an absent tip land, does not limit the margin.
     candidates = jnp.where(length > 0, dedendum, jnp.inf).ravel()
-    # By index: the derivative of `min` compares recomputed floats, which compiled
-    # programs may round differently, and is then zero.
+    # Take the minimum by index. The derivative of `min` compares recomputed floats, which a
+    # compiled program may round differently; the derivative is then zero.
     margin = candidates[lax.stop_gradient(jnp.argmin(candidates))]
     return Geometry(
         outer_radius=outer_radius,
@@ -83,20 +85,21 @@ def geometry(profile: Profile) -> Geometry:
 
 @functools.cache
 def _rule(quadrature: Quadrature) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Shares of a stretch to look at, and their weights in its integral."""
+    """Return the fractions of a stretch to evaluate, and their weights in its integral."""
     nodes, weights = np.polynomial.legendre.leggauss(quadrature.nodes)
     if quadrature.graded:
         weights = weights * _GRADING / np.cosh(_GRADING * nodes) ** 2 / np.tanh(_GRADING)
         nodes = np.tanh(_GRADING * nodes) / np.tanh(_GRADING)
-    # Each end is looked at from just inside, so that it belongs to its segment.
+    # Evaluate each end just inside the stretch, so that it belongs to its segment.
     between = np.arange(1, quadrature.between) / quadrature.between
     shares = np.concatenate([(1 + nodes) / 2, [1e-12, 1 - 1e-12], between])
     return shares, np.append(weights / 2, np.zeros(len(shares) - len(nodes)))
 
 
 def _given(profile: Outline) -> Geometry:
-    """What was measured when the outline was read. Not being the envelope of a partner, it has no
-    undercut margin (NaN)."""
+    """Return the geometry measured when the outline was read.
+
+    Its undercut margin is NaN, because an outline is not the envelope of a partner."""
     return Geometry(
         outer_radius=profile.outer_radius,
         root_radius=profile.root_radius,
@@ -109,8 +112,10 @@ def _given(profile: Outline) -> Geometry:
 
 
 def flank_nodes(profile: Profile, points: int) -> Float[Array, " n"]:
-    """Normal angles (rad) that lay about `points` nodes along the addendum, every
-    segment end included, evenly in arc length on each segment."""
+    """Return normal angles (n,) in rad of about `points` nodes along the addendum.
+
+    They include every segment end. On each segment they are evenly spaced in the density of
+    `_element`."""
     segments = [s for s in profile.segments() if float(s.stop) > float(s.start)]
     lengths, curves = [], []
     for segment in segments:
@@ -135,24 +140,28 @@ def _both(profile, nu):
 
 @Program
 def _element(profile, nu):
-    """Node density over the normal angle: the longer of the two conjugate elements, so
-    that both flanks come out even, plus a share for turning, so that a sharp spot (the
-    pitch point of EE) is resolved."""
+    """Return the node density over the normal angle (m/rad).
+
+    It is the longer of the two conjugate arc elements, so that both flanks are evenly resolved. An
+    added constant resolves sharp spots such as the pitch crossing of EE."""
     _, addendum, dedendum = profile.speeds(nu)
     longest = jnp.maximum(jnp.abs(addendum), jnp.abs(dedendum))
     return longest + 0.3 * profile.pitch_radius
 
 
 def flank(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
-    """Coordinates (m) of one flank from tip centre to root centre, about 2 `points` nodes."""
+    """Return coordinates (n, 2) in m of one flank, from tip centre to root centre.
+
+    It has about 2 `points` nodes."""
     nu = flank_nodes(profile, points)
     addendum, dedendum = map(np.asarray, _both(profile, nu))
     return jnp.asarray(np.concatenate([addendum, dedendum[::-1][1:]]))
 
 
 def outline(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
-    """Closed counter-clockwise outline (m), a lobe tip on +x, the first point repeated
-    at the end; about 4 `points` nodes per lobe."""
+    """Return the closed counter-clockwise outline (n, 2) in m, with a lobe tip on +x.
+
+    The first point is repeated at the end. There are about 4 `points` nodes per lobe."""
     upper = np.array(flank(profile, points))
     upper[0, 1] = 0.0
     lower = upper[::-1] * [1, -1]

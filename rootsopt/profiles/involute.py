@@ -1,4 +1,4 @@
-"""What is known in closed form of the length of an involute: limits, and the range to search."""
+"""Closed-form limits of the involute's length, and the range in which a search varies it."""
 
 import math
 from typing import TYPE_CHECKING, Any
@@ -14,16 +14,17 @@ if TYPE_CHECKING:
 
 _ANGLE, _LENGTH, _TIP = "pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg"
 _OVERLENGTH = 0.02
-"""How far u may exceed u_max, relative. Past u_max the roll angle turns back and two
-points of a flank mesh at once. Node search finds no interference (< 1 nm) up to 5 % over;
-the paper's printed Table 1 is 1.2 % over."""
+"""Excess of u over u_max (fraction of u_max) above which a design is rejected. Beyond u_max the
+roll angle turns back and two points of a flank mesh at once. A node search finds no interference
+(< 1 nm) up to 5 % excess; the paper's printed Table 1 has 1.2 %."""
 _CLEAR = 1e-6
-"""Least involute beyond that at which the tip arc is centred on the pitch circle a second time, in
-pitch radii."""
+"""Least excess (pitch radii) of the involute over the length at which the tip arc is centred on the
+pitch circle a second time."""
 _LEAST_INVOLUTE = 0.002
-"""Least involute in units of the longest: less makes no difference, and is a length in metres."""
+"""Involute length (fraction of the longest) below which it is rejected. A shorter involute changes
+nothing, and was probably given in metres."""
 _SHORTEST = 0.1
-"""Least involute of a search, as a share of the longest, where the config sets no bound."""
+"""Least involute of a search, as a fraction of the longest, unless the config sets a bound."""
 
 
 def ranges(
@@ -33,7 +34,7 @@ def ranges(
     involute_length_mm: Float[Array, ""],
     tip_arc_angle_deg: Float[Array, ""] | float = 0.0,
 ) -> dict[str, tuple[Float[Array, ""], Float[Array, ""]]]:
-    """Shortest and longest involute (mm) of a search at a pressure angle and tip land.
+    """Return shortest and longest involute (mm) of a search, for a pressure angle and tip land.
 
     The longest is `CIC.longest_involute`, so that u ≤ u_max holds by construction."""
     del involute_length_mm
@@ -43,7 +44,7 @@ def ranges(
 
 
 def check(profile: "ProfileConfig") -> None:
-    """Raise `InputError` unless an involute of this length can be made and meshes."""
+    """Raise `InputError` unless an involute of this length exists and meshes without undercut."""
     alpha: Any = getattr(profile, _ANGLE)
     length: Any = getattr(profile, _LENGTH)
     tip: Any = getattr(profile, _TIP) or 0.0
@@ -69,7 +70,7 @@ def check(profile: "ProfileConfig") -> None:
             f"{tip:g} (up to {limit:.4g} is tolerated), but is {length:g}: the roll angle would "
             "turn back; shorten it or raise the pressure angle"
         )
-    # The tip arc's centre must lie inside the pitch circle, which all its normals cross.
+    # The tip arc's centre must lie inside the pitch circle, so that all its normals cross it.
     shortest = radius * sine * (half - tip - 2 * alpha) * DEG
     if length < shortest + _CLEAR * radius:
         raise InputError(
@@ -78,7 +79,7 @@ def check(profile: "ProfileConfig") -> None:
             f"but is {length:g}: the tip arc would touch nothing on the other rotor; lengthen it, "
             "or raise the pressure angle or the tip arc"
         )
-    # Beyond the longest involute the tip arc turns back, until nothing is left of its radius.
+    # Beyond the longest involute the tip arc turns back; its radius decreases to 0.
     turn = (half - tip) * DEG - length / (radius * sine)
     across = math.cos(alpha * DEG - turn)
     rho = length / math.tan(alpha * DEG) + radius * math.sin(turn) / across if across > 0 else 0.0
@@ -89,7 +90,7 @@ def check(profile: "ProfileConfig") -> None:
             f"but is {length:g}: the tip arc would have no radius; shorten it or lower the "
             "pressure angle"
         )
-    # On the dedendum the involute's end is the first to be undercut.
+    # On the dedendum, undercut starts at the conjugate of the involute's end.
     uncut = radius * sine * math.tan(alpha * DEG)
     if length > uncut * (1 + 1e-9):
         raise InputError(

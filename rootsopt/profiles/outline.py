@@ -1,4 +1,4 @@
-"""A flank given as it is: its addendum and its dedendum, which need not be conjugate."""
+"""A flank given by both its addendum and its dedendum, which need not be conjugate."""
 
 import equinox as eqx
 import jax
@@ -9,10 +9,10 @@ from rootsopt.profiles.base import Mate, Profile, RollPoint, Segment
 
 
 class Table(eqx.Module):
-    """k functions of x by cubics between nodes, through values with given slopes.
+    """k functions of x as cubic Hermite interpolants.
 
-    `node` (n,), not falling; `value`, `slope` (n, k). A node that stands twice is a place where
-    slopes jump. Beyond the ends the first and the last cubic go on.
+    `node` (n,): values of x, not decreasing; `value`, `slope` (n, k): at the nodes. At a node given
+    twice the slopes may jump. Beyond the ends, the first and last cubic continue.
     """
 
     node: Float[Array, " n"]
@@ -20,7 +20,7 @@ class Table(eqx.Module):
     slope: Float[Array, "n k"]
 
     def __call__(self, x: Float[Array, "*m"]) -> tuple[Float[Array, "*m"], ...]:
-        """The k functions at x."""
+        """Return the k functions at x."""
         index = jnp.searchsorted(self.node, x, side="right") - 1
         index = jnp.clip(index, 0, self.node.shape[0] - 2)
         start, stop = self.node[index], self.node[index + 1]
@@ -36,17 +36,17 @@ class Table(eqx.Module):
 
 
 class Outline(Profile):
-    """A foreign or measured flank.
+    """A flank from a drawing or a measurement.
 
     `crown`: support function h and lever q (m) of the addendum over its normal angle ν, from the
-    tip to the pitch circle; it is convex, so that ν tells its points. `valley`: direction of the
-    normal from the valley's axis (rad), h and q of the dedendum over a parameter that runs from 0
-    at the root to the pitch normal at the pitch circle; a dedendum may be convex and concave.
-    With the direction F, dh = -q dF and dq = h dF less the element of arc along the tangent.
+    tip to the pitch circle. The addendum is convex, so that ν identifies its points. `valley`:
+    normal direction F from the valley's axis (rad), h and q (m) of the dedendum. Its parameter runs
+    from 0 at the root to the pitch normal at the pitch circle, as a dedendum may be convex and
+    concave. dh = -q dF, and dq = h dF minus the arc length element along the tangent.
 
-    Beyond its ends the addendum is continued by its circles of curvature, over the tip by its
-    mirror image. The law of gearing is nowhere assumed: `mate` is the dedendum as it is. Roll
-    angle and contact distance are those at which either curve's own normals meet the pitch circle.
+    Beyond its ends, the addendum continues with its circles of curvature, over the tip with its
+    mirror image. The law of gearing is not assumed: `mate` is the given dedendum. Roll angle and
+    contact distance are those at which each curve's own normals meet the pitch circle.
 
     `area`, `polar_area_moment`, `outer_radius`, `root_radius`, `seal_width`: see `Geometry`.
     """
@@ -66,11 +66,11 @@ class Outline(Profile):
         return (Segment("flank", jnp.zeros_like(stop), stop, False),)
 
     def _crown(self, nu):
-        """Support function and lever at any ν."""
+        """Return support function and lever (m) at any ν."""
         inside = jnp.clip(jnp.abs(nu), self.crown.node[0], self.crown.node[-1])
         beyond = jnp.abs(nu) - inside
         support, lever = self.crown(inside)
-        # Distance of the centre of curvature from the axis, along the normal and across.
+        # Distance of the centre of curvature from the axis, along the normal.
         along = jnp.where(beyond > 0, self.crown.slope[-1, 1], self.crown.slope[0, 1])
         cos, sin = jnp.cos(beyond), jnp.sin(beyond)
         support = support + along * (cos - 1) - lever * sin
@@ -107,8 +107,9 @@ class Outline(Profile):
         return False
 
     def _rolled(self, direction, mate):
-        """A point in roll-angle form. A normal that misses the pitch circle is taken where it
-        comes nearest to it."""
+        """Return a point in roll-angle form.
+
+        For a normal that misses the pitch circle, use where it comes nearest to that circle."""
         psi = jnp.arccos(jnp.clip(mate.lever / self.pitch_radius, -1.0, 1.0))
         s = mate.support - self.pitch_radius * jnp.sin(psi)
         return RollPoint(direction + psi - jnp.pi / 2, psi, s)

@@ -10,25 +10,26 @@ from rootsopt.profiles.curve import Curve, RollPiece
 def extended_cycloid(
     lobes: int, pitch_radius: Float[ArrayLike, ""], trochoid_ratio: Float[ArrayLike, ""]
 ) -> Curve:
-    """An epicycloid drawn by a point whose distance from the rolling circle's centre varies.
+    """Return an epicycloid traced by a point whose distance from the rolling circle's centre
+    varies.
 
     With r_e = r / 2N the curve is P(θ) = e^{iθ} [r + r_e + λ(θ) r_e e^{2iNθ}], from the tip (θ = 0)
-    to the pitch crossing (θ = π/2N). The ratio λ falls or rises from `trochoid_ratio` λ0 at the tip
-    to 1 at the crossing by the quintic that has no slope and no bend at either end,
-    λ = 1 + (λ0 - 1) u³ (10 - 15 u + 6 u²) with u = 1 - 2Nθ/π: the idea of Hsieh and Hwang (J. Mech.
-    Des. 129 (2007) 1278), whose own formulas were not at hand. λ0 = 1 is EE; the outer radius is
+    to the pitch crossing (θ = π/2N). The ratio λ goes from `trochoid_ratio` λ0 at the tip to 1 at
+    the crossing: λ = 1 + (λ0 - 1) u³ (10 - 15 u + 6 u²) with u = 1 - 2Nθ/π. This quintic has zero
+    first and second derivatives at both ends. The idea is that of Hsieh and Hwang (J. Mech. Des.
+    129 (2007) 1278), whose own formulas were not available. λ0 = 1 is EE; the outer radius is
     r + (1 + λ0) r_e.
 
-    The crossing is a cusp: dP/dθ vanishes with δ = π/2N - θ. What the normal needs is therefore
-    taken with the power of δ that it has divided out. In the frame turned by θ, with w = e^{-2iNδ},
-    the normal is (X δ + iY) / M, M its length, where
+    The crossing is a cusp: dP/dθ vanishes with δ = π/2N - θ. All terms of the normal are therefore
+    computed with their power of δ divided out. In the frame turned by θ, with w = e^{-2iNδ}, the
+    normal is (X δ + iY) / M, M its length, where
 
-        X δ + iY = (r + r_e) (1 - λ w) / δ + i r_e w λ′ / δ,
+        X δ + iY = (r + r_e) (1 - λ w) / δ + i r_e w λ′ / δ.
 
-    and it makes the angle η = arctan(X δ / Y) with the tangent of the pitch circle at θ. For a
-    constant λ it passes through the pitch point at θ, and ψ = η; else it misses it by
-    e = r_e² λ′ (cos 2Nδ - λ) / (δ M), and cos ψ = cos η + e / r. Of this
-    sin²(ψ/2) = sin²(η/2) - e / 2r is left, of second order in δ, and β = θ - η + ψ. (Derivation.)
+    It makes the angle η = arctan(X δ / Y) with the tangent of the pitch circle at θ. For a constant
+    λ it passes through the pitch point at θ, and ψ = η. Otherwise it misses that point by
+    e = r_e² λ′ (cos 2Nδ - λ) / (δ M), and cos ψ = cos η + e / r. Hence
+    sin²(ψ/2) = sin²(η/2) - e / 2r, of second order in δ, and β = θ - η + ψ. (Derivation.)
     """
     r, ratio = jnp.asarray(pitch_radius), jnp.asarray(trochoid_ratio)
     half, n = jnp.pi / (2 * lobes), lobes

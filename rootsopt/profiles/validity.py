@@ -1,4 +1,4 @@
-"""How far a profile is from being none."""
+"""Margins that measure how far a profile is from being unsound."""
 
 from typing import NamedTuple
 
@@ -9,24 +9,28 @@ from rootsopt.profiles.base import Profile
 from rootsopt.runtime.programs import Program
 
 PURE = ("turning", "rolling", "order")
-"""Margins that are no lengths."""
+"""Margins that are not lengths."""
 _POINTS = 400
-"""Places on a segment that are looked at."""
+"""Points per segment at which margins are evaluated."""
 
 
 class Margins(NamedTuple):
-    """Least values along a flank, positive where the profile is sound.
+    """Margins of a flank: least values along it, positive where the profile is sound.
 
-    `turning` (rad): of a segment's range of normals, that is, the order of the joints; `convexity`
-    (m): radius of curvature of the addendum; `reach` (m): what the normals' levers lack to the
-    pitch radius, beyond which they miss the pitch circle; `fall` (m): the levers, negative where
-    the outline rises again behind the tip; `rolling`: dβ/dν, negative where two points of a flank
-    mesh at once and carry over what is between them (the centre of curvature then lies outside of
-    the pitch circle); `order` (rad): β, negative where a flank meshes before its tip, together
-    with the lobe's other flank; `undercut` (m/rad): `Profile.dedendum_speed`; `star` (m): distance
-    of a tangent of addendum or dedendum from the axis, seen from which the outline folds back
-    below 0 (above it, no flank crosses the other one of its lobe or space, as they meet on its
-    axis); `root` (m): root radius.
+    `turning`: range of normal angles of a segment (rad), negative where joints are out of order.
+    `convexity`: radius of curvature of the addendum (m).
+    `reach`: pitch radius minus |lever| of a normal (m), negative where a normal misses the pitch
+    circle.
+    `fall`: lever (m), negative where the outline rises again beyond the tip.
+    `rolling`: dβ/dν, negative where two points of a flank mesh at once and carry over the gas
+    between them. The centre of curvature then lies outside the pitch circle.
+    `order`: β (rad), negative where a flank meshes before its tip, together with the lobe's other
+    flank.
+    `undercut`: `Profile.dedendum_speed` (m/rad).
+    `star`: distance of a tangent of addendum or dedendum from the axis (m), negative where the
+    outline folds back as seen from the axis. While it is positive, no flank crosses the other one
+    of its lobe or space, as they meet on its axis.
+    `root`: root radius (m).
     """
 
     turning: Float[Array, ""]
@@ -42,7 +46,7 @@ class Margins(NamedTuple):
 
 @Program
 def margins(profile: Profile) -> Margins:
-    """Margins of a profile, looked at in many places of each segment (joints from both sides)."""
+    """Return the margins of a profile from many points per segment (joints from both sides)."""
     segments = profile.segments()
     start = jnp.stack([s.start for s in segments])[:, None]
     length = jnp.stack([s.stop for s in segments])[:, None] - start
@@ -54,7 +58,7 @@ def margins(profile: Profile) -> Margins:
     present = length > 0
 
     def least(values):
-        # Between the places, the parabola through three of them.
+        # Between the points, the minimum of the parabola through three of them.
         before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
         bend = before - 2 * here + after
         low = (here <= before) & (here <= after) & (bend > 0)

@@ -1,4 +1,4 @@
-"""From config to rotor pair."""
+"""Builds a rotor pair from a config and a design."""
 
 from rootsopt.scene.build import Scene as Scene
 from rootsopt.scene.build import along as along

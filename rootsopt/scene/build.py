@@ -1,7 +1,7 @@
-"""The scene: everything but the design, from which a rotor pair is built.
+"""The scene: everything except the design. It builds a rotor pair from a design.
 
-A design is a vector of the config's design parameters in the config's own units, so gradients
-come out per config unit. A family without parameters (EE) has an empty design.
+A design is a vector of the config's design parameters in the config's own units. Gradients are
+therefore per config unit. A family without parameters (EE) has an empty design.
 """
 
 import dataclasses
@@ -44,11 +44,22 @@ from rootsopt.scene import families, reading
 
 
 class Scene(eqx.Module):
-    """Everything but the design, in SI units: builds a rotor pair from a design.
+    """Everything except the design, in SI units: builds a rotor pair from a design.
 
-    Physical quantities are leaves that one may differentiate with respect to, choices are static,
-    so that one compiled program serves every scene of the same kind. `solver`: how its steady
-    motion is found.
+    Physical quantities are leaves, and responses are differentiable with respect to them. Choices
+    are static, so that one compiled program serves every scene of the same kind.
+
+    `family`, `lobes`, `pitch_radius` (m), `design_size` d: of the profile.
+    `fidelity`, `map_size`, `nodes`: contact model and its resolution.
+    `precision`: of the integration; `solver`: finds the steady motion.
+    `straight`: whether the rotors have no helix.
+    `length` (m), `density` (kg/m³), `bore_radius` (m, `None`: no bore): of a rotor.
+    `law`, `clearance` (m): contact law, and distance added to every flank gap.
+    `speed` (rad/s), `load_torque` (N·m), `pressure` (Pa, `None`: constant torque): operation.
+    `gear`, `gear_damping_ratio`, `motor`, `friction`, `supports`: optional parts.
+    `deepest`: relative rotation (rad, negative) that a contact map must reach.
+    `center_distance_error`: centre distance minus twice the pitch radius (m), or `None`.
+    `outline`: profile read from a file, or `None`; `extra`: further parts.
     """
 
     family: str = eqx.field(static=True)
@@ -81,11 +92,13 @@ class Scene(eqx.Module):
 
     @classmethod
     def from_config(cls, config: Config, deepest: float | None = None) -> "Scene":
-        """Return the scene of a config; `deepest` (rad < 0) is the relative rotation that the
-        contact map must reach, estimated from the scene when not given. (The map has a middling
-        size where the config leaves that open; `evaluate` chooses it by `solver.map_error`.)
+        """Return the scene of a config.
 
-        Raises RuntimeError where the config asks for a precision JAX is not set to."""
+        `deepest`: relative rotation (rad, negative) that the contact map must reach; by default an
+        estimate. If the config does not give the map's size, a medium one is used; `evaluate`
+        chooses it from `solver.map_error`.
+
+        Raises RuntimeError where JAX is not set to the precision that the config needs."""
         check_precision(config.solver.precision)
         if deepest is None:
             deepest = reading.expected_rotation(config)
@@ -108,7 +121,7 @@ class Scene(eqx.Module):
         )
 
     def profile(self, design: Float[Array, " d"]) -> Profile:
-        """The profile of a design given in config units."""
+        """Return the profile of a design (d,) in config units."""
         if self.outline is not None:
             return self.outline
         return families.profile_of(self.family, self.lobes, self.pitch_radius, design)
@@ -120,14 +133,14 @@ class Scene(eqx.Module):
         return float(self.law.depth_at(force))
 
     def inertia(self, shape: Geometry) -> Float[Array, ""]:
-        """Polar moment of inertia of one rotor about its axis (kg·m²)."""
+        """Return the polar moment of inertia of one rotor about its axis (kg·m²)."""
         moment = shape.polar_area_moment
         if self.bore_radius is not None:
             moment = moment - jnp.pi / 2 * self.bore_radius**4
         return self.density * self.length * moment
 
     def mass(self, shape: Geometry) -> Float[Array, ""]:
-        """Mass of one rotor (kg)."""
+        """Return the mass of one rotor (kg)."""
         area = shape.area
         if self.bore_radius is not None:
             area = area - jnp.pi * self.bore_radius**2
@@ -135,25 +148,28 @@ class Scene(eqx.Module):
 
     @property
     def two_sided(self) -> bool:
-        """Whether drive and coast flanks may touch at once: the axes may be elsewhere than at the
-        nominal centre distance, or the flanks are not conjugate."""
+        """Whether drive and coast flanks may touch at the same time.
+
+        They may where the axes can leave the nominal centre distance or flanks are not conjugate.
+        """
         odd = self.supports, self.center_distance_error, self.outline
         moved = any(part.displaces for part in self.extra)
         return moved or any(part is not None for part in odd)
 
     def with_parts(self, *parts: Part) -> "Scene":
-        """This scene with further parts, which follow the others in the state of a motion.
+        """Return this scene with further parts; they come last in the state of a motion.
 
-        Numbers that are their fields become arrays; responses are differentiable with respect to
-        them."""
+        Numbers in their fields become arrays; responses are differentiable with respect to them."""
         return dataclasses.replace(self, extra=(*self.extra, *_as_arrays(parts)))
 
     def with_law(self, law: ContactLaw) -> "Scene":
-        """This scene with another contact law, whose numbers become arrays."""
+        """Return this scene with another contact law, whose numbers become arrays."""
         return dataclasses.replace(self, law=_as_arrays(law))
 
     def contact(self, profile: Profile) -> Contact:
-        """Gap and levers of `profile` at this scene's fidelity."""
+        """Return the contact of `profile` at this scene's fidelity.
+
+        Raises `InputError` for fidelity `auto`, which must be replaced first."""
         if self.fidelity == "map":
             return MapContact.of(profile, self.deepest, *self.map_size)
         if self.fidelity == "linear":
@@ -172,7 +188,7 @@ class Scene(eqx.Module):
         return SearchContact.of(profile, distance, two_sided=True)
 
     def _drive(self, load: Load) -> Drive:
-        """The drive; a motor without a torque of its own is given what the load takes."""
+        """Return the drive; a motor without a torque of its own gets the load's torque."""
         motor = self.motor
         if motor is None:
             return PrescribedDrive(self.speed)
@@ -190,29 +206,32 @@ class Scene(eqx.Module):
         )
 
     def pair(self, design: Float[Array, " d"]) -> RotorPair:
-        """The rotor pair of a design in config units, differentiable in it."""
+        """Return the rotor pair of a design in config units, differentiable with respect to it.
+
+        Raises `InputError` for twisted rotors."""
         return self.pair_and_shape(design)[0]
 
     def pair_and_tangents(
         self, design: Float[Array, " d"], directions: Float[Array, "n d"] | tuple[()] | None = None
     ) -> tuple[RotorPair, RotorPair, Geometry]:
-        """The rotor pair, its derivatives along the `directions` of the design (by default those of
-        its parameters; () for none) stacked along a leading axis in the pair's own structure, and
-        the rotor's geometry."""
+        """Return the rotor pair, its derivatives along `directions`, and a rotor's geometry.
+
+        `directions` (n, d) are directions of the design, by default those of its parameters; ():
+        no derivatives. The derivatives have the pair's own structure, with a leading axis (n,)."""
         if directions is None:
             directions = jnp.eye(design.shape[0])
         return along(lambda design: self.pair_and_shape(design), design, directions)
 
     def pair_and_shape(self, design: Float[Array, " d"]) -> tuple[RotorPair, Geometry]:
-        """The rotor pair and the geometry of one rotor.
+        """Return the rotor pair and the geometry of one rotor.
 
-        Raises `InputError` for twisted rotors: along their length every phase of the mesh is met
-        at once, which the pair of this package knows nothing of."""
+        Raises `InputError` for twisted rotors. Along their length all phases of the mesh occur at
+        the same time, which this package does not model."""
         if not self.straight:
             raise InputError(
-                "`rotor.helix_deg` must be 0 for a simulation, which is of straight rotors; set "
-                "it to 0 to simulate straight rotors of the same section, or draw the twisted "
-                "ones with `rootsopt profile`"
+                "`rotor.helix_deg` must be 0, because only straight rotors are simulated; set it "
+                "to 0 to simulate straight rotors of the same section, or draw the twisted ones "
+                "with `rootsopt profile`"
             )
         profile = self.profile(design)
         shape = geometry(profile)
@@ -228,7 +247,7 @@ class Scene(eqx.Module):
         for part in (gear, *self.extra):
             if part is not None and part.play is not None:
                 angle = angle + part.play
-        # Units, no quantities: nothing depends on them.
+        # These are units for scaling, not physical quantities, so results do not depend on them.
         force, angle = jax.lax.stop_gradient((force, angle))
         load = self._load(profile, shape)
         context = Context(
@@ -262,7 +281,7 @@ class Scene(eqx.Module):
         )
         pair = dataclasses.replace(pair, timescales=timescales)
         if self.precision == "float32":
-            # Built in double precision; single only where it is integrated.
+            # The pair is built in double precision, and integrated in single precision.
             pair = jax.tree.map(_single, pair)
         return pair, shape
 
@@ -270,9 +289,10 @@ class Scene(eqx.Module):
 def along(
     build: Callable[[Any], tuple[RotorPair, Geometry]], primal: Any, directions: Any
 ) -> tuple[RotorPair, RotorPair, Geometry]:
-    """The rotor pair and geometry that `build(primal)` gives, and the pair's derivatives along the
-    `directions` of the primal (stacked along a leading axis; there may be none), stacked likewise
-    in the pair's own structure."""
+    """Return the rotor pair of `build(primal)`, its derivatives along `directions`, and geometry.
+
+    `directions` have the structure of `primal` with a leading axis, which may be empty. The
+    derivatives have the pair's own structure with the same leading axis."""
 
     def parted(primal):
         pair, shape = build(primal)
@@ -291,7 +311,7 @@ def along(
 
 
 class _Static(eqx.Module):
-    """Carries what is not an array through a transformation."""
+    """Carries a value that is not an array through a transformation."""
 
     value: Any = eqx.field(static=True)
 
@@ -301,5 +321,5 @@ def _single(leaf):
 
 
 def _as_arrays(tree):
-    """`tree` with arrays in place of numbers."""
+    """Return `tree` with its numbers as arrays."""
     return jax.tree.map(lambda x: jnp.asarray(x, float) if isinstance(x, int | float) else x, tree)

@@ -1,4 +1,4 @@
-"""What a config's geometry must fulfil, and its outline."""
+"""Checks a config's geometry, and draws its outline."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,8 +15,7 @@ from rootsopt.scene.reading import design_vector
 
 
 def check_geometry(config: Config) -> None:
-    """Raise `InputError` unless the config's profile can be made and meshes, and leaves room for
-    the bore."""
+    """Raise `InputError` unless the config's profile can mesh and leaves room for the bore."""
     families.check(config.profile)
     bore = config.rotor.bore_mm
     if bore is None:
@@ -31,12 +30,14 @@ def check_geometry(config: Config) -> None:
 
 @Program
 def _shape(scene: Scene, design):
-    """Geometry of a design in config units."""
+    """Return the geometry of a design in config units."""
     return geometry(scene.profile(design))
 
 
 def outline_mm(config: Config, design: ArrayLike | None = None) -> NDArray[np.float64]:
-    """Closed counter-clockwise outline (n, 2) in mm of a design, by default the config's."""
+    """Return the closed counter-clockwise outline (n, 2) in mm of a design.
+
+    `design`: in config units, by default the config's own."""
     design = design_vector(config) if design is None else jnp.asarray(design)
     profile = _profile(Scene.from_config(config), design)
     return np.asarray(outline(profile, points=240)) / MM

@@ -1,4 +1,4 @@
-"""Profile families by the names and units of the config: how they are made, and what is wrong."""
+"""Makes and checks profiles from the config's family names, keys and units."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,18 +17,20 @@ from rootsopt.profiles.validity import PURE, margins
 from rootsopt.runtime.programs import Program
 
 _ROUNDING = 1e-9
-"""Margin relative to its scale that counts as 0."""
+"""Size of a negative margin (relative to its scale) below which it counts as 0."""
 
 
 def classical() -> tuple[str, ...]:
-    """Names of the registered families that are made from a few parameters."""
+    """Return the names of the registered families that are made from single numbers."""
     return tuple(name for name, family in families().items() if family.classical)
 
 
 def profile_of(
     family: str, lobes: int, pitch_radius: Float[Array, ""], design: Float[Array, " d"]
 ) -> Profile:
-    """The profile of a `family` with a `design` in config units, `pitch_radius` in m."""
+    """Return the profile of a `family` with a `design` (d,) in config units.
+
+    `pitch_radius` is in m."""
     found = family_of(family)
     values = {
         parameter.argument: value * parameter.unit
@@ -38,17 +40,17 @@ def profile_of(
 
 
 def keys_of(config: ProfileConfig) -> tuple[str, ...]:
-    """Names of the design parameters of a config."""
+    """Return the names of the design parameters of a config."""
     return config.design_keys
 
 
 def design_of(config: ProfileConfig) -> Float[Array, " d"]:
-    """The design parameters of a config, in its units."""
+    """Return the design parameters of a config, in its units."""
     return jnp.asarray(config.design)
 
 
 def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:
-    """A config's profile with another `design` (d,) in its units, as many as it has."""
+    """Return a config's profile with another `design` (d,) of the same length, in its units."""
     given = [float(value) for value in np.asarray(design)]
     family = family_of(config.family)
     values = zip(family.parameters, family.split(given), strict=True)
@@ -58,18 +60,20 @@ def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:
 
 
 def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, float]:
-    """A config's profile as a free form of `count` coefficients, and how far (m) that departs from
-    it at most. Raises `InputError` for an outline from a file."""
+    """Return a config's profile as a free form of `count` coefficients.
+
+    The second result is the greatest distance (m) between both flanks. Raises `InputError` for an
+    outline from a file."""
     if config.from_file:
         raise InputError(
-            "`profile.family` must be that of a design to be projected onto a free form, but is "
-            f"{config.family}: its dedendum need not be the mate of its addendum, as that of a "
-            "free form is; name the family the rotor was made to"
+            "`profile.family` must not be read from a file for a projection onto a free form, but "
+            f"is {config.family}: unlike that of a free form, its dedendum need not be conjugate "
+            "to its addendum; name the family to which the rotor was made"
         )
     radius = jnp.asarray(config.pitch_radius_mm * MM)
     profile = profile_of(config.family, config.lobes, radius, design_of(config))
     found = project(profile, count)
-    # Decimals enough for a hundredth of a micrometre.
+    # These decimals keep the outline within 0.01 µm.
     result = ProfileConfig.model_validate(
         {
             "family": "free_form",
@@ -84,16 +88,16 @@ def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, floa
 
 
 def outline(config: ProfileConfig) -> Outline | None:
-    """The profile of a config that has it in a file."""
+    """Return the profile of a config whose profile is in a file, `None` for any other."""
     if not config.from_file:
         return None
-    from rootsopt.measured.source import outline_of  # Half a second, for outlines alone.
+    from rootsopt.measured.source import outline_of  # Imported for outlines only: it takes 0.5 s.
 
     return outline_of(config)[0]
 
 
 def check(config: ProfileConfig) -> None:
-    """Raise `InputError` unless the profile can be made and meshes."""
+    """Raise `InputError` unless the profile is sound, or as an outline from a file can mesh."""
     if (given := outline(config)) is not None:
         conjugacy(given)
         return
@@ -118,8 +122,9 @@ def check(config: ProfileConfig) -> None:
 
 
 def margins_of(config: ProfileConfig) -> dict[str, float]:
-    """The margins of a config's profile by name and unit, for the result file; none for an outline
-    from a file."""
+    """Return the margins of a config's profile by name and unit, for the result file.
+
+    The result is empty for an outline from a file."""
     if config.from_file:
         return {}
     radius = jnp.asarray(config.pitch_radius_mm * MM)
@@ -134,7 +139,7 @@ def margins_of(config: ProfileConfig) -> dict[str, float]:
 
 @Program
 def _margins(family, lobes, pitch_radius, design):
-    """Margins of the profile of a design in config units."""
+    """Return the margins of the profile of a design in config units."""
     return margins(profile_of(family, lobes, pitch_radius, design))
 
 
@@ -145,12 +150,12 @@ def _written(value: float | tuple[float, ...]) -> str:
 
 
 _FAULTS = {
-    "turning": "a part of it would end before it begins, or miss the pitch crossing",
+    "turning": "one of its segments would end before it starts, or miss the pitch crossing",
     "convexity": "the addendum is not convex",
     "reach": "some normals of the addendum miss the pitch circle: it would touch nothing there",
-    "fall": "the tip is no tip: the outline rises again behind it",
+    "fall": "the outline rises again beyond the tip",
     "rolling": "two points of a flank would mesh at once",
-    "order": "a flank would touch before the tip of its lobe has come to the line of centres",
+    "order": "a flank would touch before the tip of its lobe reaches the line of centres",
     "undercut": "the dedendum is undercut",
     "star": "the outline folds back, seen from the axis",
     "root": "the root lies beyond the axis",

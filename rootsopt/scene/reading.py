@@ -1,4 +1,4 @@
-"""From config to the pieces of a scene: units, law, parts, solver."""
+"""Converts a config to the pieces of a scene: SI quantities, contact law, parts, solver."""
 
 import math
 from typing import Any
@@ -17,23 +17,23 @@ from rootsopt.dynamics.steady import Solver
 from rootsopt.scene import families
 
 _ORBIT_STEPS = 4
-"""Steps allowed for a whole orbit, in units of those allowed for a mesh period."""
+"""Greatest number of steps for a whole orbit, as a multiple of that for a mesh period."""
 _ROLLS, _RELATIVES = 384, 16
-"""Size of a contact map that the config leaves open."""
+"""Default size of a contact map: points over roll and over relative rotation."""
 
 
 def design_vector(config: Config) -> Float[Array, " d"]:
-    """The config's design parameters in config units: (3,) for CIC, (0,) for EE."""
+    """Return the config's design parameters (d,) in config units; d = 3 for CIC, 0 for EE."""
     return families.design_of(config.profile)
 
 
 def design_keys(config: Config) -> tuple[str, ...]:
-    """Names of the entries of `design_vector`."""
+    """Return the names of the entries of `design_vector`."""
     return families.keys_of(config.profile)
 
 
 def quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
-    """Physical quantities of a config in SI units, by their names in `Scene`."""
+    """Return the physical quantities of a config in SI units, by their names in `Scene`."""
     rotor, scene, gear = config.rotor, config.scene, config.scene.timing_gear
     return {
         "pitch_radius": jnp.asarray(config.profile.pitch_radius_mm * MM),
@@ -50,7 +50,7 @@ def quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
 
 
 def law_of(config: Config) -> ImpactLaw:
-    """The contact law of a config."""
+    """Return the contact law of a config."""
     contact = config.contact
     return ImpactLaw(
         stiffness=jnp.asarray(contact.stiffness_N_per_mm_e / MM**contact.exponent),
@@ -62,7 +62,9 @@ def law_of(config: Config) -> ImpactLaw:
 
 
 def gear_of(config: Config) -> TimingGear | None:
-    """The timing gear of a config; its damping depends on the rotors' inertia and is set later."""
+    """Return the timing gear of a config, `None` without one.
+
+    `Scene` sets its damping later, because that depends on the rotors' inertia."""
     gear, radius = config.scene.timing_gear, config.profile.pitch_radius_mm * MM
     if gear is None:
         return None
@@ -76,7 +78,9 @@ def gear_of(config: Config) -> TimingGear | None:
 
 
 def parts_of(config: Config) -> dict[str, Any]:
-    """Other parts of a config by their names in `Scene`; what depends on the design is NaN."""
+    """Return the other parts of a config by their names in `Scene`.
+
+    Numbers that `Scene` sets later, such as those that depend on the design, are NaN."""
     scene, friction = config.scene, config.contact.friction
     parts: dict[str, Any] = {}
     missing = jnp.asarray(float("nan"))
@@ -106,14 +110,16 @@ def parts_of(config: Config) -> dict[str, Any]:
 
 
 def map_size(config: Config) -> tuple[int, int]:
-    """Roll angles and relative rotations of the contact map."""
+    """Return the number of points of the contact map over roll angle and relative rotation."""
     solver = config.solver
     return solver.map_rolls or _ROLLS, solver.map_relatives or _RELATIVES
 
 
 def expected_rotation(config: Config) -> float:
-    """Relative rotation (rad, negative) a scene is expected to reach: the backlash and
-    clearance taken up, plus an impact ten times the static contact force."""
+    """Return the relative rotation (rad, negative) that a scene is expected to reach.
+
+    It is 1.3 times clearance and half backlash, plus 1.5 times the penetration under 20 times the
+    static contact force, and at most a quarter of π/2N."""
     contact, scene = config.contact, config.scene
     radius = config.profile.pitch_radius_mm
     play = contact.clearance_mm
@@ -125,9 +131,10 @@ def expected_rotation(config: Config) -> float:
 
 
 def integrators(config: Config) -> tuple[Integrator, Integrator]:
-    """(transient, orbit) integrators of a config.
+    """Return the integrators of a config for transient and orbit.
 
-    An orbit has several mesh periods, and many short steps about its kinks."""
+    An orbit has several mesh periods and many short steps near its kinks, so that it may take more
+    steps."""
     solver = config.solver
     steps = solver.max_steps_per_period
     return (
@@ -137,7 +144,7 @@ def integrators(config: Config) -> tuple[Integrator, Integrator]:
 
 
 def solver_of(config: Config) -> Solver:
-    """How a config asks for its steady motion to be found."""
+    """Return the solver for the steady motion, with the config's settings."""
     settings = config.solver
     transient, orbit = integrators(config)
     return Solver(
@@ -152,7 +159,7 @@ def solver_of(config: Config) -> Solver:
 
 
 def measures(config: Config) -> Measures:
-    """What of the force a config asks for, in its report or its objective."""
+    """Return the measures of the force that a config's report or objective needs."""
     objective = config.objective
     weighted = [order for order, weight in objective.line_weights.items() if weight]
     orders = dict.fromkeys([*config.response.lines, *weighted])

@@ -284,7 +284,7 @@ def test_config_keys(tmp_path):
             load(tmp_path / "scene.yaml", [change])
     with pytest.raises(InputError, match=r"must be a file that can be read"):
         check_geometry(load(tmp_path / "scene.yaml", ["profile.outline_file=none.csv"]))
-    with pytest.raises(InputError, match=r"must be that of a design to be projected"):
+    with pytest.raises(InputError, match=r"must not be read from a file for a projection"):
         free_form_of(config.profile, 12)
     with pytest.raises(InputError, match=r"to be optimised, but is outline"):
         Search(config)
