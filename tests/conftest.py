@@ -5,6 +5,7 @@ import os
 import shutil
 import tempfile
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -56,13 +57,16 @@ _OPTIMISED = (
 
 @pytest.fixture(autouse=True, scope="module")
 def compiled(request):
-    """The package's programs are optimised, as a user has them, where that pays; elsewhere they
-    are not: the arithmetic is the same but for rounding, and compiling takes half the time."""
+    """Optimise programs, as a user has them, only where that pays: elsewhere the arithmetic is the
+    same except for rounding, and compiling takes half the time."""
     name = request.path.stem.removeprefix("test_")
     options = programs.OPTIONS | {"xla_backend_optimization_level": 3 if name in _OPTIMISED else 0}
+    # The package's programs take the options; functions that a test compiles itself take the flag.
+    jax.config.update("jax_disable_most_optimizations", name not in _OPTIMISED)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(programs, "OPTIONS", options)
         yield
+    jax.config.update("jax_disable_most_optimizations", False)
 
 
 _LONGEST_FIRST = ("steady", "experiments", "accuracy", "ensemble", "measures", "gradients", "cli")
