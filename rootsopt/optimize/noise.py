@@ -157,8 +157,13 @@ def message(record: dict[str, Any]) -> str:
         "root of either), or optimizer.iterations."
     )
     found, error = record.get("verified_objective"), record.get("combined_standard_error")
-    if found is None or not np.isfinite(found):
+    if found is None:
         return f"The search found no design better than the baseline beyond the noise. {advice}"
+    if not np.isfinite(found):
+        return (
+            f"Averaged over an independent ensemble, the best design has no usable response "
+            f"({record['status']}). {advice}"
+        )
     return (
         f"The difference from the baseline is within the noise: averaged over an independent "
         f"ensemble, the best design has an objective of {found:.4g} against 1. The combined "

@@ -108,7 +108,7 @@ def prepare_members(pair: RotorPair, integrator: Integrator) -> None:
 
 def run_members(
     pairs: Sequence[RotorPair],
-    states: NDArray[np.float64] | Float[Array, "m 2"],
+    states: NDArray[np.float64] | Float[Array, "m n"],
     settle: int,
     periods: int,
     integrator: Integrator,

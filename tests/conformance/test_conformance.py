@@ -30,7 +30,7 @@ from rootsopt.profiles import CIC, EE, geometry
 from tests.conformance.contacts import check_contact
 from tests.conformance.laws import check_law
 from tests.conformance.parts import SPEED, check_in_pair, check_part, size
-from tests.dynamics.test_closed_forms import LOBES, SCALE, Far, oscillator
+from tests.standins import LOBES, SCALE, Far, oscillator
 
 R = 0.033
 PROFILES = {

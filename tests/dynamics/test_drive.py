@@ -1,12 +1,16 @@
 """The drives: a motor's torque-speed line, and what its freedom changes of time and averages."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.dynamics.parts import MotorDrive
+from rootsopt.config import load
+from rootsopt.dynamics.parts import ConstantLoad, MotorDrive
+from rootsopt.scene import Scene
 from tests.scene.test_scene import MOTOR, pair_of
+from tests.standins import INERTIA, LOAD, LOBES, SCALE, SPEED, oscillator
 
 
 def test_a_motor_follows_its_line():
@@ -42,3 +46,29 @@ def test_time_passes_as_the_rotor_turns():
     assert not bool(pair.lost(state))
     slope, _ = eqx.filter_jit(pair.derivative)(jnp.asarray(0.3), stalled)
     np.testing.assert_array_equal(slope, 0)
+
+
+def test_inertia_of_a_motor_turns_with_rotor_1():
+    """Rotor 1 is sped up by the excess torque over both inertias, rotor 2 slowed by its load."""
+    slope, torque, own, over = 0.2, 5.0, 7e-3, 4.0
+    motor = MotorDrive(*(jnp.asarray(x) for x in (SPEED, torque, slope, own)))
+    pair = oscillator(drive=motor, gear=None)
+    period = 2 * np.pi / (LOBES * SPEED)
+    share = over * period / SCALE
+    state = jnp.array([0.1, 0.3, share])
+    found, _ = jax.jit(lambda state: pair.derivative(jnp.asarray(0.2), state))(state)
+    first = (torque - slope * over) / (INERTIA + own)
+    second = -LOAD / INERTIA
+    lapse = SPEED / (SPEED + over)
+    unit = lapse * period**2 / SCALE
+    expected = [lapse * 0.3, unit * (second - first), unit * first]
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_motor_of_a_config_is_that_of_its_pair():
+    motor = "{slope_N_m_s_per_rad: 0.3, torque_N_m: 6, inertia_kg_m2: 0.004}"
+    config = load("configs/cic.yaml", ["scene.drive=torque", f"scene.motor={motor}"])
+    drive = Scene.from_config(config)._drive(ConstantLoad(jnp.asarray(LOAD)))
+    assert isinstance(drive, MotorDrive)
+    numbers = [float(x) for x in (drive.speed, drive.torque, drive.slope, drive.inertia)]
+    assert numbers == pytest.approx([100 * np.pi, 6, 0.3, 0.004])

@@ -19,6 +19,7 @@ from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.speeds import AtSpeed, SpeedsEvaluator
 from rootsopt.scene import design_vector
 from rootsopt.status import Status
+from tests.standins import evaluation_of
 
 CIC = "configs/cic.yaml"
 SPEEDS = "objective.speeds_rpm=[4000, 2000]"
@@ -334,3 +335,29 @@ def test_linearised_pair_has_the_closed_form_stiffness():
     assert flank == pytest.approx([0, total[1]], rel=1e-9)
     assert torque == pytest.approx([0, 4.775], abs=1e-9)
     assert force == pytest.approx([0, normal], rel=1e-6)
+
+
+@pytest.mark.parametrize("failing", [2000.0, 3000.0, 4000.0])
+def test_every_speed_simulated_counts_in_the_status(monkeypatch, failing):
+    """The scene's own 3000 rpm has no share in the objective, but a result that fails there is
+    none."""
+    config = load("configs/cic.yaml", ["objective.speeds_rpm=[4000, 2000]"])
+    evaluator = SpeedsEvaluator(Evaluator.of(config))
+
+    def single(self, design, start, series):
+        here = float(self.scene.speed) * 60 / (2 * np.pi)
+        lost = abs(here - failing) < 1e-6
+        return self, evaluation_of(here, Status.PASSED_THROUGH if lost else Status.PERIODIC)
+
+    monkeypatch.setattr(Evaluator, "fit", single)
+    found = evaluator()
+    assert [part.share for part in found.parts] == [0.5, 0.0, 0.5]
+    assert found.status is Status.PASSED_THROUGH
+    assert not found.usable
+    assert found.state is None
+    assert found.message.startswith(f"At {failing:g} rpm: ")
+    assert found.statistics["seconds"] == 3
+    parts = [part._replace(evaluation=evaluation_of()) for part in found.parts]
+    assert speeds.overall(parts)[0] is Status.PERIODIC
+    wrong = [AtSpeed(1.0, 0.0, evaluation_of(status=Status.CHAOTIC)), *parts]
+    assert speeds.overall(wrong)[0] is Status.CHAOTIC

@@ -1,0 +1,64 @@
+"""Small parts of the contact, against closed forms and interpolation of their own."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt.contact.map import MARGIN
+from rootsopt.contact.nodes import signed_distance
+from rootsopt.contact.search import SearchContact
+from rootsopt.contact.size import _smallest
+from rootsopt.profiles import CIC
+
+
+def test_levers_may_jump_where_flanks_do_not_roll():
+    """At the nominal centre distance conjugate flanks roll on each other, with one closest
+    approach; anywhere else there may be two as deep."""
+    paper = CIC(3, 0.033, np.radians(36.43), 8e-3, np.radians(4.0))
+    assert not SearchContact.of(paper).jumps
+    displaced = SearchContact.of(paper, jnp.asarray(0.0662), two_sided=True)
+    assert displaced.jumps
+    assert float(displaced.pair.center_distance) == 0.0662
+
+
+def test_distance_from_a_circle_of_few_nodes():
+    """Outside positive; to the chords too great by up to R (1 - cos π/n) outside, and by the cubics
+    with an error of fourth order."""
+    rng = np.random.default_rng(0)
+    radii, angles = rng.uniform(0.5, 1.5, 300), rng.uniform(0, 2 * np.pi, 300)
+    nodes = radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+    errors = []
+    for count in (32, 64):
+        turns = 2 * np.pi * np.arange(count + 1) / count
+        circle = np.column_stack([np.cos(turns), np.sin(turns)])
+        straight, cubic = (signed_distance(nodes, circle, refine) for refine in (False, True))
+        sagitta = 1 - np.cos(np.pi / count)
+        far = straight - (radii - 1)
+        assert -1e-12 < np.min(far) < 0.1 * sagitta
+        assert 0.9 * sagitta < np.max(far) < 1.001 * sagitta
+        errors.append(np.max(np.abs(cubic - (radii - 1))))
+        assert errors[-1] < 0.02 * sagitta
+    assert errors[0] / errors[1] == pytest.approx(16, rel=0.2)
+
+
+def test_error_of_a_map_is_what_its_spline_leaves():
+    """The greatest difference between a fine sampling and the cubic spline through the map's own
+    points, where the flanks overlap, by an interpolation written anew."""
+    from scipy.interpolate import make_interp_spline
+
+    points = np.linspace(0.0, 1.0, 3073)
+    lines = np.stack([-1 - 0.3 * np.cos(9 * points), -2 - 0.1 * np.sin(25 * points)])
+    exact = [lambda x: -1 - 0.3 * np.cos(9 * x), lambda x: -2 - 0.1 * np.sin(25 * x)]
+    for asked in (1e-4, 1e-5, 1e-6):
+        count, error = _smallest(
+            (12, 24, 48, 96, 192), 0.0, 1.0, (jnp.asarray(points), jnp.asarray(lines)), asked
+        )
+        assert error <= asked
+        # A map of n points has some beyond the range: those within it are a uniform grid.
+        step = 1.0 / (count - 1 - MARGIN)
+        knots = step * np.arange(count - MARGIN)
+        left = [
+            np.max(np.abs(make_interp_spline(knots, f(knots), bc_type="not-a-knot")(points) - line))
+            for f, line in zip(exact, lines, strict=True)
+        ]
+        assert error == pytest.approx(max(left), rel=1e-3)

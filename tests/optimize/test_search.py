@@ -1,0 +1,201 @@
+"""The search for a design, on made-up objectives: no rotor is simulated."""
+
+import dataclasses
+import threading
+import types
+
+import numpy as np
+import pytest
+
+from rootsopt.config import load
+from rootsopt.design.space import sobol
+from rootsopt.optimize import noise
+from rootsopt.optimize.problem import Problem
+from rootsopt.optimize.search import Search, Trial, _history
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.status import Status
+from tests.standins import evaluation_of
+
+
+def trial_of(point, objective, feasible=True) -> Trial:
+    """A trial at a point of the unit box."""
+    evaluation = evaluation_of(objective, design=point)
+    return Trial(np.asarray(point, float), 0, 0, evaluation, objective, feasible)
+
+
+def searching(truth=lambda point: 1.0, **settings) -> Search:
+    """A search whose designs are points of the unit box, and whose verification finds the `truth`
+    about them."""
+    search = object.__new__(Search)
+    search.stop, search._refuted, search._trials = threading.Event(), [], []
+    search.settings = types.SimpleNamespace(screening=0, seed=0, starts=2)
+    vars(search.settings).update(settings)
+    search.problem = types.SimpleNamespace(
+        design=lambda point: point,
+        objective=lambda evaluation: evaluation.response.get("mean_force_N", float("nan")),
+        project=lambda point: point,
+        toward=lambda point, inside: point,
+        feasible=lambda point: True,
+    )
+
+    def exact(point):
+        found = truth(tuple(point))
+        status = Status.PERIODIC if np.isfinite(found) else Status.NOT_SETTLED
+        return evaluation_of(found, status, point)
+
+    search.exact = exact
+    return search
+
+
+@pytest.mark.parametrize(
+    ("promised", "true", "accepted"),
+    [
+        (0.8, 0.8, True),
+        (0.8, 0.8079, True),
+        (0.8, 0.7921, True),
+        (0.8, 0.8081, False),  # more than 1 % from what was promised, if still better than 1
+        (0.8, 0.7919, False),
+        (0.8, float("nan"), False),
+        (0.995, 1.001, False),  # within 1 %, but no improvement
+        (1.0, 0.995, False),  # nothing was promised
+    ],
+)
+def test_a_promise_must_hold_up(promised, true, accepted):
+    """A design is accepted if simulated again it is better than the baseline and within 1 % of
+    what the search had."""
+    search = searching(lambda point: true)
+    found, record = search._verify([trial_of([0.3, 0.4], promised)])
+    assert (found is not None) == accepted
+    assert record["holds_up"] == accepted
+    if accepted:
+        assert record["verified_objective"] == true
+        assert record["searched_objective"] == promised
+        assert found.design == {"x0": 0.3, "x1": 0.4}
+
+
+def test_the_best_feasible_trial_that_holds_up_is_taken():
+    """Neither an infeasible one, though it is better, nor one without a steady state, nor one that
+    does not hold up; and neighbours of a trial that failed are not tried."""
+    truth = {(0.9, 0.9): 0.3, (0.1, 0.1): 0.95, (0.11, 0.1): 0.5, (0.5, 0.5): 0.602,
+             (0.7, 0.2): 0.65}  # fmt: skip
+    search = searching(lambda point: truth[point])
+    trials = [
+        trial_of([0.7, 0.2], 0.65),
+        trial_of([0.9, 0.9], 0.3, feasible=False),
+        trial_of([0.2, 0.9], float("nan")),
+        trial_of([0.5, 0.5], 0.6),
+        trial_of([0.11, 0.1], 0.51),
+        trial_of([0.1, 0.1], 0.5),
+    ]
+    found, record = search._verify(trials)
+    assert found is not None
+    assert found.design == {"x0": 0.5, "x1": 0.5}
+    (rejected,) = record["rejected"]
+    assert rejected["verified_objective"] == 0.95
+    assert not rejected["holds_up"]
+    best = [row["best_objective"] for row in _history(trials)]
+    np.testing.assert_array_equal(best, [0.65, 0.65, 0.65, 0.6, 0.51, 0.5])
+    starts = searching(starts=9)._starts(trials)
+    np.testing.assert_array_equal(starts, [[0.1, 0.1], [0.5, 0.5], [0.7, 0.2]])
+    only_infeasible = trial_of([0.9, 0.9], 0.3, feasible=False)
+    assert search._verify([only_infeasible])[0] is None
+    assert np.isnan(_history([only_infeasible])[0]["best_objective"])
+    assert searching()._starts([only_infeasible]) == []
+
+
+def test_an_ensemble_takes_no_infeasible_candidate():
+    problem = object.__new__(Problem)
+    vars(problem)["objective"] = lambda evaluation: 0.01
+    trials = [trial_of([0.9, 0.9], 0.3, feasible=False), trial_of([0.2, 0.3], 0.8)]
+    ((objective, point),) = noise.candidates(
+        problem, [dataclasses.replace(one, evaluation=evaluation_of()) for one in trials]
+    )
+    assert objective == 0.8
+    np.testing.assert_array_equal(point, [0.2, 0.3])
+
+
+@dataclasses.dataclass(frozen=True)
+class Told(Evaluator):
+    """An evaluator for which a quadratic bowl about 0.6 has no steady state beyond 0.3 at first."""
+
+    asked: list = dataclasses.field(default_factory=list)
+
+    def __call__(self, design=None, start=None, series=True):
+        self.asked.append((tuple(design), start))
+        lost = len(self.asked) == 2
+        force = 0.5 + float(np.sum((np.asarray(design) - 0.6) ** 2))
+        status = Status.NOT_SETTLED if lost else Status.PERIODIC
+        return evaluation_of(force, status, design, state=np.asarray(design))
+
+
+def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state():
+    """By the rule's own steps otherwise, each from the orbit of the trial before."""
+    search = searching(method="sgd", learning_rate=0.2, iterations=6)
+    search.problem.descent = lambda point, slope: slope
+    search.problem.slope = lambda evaluation, point: 2 * (point - 0.6)
+    search.patience, search.expected = np.inf, 7
+    search._lock, search._done, search._best = threading.Lock(), 0, float("nan")
+    progress = []
+    search.progress = lambda *numbers: progress.append(numbers)
+    search.fast = evaluator = Told.of(load("configs/cic.yaml"))
+    trials = search._descend(4, np.array([0.2, 0.3]))
+    points = np.array([trial.point for trial in trials])
+    assert len(trials) == 7
+    # Steps of gradient descent at a rate that falls along a cosine to a twentieth.
+    rates = [0.2 * (0.05 + 0.95 * (1 + np.cos(np.pi * k / 6)) / 2) for k in range(6)]
+    expected = [np.array([0.2, 0.3])]
+    expected.append(expected[0] - rates[0] * 2 * (expected[0] - 0.6))
+    expected.append((expected[0] + expected[1]) / 2)
+    for rate in rates[1:5]:
+        expected.append(expected[-1] - rate * 2 * (expected[-1] - 0.6))
+    np.testing.assert_allclose(points, expected, rtol=1e-6)
+    starts = [start for _, start in evaluator.asked]
+    assert starts[0] is None
+    assert starts[2] is None
+    for k in (1, 3, 4, 5, 6):
+        np.testing.assert_array_equal(starts[k], points[k - 1])
+    assert [trial.iteration for trial in trials] == list(range(7))
+    assert {trial.start for trial in trials} == {4}
+    done, wanted, best = np.array(progress).T
+    np.testing.assert_array_equal(done, np.arange(1, 8))
+    assert set(wanted) == {7}
+    objectives = [trial.objective for trial in trials]
+    np.testing.assert_array_equal(best, np.fmin.accumulate(objectives))
+
+
+def test_a_slope_is_stripped_only_of_what_is_forbidden():
+    """Steepest descent in a box with one linear constraint x + y ≥ 1: inside it is the slope
+    itself, on a face or on the constraint without its part across, in a corner nothing."""
+    problem = object.__new__(Problem)
+    normal = np.array([1.0, 1.0])
+    vars(problem)["look"] = lambda point: (
+        point, np.eye(2), np.array([normal @ point - 1]), normal[None]
+    )  # fmt: skip
+    cases = [
+        ([0.7, 0.8], [1.0, -2.0], [1.0, -2.0]),
+        ([0.7, 1.0], [1.0, -2.0], [1.0, 0.0]),
+        ([0.7, 1.0], [1.0, 2.0], [1.0, 2.0]),
+        ([1.0, 1.0], [-1.0, -2.0], [0.0, 0.0]),
+        ([0.6, 0.4], [1.0, 1.0], [0.0, 0.0]),
+        ([0.6, 0.4], [3.0, 1.0], [1.0, -1.0]),
+        ([0.6, 0.4], [-3.0, 1.0], [-3.0, 1.0]),
+        ([1.0, 0.0], [1.0, 3.0], [0.0, 0.0]),
+    ]
+    for point, slope, expected in cases:
+        found = problem.descent(np.array(point), np.array(slope))
+        np.testing.assert_allclose(found, expected, atol=1e-12, err_msg=str(point))
+
+
+def test_the_seed_of_a_search_chooses_its_screening():
+    """The screened points are the Sobol sample of `optimizer.seed`, after the baseline's own."""
+    own = np.array([0.5, 0.5, 0.5])
+    samples = {}
+    for seed in (0, 1, 5):
+        points = searching(screening=6, seed=seed)._feasible(own)
+        np.testing.assert_array_equal(points[0], own)
+        samples[seed] = np.array(points[1:])
+        np.testing.assert_array_equal(samples[seed], sobol(6, seed, 3))
+    assert not np.any(samples[0] == samples[1])
+    assert not np.any(samples[1] == samples[5])
+    again = searching(screening=6, seed=5)._feasible(own)
+    np.testing.assert_array_equal(again[1:], samples[5])

@@ -1,0 +1,114 @@
+"""Averages of the members of an ensemble, and their errors, from motions made by hand."""
+
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt.dynamics.integrator import Integrator
+from rootsopt.response import ensemble, members
+from rootsopt.response.members import Members
+from tests.standins import SCALE, oscillator, told_flow
+
+
+def test_averages_of_a_member(monkeypatch):
+    """Means, greatest values and drift of a window after `settle` others, against NumPy; the drift
+    is positive where the force rises, and the middle of an odd window belongs to neither half."""
+    settle = 3
+    means = np.random.default_rng(0).uniform(1, 2, 20) + np.arange(20)
+    monkeypatch.setattr(members, "flow", lambda pair, state, *rest: told_flow(pair, state, means))
+    monkeypatch.setattr(
+        members,
+        "strobe",
+        lambda pair, state, *rest: types.SimpleNamespace(
+            states=state[None].at[0, 0].add(1.0), solved=jnp.asarray(True)
+        ),
+    )
+    averages = averages_from(jnp.zeros(2))
+    for periods in (1, 2, 7, 12):
+        found = averages(settle, periods)
+        window = means[settle : settle + periods]
+        at = settle + np.arange(periods)
+        peaks = 3 * window + at % 2
+        expected = [np.mean(window), np.mean(2 * window**2), np.mean(peaks)]
+        np.testing.assert_allclose(found.means, expected, rtol=1e-12)
+        half = periods // 2
+        drift = np.mean(window[-half:]) - np.mean(window[:half]) if half else 0.0
+        assert float(found.drift) == pytest.approx(drift, rel=1e-12)
+        assert half == 0 or drift > 0
+        assert float(found.greatest) == pytest.approx(np.max(peaks))
+        # The trace of `told_flow` holds the state and -2 of it.
+        assert float(found.reach) == pytest.approx(SCALE * 2 * at[-1])
+        assert float(found.depth) == pytest.approx(np.max(-window))
+        assert float(found.states[0]) == settle + periods
+        assert not np.any(found.repeats)
+        assert not bool(found.stalled)
+        assert bool(found.solved)
+
+
+def averages_from(state):
+    """Function (settle, periods) → what a member from `state` comes to."""
+    pair, how = oscillator(), Integrator("tsit5", jnp.asarray(1e-6), 64)
+    run = jax.jit(lambda *counts: members.member(pair, state, *counts, how))
+    return lambda settle, periods: run(jnp.asarray(settle), jnp.asarray(periods))
+
+
+def test_a_member_repeats_after_its_period(monkeypatch):
+    """The last states of a motion of three mesh periods repeat after 3 and 6, not after others."""
+
+    def step(state):
+        return jnp.array([0.5, 0.0]).at[1].set((jnp.round(state[1]) + 1) % 3)
+
+    blank = told_flow(None, jnp.zeros(2), [1.0])
+    monkeypatch.setattr(members, "flow", lambda pair, state, *rest: blank._replace(end=step(state)))
+    averages = averages_from(jnp.zeros(2))
+    # A cycle of k counts once the last k + 1 states have been there k mesh periods before.
+    for periods, seen in ((40, [2, 5]), (13, [2, 5]), (12, [2]), (7, [2]), (6, [])):
+        assert np.flatnonzero(averages(0, periods).repeats).tolist() == seen
+
+
+def of_means(means) -> Members:
+    """Members of which only the means are of interest."""
+    count = len(means)
+    zero, no = np.zeros(count), np.zeros(count, bool)
+    return Members(
+        means, zero, zero, zero, zero, np.zeros((count, 2)), np.zeros((count, 8), bool), no, no, ~no
+    )
+
+
+def test_standard_errors_of_members_are_their_scatter():
+    """Mean, peak and RMS of 4000 ensembles of independent members scatter as they state."""
+    rng = np.random.default_rng(7)
+    samples, count = 4000, 24
+    level = 5 + rng.normal(size=(samples, count))
+    square = level**2 + rng.gamma(4.0, 1.5, size=(samples, count))
+    peak = 20 + 3 * rng.normal(size=(samples, count))
+    every = np.stack([level, square, peak], axis=-1)
+    found = np.array([of_means(one).responses for one in every])
+    values, errors = found[..., 0], found[..., 1]
+    np.testing.assert_allclose(values[0, :2], [np.mean(level[0]), np.mean(peak[0])])
+    np.testing.assert_allclose(values[0, 2], np.sqrt(np.mean(square[0])))
+    scatter = np.std(values, axis=0, ddof=1)
+    stated = np.sqrt(np.mean(errors**2, axis=0))
+    np.testing.assert_allclose(stated, scatter, rtol=0.05)
+    assert of_means(np.zeros((3, 3))).responses.tolist() == np.zeros((3, 2)).tolist()
+
+
+def test_slopes_and_errors_per_config_unit():
+    """Random slopes in the unit box, carried to config units one by one, have the mean and scatter
+    stated: dR/dp = dR/dx (dp/dx)⁻¹, with a Jacobian that is far from symmetric."""
+    rng = np.random.default_rng(11)
+    jacobian = np.array([[2.0, 0.0, 0.0], [1.5, 0.5, 0.0], [-4.0, 1.0, 3.0]])
+    slope = rng.normal(size=(2, 3))
+    roots = rng.normal(size=(2, 3, 3))
+    covariance = roots @ roots.transpose(0, 2, 1)
+    found, errors = ensemble.per_config_unit(slope, covariance, jacobian)
+    for k in range(2):
+        drawn = rng.multivariate_normal(slope[k], covariance[k], size=40_000)
+        # One solution for each: x jacobian = drawn.
+        moved = np.linalg.solve(jacobian.T, drawn.T).T
+        scatter = np.std(moved, axis=0)
+        np.testing.assert_allclose(errors[k], scatter, rtol=0.03)
+        assert np.all(np.abs(found[k] - np.mean(moved, axis=0)) < 5 * scatter / 200)

@@ -1,0 +1,89 @@
+"""Stand-ins for a pair, its flow and an evaluation, whose numbers are given by hand.
+
+A pair whose flanks are never in reach is a damped oscillator.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from rootsopt.contact.gap import Contact
+from rootsopt.contact.impact import ImpactLaw
+from rootsopt.dynamics.flow import Flow
+from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
+from rootsopt.response.evaluation import RESPONSES, Evaluation
+from rootsopt.status import Status
+
+LOBES, SPEED, INERTIA, STIFFNESS, DAMPING, LOAD = 3, 300.0, 2e-3, 2e3, 1.5, 0.4
+HALF_BACKLASH, SCALE = 1e-3, 5e-3
+
+
+class Far(Contact):
+    """Flanks a metre apart in every position."""
+
+    def __call__(self, roll, relative):
+        return jnp.ones_like(roll), jnp.zeros_like(roll), jnp.zeros_like(roll)
+
+
+def oscillator(**changes) -> RotorPair:
+    """A pair held by its gear alone."""
+    gear = TimingGear(*(jnp.asarray(x) for x in (STIFFNESS, DAMPING, HALF_BACKLASH, 1e-6)))
+    parts = {
+        "lobes": LOBES,
+        "contact": Far(),
+        "law": ImpactLaw(*(jnp.asarray(x) for x in (1e9, 1.5, 100.0, 1e-5, 1e-7))),
+        "clearance": jnp.asarray(0.0),
+        "inertia": jnp.asarray(INERTIA),
+        "drive": PrescribedDrive(jnp.asarray(SPEED)),
+        "load": ConstantLoad(jnp.asarray(LOAD)),
+        "gear": gear,
+        "angle_scale": jnp.asarray(SCALE),
+        "force_scale": jnp.asarray(100.0),
+    }
+    return RotorPair(**parts | changes)
+
+
+def told_flow(pair, state, means, growth=None):
+    """A mesh period whose force has the mean `means[k]`, k being the first state; the next state
+    counts one up. `growth`: what the derivative by the state is, times the unit matrix."""
+    at = jnp.round(state[0]).astype(int)
+    mean = jnp.asarray(means)[at]
+    blank = Flow.empty(state.shape[0], 0, 2, 1, Measures(), state.dtype)
+    slope = blank.slope
+    if growth is not None:
+        count = state.shape[0]
+        slope = slope.at[:count].set(jnp.exp(jnp.asarray(growth)[at]) * jnp.eye(count))
+    return blank._replace(
+        end=state.at[0].add(1.0).at[1].set(at % 3 + 0.001 * at),
+        mean=mean,
+        mean_square=2 * mean**2,
+        peak=3 * mean + at % 2,
+        depth=-mean,
+        states=jnp.stack([state, -2 * state]),
+        solved=jnp.asarray(True),
+        slope=slope,
+    )
+
+
+class Near(Contact):
+    """Flanks that overlap by the radius of 0.03 m times the turn towards them."""
+
+    def __call__(self, roll, relative):
+        return 0.03 * relative, 0.03 * jnp.ones_like(roll), 0.03 * jnp.ones_like(roll)
+
+
+def evaluation_of(force=1.0, status=Status.PERIODIC, design=(), state=None) -> Evaluation:
+    """An evaluation whose forces are all `force`."""
+    return Evaluation(
+        design={f"x{k}": float(x) for k, x in enumerate(design)},
+        geometry={"area_efficiency": 0.5},
+        response=dict.fromkeys(RESPONSES, force) if status.usable else {},
+        gradient={},
+        steady_state={},
+        status=status,
+        message=status.value,
+        statistics={"seconds": 1.0},
+        series=None,
+        state=np.zeros(2) if state is None else state,
+    )
