@@ -128,7 +128,7 @@ _FIELDS = dict(ProfileConfig.model_fields)
 
 
 def _derive() -> None:
-    """Give `ProfileConfig` the families and keys of the table of families."""
+    """Set the fields of `ProfileConfig` from the table of families."""
     first, last = (
         {name: field for name, field in _FIELDS.items() if name.startswith("outline") is behind}
         for behind in (False, True)
@@ -211,7 +211,7 @@ class ContactConfig(Section):
 
     @property
     def rounding_mm(self) -> float:
-        """Smoothing length (mm); a complete config always has one."""
+        """Smoothing length (mm) of a complete config, which always has one."""
         assert self.smoothing_mm is not None
         return self.smoothing_mm
 

@@ -11,8 +11,8 @@ _SHARES = {"twist": 0.05, "depth": 0.02, "damping": 0.1}
 gear rests inside its rounded edge and has another stiffness. `depth`: the flanks' penetration under
 the full load. `damping`: the depth of full damping."""
 _LEAST = {"float64": 1e-6, "float32": 1e-5}
-"""Least smoothing length (mm), by precision. A shorter one costs solver steps and accuracy of the
-gradient. In single precision the rounding of the gap is about 4e-6 mm."""
+"""Least smoothing length (mm), by precision. A shorter length costs solver steps and accuracy of
+the gradient. In single precision the rounding error of the gap is about 4e-6 mm."""
 _LEAST_LOAD = 1e-3
 """Load (N·m) below which the smoothing length no longer depends on the load."""
 
