@@ -17,11 +17,11 @@ _WIDEST = 5.0
 """Distance from the last point to the first (multiple of the longest other step) above which a loop
 is rejected as open."""
 _BYTES = 50_000_000
-"""Size of a file (bytes) above which it is rejected unread."""
+"""Size (bytes) above which a file is rejected."""
 _POINTS = 500_000
 """Number of points above which an outline is rejected: each takes some 20 µs to read and fit."""
 _SIZES = 0.1, 1e5
-"""Sizes of an outline (mm) below and above which its units must be wrong."""
+"""Sizes (mm) below and above which an outline is rejected, because its units must be wrong."""
 _SAME = 1e-9
 """Distance (fraction of the outline's size) below which two points are one."""
 _NOT_FILES = (
@@ -60,7 +60,9 @@ def read(path: Path) -> Loop:
 
 
 def _bytes(path: Path, name: str) -> bytes:
-    """Return the file's content; open only a regular file of limited size."""
+    """Return the content of a regular file.
+
+    Raises `InputError` where the file is of another kind, unreadable, too large or empty."""
     try:
         found = path.stat()
         kind = next((what for test, what in _NOT_FILES if test(found.st_mode)), None)
@@ -95,7 +97,7 @@ def _bytes(path: Path, name: str) -> bytes:
 def _closed(loop: Loop, name: str) -> Loop:
     """Return the loop without repeated points.
 
-    Raises `InputError` unless it is closed, and number of points and size are within limits."""
+    Raises `InputError` where the loop is open, or its size or number of points is out of range."""
     points = loop.points
     if len(points) > _POINTS:
         raise InputError(

@@ -111,7 +111,7 @@ class Profile(eqx.Module):
         """Return the smooth segments of the addendum, from the tip to the pitch crossing."""
 
     def stretches(self) -> tuple[Segment, ...]:
-        """Return the smooth parts for quadrature: the segments, cut where integrands are not smooth.
+        """Return the smooth parts for quadrature: segments, cut where integrands are not smooth.
 
         A segment is cut where only a few derivatives are continuous, and at a minimum of the
         pressure angle. At a minimum, a normal may almost touch the pitch circle, where ψ has a
@@ -140,8 +140,7 @@ class Profile(eqx.Module):
 
     @abc.abstractmethod
     def contact_distance(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the distance s(ν) (m) from pitch point to contact point, positive on the addendum.
-        """
+        """Return the signed distance s(ν) (m) from pitch point to contact point."""
 
     def normal_at(self, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Return ν(β) in rad, the inverse of `roll_angle` up to the pitch crossing.

@@ -119,8 +119,8 @@ def circle_epicycloid(
     """Return a tip arc centred on the lobe's axis with an epicycloid of `rolling_radius` r_e (m).
 
     `lobes`: N; `pitch_radius`: r (m). The arc ends at the normal angle `tip_arc_turn` ν (rad). For
-    ν = π/2 - π r / 4N r_e (β = 0 at the joint) the arc is centred on the pitch circle, and all of it
-    meshes at one instant."""
+    ν = π/2 - π r / 4N r_e (β = 0 at the joint) the arc is centred on the pitch circle. All of it
+    then meshes at one instant."""
     return TippedEpicycloid(lobes, pitch_radius, rolling_radius, tip_arc_turn)
 
 
