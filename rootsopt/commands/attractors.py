@@ -16,7 +16,9 @@ PURPOSE = "Find the coexisting motions of a scene and the initial states that le
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Check, search, write, print."""
+    """Run `rootsopt attractors`: check the config, search, and write files into `folder`.
+
+    Return exit code and printer. Raises `InputError` for a wrong config."""
     import numpy as np
     from rich.console import Console
 

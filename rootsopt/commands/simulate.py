@@ -16,7 +16,9 @@ PURPOSE = "Simulate one design in one scene: steady state, contact force, its gr
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Check, simulate, write, print."""
+    """Run `rootsopt simulate`: check the config, simulate, and write files into `folder`.
+
+    Return exit code and printer. Raises `InputError` for a wrong config or option."""
     from rich.console import Console
 
     from rootsopt import export

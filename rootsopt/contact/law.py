@@ -42,8 +42,8 @@ class ContactLaw(eqx.Module):
     def depth_absorbing(self, work: Float[Array, ""]) -> Float[Array, ""]:
         """Return the penetration (m) at which the static force has absorbed `work` (J).
 
-        It is that of a power law with this `exponent`. It sets the solver's steps only; no result
-        depends on it."""
+        By default, assume a power law with the law's `exponent`. The solver uses this depth to
+        choose its steps only; no result depends on it."""
         e = self.exponent
         unit = self.depth_at(jnp.ones_like(work))
         return ((e + 1) * work * unit**e) ** (1 / (e + 1))

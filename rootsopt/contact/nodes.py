@@ -101,8 +101,9 @@ def pair_gap(
 ) -> float:
     """Return the least signed distance between the two rotors at one pose, in the outline's unit.
 
-    `reach`: distance from rotor 2's outer circle beyond which nodes of rotor 1 are ignored; by
-    default 0.05 outer radii, which keeps all that can touch.
+    `outline`, `lobes`, `center_distance`, `phi1`, `phi2`: as in `place_pair`. `refine`: as in
+    `signed_distance`. `reach`: distance from rotor 2's outer circle beyond which nodes of rotor 1
+    are ignored; by default 0.05 outer radii, which includes all nodes that can touch.
     """
     first, second = place_pair(outline, lobes, center_distance, phi1, phi2)
     outer = np.max(np.hypot(outline[:, 0], outline[:, 1]))

@@ -111,7 +111,7 @@ class Outline(Profile):
     def _rolled(self, direction, mate):
         """Return a point in roll-angle form, from its normal's `direction` (rad) and lever.
 
-        For a normal that misses the pitch circle, use the point of the normal nearest to it."""
+        For a normal that misses the pitch circle, use the normal's point nearest to the circle."""
         psi = jnp.arccos(jnp.clip(mate.lever / self.pitch_radius, -1.0, 1.0))
         s = mate.support - self.pitch_radius * jnp.sin(psi)
         return RollPoint(direction + psi - jnp.pi / 2, psi, s)
