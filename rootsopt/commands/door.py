@@ -18,7 +18,7 @@ from typing import Any
 OK, BAD_INPUT, NO_RESULT = 0, 2, 3
 _NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 _GONE = (errno.EPIPE, errno.EBADF, errno.ESHUTDOWN)
-"""Errors of a stream without a reader; the run continues."""
+"""Error numbers of a stream without a reader; the exit code ignores them."""
 _WAITING = "rootsopt signals"
 _SHOW_CURSOR = "\x1b[?25h"
 
@@ -142,7 +142,7 @@ class _Stream:
         self.closed_early = False
 
     def write(self, text: str) -> int:
-        """Write as a file does, without raising errors."""
+        """Write `text` and return its length; an `OSError` is not raised."""
         if not self.closed_early:
             self._guarded(lambda: self.stream.write(text))
         return len(text)
@@ -152,7 +152,7 @@ class _Stream:
             self.write(line)
 
     def flush(self) -> None:
-        """Flush as a file does, without raising errors."""
+        """Flush the stream; an `OSError` is not raised."""
         if not self.closed_early:
             self._guarded(self.stream.flush)
 

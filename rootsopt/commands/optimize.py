@@ -26,7 +26,7 @@ best design so far may be simulated again from rest."""
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Run `rootsopt optimize`: check the config, search, and write files into `folder`.
 
-    Return exit code and printer. Raises `InputError` for a wrong config or option."""
+    Return the `Outcome`. Raises `InputError` for a wrong config or option."""
     began = time.perf_counter()
     from rich.console import Console
 
@@ -103,7 +103,9 @@ def _searched(config: "Config", progress, stop: threading.Event):
 
 
 def _nothing_known(config: "Config", folder: "RunFolder") -> "Outcome":
-    """Write the files of a run that was stopped before the baseline was simulated."""
+    """Write the files of a run that was stopped before the baseline was simulated.
+
+    Return the `Outcome`, with exit code 3."""
     from rootsopt.commands import cli
     from rootsopt.output import files
     from rootsopt.status import Status
@@ -256,7 +258,9 @@ def _progress(console) -> Iterator:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; return the exit code."""
+    """Run `rootsopt optimize` with the arguments `argv` (`None`: those of the process).
+
+    Return the exit code."""
     return door.through("optimize", lambda: _run(argv), own=argv is None)
 
 

@@ -19,13 +19,13 @@ PURPOSE = (
     "solids or an animation."
 )
 EXPORT = "dxf,svg"
-"""Default formats: a drawing takes less than a second, a solid ten."""
+"""Default formats of the command. Drawings take less than a second; a solid takes ten seconds."""
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Run `rootsopt profile`: check the config, measure, and write files into `folder`.
+    """Run `rootsopt profile`: check the config, compute the geometry, write files into `folder`.
 
-    Return exit code and printer. Raises `InputError` for a wrong config or option."""
+    Return the `Outcome`. Raises `InputError` for a wrong config or option."""
     from rootsopt import export
     from rootsopt.commands import cli
     from rootsopt.measured import report as outline_report
@@ -116,7 +116,9 @@ def _options(parser: "argparse.ArgumentParser") -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; return the exit code."""
+    """Run `rootsopt profile` with the arguments `argv` (`None`: those of the process).
+
+    Return the exit code."""
     return door.through("profile", lambda: _run(argv), own=argv is None)
 
 

@@ -19,7 +19,7 @@ PURPOSE = "Simulate one design at many speeds, each from rest: contact force and
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Run `rootsopt sweep`: check the config, simulate all speeds, and write files into `folder`.
 
-    Return exit code and printer. Raises `InputError` for a wrong config."""
+    Return the `Outcome`. Raises `InputError` for a wrong config."""
     from rich.console import Console
 
     from rootsopt.commands import cli
@@ -76,7 +76,9 @@ def _progress(console) -> Iterator[Callable[[int, int], None]]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; return the exit code."""
+    """Run `rootsopt sweep` with the arguments `argv` (`None`: those of the process).
+
+    Return the exit code."""
     return door.through("sweep", lambda: _run(argv), own=argv is None)
 
 

@@ -231,7 +231,7 @@ def limits_of(annotation: Any, metadata: Any = ()) -> Limits:
 
 
 def _range(field: FieldInfo) -> str:
-    """Return the range of a key's numbers in words; "" if there is none."""
+    """Return the range of a key's numbers in words; "" for a key without limits."""
     limits = limits_of(field.annotation, field.metadata)
     words = []
     if limits.ge is not None or limits.gt is not None:

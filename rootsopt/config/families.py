@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 MARGINS = (
     *("turning", "convexity", "reach", "fall", "rolling", "order", "undercut", "star", "root"),
 )
-"""Margins that must be positive in a sound profile; `rootsopt.profiles.validity` defines them."""
+"""Names of the margins that a sound profile has ≥ 0; `rootsopt.profiles.validity` defines them."""
 ENTRY_POINTS = "rootsopt.families"
 """Entry-point group in which an installed package offers families, each under its name."""
 _ANY_LENGTH, _ANY_ANGLE, _ANY_NUMBER = (0.01, 1.5), (0.0, 90.0), (0.0, 2.0)
@@ -96,7 +96,7 @@ class Parameter:
         return self.radii[0] * pitch_radius_mm, self.radii[1] * pitch_radius_mm
 
     def usually(self, pitch_radius_mm: float, lobes: int) -> Pair:
-        """Return the usual range (low, high), in the key's unit, at a pitch radius (mm)."""
+        """Return the usual range (low, high), in the key's unit, for a rotor of this size."""
         del lobes
         if self.usual is not None and self.radii is None:
             return self.usual

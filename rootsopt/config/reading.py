@@ -73,7 +73,7 @@ class Config(Section):
 
     @property
     def design_keys(self) -> tuple[str, ...]:
-        """Names of the design parameters; those of a list are numbered from 1."""
+        """Names of the entries of `design`; the entries of a list are numbered from 1."""
         return self.profile.design_keys
 
     def replaced(self, values: Mapping[str, Any]) -> "Config":

@@ -20,7 +20,8 @@ from rootsopt.config.units import hint
 from rootsopt.config.words import shown
 
 _USUAL = 0.01, 2.0
-"""Usual range of a profile's lengths (pitch radii), beyond which a message asks for the unit."""
+"""Usual range of a profile's lengths (pitch radii). Where a length out of limits would be in this
+range in another unit, the message suggests that unit."""
 
 
 class ProfileConfig(Section):
@@ -53,7 +54,7 @@ class ProfileConfig(Section):
 
     @property
     def design_keys(self) -> tuple[str, ...]:
-        """Names of the design parameters; those of a list are numbered from 1."""
+        """Names of the entries of `design`; the entries of a list are numbered from 1."""
         names: list[str] = []
         for key, value in self.parameters.items():
             numbers = range(1, 1 + len(value)) if isinstance(value, tuple) else ()
@@ -260,7 +261,7 @@ class SupportsConfig(Section):
 
 
 class TimingGearConfig(Section):
-    """Timing gear between the rotors."""
+    """Timing gear between the rotors: torsional stiffness, damping and backlash."""
 
     stiffness_N_m_per_rad: Annotated[float, between(1e-2, 1e10)] = Field(
         description="torsional stiffness"

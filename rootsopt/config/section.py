@@ -21,7 +21,7 @@ Weight = Annotated[float, between(0, 1e6)]
 Order = Annotated[float, between(1e-2, 1e3)]
 """Order of a spectral line, in mesh frequencies."""
 Torque = Annotated[float, between(0, 1e7)]
-"""Torque that opposes or drives, N·m."""
+"""Magnitude of the torque of a load or motor, N·m."""
 
 
 class Section(BaseModel):

@@ -24,12 +24,12 @@ def following_mm(
     contact: tuple[float, float, float],
     precision: str,
 ) -> float:
-    """Return the smoothing length (mm) for this scene, with two significant digits.
+    """Return the default smoothing length (mm) of a scene, with two significant digits.
 
-    `load_torque` (N·m): torque on rotor 2. `gear_stiffness` (N·m/rad): of the timing gear, `None`
-    without one. `contact`: stiffness (N/mm^e), exponent and depth of full damping (mm) of the
-    flanks. The length changes every force by less than 1e-4 of its value
-    (`python -m experiments.smoothing`).
+    `load_torque` (N·m): torque on rotor 2. `gear_stiffness` (N·m/rad): stiffness of the timing
+    gear, `None` without a gear. `contact`: stiffness (N/mm^e), exponent and depth of full damping
+    (mm) of the flanks. `precision`: `float64` or `float32`. The length changes every force by less
+    than 1e-4 of its value (`python -m experiments.smoothing`).
     """
     torque = max(load_torque, _LEAST_LOAD)
     stiffness, exponent, full = contact

@@ -43,9 +43,9 @@ def si_unit(key: str) -> float:
 
 
 def hint(key: object, value: float, low: float, high: float) -> str:
-    """Ask, in a text for a message, whether an out-of-range `value` is in another unit.
+    """Return the end of a message that asks whether an out-of-range `value` is in another unit.
 
-    A unit fits if the converted value lies between `low` and `high`. Return "" if none fits."""
+    A unit fits if the converted value lies between `low` and `high`. Return "" if no unit fits."""
     name = str(key)
     for end, (_, others) in _UNITS.items():
         if name.endswith(end):

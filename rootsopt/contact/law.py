@@ -27,7 +27,9 @@ class ContactLaw(eqx.Module):
 
     @abc.abstractmethod
     def depth_at(self, force: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the static penetration (m) that carries `force` (N), differentiable."""
+        """Return the static penetration (m) that carries `force` (N).
+
+        The result must be differentiable with respect to the force and the law."""
 
     def switches(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Bool[Array, " s"]:
         """Return flags (s,) that identify the law's smooth piece; by default, whether it acts."""

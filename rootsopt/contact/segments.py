@@ -175,8 +175,9 @@ def _facing(
 
 
 def _spread(profile: Profile, count: int) -> Float[Array, " n"]:
-    """Return normal angles (n,) in rad of nodes on the addendum, from the tip (or the land's end)
-    to the pitch crossing."""
+    """Return normal angles (n,) in rad of `count` nodes on the addendum.
+
+    The nodes run from the tip (or the land's end) to the pitch crossing."""
     segments = [s for s in profile.segments() if not s.land]
     share = jnp.arange(_TABLE, dtype=profile.pitch_radius.dtype) / _TABLE
     ends = [s.start + (s.stop - s.start) * share for s in segments]

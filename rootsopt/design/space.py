@@ -120,7 +120,7 @@ class Space(eqx.Module):
         return family_of(self.scene.family)
 
     def design(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
-        """Return the design in config units at `point` of the unit box."""
+        """Return the design (d,) in config units at `point` (d,) of the unit box."""
         limits = zip(self.lower, self.upper, point, strict=True)
         values = [low + (high - low) * share for low, high, share in limits]
         for place, least, most in self._within(values):

@@ -15,7 +15,7 @@ from rootsopt.runtime.programs import Program
 
 _MICRON = 1e-6
 _POSES = 361
-"""Roll angles at which the gap is measured."""
+"""Number of roll angles at which the gap is measured."""
 
 
 @dataclasses.dataclass(frozen=True)

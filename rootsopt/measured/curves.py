@@ -19,8 +19,8 @@ from rootsopt.measured.guard import guarded
 _TURNING = 0.3
 """Length (pitch radii) that counts in a curve's parameter as much as a turn of 1 rad."""
 _JUMP, _ABOVE = 0.02, 20.0
-"""Change of curvature above which it is a jump: as a fraction of the curvature, and as a multiple
-of the median change at the points around it. Both must be exceeded."""
+"""Change of curvature above which the curvature jumps: as a fraction of the curvature, and as a
+multiple of the median change at the points around. Both must be exceeded."""
 _BESIDE, _AROUND = 3, 12
 """Points on each side that a joint affects; points on each side from which the median is taken."""
 _WINDING = 7.0

@@ -123,8 +123,8 @@ def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
     """Check the raw tags of a DXF file; return the number of entities of each kind.
 
     Raises `InputError` unless the file is complete and the numbers of its entities are valid. This
-    check is needed because the library reads "1,5" as 1. It also accepts a number that is cut off
-    at the end of the file.
+    check is needed because the library reads "1,5" as 1. The library also accepts a number that is
+    cut off at the end of the file.
     """
     tags = binary_tags_loader(data) if binary else recover.bytes_loader(io.BytesIO(data))
     counted: Counter[str] = Counter()

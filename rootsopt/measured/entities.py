@@ -196,7 +196,7 @@ class _Plane:
 
 @dataclasses.dataclass(frozen=True)
 class _Fault:
-    """Makes the error messages of an entity, named `what`."""
+    """Makes the errors of an entity; `what`: name of the entity in messages."""
 
     what: str
 

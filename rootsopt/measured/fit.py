@@ -25,8 +25,8 @@ tip to root)."""
 _SHARES = 400
 """Number of points at which two flanks are compared."""
 _FOLD = 1e-3
-"""Angle (rad), seen from the axis, above which an outline that turns back is rejected. Less is
-noise and rounding."""
+"""Angle (rad), seen from the axis, above which an outline that turns back is rejected. Smaller
+angles are noise and rounding."""
 _OFF = 0.02
 """Deviation between flanks (pitch radii) above which an outline is rejected; also the greatest
 smoothing."""
@@ -36,7 +36,7 @@ which such a land does not count."""
 _CORNER = 1e-2
 """Change of direction (rad) at a joint above which the joint is a corner."""
 _AT = 1e-6
-"""Distance (pitch radii) from the pitch circle below which a joint is on it."""
+"""Distance (pitch radii) from the pitch circle below which a joint counts as on the circle."""
 _FAR = 1e3
 """Ratio of an outline's greatest radius to the pitch radius, or its inverse, above which an outline
 is rejected for its units."""
@@ -232,7 +232,7 @@ def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
 
 
 def _distances(flank: _Flank, own: _Flank) -> NDArray[np.float64]:
-    """Return the normal distance (mm, positive outside) of a flank from `own` along it."""
+    """Return the normal distances (n,) of a `flank` from `own` (mm, positive outside)."""
     share = np.linspace(0.0, 1.0, _SHARES)
     place = flank.at(share)[0]
     for _ in range(4):

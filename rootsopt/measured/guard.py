@@ -1,7 +1,7 @@
 """Boundary around libraries that read files from outside.
 
-Any exception of a library becomes one `InputError`. Its log records and warnings stay off the
-console. Put only calls of the library inside, so that errors of this package stay visible.
+Any exception of a library becomes one `InputError`. The library's log records and warnings stay off
+the console. Put only calls of the library inside, so that errors of this package stay visible.
 """
 
 import contextlib

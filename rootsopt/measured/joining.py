@@ -111,7 +111,7 @@ def _components(pairs: NDArray[np.intp], count: int) -> NDArray[np.intp]:
 
 
 def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> NDArray[np.intp]:
-    """Return the indices of the chains, without those that repeat another one.
+    """Return the indices of the chains, without chains that repeat an earlier chain.
 
     A repeated chain has the same ends and the same points between."""
     if not chains:

@@ -33,15 +33,15 @@ _NOT_FILES = (
 
 
 def read(path: Path) -> Loop:
-    """Return the outline in a CSV or DXF file.
+    """Return the outline in a CSV or DXF file as a closed loop (mm).
 
     CSV: x and y in mm, split by commas, semicolons, tabs or blanks, with or without a header. The
-    columns are `x_mm` and `y_mm` if the header names them, else the first two.
+    columns are those that the header names x and y (or `x_mm`, `y_mm`), else the first two.
 
     DXF, text or binary: the closed loop of the largest area formed by LINE, ARC, ELLIPSE, SPLINE,
-    LWPOLYLINE and POLYLINE. Only the layer OUTLINE counts, or all layers if it does not exist.
-    Units are those the file states, mm if none. The ends of a LINE and the corners of a polyline
-    are points of a smooth curve.
+    LWPOLYLINE and POLYLINE. Only entities on the layer OUTLINE count. If there are none, entities
+    drawn directly count, or else those in blocks. Lengths are in the unit that the file states, or
+    else in mm. The ends of a LINE and the corners of a polyline are points of a smooth curve.
 
     Raises `InputError` where the file cannot be read or holds no closed outline.
     """

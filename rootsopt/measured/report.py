@@ -10,9 +10,9 @@ if TYPE_CHECKING:
 
 
 def record(config: Config) -> dict[str, Any]:
-    """Return the entry `outline` of the result file: checks and conjugacy.
+    """Return {"outline": checks and conjugacy} for the result file.
 
-    The result is empty for a profile that is not read from a file."""
+    Return {} for a profile that is not read from a file."""
     if not config.profile.from_file:
         return {}
     from rootsopt.measured.source import outline_of

@@ -1,7 +1,7 @@
-"""Families of tangent circular arcs: one, four, five and an edge, with their conjugate envelopes.
+"""Families of tangent circular arcs: one arc, four arcs, five arcs, one arc with a rounded edge.
 
-Except for the single arc, the sources' own formulas were not available. Each construction is a
-derivation from the family's name and description, stated in its docstring.
+Except for the single arc, the sources' own formulas were not available. Each construction is
+derived from the family's name and description, as its docstring states.
 """
 
 import jax.numpy as jnp

@@ -145,7 +145,7 @@ class Curve(Profile):
     def _support(self, k, away):
         """Return the support function (m) at a distance `away` (rad) from node k.
 
-        It integrates the slope -r cos ψ from the node's value."""
+        The slope -r cos ψ is integrated from the node's value."""
         shares, weights = (jnp.asarray(part, away.dtype) for part in _GAUSS)
         inside = away[..., None] * (1 + shares) / 2
         mean = jnp.sum(jnp.cos(self._psi(k[..., None], inside)) * weights, axis=-1) / 2
@@ -231,7 +231,7 @@ def _rolling(piece, pitch_radius):
 
 
 def _turning(roll, t):
-    """Return ν, ψ (rad), dψ/dν and d²ψ/dν² at t."""
+    """Return (ν in rad, ψ in rad, dψ/dν, d²ψ/dν²) at t of the piece with the function `roll`."""
     one = jnp.ones_like(t)
 
     def angles(t):

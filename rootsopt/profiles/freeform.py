@@ -207,7 +207,7 @@ def _pressure_angles(profile: Profile, nu):
 def _integrals(count: int):
     """Return a function that integrates each B-spline from 0 to fractions (n,) of the length.
 
-    It returns an array (n, count), in units of the whole length."""
+    The function returns an array (n, count), in units of the whole length."""
     powers = _powers(count) / np.arange(1, 2 + _DEGREE)[:, None]
     spans = len(powers)
     before = np.cumsum(powers.sum(axis=1), axis=0) - powers.sum(axis=1)
@@ -225,8 +225,8 @@ def _integrals(count: int):
 def _powers(count: int) -> NDArray[np.float64]:
     """Return coefficients (spans, 3, count) of each B-spline in powers of the fraction of a span.
 
-    They come from the Cox-de Boor recursion on polynomials. Knots are the ends of the spans; the
-    first and the last knot are repeated."""
+    The Cox-de Boor recursion on polynomials gives the coefficients. Knots are the ends of the
+    spans; the first and the last knot are repeated."""
     spans = count - _DEGREE
     knots = np.clip(np.arange(-_DEGREE, spans + _DEGREE + 1.0), 0, spans)
     basis = np.zeros((spans, _DEGREE + 1, count + _DEGREE))

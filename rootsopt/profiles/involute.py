@@ -46,7 +46,7 @@ def ranges(
 
 
 def check(profile: "ProfileConfig") -> None:
-    """Raise `InputError` unless an involute of this length exists and meshes without undercut."""
+    """Raise `InputError` unless the profile's involute exists and meshes without undercut."""
     alpha: Any = getattr(profile, _ANGLE)
     length: Any = getattr(profile, _LENGTH)
     tip: Any = getattr(profile, _TIP) or 0.0

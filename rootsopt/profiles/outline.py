@@ -41,9 +41,10 @@ class Outline(Profile):
 
     `crown`: support function h and lever q (m) of the addendum over its normal angle ν, from the
     tip to the pitch circle. The addendum is convex, so that ν identifies its points. `valley`:
-    normal direction F from the valley's axis (rad), h and q (m) of the dedendum. Its parameter runs
-    from 0 at the root to the pitch normal at the pitch circle, as a dedendum may be convex and
-    concave. dh = -q dF, and dq = h dF minus the arc length element along the tangent.
+    normal direction F from the valley's axis (rad), h and q (m) of the dedendum. The table's
+    parameter runs from 0 at the root to `pitch_normal` at the pitch circle. F cannot replace this
+    parameter, because a dedendum may be convex and concave. dh = -q dF, and dq = h dF minus the arc
+    length element along the tangent.
 
     Beyond its ends, the addendum continues with its circles of curvature, over the tip with its
     mirror image. The law of gearing is not assumed: `mate` is the given dedendum. Roll angle and
@@ -68,7 +69,7 @@ class Outline(Profile):
         return (Segment("flank", jnp.zeros_like(stop), stop, False),)
 
     def _crown(self, nu):
-        """Return support function and lever (m) at any ν."""
+        """Return (support function, lever) of the addendum (m) at any normal angle `nu` (rad)."""
         inside = jnp.clip(jnp.abs(nu), self.crown.node[0], self.crown.node[-1])
         beyond = jnp.abs(nu) - inside
         support, lever = self.crown(inside)
