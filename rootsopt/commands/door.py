@@ -205,7 +205,7 @@ def _streams(own: bool) -> Iterator[_Stream]:
             stream = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
         elif own:
             with contextlib.suppress(AttributeError, ValueError, OSError):
-                # A terminal without a character shows a question mark.
+                # Show a question mark for a character that the terminal lacks.
                 stream.reconfigure(errors="replace")
         guards.append(_Stream(stream, number if own else None))
     sys.stdout, sys.stderr = guards

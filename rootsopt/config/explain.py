@@ -38,7 +38,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         return f"`{key}` is missing{note}; add it"
     if kind == "value_error":
         return str(context["error"])
-    if kind in ("missing", "too_short", "too_long"):  # Of a list.
+    if kind in ("missing", "too_short", "too_long"):  # Number of entries in a list.
         key = ".".join(map(named, place))
         count, given = _count(field, context), rest and first.get("input")
         return f"`{key}` must be {count}, but is {shown(given or value)}"

@@ -52,8 +52,8 @@ _DONE = 8
 # common normal. The exception is a fraction of the flank, about √|ε|, next to a cusp at the pitch
 # crossing.
 _USUAL = -5e-3
-# Distance (rad) before a cusp below which a contact belongs to the cusp. It lies between the two
-# minima, which are several |ε| apart.
+# Distance (rad) before a cusp below which a contact belongs to the cusp. The limit lies between the
+# two minima, which are several |ε| apart.
 _NEAR_CUSP = 1e-3
 # Penetration (pitch radii) above which a pair of points on flanks that are not conjugate is
 # ignored.
@@ -153,7 +153,7 @@ class FlankPair(eqx.Module):
         tip = frozen.segments()[0]
         if tip.land:
             # Beside a land, contact starts on a part of the flank that grows from zero length. At
-            # its ends, the point of rotor 1 or that of rotor 2 is at the land's edge.
+            # the ends of this part, the point of rotor 1 or of rotor 2 is at the land's edge.
             after = frozen.segments()[1]
             step = (after.stop - after.start) / count
             pieces.append(tip.stop + step * 0.5 ** jnp.arange(_CROWD, 0, -1))

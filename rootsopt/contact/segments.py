@@ -26,8 +26,8 @@ from rootsopt.profiles.base import Profile
 
 # Fractions of the addendum's nodes by which a flank is continued. Beyond the pitch crossing, the
 # other half of the flank touches near the middle of the mesh. Over the top of a rounded tip, the
-# continuation keeps the first contact away from an end. A longer one would bend the flank of EE too
-# far for the bisection in `_facing`.
+# continuation keeps the first contact away from an end. A longer continuation would bend the flank
+# of EE too far for the bisection in `_facing`.
 _BEYOND_PITCH = 0.15
 _OVER_TIP = 0.03
 # Points per segment in the table from which the nodes are spaced.

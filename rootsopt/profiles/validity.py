@@ -60,7 +60,7 @@ def margins(profile: Profile) -> Margins:
     present = length > 0
 
     def least(values):
-        # Between the points, the minimum of the parabola through three of them.
+        # Include minima between the points, from the parabola through three points.
         before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
         bend = before - 2 * here + after
         low = (here <= before) & (here <= after) & (bend > 0)

@@ -67,7 +67,7 @@ def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, floa
         raise InputError(
             "`profile.family` must not be read from a file for a projection onto a free form, but "
             f"is {config.family}: unlike that of a free form, its dedendum need not be conjugate "
-            "to its addendum; name the family to which the rotor was made"
+            "to its addendum; set the family by which the rotor was designed"
         )
     radius = jnp.asarray(config.pitch_radius_mm * MM)
     profile = profile_of(config.family, config.lobes, radius, design_of(config))
