@@ -140,7 +140,7 @@ def _side(piece: DrawnPiece, length: float, helix: float) -> "Face":
     if isinstance(piece, Arc) and helix == 0:
         return Face.extrude(_edge(piece), Vector(0, 0, length))
     degree, knots, controls, weights = _rational(piece)
-    # Along z the points turn as exp(iθ). With the control points ρ of a cubic spline of exp(iθ), and
+    # Along z the points turn as exp(iθ). With the control points ρ of a cubic spline of exp(iθ) and
     # c of the piece, the control points of the surface are c ρ.
     turns = max(_SPANS, int(np.ceil(abs(helix) / _STEP)))
     share = np.linspace(0, 1, turns + 1)
