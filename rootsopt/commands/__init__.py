@@ -1,1 +1,1 @@
-"""The commands, one file each."""
+"""The commands `rootsopt COMMAND`, one file each."""

@@ -16,7 +16,9 @@ PURPOSE = "Find the coexisting motions of a scene and the initial states that le
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Check, search, write, print."""
+    """Run `rootsopt attractors`: check the config, search, and write files into `folder`.
+
+    Return the `Outcome`. Raises `InputError` for a wrong config."""
     import numpy as np
     from rich.console import Console
 
@@ -69,7 +71,9 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; return the exit code."""
+    """Run `rootsopt attractors` with the arguments `argv` (`None`: those of the process).
+
+    Return the exit code."""
     return door.through("attractors", lambda: _run(argv), own=argv is None)
 
 

@@ -33,24 +33,28 @@ os.environ.setdefault("EQX_ON_ERROR", "off")
 
 
 class Outcome(NamedTuple):
-    """The result of a command. code: exit code; show: function that prints the result."""
+    """The result of a command.
+
+    `code`: exit code; `show`: function that prints the result on a console."""
 
     code: int
     show: "Callable[[Console], None]"
 
 
 Body = Callable[[Config, argparse.Namespace, "RunFolder"], Outcome]
-"""Function of a command: check, compute, write into the given folder."""
+"""Function that runs a command: it gets config, options and result folder, and writes the files."""
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """Print one line and exit, as for other bad input."""
+        """Print `message` as one line on stderr and exit with code 2, as for other bad input."""
         self.exit(BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
 def parser(command: str, purpose: str) -> argparse.ArgumentParser:
-    """Return a parser with the arguments that every command takes."""
+    """Return a parser with the arguments that every command takes.
+
+    `command`: its name; `purpose`: first line of its help."""
     result = _Parser(
         prog=f"rootsopt {command}",
         description=purpose,
@@ -102,7 +106,9 @@ def _add_import(arguments: argparse.ArgumentParser) -> None:
 
 
 def _import_extensions(command: str, argv: Sequence[str] | None) -> None:
-    """Import what `--import` names, before config keys are listed and read."""
+    """Import the files and modules that `--import` names, before config keys are listed and read.
+
+    Raises `InputError` where an import fails."""
     early = _Parser(prog=f"rootsopt {command}", add_help=False, allow_abbrev=False)
     _add_import(early)
     names = early.parse_known_args(argv)[0].imports
@@ -121,9 +127,9 @@ def run(
 ) -> int:
     """Run a command and return its exit code.
 
-    It parses arguments, loads the config, chooses float64, runs `body` in its own folder, puts the
-    folder in place and prints. `InputError` becomes exit code 2. `add_options` adds the command's
-    own arguments.
+    Parse the arguments `argv` (`None`: those of the process), load the config and choose float64.
+    Then run `body` in a new folder, put the folder in place and print. `InputError` becomes exit
+    code 2. `add_options` adds the command's own arguments.
     """
     environment.own_process()
     try:
@@ -176,7 +182,7 @@ def _in_folder(command: str, body: Body, config: Config, options: argparse.Names
 
 @contextlib.contextmanager
 def waiting(console: "Console", what: str) -> Iterator[None]:
-    """Show `what` on a terminal while it is in progress; nothing in a pipe."""
+    """Show the text `what` on a terminal during a `with` block; show nothing in a pipe."""
     if not console.is_terminal:
         yield
         return

@@ -15,7 +15,9 @@ COMMANDS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the console command `rootsopt`; return the exit code."""
+    """Run `rootsopt` with the arguments `argv` (`None`: those of the process).
+
+    Return the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     command = arguments[0] if arguments and arguments[0] in COMMANDS else ""
     return door.through(command, lambda: _called(arguments), own=argv is None)
@@ -47,5 +49,5 @@ def _called(arguments: list[str]) -> int:
 
 
 def console() -> None:
-    """Run the installed command and end the process."""
+    """Run `rootsopt` as its own process, and end the process with the exit code."""
     door.leave(main())

@@ -18,7 +18,7 @@ from typing import Any
 OK, BAD_INPUT, NO_RESULT = 0, 2, 3
 _NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 _GONE = (errno.EPIPE, errno.EBADF, errno.ESHUTDOWN)
-"""Errors of a stream without a reader; the run continues."""
+"""Error numbers of a stream without a reader; the exit code ignores them."""
 _WAITING = "rootsopt signals"
 _SHOW_CURSOR = "\x1b[?25h"
 
@@ -26,9 +26,10 @@ _SHOW_CURSOR = "\x1b[?25h"
 class Signals:
     """Response of a run to SIGINT and SIGTERM.
 
-    A thread waits for the signals, because the main thread may be in compiled code for long. The
-    first signal stops the run at once: `abandon` removes unfinished files, one line says so, and
-    the exit code is 3. With `patient`, the first signal only sets `stop`; the second stops at once.
+    A thread waits for the signals, because the main thread may stay in compiled code for a long
+    time. The first signal stops the run at once: `abandon` removes unfinished files, one line says
+    so, and the exit code is 3. With `patient`, the first signal only sets `stop` and tells the user
+    the `promise`. The second signal stops the run.
     """
 
     def __init__(self, command: str):
@@ -60,7 +61,7 @@ class Signals:
             signal.signal(number, _nothing)
 
     def remove(self) -> None:
-        """Restore the signals."""
+        """Restore the signal handlers that `install` replaced."""
         if self._pipe is None:
             return
         for number, before in self._before.items():
@@ -85,7 +86,7 @@ class Signals:
         os._exit(NO_RESULT)
 
     def say(self, text: str) -> None:
-        """Write one line to stderr, whatever the state of the streams."""
+        """Write one line to stderr; a stream that cannot be written is not an error."""
         shown = f"rootsopt {self.command}".rstrip()
         try:
             start = f"\r{_SHOW_CURSOR}" if os.isatty(2) else ""
@@ -105,8 +106,8 @@ _running: Signals | None = None
 def patience(promise: str) -> Iterator[threading.Event]:
     """Yield an event that the first signal sets instead of stopping the run.
 
-    `promise` tells the user what happens then. In a command that is not its own process, nothing
-    sets the event.
+    `promise`: text that tells the user what happens after the signal. In a command that is not its
+    own process, nothing sets the event.
     """
     signals = _running
     if signals is None:
@@ -118,7 +119,9 @@ def patience(promise: str) -> Iterator[threading.Event]:
 
 @contextlib.contextmanager
 def leaving(abandon: Callable[[], str]) -> Iterator[None]:
-    """Call `abandon` if the process is stopped meanwhile; it returns the text for the user."""
+    """Call `abandon` if a signal stops the process during the `with` block.
+
+    `abandon` cleans up and returns a text for the user."""
     signals = _running
     if signals is None:
         yield
@@ -139,7 +142,7 @@ class _Stream:
         self.closed_early = False
 
     def write(self, text: str) -> int:
-        """Write as a file does, without raising errors."""
+        """Write `text` and return its length; an `OSError` is not raised."""
         if not self.closed_early:
             self._guarded(lambda: self.stream.write(text))
         return len(text)
@@ -149,7 +152,7 @@ class _Stream:
             self.write(line)
 
     def flush(self) -> None:
-        """Flush as a file does, without raising errors."""
+        """Flush the stream; an `OSError` is not raised."""
         if not self.closed_early:
             self._guarded(self.stream.flush)
 
@@ -186,7 +189,9 @@ def _nowhere(number: int) -> None:
 
 @contextlib.contextmanager
 def _streams(own: bool) -> Iterator[_Stream]:
-    """Guard stdout and stderr; if they are the process's `own`, open closed ones."""
+    """Yield a guarded stdout; stdout and stderr are `_Stream` objects during the `with` block.
+
+    `own`: the streams are the process's own, so that closed streams are opened first."""
     if own:
         for number in (0, 1, 2):
             try:
@@ -200,7 +205,7 @@ def _streams(own: bool) -> Iterator[_Stream]:
             stream = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
         elif own:
             with contextlib.suppress(AttributeError, ValueError, OSError):
-                # A terminal without a character shows a question mark.
+                # Show a question mark for a character that the terminal lacks.
                 stream.reconfigure(errors="replace")
         guards.append(_Stream(stream, number if own else None))
     sys.stdout, sys.stderr = guards
@@ -255,9 +260,9 @@ def _code(command: str, code: int, out: _Stream) -> int:
 
 
 def leave(code: int) -> None:
-    """End the process; a signal during the exit changes nothing.
+    """End the process with exit `code`, which a signal during the exit does not change.
 
-    If other threads still compile, end at once without waiting for them. Shutting Python down
+    If other threads are still running, end at once without waiting for them. Shutting Python down
     around them can abort the process with another exit code.
     """
     for number in _NAMES:

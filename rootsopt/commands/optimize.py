@@ -19,11 +19,14 @@ PURPOSE = "Optimise the design parameters for low contact force and compare with
 
 
 _PATIENCE = 5.0
-"""Time (s) after an interrupt to simulate the best design so far again from rest."""
+"""Time (s) after an interrupt above which a search is not waited for any longer. In this time the
+best design so far may be simulated again from rest."""
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Check, search, write, print."""
+    """Run `rootsopt optimize`: check the config, search, and write files into `folder`.
+
+    Return the `Outcome`. Raises `InputError` for a wrong config or option."""
     began = time.perf_counter()
     from rich.console import Console
 
@@ -79,7 +82,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
 
 def _searched(config: "Config", progress, stop: threading.Event):
-    """Run the search; return the config without `auto`, the chosen settings and the result.
+    """Run the search; return (config without `auto`, record of the chosen settings, result).
 
     The result is `None` if the search was stopped before the baseline was simulated.
     """
@@ -100,7 +103,9 @@ def _searched(config: "Config", progress, stop: threading.Event):
 
 
 def _nothing_known(config: "Config", folder: "RunFolder") -> "Outcome":
-    """Write the files of a run that was stopped before the baseline was simulated."""
+    """Write the files of a run that was stopped before the baseline was simulated.
+
+    Return the `Outcome`, with exit code 3."""
     from rootsopt.commands import cli
     from rootsopt.output import files
     from rootsopt.status import Status
@@ -116,7 +121,9 @@ def _nothing_known(config: "Config", folder: "RunFolder") -> "Outcome":
 
 
 def _alike(config: "Config", result) -> dict:
-    """Return what an optimised free form resembles, for report and result file."""
+    """Return the classical families nearest to an optimised free form, for the result file.
+
+    Return {} for a classical family and without an optimised design."""
     from rootsopt.config.families import family_of
 
     if family_of(config.profile.family).classical or result.optimized is None:
@@ -132,7 +139,7 @@ def _alike(config: "Config", result) -> dict:
 
 
 def _message(result) -> str:
-    """Return the text for a search that was interrupted or found nothing."""
+    """Return status and advice, as text, for a search that was interrupted or found nothing."""
     return f"{result.status.label}: {_advice(result)}"
 
 
@@ -156,7 +163,7 @@ def _advice(result) -> str:
 
 
 def _interrupted(result) -> str:
-    """Describe how far an interrupted search got."""
+    """Return sentences on how far an interrupted search got."""
     count = len(result.history)
     begin = f"The search was stopped after {count} design{'s' if count != 1 else ''}"
     if not result.baseline.usable:
@@ -224,7 +231,9 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
 
 @contextlib.contextmanager
 def _progress(console) -> Iterator:
-    """Show a progress bar with the best objective so far on a terminal, nothing in a pipe."""
+    """Yield a function (done, expected, best objective) that moves a progress bar.
+
+    Yield `None` without a terminal, where there is no bar."""
     if not console.is_terminal:
         yield None
         return
@@ -249,7 +258,9 @@ def _progress(console) -> Iterator:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; return the exit code."""
+    """Run `rootsopt optimize` with the arguments `argv` (`None`: those of the process).
+
+    Return the exit code."""
     return door.through("optimize", lambda: _run(argv), own=argv is None)
 
 

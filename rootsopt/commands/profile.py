@@ -19,11 +19,13 @@ PURPOSE = (
     "solids or an animation."
 )
 EXPORT = "dxf,svg"
-"""Default formats: a drawing takes less than a second, a solid ten."""
+"""Default formats of the command. Drawings take less than a second; a solid takes ten seconds."""
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Check, measure, write, print."""
+    """Run `rootsopt profile`: check the config, compute the geometry, write files into `folder`.
+
+    Return the `Outcome`. Raises `InputError` for a wrong config or option."""
     from rootsopt import export
     from rootsopt.commands import cli
     from rootsopt.measured import report as outline_report
@@ -72,7 +74,9 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
 
 def _coefficients(given: str | None) -> int | None:
-    """Return the number of coefficients in `--project`. Raises `InputError` if it is invalid."""
+    """Return the number given to `--project`, `None` if it is absent.
+
+    Raises `InputError` unless the number is from 3 to 64."""
     from rootsopt.errors import InputError
 
     if given is None:
@@ -86,7 +90,9 @@ def _coefficients(given: str | None) -> int | None:
 
 
 def _projected(folder: "RunFolder", config: "Config", count: int) -> str:
-    """Write the config with its profile as a free form; return the text for the user."""
+    """Write free_form.yaml, the config with its profile as a free form of `count` coefficients.
+
+    Return the text for the user."""
     from rootsopt.scene.families import free_form_of
 
     profile, away = free_form_of(config.profile, count)
@@ -110,7 +116,9 @@ def _options(parser: "argparse.ArgumentParser") -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; return the exit code."""
+    """Run `rootsopt profile` with the arguments `argv` (`None`: those of the process).
+
+    Return the exit code."""
     return door.through("profile", lambda: _run(argv), own=argv is None)
 
 

@@ -16,7 +16,9 @@ PURPOSE = "Simulate one design in one scene: steady state, contact force, its gr
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Check, simulate, write, print."""
+    """Run `rootsopt simulate`: check the config, simulate, and write files into `folder`.
+
+    Return the `Outcome`. Raises `InputError` for a wrong config or option."""
     from rich.console import Console
 
     from rootsopt import export
@@ -53,7 +55,9 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; return the exit code."""
+    """Run `rootsopt simulate` with the arguments `argv` (`None`: those of the process).
+
+    Return the exit code."""
     return door.through("simulate", lambda: _run(argv), own=argv is None)
 
 

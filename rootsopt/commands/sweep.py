@@ -17,7 +17,9 @@ PURPOSE = "Simulate one design at many speeds, each from rest: contact force and
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Check, simulate, write, print."""
+    """Run `rootsopt sweep`: check the config, simulate all speeds, and write files into `folder`.
+
+    Return the `Outcome`. Raises `InputError` for a wrong config."""
     from rich.console import Console
 
     from rootsopt.commands import cli
@@ -62,7 +64,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
 @contextlib.contextmanager
 def _progress(console) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar on a terminal, nothing in a pipe."""
+    """Yield a function (done, expected) that moves a progress bar, which only a terminal shows."""
     if not console.is_terminal:
         yield lambda done, expected: None
         return
@@ -74,7 +76,9 @@ def _progress(console) -> Iterator[Callable[[int, int], None]]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; return the exit code."""
+    """Run `rootsopt sweep` with the arguments `argv` (`None`: those of the process).
+
+    Return the exit code."""
     return door.through("sweep", lambda: _run(argv), own=argv is None)
 
 

@@ -12,7 +12,7 @@ from rootsopt.config.study import EnsembleConfig, SolverConfig
 from rootsopt.config.units import hint
 
 load_config = load
-"""The public name of `load`."""
+"""Name of `load` in the package `rootsopt`."""
 DESIGN_KEYS = FAMILY_KEYS["cic"]
 """Config keys of the design parameters of a CIC rotor."""
 

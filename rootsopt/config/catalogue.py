@@ -11,16 +11,16 @@ if TYPE_CHECKING:
     from rootsopt.config.scene import ProfileConfig
 
 _LONGEST = 5e4
-"""Greatest length (mm) that a config may give."""
+"""Length (mm) above which a config's parameter is rejected."""
 _SHARES = 0.002, 10.0
-"""Least and greatest length of a profile, in pitch radii."""
+"""Lengths of a profile (pitch radii) below and above which a config is rejected."""
 _NO_FLOOR = 0.0, 10.0
-"""The same, for a length that may be as small as its key allows."""
+"""Range that replaces `_SHARES` for a length whose only lower limit is the one of its key (mm)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _LandAngle(Parameter):
-    """Half angle of a tip land, always less than a quarter of the lobe pitch."""
+    """Half angle of a tip land; its bounds must stay below a quarter of the lobe pitch."""
 
     def usually(self, pitch_radius_mm: float, lobes: int) -> Pair:
         return 0.0, 45.0 / lobes
@@ -35,7 +35,7 @@ class _LandAngle(Parameter):
 
 
 class _Dependent(Parameter):
-    """Length whose only bounds are a range that depends on the other parameters."""
+    """Length without default bounds: the `ranges` of its family limit a search instead."""
 
     def bounds(self, profile: "ProfileConfig") -> Pair:
         del profile

@@ -19,14 +19,15 @@ from rootsopt.errors import InputError
 MOST_BYTES = 128 * 1024
 """Text size (bytes) above which a document is rejected; a config has some 2000 bytes."""
 _MOST_NODES = 5000
-"""Number of keys, values, lists and sections, aliases expanded, above which it is rejected."""
+"""Number of keys, values, lists and sections, aliases expanded, above which a document is rejected.
+"""
 _DEEPEST = 32
-"""Levels of nested sections and lists above which it is rejected."""
+"""Levels of nested sections and lists above which a document is rejected."""
 _LONGEST_VALUE = 4096
-"""Length of a scalar (characters) above which it is rejected."""
+"""Length of a scalar (characters) above which a document is rejected."""
 _MOST_DIGITS = 400
-"""Length of a number (characters) above which it is rejected; a double has at most 309 digits
-before its point."""
+"""Length of a number (characters) above which a document is rejected; a double has at most 309
+digits before its point."""
 
 _TAG = "tag:yaml.org,2002:"
 _MERGE = _TAG + "merge"
@@ -50,7 +51,7 @@ def read_document(text: str, source: str) -> Any:
 
 
 def _told(error: Exception) -> str:
-    """Return the line and the problem of an error of the reader, for a message."""
+    """Return the line number and the problem of a YAML reader's error, as text for a message."""
     mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
     place = f" (line {mark.line + 1})" if mark is not None else ""
     problem = getattr(error, "problem", None)
@@ -66,7 +67,7 @@ def _told(error: Exception) -> str:
 
 
 def _unshared(data: Any) -> Any:
-    """Return a copy that shares nothing, so that an override changes only the key it names."""
+    """Return a copy in which aliases are separate objects, so that an override changes one key."""
     if isinstance(data, dict):
         return {key: _unshared(value) for key, value in data.items()}
     if isinstance(data, list):
@@ -75,14 +76,15 @@ def _unshared(data: Any) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader with its own limits and messages, checked while nodes are composed."""
+    """PyYAML's SafeLoader with limits and messages for configs, applied as nodes are composed."""
 
     yaml_implicit_resolvers = {}  # noqa: RUF012
     yaml_constructors = {}  # noqa: RUF012
 
     def __init__(self, text: str):
         super().__init__(text)
-        # (nodes, height): of each open node so far, and of each complete anchored node.
+        # Pairs (nodes, height): the count so far of each open node, and the total of each complete
+        # anchored node.
         self._open: list[tuple[int, int]] = []
         self._anchored: dict[str, tuple[int, int]] = {}
 
@@ -106,7 +108,7 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def _count(self, nodes: int, height: int, mark) -> None:
-        """Add a complete node of this size to the node that holds it."""
+        """Add a complete node (`nodes` in total, `height` levels) to the node that contains it."""
         if len(self._open) + height > _DEEPEST:
             raise _wrong(f"there are more than {_DEEPEST} nested levels", mark)
         if not self._open:
@@ -205,7 +207,9 @@ def _real(text: str) -> float:
 
 
 def _scalar(kind: str, read: Callable[[str], Any]) -> None:
-    """Read scalars of this kind with `read`, which raises `ValueError` or `KeyError`."""
+    """Make `read` the function for scalars of a `kind`.
+
+    It must raise `ValueError`, `KeyError` or `OverflowError` for text that is not valid."""
 
     def construct(loader, node):
         text = loader.construct_scalar(node)

@@ -13,13 +13,14 @@ from rootsopt.config.units import hint, unit_of
 from rootsopt.config.words import named, shown
 
 _MOST_NAMES = 12
-"""Number of valid keys that a message lists at most."""
+"""Greatest number of valid keys that a message lists."""
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """Return one sentence on the most telling problem of a config of type `model`.
+    """Return one sentence on the problem that pydantic's `error` reports in a config.
 
-    An unknown key comes first, then pydantic's first problem."""
+    `model`: type of the config. Of several problems, report the first unknown key, or else the
+    first problem."""
     problems = error.errors(include_url=False)
     first = next((p for p in problems if p["type"] in _UNKNOWN), problems[0])
     place, rest = _split(model, first["loc"])
@@ -37,7 +38,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         return f"`{key}` is missing{note}; add it"
     if kind == "value_error":
         return str(context["error"])
-    if kind in ("missing", "too_short", "too_long"):  # Of a list.
+    if kind in ("missing", "too_short", "too_long"):  # Number of entries in a list.
         key = ".".join(map(named, place))
         count, given = _count(field, context), rest and first.get("input")
         return f"`{key}` must be {count}, but is {shown(given or value)}"
@@ -49,7 +50,7 @@ _UNKNOWN = ("extra_forbidden", "invalid_key")
 
 
 def _split(model: type[BaseModel], location: tuple) -> tuple[list[Any], list[Any]]:
-    """Split a location into the config's keys and what pydantic adds after the last of them."""
+    """Split pydantic's location of an error into the config's keys and the parts after them."""
     place: list[Any] = []
     inner: type[BaseModel] | None = model
     for number, part in enumerate(location):
@@ -77,7 +78,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_real(field: FieldInfo | None) -> bool:
-    """Return whether a key takes numbers that need not be whole."""
+    """Return whether a key takes real numbers, not only whole ones."""
     return field is not None and "float" in str(field.annotation)
 
 
@@ -120,7 +121,7 @@ def _allowed(kind: str, value: Any, context: dict, message: str, field: FieldInf
 
 
 def _advice(place: list, kind: str, value: Any, field: FieldInfo | None) -> str:
-    """Return a hint at what was probably meant; "" if there is none."""
+    """Return the end of a message, with a guess at what the user meant; "" without a guess."""
     if field is None:
         return ""
     if kind in ("greater_than_equal", "less_than_equal", "less_than") and _is_number(value):
@@ -158,7 +159,7 @@ def _model_of(annotation: Any) -> type[BaseModel] | None:
 
 
 def field_of(model: type[BaseModel], place: list) -> FieldInfo | None:
-    """Return the field of `model` at `place`, a list of keys; `None` if there is none."""
+    """Return the field of `model` at `place`, a list of keys; `None` if no such key exists."""
     section = _section(model, place[:-1])
     return section.model_fields.get(place[-1]) if section is not None and place else None
 
@@ -180,7 +181,7 @@ def _unknown(model: type[BaseModel], place: list) -> str:
 
 
 def all_keys(model: type[BaseModel], prefix: str = ""):
-    """Yield the dotted names of all sections and keys of a `model`."""
+    """Yield the dotted names of all sections and keys of a `model`, each after the `prefix`."""
     for name, field in model.model_fields.items():
         inner = _model_of(field.annotation)
         yield f"{prefix}{name}"
@@ -198,14 +199,18 @@ class Limits(NamedTuple):
 
     @property
     def ends(self) -> tuple[float, float]:
-        """(low, high), infinite where there is no limit; an end may itself be excluded."""
+        """Ends (low, high) of the range, infinite where there is no limit.
+
+        An end that the range excludes (`gt`, `lt`) is given like any other."""
         low = self.ge if self.ge is not None else self.gt
         high = self.le if self.le is not None else self.lt
         return (float("-inf") if low is None else low, float("inf") if high is None else high)
 
 
 def limits_of(annotation: Any, metadata: Any = ()) -> Limits:
-    """Return the range of a number, of each number of a list, or of a dictionary's values."""
+    """Return the limits that a field's `annotation` and `metadata` set for its numbers.
+
+    In a list these are the limits of each number, in a dictionary those of its values."""
     found: dict[str, Any] = {}
     for mark in metadata:
         for inner in mark.metadata if isinstance(mark, FieldInfo) else (mark,):
@@ -226,7 +231,7 @@ def limits_of(annotation: Any, metadata: Any = ()) -> Limits:
 
 
 def _range(field: FieldInfo) -> str:
-    """Return the range of a key's numbers in words; "" if there is none."""
+    """Return the range of a key's numbers in words; "" for a key without limits."""
     limits = limits_of(field.annotation, field.metadata)
     words = []
     if limits.ge is not None or limits.gt is not None:

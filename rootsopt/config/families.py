@@ -34,13 +34,14 @@ if TYPE_CHECKING:
 MARGINS = (
     *("turning", "convexity", "reach", "fall", "rolling", "order", "undercut", "star", "root"),
 )
-"""Margins that must be positive in a sound profile; `rootsopt.profiles.validity` defines them."""
+"""Names of the margins that a sound profile has ≥ 0; `rootsopt.profiles.validity` defines them."""
 ENTRY_POINTS = "rootsopt.families"
 """Entry-point group in which an installed package offers families, each under its name."""
 _ANY_LENGTH, _ANY_ANGLE, _ANY_NUMBER = (0.01, 1.5), (0.0, 90.0), (0.0, 2.0)
-"""Usual range of a parameter without `usual`: length (pitch radii), angle (°) and number."""
+"""Usual ranges of a length (pitch radii), an angle (°) and a number, for a parameter without its
+own."""
 _AROUND = (0.5, 1.5)
-"""Default bounds of such a parameter, as multiples of the config's own value."""
+"""Default bounds of a parameter without a usual range, as multiples of the config's own value."""
 _WORD = re.compile(r"[a-z][a-z0-9_]*")
 
 Pair = tuple[float, float]
@@ -57,7 +58,7 @@ class Parameter:
     `lowest`, `highest`: least and greatest value in a config; `below`: exclude `highest` itself.
     `radii`: for a length that scales with the rotor, its least and greatest value in pitch radii.
     `usual`: usual range, in pitch radii if `radii` is given; also the default bounds of an
-    optimisation. `None`: those are 0.5 to 1.5 times the config's own value.
+    optimisation. `None`: the default bounds are 0.5 to 1.5 times the config's own value.
     `default_bounds`: default bounds that replace `usual` and are written out in every config.
     `bounds_limits`: limits of the bounds, where narrower than `lowest` and `highest`.
     `bounds_note`: text on the default bounds for `--help`, instead of the generated one.
@@ -87,13 +88,15 @@ class Parameter:
         return si_unit(self.key)
 
     def limits(self, pitch_radius_mm: float) -> Pair | None:
-        """Return the least and greatest value for a rotor of this size; `None`: no such limit."""
+        """Return the least and greatest length (mm) at a pitch radius (mm).
+
+        `None`: the limits do not depend on the rotor's size."""
         if self.radii is None:
             return None
         return self.radii[0] * pitch_radius_mm, self.radii[1] * pitch_radius_mm
 
     def usually(self, pitch_radius_mm: float, lobes: int) -> Pair:
-        """Return the usual range (low, high) for a rotor of this size, in the key's unit."""
+        """Return the usual range (low, high), in the key's unit, for a rotor of this size."""
         del lobes
         if self.usual is not None and self.radii is None:
             return self.usual
@@ -103,17 +106,19 @@ class Parameter:
         return _ANY_ANGLE if self.key.endswith("_deg") else _ANY_NUMBER
 
     def bounds(self, profile: "ProfileConfig") -> Pair:
-        """Return the bounds for optimising this profile if its config gives none."""
+        """Return the default bounds (low, high) of an optimisation, in the key's unit."""
         if self.usual is not None:
             return self.usually(profile.pitch_radius_mm, profile.lobes)
         value = abs(getattr(profile, self.key))
         return _AROUND[0] * value, _AROUND[1] * value
 
     def check_bounds(self, bounds: Pair, lobes: int) -> None:
-        """Raise `InputError` for bounds that are impossible with this number of lobes."""
+        """Raise `InputError` for bounds that are impossible with this number of lobes.
+
+        By default all bounds are accepted. A subclass may reject some."""
 
     def field(self, families: list[str]) -> tuple[Any, Any]:
-        """Return annotation and pydantic field of the key; its help names the `families`."""
+        """Return (annotation, pydantic field) of the key; the field's help names the `families`."""
         limits = between(self.lowest, self.highest)
         if self.below:
             limits = Field(ge=self.lowest, lt=self.highest)
@@ -125,7 +130,7 @@ class Parameter:
         return kind | None, Field(None, description=f"{', '.join(families)}: {self.help}")
 
     def bounds_field(self) -> tuple[Any, Any]:
-        """Return annotation and pydantic field of the key's bounds."""
+        """Return (annotation, pydantic field) of the key's bounds."""
         least, most = self.bounds_limits or (self.lowest, self.highest)
         note = f"{self._bounds_words()}; from {least:g} to {most:g}"
         kind: Any = Pair if self.default_bounds is not None else Pair | None
@@ -191,7 +196,10 @@ class Family:
         return self.maker is not None and not lists
 
     def make(self, lobes: int, pitch_radius: Any, **parameters: Any) -> Any:
-        """Return the `Profile` of these parameters, in SI units."""
+        """Return the `Profile` with a `pitch_radius` (m) and `parameters` (SI units).
+
+        `parameters`: by the names of the maker's arguments. Raises `TypeError` for a family whose
+        profiles are in files."""
         return _found(self.maker)(lobes, pitch_radius, **parameters)
 
     def check(self, profile: "ProfileConfig") -> None:
@@ -200,7 +208,9 @@ class Family:
             _found(self.limits)(profile)
 
     def dependent(self, lobes: int, pitch_radius_mm: Any, **values: Any) -> Mapping[str, Any]:
-        """Return (low, high) by key, in the key's unit, of parameters that depend on the others."""
+        """Return {key: (low, high)} for the parameters whose range depends on the others.
+
+        `values`: all parameters by key. Values and ranges are in the units of the keys."""
         if self.ranges is None:
             return {}
         return _found(self.ranges)(lobes, pitch_radius_mm, **values)
@@ -233,7 +243,7 @@ def families() -> dict[str, Family]:
 
 
 def family_of(name: str) -> Family:
-    """Return the registered family of this name."""
+    """Return the registered family of this name; raises `KeyError` if there is none."""
     return _families[name]
 
 
@@ -253,13 +263,15 @@ def users_of(key: str) -> list[str]:
 
 
 def follow(update: Callable[[], None]) -> None:
-    """Call `update` after each change of the table, in the order of registration."""
+    """Register `update`, to be called after each change of the table of families.
+
+    Functions are called in the order in which they were registered."""
     _followers.append(update)
 
 
 @contextlib.contextmanager
 def for_a_time() -> Iterator[None]:
-    """Remove, at the end of a `with` block, the families registered in it; for tests.
+    """Remove the families registered inside a `with` block when it ends; for tests.
 
     Programs compiled for these families stay in memory: do not use their names again."""
     before = dict(_families)
@@ -274,7 +286,9 @@ def for_a_time() -> Iterator[None]:
 
 
 def find_installed(name: str) -> None:
-    """Load the installed package that offers a family under this `name`, if there is one."""
+    """Load the installed package that offers a family under this `name`, if there is one.
+
+    Raises `InputError` where loading fails."""
     from importlib.metadata import entry_points  # Slow: scans all installed packages.
 
     for point in entry_points(group=ENTRY_POINTS):
@@ -405,7 +419,9 @@ def _wrong(argument: str, wanted: str, found: Any) -> ValueError:
 
 
 def replace_fields(model: Any, fields: Mapping[str, Any]) -> None:
-    """Replace all fields of a pydantic `model`; a field is ready or (annotation, field)."""
+    """Replace all fields of a pydantic `model` in place.
+
+    `fields`: by name, a complete `FieldInfo`, or a pair (annotation, field) to make one from."""
     new = {name: field for name, field in fields.items() if not isinstance(field, FieldInfo)}
     made = create_model("Fields", **new).model_fields
     found = {name: made.get(name, field) for name, field in fields.items()}

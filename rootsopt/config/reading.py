@@ -42,7 +42,8 @@ from rootsopt.config.words import named, placed, sentence, shown
 from rootsopt.errors import InputError
 
 _MOST_PARTS = 8
-"""Number of dotted keys above which an override is rejected; config keys have at most 3."""
+"""Number of dotted parts of a key above which an override is rejected; config keys have at most 3.
+"""
 
 
 class Config(Section):
@@ -72,11 +73,11 @@ class Config(Section):
 
     @property
     def design_keys(self) -> tuple[str, ...]:
-        """Names of the design parameters; those of a list are numbered from 1."""
+        """Names of the entries of `design`; the entries of a list are numbered from 1."""
         return self.profile.design_keys
 
     def replaced(self, values: Mapping[str, Any]) -> "Config":
-        """Return the config with other `values` of dotted keys, checked like a file.
+        """Return the config with new `values` by dotted key, checked like a file.
 
         Raises `InputError` for an unknown key or a value that is not allowed."""
         data = self.model_dump(mode="json", exclude_none=True)
@@ -95,7 +96,8 @@ class Config(Section):
     def needs_search(self) -> tuple[str, ...]:
         """Keys set in this config that need fidelity `search`.
 
-        They need the place of contact, or any pair of flanks, which only the search has."""
+        Friction and supports need the point of contact. An outline or a centre distance error
+        needs a gap without perfect rolling. Only the search provides these."""
         parts = {
             "contact.friction": self.contact.friction,
             "scene.supports": self.scene.supports,
@@ -106,7 +108,7 @@ class Config(Section):
 
     @property
     def load_torque(self) -> float:
-        """Torque against rotor 2 (N·m); for a gas load an estimate of its mean, only to set scales.
+        """Load torque on rotor 2 (N·m); for a gas load, an estimate of its mean to set scales.
 
         The estimate assumes an outer radius of 1.4 pitch radii and an area efficiency of 0.45."""
         load = self.scene.load
@@ -182,10 +184,12 @@ def parse(
     source: str = "config",
     folder: str | Path = ".",
 ) -> Config:
-    """Read a config from YAML text, otherwise like `load`; `source` names it in messages.
+    """Read a config from YAML text and apply `dotted.key=value` overrides.
 
-    Paths in the text are relative to `folder`, paths in `overrides` to the current folder. The
-    returned config has absolute paths. Raises `InputError` as `load` does."""
+    `source`: name of the text in messages. Paths in the text are relative to `folder`, paths in
+    `overrides` to the current folder. The returned config has absolute paths.
+
+    Raises `InputError` where the text, a key or a value is wrong."""
     name = placed(source)
     data = read_document(text, name)
     if data is None:

@@ -20,7 +20,8 @@ from rootsopt.config.units import hint
 from rootsopt.config.words import shown
 
 _USUAL = 0.01, 2.0
-"""Usual range of a profile's lengths (pitch radii), beyond which a message asks for the unit."""
+"""Usual range of a profile's lengths (pitch radii). Where a length out of limits would be in this
+range in another unit, the message suggests that unit."""
 
 
 class ProfileConfig(Section):
@@ -53,7 +54,7 @@ class ProfileConfig(Section):
 
     @property
     def design_keys(self) -> tuple[str, ...]:
-        """Names of the design parameters; those of a list are numbered from 1."""
+        """Names of the entries of `design`; the entries of a list are numbered from 1."""
         names: list[str] = []
         for key, value in self.parameters.items():
             numbers = range(1, 1 + len(value)) if isinstance(value, tuple) else ()
@@ -128,7 +129,7 @@ _FIELDS = dict(ProfileConfig.model_fields)
 
 
 def _derive() -> None:
-    """Give `ProfileConfig` the families and keys of the table of families."""
+    """Set the fields of `ProfileConfig` from the table of families."""
     first, last = (
         {name: field for name, field in _FIELDS.items() if name.startswith("outline") is behind}
         for behind in (False, True)
@@ -211,7 +212,7 @@ class ContactConfig(Section):
 
     @property
     def rounding_mm(self) -> float:
-        """Smoothing length (mm); a complete config always has one."""
+        """Smoothing length (mm) of a complete config, which always has one."""
         assert self.smoothing_mm is not None
         return self.smoothing_mm
 
@@ -260,7 +261,7 @@ class SupportsConfig(Section):
 
 
 class TimingGearConfig(Section):
-    """Timing gear between the rotors."""
+    """Timing gear between the rotors: torsional stiffness, damping and backlash."""
 
     stiffness_N_m_per_rad: Annotated[float, between(1e-2, 1e10)] = Field(
         description="torsional stiffness"

@@ -21,7 +21,7 @@ Weight = Annotated[float, between(0, 1e6)]
 Order = Annotated[float, between(1e-2, 1e3)]
 """Order of a spectral line, in mesh frequencies."""
 Torque = Annotated[float, between(0, 1e7)]
-"""Torque that opposes or drives, N·m."""
+"""Magnitude of the torque of a load or motor, N·m."""
 
 
 class Section(BaseModel):
@@ -50,7 +50,9 @@ class Section(BaseModel):
 
 
 def choices(annotation: Any) -> tuple[str, ...]:
-    """Return the words that a value, or a key of a dictionary, may be; () if it is no choice."""
+    """Return the words that a type allows for a value, or for the keys of a dictionary.
+
+    Return () for a type that is not a choice of words."""
     if get_origin(annotation) is Literal:
         return get_args(annotation)
     if get_origin(annotation) in (Union, types.UnionType, Annotated, dict):
@@ -64,7 +66,9 @@ def bare(word: str) -> str:
 
 
 def tuples(data: Any) -> Any:
-    """Return a section's data with lists turned into tuples, which YAML lacks."""
+    """Convert the lists of a section to tuples, because YAML has no tuples.
+
+    Return anything but a dictionary unchanged."""
     if isinstance(data, dict):
         return {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
     return data

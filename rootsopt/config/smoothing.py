@@ -11,8 +11,8 @@ _SHARES = {"twist": 0.05, "depth": 0.02, "damping": 0.1}
 gear rests inside its rounded edge and has another stiffness. `depth`: the flanks' penetration under
 the full load. `damping`: the depth of full damping."""
 _LEAST = {"float64": 1e-6, "float32": 1e-5}
-"""Least smoothing length (mm), by precision. A shorter one costs solver steps and accuracy of the
-gradient. In single precision the rounding of the gap is about 4e-6 mm."""
+"""Least smoothing length (mm), by precision. A shorter length costs solver steps and accuracy of
+the gradient. In single precision the rounding error of the gap is about 4e-6 mm."""
 _LEAST_LOAD = 1e-3
 """Load (N·m) below which the smoothing length no longer depends on the load."""
 
@@ -24,12 +24,12 @@ def following_mm(
     contact: tuple[float, float, float],
     precision: str,
 ) -> float:
-    """Return the smoothing length (mm) for this scene, with two significant digits.
+    """Return the default smoothing length (mm) of a scene, with two significant digits.
 
-    `load_torque` (N·m): torque on rotor 2. `gear_stiffness` (N·m/rad): of the timing gear, `None`
-    without one. `contact`: stiffness (N/mm^e), exponent and depth of full damping (mm) of the
-    flanks. The length changes every force by less than 1e-4 of its value
-    (`python -m experiments.smoothing`).
+    `load_torque` (N·m): torque on rotor 2. `gear_stiffness` (N·m/rad): stiffness of the timing
+    gear, `None` without a gear. `contact`: stiffness (N/mm^e), exponent and depth of full damping
+    (mm) of the flanks. `precision`: `float64` or `float32`. The length changes every force by less
+    than 1e-4 of its value (`python -m experiments.smoothing`).
     """
     torque = max(load_torque, _LEAST_LOAD)
     stiffness, exponent, full = contact

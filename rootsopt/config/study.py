@@ -11,13 +11,13 @@ from rootsopt.config.words import shown
 
 _Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 _LEAST_WEIGHT = 1e-6
-"""Sum of the objective's weights below which it is rejected as empty."""
+"""Sum of an objective's weights below which the objective is rejected as empty."""
 _MOST_LINES = 32
 """Number of spectral lines above which an objective is rejected."""
 
 
 class SolverConfig(Section):
-    """Fidelity, integration method, tolerances and limits with which the scene is solved."""
+    """Settings of the simulation: fidelity, integration method, tolerances and limits."""
 
     fidelity: Literal["search", "map", "linear", "nodes", "auto"] = Field(
         "search",
@@ -202,7 +202,7 @@ _Rates = tuple[Annotated[float, between(-1e6, 1e6)], Annotated[float, between(-1
 
 
 class AttractorsConfig(Section):
-    """Initial states from which coexisting motions are searched."""
+    """Grid of initial states from which a search for coexisting motions starts."""
 
     relatives: Annotated[int, Field(ge=1, le=1000)] = Field(
         12, description="initial relative rotations tried"
@@ -235,7 +235,7 @@ class AttractorsConfig(Section):
 
 
 class EnsembleConfig(Section):
-    """Ensemble of motions that are averaged where a single motion is not representative (chaos)."""
+    """Settings of an ensemble: motions averaged where one motion is not representative (chaos)."""
 
     members: Annotated[int, Field(ge=4, le=100_000)] = Field(
         16, description="motions from different initial states, per design"
@@ -336,7 +336,7 @@ class BoundsConfig(Section):
 
 
 def _derive() -> None:
-    """Give `BoundsConfig` the keys of the table of families."""
+    """Set the fields of `BoundsConfig` from the table of families."""
     made = {key: parameter.bounds_field() for key, parameter in parameters().items()}
     replace_fields(BoundsConfig, made)
 

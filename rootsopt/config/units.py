@@ -10,7 +10,7 @@ RPM = 2 * math.pi / 60
 """One revolution per minute (rad/s)."""
 
 # Ending of a key: (unit, {unit often written by mistake: factor to the right unit}). The first
-# ending that fits counts, so the longest come first.
+# ending that fits counts, so the longest endings come first.
 _UNITS: dict[str, tuple[str, dict[str, float]]] = {
     "_N_s_per_mm": ("N·s/mm", {"N·s/m": 1e-3}),
     "_N_per_mm_e": ("N/mm^e", {}),
@@ -43,9 +43,9 @@ def si_unit(key: str) -> float:
 
 
 def hint(key: object, value: float, low: float, high: float) -> str:
-    """Return a question whether an out-of-range `value` is in another unit; "" if none fits.
+    """Return the end of a message that asks whether an out-of-range `value` is in another unit.
 
-    A unit fits if the converted value lies between `low` and `high`."""
+    A unit fits if the converted value lies between `low` and `high`. Return "" if no unit fits."""
     name = str(key)
     for end, (_, others) in _UNITS.items():
         if name.endswith(end):

@@ -6,11 +6,11 @@ from typing import Any
 LONGEST = 500
 """Greatest length (characters) of a message about a config."""
 _VALUE, _NAME, _PATH = 80, 60, 160
-"""Greatest length (characters) of a value, key and path in a message."""
+"""Greatest length (characters) of a value, of a key and of a path in a message."""
 
 
 class _Bounded(reprlib.Repr):
-    """`repr` that reads no more of a value than it shows."""
+    """A `repr` that shortens long values without reading the part that it leaves out."""
 
     def __init__(self):
         super().__init__()
@@ -33,13 +33,13 @@ def shown(value: Any) -> str:
 
 
 def named(part: Any) -> str:
-    """Return a key for a message: shortened and printable."""
+    """Return a config key as text for a message: shortened and printable."""
     text = clipped(part if isinstance(part, str) else shown(part), _NAME)
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
 def placed(path: Any) -> str:
-    """Return a path for a message: printable, and only its end if it is long."""
+    """Return a path as text for a message: printable, and only its end if it is long."""
     text = str(path)
     text = text if len(text) <= _PATH else "..." + text[3 - _PATH :]
     return text if text.isprintable() else ascii(text)[1:-1]

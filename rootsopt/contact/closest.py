@@ -45,15 +45,15 @@ _NEWTON_STEPS = 5
 _CONVERGED = {8: 1e-8, 4: 1e-3}
 # Greatest number of steps inside a bracket; halving alone needs about fifty.
 _GUARDED_STEPS = 60
-# Added to the number of attempts when the closest approach has been found.
+# Marks a finished search: this is added to the number of attempts.
 _DONE = 8
-# ε (rad) below which a converged Newton search from perfect rolling is not trusted. Down to it, and
-# at the nominal centre distance, tests show that Newton finds the closest approach and no other
+# ε (rad) below which a converged Newton search from perfect rolling is not trusted. Down to this ε,
+# and at the nominal centre distance, tests show that Newton finds the closest approach and no other
 # common normal. The exception is a fraction of the flank, about √|ε|, next to a cusp at the pitch
 # crossing.
 _USUAL = -5e-3
-# Distance (rad) before a cusp below which a contact belongs to the cusp. It lies between the two
-# minima, which are several |ε| apart.
+# Distance (rad) before a cusp below which a contact belongs to the cusp. The limit lies between the
+# two minima, which are several |ε| apart.
 _NEAR_CUSP = 1e-3
 # Penetration (pitch radii) above which a pair of points on flanks that are not conjugate is
 # ignored.
@@ -108,7 +108,7 @@ class FlankPair(eqx.Module):
 
     Build it with `FlankPair.of(profile)` outside any time loop.
 
-    `profile`: both rotors' profile; `frozen`: the same without derivatives, for the search;
+    `profile`: both rotors' profile; `frozen`: the same profile without derivatives, for the search;
     `nodes`: see `FlankNodes`; `center_distance`: E (m); `rolling`: whether the flanks are conjugate
     and E is the distance of perfect rolling.
     """
@@ -126,11 +126,11 @@ class FlankPair(eqx.Module):
         center_distance: Float[Array, ""] | None = None,
         two_sided: bool = False,
     ) -> "FlankPair":
-        """Prepare the search for `profile`; the nodes carry no derivatives.
+        """Return the flank pair of `profile`, prepared for searches; its nodes have no derivatives.
 
-        `center_distance` (m) is by default that of perfect rolling, 2r. At other distances, drive
-        and coast flanks can touch at the same time: set `two_sided` then. The search covers lands
-        too, up to the lobe's axis, beyond which the other side covers them.
+        `center_distance`: E (m), by default the distance of perfect rolling, 2r. At other
+        distances, drive and coast flanks can touch at the same time: set `two_sided`. The search
+        then also covers lands up to the lobe's axis. The flank on the other side covers the rest.
         """
         frozen = lax.stop_gradient(profile)
         segments = [s for s in frozen.segments() if two_sided or not s.land]
@@ -153,7 +153,7 @@ class FlankPair(eqx.Module):
         tip = frozen.segments()[0]
         if tip.land:
             # Beside a land, contact starts on a part of the flank that grows from zero length. At
-            # its ends, the point of rotor 1 or that of rotor 2 is at the land's edge.
+            # the ends of this part, the point of rotor 1 or of rotor 2 is at the land's edge.
             after = frozen.segments()[1]
             step = (after.stop - after.start) / count
             pieces.append(tip.stop + step * 0.5 ** jnp.arange(_CROWD, 0, -1))
@@ -188,17 +188,18 @@ class FlankPair(eqx.Module):
         )
 
     def folded(self, roll: Float[Array, ""]) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-        """Return x (rad) in the half that is searched, and whether the rotors are exchanged."""
+        """Return (x in the searched half of the mesh (rad), whether the rotors are exchanged)."""
         half = self.profile.half_pitch
         centered = roll - half
         centered = centered - 4 * half * jnp.round(centered / (4 * half))
         return half - jnp.abs(centered), centered > 0
 
     def switches(self, roll: Float[Array, ""], found: ClosestApproach) -> Bool[Array, " s"]:
-        """Return flags (s,) for the pieces of the flanks that are closest in `found` at `roll`.
+        """Return flags (s,) that identify the pieces of the flanks at the closest approach.
 
-        Where a flag changes, derivatives of the gap jump: second derivatives with respect to the
-        pose, and first derivatives of the levers with respect to the design."""
+        `roll`: x (rad); `found`: result at this pose. Where a flag changes, derivatives of the gap
+        jump: second derivatives with respect to the pose, and first derivatives of the levers with
+        respect to the design."""
         ends = jnp.stack([segment.stop for segment in self.frozen.segments()[:-1]] or [0.0])
         normals = jnp.stack([found.normal1, found.normal2])
         beyond = (normals[:, None] > ends).ravel()
@@ -254,14 +255,16 @@ class FlankPair(eqx.Module):
         return closest(dynamic, roll, relative)
 
     def reach(self, normal1, normal2, roll, relative):
-        """Return both points' support functions (m), and the cosine between common normal and line
-        of centres, at a folded `roll`."""
+        """Return (support of rotor 1's point (m), of rotor 2's point (m), cosine).
+
+        The cosine is that of the angle between the common normal and the line of centres.
+        `normal1`, `normal2`: ν1 and ν2 (rad); `roll`: folded x; `relative`: ε (rad)."""
         mate = self.profile.mate(normal2)
         direction = mate.facing + roll - relative / 2
         return self.profile.support(normal1), mate.support, jnp.cos(direction)
 
     def _mesh(self, normal2, roll, relative):
-        """Return T, G, ν1, q1, q2 at `normal2`, from the definition."""
+        """Return T, G, ν1, q1, q2 at ν2 = `normal2` from the formulas of the module's docstring."""
         profile = self.profile
         mate = profile.mate(normal2)
         normal1 = mate.facing + 2 * roll
@@ -273,18 +276,18 @@ class FlankPair(eqx.Module):
         return offset, gap, normal1, lever1, mate.lever
 
     def _offset(self, normal2, roll, relative):
-        """Return T alone, with as little work as possible."""
+        """Return T (m) at ν2 = `normal2`, without the other results of `_mesh`."""
         mate = self.profile.mate(normal2, support=False)
         reach = self.center_distance * jnp.sin(mate.facing + roll - relative / 2)
         return reach - self.profile.lever(mate.facing + 2 * roll) - mate.lever
 
     def _search(self, roll, relative, attempt=0):
-        """Return the closest approach at a folded `roll`, and the number of attempts.
+        """Return (number of attempts, closest approach) at a folded `roll`.
 
         Attempt 0 is Newton's method from the point of perfect rolling. Where its result is not
         reliable, attempts 1 and 2 follow. Two minima occur away from the nominal centre distance
         and next to a cusp. They lie in the last and the first interval of nodes where T falls
-        through zero; the deeper one is returned. Flanks that are not conjugate may have more
+        through zero; the deeper minimum is returned. Flanks that are not conjugate may have more
         minima; the attempts then try the two that are deepest at the nodes. All attempts share one
         loop, which is compiled once.
         """
@@ -327,9 +330,9 @@ class FlankPair(eqx.Module):
     def _bracket(self, attempt, roll, relative):
         """Return an interval between nodes where T falls through zero.
 
-        It is the last (`attempt` 1) or the first one; for flanks that are not conjugate, the
-        deepest or the second deepest. The result is (low, high), the first guess, whether there is
-        such an interval, and whether there is only one."""
+        On conjugate flanks, attempt 1 takes the last interval and attempt 2 the first. On other
+        flanks, they take the deepest and the second deepest. The result is ((low, high), first
+        guess, whether such an interval exists, whether there is at most one)."""
         profile, nodes = self.profile, self.nodes
         turned = _rotate(nodes.turned, 2 * profile.turn_ratio * roll)
         normal1 = nodes.facing + 2 * roll
@@ -363,11 +366,11 @@ class FlankPair(eqx.Module):
         return (low, high), low + (high - low) * share, present, single
 
     def _root(self, bracket, guess, guarded, roll, relative):
-        """Return the root of T by Newton's method from `guess`, and whether it converged.
+        """Return (root of T by Newton's method from `guess`, whether the method converged).
 
-        `guarded`: T falls through zero in the bracket, which shrinks around the root. It is halved
-        where Newton's step leaves it or is longer than half the last one. This is needed because T
-        has a kink where ν1 crosses a segment's end.
+        `guarded`: T falls through zero in the bracket, which shrinks around the root. The bracket
+        is halved where Newton's step leaves it or is longer than half the last step. Halving is
+        needed because T has a kink where ν1 crosses a segment's end.
         """
         tolerance = _CONVERGED[guess.dtype.itemsize]
         limit = jnp.where(guarded, _GUARDED_STEPS, _NEWTON_STEPS)
@@ -398,7 +401,7 @@ class FlankPair(eqx.Module):
 
 
 def _search_one_by_one(pair: FlankPair, roll, relative):
-    """Run `FlankPair._search` on the frozen profile.
+    """Return the closest approach at a folded `roll`, searched on the profile without derivatives.
 
     On a CPU many poses are searched one by one. A single pose rarely needs the nodes, but a batch
     of poses nearly always does."""
@@ -422,11 +425,11 @@ def contact_begins(relative: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def _materialized(tree, true):
-    """Return `tree` unchanged, but keep XLA from fusing it with its uses.
+    """Return `tree` unchanged, but keep XLA from fusing its arrays with the code that uses them.
 
-    Otherwise XLA would recompute sines of the nodes at every pose. On CPUs it drops optimisation
-    barriers, but it must run a loop of unknown length. `true`: a value that is always true, which
-    the compiler does not know."""
+    Otherwise XLA would recompute sines of the nodes at every pose. On CPUs XLA drops optimisation
+    barriers, but it must run a loop of unknown length. `true`: a traced value that is always true,
+    which the compiler does not know."""
 
     def copy(carry):
         return carry[0] + 1, tree
@@ -436,7 +439,7 @@ def _materialized(tree, true):
 
 
 def _circle(angle):
-    """Return cosine and sine, stacked."""
+    """Return cosine and sine of an `angle` (rad), stacked along a new first axis."""
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 

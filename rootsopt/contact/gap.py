@@ -12,10 +12,10 @@ from rootsopt.errors import InputError
 
 
 class Approach(NamedTuple):
-    """Two flanks at a pose.
+    """Gap and levers of two flanks at a pose.
 
     `gap`: gap (m), negative when the flanks penetrate; `lever1`, `lever2`: levers (m) of rotor 1
-    and rotor 2; `place`: further results that the contact itself needs later, or `None`."""
+    and rotor 2; `place`: result that the contact's `point` and `switches` need, or `None`."""
 
     gap: Float[Array, ""]
     lever1: Float[Array, ""]
@@ -26,9 +26,11 @@ class Approach(NamedTuple):
 class Contact(eqx.Module):
     """Gap and levers of the drive flanks of two rotors.
 
-    The pose is the roll coordinate x = -(φ1 + φ2)/2 and ε = φ2 - φ1 (rad), see `FlankPair`. A
-    contact returns the gap with its levers, d gap = -lever1 dφ1 + lever2 dφ2, so that forces come
-    from a potential. Its period in x is 2π/N. The coast flanks follow by x → -x, ε → -ε.
+    A pose is the roll coordinate x = -(φ1 + φ2)/2 and the relative rotation ε = φ2 - φ1 (rad), with
+    the rotations φ1 and φ2 of the rotors. A contact returns the gap and its levers. They satisfy
+    d gap = -lever1 dφ1 + lever2 dφ2, so that forces come from a potential. The gap's period in x is
+    2π/N. The coast flanks follow by x → -x, ε → -ε.
+
     A scene may also need the point of contact or other centre distances. By default a contact
     rejects these with `InputError`.
     """
@@ -49,7 +51,7 @@ class Contact(eqx.Module):
     def jumps(self) -> bool:
         """Whether levers may jump where a flag of `switches` changes.
 
-        Such a contact needs a `length_scale`."""
+        A contact with jumps needs a `length_scale`."""
         return False
 
     @property
@@ -61,42 +63,45 @@ class Contact(eqx.Module):
 
     @property
     def length_scale(self) -> Float[Array, ""] | None:
-        """Length (m) whose rounding error is the gap's, about the pitch radius.
+        """Length (m) with the same rounding error as the gap: about the pitch radius.
 
-        The levers are of this size too. `None`: the gap's rounding error is negligible."""
+        The levers are about as long, too. `None`: the gap's rounding error is negligible."""
         return None
 
     @property
     def center_distance(self) -> Float[Array, ""]:
-        """Distance of the axes (m).
+        """Distance between the rotors' axes (m).
 
-        Raises InputError where a contact supports the nominal distance only."""
+        Raises `InputError` where a contact supports the nominal distance only."""
         raise self._lacks("another centre distance", "displaced axes need")
 
     def at_distance(self, distance: Float[Array, ""]) -> "Contact":
-        """Return the contact of the same flanks at another centre distance (m).
+        """Return the contact of the same flanks at another centre `distance` (m).
 
-        Raises InputError where a contact supports the nominal distance only."""
+        Raises `InputError` where a contact supports the nominal distance only."""
         del distance
         raise self._lacks("another centre distance", "displaced axes need")
 
     def approach(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> Approach:
-        """Return gap and levers, with what `point` and `switches` need at the same pose."""
+        """Return gap and levers at x = `roll` and ε = `relative` (rad).
+
+        The result also holds what `point` and `switches` need at the same pose."""
         return Approach(*self(roll, relative))
 
     def point(
         self, roll: Float[Array, ""], relative: Float[Array, ""], approach: Approach
     ) -> ContactPoint:
-        """Return place and direction of the contact that `approach` has found at this pose.
+        """Return position and direction of the contact that `approach` has found at this pose.
 
-        Raises InputError where a contact cannot compute them."""
+        `roll`, `relative`: x and ε (rad). Raises `InputError` where a contact cannot compute the
+        point."""
         del roll, relative, approach
         raise self._lacks("the point of contact", "friction and supports need")
 
     def switches(self, roll: Float[Array, ""], approach: Approach) -> Bool[Array, " s"]:
-        """Return flags (s,) that identify the smooth piece of the gap at this pose.
+        """Return flags (s,) that identify the smooth piece of the gap at x = `roll` (rad).
 
-        There is one flag for each surface in the space of poses at which a derivative jumps."""
+        One flag changes at each surface in the space of poses where a derivative jumps."""
         del roll, approach
         return jnp.zeros(0, bool)
 

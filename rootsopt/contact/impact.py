@@ -7,8 +7,8 @@ Eq. 10 cannot have exponent 2.2) is
 
 Two corners are rounded over the smoothing length h. At the onset of contact, a ramp replaces δ; it
 is zero up to δ = 0 and exactly δ from δ = h. At the release, the same ramp over the force
-h/d · K δ^e replaces max(0, ·). Outside these two zones the law is unchanged. It is never adhesive,
-and exactly zero without penetration.
+h/d · K δ^e replaces max(0, ·). Outside these two zones the law is unchanged. The force is never
+adhesive, and exactly zero without penetration.
 """
 
 import jax.numpy as jnp
@@ -18,7 +18,9 @@ from rootsopt.contact.law import ContactLaw
 
 
 def ramp(x: Float[Array, "*n"], width: Float[Array, "*#n"]) -> Float[Array, "*n"]:
-    """Return max(0, x) with its corner rounded on 0 < x < width: 2 x²/w - x³/w², C¹ throughout."""
+    """Return max(0, x), with its corner rounded to 2 x²/w - x³/w² on 0 < x < w = `width`.
+
+    The function is C¹. `x` and `width` have the same unit."""
     safe = jnp.where(width > 0, width, 1.0)
     t = jnp.clip(x / safe, 0.0, 1.0)
     rounded = safe * t**2 * (2 - t)
@@ -33,11 +35,11 @@ def smooth_step(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def balanced_ramp(x: Float[Array, "*n"], width: Float[Array, "*#n"]) -> Float[Array, "*n"]:
-    """Return max(0, x) with its corner rounded on 0 < x < width, C¹, and with the same integral.
+    """Return max(0, x), with its corner rounded on 0 < x < w = `width` and its integral kept.
 
-    A spring with this rounding stores the same energy beyond the zone as a sharp one. The function
-    is `ramp` plus the multiple of t² (1 - t)² that restores the integral:
-    w (9 t² - 12 t³ + 5 t⁴) / 2.
+    Beyond the rounded zone, a spring with this force stores the same energy as with a sharp corner.
+    The function is C¹: `ramp` plus the multiple of t² (1 - t)² that restores the integral, which is
+    w (9 t² - 12 t³ + 5 t⁴) / 2 with t = x/w.
     """
     safe = jnp.where(width > 0, width, 1.0)
     t = jnp.clip(x / safe, 0.0, 1.0)
@@ -48,9 +50,9 @@ def balanced_ramp(x: Float[Array, "*n"], width: Float[Array, "*#n"]) -> Float[Ar
 def balanced_step(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Return a step from 0 to 1 on 0 < x < 1, C¹, with the integral of a sharp step at 0.
 
-    A motion that crosses the zone loses the same momentum to a damper with this onset as to one
-    with a sharp onset. The step therefore exceeds 1 inside the zone, by up to half; it is never
-    negative. `smooth_step` was rejected: it omits half a width of damping on every crossing.
+    With this onset, a damper takes the same momentum from a motion that crosses the zone as with a
+    sharp onset. The step therefore exceeds 1 inside the zone, by up to half. It is never negative.
+    `smooth_step` was rejected, because it omits half a width of damping on every crossing.
     """
     t = jnp.clip(x, 0.0, 1.0)
     return t**2 * (18 - 32 * t + 15 * t**2)
@@ -59,10 +61,11 @@ def balanced_step(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
 def force_rounding(
     depth: Float[Array, ""], exponent: Float[Array, ""], radius: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Return the relative rounding error of the force at a `depth` (m); 0 without contact.
+    """Return the relative rounding error of the force at a penetration `depth` (m).
 
     The gap is a difference of lengths about as large as the pitch `radius` (m), and has their
-    rounding error. The force is a power of the gap with the law's `exponent`.
+    rounding error. The force is a power of the gap with the law's `exponent`. Without contact the
+    error is 0.
     """
     deep = jnp.where(depth > 0, depth, jnp.inf)
     return exponent * float(jnp.finfo(depth.dtype).eps) * radius / deep
@@ -106,9 +109,10 @@ class ImpactLaw(ContactLaw):
         """Return contact flag, elastic force (N), total force (N) before release, and width.
 
         The width is the fraction of the elastic force over which the release is rounded. The
-        damping force is added to the elastic one; their quotient is used only near the release. At
-        the onset both forces are so small that its derivative would overflow in single precision.
-        (The release is not rounded where the square of the elastic force is out of range.)
+        damping force is added to the elastic force; their quotient is used only near the release.
+        At the onset both forces are so small that the quotient's derivative would overflow in
+        single precision. (The release is not rounded where the square of the elastic force is out
+        of range.)
         """
         delta = ramp(depth, self.smoothing)
         safe = jnp.where(delta > 0, delta, self.full_damping_depth)

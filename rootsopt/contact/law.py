@@ -27,7 +27,9 @@ class ContactLaw(eqx.Module):
 
     @abc.abstractmethod
     def depth_at(self, force: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the static penetration (m) that carries `force` (N), differentiable."""
+        """Return the static penetration (m) that carries `force` (N).
+
+        The result must be differentiable with respect to the force and the law."""
 
     def switches(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Bool[Array, " s"]:
         """Return flags (s,) that identify the law's smooth piece; by default, whether it acts."""
@@ -42,8 +44,8 @@ class ContactLaw(eqx.Module):
     def depth_absorbing(self, work: Float[Array, ""]) -> Float[Array, ""]:
         """Return the penetration (m) at which the static force has absorbed `work` (J).
 
-        It is that of a power law with this `exponent`. It sets the solver's steps only; no result
-        depends on it."""
+        By default, assume a power law with the law's `exponent`. The solver uses this depth to
+        choose its steps only; no result depends on it."""
         e = self.exponent
         unit = self.depth_at(jnp.ones_like(work))
         return ((e + 1) * work * unit**e) ** (1 / (e + 1))

@@ -22,7 +22,7 @@ from rootsopt.profiles.base import Profile
 class LinearContact(Contact):
     """Gap and levers of a flank pair at a pose, to first order in ε.
 
-    Call it with roll coordinate and ε (rad); see `FlankPair` for their meaning. `profile`:
+    Call an instance with roll coordinate x and relative rotation ε (rad), see `Contact`. `profile`:
     both rotors' profile.
     """
 
@@ -30,7 +30,7 @@ class LinearContact(Contact):
 
     @property
     def smooth(self) -> bool:
-        """False: its levers jump without a change of `switches`."""
+        """False: the levers jump without a change of `switches`."""
         return False
 
     @classmethod
@@ -41,11 +41,11 @@ class LinearContact(Contact):
     def __call__(
         self, roll: Float[Array, ""], relative: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """Return the gap (m) and the levers (m) about rotor 1 and rotor 2.
+        """Return gap and levers (m) of rotor 1 and rotor 2 at x = `roll`, ε = `relative` (rad).
 
-        Contact starts with the first point of the flank that can carry torque (the end of
-        the tip land). Before it there is no contact: the gap is the pitch radius and the levers
-        are zero. The depth starts from zero there, unless the whole tip arc meshes at once.
+        Contact starts with the first point of the flank that can carry torque (the end of the tip
+        land). Before that point, there is no contact: the gap is the pitch radius and the levers
+        are zero. The penetration starts from zero, unless the whole tip arc meshes at once.
         """
         profile = self.profile
         half = profile.half_pitch

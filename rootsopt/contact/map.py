@@ -20,22 +20,25 @@ from rootsopt.contact.closest import FlankPair, contact_begins
 from rootsopt.contact.gap import Contact
 from rootsopt.profiles.base import Profile
 
-# Grid cells beyond ε = 0, and beyond the middle of the flank. They keep the spline in its interior
-# where contact starts.
+# Grid cells beyond ε = 0, and beyond the middle of the flank. With them, no contact is close to an
+# end of the spline.
 MARGIN = 3
 
 
 def first_roll(deepest: Float[Array, ""] | float, half_pitch: float) -> Float[Array, ""]:
-    """Return the roll (rad) at which a map down to ε = `deepest` (rad) starts."""
+    """Return the roll coordinate (rad) at which a map down to ε = `deepest` (rad) starts.
+
+    `half_pitch`: π/2N (rad)."""
     return jnp.maximum(-0.9 * half_pitch, contact_begins(jnp.asarray(deepest)))
 
 
 def continued_gap(
     pair: FlankPair, roll: Float[Array, ""], relative: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Return the gap (m), continued where the flanks have no common normal.
+    """Return the gap (m) at x = `roll` and ε = `relative` (rad), continued past its domain.
 
-    There the tip land is passing. A parabola continues the gap from the land's end.
+    Where the tip land passes, the flanks have no common normal. A parabola then continues the gap
+    from the land's end.
     """
     contact = pair(roll, relative)
     away = roll - lax.stop_gradient(_land_end(pair.profile)) - relative / 2
@@ -59,7 +62,7 @@ def _interpolation_matrix(count: int) -> NDArray[np.float64]:
 
 
 def _weights(t):
-    """Return B-spline weights of the four coefficients around a cell, and two derivatives."""
+    """Return (values, first, second derivatives) of the 4 B-splines at the fraction t of a cell."""
     u = 1 - t
     value = jnp.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]) / 6
     slope = jnp.stack([-(u**2), 3 * t**2 - 4 * t, -3 * u**2 + 4 * u, t**2]) / 2
@@ -70,7 +73,7 @@ def _weights(t):
 class MapContact(Contact):
     """Gap and levers of a flank pair at a pose, from a spline map.
 
-    Call it with roll coordinate and ε (rad); see `FlankPair` for their meaning. Below
+    Call an instance with roll coordinate x and relative rotation ε (rad), see `Contact`. Below
     ε = `deepest` the gap continues linearly in ε. A simulation then goes on, so that the caller can
     see that the map must be larger.
 
@@ -89,9 +92,9 @@ class MapContact(Contact):
     def of(
         cls, profile: Profile, deepest: Float[Array, ""], rolls: int, relatives: int
     ) -> "MapContact":
-        """Tabulate `profile` down to ε = `deepest` < 0 (rad).
+        """Return the map of `profile` down to ε = `deepest` < 0 (rad).
 
-        The grid has `rolls` × `relatives` points, both at least 8."""
+        The grid has `rolls` points over x and `relatives` points over ε, both at least 8."""
         pair = FlankPair.of(profile)
         half = float(profile.half_pitch)
         first = first_roll(deepest, half)
@@ -114,7 +117,7 @@ class MapContact(Contact):
     def __call__(
         self, roll: Float[Array, ""], relative: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """Return the gap (m) and the levers (m) about rotor 1 and rotor 2."""
+        """Return gap and levers (m) of rotor 1 and rotor 2 at x = `roll`, ε = `relative` (rad)."""
         half = self.half_pitch
         centered = roll - half
         centered = centered - 4 * half * jnp.round(centered / (4 * half))
@@ -134,7 +137,7 @@ class MapContact(Contact):
 
 @jax.custom_jvp
 def _bicubic(coefficients, x, y):
-    """Return the spline's value and its derivatives ∂x, ∂y, ∂x∂y at a position in cells."""
+    """Return the spline's value and its derivatives ∂x, ∂y, ∂x∂y at x, y in units of cells."""
     i, j = (lax.stop_gradient(jnp.floor(t)).astype(jnp.int32) for t in (x, y))
     return _sums(_local(coefficients, i, j), _weights(x - i), _weights(y - j))
 

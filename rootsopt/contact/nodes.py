@@ -34,9 +34,10 @@ def place_pair(
 def signed_distance(nodes: Points, outline: Points, refine: bool = True) -> NDArray[np.float64]:
     """Return the signed distance (n,) from `nodes` to a closed counter-clockwise `outline`.
 
-    It is positive outside. Without `refine` it is the distance to the nearest straight segment
-    (Eq. 9). With `refine`, a cubic through the segment's two ends, with the outline's own tangents,
-    replaces that segment. The error is then of fourth order in the node spacing, not second.
+    The distance is positive outside, in the unit of `nodes` (n, 2) and `outline` (m, 2). Without
+    `refine`, measure to the nearest straight segment (Eq. 9). With `refine`, a cubic through the
+    segment's two ends, with the outline's own tangents, replaces that segment. The error is then of
+    fourth order in the node spacing, not second.
     """
     corners = outline[:-1] if np.allclose(outline[0], outline[-1], atol=0) else outline
     count = len(corners)
@@ -67,7 +68,7 @@ def _tangents(corners):
 
 
 def _project(nodes, corners, start, stop, tangents):
-    """Return foot points on the segments start → stop, and the direction of the curve there."""
+    """Return (foot points of `nodes` on the segments start → stop, tangents of the curve there)."""
     a = corners[start]
     chord = corners[stop] - a
     length2 = np.einsum("ij,ij->i", chord, chord)
@@ -101,8 +102,9 @@ def pair_gap(
 ) -> float:
     """Return the least signed distance between the two rotors at one pose, in the outline's unit.
 
-    `reach`: distance from rotor 2's outer circle beyond which nodes of rotor 1 are ignored; by
-    default 0.05 outer radii, which keeps all that can touch.
+    `outline`, `lobes`, `center_distance`, `phi1`, `phi2`: as in `place_pair`. `refine`: as in
+    `signed_distance`. `reach`: distance from rotor 2's outer circle beyond which nodes of rotor 1
+    are ignored; by default 0.05 outer radii, which includes all nodes that can touch.
     """
     first, second = place_pair(outline, lobes, center_distance, phi1, phi2)
     outer = np.max(np.hypot(outline[:, 0], outline[:, 1]))

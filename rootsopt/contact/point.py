@@ -1,4 +1,4 @@
-"""Place of the closest approach on the flanks, for friction and elastic supports."""
+"""Position of the closest approach on the flanks, for friction and elastic supports."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from rootsopt.contact.closest import ClosestApproach, FlankPair
 
 
 class ContactPoint(NamedTuple):
-    """Place and direction of a flank contact.
+    """Position and direction of a flank contact.
 
     n is the common normal from rotor 1 to rotor 2, O1 and O2 are the axes.
     `support1`: (P - O1)·n (m), distance of the contact P from axis 1 along n.
@@ -25,7 +25,9 @@ class ContactPoint(NamedTuple):
 def contact_point(
     pair: FlankPair, roll: Float[Array, ""], relative: Float[Array, ""], found: ClosestApproach
 ) -> ContactPoint:
-    """Return the place of the closest approach `found` at x = `roll` and ε = `relative` (rad)."""
+    """Return position and direction of the closest approach `found` at x = `roll`, ε = `relative`.
+
+    Both angles are in rad."""
     folded, mirrored = pair.folded(roll)
     support1, support2, radial = pair.reach(found.normal1, found.normal2, folded, relative)
     return ContactPoint(

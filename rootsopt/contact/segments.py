@@ -26,8 +26,8 @@ from rootsopt.profiles.base import Profile
 
 # Fractions of the addendum's nodes by which a flank is continued. Beyond the pitch crossing, the
 # other half of the flank touches near the middle of the mesh. Over the top of a rounded tip, the
-# continuation keeps the first contact away from an end. A longer one would bend the flank of EE too
-# far for the bisection in `_facing`.
+# continuation keeps the first contact away from an end. A longer continuation would bend the flank
+# of EE too far for the bisection in `_facing`.
 _BEYOND_PITCH = 0.15
 _OVER_TIP = 0.03
 # Points per segment in the table from which the nodes are spaced.
@@ -40,10 +40,11 @@ _DEEPEST = 0.1
 class NodeContact(Contact):
     """Gap and levers of a flank pair at a pose, from two polylines.
 
-    Call it with roll coordinate and ε (rad); see `FlankPair` for their meaning. Fields have rotor 1
-    first, rotor 2 second, each in its own rotor's frame. `nodes` (2, n, 2): in m; `tangent`
-    (2, n, 2): unit tangents at the nodes, normal to the bisectors; `normal` (2, n - 1, 2): outward
-    unit normals of the segments; `pitch_radius`: r (m); `half_pitch`: π/2N (rad).
+    Call an instance with roll coordinate x and relative rotation ε (rad), see `Contact`. Fields
+    have rotor 1 first, rotor 2 second, each in its own rotor's frame. `nodes` (2, n, 2): in m;
+    `tangent` (2, n, 2): unit tangents at the nodes, normal to the bisectors; `normal`
+    (2, n - 1, 2): outward unit normals of the segments; `pitch_radius`: r (m); `half_pitch`: π/2N
+    (rad).
 
     Tip lands carry no torque and have no nodes. The flank of rotor 1 is its addendum and a little
     more, that of rotor 2 its mate. The rest of the mesh follows by exchange of the rotors.
@@ -57,16 +58,16 @@ class NodeContact(Contact):
 
     @property
     def smooth(self) -> bool:
-        """False: its levers jump without a change of `switches`."""
+        """False: the levers jump without a change of `switches`."""
         return False
 
     @classmethod
     def of(cls, profile: Profile, nodes: int) -> "NodeContact":
-        """Place `nodes` (at least 16) per flank, half of them on the addendum.
+        """Return the contact of `profile` with `nodes` per whole flank, half on the addendum.
 
-        They are evenly spaced in the longer of the two mating arc elements plus a constant. The
+        Nodes are evenly spaced in the longer of the two mating arc elements plus a constant. The
         constant resolves the sharp spot at the pitch crossing of EE. Raises `ValueError` for fewer
-        nodes.
+        than 16 nodes.
         """
         if nodes < 16:
             raise ValueError(f"Argument `nodes` must be at least 16, but is {nodes}.")
@@ -91,9 +92,9 @@ class NodeContact(Contact):
     def __call__(
         self, roll: Float[Array, ""], relative: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """Return the gap (m) and the levers (m) about rotor 1 and rotor 2.
+        """Return gap and levers (m) of rotor 1 and rotor 2 at x = `roll`, ε = `relative` (rad).
 
-        The derivative is that of the deepest pair of node and segment. Where no node faces a
+        Derivatives are those of the deepest pair of node and segment. Where no node faces a
         segment, the gap is the pitch radius and the levers are zero.
         """
         half = self.half_pitch
@@ -118,11 +119,11 @@ class NodeContact(Contact):
         )
 
     def _center(self, angle):
-        """Return the other rotor's axis (2,) in m, in the frame of a rotor at `angle`."""
+        """Return the other rotor's axis (2,) in m, in the frame of a rotor at `angle` a (rad)."""
         return 2 * self.pitch_radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
     def _transfer(self, points, angle, other_angle):
-        """Return the other rotor's `points` (..., 2) in the frame of a rotor at `angle`."""
+        """Return the other rotor's `points` (..., 2) in the frame of a rotor at `angle` a (rad)."""
         turn = angle - other_angle
         cos, sin = jnp.cos(turn), jnp.sin(turn)
         return self._center(angle) - points @ jnp.array([[cos, sin], [-sin, cos]])
@@ -130,7 +131,7 @@ class NodeContact(Contact):
     def _search(
         self, angles: Float[Array, " 2"]
     ) -> tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""], Bool[Array, ""]]:
-        """Return the deepest pair: (rotor of the segment, node, segment, whether one exists)."""
+        """Return the deepest pair: (rotor of the segment, node, segment, whether a pair exists)."""
         points = jax.vmap(self._transfer)(self.nodes[::-1], angles, angles[::-1])
         gap, segment = jax.vmap(_facing)(points, self.nodes, self.tangent, self.normal)
         gap = jnp.where(gap > -_DEEPEST * self.pitch_radius, gap, jnp.inf)
@@ -145,12 +146,12 @@ def _facing(
     tangent: Float[Array, "n 2"],
     normal: Float[Array, "n-1 2"],
 ) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
-    """Return the signed distance (m) of each of `points` to the segment that faces it.
+    """Return (signed distance in m, segment index) for each point and the segment that faces it.
 
-    The distance is inf if no segment does. The second result is the segment's index. It is found by
-    bisection over the nodes. A point near the flank is ahead of the bisectors on the tip's side of
-    its segment, and behind all others. The reason is that the chord between any two nodes of a
-    flank stays within a right angle of the tangents at both.
+    Where no segment faces a point, the distance is inf. Bisection over the nodes finds the segment.
+    A point near the flank is ahead of the bisectors on the tip's side of its segment, and behind
+    all others. This holds because the chord between any two nodes of a flank stays within a right
+    angle of the tangents at both.
     """
     x, y = points[:, 0], points[:, 1]
     offset = jnp.sum(nodes * tangent, axis=1)
@@ -174,8 +175,9 @@ def _facing(
 
 
 def _spread(profile: Profile, count: int) -> Float[Array, " n"]:
-    """Return normal angles (n,) in rad of nodes on the addendum, from the tip (or the land's end)
-    to the pitch crossing."""
+    """Return normal angles (n,) in rad of `count` nodes on the addendum.
+
+    The nodes run from the tip (or the land's end) to the pitch crossing."""
     segments = [s for s in profile.segments() if not s.land]
     share = jnp.arange(_TABLE, dtype=profile.pitch_radius.dtype) / _TABLE
     ends = [s.start + (s.stop - s.start) * share for s in segments]

@@ -1,9 +1,9 @@
 """Finds the size that a contact map needs for a stated error.
 
-The gap is computed by search along a few fine lines through the map. The map's spline is fitted to
-it at each of a fixed list of sizes (SciPy, one dimension at a time). The error is that of the
-penetration where the flanks overlap. The list is fixed because every size needs its own compiled
-program.
+The gap is computed by search along a few fine lines through the map. For each of a fixed list of
+sizes, the map's spline is fitted to this gap (SciPy, one dimension at a time). The error is that of
+the penetration where the flanks overlap. The list is fixed because every size needs its own
+compiled program.
 """
 
 from typing import NamedTuple
@@ -30,7 +30,7 @@ class MapSize(NamedTuple):
     """Size of a contact map.
 
     `rolls`, `relatives`: points over roll and over ε; `error`: error (m) of the penetration;
-    `enough`: whether that is within the requested error."""
+    `enough`: whether the map meets the requested error."""
 
     rolls: int
     relatives: int
@@ -41,7 +41,8 @@ class MapSize(NamedTuple):
 def size_map(profile: Profile, deepest: float, error: float) -> MapSize:
     """Return the smallest map down to ε = `deepest` (rad) with a penetration error ≤ `error` (m).
 
-    If even the largest map exceeds that error, return the smallest one that is nearly as good.
+    If no listed size meets the error, return the smallest whose error is at most 1.5 times the
+    least error in the list.
     """
     along_roll, along_relative = _probe(profile, jnp.asarray(deepest))
     half = float(profile.half_pitch)
@@ -54,7 +55,7 @@ def size_map(profile: Profile, deepest: float, error: float) -> MapSize:
 
 @Program
 def _probe(profile, deepest):
-    """Return points and gap (lines, points) on fine lines along the roll, then along ε."""
+    """Return (points, gap (lines, points)) on fine lines along the roll, and the same along ε."""
     pair = FlankPair.of(profile)
     half = profile.half_pitch
     first = first_roll(deepest, half)
@@ -73,8 +74,9 @@ def _smallest(
     probed: tuple[Array, Array],
     error: float,
 ) -> tuple[int, float]:
-    """Return the smallest number of points in `ladder` with at most this `error` (m), and its
-    error."""
+    """Return (smallest number of points in `ladder` with at most this `error` (m), its error).
+
+    `start`, `stop`: range of the map (rad); `probed`: points and gap on fine lines."""
     from scipy.interpolate import CubicSpline  # Imported for maps only: it takes 0.5 s.
 
     points, lines = map(np.asarray, probed)

@@ -5,7 +5,7 @@ from rootsopt.config.families import Parameter, family_of
 
 
 def bounds_of(config: Config) -> list[tuple[float, float]]:
-    """Return (low, high) of every design parameter of a config, in its units.
+    """Return the bounds (low, high) of every design parameter of a config, in config units.
 
     Raises `InputError` where a bound is impossible, such as a tip land wider than the lobe."""
     found = []

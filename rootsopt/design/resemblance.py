@@ -1,4 +1,4 @@
-"""Finds the classical family that a profile resembles most, and its distance from that."""
+"""Finds the nearest member of each classical family to a profile, and its distance."""
 
 import functools
 import math
@@ -23,23 +23,23 @@ from rootsopt.scene.families import classical, profile_of
 _NODES = 96
 """Nodes on each side of the pitch circle in the search."""
 _SAMPLE = 128
-"""Members of a family that are sampled; searches start from the best of them."""
+"""Number of sampled members of a family; searches start from the best of them."""
 _STARTS = 3
 """Number of searches per family."""
 _PROGRAMS, _LONGEST, _SHORTEST = 80, 0.2, 1e-9
-"""Greatest number of linear programs in a search; their longest and shortest step, as a fraction of
-the parameters' usual ranges."""
+"""Greatest number of linear programs in a search; longest and shortest step of a program, as a
+fraction of the parameters' usual ranges."""
 _UNSOUND_WEIGHT = 10.0
-"""Weight of a negative margin (relative to its scale) against distance (pitch radii)."""
+"""Weight of a negative margin (relative to its scale) against the distance (pitch radii)."""
 _UNSOUND = 1e-6
 """Size of a negative margin (relative to its scale) above which a member of a family is unsound."""
 
 
 class Likeness(NamedTuple):
-    """The nearest member of a family to a profile.
+    """The member of a family that is nearest to a profile.
 
-    `family`: its name; `design`: its parameters by key, in config units; `departure`: greatest
-    distance (m) between the outlines."""
+    `family`: name of the family; `design`: the member's parameters by key, in config units;
+    `departure`: greatest distance (m) between the flanks of member and profile."""
 
     family: str
     design: dict[str, float]
@@ -57,9 +57,9 @@ class Likeness(NamedTuple):
 def likenesses(profile: Profile) -> list[Likeness]:
     """Return the nearest member of every classical family to `profile`, nearest first.
 
-    The nearest member has the least greatest distance between the outlines. The search starts from
-    the best of a Sobol sample, so that it may miss a nearer member. Families without a sound member
-    are left out.
+    The nearest member minimises the greatest distance between the flanks. The search starts from
+    the best of a Sobol sample, so that it may miss a nearer member. Families in which the search
+    finds no sound member are left out.
     """
     found = []
     for family in classical():
@@ -91,11 +91,11 @@ def _nearest(profile: Profile, family: str) -> Likeness | None:
 
 
 class _Seen(NamedTuple):
-    """A member of a family compared with the profile.
+    """Comparison of a family's member with the profile.
 
-    `distance` (n,): distances of the outlines (pitch radii); `margin` (m,): margins relative to
-    their scales; `distance_slope` (n, d), `margin_slope` (m, d): derivatives of both with respect
-    to the design."""
+    `distance` (n,): signed distances between the flanks (pitch radii); `margin` (m,): margins
+    relative to their scales; `distance_slope` (n, d), `margin_slope` (m, d): derivatives of both
+    with respect to the design."""
 
     distance: NDArray[np.float64]
     margin: NDArray[np.float64]
@@ -114,7 +114,9 @@ class _Seen(NamedTuple):
 
     @property
     def fault(self) -> float:
-        """Value that a search minimises: the greatest distance plus the weighted worst margin."""
+        """Value that a search minimises: the greatest distance plus the weighted worst margin.
+
+        The distance is in pitch radii. Only a negative margin counts."""
         if not self.finite:
             return math.inf
         lacking = max(0.0, -float(np.min(self.margin)))
@@ -127,7 +129,7 @@ class _Seen(NamedTuple):
 
 
 class _Look:
-    """Compares members of a `family` with a `profile`; results are cached by design."""
+    """Function of a design: compares the member of a `family` with a `profile`; caches results."""
 
     def __init__(self, profile: Profile, family: str):
         self.family, self.lobes, self.radius = family, profile.lobes, profile.pitch_radius
@@ -144,10 +146,10 @@ class _Look:
 
 
 def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
-    """Return the design near `start` with the least greatest distance.
+    """Return the design near `start` with the least `fault`.
 
-    A sequence of linear programs finds it. Each finds the best step to first order, of at most
-    `size` times `width`."""
+    A sequence of linear programs finds the design. Each program finds the best step to first order,
+    at most a fraction of `width`, the parameters' usual ranges."""
     design, size = start, _LONGEST
     for _ in range(_PROGRAMS):
         seen = look(design)
@@ -162,10 +164,10 @@ def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
 
 
 def _promising(seen: _Seen, width, size: float) -> NDArray[np.float64]:
-    """Return the step, in units of `width`, with the least fault to first order.
+    """Return the step (d,), in units of `width`, with the least fault to first order.
 
-    The linear program minimises a bound t on all distances plus a weighted bound u on negative
-    margins."""
+    No entry of the step exceeds `size`. The linear program minimises a bound t on all distances
+    plus a weighted bound u on negative margins."""
     count, distances, soundness = len(width), len(seen.distance), len(seen.margin)
     by_step = np.concatenate([seen.distance_slope, -seen.distance_slope, -seen.margin_slope])
     one, none = np.ones((2 * distances, 1)), np.zeros((2 * distances, 1))
@@ -181,9 +183,9 @@ def _promising(seen: _Seen, width, size: float) -> NDArray[np.float64]:
 
 @Program
 def _target(profile: Profile):
-    """Return normal angles (n,) in rad, and points (m) and outward normals there.
+    """Return (normal angles (n,) in rad, points (2, n, 2) in m, outward unit normals (2, n, 2)).
 
-    Points and normals are (2, n, 2), of addendum and dedendum."""
+    The first axis of points and normals is addendum, dedendum."""
     nu = profile.pitch_normal * jnp.linspace(0.0, 1.0, _NODES)
     points = [side(nu) for side in (profile.addendum, profile.dedendum)]
     places = jnp.stack([profile.position(point) for point in points])
@@ -193,10 +195,10 @@ def _target(profile: Profile):
 
 @Program
 def _compared(family: str, lobes: int, radius: Float[Array, ""], target, design):
-    """Return distances from the `target` along its normals, margins, and derivatives of both.
+    """Return the fields of `_Seen` for a `design`: distances, margins, derivatives of both.
 
-    Points with equal normal angles of the addendum are compared. To first order these distances
-    are those between the outlines."""
+    Distances are measured along the normals of the `target`, between points with the same normal
+    angle on the addendum. To first order they are the distances between the flanks."""
     nu, places, normals = target
 
     def both(design):

@@ -62,16 +62,18 @@ class Constraint(eqx.Module):
         return -1.0 if self.ceiling else 1.0
 
     def slack(self, shape: Geometry, found: Margins | None = None) -> Float[Array, ""]:
-        """Return the scaled distance to the limit, ≥ 0 where satisfied."""
+        """Return the scaled distance from the limit, ≥ 0 where the constraint is satisfied.
+
+        `shape`, `found`: geometry and margins of the design."""
         value = getattr(found if self.margin else shape, self.quantity)
         return self.sign * (value - self.limit) / self.scale
 
 
 class Space(eqx.Module):
-    """The unit box of d design parameters and the constraints in it.
+    """The unit box of d design parameters, with m constraints.
 
-    `scene`: builds profiles; `lower`, `upper` (d,): bounds in config units; `constraints`: m of
-    them.
+    `scene`: builds profiles from designs; `lower`, `upper` (d,): bounds in config units;
+    `constraints`: the m constraints.
     """
 
     scene: Scene
@@ -83,7 +85,7 @@ class Space(eqx.Module):
     def of(cls, config: Config, scene: Scene, area_efficiency: float) -> "Space":
         """Return the space of a config whose baseline has this `area_efficiency`.
 
-        Raises `InputError` where its bounds leave no design."""
+        Raises `InputError` where the config's bounds are impossible."""
         limits, family = config.constraints, family_of(config.profile.family)
         rows = bounds_of(config)
         floor = limits.area_efficiency_min
@@ -118,7 +120,7 @@ class Space(eqx.Module):
         return family_of(self.scene.family)
 
     def design(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
-        """Return the design in config units at `point` of the unit box."""
+        """Return the design (d,) in config units at `point` (d,) of the unit box."""
         limits = zip(self.lower, self.upper, point, strict=True)
         values = [low + (high - low) * share for low, high, share in limits]
         for place, least, most in self._within(values):
@@ -126,7 +128,9 @@ class Space(eqx.Module):
         return jnp.stack(values)
 
     def point(self, design: Float[Array, " d"]) -> Float[Array, " d"]:
-        """Return the point of the unit box nearest to a design in config units."""
+        """Return the point (d,) of the unit box for a design in config units.
+
+        A design outside the bounds is moved to them."""
         values = jnp.clip(design, self.lower, self.upper)
         limits = zip(self.lower, self.upper, values, strict=True)
         shares = [(value - low) / (high - low) for low, high, value in limits]
@@ -135,14 +139,15 @@ class Space(eqx.Module):
         return jnp.clip(jnp.stack(shares), 0.0, 1.0)
 
     def ranges(self, values) -> dict[str, tuple[Float[Array, ""], Float[Array, ""]]]:
-        """Return (low, high) by key of parameters whose range depends on other `values` (d,)."""
+        """Return {key: (low, high)} for the parameters whose range depends on the others.
+
+        `values` (d,): the design. Values and ranges are in config units."""
         radius = self.scene.pitch_radius / MM
         named = dict(zip(self.family.keys, self.family.split(values), strict=True))
         return dict(self.family.dependent(self.scene.lobes, radius, **named))
 
     def _within(self, values):
-        """Yield index in the design, least and greatest value of the parameters in `ranges`, within
-        the bounds."""
+        """Yield (index in the design, low, high), within the bounds, of parameters in `ranges`."""
         for key, (least, most) in self.ranges(values).items():
             place = self.family.keys.index(key)
             most = jnp.minimum(most, self.upper[place])
@@ -150,18 +155,22 @@ class Space(eqx.Module):
             yield place, least, most
 
     def slacks(self, point: Float[Array, " d"]) -> Float[Array, " m"]:
-        """Return the scaled slack of every constraint at `point` of the unit box."""
+        """Return the scaled slacks (m,) of the constraints at `point` of the unit box.
+
+        A slack is ≥ 0 where its constraint is satisfied."""
         return self.slacks_of(self.design(point))
 
     def slacks_of(self, design: Float[Array, " d"]) -> Float[Array, " m"]:
-        """Return the scaled slack of every constraint at a design in config units."""
+        """Return the scaled slacks (m,) of the constraints at a design in config units.
+
+        A slack is ≥ 0 where its constraint is satisfied."""
         profile = self.scene.profile(design)
         shape = geometry(profile)
         found = margins(profile) if any(c.margin for c in self.constraints) else None
         return jnp.stack([c.slack(shape, found) for c in self.constraints])
 
     def prepare(self) -> None:
-        """Compile in the background what a search in this space needs."""
+        """Start to compile, in the background, the program that a search in this space needs."""
         # Import in advance: it takes 0.5 s.
         threading.Thread(target=importlib.import_module, args=("scipy.stats.qmc",)).start()
         slacks_and_slopes.prepare(self, jax.ShapeDtypeStruct(self.lower.shape, self.lower.dtype))
@@ -169,7 +178,9 @@ class Space(eqx.Module):
 
 @Program
 def slacks_and_slopes(space: Space, point):
-    """Return design (d,), its Jacobian (d, d), slacks (m,) and their Jacobian (m, d)."""
+    """Return (design (d,), its Jacobian (d, d), slacks (m,), their Jacobian (m, d)) at `point`.
+
+    The Jacobians are derivatives with respect to `point` in the unit box."""
 
     def both(point):
         values = space.design(point), space.slacks(point)
@@ -187,7 +198,9 @@ def _constraint(
 
 
 def sobol(count: int, seed: int, dimension: int = 3) -> NDArray[np.float64]:
-    """Return `count` points (count, dimension) of a scrambled Sobol sequence in the unit box."""
+    """Return `count` points (count, dimension) of a scrambled Sobol sequence in the unit box.
+
+    `seed`: seed of the scrambling."""
     from scipy.stats import qmc
 
     sampler = qmc.Sobol(dimension, rng=np.random.default_rng(seed))

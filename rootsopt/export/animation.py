@@ -36,8 +36,8 @@ _FLANKS = ("drive flank", BLUE), ("coast flank", VERMILION)
 class Contacts:
     """Contacts at n rotations φ of rotor 1.
 
-    point: contact point (mm, fixed frame, (n, 2)); normal: unit normal from rotor 1 to rotor 2
-    ((n, 2)); present: whether there is a contact ((n,)).
+    `point` (n, 2): contact points (mm, fixed frame); `normal` (n, 2): unit normals from rotor 1 to
+    rotor 2; `present` (n,): whether there is a contact.
     """
 
     point: NDArray[np.float64]
@@ -47,7 +47,7 @@ class Contacts:
 
 @Program
 def _rolling(profile, roll):
-    """Return pressure angle (rad) and distance (m) from the pitch point at a flank's roll angle."""
+    """Return (pressure angle (rad), distance from the pitch point (m)) at a flank's roll angle."""
     half = profile.half_pitch
     beyond = roll > half
     point = profile.addendum(profile.normal_at(jnp.where(beyond, 2 * half - roll, roll)))
@@ -59,9 +59,10 @@ def rolling_contacts(
 ) -> Contacts:
     """Return the contacts of the drive (or coast) flanks in perfect rolling, at rotations φ (rad).
 
-    A drive flank touches at the roll angle β = -φ, for 0 ≤ β ≤ π/N in every lobe pitch. Outside,
-    the point is that of the nearer end. The contact is (r + s sin ψ, s cos ψ), its normal
-    (sin ψ, cos ψ). A coast flank is the mirror image, with β = φ.
+    A drive flank touches at the roll angle β = -φ, for 0 ≤ β ≤ π/N in every lobe pitch. Outside
+    this range, return the point of the nearer end, marked as not present. The contact is
+    (r + s sin ψ, s cos ψ), its normal (sin ψ, cos ψ). A coast flank is the mirror image, with
+    β = φ.
     """
     half = np.pi / (2 * profile.lobes)
     roll = (rotation if coast else -rotation) - half
@@ -73,9 +74,10 @@ def rolling_contacts(
 
 
 def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
-    """Return a GIF of the pair in perfect rolling over one lobe pitch.
+    """Return the content of a GIF of the pair in perfect rolling over one lobe pitch.
 
-    It shows the contact and the direction of its force; the size of the force needs a simulation.
+    The GIF shows the contact and the direction of its force, not the size of the force, which needs
+    a simulation.
     """
     rotation = 2 * np.pi / profile.lobes * np.arange(_FRAMES) / _FRAMES
     flanks = [rolling_contacts(profile, rotation, coast) for coast in (False, True)]
@@ -94,10 +96,10 @@ def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
 
 
 def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: int) -> bytes:
-    """Return a GIF of a simulated motion over `periods` mesh periods (4 at most).
+    """Return the content of a GIF of a simulated motion over `periods` mesh periods (4 at most).
 
-    It shows the contacts and the force over the rotation. Each arrow is as long as the largest
-    force in the time interval of its frame.
+    The GIF shows the contacts and the force over the rotation. An arrow's length is proportional to
+    the largest force in the time interval of its frame.
     """
     pitch = 2 * np.pi / profile.lobes
     whole = max(1, round(float(np.ptp(series.rotation)) / pitch))
@@ -129,7 +131,7 @@ def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: 
 
 
 def _force_panel(ax: Axes, series: Series, samples: int):
-    """Draw flank forces over the rotation; return the line that marks the frame."""
+    """Draw flank forces over the rotation; return the line that marks the frame's rotation."""
     shown = slice(0, samples)
     degrees = np.degrees(series.rotation[shown] - series.rotation[0])
     forces = series.drive_force[shown], series.coast_force[shown]
@@ -148,7 +150,7 @@ def _force_panel(ax: Axes, series: Series, samples: int):
 
 
 class _Arrow:
-    """The contact and its force on one kind of flank."""
+    """Point and arrow for the contact and its force on one kind of flank."""
 
     def __init__(self, ax: Axes, color: str, longest: float):
         self.longest = longest
@@ -163,7 +165,9 @@ class _Arrow:
         )  # fmt: skip
 
     def show(self, point, normal, share: float) -> None:
-        """Put the arrow at `point` along `normal`, at a fraction of the longest; 0 hides it."""
+        """Show the arrow at `point` along `normal`.
+
+        `share`: length as a fraction of the longest arrow; 0 hides the arrow and its point."""
         self.point.set_data([point[0]], [point[1]])
         for artist in (self.point, self.arrow):
             artist.set_visible(share > 0)
@@ -172,7 +176,7 @@ class _Arrow:
 
 
 class _Scene:
-    """The axes with both rotors, turned frame by frame."""
+    """Matplotlib axes with both rotors, which `turn` rotates for each frame."""
 
     def __init__(self, ax: Axes, drawing: Drawing):
         points = polyline(drawing.pieces, _CHORD * drawing.outer_radius)
@@ -190,7 +194,7 @@ class _Scene:
         self.arrows = [_Arrow(ax, color, _ARROW * drawing.pitch_radius) for _, color in _FLANKS]
 
     def _rotor(self, ax, drawing, color, name, x):
-        """Draw a rotor with its axis at `x`; return the part that turns."""
+        """Draw a rotor with its axis at `x` (mm); return the patch that turns."""
         line = {"edgecolor": "black", "linewidth": 0.8}
         (patch,) = ax.fill(*self.outline.T, facecolor=color, alpha=0.75, **line)
         circle = np.exp(1j * np.linspace(0, 2 * np.pi, 181))
@@ -205,7 +209,7 @@ class _Scene:
         return patch
 
     def turn(self, first: float, second: float) -> None:
-        """Turn both rotors (rad)."""
+        """Turn rotor 1 to the angle `first` and rotor 2 to the angle `second` (rad)."""
         placed = place_pair(self.outline, self.lobes, self.center, first, second)
         for rotor, points in zip(self.rotors, placed, strict=True):
             rotor.set_xy(points)
@@ -214,7 +218,9 @@ class _Scene:
 
 
 def _gif(made: Figure, draw, count: int) -> bytes:
-    """Return frames 0 to `count` - 1, as drawn by `draw`, as one endless GIF with one palette."""
+    """Return the content of an endless GIF with frames 0 to `count` - 1.
+
+    `draw`: function that draws a frame by its number. All frames share one palette."""
     made.set_dpi(_DPI)
     canvas = FigureCanvasAgg(made)
     pictures: list[Image.Image] = []

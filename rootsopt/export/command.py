@@ -23,7 +23,7 @@ _SOLID = ("step", "stl")
 
 
 def add_option(parser: argparse.ArgumentParser, default: str) -> None:
-    """Add `--export` to a command that writes `default` unless told otherwise."""
+    """Add the option `--export` to a command; `default`: formats without the option."""
     formats = "; ".join(f"{name}: {files}" for name, files in FORMATS.items())
     parser.add_argument(
         "--export",
@@ -35,9 +35,9 @@ def add_option(parser: argparse.ArgumentParser, default: str) -> None:
 
 
 def chosen(text: str) -> tuple[str, ...]:
-    """Return the formats that `--export` names.
+    """Return the formats that `text`, the value of `--export`, names.
 
-    Raises `InputError` for an unknown format, and for one that needs a CAD kernel if there is none.
+    Raises `InputError` for an unknown format, and for a solid if the CAD kernel is not installed.
     """
     names = tuple(name.strip() for name in text.lower().split(",") if name.strip())
     if names == ("none",):
@@ -65,9 +65,10 @@ def write(
     series: "Series | None" = None,
     periods: int = 1,
 ) -> list[str]:
-    """Write a `design` (config units) in the `formats`; return the files' names.
+    """Write drawings of a `design` into `folder`; return the names of the files.
 
-    With the `series` of a simulation, the GIF shows `periods` mesh periods of it.
+    `design`: parameters by key (config units); `formats`: keys of `FORMATS`. With the `series` of a
+    simulation, the GIF shows `periods` mesh periods of the simulated motion.
     """
     if not formats:
         return []
@@ -106,7 +107,9 @@ def write(
 def write_simulated(
     folder: "ResultFolder", config: "Config", formats: Sequence[str], evaluation: "Evaluation"
 ) -> list[str]:
-    """Write a simulated design as `write` does; the GIF shows its motion if it has one."""
+    """Write drawings of a simulated design as `write` does; return the names of the files.
+
+    The GIF shows the simulated motion. Without a motion, no GIF is written."""
     series = evaluation.series
     if series is None:
         formats = tuple(name for name in formats if name != "gif")
@@ -115,7 +118,9 @@ def write_simulated(
 
 
 def _solids(drawing, formats, place) -> dict[str, bytes]:
-    """Return the STEP and STL files; each solid is made once."""
+    """Return the content of the STEP and STL files by name; each solid is made once.
+
+    `place`: folder for temporary files."""
     import math
 
     from rootsopt.export import solid

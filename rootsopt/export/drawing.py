@@ -1,4 +1,4 @@
-"""Content of the drawing of one rotor, for every format (mm, angles in rad)."""
+"""Content of the drawing of one rotor, for every format (mm)."""
 
 import dataclasses
 
@@ -15,9 +15,9 @@ _shape = Program(geometry)
 class Drawing:
     """One rotor to draw.
 
-    pieces: closed outline; pitch_radius, outer_radius: radii (mm); lobes: number of lobes; length:
-    axial length (mm); helix_deg: twist over the length (deg); bore: diameter (mm), `None` without a
-    bore; notes: lines of text with the design's numbers.
+    `pieces`: closed outline; `pitch_radius`, `outer_radius`: radii (mm); `lobes`: number of lobes;
+    `length`: axial length (mm); `helix_deg`: twist over the length (°); `bore`: diameter (mm),
+    `None` without a bore; `notes`: lines of text with the design's numbers.
     """
 
     pieces: list[DrawnPiece]
@@ -31,7 +31,9 @@ class Drawing:
 
     @classmethod
     def of(cls, config: Config, profile: Profile, design: dict[str, float]) -> "Drawing":
-        """Return the drawing of `profile`, made from a `design` (config units)."""
+        """Return the drawing of `profile`.
+
+        `design`: the profile's parameters by key (config units), for the notes."""
         shape: Geometry = _shape(profile)
         outer, root = float(shape.outer_radius) * _MM, float(shape.root_radius) * _MM
         rotor, radius = config.rotor, config.profile.pitch_radius_mm
@@ -62,5 +64,5 @@ class Drawing:
 
     @property
     def reach(self) -> float:
-        """Distance (mm) that centre lines extend from the axis."""
+        """Distance (mm) from the axis to the ends of the centre lines."""
         return 1.08 * self.outer_radius

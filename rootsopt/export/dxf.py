@@ -22,8 +22,10 @@ _STYLES = {
 
 
 def dxf_bytes(drawing: Drawing) -> bytes:
-    """Return a DXF file (R2010). The outline's entities follow counter-clockwise, each starting
-    where the last one stops."""
+    """Return the content of a DXF file (R2010, mm) of one rotor.
+
+    The outline's entities are in counter-clockwise order, and adjacent entities share their ends.
+    """
     # Imported here because it takes a quarter of a second; it also logs its start.
     logging.getLogger("ezdxf").setLevel(logging.WARNING)
     import ezdxf

@@ -1,4 +1,4 @@
-"""The outline of a rotor as true arcs and cubic splines: the one source of every drawing.
+"""The outline of a rotor as true arcs and cubic splines, from which every drawing is made.
 
 Each smooth segment of the flank becomes an arc or a spline. A circular arc is recognised by its
 points and normals. Otherwise a cubic B-spline is fitted through exact points with exact end
@@ -22,10 +22,10 @@ from rootsopt.profiles import Profile
 from rootsopt.runtime.programs import Program
 
 TOLERANCE = 1e-7
-"""Largest deviation (pitch radii) of a spline from the true flank. The perimeter times it bounds
-the error in area, which is below 1e-6 for every rotor."""
+"""Deviation (pitch radii) of a spline from the true flank above which the spline is refined. The
+deviation times the perimeter bounds the error in area, which is below 1e-6 for every rotor."""
 ROUND = 1e-9
-"""Deviation (pitch radii) from a circle up to which a segment counts as an arc."""
+"""Deviation (pitch radii) from a circle above which a segment does not count as an arc."""
 _MM = 1e3
 _SAMPLES = 65
 """Number of points at which a segment is compared with a circle."""
@@ -45,8 +45,8 @@ _GAUSS = np.polynomial.legendre.leggauss(8)
 class Arc:
     """Part of a circle.
 
-    center: its centre; radius: > 0; begin: first angle; sweep: angle covered, > 0
-    counter-clockwise.
+    `center`: the circle's centre (mm); `radius`: > 0 (mm); `begin`: angle of the first point (rad);
+    `sweep`: angle covered (rad), > 0 counter-clockwise.
     """
 
     center: complex
@@ -55,7 +55,7 @@ class Arc:
     sweep: float
 
     def at(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
-        """Return points at fractions 0 to 1 of the arc."""
+        """Return points (mm) at fractions 0 to 1 of the arc."""
         angle = self.begin + np.asarray(share) * self.sweep
         return np.asarray(self.center + self.radius * np.exp(1j * angle))
 
@@ -72,7 +72,7 @@ class Arc:
         return self.radius * abs(self.sweep)
 
     def turned(self, angle: float) -> "Arc":
-        """Return the arc rotated about the rotor's axis."""
+        """Return the arc rotated by `angle` (rad) about the rotor's axis."""
         center = complex(self.center * np.exp(1j * angle))
         return dataclasses.replace(self, center=center, begin=self.begin + angle)
 
@@ -86,14 +86,15 @@ class Arc:
 class Spline:
     """A cubic B-spline from its first control point to its last.
 
-    knots: (n + 4,), fourfold at the ends; controls: control points (n,).
+    `knots` (n + 4,): approximate arc length (mm), fourfold at the ends; `controls` (n,): control
+    points (mm).
     """
 
     knots: Float64[np.ndarray, " m"]
     controls: Complex128[np.ndarray, " n"]
 
     def at(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
-        """Return points at fractions 0 to 1 of the parameter, which is nearly arc length."""
+        """Return points (mm) at fractions 0 to 1 of the parameter, which is nearly arc length."""
         first, last = self.knots[0], self.knots[-1]
         return np.asarray(BSpline(self.knots, self.controls, 3)(first + share * (last - first)))
 
@@ -110,7 +111,7 @@ class Spline:
         return float(self.knots[-1] - self.knots[0])
 
     def turned(self, angle: float) -> "Spline":
-        """Return the spline rotated about the rotor's axis."""
+        """Return the spline rotated by `angle` (rad) about the rotor's axis."""
         return dataclasses.replace(self, controls=self.controls * np.exp(1j * angle))
 
     def mirrored(self) -> "Spline":
@@ -119,7 +120,7 @@ class Spline:
         return Spline(knots, np.conj(self.controls[::-1]))
 
     def beziers(self) -> Complex128[np.ndarray, "k 4"]:
-        """Return the same curve as cubic Bézier curves, one per row."""
+        """Return the same curve as k cubic Bézier curves: 4 control points (mm) per row."""
         curve = BSpline(self.knots, self.controls, 3)
         ends = np.unique(self.knots)
         points, third = curve(ends), np.diff(ends) / 3
@@ -133,10 +134,12 @@ DrawnPiece = Arc | Spline
 
 
 def outline_pieces(profile: Profile) -> list[DrawnPiece]:
-    """Return the closed counter-clockwise outline (mm), from the root before the lobe on +x.
+    """Return the pieces of the closed counter-clockwise outline (mm).
 
-    Every piece starts where the one before it stops. Raises `InputError` where a segment of the
-    flank needs too many nodes to come within `TOLERANCE` of the true one.
+    The outline starts at the root before the lobe on +x, or slightly earlier if arcs are joined.
+
+    Every piece starts at the end of the previous piece. Raises `InputError` where a segment of the
+    flank needs too many nodes to come within `TOLERANCE` of the true flank.
     """
     flank = _flank(profile)
     lobe = [piece.mirrored() for piece in reversed(flank)] + flank
@@ -187,8 +190,9 @@ def _flank(profile: Profile) -> list[DrawnPiece]:
 
 @Program
 def _points(profile, nu):
-    """Return points (m), directions of the outward normal (rad) and arc length per normal angle
-    (m/rad), first of the addendum, then of the dedendum."""
+    """Return two tuples, of the addendum and of the dedendum, at the normal angles `nu` (rad).
+
+    A tuple is (points (m), directions of the outward normal (rad), arc length per `nu` (m/rad))."""
     _, addendum, dedendum = profile.speeds(nu)
     below = profile.dedendum(nu)
     turned = below.beta + jnp.pi / 2 - below.psi
@@ -206,7 +210,7 @@ class _Stretch:
     dedendum: bool
 
     def look(self, share: NDArray[np.float64]):
-        """Return points (mm), unit normals and arc length per share (mm).
+        """Return (points (mm), unit normals, arc length per share (mm)) at each share.
 
         A share is a fraction (0 to 1) of the range of normal angles. Each end is evaluated just
         inside, so that it belongs to its segment.
@@ -225,7 +229,9 @@ class _Stretch:
         )
 
     def pieces(self, size: float) -> list[DrawnPiece]:
-        """Return the arc, the spline or the two splines; `size` is the pitch radius (mm)."""
+        """Return the segment as one arc, one spline or two splines.
+
+        `size`: pitch radius (mm). Raises `InputError` where a spline needs too many nodes."""
         if arc := self._arc(ROUND * size):
             return [arc]
         spline = self._spline(TOLERANCE * size)
@@ -240,8 +246,9 @@ class _Stretch:
         return [part._spline(TOLERANCE * size) for part in parts]
 
     def _arc(self, tolerance: float) -> Arc | None:
-        """Return the circle P = C + ρ n nearest to a sample of points and normals; `None` unless
-        all of them are on it."""
+        """Return the segment as an arc; `None` unless all sampled points are within `tolerance`.
+
+        The circle P = C + ρ n is the nearest to a sample of points and normals. `tolerance`: mm."""
         points, normals, _ = self.look(np.linspace(0, 1, _SAMPLES))
         spread = normals - normals.mean()
         turning = np.sum(np.abs(spread) ** 2)
@@ -257,7 +264,9 @@ class _Stretch:
         return Arc(complex(center), float(abs(radius)), float(np.angle(ends[0])) + side, sweep)
 
     def _spline(self, tolerance: float) -> Spline:
-        """Return a cubic spline over arc length; nodes are added until it is within tolerance."""
+        """Return a cubic spline over arc length, within `tolerance` (mm) of the segment.
+
+        Nodes are added until this is so. Raises `InputError` where too many are needed."""
         nodes = np.linspace(0, 1, 5)
         while len(nodes) <= _MOST_NODES:
             spline, error = self._fitted(nodes)
@@ -273,7 +282,7 @@ class _Stretch:
         )
 
     def _fitted(self, nodes: NDArray[np.float64]) -> tuple[Spline, NDArray[np.float64]]:
-        """Return the spline through `nodes`, and its largest deviation (mm) in each interval."""
+        """Return (spline through `nodes`, its largest deviation (mm) in each interval)."""
         width = np.diff(nodes)
         gauss, weights = _GAUSS
         at = nodes[:-1, None] + width[:, None] * (1 + gauss) / 2
@@ -318,7 +327,9 @@ def _joined(one: DrawnPiece, other: DrawnPiece, tolerance: float) -> Arc | None:
 
 
 def _closed(pieces: list[DrawnPiece]) -> list[DrawnPiece]:
-    """Move the ends of every spline to those of its neighbours, which differ by rounding."""
+    """Move the ends of every spline onto the ends of the adjacent pieces.
+
+    Before, they differ by rounding."""
     closed = list(pieces)
     for i, piece in enumerate(closed):
         if isinstance(piece, Spline):

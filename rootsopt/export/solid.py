@@ -25,16 +25,16 @@ if TYPE_CHECKING:
     from build123d.topology import Shape
 
 CHORD = 0.005
-"""Largest distance (mm) between a facet of an STL file and the solid."""
+"""Greatest distance (mm) between a facet of an STL file and the solid."""
 TURN = 0.05
-"""Largest angle (rad) between neighbouring facets of a curved face of an STL file."""
+"""Greatest angle (rad) between neighbouring facets of a curved face of an STL file."""
 _STEP = np.pi / 48
 """Twist (rad) between the knots of a helical face. With this step, a cubic spline of the rotation
 is off by 5e-8 of the radius."""
 _SPANS = 8
-"""Minimum number of knot spans along a face. A straight rotor needs only one. But most programs
-compute a volume with the kernel's Gauss quadrature, which is finer with more knots. With a single
-span it is off by 2e-4 next to a cusp, where the solid itself is exact to 1e-8."""
+"""Minimum number of knot spans along a face. A straight rotor needs only one span. But most
+programs compute a volume with the kernel's Gauss quadrature, which is finer with more knots. With a
+single span the volume is off by 2e-4 next to a cusp, where the solid itself is exact to 1e-8."""
 
 
 def require_kernel() -> None:
@@ -49,8 +49,8 @@ def require_kernel() -> None:
 def rotor(pieces: list[DrawnPiece], length: float, bore: float | None, helix: float) -> "Solid":
     """Return one rotor between z = 0 and `length` (mm).
 
-    pieces: closed outline at z = 0, turned by `helix` (rad) on the way up; bore: its diameter (mm),
-    `None`: no bore.
+    `pieces`: closed outline at z = 0; `helix`: angle (rad) by which the outline turns up to
+    z = `length`; `bore`: diameter (mm), `None`: no bore.
     """
     from build123d import Axis, Edge, Face, Shell, Solid, Vector, Wire
 
@@ -75,10 +75,11 @@ def pair(
     bore: float | None,
     helix: float,
 ) -> "Compound":
-    """Return both rotors at φ = 0.
+    """Return both rotors as one assembly, at rotation φ = 0.
 
-    Rotor 1 is at the origin with a lobe on +x. Rotor 2 is at (`center_distance`, 0) with a space
-    there, twisted the other way.
+    Rotor 1 is at the origin with a lobe on +x. Rotor 2 is at (`center_distance` (mm), 0), with a
+    valley that faces this lobe, and is twisted the other way. `pieces`, `length`, `bore`, `helix`:
+    as in `rotor`.
     """
     from build123d import Axis, Compound, Vector
 
@@ -90,7 +91,7 @@ def pair(
 
 
 def step_bytes(shape: "Shape") -> bytes:
-    """Return a STEP file (mm) of a solid or an assembly."""
+    """Return the content of a STEP file (mm) of a solid or an assembly."""
     from build123d import export_step
 
     file = io.BytesIO()
@@ -99,9 +100,10 @@ def step_bytes(shape: "Shape") -> bytes:
 
 
 def stl_bytes(shape: "Shape", place: Path | None = None) -> bytes:
-    """Return a binary STL file (mm) within `CHORD` and `TURN` of a solid or an assembly.
+    """Return the content of a binary STL file (mm) within `CHORD` and `TURN` of the shape.
 
-    The kernel writes it to a temporary file in the folder `place`.
+    The kernel writes a temporary file in the folder `place` (`None`: the system's folder). Raises
+    `InputError` where the kernel fails to make triangles.
     """
     from build123d import export_stl
 
@@ -128,18 +130,18 @@ def _edge(piece: DrawnPiece) -> "Edge":
 
 
 def _side(piece: DrawnPiece, length: float, helix: float) -> "Face":
-    """Return the side of the rotor over one piece.
+    """Return the side face of the rotor over one piece of the outline.
 
-    Over an arc of a straight rotor it is a cylinder, otherwise a B-spline surface. The surface is
-    accurate; the kernel's own twisted sweeps are off by 1e-4 near a cusp.
+    Over an arc of a straight rotor the face is a cylinder, otherwise a B-spline surface. The
+    kernel's own twisted sweeps were rejected: they are off by 1e-4 near a cusp.
     """
     from build123d import Face, Vector
 
     if isinstance(piece, Arc) and helix == 0:
         return Face.extrude(_edge(piece), Vector(0, 0, length))
     degree, knots, controls, weights = _rational(piece)
-    # Along z the points turn as exp(iθ). If ρ are the controls of its cubic spline, the surface's
-    # are c ρ.
+    # Along z the points turn as exp(iθ). With the control points ρ of a cubic spline of exp(iθ) and
+    # c of the piece, the control points of the surface are c ρ.
     turns = max(_SPANS, int(np.ceil(abs(helix) / _STEP)))
     share = np.linspace(0, 1, turns + 1)
     rate = 1j * helix
@@ -156,7 +158,7 @@ def _side(piece: DrawnPiece, length: float, helix: float) -> "Face":
 
 
 def _rational(piece: DrawnPiece):
-    """Return degree, knots, control points and weights of a piece as a rational B-spline.
+    """Return (degree, knots, control points, weights) of a piece as a rational B-spline.
 
     An arc must be shorter than half a circle.
     """
@@ -179,7 +181,10 @@ def _quarters(piece: DrawnPiece) -> list[DrawnPiece]:
 
 
 def _surface(degrees, knots, points, heights, weights) -> "Face":
-    """Return a face on a rational B-spline surface: `points` complex (n, m), at `heights`."""
+    """Return a face on a rational B-spline surface (mm).
+
+    `points`, `heights`, `weights` (n, m): x + iy, z and weight of the control points. `degrees`,
+    `knots`: pairs, along the outline and along the axis."""
     from build123d import Face
     from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeFace
     from OCP.collections import Array1_double, Array1_int, Array2_double, Array2_gp_Pnt

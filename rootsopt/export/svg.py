@@ -14,7 +14,9 @@ _STYLE = (
 
 
 def svg_text(drawing: Drawing) -> str:
-    """Return an SVG file. One user unit is a millimetre; y points up in the drawing."""
+    """Return the content of an SVG file of one rotor.
+
+    One user unit is a millimetre; y points up in the drawing."""
     reach = drawing.reach + 1
     size = _number(2 * reach)
     corner = _number(-reach)
@@ -64,5 +66,5 @@ def _point(z: complex) -> str:
 
 
 def _number(value: float) -> str:
-    """Format with ten decimals of a millimetre at most."""
+    """Format a number with at most ten decimals."""
     return f"{value + 0.0:.10f}".rstrip("0").rstrip(".")

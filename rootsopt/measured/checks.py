@@ -7,14 +7,14 @@ import dataclasses
 class Checks:
     """Deviations and margins of an imported outline.
 
-    `points`: number of points in the file.
+    `points`: number of points of the outline as read, without repeated points.
     `turned_deg`: rotation (°) that put a lobe on +x.
     `reversed`: whether the points ran clockwise.
     `axis_offset_um`: distance of the centroid from the origin (µm).
     `lobe_deviation_um`: greatest normal distance of a flank from the same flank of the mean lobe
     (µm).
     `flank_deviation_um`: greatest normal distance of the mean trailing flank, mirrored, from the
-    mean leading one (µm).
+    mean leading flank (µm).
     `fit_deviation_um`: RMS distance of the leading flank's points from the fitted curve (µm); 0 if
     the curve passes through them.
     `star_margin_mm`: least distance of a tangent from the axis (mm).
@@ -32,5 +32,5 @@ class Checks:
     convexity_margin_mm: float
 
     def record(self) -> dict[str, float | int | bool]:
-        """Return the fields for the result file."""
+        """Return the fields by name, for the result file."""
         return dataclasses.asdict(self)

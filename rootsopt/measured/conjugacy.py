@@ -15,7 +15,7 @@ from rootsopt.runtime.programs import Program
 
 _MICRON = 1e-6
 _POSES = 361
-"""Roll angles at which the gap is measured."""
+"""Number of roll angles at which the gap is measured."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,9 +23,10 @@ class Conjugacy:
     """Gap of a pair that rolls at relative rotation ε = 0 and nominal centre distance.
 
     `roll` (n,): angle (rad) of rotor 1 from where its tip passes the line of centres, over a
-    quarter of a lobe pitch. The rest repeats it with rotors or flanks exchanged.
-    `gap` (n,): gap (m) of the drive or the coast flanks, whichever is less. It is negative where
-    flanks overlap, NaN where no points of the flanks face each other.
+    quarter of a lobe pitch. The rest of the mesh repeats this quarter with rotors or flanks
+    exchanged.
+    `gap` (n,): lesser gap (m) of drive and coast flanks, negative where flanks overlap. It is NaN
+    where no points of the flanks face each other.
     """
 
     roll: Float64[np.ndarray, " n"]
@@ -44,8 +45,9 @@ class Conjugacy:
     def record(self) -> dict[str, float]:
         """Return the gap's statistics for the result file.
 
-        `interference_um`: greatest overlap (µm); `backlash_um`: twice the least gap (µm), which is
-        the normal backlash of a lobe between both of its neighbours."""
+        `mesh_gap_min_um`, `mesh_gap_max_um`: least and greatest gap (µm), with their roll angles
+        (°). `interference_um`: greatest overlap (µm). `backlash_um`: twice the least gap (µm), the
+        normal backlash of a lobe between both of its neighbours."""
         return {
             "mesh_gap_min_um": self.least / _MICRON,
             "mesh_gap_min_at_deg": float(np.degrees(self.roll[np.nanargmin(self.gap)])),
@@ -57,7 +59,7 @@ class Conjugacy:
 
 
 def conjugacy(profile: Profile) -> Conjugacy:
-    """Return the gap of `profile` through a mesh.
+    """Return the gap between the flanks of `profile` over a mesh, in pure rolling.
 
     Raises `InputError` where the flanks never face each other."""
     roll = float(profile.half_pitch) * (np.arange(_POSES) + 0.5) / _POSES
@@ -81,5 +83,5 @@ def _gaps(profile, roll):
 
 
 def gaps_um(found: Conjugacy) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return roll angle (deg) and gap (µm), each (n,), for a figure."""
+    """Return (roll angles (n,) in degrees, gaps (n,) in µm) for a figure."""
     return np.degrees(found.roll), found.gap / _MICRON

@@ -17,43 +17,43 @@ from rootsopt.errors import InputError
 from rootsopt.measured.guard import guarded
 
 _TURNING = 0.3
-"""Length (pitch radii) that weighs as much in the parameter as a turn of 1 rad."""
+"""Length (pitch radii) that counts in a curve's parameter as much as a turn of 1 rad."""
 _JUMP, _ABOVE = 0.02, 20.0
-"""Change of curvature above which it is a jump: as a fraction of the curvature, and as a multiple
-of the median change at the points around it. Both must be exceeded."""
+"""Change of curvature above which the curvature jumps: as a fraction of the curvature, and as a
+multiple of the median change at the points around. Both must be exceeded."""
 _BESIDE, _AROUND = 3, 12
 """Points on each side that a joint affects; points on each side from which the median is taken."""
 _WINDING = 7.0
 """Sum of the turns (rad) between successive steps along a flank above which its points are rejected
 as scattered."""
 _SHORTEST = 4
-"""Least number of intervals of a piece."""
+"""Number of intervals between points below which a piece is not split off."""
 _MOST_KNOTS, _NO_ROOM = 500, 1
-"""Number of knots above which a smoothing spline follows the noise; FITPACK's flag for reaching it.
-"""
+"""Number of knots above which a smoothing spline is rejected because it follows the noise; the flag
+by which FITPACK says so."""
 _KEY = "`profile.outline_file`"
 _UNEVEN = "remove points that are much closer together than others"
 _CUSP, _SPARED = 2e-2, 2
-"""Speed at the end of a piece (fraction of its mean) below which the end is a cusp; number of knot
-intervals next to a cusp that are not sampled. The curve is not sampled either up to where it
-reaches that speed."""
+"""Speed at the end of a piece (fraction of the mean speed) below which the end is a cusp; number of
+knot intervals next to a cusp that are not sampled. Sampling also starts no closer to the cusp than
+where the curve reaches this speed."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MeasuredCurve:
     """A curve z(t) (mm) of successive spline pieces.
 
-    `ends` (k,): parameters of the pieces' ends; `pieces`: k - 1 splines, one between two ends."""
+    `ends` (k,): values of t at the ends of the pieces; `pieces`: the k - 1 splines between them."""
 
     ends: Float64[np.ndarray, " k"]
     pieces: tuple[BSpline, ...]
 
     def derivatives(self, t: NDArray[np.float64], place: int) -> NDArray[np.complex128]:
-        """Return z, z′, z″, z‴ (4, n) on the piece with index `place`."""
+        """Return z, z′, z″, z‴ (4, n) at `t` (n,) on the piece with index `place`."""
         return np.stack([self.pieces[place](t, order) for order in range(4)])
 
     def __call__(self, t: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return z, z′, z″, z‴ (4, n) at any t."""
+        """Return z, z′, z″, z‴ (4, n) at `t` (n,), each value on its own piece."""
         place = np.clip(np.searchsorted(self.ends, t, side="right") - 1, 0, len(self.pieces) - 1)
         found = np.empty((4, len(t)), complex)
         for k in map(int, np.unique(place)):
@@ -61,7 +61,9 @@ class MeasuredCurve:
         return found
 
     def between(self, start: float, stop: float) -> list[tuple[int, float, float]]:
-        """Return the index of each piece inside (start, stop), with the part of it inside."""
+        """Return (index, low, high) of each piece between the parameters `start` and `stop`.
+
+        `low` and `high` are the parameters at the ends of the piece's part in between."""
         parts = []
         for k, (low, high) in enumerate(zip(self.ends[:-1], self.ends[1:], strict=True)):
             low, high = max(low, start), min(high, stop)
@@ -72,7 +74,7 @@ class MeasuredCurve:
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """Points of a curve with direction, from the tip towards the root.
+    """Points and tangents of a curve that runs from the tip towards the root.
 
     `z` (n,): points (mm); `tangent` (n,): unit tangents; `speed` (n,): |z′| (mm per parameter);
     `turning` (n,): turn of the tangent (rad per parameter)."""
@@ -91,7 +93,7 @@ class Frame:
 def stretch(
     curve: MeasuredCurve, place: int, low: float, high: float, count: int
 ) -> tuple[NDArray[np.float64], Frame]:
-    """Return `count` parameters from `low` to `high` on a piece, and the curve there.
+    """Return (`count` parameters from `low` to `high`, `Frame` at them) on the piece `place`.
 
     At a cusp, where z′ vanishes, the points of the last intervals hardly determine the curve. These
     intervals are not sampled, and tangent and turning are extrapolated to the cusp.
@@ -125,10 +127,13 @@ def through(
     pitch_radius: float,
     smoothing: float,
 ) -> MeasuredCurve:
-    """Return the curve through `points`, or at an RMS distance `smoothing` (mm) from them.
+    """Return the curve through `points` (mm), or at an RMS distance `smoothing` (mm) from them.
 
-    Without smoothing it is a quintic spline between `joints`, and between points where the
-    polygon's own curvature jumps. Raises `InputError` where points are too few or scattered.
+    `joints` marks the points at which curvature may jump. Without smoothing the curve has one
+    spline, quintic where the points suffice, between two joints. Points where the polygon's own
+    curvature jumps are joints, too. `pitch_radius`: in mm.
+
+    Raises `InputError` where points are too few or scattered.
     """
     if len(points) < 8:
         raise InputError(
@@ -185,7 +190,7 @@ def _smoothed(points: NDArray[np.complex128], smoothing: float) -> MeasuredCurve
 def _parameter(points: NDArray[np.complex128], weight: float) -> NDArray[np.float64]:
     """Return parameters (n,) of the points of a smooth piece, from 0.
 
-    `weight`: length (mm) that weighs as much as a turn of 1 rad."""
+    `weight`: length (mm) that counts as much as a turn of 1 rad."""
     bend, lengths = _curvature(points)
     # Extrapolate the curvature to the ends, as the next piece turns differently.
     first, last = 2 * bend[0] - bend[1], 2 * bend[-1] - bend[-2]
@@ -195,14 +200,14 @@ def _parameter(points: NDArray[np.complex128], weight: float) -> NDArray[np.floa
 
 
 def _curvature(points: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a polygon's curvature (1/mm) at its inner corners, and its side lengths (mm)."""
+    """Return (curvature at a polygon's inner corners in 1/mm, lengths of its sides in mm)."""
     steps = np.diff(points)
     lengths = np.abs(steps)
     return 2 * np.angle(steps[1:] / steps[:-1]) / (lengths[1:] + lengths[:-1]), lengths
 
 
 def _jumps(points: NDArray[np.complex128]) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the points at or near which the curvature jumps."""
+    """Return a mask (n,) of the points at which the polygon's curvature jumps or has a cusp."""
     found = np.zeros(len(points), bool)
     if len(points) < 2 * _AROUND:
         return found

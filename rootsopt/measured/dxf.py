@@ -1,4 +1,4 @@
-"""Reads outlines from DXF drawings, text or binary: their entities, and points on these."""
+"""Reads outlines from DXF drawings, text or binary."""
 
 import io
 from collections import Counter
@@ -31,7 +31,8 @@ _POINTS = 500_000
 _DEEPEST = 8
 """Depth of nested blocks above which a drawing is rejected."""
 _LARGEST = 1e9
-"""Magnitude of a number in an entity (drawing units) above which it is rejected as damaged."""
+"""Magnitude of a number in an entity (drawing units) above which a drawing is rejected as damaged.
+"""
 _BINARY = b"AutoCAD Binary DXF\r\n\x1a\x00"
 _NOT = "is not a DXF file that can be read"
 _AGAIN = "export it again (DXF R2000 or newer) or save the outline as CSV"
@@ -64,9 +65,10 @@ _UNITS = {
 
 
 def from_dxf(data: bytes, name: str) -> Loop:
-    """Return the closed loop of the largest area in a drawing; `name` names it in messages.
+    """Return the closed loop (mm) of the largest area in a drawing.
 
-    Raises `InputError` where the drawing cannot be read or holds no such loop."""
+    `data`: content of the file; `name`: name of the file in messages. Raises `InputError` where the
+    drawing cannot be read or holds no closed loop."""
     binary = data.startswith(_BINARY)
     counted = _check_tags(data, binary, name)
     with guarded(name, _NOT, _AGAIN):
@@ -118,11 +120,11 @@ def from_dxf(data: bytes, name: str) -> Loop:
 
 
 def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
-    """Return the number of entities of each kind.
+    """Check the raw tags of a DXF file; return the number of entities of each kind.
 
     Raises `InputError` unless the file is complete and the numbers of its entities are valid. This
-    check is needed because the library reads "1,5" as 1, and accepts a number cut off by the end of
-    the file.
+    check is needed because the library reads "1,5" as 1. The library also accepts a number that is
+    cut off at the end of the file.
     """
     tags = binary_tags_loader(data) if binary else recover.bytes_loader(io.BytesIO(data))
     counted: Counter[str] = Counter()
@@ -168,7 +170,8 @@ def _raw(value: Any) -> bytes:
 def _chosen(document: Drawing, name: str) -> list[Any]:
     """Return the entities that may be the outline.
 
-    These are the ones on the layer OUTLINE, else those drawn directly, else those in blocks."""
+    Entities on the layer OUTLINE come first. Without them, return the entities drawn directly, and
+    if there are none, those in blocks."""
     with guarded(name, _NOT, _AGAIN):
         everything = list(document.modelspace())
     direct = [e for e in everything if e.dxftype() in _KINDS]
@@ -196,7 +199,7 @@ def _on_layer(entities: list[Any], name: str) -> list[Any]:
 
 
 def _exploded(inserts: list[Any], name: str) -> list[Any]:
-    """Return the entities of inserted blocks, nested ones included, at their place."""
+    """Return the entities of inserted blocks and of the blocks inside, where they appear."""
     found: list[Any] = []
     stack = [(insert, 1) for insert in reversed(inserts)]
     handled = 0

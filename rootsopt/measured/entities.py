@@ -31,11 +31,11 @@ _FITTED = 5_000
 _SAME_KNOT = 1e-9
 """Difference of knots (fraction of their range) below which they are one knot."""
 _FULL = 1e-9
-"""Sweep (rad) of an ellipse below which it is a full ellipse."""
+"""Sweep (rad) below which an ELLIPSE is read as a full ellipse."""
 _STRAIGHT = 1e-12
 """Bulge below which a side of a polyline is straight."""
 _FRAME = 16
-"""Flag of a control vertex of a spline-fitted polyline; it is not on the curve."""
+"""DXF flag of a vertex that controls a spline-fitted polyline and does not lie on its curve."""
 _TILT = 1e-6
 """Tilt (rad) of an entity's plane against the drawing's above which the entity is rejected."""
 
@@ -44,9 +44,9 @@ class Stroke(abc.ABC):
     """One segment of an entity."""
 
     curved: bool
-    """Whether its ends are joints."""
+    """Whether the segment's ends are joints (see `Loop`)."""
     least: int
-    """Least number of intervals from which its extent can be measured."""
+    """Number of intervals with which the segment's extent is measured."""
 
     @abc.abstractmethod
     def intervals(self, spacing: float) -> int:
@@ -54,7 +54,9 @@ class Stroke(abc.ABC):
 
     @abc.abstractmethod
     def points(self, count: int) -> NDArray[np.complex128]:
-        """Return points (mm) from end to end, at least `count` + 1 on a curve."""
+        """Return points (mm, as x + iy) from end to end: at least `count` + 1 on a curve.
+
+        On straight lines, return the corners, whatever `count` is."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +78,7 @@ class _Corners(Stroke):
 
 @dataclasses.dataclass(frozen=True)
 class _Ellipse(Stroke):
-    """Elliptic or circular arc: center + major cos t + minor sin t for t from start over sweep."""
+    """Elliptic or circular arc: center + major cos t + minor sin t, start ≤ t ≤ start + sweep."""
 
     center: complex
     major: complex
@@ -122,7 +124,9 @@ def _bounded(count: float) -> int:
 
 
 def chain(parts: list[Stroke], spacing: float) -> Loop:
-    """Return points on the segments of one entity; the ends of its curves are joints."""
+    """Return points on the segments of one entity, about `spacing` (mm) apart.
+
+    The ends of the entity's curves are joints."""
     points, joints = [], []
     for segment in parts:
         own = segment.points(segment.intervals(spacing))
@@ -138,7 +142,7 @@ def chain(parts: list[Stroke], spacing: float) -> Loop:
 
 @dataclasses.dataclass(frozen=True)
 class Entity:
-    """An entity as a drawing states it.
+    """One entity of a drawing, in the drawing's units.
 
     `kind`: its DXF type; `what`: its name in messages; `normal`: normal of its plane; `data`:
     arguments of the function that makes its segments."""
@@ -150,7 +154,9 @@ class Entity:
 
     @classmethod
     def of(cls, entity: Any, name: str) -> "Entity":
-        """Build the entity from the library's object; raises `InputError` if it is unreadable."""
+        """Build the entity from the library's object; `name` names the drawing in messages.
+
+        Raises `InputError` where the object cannot be read."""
         kind = entity.dxftype()
         with guarded(name, f"{kind} cannot be read", "repair or remove it in the drawing"):
             handle = short(entity.dxf.handle or "unknown", 20)
@@ -159,9 +165,9 @@ class Entity:
         return cls(kind, f"{name}: {kind} (handle {handle})", normal, data)
 
     def segments(self, scale: float) -> list[Stroke]:
-        """Return its segments, with `scale` mm per drawing unit; none if it has no extent.
+        """Return the entity's segments (mm); an entity without extent has none.
 
-        Raises `InputError` for an entity that is not valid.
+        `scale`: mm per drawing unit. Raises `InputError` for an entity that is not valid.
         """
         fault, across = _Fault(self.what), abs(self.normal[2])
         if self.kind not in _SPATIAL and math.hypot(*self.normal[:2]) > _TILT * across:
@@ -190,7 +196,7 @@ class _Plane:
 
 @dataclasses.dataclass(frozen=True)
 class _Fault:
-    """Makes the error messages of an entity, named `what`."""
+    """Makes the errors of an entity; `what`: name of the entity in messages."""
 
     what: str
 
@@ -325,7 +331,7 @@ def _polyline(corners, bulges, closed, spatial, plane, fault) -> list[Stroke]:
 
 
 _SPATIAL = ("LINE", "SPLINE")
-"""Kinds whose plane is ignored."""
+"""Kinds of entities whose stated plane is ignored."""
 _KINDS = {
     "LINE": (_read_line, _line),
     "ARC": (_read_arc, _arc),

@@ -20,32 +20,35 @@ NODES = 1536
 _PIECES = NODES // 4
 """Number of smooth pieces of an addendum or dedendum above which an outline is rejected."""
 _BEYOND = 0.3
-"""Polar angle by which a flank's points extend beyond tip and root (fraction of the flank's)."""
+"""Polar angle by which the points of a flank extend beyond tip and root (fraction of the angle from
+tip to root)."""
 _SHARES = 400
-"""Points at which flanks are compared."""
+"""Number of points at which two flanks are compared."""
 _FOLD = 1e-3
-"""Angle (rad), seen from the axis, above which an outline that turns back is rejected. Less is
-noise and rounding."""
+"""Angle (rad), seen from the axis, above which an outline that turns back is rejected. Smaller
+angles are noise and rounding."""
 _OFF = 0.02
-"""Deviation between flanks (pitch radii) above which they are not those of one rotor."""
+"""Deviation between flanks (pitch radii) above which an outline is rejected; also the greatest
+smoothing."""
 _LAND = 1e-3, 0.5 * np.pi / 180
-"""A land's normals miss the axis by less than the first number (pitch radii). They do so over an
-angle of more than the second (rad)."""
+"""Lever (pitch radii) below which points from the tip on belong to a land; normal angle (rad) below
+which such a land does not count."""
 _CORNER = 1e-2
-"""Angle (rad) at a joint above which it is a corner."""
+"""Change of direction (rad) at a joint above which the joint is a corner."""
 _AT = 1e-6
-"""Distance (pitch radii) from the pitch circle below which a joint is on it."""
+"""Distance (pitch radii) from the pitch circle below which a joint counts as on the circle."""
 _FAR = 1e3
-"""Ratio of an outline's greatest radius to the pitch radius above which units are wrong."""
+"""Ratio of an outline's greatest radius to the pitch radius, or its inverse, above which an outline
+is rejected for its units."""
 _GAUSS = np.polynomial.legendre.leggauss(12)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Flank:
-    """A flank in its own lobe's frame, tip on +x, mirrored if it is a trailing one.
+    """A flank in its own lobe's frame, tip on +x; a trailing flank is mirrored.
 
-    `curve`: its curve; `tip`, `pitch`, `root`: parameters at tip, pitch circle and root; `off`: RMS
-    distance of the points from the curve (mm)."""
+    `curve`: curve of the flank (mm); `tip`, `pitch`, `root`: the curve's parameters at tip, pitch
+    circle and root; `off`: RMS distance of the points from the curve (mm)."""
 
     curve: MeasuredCurve
     tip: float
@@ -61,12 +64,12 @@ class _Flank:
 def imported(
     loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: float
 ) -> tuple[Outline, Checks]:
-    """Return the profile of an outline, and its deviations.
+    """Return (profile, deviations) of an outline given as a closed `loop` of points.
 
-    The profile is made from one flank: the leading one of the lobe next to +x, for a rotor that
-    turns counter-clockwise. The other flanks are compared with it. The loop is first made
+    The profile is made from one flank: the leading flank of the lobe next to +x, for a rotor that
+    turns counter-clockwise. The other flanks are compared with this flank. The loop is first made
     counter-clockwise and turned until a lobe's axis is on +x. The phase of the N-th moment
-    ∬ z^N dA gives that axis.
+    ∬ z^N dA gives this axis.
 
     Raises `InputError` where the loop does not have this number of lobes, or where such a rotor
     cannot be simulated.
@@ -172,7 +175,7 @@ def _moment(points, order):
 def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
     """Return the leading (`side` 1) or trailing (-1) flank of a lobe.
 
-    Its curve also takes in points beyond tip and root, where the neighbouring flanks start."""
+    The flank's curve also fits points beyond tip and root, where the neighbouring flanks start."""
     local = points * np.exp(-2j * np.pi * lobe / lobes)
     if side < 0:
         local, joints = np.conj(local)[::-1], joints[::-1]
@@ -229,7 +232,7 @@ def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
 
 
 def _distances(flank: _Flank, own: _Flank) -> NDArray[np.float64]:
-    """Return the normal distance (mm, positive outside) of a flank from `own` along it."""
+    """Return the normal distances (n,) of a `flank` from `own` (mm, positive outside)."""
     share = np.linspace(0.0, 1.0, _SHARES)
     place = flank.at(share)[0]
     for _ in range(4):
@@ -244,8 +247,9 @@ def _distances(flank: _Flank, own: _Flank) -> NDArray[np.float64]:
 
 
 def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray[np.float64], Frame]]:
-    """Return `NODES` parameters from `start` to `stop` by piece, each joint twice, with the curve
-    there."""
+    """Return (parameters, `Frame` at them) for each piece of a flank from `start` to `stop`.
+
+    All pieces together have `NODES` parameters, with each joint twice."""
     parts = flank.curve.between(start, stop)
     if len(parts) > _PIECES:
         raise InputError(
@@ -263,7 +267,9 @@ def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray[np.
 
 
 def _outline(flank: _Flank, lobes: int, radius: float) -> tuple[Outline, float, float]:
-    """Return the profile of a flank, its star margin and its convexity margin (mm)."""
+    """Return (profile, star margin in mm, convexity margin in mm) of a rotor with this flank.
+
+    The margins are defined in `Checks`. Raises `InputError` where the flank folds."""
     upper = _stretch(flank, flank.tip, flank.pitch)
     lower = _stretch(flank, flank.pitch, flank.root)
     t, z, direction, speed, turning = (
@@ -346,7 +352,7 @@ def _land(nu, lever, curvature_radius, radius) -> float:
 
 
 def _integrals(flank: _Flank, lobes: int) -> tuple[float, float]:
-    """Return area (mm²) and polar moment of area (mm⁴) of the rotor made from a flank."""
+    """Return (area in mm², polar moment of area in mm⁴) of the rotor made from a flank."""
     nodes, weights = _GAUSS
     area = moment = 0.0
     for place, low, high in flank.curve.between(flank.tip, flank.root):

@@ -1,7 +1,7 @@
 """Boundary around libraries that read files from outside.
 
-Any exception of a library becomes one `InputError`. Its log records and warnings stay off the
-console. Put only calls of the library inside, so that errors of this package stay visible.
+Any exception of a library becomes one `InputError`. The library's log records and warnings stay off
+the console. Put only calls of the library inside, so that errors of this package stay visible.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ _REASON = 120
 
 
 def short(value: object, width: int = 60) -> str:
-    """Return a value as one line of about `width` characters at most."""
+    """Return a value as printable text for a message, cut to about `width` characters."""
     text = value if isinstance(value, str) else str(value)
     size = len(text)
     text = text[:width] if size > width else text
@@ -48,10 +48,10 @@ def silenced() -> Iterator[None]:
 
 @contextlib.contextmanager
 def guarded(name: str, fault: str, remedy: str) -> Iterator[None]:
-    """Call a library inside this block.
+    """Turn any exception in a `with` block into an `InputError`; call a library inside.
 
-    Raises `InputError` "`name`: `fault`: (its message); `remedy`" for any exception, including
-    `MemoryError` and `RecursionError`."""
+    The message reads "`name`: `fault`: (the exception's message); `remedy`". `MemoryError` and
+    `RecursionError` are included; an `InputError` passes unchanged."""
     try:
         with silenced():
             yield
@@ -62,9 +62,9 @@ def guarded(name: str, fault: str, remedy: str) -> Iterator[None]:
 
 
 def each(items: Iterator[Any], name: str, fault: str, remedy: str) -> Iterator[Any]:
-    """Yield the items of a library's iterator under the same guard.
+    """Yield the items of a library's iterator; its exceptions become `InputError` as in `guarded`.
 
-    The code that uses the items is not guarded."""
+    Exceptions in the code that uses the items pass unchanged."""
     while True:
         try:
             item = next(items)

@@ -10,19 +10,20 @@ from rootsopt.errors import InputError
 from rootsopt.measured.loop import Loop, place, signed_area
 
 TOGETHER = 1e-3
-"""Distance (mm) below which ends of entities are one point."""
+"""Distance (mm) below which ends of entities count as one point."""
 _CROWDED = 50
 """Mean number of ends within `TOGETHER` of an end above which a drawing is rejected."""
 
 
 def joined(chains: list[Loop], layer: str, name: str) -> Loop:
-    """Return the closed loop of the largest area that `chains` form, each in either direction.
+    """Join `chains` of points at their ends; return the closed loop of the largest area.
 
-    A chain given twice counts once. Chains that lead to a dead end, such as centre lines, belong to
-    no loop. `layer`: layer named in messages; `name`: the drawing's name.
+    A chain may run in either direction. A chain given twice counts once. Chains that lead to a dead
+    end, such as centre lines, belong to no loop. `layer`, `name`: names of layer and drawing in
+    messages.
 
-    Raises `InputError` where there is no closed loop, or where open chains would enclose more than
-    the largest loop. It also does where more than two ends meet in a possible outline.
+    Raises `InputError` in three cases: there is no closed loop, open chains would enclose more than
+    the largest loop, or more than two ends meet in a possible outline.
     """
     remedy = f"join them in the drawing, on a layer {layer}"
     ends = np.array([chain.points[[0, -1]] for chain in chains]).reshape(-1, 2)
@@ -80,7 +81,7 @@ def _where(chains: list[Loop], which: NDArray) -> list[Loop]:
 
 
 def _closing(joints: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the joints of a chain whose last point is its first, without that last point."""
+    """Return the joint marks of a closed chain without its last point, which repeats the first."""
     joints = joints.copy()
     joints[0] |= joints[-1]
     return joints[:-1]
@@ -110,7 +111,7 @@ def _components(pairs: NDArray[np.intp], count: int) -> NDArray[np.intp]:
 
 
 def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> NDArray[np.intp]:
-    """Return the indices of the chains, without those that repeat another one.
+    """Return the indices of the chains, without chains that repeat an earlier chain.
 
     A repeated chain has the same ends and the same points between."""
     if not chains:
@@ -127,7 +128,7 @@ def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> N
 
 
 def _quarters(points: NDArray[np.complex128], backwards: bool) -> NDArray[np.complex128]:
-    """Return the points at a quarter, half and three quarters of the length."""
+    """Return the points (3,) at a quarter, half and three quarters of a chain's length."""
     points = points[::-1] if backwards else points
     if len(points) == 2:
         return points[0] + (points[1] - points[0]) * np.array([0.25, 0.5, 0.75])
@@ -155,7 +156,7 @@ def _in_loops(vertex: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def _groups(vertex: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Return the indices of the links of each connected part, in order."""
+    """Return the indices of the links in each connected group of links, in order."""
     if not len(vertex):
         return []
     _, which = np.unique(vertex, return_inverse=True)
@@ -169,7 +170,7 @@ def _groups(vertex: NDArray[np.intp]) -> list[NDArray[np.intp]]:
 def _walked(
     chains: list[Loop], members: NDArray[np.intp], vertex: NDArray[np.intp]
 ) -> tuple[NDArray[np.complex128], NDArray[np.bool_]]:
-    """Return points and joints of links that form one loop or one open path, from end to end."""
+    """Return (points, joint marks) of links that form one loop or one open path, in order."""
     at: dict[int, list[int]] = {}
     for link in members.tolist():
         for v in vertex[link].tolist():
@@ -196,7 +197,7 @@ def _walked(
 def _widest_gap(
     ends: NDArray[np.complex128], vertex: NDArray[np.intp], links: NDArray[np.intp]
 ) -> tuple[float, complex]:
-    """Return the greatest distance (mm) from a dead end to the nearest other one, and its point."""
+    """Return (distance in mm, point) of the dead end that is farthest from any other dead end."""
     places = ends[links].ravel()
     numbers = vertex[links].ravel()
     single = np.flatnonzero(np.bincount(numbers)[numbers] == 1)

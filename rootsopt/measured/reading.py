@@ -17,11 +17,11 @@ _WIDEST = 5.0
 """Distance from the last point to the first (multiple of the longest other step) above which a loop
 is rejected as open."""
 _BYTES = 50_000_000
-"""Size of a file (bytes) above which it is rejected unread."""
+"""Size (bytes) above which a file is rejected."""
 _POINTS = 500_000
 """Number of points above which an outline is rejected: each takes some 20 µs to read and fit."""
 _SIZES = 0.1, 1e5
-"""Sizes of an outline (mm) below and above which its units must be wrong."""
+"""Sizes (mm) below and above which an outline is rejected, because its units must be wrong."""
 _SAME = 1e-9
 """Distance (fraction of the outline's size) below which two points are one."""
 _NOT_FILES = (
@@ -33,15 +33,15 @@ _NOT_FILES = (
 
 
 def read(path: Path) -> Loop:
-    """Return the outline in a CSV or DXF file.
+    """Return the outline in a CSV or DXF file as a closed loop (mm).
 
     CSV: x and y in mm, split by commas, semicolons, tabs or blanks, with or without a header. The
-    columns are `x_mm` and `y_mm` if the header names them, else the first two.
+    columns are those that the header names x and y (or `x_mm`, `y_mm`), else the first two.
 
     DXF, text or binary: the closed loop of the largest area formed by LINE, ARC, ELLIPSE, SPLINE,
-    LWPOLYLINE and POLYLINE. Only the layer OUTLINE counts, or all layers if it does not exist.
-    Units are those the file states, mm if none. The ends of a LINE and the corners of a polyline
-    are points of a smooth curve.
+    LWPOLYLINE and POLYLINE. Only entities on the layer OUTLINE count. If there are none, entities
+    drawn directly count, or else those in blocks. Lengths are in the unit that the file states, or
+    else in mm. The ends of a LINE and the corners of a polyline are points of a smooth curve.
 
     Raises `InputError` where the file cannot be read or holds no closed outline.
     """
@@ -60,7 +60,9 @@ def read(path: Path) -> Loop:
 
 
 def _bytes(path: Path, name: str) -> bytes:
-    """Return the file's content; open only a regular file of limited size."""
+    """Return the content of a regular file.
+
+    Raises `InputError` where the file is of another kind, unreadable, too large or empty."""
     try:
         found = path.stat()
         kind = next((what for test, what in _NOT_FILES if test(found.st_mode)), None)
@@ -95,7 +97,7 @@ def _bytes(path: Path, name: str) -> bytes:
 def _closed(loop: Loop, name: str) -> Loop:
     """Return the loop without repeated points.
 
-    Raises `InputError` unless it is closed, and number of points and size are within limits."""
+    Raises `InputError` where the loop is open, or its size or number of points is out of range."""
     points = loop.points
     if len(points) > _POINTS:
         raise InputError(

@@ -10,9 +10,9 @@ if TYPE_CHECKING:
 
 
 def record(config: Config) -> dict[str, Any]:
-    """Return the entry `outline` of the result file: checks and conjugacy.
+    """Return {"outline": checks and conjugacy} for the result file.
 
-    The result is empty for a profile that is not read from a file."""
+    Return {} for a profile that is not read from a file."""
     if not config.profile.from_file:
         return {}
     from rootsopt.measured.source import outline_of
@@ -22,7 +22,7 @@ def record(config: Config) -> dict[str, Any]:
 
 
 def say(config: Config, out: "Console") -> None:
-    """Print a note if the flanks of an imported outline differ notably."""
+    """Print a note to `out` if the flanks of an imported outline differ by 1 µm or more."""
     if not config.profile.from_file:
         return
     from rootsopt.measured.source import note, outline_of

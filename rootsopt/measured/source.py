@@ -17,9 +17,10 @@ _NOTABLE = 1.0
 
 
 def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
-    """Return the profile of family `outline`, and its deviations.
+    """Return (profile, deviations) of the outline file that a config names.
 
-    Raises `InputError` where the file does not hold one."""
+    A file that has not changed is read once. Raises `InputError` where the file does not hold the
+    outline of a rotor that can be simulated."""
     path = Path(config.outline_file or "")
     try:
         found = path.stat()
@@ -37,9 +38,9 @@ def _kept(path: Path, stamp: tuple[int, ...], lobes: int, radius: float, smoothi
 
 
 def note(checks: Checks) -> str | None:
-    """Return a note for the user if the flanks differ notably, else `None`.
+    """Return a note for the user if the flanks differ by `_NOTABLE` or more, else `None`.
 
-    One flank represents all of them."""
+    The profile is made from one flank, so that differences between flanks are lost."""
     worst = max(checks.lobe_deviation_um, checks.flank_deviation_um)
     if worst < _NOTABLE:
         return None

@@ -12,7 +12,7 @@ from rootsopt.profiles.base import Profile, Segment
 
 
 class Arcs(Profile):
-    """An addendum of n circular arcs, and the envelope it generates on the partner.
+    """An addendum of n circular arcs; its conjugate is the envelope on the partner.
 
     On the arc with centre C and radius ρ, the point with normal direction ν is C + ρ n(ν). Its
     support function is C·n + ρ, and the lever of its normal is C × n. The normal meets the pitch
@@ -20,7 +20,8 @@ class Arcs(Profile):
 
     `center` (n, 2) and `radius` (n,): centres and radii of the arcs (m), in the rotor frame with
     the lobe's axis on +x. `joints` (n + 1,): normal angles (rad) from the tip, 0, to the pitch
-    crossing. `names`: of the arcs; `land`: whether the first arc is centred on the rotor's axis.
+    crossing. `names`: names of the arcs. `land`: whether the first arc is centred on the rotor's
+    axis. `lobes`: N; `pitch_radius`: r (m).
     """
 
     lobes: int = eqx.field(static=True)
@@ -41,11 +42,12 @@ class Arcs(Profile):
         joints: Sequence[Float[ArrayLike, ""]],
         names: Sequence[str],
     ) -> "Arcs":
-        """Return tangent arcs from the tip to the pitch crossing.
+        """Return n tangent arcs from the tip to the pitch crossing.
 
-        The first arc has its `center` (m) on the lobe's axis (`None`: it is a land). All arcs but
-        the last have the `radii` (m) and end at the `joints` (rad). The last one gets the radius
-        with which it passes through the pitch crossing."""
+        `pitch_radius`: r (m). `center`: distance (m) of the first arc's centre from the rotor's
+        axis, along the lobe's axis; `None`: the first arc is a land. `radii` (n - 1,): of all arcs
+        but the last (m). `joints` (n - 1,): normal angles (rad) at which these arcs end. The last
+        arc's radius follows from the pitch crossing. `names` (n,): names of the arcs."""
         r = jnp.asarray(pitch_radius)
         half = jnp.pi / (2 * lobes)
         crossing = r * jnp.stack([jnp.cos(half), jnp.sin(half)])

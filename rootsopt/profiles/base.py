@@ -36,11 +36,13 @@ from jaxtyping import Array, Float
 _BRACKETS = 16
 """Intervals per segment that bracket the normal angle at a roll angle."""
 _STEPS = 10
-"""Safeguarded Newton steps of this search; a step that leaves the bracket is a bisection."""
+"""Safeguarded Newton steps for the normal angle at a roll angle; a step that leaves the bracket is
+replaced by a bisection."""
 _POLISH = 3
-"""Plain Newton steps after these; they carry derivatives up to that order."""
+"""Plain Newton steps after the safeguarded ones; they carry derivatives up to this order."""
 _FLAT = 1e-9
-"""Least dβ/dν used in these steps; it is 0 on an arc centred on the pitch circle."""
+"""Least dβ/dν by which a Newton step divides. The true value is 0 on an arc centred on the pitch
+circle."""
 
 
 class RollPoint(NamedTuple):
@@ -70,7 +72,7 @@ class Segment(NamedTuple):
 
 
 class Quadrature(NamedTuple):
-    """Rule for integrals over one stretch of a profile.
+    """Rule for integrals over one smooth part of a profile (see `Profile.stretches`).
 
     `nodes`: number of Gauss-Legendre nodes; `graded`: whether they crowd towards both ends;
     `between`: number of equal intervals whose ends are also checked for undercut."""
@@ -84,7 +86,7 @@ class Mate(NamedTuple):
     """A point of the partner's flank.
 
     `facing`: direction (rad) of its outward normal, from the axis of the valley between two lobes;
-    `lever`, `support`: of that normal (m)."""
+    `lever`, `support`: lever of this normal and support function of the point (m)."""
 
     facing: Float[Array, "*n"]
     lever: Float[Array, "*n"]
@@ -92,12 +94,13 @@ class Mate(NamedTuple):
 
 
 class Profile(eqx.Module):
-    """One flank of a conjugate Roots rotor; see the module's docstring.
+    """Base class of all profiles: one flank of a Roots rotor in roll-angle form.
 
-    Subclasses define `segments`, `roll_angle` and `contact_distance` on 0 ≤ ν ≤ `pitch_normal`.
-    They continue them analytically beyond the pitch crossing and, unless the first segment is a
-    land, over the tip (β odd and s even in ν). This class derives the rest. A subclass may override
-    `normal_at`, `lever` and `support` with a closed form, which is faster and more exact.
+    `lobes`: N; `pitch_radius`: r (m). A subclass defines `segments`, `roll_angle` and
+    `contact_distance` for normal angles 0 ≤ ν ≤ `pitch_normal`. It continues both functions
+    analytically beyond the pitch crossing and, unless the first segment is a land, over the tip
+    (β odd and s even in ν). This class derives all else. A subclass may override `normal_at`,
+    `lever` and `support` with a closed form, which is faster and more exact.
     """
 
     lobes: eqx.AbstractVar[int]
@@ -108,34 +111,36 @@ class Profile(eqx.Module):
         """Return the smooth segments of the addendum, from the tip to the pitch crossing."""
 
     def stretches(self) -> tuple[Segment, ...]:
-        """Return the stretches for quadrature: the segments, cut where an integrand is not smooth.
+        """Return the smooth parts for quadrature: segments, cut where integrands are not smooth.
 
-        A segment is cut where only a few derivatives are continuous, and where the pressure angle
-        has a minimum inside it. There a normal may almost touch the pitch circle, where ψ has a
-        square-root singularity."""
+        A segment is cut where only a few derivatives are continuous, and at a minimum of the
+        pressure angle. At a minimum, a normal may almost touch the pitch circle, where ψ has a
+        square-root singularity. The default is no cut."""
         return self.segments()
 
     @property
     def quadrature(self) -> Quadrature:
-        """Rule for integrals over each of the `stretches`.
+        """Rule for integrals over each part in `stretches`.
 
         By default nodes crowd towards the ends. They resolve a square-root singularity of ψ to
-        rounding, even 1e-4 of the stretch beyond an end."""
+        rounding, even one that lies 1e-4 of the part's length beyond an end."""
         return Quadrature(64, True, 128)
 
     def _cut(self, segment: Segment, place: Float[Array, ""]) -> tuple[Segment, Segment]:
-        """Split a segment at `place` (rad); one part is empty if `place` is outside."""
+        """Split a segment at the normal angle `place` (rad); outside it, one part is empty."""
         name, start, stop, land = segment
         middle = jnp.clip(lax.stop_gradient(place), start, stop)
         return Segment(name, start, middle, land), Segment(name, middle, stop, land)
 
     @abc.abstractmethod
     def roll_angle(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return β(ν) in rad; it must not decrease in a profile free of interference."""
+        """Return the roll angle β(ν) in rad.
+
+        In a profile free of interference, β does not decrease with ν."""
 
     @abc.abstractmethod
     def contact_distance(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return s(ν) in m."""
+        """Return the signed distance s(ν) (m) from pitch point to contact point."""
 
     def normal_at(self, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Return ν(β) in rad, the inverse of `roll_angle` up to the pitch crossing.
@@ -158,10 +163,11 @@ class Profile(eqx.Module):
         return arm + self.contact_distance(nu)
 
     def mate(self, nu: Float[Array, "*n"], support: bool = True) -> Mate:
-        """Return the partner's point that meshes with the addendum point `nu`.
+        """Return the partner's point that meshes with the addendum point `nu` (normal angle, rad).
 
-        Beyond the pitch normal it is a point of the partner's addendum, reflected at that normal.
-        `support` False: do not compute the support function, and return 0 for it."""
+        If `nu` exceeds `pitch_normal`, return a point of the partner's addendum: that of `nu`
+        reflected at `pitch_normal`. `support`: whether to compute the support function; otherwise
+        it is 0."""
         pitch = self.pitch_normal
         beyond = nu > pitch
         nu = jnp.where(beyond, 2 * pitch - nu, nu)
@@ -183,16 +189,16 @@ class Profile(eqx.Module):
 
     @property
     def search_nodes(self) -> int:
-        """Nodes per segment that bracket the closest approach.
+        """Nodes per segment on which the contact search brackets the closest approach.
 
-        They only need to separate its candidates."""
+        They need to be just dense enough to separate the minima of the gap."""
         return 32
 
     @property
     def turn_ratio(self) -> float:
-        """Factor κ: `lever_from` receives the cosine and sine of κ ν.
+        """Factor κ of the angle κν whose cosine and sine `lever_from` receives.
 
-        A search over many poses has both at no cost."""
+        The contact search gets both from the addition theorem, without a call per node."""
         return 1.0
 
     @property
@@ -205,7 +211,7 @@ class Profile(eqx.Module):
     def lever_from(
         self, nu: Float[Array, "*n"], cos: Float[Array, "*n"], sin: Float[Array, "*n"]
     ) -> Float[Array, "*n"]:
-        """Return `lever` (m) at `nu`, given cos κν and sin κν."""
+        """Return the lever (m) at `nu` (rad), given cos κν and sin κν (κ: see `turn_ratio`)."""
         del cos, sin
         return self.lever(nu)
 
@@ -220,17 +226,17 @@ class Profile(eqx.Module):
         return self.segments()[-1].stop
 
     def addendum(self, nu: Float[Array, "*n"]) -> RollPoint:
-        """Return the addendum point with normal angle `nu`."""
+        """Return the addendum point with normal angle `nu` (rad)."""
         beta = self.roll_angle(nu)
         return RollPoint(beta, beta + jnp.pi / 2 - nu, self.contact_distance(nu))
 
     def dedendum(self, nu: Float[Array, "*n"]) -> RollPoint:
-        """Return the dedendum point that meshes with the partner's addendum point `nu`."""
+        """Return the dedendum point that meshes with the partner's addendum point `nu` (rad)."""
         point = self.addendum(nu)
         return RollPoint(jnp.pi / self.lobes - point.beta, point.psi, -point.s)
 
     def position(self, point: RollPoint) -> Float[Array, "*n 2"]:
-        """Return Cartesian coordinates (m) in the rotor frame, with a lobe tip on +x."""
+        """Return the point's coordinates (m) in the rotor frame, with a lobe tip on +x."""
         beta, psi, s = point
         radial = self.pitch_radius + s * jnp.sin(psi)
         tangential = s * jnp.cos(psi)
@@ -246,8 +252,10 @@ class Profile(eqx.Module):
     def speeds(
         self, nu: Float[Array, "*n"]
     ) -> tuple[RollPoint, Float[Array, "*n"], Float[Array, "*n"]]:
-        """Return the addendum point and the arc length per normal angle (m/rad) of two curves: the
-        addendum, and the dedendum that meshes with it."""
+        """Return (addendum point, speed of the addendum, speed of the dedendum) at `nu` (rad).
+
+        A speed is arc length per normal angle `nu` (m/rad). The dedendum is the partner's curve
+        that meshes with the addendum."""
         point, rate = self.addendum(nu), self.roll_rate(nu)
         sliding = self.pitch_radius * jnp.sin(point.psi)
         return point, sliding * rate + point.s, (sliding - 2 * point.s) * rate + point.s

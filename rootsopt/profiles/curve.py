@@ -1,4 +1,4 @@
-"""Addenda given as curves: their normals give the meshing condition, `Profile` the conjugate."""
+"""Addenda given as curves; the roll angle follows from their normals by the law of gearing."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -19,14 +19,15 @@ INTERVALS = 48
 _STEPS = 4
 """Newton steps for the normal angle at a roll angle, from a table accurate to about 1e-4."""
 _GAUSS = np.polynomial.legendre.leggauss(4)
-"""Quadrature over one interval or a part of it, exact to rounding."""
+"""Gauss-Legendre nodes and weights for one interval or a part of it; the integral is exact to
+rounding."""
 
 
 class Piece(NamedTuple):
     """A convex part of an addendum, given as a curve.
 
-    `name`: of its segment; `position`: function of t to the point (2,) in m, for t from 0 to 1 from
-    the tip towards the pitch crossing; `land`: as in `Segment`."""
+    `name`: name of the piece's segment; `position`: function from t to the point (2,) in m, with t
+    rising from 0 to 1 towards the pitch crossing; `land`: as in `Segment`."""
 
     name: str
     position: Callable[[Float[Array, ""]], Float[Array, "2"]]
@@ -34,11 +35,11 @@ class Piece(NamedTuple):
 
 
 class RollPiece(NamedTuple):
-    """A part of an addendum, given by its roll and pressure angle.
+    """A part of an addendum, given by its roll angle and pressure angle.
 
-    `name`: of its segment; `roll`: function of t to (β, ψ) in rad, for t from 0 to 1 as in `Piece`;
-    `land`: as in `Segment`. Use it for a part that ends in a cusp (ψ = 0), where a curve has no
-    tangent."""
+    `name`: name of the piece's segment; `roll`: function from t to (β, ψ) in rad, with t from 0 to
+    1 as in `Piece`; `land`: as in `Segment`. Use this class for a part that ends in a cusp (ψ = 0),
+    where a curve has no tangent."""
 
     name: str
     roll: Callable[[Float[Array, ""]], Float[Array, "2"]]
@@ -53,11 +54,12 @@ class Curve(Profile):
     r cos ψ, and the support function by quadrature from the pitch crossing. The law of gearing
     therefore holds for the quintics themselves, even where they deviate from the given curve.
 
-    `names`, `lands`: of the pieces; `sharp`: whether the last piece ends in a cusp; `node` (n,):
-    normal angles (rad); `series` (n, 6): coefficients of ψ (rad) in powers of the distance from the
-    node; `value` (n,): support function (m) at the node; `ends` (m,): joints (rad) between the
-    pieces, from 0 to the pitch crossing. A joint has one node of each piece, as dψ/dν may jump
-    there. Beyond the pitch crossing ψ continues as a parabola, over the tip by symmetry.
+    `names`, `lands`: as in `Piece`, one per piece; `sharp`: whether the last piece ends in a cusp;
+    `node` (n,): normal angles (rad); `series` (n, 6): coefficients of ψ (rad) in powers of the
+    distance from the node; `value` (n,): support function (m) at the node; `ends` (m,): joints
+    (rad) between the pieces, from 0 to the pitch crossing. A joint has one node of each piece,
+    because dψ/dν may jump there. Beyond the pitch crossing ψ continues as a parabola, over the tip
+    by symmetry.
     """
 
     lobes: int = eqx.field(static=True)
@@ -82,7 +84,7 @@ class Curve(Profile):
         """Return the addendum made of `pieces`, with `intervals` quintics each.
 
         The pieces extend from the lobe's axis to the pitch crossing and have the same normal where
-        they meet. `sharp`: whether the last one ends in a cusp."""
+        they meet. `pitch_radius`: r (m). `sharp`: whether the last piece ends in a cusp."""
         r = jnp.asarray(pitch_radius)
         t = jnp.arange(intervals + 1, dtype=r.dtype) / intervals
         turning = [functools.partial(_turning, _rolling(piece, r)) for piece in pieces]
@@ -123,7 +125,7 @@ class Curve(Profile):
         return Quadrature(6, False, 4)
 
     def _place(self, nu):
-        """Return the index of the last node before `nu` and the distance (rad) from it.
+        """Return (index of the last node before `nu`, distance of `nu` from this node in rad).
 
         The end node of a piece is skipped, except that of the last piece."""
         last = self.node.shape[0] - 1
@@ -141,15 +143,16 @@ class Curve(Profile):
         return psi
 
     def _support(self, k, away):
-        """Return the support function (m) at a distance `away` (rad) from node k; its slope is
-        -r cos ψ."""
+        """Return the support function (m) at a distance `away` (rad) from node k.
+
+        The slope -r cos ψ is integrated from the node's value."""
         shares, weights = (jnp.asarray(part, away.dtype) for part in _GAUSS)
         inside = away[..., None] * (1 + shares) / 2
         mean = jnp.sum(jnp.cos(self._psi(k[..., None], inside)) * weights, axis=-1) / 2
         return self.value[k] - self.pitch_radius * mean * away
 
     def _mirrored(self, nu):
-        """Return |ν|, and whether ν was on the other side of the lobe's axis.
+        """Return (|ν|, whether ν was negative): a point beyond the lobe's axis is mirrored.
 
         If the first piece is a land, ν is unchanged: the land itself continues over the tip."""
         over = jnp.zeros(nu.shape, bool) if self.lands[0] else nu < 0
@@ -187,8 +190,9 @@ class Curve(Profile):
 
 
 def _quintics(node, psi, slope, bend):
-    """Return coefficients (n, 6) in powers of the distance from each node; at the last node of a
-    piece they are those of a parabola."""
+    """Return coefficients (n, 6) of ψ (rad) in powers of the distance from each node.
+
+    At the last node of a piece, they are the coefficients of a parabola."""
     here = node, psi, slope, bend
     following = (jnp.append(row[1:], row[-1:]) for row in here)
 
@@ -210,7 +214,7 @@ def _quintics(node, psi, slope, bend):
 
 
 def _rolling(piece, pitch_radius):
-    """Return the function t → (β, ψ) in rad of a piece."""
+    """Return a piece as a function from t to (β, ψ) in rad."""
     if isinstance(piece, RollPiece):
         return piece.roll
 
@@ -227,7 +231,7 @@ def _rolling(piece, pitch_radius):
 
 
 def _turning(roll, t):
-    """Return ν, ψ (rad), dψ/dν and d²ψ/dν² at t."""
+    """Return (ν in rad, ψ in rad, dψ/dν, d²ψ/dν²) at t of the piece with the function `roll`."""
     one = jnp.ones_like(t)
 
     def angles(t):

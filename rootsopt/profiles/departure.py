@@ -21,7 +21,9 @@ def departure(profile: Profile, other: Profile, nodes: int = _NODES) -> float:
 
 
 def flank_points(profile: Profile, nodes: int = _NODES) -> NDArray[np.float64]:
-    """Return points (n, 2) in m from tip to root, dense where the normal turns."""
+    """Return points (n, 2) in m on a flank from tip to root, dense where the normal turns.
+
+    `nodes`: least number of points on each side of the pitch circle."""
     stop = float(profile.pitch_normal)
     ends = [float(s.stop) for s in profile.segments()]
     return np.asarray(_points(profile, np.union1d(np.linspace(0, stop, nodes), ends)))
@@ -36,7 +38,9 @@ def _points(profile: Profile, nu):
 def distances(
     points: Float[np.ndarray, "n 2"], line: Float[np.ndarray, "m 2"]
 ) -> NDArray[np.float64]:
-    """Return the distance (n,) of each of the `points` from a polygonal `line`, in their unit."""
+    """Return the distance (n,) of each of the `points` from a polygonal `line`.
+
+    Points, line and distances have the same unit of length."""
     start, step = line[:-1], np.diff(line, axis=0)
     squares = np.maximum(np.sum(step**2, axis=1), np.finfo(float).tiny)
     away = points[:, None] - start

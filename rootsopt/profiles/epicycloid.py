@@ -21,7 +21,7 @@ class TippedEpicycloid(Profile):
 
     `rolling_radius`: r_e (m). `joint`: normal angle (rad) at which the arc ends.
     `arc_center_radius`: c (m). `arc_radius`: radius of the tip arc (m). `land`: whether the arc is
-    centred on the rotor's axis (c = 0).
+    centred on the rotor's axis (c = 0). `lobes`: N; `pitch_radius`: r (m).
     """
 
     lobes: int = eqx.field(static=True)
@@ -73,7 +73,7 @@ class TippedEpicycloid(Profile):
         return (self.pitch_radius + 2 * self.rolling_radius) * jnp.sin(self._psi(nu))
 
     def _on_arc(self, nu):
-        """Return whether `nu` is on the arc, and `nu` itself there, 0 elsewhere."""
+        """Return (whether `nu` is on the arc, `nu` on the arc and 0 elsewhere)."""
         on_arc = nu < self.joint
         return on_arc, jnp.where(on_arc, nu, 0.0)
 
@@ -118,9 +118,9 @@ def circle_epicycloid(
 ) -> TippedEpicycloid:
     """Return a tip arc centred on the lobe's axis with an epicycloid of `rolling_radius` r_e (m).
 
-    The arc ends at the normal angle `tip_arc_turn` (rad). If β = 0 at the joint, that is
-    ν = π/2 - π r / 4N r_e, the arc is centred on the pitch circle and all of it meshes at one
-    instant."""
+    `lobes`: N; `pitch_radius`: r (m). The arc ends at the normal angle `tip_arc_turn` ν (rad). For
+    ν = π/2 - π r / 4N r_e (β = 0 at the joint) the arc is centred on the pitch circle. All of it
+    then meshes at one instant."""
     return TippedEpicycloid(lobes, pitch_radius, rolling_radius, tip_arc_turn)
 
 
@@ -129,9 +129,9 @@ def hypo_epicycloid(
 ) -> TippedEpicycloid:
     """Return complete half arches of hypocycloid and epicycloid, with a land at tip and root.
 
-    The land has the half angle `tip_arc_angle` θ1 (rad). For identical rotors at 1:1 one circle
-    rolls both arches. ψ must reach π/2 where the land starts: r_e = r (π/2N - θ1) / π. Without a
-    land this is EE. (Derivation.)
+    `lobes`: N; `pitch_radius`: r (m). The land has the half angle `tip_arc_angle` θ1 (rad). For
+    identical rotors at 1:1, the rolling circle of both arches is the same. ψ must be π/2 where the
+    land starts: r_e = r (π/2N - θ1) / π. Without a land this is EE. (Derivation.)
     """
     rolling = jnp.asarray(pitch_radius) * (1 / (2 * lobes) - jnp.asarray(tip_arc_angle) / jnp.pi)
     return TippedEpicycloid(lobes, pitch_radius, rolling, tip_arc_angle, land=True)

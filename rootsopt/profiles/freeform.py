@@ -18,15 +18,16 @@ _DEGREE = 2
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _STEPS = 8
 """Safeguarded Newton steps for the normal angle at a roll angle; a step that leaves the bracket is
-a bisection."""
+replaced by a bisection."""
 _POLISH = 3
-"""Plain Newton steps after these; they carry derivatives up to that order."""
+"""Plain Newton steps after the safeguarded ones; they carry derivatives up to this order."""
 _SAMPLES = 40
-"""Points per knot span at which a free form is fitted."""
+"""Points per knot span in the least-squares fit of a free form."""
 _FIRMLY = 1e3
-"""Weight of the pitch crossing in the fit."""
+"""Weight of the pitch crossing in the fit of a free form; all other points have weight 1."""
 _FLAT = 1e-9
-"""Least dβ/dν used in these steps; it is 0 on an arc centred on the pitch circle."""
+"""Least dβ/dν by which a Newton step divides. The true value is 0 on an arc centred on the pitch
+circle."""
 
 
 class FreeForm(Profile):
@@ -34,11 +35,11 @@ class FreeForm(Profile):
 
     A turn of the normal dν changes the roll angle by dβ = (1 - τ) dν and the pressure angle by
     dψ = -τ dν. The rate τ(ν) is a quadratic B-spline with even knots from the end of the land to
-    the pitch crossing. ψ(ν) starts at π/2 and is a cubic one.
+    the pitch crossing. ψ(ν) is a cubic B-spline that starts at π/2.
 
     If no coefficient exceeds 1 (an arc centred on the pitch circle), the roll angle does not turn
-    back. If none is below 0 (an involute), ψ falls steadily. Where τ < 0 it rises, as it does
-    towards the pitch circle in a single arc. In an EE rotor without a land all coefficients are
+    back. If no coefficient is below 0 (an involute), ψ falls steadily. Where τ < 0, ψ rises, as in
+    a single arc towards the pitch circle. In an EE rotor without a land all coefficients are
     N / (1 + N). The length of the spline follows from the roll angle of the pitch crossing,
 
         (ν_p - θ1) (1 - mean of τ) = π/2N - θ1,
@@ -48,10 +49,10 @@ class FreeForm(Profile):
     coefficients. The spline is a function of ν, not of β, because ψ(β) jumps on an arc centred on
     the pitch circle.
 
-    `tip_arc_angle`: θ1 (rad), half the angle of the land. `coefficients` (n,), n ≥ 3: of τ, from
-    the land to the pitch crossing. `width`: of a knot span (rad). `turn` (n - 2, 4): coefficients
-    of ψ (rad) in each span, in powers of the fraction of the span. `beyond` (n - 2,): support
-    function (m) at the end of each span.
+    `lobes`: N; `pitch_radius`: r (m). `tip_arc_angle`: θ1 (rad), half the angle of the land.
+    `coefficients` (n,), n ≥ 3: coefficients of τ, from the land to the pitch crossing. `width`:
+    width of a knot span (rad). `turn` (n - 2, 4): coefficients of ψ (rad) in each span, in powers
+    of the fraction of the span. `beyond` (n - 2,): support function (m) at the end of each span.
     """
 
     lobes: int = eqx.field(static=True)
@@ -107,8 +108,9 @@ class FreeForm(Profile):
         return Quadrature(24, False, 128)
 
     def _place(self, nu):
-        """Return the knot span at `nu` and the fraction of it; the first and last span extend
-        beyond their ends."""
+        """Return (index of the knot span at `nu`, fraction of this span).
+
+        The first and the last span extend beyond the spline."""
         x = (nu - self.tip_arc_angle) / self.width
         span = jnp.clip(jnp.floor(lax.stop_gradient(x)), 0, self._spans - 1).astype(int)
         return span, x - span
@@ -119,7 +121,7 @@ class FreeForm(Profile):
         return c[0] + share * (c[1] + share * (c[2] + share * c[3]))
 
     def _within(self, span, share):
-        """Return ∫ r cos ψ dν (m) from a fraction of a span to its end."""
+        """Return ∫ r cos ψ dν (m) from a fraction of a span to the span's end."""
         nodes, weights = (jnp.asarray(x, self.width.dtype) for x in (_NODES, _WEIGHTS))
         rest = (1 - share)[..., None]
         at = share[..., None] + rest * (1 + nodes) / 2
@@ -153,7 +155,7 @@ class FreeForm(Profile):
         want = roll_angle - starts[span]
 
         def short(c, width, want, share):
-            """Return β minus the wanted one (rad), and its slope, at a fraction of the span."""
+            """Return β minus the wanted β (rad) at a fraction of the span, and its derivative."""
             rise = share * (width + c[1] + share * (c[2] + share * c[3]))
             slope = width + c[1] + share * (2 * c[2] + 3 * share * c[3])
             return rise - want, jnp.maximum(slope, _FLAT * width)
@@ -176,8 +178,8 @@ class FreeForm(Profile):
 def project(profile: Profile, count: int) -> FreeForm:
     """Return the free form of `count` coefficients nearest to a `profile`, with the same tip land.
 
-    It is the least-squares fit of the pressure angle over the normal angle, which is linear in the
-    coefficients. These stay between -1 and 1. The spline is as long as the addendum.
+    `count`: at least 3. A least-squares fit of the pressure angle over the normal angle, linear in
+    the coefficients, gives their values. They stay between -1 and 1.
     """
     from scipy.optimize import lsq_linear  # Imported here only: it takes 0.2 s.
 
@@ -205,7 +207,7 @@ def _pressure_angles(profile: Profile, nu):
 def _integrals(count: int):
     """Return a function that integrates each B-spline from 0 to fractions (n,) of the length.
 
-    It returns an array (n, count), in units of the whole length."""
+    The function returns an array (n, count), in units of the whole length."""
     powers = _powers(count) / np.arange(1, 2 + _DEGREE)[:, None]
     spans = len(powers)
     before = np.cumsum(powers.sum(axis=1), axis=0) - powers.sum(axis=1)
@@ -223,8 +225,8 @@ def _integrals(count: int):
 def _powers(count: int) -> NDArray[np.float64]:
     """Return coefficients (spans, 3, count) of each B-spline in powers of the fraction of a span.
 
-    They come from the Cox-de Boor recursion on polynomials. Knots are the ends of the spans; the
-    first and the last knot are repeated."""
+    The Cox-de Boor recursion on polynomials gives the coefficients. Knots are the ends of the
+    spans; the first and the last knot are repeated."""
     spans = count - _DEGREE
     knots = np.clip(np.arange(-_DEGREE, spans + _DEGREE + 1.0), 0, spans)
     basis = np.zeros((spans, _DEGREE + 1, count + _DEGREE))

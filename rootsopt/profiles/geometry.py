@@ -16,8 +16,9 @@ from rootsopt.runtime.programs import Program
 _GRADING = 4.0
 """Factor g of graded nodes: Gauss-Legendre nodes x become tanh(g x) / tanh(g).
 
-Powers, hyperbolic tangents and double exponentials with 32 to 96 nodes were compared on a square
-root that starts 0.3 to 1e-4 of the length beyond an end. This one had the least error, 1e-13."""
+Powers, hyperbolic tangents and double exponentials with 32 to 96 nodes were compared. The integrand
+was a square root that starts 0.3 to 1e-4 of the length beyond an end. This rule had the least
+error, 1e-13."""
 
 
 class Geometry(eqx.Module):
@@ -41,8 +42,9 @@ class Geometry(eqx.Module):
 def geometry(profile: Profile) -> Geometry:
     """Return the `Geometry` of a profile, with area and inertia exact to rounding.
 
-    They follow from Green's theorem on the roll-angle form. With the support function h = P·n and
-    arc length element dl, dA = h dl / 2 and ∫r² dA = ∫ |P|² h dl / 4 over the outline.
+    Area and inertia follow from Green's theorem on the roll-angle form. With the support function
+    h = P·n and the arc length element dl, dA = h dl / 2 and ∫r² dA = ∫ |P|² h dl / 4 over the
+    outline. An `Outline` brings its own values, measured when its file was read.
     """
     if isinstance(profile, Outline):
         return _given(profile)
@@ -85,7 +87,9 @@ def geometry(profile: Profile) -> Geometry:
 
 @functools.cache
 def _rule(quadrature: Quadrature) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the fractions of a stretch to evaluate, and their weights in its integral."""
+    """Return (fractions, weights) to integrate over one smooth part of a profile.
+
+    Points that are only checked for undercut have weight 0."""
     nodes, weights = np.polynomial.legendre.leggauss(quadrature.nodes)
     if quadrature.graded:
         weights = weights * _GRADING / np.cosh(_GRADING * nodes) ** 2 / np.tanh(_GRADING)
@@ -97,9 +101,9 @@ def _rule(quadrature: Quadrature) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 def _given(profile: Outline) -> Geometry:
-    """Return the geometry measured when the outline was read.
+    """Return the geometry of an outline, measured when its file was read.
 
-    Its undercut margin is NaN, because an outline is not the envelope of a partner."""
+    The undercut margin is NaN, because an outline is not the envelope of a partner."""
     return Geometry(
         outer_radius=profile.outer_radius,
         root_radius=profile.root_radius,
@@ -114,8 +118,8 @@ def _given(profile: Outline) -> Geometry:
 def flank_nodes(profile: Profile, points: int) -> Float[Array, " n"]:
     """Return normal angles (n,) in rad of about `points` nodes along the addendum.
 
-    They include every segment end. On each segment they are evenly spaced in the density of
-    `_element`."""
+    Every segment end is a node. On each segment, nodes are dense where the longer of the two
+    conjugate arc elements is long."""
     segments = [s for s in profile.segments() if float(s.stop) > float(s.start)]
     lengths, curves = [], []
     for segment in segments:
@@ -142,8 +146,8 @@ def _both(profile, nu):
 def _element(profile, nu):
     """Return the node density over the normal angle (m/rad).
 
-    It is the longer of the two conjugate arc elements, so that both flanks are evenly resolved. An
-    added constant resolves sharp spots such as the pitch crossing of EE."""
+    The longer of the two conjugate arc elements resolves both flanks evenly. An added constant
+    resolves sharp spots such as the pitch crossing of EE."""
     _, addendum, dedendum = profile.speeds(nu)
     longest = jnp.maximum(jnp.abs(addendum), jnp.abs(dedendum))
     return longest + 0.3 * profile.pitch_radius
@@ -152,7 +156,7 @@ def _element(profile, nu):
 def flank(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
     """Return coordinates (n, 2) in m of one flank, from tip centre to root centre.
 
-    It has about 2 `points` nodes."""
+    `points`: approximate number of nodes on each side of the pitch circle."""
     nu = flank_nodes(profile, points)
     addendum, dedendum = map(np.asarray, _both(profile, nu))
     return jnp.asarray(np.concatenate([addendum, dedendum[::-1][1:]]))
@@ -161,7 +165,8 @@ def flank(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
 def outline(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
     """Return the closed counter-clockwise outline (n, 2) in m, with a lobe tip on +x.
 
-    The first point is repeated at the end. There are about 4 `points` nodes per lobe."""
+    The first point is repeated at the end. `points`: approximate number of nodes on each side of
+    the pitch circle of each flank."""
     upper = np.array(flank(profile, points))
     upper[0, 1] = 0.0
     lower = upper[::-1] * [1, -1]

@@ -14,17 +14,18 @@ if TYPE_CHECKING:
 
 _ANGLE, _LENGTH, _TIP = "pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg"
 _OVERLENGTH = 0.02
-"""Excess of u over u_max (fraction of u_max) above which a design is rejected. Beyond u_max the
-roll angle turns back and two points of a flank mesh at once. A node search finds no interference
-(< 1 nm) up to 5 % excess; the paper's printed Table 1 has 1.2 %."""
+"""Excess of the involute length u over u_max (fraction of u_max) above which a config is rejected.
+Beyond u_max the roll angle turns back and two points of a flank mesh at once. A node search finds
+no interference (< 1 nm) up to 5 % excess; the paper's printed Table 1 has 1.2 %."""
 _CLEAR = 1e-6
-"""Least excess (pitch radii) of the involute over the length at which the tip arc is centred on the
-pitch circle a second time."""
+"""Excess (pitch radii) of the involute length over its lower limit below which a config is
+rejected. At the limit, the tip arc's centre is on the pitch circle for the second time."""
 _LEAST_INVOLUTE = 0.002
-"""Involute length (fraction of the longest) below which it is rejected. A shorter involute changes
-nothing, and was probably given in metres."""
+"""Involute length (fraction of the longest) below which a config is rejected. A shorter involute
+changes nothing, and was probably given in metres."""
 _SHORTEST = 0.1
-"""Least involute of a search, as a fraction of the longest, unless the config sets a bound."""
+"""Involute length (fraction of the longest) below which a search does not go; a config can only
+raise this bound."""
 
 
 def ranges(
@@ -34,9 +35,10 @@ def ranges(
     involute_length_mm: Float[Array, ""],
     tip_arc_angle_deg: Float[Array, ""] | float = 0.0,
 ) -> dict[str, tuple[Float[Array, ""], Float[Array, ""]]]:
-    """Return shortest and longest involute (mm) of a search, for a pressure angle and tip land.
+    """Return {"involute_length_mm": (shortest, longest)} (mm), the range that a search may use.
 
-    The longest is `CIC.longest_involute`, so that u ≤ u_max holds by construction."""
+    The other parameters determine this range. The longest involute is `CIC.longest_involute`, so
+    that u ≤ u_max holds by construction."""
     del involute_length_mm
     half = jnp.pi / (2 * lobes)
     longest = pitch_radius_mm * jnp.sin(pressure_angle_deg * DEG) * (half - tip_arc_angle_deg * DEG)
@@ -44,7 +46,7 @@ def ranges(
 
 
 def check(profile: "ProfileConfig") -> None:
-    """Raise `InputError` unless an involute of this length exists and meshes without undercut."""
+    """Raise `InputError` unless the profile's involute exists and meshes without undercut."""
     alpha: Any = getattr(profile, _ANGLE)
     length: Any = getattr(profile, _LENGTH)
     tip: Any = getattr(profile, _TIP) or 0.0

@@ -11,8 +11,9 @@ from rootsopt.profiles.base import Mate, Profile, RollPoint, Segment
 class Table(eqx.Module):
     """k functions of x as cubic Hermite interpolants.
 
-    `node` (n,): values of x, not decreasing; `value`, `slope` (n, k): at the nodes. At a node given
-    twice the slopes may jump. Beyond the ends, the first and last cubic continue.
+    `node` (n,): values of x, not decreasing; `value`, `slope` (n, k): values and derivatives of the
+    functions at the nodes. Where a node is given twice, the slopes may jump. Beyond the ends, the
+    first and the last cubic continue.
     """
 
     node: Float[Array, " n"]
@@ -20,7 +21,7 @@ class Table(eqx.Module):
     slope: Float[Array, "n k"]
 
     def __call__(self, x: Float[Array, "*m"]) -> tuple[Float[Array, "*m"], ...]:
-        """Return the k functions at x."""
+        """Return the values of the k functions at `x`, each of the shape of `x`."""
         index = jnp.searchsorted(self.node, x, side="right") - 1
         index = jnp.clip(index, 0, self.node.shape[0] - 2)
         start, stop = self.node[index], self.node[index + 1]
@@ -40,15 +41,17 @@ class Outline(Profile):
 
     `crown`: support function h and lever q (m) of the addendum over its normal angle ν, from the
     tip to the pitch circle. The addendum is convex, so that ν identifies its points. `valley`:
-    normal direction F from the valley's axis (rad), h and q (m) of the dedendum. Its parameter runs
-    from 0 at the root to the pitch normal at the pitch circle, as a dedendum may be convex and
-    concave. dh = -q dF, and dq = h dF minus the arc length element along the tangent.
+    normal direction F from the valley's axis (rad), h and q (m) of the dedendum. The table's
+    parameter runs from 0 at the root to `pitch_normal` at the pitch circle. F cannot replace this
+    parameter, because a dedendum may be convex and concave. dh = -q dF, and dq = h dF minus the arc
+    length element along the tangent.
 
     Beyond its ends, the addendum continues with its circles of curvature, over the tip with its
     mirror image. The law of gearing is not assumed: `mate` is the given dedendum. Roll angle and
     contact distance are those at which each curve's own normals meet the pitch circle.
 
-    `area`, `polar_area_moment`, `outer_radius`, `root_radius`, `seal_width`: see `Geometry`.
+    `lobes`: N; `pitch_radius`: r (m). `area`, `polar_area_moment`, `outer_radius`, `root_radius`,
+    `seal_width`: see `Geometry`.
     """
 
     lobes: int = eqx.field(static=True)
@@ -66,7 +69,7 @@ class Outline(Profile):
         return (Segment("flank", jnp.zeros_like(stop), stop, False),)
 
     def _crown(self, nu):
-        """Return support function and lever (m) at any ν."""
+        """Return (support function, lever) of the addendum (m) at any normal angle `nu` (rad)."""
         inside = jnp.clip(jnp.abs(nu), self.crown.node[0], self.crown.node[-1])
         beyond = jnp.abs(nu) - inside
         support, lever = self.crown(inside)
@@ -107,9 +110,9 @@ class Outline(Profile):
         return False
 
     def _rolled(self, direction, mate):
-        """Return a point in roll-angle form.
+        """Return a point in roll-angle form, from its normal's `direction` (rad) and lever.
 
-        For a normal that misses the pitch circle, use where it comes nearest to that circle."""
+        For a normal that misses the pitch circle, use the normal's point nearest to the circle."""
         psi = jnp.arccos(jnp.clip(mate.lever / self.pitch_radius, -1.0, 1.0))
         s = mate.support - self.pitch_radius * jnp.sin(psi)
         return RollPoint(direction + psi - jnp.pi / 2, psi, s)

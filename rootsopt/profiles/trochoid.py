@@ -13,22 +13,23 @@ def extended_cycloid(
     """Return an epicycloid traced by a point whose distance from the rolling circle's centre
     varies.
 
-    With r_e = r / 2N the curve is P(θ) = e^{iθ} [r + r_e + λ(θ) r_e e^{2iNθ}], from the tip (θ = 0)
-    to the pitch crossing (θ = π/2N). The ratio λ goes from `trochoid_ratio` λ0 at the tip to 1 at
-    the crossing: λ = 1 + (λ0 - 1) u³ (10 - 15 u + 6 u²) with u = 1 - 2Nθ/π. This quintic has zero
-    first and second derivatives at both ends. The idea is that of Hsieh and Hwang (J. Mech. Des.
-    129 (2007) 1278), whose own formulas were not available. λ0 = 1 is EE; the outer radius is
+    `lobes`: N; `pitch_radius`: r (m). With r_e = r / 2N the curve is
+    P(θ) = e^{iθ} [r + r_e + λ(θ) r_e e^{2iNθ}], from the tip (θ = 0) to the pitch crossing
+    (θ = π/2N). The ratio λ goes from `trochoid_ratio` λ0 at the tip to 1 at the crossing:
+    λ = 1 + (λ0 - 1) u³ (10 - 15 u + 6 u²) with u = 1 - 2Nθ/π. This quintic has zero first and
+    second derivatives at both ends. The idea comes from Hsieh and Hwang (J. Mech. Des. 129 (2007)
+    1278), whose own formulas were not available. λ0 = 1 gives EE. The outer radius is
     r + (1 + λ0) r_e.
 
     The crossing is a cusp: dP/dθ vanishes with δ = π/2N - θ. All terms of the normal are therefore
     computed with their power of δ divided out. In the frame turned by θ, with w = e^{-2iNδ}, the
-    normal is (X δ + iY) / M, M its length, where
+    normal is (X δ + iY) / M, with M = |X δ + iY| and
 
         X δ + iY = (r + r_e) (1 - λ w) / δ + i r_e w λ′ / δ.
 
-    It makes the angle η = arctan(X δ / Y) with the tangent of the pitch circle at θ. For a constant
-    λ it passes through the pitch point at θ, and ψ = η. Otherwise it misses that point by
-    e = r_e² λ′ (cos 2Nδ - λ) / (δ M), and cos ψ = cos η + e / r. Hence
+    The normal makes the angle η = arctan(X δ / Y) with the tangent of the pitch circle at θ. For a
+    constant λ the normal passes through the pitch point at θ, and ψ = η. Otherwise it misses this
+    point by e = r_e² λ′ (cos 2Nδ - λ) / (δ M), and cos ψ = cos η + e / r. Hence
     sin²(ψ/2) = sin²(η/2) - e / 2r, of second order in δ, and β = θ - η + ψ. (Derivation.)
     """
     r, ratio = jnp.asarray(pitch_radius), jnp.asarray(trochoid_ratio)

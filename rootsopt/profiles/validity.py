@@ -9,7 +9,7 @@ from rootsopt.profiles.base import Profile
 from rootsopt.runtime.programs import Program
 
 PURE = ("turning", "rolling", "order")
-"""Margins that are not lengths."""
+"""Names of the margins that are angles or ratios, not lengths."""
 _POINTS = 400
 """Points per segment at which margins are evaluated."""
 
@@ -28,8 +28,8 @@ class Margins(NamedTuple):
     flank.
     `undercut`: `Profile.dedendum_speed` (m/rad).
     `star`: distance of a tangent of addendum or dedendum from the axis (m), negative where the
-    outline folds back as seen from the axis. While it is positive, no flank crosses the other one
-    of its lobe or space, as they meet on its axis.
+    outline folds back as seen from the axis. While it is positive, the two flanks of a lobe, or of
+    a valley, do not cross.
     `root`: root radius (m).
     """
 
@@ -46,7 +46,9 @@ class Margins(NamedTuple):
 
 @Program
 def margins(profile: Profile) -> Margins:
-    """Return the margins of a profile from many points per segment (joints from both sides)."""
+    """Return the margins of a profile, each the least value over `_POINTS` points per segment.
+
+    Both sides of a joint are evaluated. Minima between points are found by a parabola."""
     segments = profile.segments()
     start = jnp.stack([s.start for s in segments])[:, None]
     length = jnp.stack([s.stop for s in segments])[:, None] - start
@@ -58,7 +60,7 @@ def margins(profile: Profile) -> Margins:
     present = length > 0
 
     def least(values):
-        # Between the points, the minimum of the parabola through three of them.
+        # Include minima between the points, from the parabola through three points.
         before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
         bend = before - 2 * here + after
         low = (here <= before) & (here <= after) & (bend > 0)

@@ -1,4 +1,4 @@
-"""The scene: everything except the design. It builds a rotor pair from a design.
+"""The scene: everything except the design. A scene builds a rotor pair from a design.
 
 A design is a vector of the config's design parameters in the config's own units. Gradients are
 therefore per config unit. A family without parameters (EE) has an empty design.
@@ -49,11 +49,11 @@ class Scene(eqx.Module):
     Physical quantities are leaves, and responses are differentiable with respect to them. Choices
     are static, so that one compiled program serves every scene of the same kind.
 
-    `family`, `lobes`, `pitch_radius` (m), `design_size` d: of the profile.
+    `family`, `lobes`, `pitch_radius` (m): profile; `design_size`: number d of its parameters.
     `fidelity`, `map_size`, `nodes`: contact model and its resolution.
-    `precision`: of the integration; `solver`: finds the steady motion.
+    `precision`: number type of the integration; `solver`: finds the steady motion.
     `straight`: whether the rotors have no helix.
-    `length` (m), `density` (kg/m³), `bore_radius` (m, `None`: no bore): of a rotor.
+    `length` (m), `density` (kg/m³), `bore_radius` (m, `None`: no bore): body of a rotor.
     `law`, `clearance` (m): contact law, and distance added to every flank gap.
     `speed` (rad/s), `load_torque` (N·m), `pressure` (Pa, `None`: constant torque): operation.
     `gear`, `gear_damping_ratio`, `motor`, `friction`, `supports`: optional parts.
@@ -95,10 +95,11 @@ class Scene(eqx.Module):
         """Return the scene of a config.
 
         `deepest`: relative rotation (rad, negative) that the contact map must reach; by default an
-        estimate. If the config does not give the map's size, a medium one is used; `evaluate`
-        chooses it from `solver.map_error`.
+        estimate. If the config does not give the map's size, use a medium size. (`evaluate` chooses
+        the size from `solver.map_error` instead.)
 
-        Raises RuntimeError where JAX is not set to the precision that the config needs."""
+        Raises `RuntimeError` where JAX is not set to the precision that the config needs, and
+        `InputError` where an outline file cannot be used."""
         check_precision(config.solver.precision)
         if deepest is None:
             deepest = reading.expected_rotation(config)
@@ -128,19 +129,21 @@ class Scene(eqx.Module):
 
     @property
     def static_depth(self) -> float:
-        """Penetration (m) that carries the load at the pitch radius."""
+        """Penetration (m) at which the static contact force carries the load torque.
+
+        The force is assumed to act at the pitch radius."""
         force = jnp.maximum(self.load_torque, 1e-3) / self.pitch_radius
         return float(self.law.depth_at(force))
 
     def inertia(self, shape: Geometry) -> Float[Array, ""]:
-        """Return the polar moment of inertia of one rotor about its axis (kg·m²)."""
+        """Return the moment of inertia (kg·m²) about its axis of one rotor with this geometry."""
         moment = shape.polar_area_moment
         if self.bore_radius is not None:
             moment = moment - jnp.pi / 2 * self.bore_radius**4
         return self.density * self.length * moment
 
     def mass(self, shape: Geometry) -> Float[Array, ""]:
-        """Return the mass of one rotor (kg)."""
+        """Return the mass (kg) of one rotor with this geometry."""
         area = shape.area
         if self.bore_radius is not None:
             area = area - jnp.pi * self.bore_radius**2
@@ -150,26 +153,30 @@ class Scene(eqx.Module):
     def two_sided(self) -> bool:
         """Whether drive and coast flanks may touch at the same time.
 
-        They may where the axes can leave the nominal centre distance or flanks are not conjugate.
+        This is so where the axes can leave the nominal centre distance or flanks are not conjugate.
         """
         odd = self.supports, self.center_distance_error, self.outline
         moved = any(part.displaces for part in self.extra)
         return moved or any(part is not None for part in odd)
 
     def with_parts(self, *parts: Part) -> "Scene":
-        """Return this scene with further parts; they come last in the state of a motion.
+        """Return this scene with further `parts`, whose states come last in the state of a motion.
 
-        Numbers in their fields become arrays; responses are differentiable with respect to them."""
+        Numbers in the parts' fields become arrays, so that responses are differentiable with
+        respect to them."""
         return dataclasses.replace(self, extra=(*self.extra, *_as_arrays(parts)))
 
     def with_law(self, law: ContactLaw) -> "Scene":
-        """Return this scene with another contact law, whose numbers become arrays."""
+        """Return this scene with another contact law.
+
+        Numbers in the law's fields become arrays, so that responses are differentiable with respect
+        to them."""
         return dataclasses.replace(self, law=_as_arrays(law))
 
     def contact(self, profile: Profile) -> Contact:
         """Return the contact of `profile` at this scene's fidelity.
 
-        Raises `InputError` for fidelity `auto`, which must be replaced first."""
+        Raises `InputError` for fidelity `auto`: replace it by a fidelity first."""
         if self.fidelity == "map":
             return MapContact.of(profile, self.deepest, *self.map_size)
         if self.fidelity == "linear":
@@ -214,16 +221,17 @@ class Scene(eqx.Module):
     def pair_and_tangents(
         self, design: Float[Array, " d"], directions: Float[Array, "n d"] | tuple[()] | None = None
     ) -> tuple[RotorPair, RotorPair, Geometry]:
-        """Return the rotor pair, its derivatives along `directions`, and a rotor's geometry.
+        """Return (rotor pair, its derivatives along `directions`, geometry of one rotor).
 
-        `directions` (n, d) are directions of the design, by default those of its parameters; ():
-        no derivatives. The derivatives have the pair's own structure, with a leading axis (n,)."""
+        `design` (d,): in config units. `directions` (n, d): directions in the design space, by
+        default one per parameter; (): no derivatives. The derivatives have the pair's own
+        structure, with a leading axis (n,). Raises `InputError` as `pair_and_shape` does."""
         if directions is None:
             directions = jnp.eye(design.shape[0])
         return along(lambda design: self.pair_and_shape(design), design, directions)
 
     def pair_and_shape(self, design: Float[Array, " d"]) -> tuple[RotorPair, Geometry]:
-        """Return the rotor pair and the geometry of one rotor.
+        """Return (rotor pair, geometry of one rotor) for a design (d,) in config units.
 
         Raises `InputError` for twisted rotors. Along their length all phases of the mesh occur at
         the same time, which this package does not model."""
@@ -289,10 +297,11 @@ class Scene(eqx.Module):
 def along(
     build: Callable[[Any], tuple[RotorPair, Geometry]], primal: Any, directions: Any
 ) -> tuple[RotorPair, RotorPair, Geometry]:
-    """Return the rotor pair of `build(primal)`, its derivatives along `directions`, and geometry.
+    """Return (pair, derivatives of the pair along `directions`, geometry) of `build(primal)`.
 
-    `directions` have the structure of `primal` with a leading axis, which may be empty. The
-    derivatives have the pair's own structure with the same leading axis."""
+    `build`: function that returns a rotor pair and the geometry of one rotor. `directions`: tree
+    with the structure of `primal` and a leading axis, which may be empty. The derivatives have the
+    pair's own structure with the same leading axis."""
 
     def parted(primal):
         pair, shape = build(primal)

@@ -15,7 +15,7 @@ from rootsopt.scene.reading import design_vector
 
 
 def check_geometry(config: Config) -> None:
-    """Raise `InputError` unless the config's profile can mesh and leaves room for the bore."""
+    """Raise `InputError` unless the config's profile is sound and leaves room for the bore."""
     families.check(config.profile)
     bore = config.rotor.bore_mm
     if bore is None:

@@ -21,7 +21,7 @@ _ROUNDING = 1e-9
 
 
 def classical() -> tuple[str, ...]:
-    """Return the names of the registered families that are made from single numbers."""
+    """Return the names of the registered families without a list of parameters or a file."""
     return tuple(name for name, family in families().items() if family.classical)
 
 
@@ -45,12 +45,12 @@ def keys_of(config: ProfileConfig) -> tuple[str, ...]:
 
 
 def design_of(config: ProfileConfig) -> Float[Array, " d"]:
-    """Return the design parameters of a config, in its units."""
+    """Return the design parameters (d,) of a config, in config units."""
     return jnp.asarray(config.design)
 
 
 def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:
-    """Return a config's profile with another `design` (d,) of the same length, in its units."""
+    """Return a copy of a config's profile with another `design` (d,) in config units."""
     given = [float(value) for value in np.asarray(design)]
     family = family_of(config.family)
     values = zip(family.parameters, family.split(given), strict=True)
@@ -60,15 +60,14 @@ def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:
 
 
 def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, float]:
-    """Return a config's profile as a free form of `count` coefficients.
+    """Return (a config's profile as a free form, greatest distance (m) between the two flanks).
 
-    The second result is the greatest distance (m) between both flanks. Raises `InputError` for an
-    outline from a file."""
+    `count`: number of coefficients. Raises `InputError` for an outline from a file."""
     if config.from_file:
         raise InputError(
             "`profile.family` must not be read from a file for a projection onto a free form, but "
             f"is {config.family}: unlike that of a free form, its dedendum need not be conjugate "
-            "to its addendum; name the family to which the rotor was made"
+            "to its addendum; set the family by which the rotor was designed"
         )
     radius = jnp.asarray(config.pitch_radius_mm * MM)
     profile = profile_of(config.family, config.lobes, radius, design_of(config))
@@ -88,7 +87,9 @@ def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, floa
 
 
 def outline(config: ProfileConfig) -> Outline | None:
-    """Return the profile of a config whose profile is in a file, `None` for any other."""
+    """Return the profile of a config that names an outline file, `None` for any other config.
+
+    Raises `InputError` where the file does not hold a usable outline."""
     if not config.from_file:
         return None
     from rootsopt.measured.source import outline_of  # Imported for outlines only: it takes 0.5 s.
@@ -97,7 +98,9 @@ def outline(config: ProfileConfig) -> Outline | None:
 
 
 def check(config: ProfileConfig) -> None:
-    """Raise `InputError` unless the profile is sound, or as an outline from a file can mesh."""
+    """Raise `InputError` unless the profile is sound.
+
+    For an outline from a file, raise it where the flanks never face each other."""
     if (given := outline(config)) is not None:
         conjugacy(given)
         return
@@ -122,9 +125,9 @@ def check(config: ProfileConfig) -> None:
 
 
 def margins_of(config: ProfileConfig) -> dict[str, float]:
-    """Return the margins of a config's profile by name and unit, for the result file.
+    """Return the margins of a config's profile for the result file; {} for an outline from a file.
 
-    The result is empty for an outline from a file."""
+    Each key is the name of a margin and its unit, as in `order_deg`."""
     if config.from_file:
         return {}
     radius = jnp.asarray(config.pitch_radius_mm * MM)

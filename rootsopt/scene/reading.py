@@ -17,7 +17,7 @@ from rootsopt.dynamics.steady import Solver
 from rootsopt.scene import families
 
 _ORBIT_STEPS = 4
-"""Greatest number of steps for a whole orbit, as a multiple of that for a mesh period."""
+"""Greatest number of steps for a whole orbit, as a multiple of the number for a mesh period."""
 _ROLLS, _RELATIVES = 384, 16
 """Default size of a contact map: points over roll and over relative rotation."""
 
@@ -50,7 +50,7 @@ def quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
 
 
 def law_of(config: Config) -> ImpactLaw:
-    """Return the contact law of a config."""
+    """Return the IMPACT contact law of a config, in SI units."""
     contact = config.contact
     return ImpactLaw(
         stiffness=jnp.asarray(contact.stiffness_N_per_mm_e / MM**contact.exponent),
@@ -62,9 +62,9 @@ def law_of(config: Config) -> ImpactLaw:
 
 
 def gear_of(config: Config) -> TimingGear | None:
-    """Return the timing gear of a config, `None` without one.
+    """Return the timing gear of a config in SI units; `None` if the config has no gear.
 
-    `Scene` sets its damping later, because that depends on the rotors' inertia."""
+    The damping is 0 here. `Scene` sets it later, because it depends on the rotors' inertia."""
     gear, radius = config.scene.timing_gear, config.profile.pitch_radius_mm * MM
     if gear is None:
         return None
@@ -78,7 +78,7 @@ def gear_of(config: Config) -> TimingGear | None:
 
 
 def parts_of(config: Config) -> dict[str, Any]:
-    """Return the other parts of a config by their names in `Scene`.
+    """Return motor, friction and supports of a config, as far as present, by their `Scene` names.
 
     Numbers that `Scene` sets later, such as those that depend on the design, are NaN."""
     scene, friction = config.scene, config.contact.friction
@@ -116,10 +116,11 @@ def map_size(config: Config) -> tuple[int, int]:
 
 
 def expected_rotation(config: Config) -> float:
-    """Return the relative rotation (rad, negative) that a scene is expected to reach.
+    """Return an estimate of the greatest relative rotation (rad, negative) in a scene.
 
-    It is 1.3 times clearance and half backlash, plus 1.5 times the penetration under 20 times the
-    static contact force, and at most a quarter of π/2N."""
+    The length is 1.3 times clearance and half backlash, plus 1.5 times the penetration under 20
+    times the static contact force. The angle is this length over the pitch radius, at most a
+    quarter of π/2N."""
     contact, scene = config.contact, config.scene
     radius = config.profile.pitch_radius_mm
     play = contact.clearance_mm
@@ -131,10 +132,10 @@ def expected_rotation(config: Config) -> float:
 
 
 def integrators(config: Config) -> tuple[Integrator, Integrator]:
-    """Return the integrators of a config for transient and orbit.
+    """Return (integrator of the transient, integrator of the orbit) with the config's settings.
 
-    An orbit has several mesh periods and many short steps near its kinks, so that it may take more
-    steps."""
+    An orbit is allowed more steps, because it has several mesh periods and many short steps near
+    its kinks."""
     solver = config.solver
     steps = solver.max_steps_per_period
     return (
