@@ -29,7 +29,7 @@ class SolverConfig(Section):
         1e-3, description="relative error of mean and peak force that auto accepts"
     )
     nodes: Annotated[int, Field(ge=16, le=20_000)] = Field(
-        400, description="nodes per flank of fidelity nodes"
+        400, description="nodes per whole flank of fidelity nodes"
     )
     map_error: Annotated[float, Field(ge=1e-6, le=0.1)] = Field(
         1e-4, description="error of the map's penetration, relative to the static penetration"
