@@ -24,10 +24,10 @@ IMPLICIT = ("kvaerno3", "kvaerno5")
 
 
 _STAGES = 1e5
-"""Minimum tolerance (rounding errors) of Newton's method for the stages of an implicit step. The gap
-is a difference of lengths ten thousand times a penetration, and the force is a power of the gap.
-With a finer tolerance, the iterations would never end, and a repeated step cannot be made shorter.
-The result is better than this tolerance, because every iteration is a full Newton step."""
+"""Minimum tolerance (rounding errors) of Newton's method for the stages of an implicit step. The
+gap is a difference of lengths ten thousand times a penetration, and the force is a power of the
+gap. With a finer tolerance, the iterations would never end, and a repeated step cannot be made
+shorter. The result is better than this tolerance, because every iteration is a full Newton step."""
 _FIRST_STEP = 1e-3, 0.05
 """Length of the first step: the smaller of an absolute limit (mesh periods) and a limit in units of
 `Timescales.swing`. The error control rejects a first step that is too long."""

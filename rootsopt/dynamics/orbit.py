@@ -33,15 +33,15 @@ of each mesh period."""
 _NEWTON_STEPS = 24
 """Default limit of integrations per orbit."""
 _CLOSED = 4000, 1e-3, 1e-10
-"""Limits (rounding errors, tolerances, scaled) that give the residual at which Newton's method stops.
-It is the second limit, but at most the third and at least the first (1e-12 in float64)."""
+"""Limits (rounding errors, tolerances, scaled) that give the residual at which Newton's method
+stops. It is the second limit, but at most the third and at least the first (1e-12 in float64)."""
 _KEPT = 4
 """Number of integrations after which the solver steps are kept, however large the Newton step."""
 _LOOKS = 6
 """Maximum number of searches for kinks while an orbit is closed."""
 _DRIFT = 30.0, 1e-9, 1e-6
-"""Change (tolerances) of the orbit's start since the last search for kinks above which the search is
-repeated, with lower and upper limit (scaled). Kinks may lie this far outside their steps, which
+"""Change (tolerances) of the orbit's start since the last search for kinks above which the search
+is repeated, with lower and upper limit (scaled). Kinks may lie this far outside their steps, which
 causes an error of first order."""
 _STRAIN = 10.0
 """Error of a repeated step, in tolerances, above which the solver steps are chosen anew."""

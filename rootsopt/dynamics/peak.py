@@ -29,8 +29,8 @@ _ROUNDINGS = 1e5
 """Second difference of the force over `_WIDE` (rounding errors of the force) above which it counts
 as curvature, not rounding."""
 _NOISES = 10.0
-"""Second difference of the force over `_WIDE` (multiples of the force's noise) above which it counts
-as curvature. Forces beside a smooth peak may also scatter by this much."""
+"""Second difference of the force over `_WIDE` (multiples of the force's noise) above which it
+counts as curvature. Forces beside a smooth peak may also scatter by this much."""
 _LEAST = 1e-9
 """Relative fall of the force on both sides of a peak below which the peak is not a corner: the fall
 may be rounding."""

@@ -21,8 +21,8 @@ LONGEST = 4e-6
 """Length of a step (mesh periods) above which the step is not checked for a jump. All steps made
 around a switch are shorter."""
 _FASTER = 20.0
-"""Rate of change of a lever (pitch radii per mesh period) above which the lever jumps. Along a flank
-of the EE family the rate is at most 2π, for any number of lobes."""
+"""Rate of change of a lever (pitch radii per mesh period) above which the lever jumps. Along a
+flank of the EE family the rate is at most 2π, for any number of lobes."""
 _ROUNDINGS = 300
 """Lever changes below this many rounding errors are not jumps."""
 _ALIKE = 0.05

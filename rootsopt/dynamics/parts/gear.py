@@ -58,10 +58,11 @@ class TimingGear(Part):
         return self.stiffness
 
     def switches(self, motion: Motion, own) -> Bool[Array, "2"]:
-        """Return flags of the smooth piece that the gear is on: engaged, beyond the rounding."""
+        """Return flags (2,): whether the gear is engaged, and whether it is beyond the rounding."""
         del own
         excess = jnp.abs(self._from_middle(motion.relative)) - self.half_backlash
         return excess > jnp.stack([jnp.zeros_like(self.rounding), self.rounding])
 
     def _from_middle(self, relative):
+        """Return ε (rad) relative to the middle of the backlash."""
         return relative if self.offset is None else relative - self.offset
