@@ -16,11 +16,14 @@ _COLUMNS = {
     "force": ("contact_force_N", "N", "contact force: sum of the normal forces", 1.0),
     "depth": ("penetration_m", "m", "greatest penetration; negative: least gap", 1.0),
 }
-"""Fields of a series: name as in the response's CSV file, unit, long name, factor from SI units."""
+"""Fields of a series, each with its name in the CSV file of the response, its unit, its long name
+and the factor from SI units to this unit."""
 
 
 def dataset(evaluation: "Evaluation") -> xarray.Dataset:
-    """Return the series of an `evaluation` over time, with units and long names."""
+    """Return the series of an `evaluation` as a dataset over time, with units and long names.
+
+    Design, geometry, response and status are attributes of the dataset."""
     series = evaluation.series
     assert series is not None
     columns = {
