@@ -116,10 +116,10 @@ class Problem:
         ]
 
     def look(self, point) -> tuple[NDArray[np.float64], ...]:
-        """Return design (d,), its Jacobian (d, d), constraint slacks (c,) and their Jacobian (c,
-        d).
+        """Return four arrays at a point (d,): the design (d,), its Jacobian (d, d), the slacks of
+        the c constraints (c,), and their Jacobian (c, d).
 
-        All are at a point (d,). A slack is negative where its constraint is violated."""
+        A slack is negative where its constraint is violated."""
         return self._look_at(tuple(np.asarray(point, dtype=np.float64)))
 
     @functools.cached_property

@@ -155,8 +155,8 @@ class RunFolder(ResultFolder):
                 other.release()
 
     def _state(self) -> _State:
-        """Return the state of the target, such as `ours` (an earlier run and nothing else) or
-        `more` (an earlier run and other files)."""
+        """Return what the target is: `absent`, `empty`, `ours` (an earlier run and nothing else),
+        `more` (an earlier run and other files) or `foreign` (anything else)."""
         if not os.path.lexists(self.target):
             return "absent"
         if not self.target.is_dir():
@@ -190,8 +190,9 @@ class RunFolder(ResultFolder):
         return self.path / name
 
     def write_json(self, name: str, data: Any) -> Path:
-        """Write `data` as strict JSON; return the final path. Write `result.json` last: it then
-        gets a list of all files."""
+        """Write `data` as strict JSON; return the final path of the file.
+
+        `put_in_place` writes `result.json`, with a list of all files."""
         if name != RESULT:
             return super().write_json(name, data)
         self._result = data

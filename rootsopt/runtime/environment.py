@@ -221,9 +221,9 @@ def _agrees(setting: object, value: str) -> bool:
 
 
 def _require(config) -> list[tuple[str, object]]:
-    """Apply the required settings of JAX. Return (name, former value) of each setting that
-    differed.
-    """
+    """Apply the required settings of JAX.
+
+    Return (name, former value) of each setting that differed, except double precision."""
     changed = []
     for name, needed in _REQUIRED.items():
         if name not in config.values:  # gone in this version of JAX
