@@ -73,9 +73,9 @@ class Size:
 
 
 def _slopes(designs: int, members: int, count: int) -> tuple[tuple[int, int], ...]:
-    """List `count` sizes (designs, members) of a gradient, which double at every step.
+    """List sizes (designs, members) of gradients, starting from the given size.
 
-    First the members double, then the designs."""
+    First come `count` sizes with doubling members, then `count` - 1 with doubling designs."""
     more = [(designs, members * 2**k) for k in range(count)]
     return (*more, *((designs * 2**k, members) for k in range(1, count)))
 

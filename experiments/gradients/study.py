@@ -191,7 +191,9 @@ class Draw:
 
 
 def wanted_of(quick: bool, count: int) -> dict[str, int]:
-    """Return the number of pairs of each kind, `count` in all. The first kind gets most pairs."""
+    """Return the number of pairs of each kind. The first kind gets most pairs.
+
+    `count`: number of pairs of all kinds except `LONG`, which a reduced run omits."""
     kinds = [kind for kind in KINDS if kind != LONG][: 1 if quick else None]
     wanted = {
         kind: count * (2 if k == 0 else 1) // (len(kinds) + 1) for k, kind in enumerate(kinds)
