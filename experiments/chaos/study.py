@@ -199,8 +199,7 @@ def gradients(config: Config, model: Scene, design, size: Size) -> list[dict]:
 
 
 def summary(problem: Problem, result: Optimization) -> dict[str, Any]:
-    """Return forces of baseline and optimum by the verifying ensemble, and the gain's significance.
-    """
+    """Return forces of baseline and optimum by the verifying ensemble, and the gain's significance."""
     found: dict[str, Any] = {"verification": result.verification}
     for name, one in (("baseline", result.baseline), ("optimized", result.optimized)):
         if one is not None:

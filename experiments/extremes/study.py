@@ -121,7 +121,7 @@ def run(
                     say(f"{what}: {done} of {len(chosen)}")
         say(f"{what}: {len(chosen)} in {time.perf_counter() - began:.0f} s")
 
-    # The next kind's program compiles while scenes of this one are simulated.
+    # The program of the next kind compiles while scenes of this kind are simulated.
     first = [next(case for case in cases if case.kind == kind) for kind, _ in size.kinds]
     for number, (kind, _) in enumerate(size.kinds):
         for case in first[number : number + 2]:

@@ -43,7 +43,8 @@ behave like a square root."""
 _LONGEST_INVOLUTE = 1.02
 """Longest involute that a config accepts, as a fraction of the longest possible."""
 _ROUNDING = 1e-9
-"""Margin of a limit (relative to the limit's scale) below which the margin counts as 0."""
+"""Violation of a limit (relative to the limit's scale) below which a design still counts as
+valid."""
 
 
 def by_polygons(profile):

@@ -23,7 +23,7 @@ from rootsopt.config import Config, load
 from rootsopt.scene import Scene, design_vector
 
 Row = dict[str, Any]
-# The flanks alone can hold a light load at high speed. At lower speed the lobes pass through.
+# The flanks alone hold a light load at high speed. At lower speed, the lobes pass each other.
 BARE = (
     "scene.timing_gear=null",
     "scene.speed_rpm=6000",

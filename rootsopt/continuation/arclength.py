@@ -316,8 +316,7 @@ def _back_at_first(curve: SolutionCurve, spots: list[Spot]) -> bool:
 
 
 def _located(curve: SolutionCurve, old: Spot, new: Spot, test: Callable[[Spot], float]) -> Spot:
-    """Return the spot between `old` and `new` at which `test` is zero, by regula falsi (Illinois).
-    """
+    """Return the spot between `old` and `new` at which `test` is zero, by regula falsi (Illinois)."""
     chord = new.place - old.place
     across = chord / np.linalg.norm(chord)
     low, high = 0.0, 1.0

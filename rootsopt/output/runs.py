@@ -223,7 +223,9 @@ class RunFolder(ResultFolder):
                 disk.adopt_mode(self.stage, self.target)
             disk.move(self.stage, self.target)
             return []
-        if state == "foreign":  # It was not when the run started. Do not throw away a long run.
+        if (
+            state == "foreign"
+        ):  # The target was different at the start of the run. Do not throw away a long run.
             self.target = self.path = self._free()
             disk.move(self.stage, self.target)
             return [f"the requested folder now holds other files; this run is in {self.path}"]

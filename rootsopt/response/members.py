@@ -100,8 +100,7 @@ def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float
 
 
 def prepare_members(pair: RotorPair, integrator: Integrator) -> None:
-    """Compile in the background the program that `run_members` needs on CPUs for pairs like `pair`.
-    """
+    """Compile in the background the program that `run_members` needs on CPUs for pairs like `pair`."""
     states = jax.ShapeDtypeStruct((_MEMBERS, pair.states), pair.angle_scale.dtype)
     count = jax.ShapeDtypeStruct((), int)
     _in_turn.prepare(pair, states, count, count, integrator)
