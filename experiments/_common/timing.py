@@ -19,7 +19,7 @@ def ready(result: Any) -> Any:
 
 
 def times_of(call: Callable[[], Any], repeats: int, at_most: float = math.inf) -> list[float]:
-    """Return the times (s) of up to `repeats` calls; make no further call after `at_most` seconds."""
+    """Return the times (s) of up to `repeats` calls; start no call after `at_most` seconds."""
     times: list[float] = []
     while not times or (len(times) < repeats and sum(times) < at_most):
         began = time.perf_counter()

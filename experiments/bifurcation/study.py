@@ -33,8 +33,8 @@ QUIET = 4.0
 """Peak force (units of the static force that carries the load at the pitch radius) above which an
 orbit counts as noisy: the flanks hammer."""
 POINTS, FEWEST = 100, 25
-"""Sum of the periods (mesh periods) of all points of a branch above which the branch ends, and the
-number of points that every branch may have."""
+"""Sum of the periods (mesh periods) of all points above which a branch ends. The second number is
+the number of points that every branch may have."""
 LONGEST, DOUBLED = 4, 2
 """Longest orbits followed (mesh periods): if found by a simulation, and if born at a period
 doubling.

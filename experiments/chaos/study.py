@@ -199,7 +199,9 @@ def gradients(config: Config, model: Scene, design, size: Size) -> list[dict]:
 
 
 def summary(problem: Problem, result: Optimization) -> dict[str, Any]:
-    """Return forces of baseline and optimum by the verifying ensemble, and the gain's significance."""
+    """Return a record of baseline and optimum, evaluated by the verifying ensemble.
+
+    The record includes the significance of the gain."""
     found: dict[str, Any] = {"verification": result.verification}
     for name, one in (("baseline", result.baseline), ("optimized", result.optimized)):
         if one is not None:

@@ -68,8 +68,9 @@ def changed(config: Config, **sections: dict[str, Any]) -> Config:
 
 
 def in_housing(config: Config, bore_radius_mm: float, area_efficiency: float) -> Config:
-    """Return `config` with constraints: rotors fill the bore, and have at least an area
-    efficiency."""
+    """Return `config` with the constraints of a housing.
+
+    The rotors must fill the bore, and have at least the given area efficiency."""
     return changed(
         config,
         constraints={

@@ -30,7 +30,7 @@ def is_missing(row: Row) -> bool:
 
 
 def title(name: str, reference: Row) -> str:
-    """Return a title for a housing: its name, bore and area efficiency."""
+    """Return a title for a housing: bore, area efficiency, and `name` of the reference config."""
     shape = reference["geometry"]
     return (
         f"Bore {2 * shape['outer_radius_mm']:.1f} mm, area efficiency "

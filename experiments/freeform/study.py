@@ -30,7 +30,7 @@ def signed_departures(profile: Profile, other: Profile) -> tuple[np.ndarray, np.
     """Measure how far the flank of `profile` departs from the flank of `other`.
 
     Returns radii (n,) in mm of points on the flank of `other`, and signed distances (n,) in µm from
-    these points along the normal, NaN where the normal does not meet `profile`.
+    these points along the normal. A distance is NaN if the normal does not meet `profile`.
     """
     points = flank_points(other) / MM @ [1, 1j]
     line = flank_points(profile) / MM @ [1, 1j]

@@ -1,7 +1,7 @@
 """Simulates the paper's scene, and studies how far its forces determine the omitted quantities.
 
-Section 4 of the paper gives the mean and maximum contact force of a CIC and an EE pair, but not the
-rotors' length, load, timing gear or backlash. `run` simulates the values of
+Section 4 of the paper gives the mean and maximum contact force of a CIC and an EE pair. It does not
+give the rotors' length, load, timing gear or backlash. `run` simulates the values of
 `configs/paper_cic.yaml` and `configs/paper_ee.yaml` from rest. It searches for coexisting motions,
 and applies other definitions of mean and maximum. It changes each quantity alone, then with the
 others solved for again. `look` searches for other values in the box of plausible ones.

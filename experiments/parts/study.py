@@ -1,10 +1,10 @@
 """Measures what each part of a scene costs.
 
 The smallest scene is contact alone, driven at constant speed. The study adds each part on its own,
-then all parts. It measures the number of states, the number of equations in the traced right-hand
-side, the time of one right-hand side inside a compiled loop, and the time of a simulation with
-gradient (the first with compilation, and later ones). Ratios are relative to the smallest scene in
-the same run.
+then all parts. It counts states, and equations in the traced right-hand side. It times one
+right-hand side inside a compiled loop. It also times the first simulation with gradient, which
+includes compilation, and later simulations. Ratios are relative to the smallest scene in the same
+run.
 """
 
 import statistics

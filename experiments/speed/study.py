@@ -67,7 +67,7 @@ def equilibria(pair: RotorPair, phases):
     still = jnp.asarray(0.0)
 
     def flank(phase, relative):
-        # Low speed: no damping force.
+        # At zero penetration rate, so that there is no damping force.
         side = jnp.where(relative < 0, 1.0, -1.0)
         pose = -side * (2 * np.pi / pair.lobes * phase + relative / 2), side * relative
         gap, _, lever = pair.contact(*pose)
@@ -174,8 +174,9 @@ def covered(rows: list[Row], speeds) -> float:
 
 
 def objective(config: Config, one: Evaluation, baseline: Evaluation) -> float:
-    """Return the objective at one speed. If the motion is not periodic, use averages of the
-    force."""
+    """Return the objective at one speed, also for motions that are not periodic.
+
+    The forces of such a motion are averages over a window. NaN without forces."""
     if not (one.response and baseline.response):
         return math.nan
     weights = objective_weights(config)

@@ -80,8 +80,8 @@ class Look(NamedTuple):
     """The equations evaluated at a place.
 
     `residual` (n,) and `jacobian` (n, n + 1) of the equations; `memory`: pass this to the curve to
-    repeat the same computation, such as the same solver steps, so that the residual is a smooth
-    function (None if the residual is smooth anyway); `data`: further results of the curve.
+    repeat the same computation, such as the same solver steps; `data`: further results of the
+    curve. A repeated computation makes the residual smooth. `memory` is None if it always is.
     """
 
     residual: NDArray[np.float64]
@@ -316,7 +316,9 @@ def _back_at_first(curve: SolutionCurve, spots: list[Spot]) -> bool:
 
 
 def _located(curve: SolutionCurve, old: Spot, new: Spot, test: Callable[[Spot], float]) -> Spot:
-    """Return the spot between `old` and `new` at which `test` is zero, by regula falsi (Illinois)."""
+    """Return the spot between `old` and `new` at which `test` is zero.
+
+    The method is regula falsi, Illinois variant."""
     chord = new.place - old.place
     across = chord / np.linalg.norm(chord)
     low, high = 0.0, 1.0

@@ -37,8 +37,8 @@ from rootsopt.dynamics.verdict import RESIDUAL
 from rootsopt.errors import InputError
 
 _HALVED = 0.004
-"""Distance (unit of `StepSizes`) between the states at the start and the middle of an orbit, below
-which a branch that ends for no other reason ends as `End.HALVED`."""
+"""Distance (unit of `StepSizes`) between the states at the start and middle of an orbit below which
+the end of a branch without other reason is `End.HALVED`."""
 _SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
 """Distances (unit of `StepSizes`) from a period doubling at which the orbit of twice the period is
 searched for, in this order."""

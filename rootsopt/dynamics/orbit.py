@@ -414,8 +414,8 @@ def disagreement(
 ) -> Float[Array, ""]:
     """Return the largest relative difference of two estimates of an orbit's derivatives.
 
-    The comparison covers (I - M)⁻¹, with the monodromy matrix M, and the derivatives of the state,
-    the mean force and the mean square force with respect to the design. Differences are relative
+    The estimates are compared in (I - M)⁻¹, where M is the monodromy matrix, and in derivatives
+    with respect to the design: of state, mean force and mean square force. Differences are relative
     to the greatest entry of the same quantity in `first`. `first` and `second`: `Flow.slope` on two
     grids; `count`: number of states.
     """

@@ -103,8 +103,8 @@ class RotorPair(eqx.Module):
     whether drive and coast flanks can touch at once. They cannot at the nominal centre distance
     without negative clearance. `parts`: all other parts. An absent part is None and costs nothing.
 
-    Raises InputError if two parts let the axes move, if one part does but `two_sided` is False, or
-    if the pair is two-sided but the contact is not (see `Contact.two_sided`).
+    Raises InputError if two parts let the axes move; if one part does but `two_sided` is False; if
+    the pair is two-sided but the contact is not (see `Contact.two_sided`).
     """
 
     lobes: int = eqx.field(static=True)
@@ -356,8 +356,8 @@ class RotorPair(eqx.Module):
 
         Let n be the drive side's normal from rotor 1 to rotor 2, and t the tangent, n turned by
         +90°. Rotor 1 slides along rotor 2 at the speed ω1 h1 - ω2 h2 + (v1 - v2)·t. The coast side
-        is the mirror image. A pair with displaced axes equals a pair at another centre distance
-        with the angles φ1 - θ and φ2 + θ, where θ is the angle of the displaced line of centres.
+        is the mirror image. Let θ be the angle of the displaced line of centres. A pair with
+        displaced axes equals a pair at another centre distance with the angles φ1 - θ and φ2 + θ.
         """
         contact, line, relative = self.contact, None, motion.relative
         if motion.shift is not None:
@@ -467,8 +467,8 @@ class RotorPair(eqx.Module):
     def lost(self, state: Float[Array, " n"]) -> Bool[Array, ""]:
         """Return whether a pair in this scaled state no longer runs as a pair.
 
-        That is so if the lobes have passed through each other, the motor has stalled, or a part
-        reports a loss, such as an axis displaced too far."""
+        Either the lobes have passed through each other, the motor has stalled, or a part reports a
+        loss, such as an axis displaced too far."""
         return self._lost(state, zip(self.all_parts, self.own_states(state), strict=True))
 
     def _lost(self, state, acting) -> Bool[Array, ""]:

@@ -65,9 +65,9 @@ def settle(
     """Integrate from the scaled `state` (n,) until the stroboscopic states repeat with a period k.
 
     The motion has settled if the last k + 1 states differ from the states k periods earlier by less
-    than `tolerance` (scaled), or by less than the noise of the steps if that is greater. k is the
-    smallest such period, at most `max_orbit` ≤ 8. Steps become finer after `_PATIENCE`. The
-    transient ends unsettled after `max_periods` mesh periods.
+    than `tolerance` (scaled). For large states, the noise of the steps is the limit if it is
+    greater. k is the smallest such period, at most `max_orbit` ≤ 8. Steps become finer after
+    `_PATIENCE`. The transient ends unsettled after `max_periods` mesh periods.
     """
     orders = jnp.arange(1, max_orbit + 1)
     age = jnp.arange(_MEMORY)[::-1]

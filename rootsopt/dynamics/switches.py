@@ -17,8 +17,8 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.peak import Steps, blended
 
 _LOOKS, _LONGEST = 252, 8
-"""Number of times per mesh period at which flags are compared to find changes, in addition to the
-ends of steps, and the maximum number of mesh periods."""
+"""Number of times per mesh period, in addition to the ends of steps, at which flags are compared to
+find changes; and the maximum number of mesh periods."""
 _CHANGES = 1024
 """Maximum number of changes found in one motion. A mesh period has about 20 to 100."""
 _LANES = 16

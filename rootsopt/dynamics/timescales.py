@@ -37,9 +37,9 @@ class Timescales(eqx.Module):
         """Return the timescales of a pair, without derivatives.
 
         `inertia` (kg·m²) of one rotor; `force` (N): static flank force at the pitch `radius` (m);
-        `clearance` (m) of the flanks. The contact stiffness is taken at the static penetration, or
-        at the penetration of an impact after a fall through the play if that is greater. The energy
-        of this impact is the work of the load.
+        `clearance` (m) of the flanks. The contact stiffness is taken at the greater of two depths:
+        the static penetration, and the penetration of an impact after a fall through the play. The
+        energy of this impact is the work of the load.
         """
         parts = tuple(parts)
         play = jnp.zeros_like(force)

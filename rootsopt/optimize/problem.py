@@ -189,8 +189,8 @@ class Problem:
     def toward(self, point, inside) -> NDArray[np.float64]:
         """Return a feasible point near `point`, as `project` does, with a fallback to `inside`.
 
-        `inside`: a feasible point. If `project` finds no feasible point, because a profile may not
-        even exist at `point`, the point is moved half way towards `inside`, up to `_DRAWN` times.
+        `inside`: a feasible point. If `project` finds no feasible point, the point is moved half
+        way towards `inside`, up to `_DRAWN` times. A profile may not even exist at `point`.
         """
         found = self.project(point)
         if self.space.family.by_limits:

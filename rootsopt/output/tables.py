@@ -238,7 +238,9 @@ def _status(evaluation: Evaluation) -> Text:
 
 
 def _gradients(*gradients: Mapping[str, Mapping[str, float]]) -> list[tuple]:
-    """Return (heading, rows of each gradient) for each response; one empty group without gradients."""
+    """Return (heading, rows of each gradient) for each response.
+
+    Without gradients, return one empty group."""
     found = dict.fromkeys(response for gradient in gradients for response in gradient)
     groups = []
     for response in found:

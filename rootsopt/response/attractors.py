@@ -335,7 +335,7 @@ def _cycle(pair: RotorPair, state, integrator: Integrator):
 class AttractorEvaluator(Wrapper):
     """Evaluates a design by all its coexisting motions.
 
-    With `objective.motion: worst`, the result is that of the motion with the greatest weighted sum
+    With `objective.motion: worst`, the result describes the motion with the greatest weighted sum
     of the objective's measures. Each measure is relative to the `reference` of `single`: a
     response, usually the baseline's. The default reference is the greatest value among the motions.
 

@@ -101,7 +101,7 @@ class EnsembleEvaluator(Wrapper):
 
     @property
     def integrator(self) -> Integrator:
-        """Integrator of the motions: that of the transient, but no finer than `_RTOL`."""
+        """Integrator of the motions: the transient's integrator, but no finer than `_RTOL`."""
         transient = self.scene.solver.transient
         return dataclasses.replace(transient, rtol=jnp.maximum(transient.rtol, _RTOL))
 

@@ -400,7 +400,9 @@ def at_speed(scene: Scene, speed_rpm: float) -> Scene:
 
 
 def _reached(pair: RotorPair, found: Steady) -> float:
-    """Return the largest |ε| (rad) of the orbit, of the window or, without both, at the last state."""
+    """Return the largest |ε| (rad) of the motion `found`.
+
+    The motion is the orbit, else the window, else only the last state of the transient."""
     scale = float(pair.angle_scale)
     if Status.of(found.status) in (*CLOSED, Status.IDLE):
         return scale * float(np.max(np.abs(found.orbit.flow.states[:, 0])))

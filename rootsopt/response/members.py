@@ -66,8 +66,8 @@ class Members(NamedTuple):
     def responses(self) -> NDArray[np.float64]:
         """Mean, peak and RMS force (N) in rows, with their standard errors, (3, 2).
 
-        The members are independent, so each standard error is that of the mean over members. For
-        the RMS it is correct to first order.
+        The standard errors are those of means over independent members. The standard error of the
+        RMS is correct to first order.
         """
         values, errors = mean_and_error(np.asarray(self.means, np.float64))
         mean, square, peak = values
@@ -100,7 +100,7 @@ def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float
 
 
 def prepare_members(pair: RotorPair, integrator: Integrator) -> None:
-    """Compile in the background the program that `run_members` needs on CPUs for pairs like `pair`."""
+    """Compile in the background the program that `run_members` needs on CPUs for `pair`."""
     states = jax.ShapeDtypeStruct((_MEMBERS, pair.states), pair.angle_scale.dtype)
     count = jax.ShapeDtypeStruct((), int)
     _in_turn.prepare(pair, states, count, count, integrator)

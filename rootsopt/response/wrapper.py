@@ -1,4 +1,4 @@
-"""The protocol of all evaluators, and the base class of those that wrap another evaluator."""
+"""The protocol of all evaluators, and the base class of evaluators that wrap another evaluator."""
 
 import dataclasses
 from typing import Any, Protocol, TypeVar, runtime_checkable

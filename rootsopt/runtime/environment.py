@@ -204,7 +204,7 @@ def _set_aside(named: list[str]) -> None:
 
 
 def _without_settings() -> dict[str, str]:
-    """Remove variables of JAX that are not respected from the environment; return names and values."""
+    """Remove JAX variables that are not respected from the environment; return names and values."""
     names = [
         name for name in os.environ if name.startswith("JAX_") and not name.startswith(_RESPECTED)
     ]

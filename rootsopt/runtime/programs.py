@@ -143,7 +143,9 @@ class Program:
         return jax.tree.map(_outline, eqx.filter_eval_shape(self.function, *args))
 
     def _future(self, kind: _Kind) -> tuple[Future[_Made], bool]:
-        """Return the future program for a `kind` of arguments, and whether the caller must make it."""
+        """Return the future program for a `kind` of arguments.
+
+        Return also whether the caller must compile it."""
         with self._lock:
             new = kind not in self._made
             return self._made.setdefault(kind, Future()), new

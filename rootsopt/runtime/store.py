@@ -83,7 +83,7 @@ class Folder:
         return name if self._open is not None else os.fspath(self.path / name)
 
     def open(self, name: str, flags: int) -> int:
-        """Open a file in the folder and return its descriptor. Only the user can access a new file."""
+        """Open a file in the folder and return its descriptor. A new file is for the user alone."""
         return os.open(self._at(name), flags | _SAFELY, 0o600, dir_fd=self._open)
 
     def stat(self, name: str) -> os.stat_result:
@@ -304,7 +304,7 @@ def _make(path: Path) -> None:
 
 
 def _check(path: Path, found: os.stat_result) -> None:
-    """Raise `UnsafeFolderError` if other users own the folder `path`, or can change or replace it."""
+    """Raise `UnsafeFolderError` if others own the folder `path`, or can change or replace it."""
     if not _HAS_OWNERS:
         return  # On such systems, folders below the user's home are the user's by default.
     me = os.geteuid()

@@ -113,8 +113,8 @@ _WINDOW = 8
 _COARSE = 64
 """Number of nodes of the coarse search along the whole flank."""
 _PAD = 4
-"""Number of segments by which the window of segments exceeds the window of nodes on either side, so
-that the contact may slide between two calls."""
+"""Number of segments by which the window of segments exceeds the window of nodes on either side.
+The contact may slide by this distance between two calls."""
 
 
 class _Segments(NamedTuple):

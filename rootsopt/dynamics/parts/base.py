@@ -139,7 +139,7 @@ class Part(eqx.Module):
         raise NotImplementedError(f"`{type(self).__name__}` displaces the axes, but has no `axes`")
 
     def lost(self, own: Own) -> Bool[Array, ""] | None:
-        """Return whether a pair with these states of the part no longer runs; None: it always does."""
+        """Return whether the part's own states stop the pair from running; None: they never do."""
         del own
         return None
 
@@ -174,12 +174,12 @@ class Part(eqx.Module):
     # integrals lose accuracy and derivatives are wrong.
 
     def switches(self, motion: Motion, own: Own) -> Bool[Array, " s"]:
-        """Return flags (s,) that change where the part's torques, forces or rates are not smooth."""
+        """Return flags (s,) that change where the part's loads or rates are not smooth."""
         del motion, own
         return jnp.zeros(0, bool)
 
     def drag_switches(self, sliding: Float[Array, ""]) -> Bool[Array, " s"]:
-        """Return flags (s,) that change where the drag is not smooth in the speed `sliding` (m/s)."""
+        """Return flags (s,) that change where the drag is not smooth in `sliding` (m/s)."""
         del sliding
         return jnp.zeros(0, bool)
 
