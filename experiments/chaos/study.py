@@ -178,7 +178,7 @@ def errors_by_members(config: Config, model: Scene, design, size: Size) -> list[
 def gradients(config: Config, model: Scene, design, size: Size) -> list[dict]:
     """Estimate the slope of the mean force over the pressure angle, with its standard error.
 
-    Compare more members with more designs.
+    Returns a row for each size in `size.slopes`: more members, or more designs.
     """
     rows = []
     for designs, members in size.slopes:

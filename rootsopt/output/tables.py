@@ -133,10 +133,10 @@ def _word(row: Mapping[str, Any]) -> Text:
 
 
 def attractor_table(rows: list[dict[str, Any]], lost: Mapping[str, float]) -> RenderableType:
-    """Show coexisting motions, one column each.
+    """Show coexisting motions, one column per motion.
 
-    `rows` holds {attractor, share, reached, status, ...}; `lost` the shares of initial states that
-    lead to none of them.
+    `rows`: one {attractor, share, reached, status, ...} per motion; `lost`: shares of the initial
+    states that lead to no motion, by status label.
     """
     table = _table("Coexisting motions", *(f"motion {row['attractor']}" for row in rows))
     labels = {

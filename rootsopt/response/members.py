@@ -53,7 +53,7 @@ class Members(NamedTuple):
 
     @property
     def status(self) -> Status:
-        """First failure among the members, or AVERAGED."""
+        """Status of the first member that has failed, or AVERAGED."""
         if not np.all(self.solved):
             return Status.SOLVER_FAILED
         if not np.all(np.isfinite(self.means)):

@@ -97,7 +97,7 @@ class _Made(NamedTuple):
 
 
 class Program:
-    """A function of trees, compiled once for each kind of arguments.
+    """A function whose arguments are JAX trees, compiled once for each kind of arguments.
 
     As with `equinox.filter_jit`, arrays are traced. Everything else is static and must be hashable.
     """
