@@ -53,7 +53,9 @@ class Members(NamedTuple):
 
     @property
     def status(self) -> Status:
-        """Status of the first member that has failed, or AVERAGED."""
+        """AVERAGED, or the failure of some member: solver, finite forces, stall, passing lobes.
+
+        The kinds of failure are checked in this order."""
         if not np.all(self.solved):
             return Status.SOLVER_FAILED
         if not np.all(np.isfinite(self.means)):
