@@ -1,7 +1,7 @@
 """Design of Roots rotors by the gradient of their dynamic contact force; see the README.
 
-Public names are imported on first use. So importing the package is fast: it loads no solver and
-changes no global setting.
+Public names are imported on first use. Importing the package is therefore fast, loads no solver,
+and changes no global setting.
 """
 
 from importlib import import_module
@@ -57,7 +57,7 @@ _PUBLIC = {
     "steady_response": "rootsopt.response.steady:steady_response",
     "sweep_scenes": "rootsopt.response.scenes:sweep_scenes",
 }
-"""Public names, each with its module and attribute."""
+"""Public names, each with the module and attribute it stands for."""
 __all__ = ["__version__", *_PUBLIC]  # pyright: ignore[reportUnsupportedDunderAll]
 
 

@@ -1,4 +1,4 @@
-"""Statuses of results. Every reported number comes with one of them."""
+"""Statuses of results. Every result carries one status."""
 
 import enum
 import operator
@@ -74,7 +74,7 @@ class Status(enum.Enum):
 
     @property
     def code(self) -> int:
-        """Number of the status in arrays."""
+        """Number that stands for the status in arrays."""
         return list(Status).index(self)
 
     @classmethod

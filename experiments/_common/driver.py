@@ -33,7 +33,7 @@ DOCS = Path("docs")
 
 
 class NoResultError(Exception):
-    """A study cannot continue: the message says why, and the exit code is 3."""
+    """A study cannot continue. The message says why; the exit code of the study is 3."""
 
 
 def start_process(cache: bool = False, gpu: bool = False) -> None:
@@ -55,8 +55,8 @@ def start_process(cache: bool = False, gpu: bool = False) -> None:
 class Run:
     """One run of a study: its options, its result folder, and its published figures.
 
-    `published` maps a figure's name in the result folder to its name in `docs/`. `began` is the
-    clock (s) at the start.
+    `published`: for each published figure, its name in the result folder and its name in `docs/`;
+    `began`: clock (s) at the start.
     """
 
     options: argparse.Namespace
@@ -66,12 +66,12 @@ class Run:
 
     @property
     def quick(self) -> bool:
-        """Return whether this is the reduced run."""
+        """Whether this is a reduced run (`--quick`)."""
         return self.options.quick
 
     @property
     def seconds(self) -> float:
-        """Return the seconds since the start."""
+        """Time (s) since the start."""
         return time.perf_counter() - self.began
 
     def say(self, text: str) -> None:
@@ -89,14 +89,15 @@ class Run:
         self.folder.write_json(name, {**data, "versions": versions()})
 
     def figure(self, name: str, figure: "Figure") -> None:
-        """Write a figure; with `--docs` also write the published one."""
+        """Write a figure into the result folder and, with `--docs`, into `docs/` if published."""
         self.folder.write_figure(name, figure)
         if self.options.docs and name in self.published:
             ResultFolder(DOCS).write_figure(self.published[name], figure)
 
 
 Body = Callable[[Run], int]
-"""Body of a study for a run: compute, write, print. Returns the exit code."""
+"""Type of the body of a study: a function that computes, writes and prints for a run, and returns
+the exit code."""
 
 
 def drive(
@@ -112,9 +113,10 @@ def drive(
 ) -> int:
     """Parse the arguments, choose double precision, run a study's body; return the exit code.
 
-    `purpose` is the text of `--help`. `quick` says what `--quick` omits. `published` is as in
-    `Run`, and `cache` as in `start_process`. `add_options` adds the study's own options. Without
-    `precision` JAX is not touched: the study starts it in its own processes.
+    `name`: folder of the study; `purpose`: text of `--help`; `quick`: what `--quick` omits;
+    `published`: see `Run`; `add_options`: adds the study's own options; `cache`: see
+    `start_process`. If `precision` is False, JAX is not started: the study does that in its own
+    processes.
     """
     parser = _parser(name, purpose, quick, bool(published))
     add_options(parser)
@@ -136,7 +138,7 @@ def drive(
 
 
 def verdict(kept: bool) -> int:
-    """Return the exit code of a study whose promises are kept, or not."""
+    """Return the exit code of a study that checks promises: 0 if they are `kept`, else 3."""
     return OK if kept else NO_RESULT
 
 

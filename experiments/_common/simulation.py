@@ -16,13 +16,13 @@ from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.scene import Scene, design_vector
 
 pair_of_model = eqx.filter_jit(Scene.pair)
-"""Compiled function that returns the rotor pair of a model and a design."""
+"""Compiled `Scene.pair`: returns the rotor pair of a scene and a design."""
 
 
 def evaluator_of(config: Config, give_up_early: bool = False) -> Evaluator:
     """Make the evaluator of a config.
 
-    `give_up_early`: give up motions that settle late.
+    `give_up_early`: whether to give up motions that settle late.
     """
     return Evaluator.of(config, survey=give_up_early)
 
@@ -33,9 +33,9 @@ def evaluate(config: Config) -> Evaluation:
 
 
 def at(evaluator: Evaluator, rtol: float, transient: float | None = None) -> Evaluator:
-    """Return an evaluator with other tolerances of orbit and transient (default: the same).
+    """Return an evaluator with the tolerances `rtol` of the orbit and `transient` of the transient.
 
-    Nothing is compiled again.
+    By default the transient's tolerance is unchanged. Nothing is compiled again.
     """
     coarse = jnp.asarray(rtol if transient is None else transient)
     scene = eqx.tree_at(lambda scene: scene.solver.transient.rtol, evaluator.scene, coarse)
@@ -49,8 +49,9 @@ def profile_of(config: Config, design: ArrayLike | None = None) -> Profile:
 
 
 def stacked(configs: Sequence[Config], precision: str) -> Scene:
-    """Return the models of scenes with one kind of pair, at one precision; their numbers are
-    stacked along a leading axis (n,)."""
+    """Return n scenes of one kind, their numbers stacked along a leading axis (n,).
+
+    All `configs` must lead to the same compiled program; `precision`: float64 or float32."""
     models = [
         jax.tree.map(
             np.asarray, dataclasses.replace(Scene.from_config(config), precision=precision)
@@ -61,8 +62,9 @@ def stacked(configs: Sequence[Config], precision: str) -> Scene:
 
 
 def objective(evaluation: Evaluation, reference: dict[str, float]) -> float:
-    """Return the average of mean and peak force, each relative to the reference's; NaN without a
-    periodic motion."""
+    """Return the average of mean and peak force, each divided by the force in `reference` (N).
+
+    The result is NaN without a periodic motion."""
     if not evaluation.usable:
         return float("nan")
     return float(np.mean([evaluation.response[key] / reference[key] for key in FORCES]))

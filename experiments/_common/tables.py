@@ -8,15 +8,16 @@ from rich.console import Console
 from rich.table import Table
 
 _WIDTH = 250
-"""Width of a line (characters); wider than a terminal, so that a file holds everything."""
+"""Width of a table (characters): wider than a terminal, so that no column is cut in a file."""
 
 
 def show(
     title: str, rows: Sequence[Mapping[str, Any]], columns: Iterable[str] | None = None
 ) -> None:
-    """Print rows under a title; `columns` chooses and orders (default: those of the first row).
+    """Print rows as a table under a title.
 
-    Text columns are left-aligned, all others right-aligned.
+    `columns`: keys to show, in order, by default the keys of the first row. Text columns are
+    left-aligned, all others right-aligned.
     """
     keys = list(rows[0]) if columns is None else list(columns)
     table = Table(title=title)

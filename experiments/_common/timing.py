@@ -12,14 +12,14 @@ MB = 1e-6
 
 
 def ready(result: Any) -> Any:
-    """Wait for a result of JAX; return it."""
+    """Wait until JAX has computed `result`, and return it."""
     import jax
 
     return jax.block_until_ready(result)
 
 
 def times_of(call: Callable[[], Any], repeats: int, at_most: float = math.inf) -> list[float]:
-    """Return the seconds of each of `repeats` calls; stop after `at_most` seconds in all."""
+    """Return the times (s) of up to `repeats` calls; start no call after `at_most` seconds."""
     times: list[float] = []
     while not times or (len(times) < repeats and sum(times) < at_most):
         began = time.perf_counter()
@@ -31,7 +31,9 @@ def times_of(call: Callable[[], Any], repeats: int, at_most: float = math.inf) -
 def median_time(
     call: Callable[[], Any], repeats: int, at_most: float = math.inf
 ) -> tuple[float, Any]:
-    """Return the median seconds of a call and its last result; stop after `at_most` seconds."""
+    """Return the median time (s) of up to `repeats` calls, and the last result.
+
+    No further call is made after `at_most` seconds."""
     results = []
 
     def keep() -> None:
@@ -43,8 +45,9 @@ def median_time(
 def first_and_warm(
     call: Callable[[], Any], repeats: int, at_most: float = math.inf
 ) -> tuple[float, float, Any]:
-    """Return the seconds of compilation (first call minus a warm one), of a warm call, and the
-    result."""
+    """Return the time (s) of compilation, the time (s) of a warm call, and the result.
+
+    The time of compilation is the time of the first call minus that of a warm call."""
     first, _ = median_time(call, 1)
     warm, result = median_time(call, repeats, at_most)
     return max(first - warm, 0.0), warm, result

@@ -1,7 +1,7 @@
 """Does `solver.fidelity: auto` keep within the requested error?
 
-Writes auto.csv (a row per scene), auto.json and auto.png. The exit code is 3 if a request was
-missed.
+Writes auto.csv (a row per scene), auto.json and auto.png. The exit code is 3 if the true error of a
+scene exceeds the requested error.
 """
 
 import argparse
@@ -13,7 +13,7 @@ FIGURES = {"auto.png": "auto.png"}
 
 
 def body(run: Run) -> int:
-    """Measure, write, print the counts."""
+    """Measure the errors, write results, print the counts."""
     from experiments._common.tables import print_record
     from experiments.auto_accuracy import figures, study
 
@@ -27,7 +27,7 @@ def body(run: Run) -> int:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the size and the seed of the draw."""
+    """Add options for the number of random scenes and the seed."""
     parser.add_argument("--count", type=int, default=50, help="periodic scenes (default: 50)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the draw (default: 0)")
 

@@ -10,7 +10,9 @@ MARKS = {"linear": ("o", BLUE), "search": ("s", VERMILION), "map": ("^", GREEN)}
 
 
 def errors(rows: list[Row]) -> Figure:
-    """Draw the true error over the requested error; all points should be below the line."""
+    """Draw the true error over the requested error, with the line on which both are equal.
+
+    All points should be below this line."""
     figure, axes = sheet(6.4, 4.8)
     ax = axes[0, 0]
     spread = np.random.default_rng(0)

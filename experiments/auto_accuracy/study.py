@@ -1,9 +1,9 @@
 """Measures the true error of the settings that `auto` chooses, on random designs and scenes.
 
-Profiles are CIC of random pressure angle, involute and tip land, and EE, with two to four lobes.
-Scenes vary speed, load, backlash and damping. `auto` chooses for a relative error of 1 %, 0.1 % or
-0.01 % in turn. The true error of mean and peak force is measured against contact by search with
-dopri8 at 1e-10. Scenes without a periodic orbit are listed, and others drawn in their place.
+Profiles are EE, and CIC with random pressure angle, involute and tip land, with two to four lobes.
+Scenes vary speed, load, backlash and damping. The requested relative error is 1 %, 0.1 % or 0.01 %
+in turn. The true error of mean and peak force is measured against contact by search with dopri8 at
+1e-10. Scenes without a periodic orbit are listed, and replaced by other random scenes.
 """
 
 import time
@@ -28,7 +28,7 @@ QUICK_COUNT = 1
 
 
 def scenes(seed: int) -> Iterator[tuple[str, list[str]]]:
-    """Yield pairs of a shipped config's name and random overrides, without end."""
+    """Yield (name of a shipped config, random overrides) without end."""
     draw = np.random.default_rng(seed)
     while True:
         family = "ee" if draw.uniform() < 0.25 else "cic"
@@ -53,7 +53,10 @@ def scenes(seed: int) -> Iterator[tuple[str, list[str]]]:
 
 
 def measure(config: Config, overrides: list[str], family: str, wanted: float) -> Row:
-    """Measure one scene: requested, chosen and estimated accuracy, and the true error."""
+    """Measure one scene. Return a row with requested error, chosen settings, estimated and true
+    error.
+
+    `wanted`: requested relative error."""
     truth = evaluate(shipped(family, *overrides, *SHARP))
     row: Row = {"family": family, "scene": " ".join(overrides), "requested": wanted}
     row |= {"fidelity": "", "rtol": np.nan, "estimated": np.nan, "error": np.nan}
@@ -101,12 +104,12 @@ def run(
 
 
 def judged(rows: list[Row]) -> list[Row]:
-    """Return the rows of periodic scenes, for which `auto` has chosen."""
+    """Return the rows of periodic scenes, whose true error is known."""
     return [row for row in rows if row["fidelity"]]
 
 
 def summary(rows: list[Row]) -> dict[str, Any]:
-    """Count the fulfilled requests and the chosen settings."""
+    """Return counts of the fulfilled requests and of the chosen settings."""
     known = judged(rows)
     return {
         "judged": len(known),

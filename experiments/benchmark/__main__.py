@@ -34,7 +34,7 @@ COLUMNS = (
 
 
 def body(run: Run) -> int:
-    """Run all parts, write, print the tables; or run one part in its process."""
+    """Run all parts, write results and print tables; with --part, run one part in this process."""
     from experiments.benchmark import study
 
     options = run.options

@@ -24,7 +24,10 @@ from rootsopt.config import load
 def tuned(
     make: Callable[..., Simulator], settings: Sequence[dict[str, Any]], truth: Any
 ) -> tuple[dict[str, Any], Simulator]:
-    """Choose the fastest of `settings` that is accurate enough at the baseline, or the best."""
+    """Choose the fastest of `settings` that is accurate enough at the baseline.
+
+    If no setting is accurate enough, choose the most accurate. Returns the setting and the
+    simulator."""
     tried = []
     for one in settings:
         tool = make(**one)
@@ -39,7 +42,7 @@ def tuned(
 def competitor_rows(
     name: str, tool: Simulator, settings: dict[str, Any], job: Job, more: Row, repeats: int
 ) -> list[Row]:
-    """Time value, then value and gradient, of a competitor."""
+    """Time a competitor: forces alone, then forces with gradient. Return the rows."""
     truth, slope = job.known["forces"][0], job.known["slopes"][0]
     text = ", ".join(f"{key} {value}" for key, value in settings.items())
     seconds, found = median_time(lambda: tool.simulate(BASELINE), repeats)
@@ -62,7 +65,7 @@ def competitor_rows(
 
 
 def part_scipy(job: Job) -> dict[str, Any]:
-    """Measure (a): LSODA and DOP853."""
+    """Measure part (a): SciPy with LSODA and DOP853."""
     scene = Scene.of(load(CIC))
     rows = []
     choices = {
@@ -80,9 +83,9 @@ def part_scipy(job: Job) -> dict[str, Any]:
 
 
 def part_numba(job: Job) -> dict[str, Any]:
-    """Measure (b): search and map, with few and with four periods to settle.
+    """Measure part (b): Numba with search and with map, with few and with four periods to settle.
 
-    Also measures the setting with a gradient accurate to 1e-3.
+    The setting whose gradient is accurate to 1e-3 is measured too.
     """
     from experiments._common.engines import motion_of, rotor_of
     from experiments._common.engines import numba_pair as numba

@@ -32,9 +32,9 @@ REFERENCE_RTOL = 1e-11
 REFERENCE_STEPS = tuple(step / 5 for step in FD_STEPS)
 """Steps (deg, mm, deg) of the reference's central differences; their truncation error is 1e-5."""
 CHECKED = 8
-"""Number of designs of a batch with a reference."""
+"""Number of designs of a batch that are compared with a reference."""
 TOLERANCES = ((1e-4, 1e-4), (1e-5, 1e-5), (1e-6, 1e-6), (1e-5, 1e-6), (1e-7, 1e-7))
-"""Tolerances of orbit and transient."""
+"""Tolerances (orbit, transient) to choose from, in the order in which they are tried."""
 
 
 def part_reference(job: Job) -> dict[str, Any]:
@@ -79,9 +79,9 @@ def part_reference(job: Job) -> dict[str, Any]:
 
 
 def part_single(job: Job) -> dict[str, Any]:
-    """Time one design through `Evaluator`, at the cheapest sufficient setting and at the default.
+    """Time one design with `Evaluator`, at the cheapest sufficient setting and at the default.
 
-    Also times the traceable `respond`, with and without gradient.
+    The pure function `respond` is timed too, with and without gradient.
     """
     start_process()
     import equinox as eqx
@@ -158,7 +158,7 @@ def part_single(job: Job) -> dict[str, Any]:
 
 
 class _Batch:
-    """Designs around the baseline, each simulated from rest, and references of the checked ones."""
+    """Designs around the baseline, each simulated from rest, and references for some of them."""
 
     def __init__(self, job: Job):
         import jax.numpy as jnp
@@ -173,7 +173,7 @@ class _Batch:
         self.tried: list[list[Any]] = []
 
     def run(self, contact: str, rtol: float, transient_rtol: float, gradient: bool) -> Any:
-        """Simulate all designs with one setting."""
+        """Simulate all designs with one setting: contact and tolerances."""
         import jax.numpy as jnp
 
         from rootsopt.response.batch import coarse, respond_many
@@ -190,9 +190,9 @@ class _Batch:
         return ready(respond_many(scene, self.designs, self.states, solver, gradient))
 
     def errors(self, out: Any) -> tuple[int, float, list[float]]:
-        """Count usable designs, and compare the checked ones with the reference.
+        """Count usable designs, and compare the designs that have a reference with it.
 
-        Returns the count, the largest error of the forces, and that of each gradient.
+        Returns the count, the largest error of the forces, and the error of each gradient.
         """
         usable = np.asarray(out.usable)[: self.checked]
         forces = np.asarray(out.response)[: self.checked, :2][usable]
@@ -204,7 +204,8 @@ class _Batch:
     def choose(self) -> tuple[str, float, float]:
         """Choose the cheapest contact and tolerances at which all designs are accurate enough.
 
-        If there are none, choose the finest.
+        If no setting is accurate enough, choose the finest. Returns (contact, orbit tolerance,
+        transient tolerance).
         """
         job = self.job
         contacts = job.contacts[job.contacts.index(job.known["choice"][0]) :]
@@ -255,9 +256,9 @@ class _Batch:
 
 
 def part_batch(job: Job) -> dict[str, Any]:
-    """Time designs around the baseline through `respond_many`, each from rest.
+    """Time a batch of designs around the baseline with `respond_many`, each from rest.
 
-    The first batch searches for the cheapest sufficient setting; later ones use it.
+    The first batch searches for the cheapest sufficient setting; later batches reuse this setting.
     """
     start_process(gpu=job.part == "gpu")
     import jax

@@ -52,14 +52,16 @@ def figure_of(rows: list[Row]) -> Figure:
 
 
 def short(value: float) -> str:
-    """Write two digits, without a power of ten."""
+    """Format `value` with two significant digits, without a power of ten."""
     return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
 
 
 def draw_power(
     ax: Any, points: list[tuple[float, float]], label: str, color: str, mark: str
 ) -> None:
-    """Draw the points of a cost, with the exponent of their fit."""
+    """Draw (size, seconds) points on logarithmic axes, with the exponent of a power law in the
+    label.
+    """
     if not points:
         return
     slope = exponent(points)

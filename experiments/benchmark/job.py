@@ -1,4 +1,4 @@
-"""Shared by the parts of the benchmark: the scene, required accuracies, rows."""
+"""What all parts of the benchmark share: the scene, required accuracies, rows."""
 
 import dataclasses
 import math
@@ -12,10 +12,10 @@ BASELINE = (36.43, 9.0, 4.0)
 ACCURACY = 1e-3
 """Relative error of mean and peak force above which a setting is rejected."""
 GRADIENT_ACCURACY = 0.1
-"""Relative error of a gradient above which a setting is rejected, where one is requested. The
-competitors' differences reach some 0.05 at settings with forces accurate to `ACCURACY`."""
+"""Relative error of a requested gradient above which a setting is rejected. The competitors'
+central differences reach about 0.05 at settings with forces accurate to `ACCURACY`."""
 BATCH_SECONDS = 150.0
-"""Expected time (s) of all runs of a batch above which it is not run."""
+"""Expected time (s) of all runs of a batch above which the batch is skipped."""
 CONTACTS = {
     "search": ("solver.fidelity=search",),
     "map 384x16": ("solver.fidelity=map", "solver.map_rolls=384", "solver.map_relatives=16"),
@@ -27,7 +27,7 @@ Row = dict[str, Any]
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """Task of a part: its name, whether it is reduced, a batch size, and earlier findings."""
+    """Task of a part: its name, whether the run is reduced, a batch size, and earlier findings."""
 
     part: str
     quick: bool
@@ -36,17 +36,17 @@ class Job:
 
     @property
     def contacts(self) -> tuple[str, ...]:
-        """Return the contacts to choose from, from coarse to fine."""
+        """Contacts to choose from, from coarse to fine."""
         return ("linear",) if self.quick else ("map 192x12", "map 384x16", "search")
 
 
 def forces_of(response: dict[str, float]) -> list[float]:
-    """Return mean and peak force (N), NaN where there is none."""
+    """Return mean and peak force (N) of a `response`, NaN if unknown."""
     return [response.get(key, math.nan) for key in FORCES]
 
 
 def slopes_of(gradient: dict[str, dict[str, float]]) -> list[list[float]]:
-    """Return the gradients of mean and peak force (2, 3), NaN where there is none."""
+    """Return the gradients of mean and peak force (2, 3), NaN if unknown."""
     return [list(gradient[key].values()) if key in gradient else [math.nan] * 3 for key in FORCES]
 
 
@@ -56,14 +56,14 @@ def value_error(forces: Any, truth: Any) -> float:
 
 
 def gradient_error(slopes: Any, truth: Any) -> float:
-    """Return the largest error of a gradient, relative to the largest entry of its force."""
+    """Return the largest error of the gradients, relative to the largest entry of each gradient."""
     slopes, truth = np.asarray(slopes), np.asarray(truth)
     off = np.abs(slopes - truth).max(axis=-1) / np.abs(truth).max(axis=-1)
     return float(np.max(off))
 
 
 def row(tool: str, what: str, seconds: float, **more: Any) -> Row:
-    """Return a row of the result: `seconds` for each call with `designs` designs."""
+    """Return a row of the result; `seconds`: time of one call, for all its designs."""
     designs = more.pop("designs", 1)
     start: Row = {"tool": tool, "what": what, "designs": designs, "run_s": seconds}
     return start | {"per_design_ms": 1e3 * seconds / designs} | more

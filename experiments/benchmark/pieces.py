@@ -1,4 +1,4 @@
-"""Times of the pieces of one evaluation: gap table, orbit, integration, reverse mode."""
+"""Time the pieces of one evaluation: gap table, orbit, integration, reverse mode."""
 
 import dataclasses
 import functools
@@ -65,10 +65,10 @@ def part_table(job: Job) -> dict[str, Any]:
 
 
 def part_orbit(job: Job) -> dict[str, Any]:
-    """Time value and gradient on the orbit, and by averaging after the transient.
+    """Time forces with gradient by a closed orbit, and by averaging after a transient.
 
-    The orbit starts from that of a neighbouring design. Both are accurate to `ORBIT_ACCURACY`, on
-    one processor core.
+    The orbit is closed from the state of a neighbouring design's orbit. Both methods are accurate
+    to `ORBIT_ACCURACY` and run on one processor core.
     """
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})

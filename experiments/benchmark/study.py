@@ -10,9 +10,9 @@ accurate to 1e-3:
 (f) the main job from a cold process, without and with cached programs;
 (g) large batches on a GPU.
 
-Each part runs in its own process (`--part NAME`, which writes JSON), so that its peak memory is its
-own. No module here loads JAX before a part needs it. Build, compile and run are timed separately,
-and the error reached is listed next to the time.
+Each part runs in its own process (`--part NAME`, which writes JSON), so that peak memory is
+measured for each part. No module here loads JAX before a part needs it. Build, compile and run are
+timed separately, and the error reached is listed next to the time.
 """
 
 import json
@@ -42,9 +42,9 @@ Say = Callable[[str], None]
 SIZES = (16, 256, 1024)
 GPU_SIZES = (256, 4096, 16384, 65536)
 MODULE = "experiments.benchmark"
-"""Module that a part's process runs."""
+"""Name of the module that the process of a part runs."""
 RESULT = "part.json"
-"""File with a part's findings, in the result folder of its process."""
+"""Name of the file with a part's findings, in the result folder of its process."""
 
 PARTS: dict[str, Callable[[Job], dict[str, Any]]] = {
     "reference": part_reference,
@@ -63,7 +63,7 @@ PARTS: dict[str, Callable[[Job], dict[str, Any]]] = {
 def timed_child(
     command: list[str], environment: dict[str, str], log: Path
 ) -> tuple[float, float, int]:
-    """Run a process; return wall seconds, peak memory (MB) and exit code."""
+    """Run a process; return wall time (s), peak memory (MB) and exit code."""
     began = time.perf_counter()
     with open(log, "wb") as sink:
         child = subprocess.Popen(command, env=environment, stdout=sink, stderr=sink)
@@ -136,7 +136,7 @@ class Parts:
 
 
 def run(quick: bool, gpu: bool = False, say: Say = lambda text: None) -> Parts:
-    """Run all parts. Raises `NoResultError` where there is no reference.
+    """Run all parts. Raises `NoResultError` if the reference cannot be computed.
 
     A reduced run uses coarse contact and small sizes, and omits the longest parts.
     """

@@ -1,4 +1,4 @@
-"""Targets of the benchmark, and the figures of a finished run to compare with them."""
+"""Targets of the benchmark, compared with the times measured in a finished run."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -9,7 +9,8 @@ from experiments.benchmark.job import ACCURACY, GRADIENT_ACCURACY, Row
 
 
 def exponent(points: Sequence[tuple[float, float]]) -> float | None:
-    """Fit the slope of log time over log size; `None` for fewer than two points."""
+    """Return the exponent of a power law fitted to (size, time); `None` for fewer than two
+    points."""
     if len(points) < 2:
         return None
     x, y = np.log(np.array(points)).T
@@ -18,12 +19,14 @@ def exponent(points: Sequence[tuple[float, float]]) -> float | None:
 
 @dataclasses.dataclass(frozen=True)
 class Lookup:
-    """Looks up figures of a finished run by tool and task."""
+    """Looks up measured times of a finished run by tool and task."""
 
     rows: list[Row]
 
     def best(self, tool: str, what: str) -> Row | None:
-        """Find the fastest sufficient row of the tools whose names start with `tool`."""
+        """Return the fastest row with sufficient accuracy for the task `what`, or `None`.
+
+        Rows of all tools whose names start with `tool` are considered."""
         rows = [r for r in self.rows if r["tool"].startswith(tool) and r["what"] == what]
         fine = [
             r
@@ -34,12 +37,12 @@ class Lookup:
         return min(fine, key=lambda r: r["per_design_ms"], default=None)
 
     def ratio(self, slow: tuple[str, str], fast: tuple[str, str]) -> float | None:
-        """Return the ratio of the times of two tools for a design."""
+        """Return the time per design of `slow` divided by that of `fast`, each a (tool, task)."""
         one, other = self.best(*slow), self.best(*fast)
         return one["per_design_ms"] / other["per_design_ms"] if one and other else None
 
     def seconds(self, what: str) -> float | None:
-        """Return the seconds of the first task whose name ends with `what`."""
+        """Return the time (s) of the first task whose name ends with `what`."""
         found = [r["run_s"] for r in self.rows if r["what"].endswith(what)]
         return found[0] if found else None
 
@@ -55,7 +58,7 @@ class Lookup:
 
 
 def targets(rows: list[Row]) -> list[Row]:
-    """List the targets with the measured figures; `reached` is `None` where not measured."""
+    """Return a row per target, with the measured value; `reached` is `None` if not measured."""
     look = Lookup(rows)
     both, value, one, many = "value+gradient", "value", "rootsopt, ", "rootsopt, batch of 256"
     single = Lookup([r for r in rows if r["part"] == "single" or r["tool"].startswith("(")])

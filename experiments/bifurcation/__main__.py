@@ -20,7 +20,7 @@ FIGURES = {
 
 
 def body(run: Run) -> int:
-    """Follow, write and print after every parameter."""
+    """Follow all branches; write and print results after every parameter."""
     from experiments.bifurcation import study
 
     def keep(diagrams: "list[Diagram]") -> None:

@@ -32,7 +32,10 @@ COLORS = {"cic": BLUE, "ee": VERMILION}
 
 
 def draw_branches(ax, diagram: Diagram, quantity: str, color: str) -> None:
-    """Draw stable parts solid, unstable ones dashed, and mark special points."""
+    """Draw the branches of a diagram: stable parts solid, unstable parts dashed, special points
+    marked.
+
+    `quantity`: force to draw, a field of `BranchPoint`."""
     for branch in diagram.branches:
         points = branch.points
         for stable, part in itertools.groupby(
@@ -62,7 +65,7 @@ def draw_branches(ax, diagram: Diagram, quantity: str, color: str) -> None:
 
 
 def drawn_specials(diagram: Diagram) -> list[Bifurcation]:
-    """Return the special points where a stable part begins or ends."""
+    """Return the bifurcations and corners at which a stable part of a branch begins or ends."""
     return [
         special
         for branch in diagram.branches
@@ -72,7 +75,7 @@ def drawn_specials(diagram: Diagram) -> list[Bifurcation]:
 
 
 def chaotic(diagram: Diagram) -> list[float]:
-    """Return the values at which a simulation was chaotic."""
+    """Return the values of the parameter at which a simulation was chaotic."""
     return sorted({v for v, status in diagram.seeds if status == Status.CHAOTIC.label})
 
 
@@ -97,7 +100,7 @@ def legend_handles(diagrams: list[Diagram]) -> list:
 
 
 def pictures(diagrams: list[Diagram]) -> dict[str, Figure]:
-    """Draw all figures by name: over speed, over the other parameters (if any), and ranges."""
+    """Draw all figures. Return them by name: over speed, over other parameters (if any), ranges."""
     over_speed = [d for d in diagrams if d.parameter == "speed_rpm"]
     scenes = list(dict.fromkeys(d.scene for d in over_speed))
     columns = [[d for d in over_speed if d.scene == scene] for scene in scenes]

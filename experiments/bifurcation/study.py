@@ -1,9 +1,9 @@
 """Follows the periodic orbits of both rotor pairs over speed, load, backlash and design.
 
-The study starts from rest and from up to five other states at a few values of a parameter. It
-follows every periodic orbit reached over the whole range, stable or not, through folds and period
-doublings (`rootsopt.continuation`). It reports where a stable quiet orbit exists, where a stable
-noisy one, and where both.
+The study simulates from rest and from up to five other states, at a few values of a parameter. It
+follows every periodic orbit found over the whole range of the parameter, stable or not, through
+folds and period doublings (`rootsopt.continuation`). It reports where a stable quiet orbit exists,
+where a stable noisy orbit exists, and where both do.
 """
 
 import dataclasses
@@ -23,28 +23,31 @@ from rootsopt.errors import InputError
 Row = dict[str, Any]
 Say = Callable[[str], None]
 STARTS = ((0.0, 0.0), (-0.2, -1.8), (-1.0, 0.0), (-3.0, 0.0), (0.8, 5.0), (-0.5, -8.0))
-"""Scaled initial states tried at every value of the parameter."""
+"""Scaled initial states (ε, dε/dt) tried at every value of the parameter."""
 LIVELY = ("scene.timing_gear.backlash_mm=0.2", "scene.timing_gear.damping_ratio=0.2")
 SCENES = {"shipped": (), "livelier": LIVELY}
 SLOWEST = {"shipped": 300, "livelier": 3500}
-"""Lowest speed (rpm) studied. Below it the livelier pair bounces so often per mesh period that its
-orbits can hardly be followed."""
+"""Lowest speed (rpm) studied, by pair. At lower speeds the livelier pair bounces so often per mesh
+period that its orbits can hardly be followed."""
 QUIET = 4.0
-"""Peak force, in units of the force that carries the load at the pitch radius, above which an orbit
-is noisy: the flanks hammer."""
+"""Peak force (units of the static force that carries the load at the pitch radius) above which an
+orbit counts as noisy: the flanks hammer."""
 POINTS, FEWEST = 100, 25
-"""Mesh periods in all points of a branch, and the minimum number of points of a branch."""
+"""Sum of the periods (mesh periods) of all points above which a branch ends. The second number is
+the number of points that every branch may have."""
 LONGEST, DOUBLED = 4, 2
-"""Longest orbits (mesh periods) followed: reached by a simulation, and by a period doubling."""
+"""Longest orbits followed (mesh periods): if found by a simulation, and if born at a period
+doubling.
+"""
 CELLS = 570
-"""Number of cells of a range, each searched for quiet and noisy orbits."""
+"""Number of cells into which a parameter's range is divided to find quiet and noisy orbits."""
 
 
 @dataclasses.dataclass
 class Diagram:
     """Branches of one pair in one scene over one parameter.
 
-    `seeds`: (value, status) of the evaluations that searched for orbits.
+    `seeds`: (value of the parameter, status) of each simulation that searched for orbits.
     """
 
     scene: str
@@ -58,9 +61,10 @@ class Diagram:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """A pair in a scene, a parameter and its range.
+    """Plan of a diagram: a pair in a scene, a parameter and its range.
 
-    Also the number of values to start from, and the scaled states tried at each.
+    Further fields: number of parameter values at which simulations start, and scaled initial states
+    tried at each value.
     """
 
     scene: str
@@ -73,7 +77,7 @@ class Plan:
 
 
 def plans(quick: bool) -> list[Plan]:
-    """List the plans of a run."""
+    """Return the plans of all diagrams of a full or reduced run."""
     configs = {
         (scene, family): shipped(family, *overrides)
         for scene, overrides in SCENES.items()
@@ -99,7 +103,7 @@ def run(
     say: Say = lambda text: None,
     keep: Callable[[list[Diagram]], None] = lambda diagrams: None,
 ) -> list[Diagram]:
-    """Explore all plans; call `keep` with all diagrams so far after each."""
+    """Explore all plans. After each plan, call `keep` with all diagrams so far."""
     diagrams: list[Diagram] = []
     for plan in plans(quick):
         diagrams.append(explore(plan, say))
@@ -108,7 +112,7 @@ def run(
 
 
 def explore(plan: Plan, say: Say) -> Diagram:
-    """Follow all orbits that can be reached from the plan's starts."""
+    """Simulate from all starts of a plan, and follow every orbit found. Return the diagram."""
     config, low, high = plan.config, plan.low, plan.high
     diagram = Diagram(plan.scene, config.profile.family, plan.parameter, low, high, [], [])
     for value in np.linspace(low, high, plan.seeds + 2)[1:-1]:
@@ -132,7 +136,9 @@ def explore(plan: Plan, say: Say) -> Diagram:
 
 
 def follow_on(diagram: Diagram, config: Config, state, period: int, forces, say: Say) -> None:
-    """Follow an orbit, and those it doubles to or came from, unless they are known."""
+    """Follow an orbit, and the orbits related to it by period doubling, unless they are known.
+
+    `state` (scaled), `period` and `forces` identify the orbit. Branches are added to `diagram`."""
     value = continuation.value_of(config, diagram.parameter)
     if period > LONGEST or known(diagram, value, period, forces):
         return
@@ -150,7 +156,7 @@ def follow_on(diagram: Diagram, config: Config, state, period: int, forces, say:
         say(described(diagram, branch))
         for special in branch.bifurcations:
             doubling = special.kind is Kind.PERIOD_DOUBLING
-            # A longer orbit born where the simple one was unstable before is unstable too.
+            # If the orbit of single period was unstable before, the doubled orbit is unstable too.
             if 2 * branch.period > DOUBLED or not doubling:
                 continue
             if not any(p.stable for p in beside(branch, special)):
@@ -175,17 +181,17 @@ def follow_on(diagram: Diagram, config: Config, state, period: int, forces, say:
 
 
 def beside(branch: Branch, special) -> tuple:
-    """Return the points of a branch on both sides of a special one."""
+    """Return the two points of a branch on both sides of a `special` point."""
     return branch.points[special.after : special.after + 2]
 
 
 def limits(diagram: Diagram, period: int) -> StepSizes:
-    """Return the range of a branch of this period, and how many points it may have."""
+    """Return range, step sizes and maximum number of points of a branch of this `period`."""
     return StepSizes(diagram.low, diagram.high, points=max(POINTS // period, FEWEST))
 
 
 def known(diagram: Diagram, value: float, period: int, forces) -> bool:
-    """Return whether a branch of the diagram contains this orbit."""
+    """Return whether a branch of the diagram contains the orbit with this `period` and `forces`."""
     return any(
         np.allclose(forces, (point.mean, point.peak), rtol=1e-3)
         for branch in diagram.branches
@@ -195,7 +201,7 @@ def known(diagram: Diagram, value: float, period: int, forces) -> bool:
 
 
 def known_branch(branches: list[Branch], new: Branch) -> bool:
-    """Return whether the middle of a branch lies on another one of the same period."""
+    """Return whether the middle of the `new` branch lies on a known branch of the same period."""
     middle = new.points[len(new.points) // 2]
     return any(
         np.allclose((middle.mean, middle.peak), (point.mean, point.peak), rtol=1e-3)
@@ -217,7 +223,8 @@ def described(diagram: Diagram, branch: Branch) -> str:
 
 
 def ranges(diagram: Diagram) -> dict[str, list[list[float]]]:
-    """Return the ranges with a stable quiet orbit, a stable noisy one, both, and none."""
+    """Return the ranges of the parameter with stable quiet orbits, stable noisy orbits, both,
+    none."""
     edges = np.linspace(diagram.low, diagram.high, CELLS + 1)
     centres = (edges[1:] + edges[:-1]) / 2
     quiet, noisy = np.zeros(CELLS, bool), np.zeros(CELLS, bool)
@@ -235,7 +242,7 @@ def ranges(diagram: Diagram) -> dict[str, list[list[float]]]:
 
 
 def peak_ratio(branch: Branch, point) -> float:
-    """Return the ratio of the peak force to the static one."""
+    """Return the ratio of an orbit's peak force to the static force that carries the load."""
     torque = branch.config.scene.load.torque_N_m
     torque = point.value if branch.parameter == "torque_N_m" else torque
     assert torque is not None  # Scenes here have a constant load.
@@ -243,14 +250,14 @@ def peak_ratio(branch: Branch, point) -> float:
 
 
 def runs(mask: np.ndarray, edges: np.ndarray) -> Iterator[list[float]]:
-    """Yield the ends of every run of true cells."""
+    """Yield both ends of every run of true cells; `edges`: ends of all cells."""
     change = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
     for begin, end in change.reshape(-1, 2):
         yield [float(edges[begin]), float(edges[end])]
 
 
 def overlaps(diagram: Diagram) -> list[list[float]]:
-    """Return the ranges with more than one stable orbit, quiet or noisy."""
+    """Return the ranges of the parameter with more than one stable orbit, quiet or noisy."""
     edges = np.linspace(diagram.low, diagram.high, CELLS + 1)
     centres = (edges[1:] + edges[:-1]) / 2
     count = np.zeros(CELLS, int)
@@ -266,7 +273,7 @@ def overlaps(diagram: Diagram) -> list[list[float]]:
 
 
 def point_rows(diagrams: list[Diagram]) -> list[Row]:
-    """List all points of all branches."""
+    """Return a row for every point of every branch."""
     return [
         {**where, **orbit_row(point)}
         for where, branch in branches_of(diagrams)
@@ -275,7 +282,7 @@ def point_rows(diagrams: list[Diagram]) -> list[Row]:
 
 
 def special_rows(diagrams: list[Diagram]) -> list[Row]:
-    """List all bifurcations and corners."""
+    """Return a row for every bifurcation and corner."""
     return [
         {**where, "kind": special.kind.name.lower(), **orbit_row(special.point)}
         for where, branch in branches_of(diagrams)
@@ -284,7 +291,7 @@ def special_rows(diagrams: list[Diagram]) -> list[Row]:
 
 
 def branches_of(diagrams: list[Diagram]) -> Iterator[tuple[Row, Branch]]:
-    """Yield every branch, with the columns that identify it."""
+    """Yield (columns that identify the branch, branch) for every branch."""
     for diagram in diagrams:
         keys = {name: getattr(diagram, name) for name in ("scene", "family", "parameter")}
         for number, branch in enumerate(diagram.branches):
@@ -292,7 +299,7 @@ def branches_of(diagrams: list[Diagram]) -> Iterator[tuple[Row, Branch]]:
 
 
 def orbit_row(point) -> Row:
-    """List the numbers of an orbit."""
+    """Return the columns of a row that describe an orbit."""
     row = {
         "value": point.value,
         "period": point.period,
@@ -310,7 +317,7 @@ def orbit_row(point) -> Row:
 
 
 def summary(diagrams: list[Diagram], seconds: float) -> dict[str, Any]:
-    """Record the ranges, the branches, and the starts that reached no periodic orbit."""
+    """Return ranges, branches, and the simulations that led to no periodic orbit."""
     return {
         "quiet_up_to_static_forces": QUIET,
         "diagrams": [

@@ -12,7 +12,7 @@ FIGURES = {"chaos.png": "chaos.png"}
 
 
 def body(run: Run) -> int:
-    """Compute, write, print the record."""
+    """Compute, write results, print the record."""
     from experiments._common.tables import print_record
     from experiments.chaos import figures, study
 

@@ -15,7 +15,7 @@ Rows = list[dict]
 
 
 def panels(results: Results) -> Figure:
-    """Draw the four panels."""
+    """Draw the four panels of the figure: averages, derivatives, optimisation, standard errors."""
     figure, axes = sheet(12.5, 9, 2, 2)
     (a, b), (c, d) = axes
     averages(a, results.line)
@@ -28,7 +28,7 @@ def panels(results: Results) -> Figure:
 
 
 def column(rows: Rows, key: str) -> np.ndarray:
-    """Return a column (n,) of rows; NaN where there is no number."""
+    """Return the column `key` (n,) of `rows`, with NaN for entries that are not numbers."""
     return np.array([np.nan if row[key] is None else row[key] for row in rows], float)
 
 

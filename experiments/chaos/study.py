@@ -56,11 +56,11 @@ QUICK = (
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """Sizes of all parts except the optimisation.
+    """Sizes of all parts of the study except the optimisation.
 
-    line: designs along the line; members, window: members and mesh periods of an average; pathwise:
-    mesh periods of the single motion that is differentiated; large: members of the ensemble that is
-    divided into `groups`; slopes: (designs, members) of each gradient.
+    `line`: number of designs along the line; `members`, `window`: members and mesh periods of an
+    average; `pathwise`: mesh periods of the single motion that is differentiated; `large`: members
+    of the ensemble that is divided into `groups`; `slopes`: (designs, members) of each gradient.
     """
 
     line: int
@@ -73,7 +73,9 @@ class Size:
 
 
 def _slopes(designs: int, members: int, count: int) -> tuple[tuple[int, int], ...]:
-    """List (designs, members): first more members, then more designs, doubling each time."""
+    """List sizes (designs, members) of gradients, starting from the given size.
+
+    First come `count` sizes with doubling members, then `count` - 1 with doubling designs."""
     more = [(designs, members * 2**k) for k in range(count)]
     return (*more, *((designs * 2**k, members) for k in range(1, count)))
 
@@ -85,14 +87,15 @@ SIZES = {
 
 
 def resized(config: Config, model: Scene, **changes) -> EnsembleEvaluator:
-    """Make an evaluator without gradients for an ensemble of another size."""
+    """Make an evaluator without gradients, with `changes` to the config's `ensemble` section."""
     ensemble = config.ensemble.model_copy(update=changes)
     single = Evaluator(config.model_copy(update={"ensemble": ensemble}), model, fitted=True)
     return EnsembleEvaluator(single.surveying(), differentiate=False)
 
 
 def line(config: Config, model: Scene, designs: np.ndarray, size: Size) -> list[dict]:
-    """Average along a line of designs (n, d): the motion from rest, and an ensemble."""
+    """Average the force along a line of designs (n, d), over the motion from rest and an
+    ensemble."""
     evaluator = resized(config, model, members=size.members, periods=size.window)
     settle = config.ensemble.settle_periods
     rest = np.zeros((1, 2))
@@ -116,7 +119,7 @@ _pair = Program(Scene.pair)
 def _pathwise(model: Scene, design, periods, how):
     """Differentiate the mean force with respect to the design, along the motion from rest.
 
-    Returns (periods, d): the k-th mean covers the time from the start to the end of period k.
+    Returns derivatives (periods, d): row k is for the mean over all mesh periods up to the k-th.
     """
     pair, tangents, _ = model.pair_and_tangents(design)
 
@@ -133,7 +136,8 @@ def _pathwise(model: Scene, design, periods, how):
 
 
 def pathwise(evaluator: EnsembleEvaluator, design, size: Size) -> list[dict]:
-    """Measure how the single motion's derivative grows with the window."""
+    """Measure how the derivative of a single motion's mean force grows with the averaging
+    window."""
     slopes = np.asarray(
         _pathwise(evaluator.scene, jnp.asarray(design), size.pathwise, evaluator.integrator)
     )
@@ -146,7 +150,7 @@ def pathwise(evaluator: EnsembleEvaluator, design, size: Size) -> list[dict]:
 def errors_by_members(config: Config, model: Scene, design, size: Size) -> list[dict]:
     """Compare the stated standard error of the mean force with the scatter of independent groups.
 
-    The groups come from one large ensemble; the scatter has its own standard error.
+    The groups are parts of one large ensemble. The standard error of the scatter is listed too.
     """
     evaluator = resized(config, model, members=size.large)
     design = jnp.asarray(design)
@@ -174,7 +178,7 @@ def errors_by_members(config: Config, model: Scene, design, size: Size) -> list[
 def gradients(config: Config, model: Scene, design, size: Size) -> list[dict]:
     """Estimate the slope of the mean force over the pressure angle, with its standard error.
 
-    Compare more members with more designs.
+    Returns a row for each size in `size.slopes`: more members, or more designs.
     """
     rows = []
     for designs, members in size.slopes:
@@ -195,7 +199,9 @@ def gradients(config: Config, model: Scene, design, size: Size) -> list[dict]:
 
 
 def summary(problem: Problem, result: Optimization) -> dict[str, Any]:
-    """Record baseline and optimum by the verifying ensemble, and the significance of the gain."""
+    """Return a record of baseline and optimum, evaluated by the verifying ensemble.
+
+    The record includes the significance of the gain."""
     found: dict[str, Any] = {"verification": result.verification}
     for name, one in (("baseline", result.baseline), ("optimized", result.optimized)):
         if one is not None:
@@ -249,7 +255,7 @@ class Results:
 def run(quick: bool, say: Callable[[str], None] = lambda text: None) -> Results:
     """Optimise, then study the baseline and the line of designs to the optimum.
 
-    Raises `NoResultError` where the baseline has no average.
+    Raises `NoResultError` if the baseline has no average.
     """
     seconds: dict[str, float] = {}
 
@@ -283,9 +289,9 @@ def run(quick: bool, say: Callable[[str], None] = lambda text: None) -> Results:
 
 
 def designs_between(problem: Problem, result: Optimization, count: int) -> np.ndarray:
-    """Lay a line of designs (count, d) from the baseline to the optimum.
+    """Return designs (count, d) on a line from the baseline to the optimum.
 
-    Without a significant optimum (as in a reduced run) the line leads to the last design.
+    Without a significant optimum (as in a reduced run) the line ends at the last design.
     """
     first = problem.point(list(result.baseline.design.values()))
     end = list((result.optimized or result.baseline).design.values())

@@ -1,4 +1,4 @@
-"""Where do solvers and precisions hold, up to the limits of every key?
+"""Where do solvers and precisions give valid results, up to the limits of every config key?
 
 Writes extremes.csv (a row per scene, updated after every stage), extremes.json (counts and worst
 deviations) and extremes.png. The exit code is 3 if a promise is broken.
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 FIGURES = {"extremes.png": "extremes.png"}
 PROMISES = ("unnamed", "not_finite", "beyond_allowed")
-"""Counts that must be 0."""
+"""Entries of the record that count broken promises: all must be 0."""
 
 
 def body(run: Run) -> int:
-    """Check all scenes, write, print the counts of each kind."""
+    """Check all scenes, write results, print the counts of each kind."""
     from experiments._common.tables import print_record
     from experiments.extremes import figures, study
 
@@ -37,7 +37,7 @@ def body(run: Run) -> int:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the number of threads."""
+    """Add the option for the number of threads."""
     parser.add_argument(
         "--jobs", type=int, default=2, help="scenes simulated in parallel (default: 2)"
     )

@@ -1,4 +1,5 @@
-"""Checks of every scene: finite numbers, a named status, the reference, the public path."""
+"""Checks of each scene: finite numbers, named status, deviation from a reference, public
+functions."""
 
 import dataclasses
 import functools
@@ -32,11 +33,11 @@ HORIZON = 24
 STEPS = 1024
 """Maximum number of solver steps in a mesh period."""
 ALLOWED = 100.0
-"""Deviation of a force (in tolerances, relative to the larger of the true and the static force)
-above which a promise is broken. In single precision five roundings of the gap are added."""
+"""Deviation of a force (tolerances, relative to the larger of true and static force) above which a
+promise is broken. In single precision, five rounding errors of the gap are added to the limit."""
 CORNER = 1e-9
-"""Tolerance below which the limit stays that of this tolerance. A peak on a corner of the force is
-known to some 1e-8 only (docs/accuracy.md)."""
+"""Tolerance below which the limit on the deviation no longer falls. A peak on a corner of the force
+is known only to about 1e-8 (docs/accuracy.md)."""
 SINGLE = 2.4e-6
 """Finest tolerance possible in single precision."""
 SHARP = "dopri8", 1e-12, 20_000
@@ -44,7 +45,7 @@ SHARP = "dopri8", 1e-12, 20_000
 FEW = 50
 """Contact oscillations per mesh period above which SciPy (explicit, in Python) is not used."""
 PATIENCE = 24
-"""Mesh periods of plain motion if Newton's method does not close a reference."""
+"""Length (mesh periods) of the plain integration if Newton's method does not close a reference."""
 DEPTHS = np.concatenate([[-1e-3, 0.0], np.geomspace(1e-36, 1e-2, 39)])
 RATES = np.concatenate([-np.geomspace(1e-9, 1e3, 7), [0.0], np.geomspace(1e-9, 1e3, 4)])
 POSES = 4
@@ -53,7 +54,7 @@ POSES = 4
 
 @dataclasses.dataclass
 class Case:
-    """A scene, its row of the table, and the scaled state of its orbit, once known."""
+    """A scene, its row in the table, and the scaled state of its orbit if known."""
 
     kind: Kind
     config: Config
@@ -99,7 +100,7 @@ def _equation_values(models: Scene, designs, poses):
 
 
 def law(cases: list[Case]) -> dict[str, Any]:
-    """Count the values of the law that are not finite, or negative, over all scenes."""
+    """Count the values of the contact laws that are not finite or negative, over all scenes."""
     laws = [jax.tree.map(np.asarray, Scene.from_config(case.config).law) for case in cases]
     laws = jax.tree.map(lambda *leaves: np.stack(leaves), *laws)
     found: dict[str, Any] = {}
@@ -117,8 +118,8 @@ def law(cases: list[Case]) -> dict[str, Any]:
 def equation(cases: list[Case], seed: int) -> dict[str, Any]:
     """Count non-finite values of the equation of motion and of its derivatives.
 
-    Derivatives are with respect to state and design. Times are random. States lie some static
-    depths and plays to either side, at any speed.
+    Derivatives are with respect to state and design. Times and states are random; ε reaches 30 of
+    the solver's units (play and static penetration together) on either side.
     """
     draw = np.random.default_rng(seed)
     found: dict[str, Any] = {}
@@ -157,7 +158,7 @@ def _simulate(model: Scene, design, tolerances, method: str):
     out = respond(model, design, jnp.zeros(pair.states), solver)
     assert pair.timescales is not None
     swings = pair.mesh_period / (2 * jnp.pi * pair.timescales.swing)
-    # Share of the static penetration that rounding loses.
+    # Rounding error of the gap, as a fraction of the static penetration.
     rounding = jnp.finfo(pair.angle_scale.dtype).eps * model.pitch_radius
     return out, swings, rounding / pair.law.depth_at(pair.force_scale), pair.force_scale
 
@@ -215,7 +216,8 @@ def _sharp(model: Scene, design, state, period):
 
 @Program
 def _patient(model: Scene, design, state, period):
-    """Integrate without Newton's method; return the last round and the state it starts from."""
+    """Integrate without Newton's method. Return the last period of the motion and its start
+    state."""
     method, rtol, steps = SHARP
     pair = model.pair(design)
     how = Integrator(method, jnp.asarray(100 * rtol), steps)
@@ -232,7 +234,8 @@ def _rates(pair, tau, state):
 
 
 def refine(case: Case) -> None:
-    """Measure how far a periodic result is from the orbit that the sharp settings find nearby."""
+    """Measure how far a periodic result deviates from the nearby orbit found with `SHARP`
+    settings."""
     model = dataclasses.replace(Scene.from_config(case.config), precision="float64")
     design = np.asarray(design_vector(case.config))
     period = np.asarray(case.row["period"])
@@ -269,9 +272,9 @@ def refine(case: Case) -> None:
 
 
 def by_scipy(case: Case) -> None:
-    """Follow the orbit (that of the reference, if there is one) with SciPy.
+    """Integrate one period of the orbit (of the reference, if there is one) with SciPy.
 
-    Measures the distance from start to end, and the mean force.
+    Writes the distance between start and end, and the mean force, into the row.
     """
     model = dataclasses.replace(Scene.from_config(case.config), precision="float64")
     pair = pair_of_model(model, design_vector(case.config))
@@ -297,7 +300,7 @@ def by_scipy(case: Case) -> None:
 
 
 def evaluate(case: Case, evaluator: Evaluator) -> None:
-    """Simulate a scene as the commands do."""
+    """Evaluate a scene as the commands do, and add the result to the row of `case`."""
     began = time.perf_counter()
     evaluation = evaluator(series=False)
     record = evaluation.record()
@@ -313,7 +316,7 @@ def evaluate(case: Case, evaluator: Evaluator) -> None:
 
 
 def evaluator_of(config: Config, horizon: int) -> Evaluator:
-    """Make an evaluator of a config with a transient of at most `horizon` mesh periods."""
+    """Make the evaluator of a config, with a transient of at most `horizon` mesh periods."""
     changes = {"max_mesh_periods": horizon, "max_steps_per_period": STEPS}
     solver = config.solver.model_copy(update=changes)
     return make_evaluator(config.model_copy(update={"solver": solver}))

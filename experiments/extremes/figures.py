@@ -1,4 +1,4 @@
-"""Figures of the extremes: outcome over stiffness and speed, deviation over tolerance."""
+"""Figure of the outcomes over contact oscillations, and of the deviations over tolerance."""
 
 from collections import Counter
 from typing import Any
@@ -34,13 +34,13 @@ COLOURS = {
     "non_finite": BLACK,
 }
 MOST = 7
-"""Number of solvers shown, those with most scenes first."""
+"""Maximum number of solvers shown; those with most scenes come first."""
 _EDGES = np.logspace(-2, 8, 11)
 MARKS = "os^vD<>"
 
 
 def solver_of(row: Row) -> tuple[str, str, str]:
-    """Return contact, method and precision of a scene."""
+    """Return (contact, method, precision) of the scene in a `row`."""
     return row["fidelity"], row["method"], row["precision"]
 
 
@@ -73,7 +73,10 @@ def atlas(rows: list[Row]) -> Figure:
 
 
 def outcomes(ax: Axes, group: tuple[str, str, str], mine: list[Row], present: list[str]) -> None:
-    """Draw the share of each outcome over the contact oscillations in a mesh period."""
+    """Draw the share of each outcome over the number of contact oscillations in a mesh period.
+
+    `group`: solver, as (contact, method, precision); `mine`: rows of this solver; `present`:
+    outcomes to draw."""
     bins = len(_EDGES) - 1
     swings = np.clip([row["swings"] for row in mine], _EDGES[0], _EDGES[-1] * 0.999)
     place = np.digitize(swings, _EDGES) - 1
@@ -97,7 +100,8 @@ def outcomes(ax: Axes, group: tuple[str, str, str], mine: list[Row], present: li
 
 
 def deviations(ax: Axes, groups: list[tuple[str, str, str]], judged: list[Row]) -> None:
-    """Draw the deviation from the reference over the tolerance, with the limit."""
+    """Draw the deviation from the reference over the tolerance by solver, with the allowed
+    limit."""
     finest = {"float64": 0.0, "float32": SINGLE}
     for mark, colour, group in zip(MARKS, COLORS, groups, strict=False):
         mine = [row for row in judged if solver_of(row) == group]

@@ -1,7 +1,7 @@
-"""Scenes at and between the limits of a config, as a cloud and as a grid.
+"""Scenes at and between the limits of a config, as a random cloud and as a grid.
 
-All numbers are drawn at random. A `Kind` holds what determines the compiled program (family, lobes,
-gear, contact, solver, precision), so all scenes of a kind share one program.
+A `Kind` holds everything that determines the compiled program: family, lobes, gear, contact,
+solver, precision. All scenes of a kind therefore share one program.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ SPANS: dict[str, tuple[float, float]] = {
     "solver.rtol": (1e-12, 1e-2),
     "solver.transient_rtol": (1e-12, 1e-2),
 }
-"""Ranges of the draw, uniform in the logarithm."""
+"""Ranges of the random values by config key, uniform in the logarithm."""
 PUMP_SPANS: dict[str, tuple[float, float]] = {
     "scene.load.pressure_difference_Pa": (1.0, 1e7),
     "scene.motor.slope_N_m_s_per_rad": (1e-3, 10.0),
@@ -42,9 +42,10 @@ PUMP_SPANS: dict[str, tuple[float, float]] = {
     "contact.friction.stiction_speed_mm_s": (1.0, 1e4),
     "contact.clearance_mm": (1e-4, 0.1),
 }
-"""Ranges for the parts of a scene with everything, which replace its constant load."""
+"""Ranges by config key for scenes of the kind `pump`: gas load and motor replace the constant load.
+"""
 SIGNED = {"scene.center_distance_error_mm": 1.0, "scene.phase_error_mrad": 100.0}
-"""Largest assembly errors (config units), to either side; drawn over four decades."""
+"""Largest assembly errors by config key, of either sign; drawn over four decades."""
 EXPONENT = 1.0, 3.0
 MAY_VANISH = (
     "contact.max_damping_N_s_per_mm",
@@ -65,14 +66,15 @@ GRID: dict[str, tuple[float, ...]] = {
     "scene.timing_gear.backlash_mm": (0.0, 0.03, 1.0),
     "contact.full_damping_depth_mm": (1e-5, 1e-2, 1.0),
 }
-"""Corners and middle of the ranges; everything else as in the shipped CIC scene."""
+"""Values of the grid by config key: ends and middle of the ranges. All other values are those of
+the shipped CIC scene."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """Common properties of the scenes of one compiled program.
+    """Properties that all scenes of one compiled program share.
 
-    `scene` is plain (flanks alone), gear, or pump (all parts of a scene).
+    `scene`: `plain` (flanks alone), `gear`, or `pump` (all parts).
     """
 
     method: str = "tsit5"
@@ -84,7 +86,7 @@ class Kind:
 
     @property
     def label(self) -> str:
-        """Return the name in tables."""
+        """Name of the kind in tables."""
         scene = "" if self.scene == "gear" else f", {self.scene}"
         return (
             f"{self.family} {self.lobes}, {self.fidelity}, {self.method}, {self.precision}{scene}"
@@ -92,7 +94,7 @@ class Kind:
 
     @property
     def states(self) -> int:
-        """Return the number of states of the equation of motion."""
+        """Number of states of the equation of motion."""
         return 11 if self.scene == "pump" else 2
 
 
@@ -106,7 +108,7 @@ def _base(kind: Kind) -> Config:
 
 
 def config_of(kind: Kind, values: dict[str, float]) -> Config:
-    """Put `values`, by dotted key, into the shipped config of the kind."""
+    """Return the shipped config of a kind with `values`, by dotted key."""
     data = _base(kind).model_dump()
     fixed = {
         "profile.lobes": kind.lobes,
@@ -128,7 +130,9 @@ def config_of(kind: Kind, values: dict[str, float]) -> Config:
 
 
 def _design(draw: np.random.Generator, lobes: int, radius: float) -> dict[str, float]:
-    """Draw pressure angle, u and tip arc; a fifth of the draws of each is on a limit."""
+    """Draw pressure angle, involute length u and tip arc; a fifth of each lies on a limit.
+
+    `radius`: pitch radius (mm). Returns values by config key."""
     half = 90 / lobes
     while True:
         angle = draw.choice([1.0, 89.0]) if draw.uniform() < 0.2 else draw.uniform(1, 89)
@@ -150,7 +154,9 @@ def _design(draw: np.random.Generator, lobes: int, radius: float) -> dict[str, f
 
 
 def _assembly(draw: np.random.Generator, values: dict[str, float]) -> dict[str, float]:
-    """Draw assembly errors, and the friction that follows from other `values`."""
+    """Draw assembly errors and friction. Returns values by config key.
+
+    Friction depends on other `values` of the scene."""
     kinetic = values["contact.friction.kinetic"]
     stiction = values["contact.friction.stiction_speed_mm_s"]
     found = {
@@ -164,7 +170,8 @@ def _assembly(draw: np.random.Generator, values: dict[str, float]) -> dict[str, 
 
 
 def cloud(kind: Kind, count: int, seed: int) -> Iterator[Config]:
-    """Yield `count` random scenes of a kind; a tenth of the values that may be 0 are 0."""
+    """Yield `count` random scenes of a kind. Values that may be 0 are 0 in a tenth of the
+    scenes."""
     draw = np.random.default_rng([seed, *kind.label.encode()])
     radius = _base(kind).profile.pitch_radius_mm
     spans = SPANS
@@ -192,13 +199,13 @@ def cloud(kind: Kind, count: int, seed: int) -> Iterator[Config]:
 
 
 def grid(kind: Kind) -> Iterator[Config]:
-    """Yield every combination of `GRID`."""
+    """Yield the scenes of a kind for every combination of the values in `GRID`."""
     for values in itertools.product(*GRID.values()):
         yield config_of(kind, dict(zip(GRID, values, strict=True)))
 
 
 def row_of(config: Config) -> dict[str, float]:
-    """List the numbers of a scene by dotted key."""
+    """Return the numbers of a scene by dotted config key."""
     data: Any = config.model_dump()
     keys = [
         *SPANS,

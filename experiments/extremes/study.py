@@ -1,8 +1,9 @@
-"""Tests where solvers and precisions hold: scenes at and between the limits of every key.
+"""Tests where solvers and precisions are valid: scenes at and between the limits of every config
+key.
 
-1. Law: force and derivatives of every scene's contact law must be finite in either precision, from
-   no penetration to far beyond any. So must the equation of motion and its derivatives with respect
-   to state and design.
+1. Law: force and derivatives of every scene's contact law must be finite in both precisions, at all
+   penetrations from zero to far beyond the largest possible. The equation of motion and its
+   derivatives with respect to state and design must be finite too.
 2. Motion: every scene is simulated from rest and must end in a finite result or a named status.
 3. Truth: a sample of the periodic results is closed again from the same state by dopri8 at 1e-12 in
    double precision, and by SciPy's DOP853 along that orbit. The relative deviation of mean and peak
@@ -32,12 +33,12 @@ Keep = Callable[[list[Case]], None]
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """Number of scenes.
+    """Numbers of scenes.
 
-    kinds: each with its number of random scenes; gridded: whether the grid is added; references,
-    scipy, evaluated: scenes of each kind that go to the reference (a third where that needs its own
-    program), to SciPy, and through the evaluator; long: how many of the last have the long
-    `horizon` (mesh periods).
+    `kinds`: each kind with its number of random scenes; `gridded`: whether the grid is added;
+    `references`, `scipy`, `evaluated`: number of scenes of each kind that go to the reference (a
+    third where the reference needs its own program), to SciPy, and through the evaluator; `long`:
+    number of evaluated scenes with the long transient `horizon` (mesh periods).
     """
 
     kinds: tuple[tuple[Kind, int], ...]
@@ -104,7 +105,8 @@ def run(
     say: Say = lambda text: None,
     keep: Keep = lambda cases: None,
 ) -> Results:
-    """Draw and check all scenes, `jobs` at a time; call `keep` with them after every stage."""
+    """Draw and check all scenes, `jobs` at a time; call `keep` with all scenes after every
+    stage."""
     size = QUICK if quick else FULL
     cases = drawn(size)
     say(f"{len(cases)} scenes")
@@ -119,7 +121,7 @@ def run(
                     say(f"{what}: {done} of {len(chosen)}")
         say(f"{what}: {len(chosen)} in {time.perf_counter() - began:.0f} s")
 
-    # The next kind's program compiles while scenes of this one are simulated.
+    # The program of the next kind compiles while scenes of this kind are simulated.
     first = [next(case for case in cases if case.kind == kind) for kind, _ in size.kinds]
     for number, (kind, _) in enumerate(size.kinds):
         for case in first[number : number + 2]:
@@ -154,7 +156,7 @@ def drawn(size: Size) -> list[Case]:
 
 
 def samples(size: Size, cases: list[Case]) -> tuple[list[Case], list[Case]]:
-    """Choose the periodic scenes that go to the reference, and those that go to SciPy."""
+    """Choose periodic scenes. Return the scenes for the reference, and the scenes for SciPy."""
     picked: list[Case] = []
     compared: list[Case] = []
     for kind, _ in size.kinds:
@@ -172,7 +174,7 @@ def samples(size: Size, cases: list[Case]) -> tuple[list[Case], list[Case]]:
 
 
 def summary(results: Results) -> dict[str, Any]:
-    """Count each status, find the worst deviations, and count what broke a promise."""
+    """Return counts of each status, the worst deviations, and counts of broken promises."""
     rows, checks = results.rows, results.checks
     kinds = dict.fromkeys(row["kind"] for row in rows)
     judged = [row for row in rows if row.get("reference") == "closed"]

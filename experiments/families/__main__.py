@@ -17,7 +17,7 @@ LONG = ("design", "outline_mm", "config")
 
 
 def body(run: Run) -> int:
-    """Study all families or read an earlier run, write, print the tables."""
+    """Study all families, or read an earlier run; write results and print the tables."""
     from experiments.families import figures, study, tables
 
     options = run.options
@@ -38,7 +38,7 @@ def body(run: Run) -> int:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add options for references, families, processes, and an earlier run."""
+    """Add options for reference configs, families, number of processes, and an earlier run."""
     parser.add_argument(
         "configs",
         nargs="*",

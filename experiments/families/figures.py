@@ -14,7 +14,7 @@ _COLUMNS = 4
 
 
 def ranking_figure(data: dict[str, Any]) -> Figure:
-    """Draw the forces of each family relative to the reference's, one panel per housing."""
+    """Draw the forces of each family relative to the reference's forces, one panel per housing."""
     studies = by_study(data)
     longest = max(len(rows) for rows in studies.values())
     made, axes = sheet(6.2 * len(studies), 2.0 + 0.34 * longest, 1, len(studies))
@@ -56,7 +56,7 @@ def _panel_name(row: Row) -> str:
 
 
 def profiles_figure(data: dict[str, Any]) -> Figure:
-    """Draw each optimised flank over the best of its housing."""
+    """Draw each optimised flank together with the best flank for the same housing."""
     studies = by_study(data)
     heights = [-(-len(rows) // _COLUMNS) for rows in studies.values()]
     made, axes = sheet(3.0 * _COLUMNS, 2.15 * sum(heights) + 0.4, sum(heights), _COLUMNS)

@@ -1,4 +1,9 @@
-"""Finds what a family can reach inside a housing, from geometry alone: designs, area efficiency."""
+"""Finds the feasible designs of a profile family in a housing, and the range of their area
+efficiency.
+
+The *reach* of a family is a set of feasible designs, including those with the least and the
+greatest area efficiency. Only geometry is computed, no motion.
+"""
 
 from typing import Any, NamedTuple, cast
 
@@ -16,27 +21,28 @@ from rootsopt.profiles import geometry
 from rootsopt.scene import Scene, design_keys
 
 BAND_MM = 1e-3
-"""Clearance (mm) up to which an outer radius fills the bore."""
+"""Clearance (mm) between tip and bore above which a rotor does not fill the bore."""
 SAMPLE = 256
 """Number of points of a family's unit box from which starting designs are chosen."""
 STARTS = 4
 _LEAST_SHARE = 1e-3
-"""Smallest value of a parameter that must not be 0, as a share of its bound."""
+"""Smallest value (fraction of the upper bound) of a parameter that must not be 0."""
 _CLOSE = 1e-7
-"""Margin of the constraints in the search for the extremes of area efficiency."""
+"""Margin by which constraints must hold in the search for the extremes of area efficiency."""
 
 
 class Reach(NamedTuple):
-    """Feasible points (n, d) of a family's unit box and their area efficiencies (n,), best last."""
+    """Feasible designs of a family: points (n, d) of its unit box, and area efficiencies (n,), best
+    last."""
 
     points: NDArray[np.float64]
     efficiencies: NDArray[np.float64]
 
 
 def of_family(reference: Config, family: str) -> Config:
-    """Put a profile of a classical `family` of the same pitch radius into a reference's scene.
+    """Return the reference config with a profile of a classical `family` and the same pitch radius.
 
-    Its parameters are in the middle of their usual bounds.
+    The parameters of the profile are in the middle of their usual bounds.
     """
     size = reference.profile.pitch_radius_mm, reference.profile.lobes
     bounds: dict[str, Any] = {}
@@ -54,7 +60,7 @@ def of_family(reference: Config, family: str) -> Config:
 
 
 def changed(config: Config, **sections: dict[str, Any]) -> Config:
-    """Change values in some `sections` of a config; a profile is replaced completely."""
+    """Return `config` with other values in some `sections`; the profile is replaced completely."""
     data = config.model_dump()
     for section, values in sections.items():
         data[section] = values if section == "profile" else data[section] | values
@@ -62,7 +68,9 @@ def changed(config: Config, **sections: dict[str, Any]) -> Config:
 
 
 def in_housing(config: Config, bore_radius_mm: float, area_efficiency: float) -> Config:
-    """Require rotors that fill a bore of this radius and have at least this area efficiency."""
+    """Return `config` with the constraints of a housing.
+
+    The rotors must fill the bore, and have at least the given area efficiency."""
     return changed(
         config,
         constraints={
@@ -76,15 +84,16 @@ def in_housing(config: Config, bore_radius_mm: float, area_efficiency: float) ->
 
 
 def problem_of(config: Config) -> Problem:
-    """Return the geometric part of a design problem: constraints, without a baseline."""
+    """Return the design problem of a config for geometry alone, without an evaluated baseline."""
     return Problem(config, cast(Any, None), Space.of(config, Scene.from_config(config), 0.0))
 
 
 def reach(config: Config, sample: int = SAMPLE) -> Reach | None:
-    """Find valid designs of a family in the housing of a config, without a limit on efficiency.
+    """Find feasible designs of a family in the housing of a config, at any area efficiency.
 
-    They come from a Sobol sample projected onto the constraints. From there, a search follows the
-    area efficiency up and down to its maximum and minimum. `None` if the family does not fit.
+    `sample` points of a Sobol sequence are projected onto the constraints. From these designs, a
+    search finds the maximum and minimum area efficiency. The result is `None` if the family does
+    not fit into the housing.
     """
     size = len(design_keys(config))
     if size == 0:
@@ -104,7 +113,7 @@ def reach(config: Config, sample: int = SAMPLE) -> Reach | None:
 
 
 def _only(config: Config) -> Reach | None:
-    """Find the reach of a family without design parameters."""
+    """Return the reach of a family without design parameters, or `None` if it does not fit."""
     shape = geometry(profile_of(config))
     limits = config.constraints
     low, high = limits.outer_radius_min_mm, limits.outer_radius_max_mm
@@ -116,7 +125,7 @@ def _only(config: Config) -> Reach | None:
 
 
 def _efficiency(problem: Problem, point) -> float:
-    """Return the area efficiency at a point of the box, -inf where it is NaN."""
+    """Return the area efficiency at a point (d,) of the unit box, -inf if it is NaN."""
     first = problem.space.constraints[0]
     assert first.quantity == "area_efficiency"
     value = float(problem.look(point)[2][0]) * first.scale + float(first.limit)
@@ -124,7 +133,8 @@ def _efficiency(problem: Problem, point) -> float:
 
 
 def _extreme(problem: Problem, start, sign: float) -> NDArray[np.float64]:
-    """Find the maximum (`sign` 1) or minimum (-1) area efficiency near `start`."""
+    """Return the point with maximum (`sign` 1) or minimum (-1) area efficiency near `start`
+    (d,)."""
 
     def goal(point):
         return -sign * problem.look(point)[2][0], -sign * problem.look(point)[3][0]

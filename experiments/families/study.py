@@ -1,11 +1,11 @@
-"""Puts every profile family into the same housings, and optimises each there.
+"""Puts every profile family into the same housings, and optimises each family there.
 
-Every given config is a reference: its pitch radius, its outer radius (the bore of the housing) and
-its area efficiency. Each classical family gets the pitch radius and the outer radius of the
-reference. It also gets at least its area efficiency, or the maximum the family can reach. The other
-parameters are optimised in the config's scene. The objective is the average of mean and peak force,
-each relative to the reference's. The free form starts from the best family. The optimised designs
-are then simulated in further scenes.
+Every given config is a reference, which sets pitch radius, outer radius (the bore of the housing)
+and area efficiency. Each classical family gets the pitch radius and the outer radius of the
+reference. Its area efficiency must be at least that of the reference, or the family's maximum if
+that is less. The other parameters are optimised in the config's scene. The objective is the average
+of mean and peak force, each relative to the reference's. The free form starts from the best family.
+The optimised designs are then simulated in further scenes.
 """
 
 import functools
@@ -39,7 +39,8 @@ REFERENCES = ("configs/ee.yaml", "configs/cic.yaml")
 EQUAL = 5e-5
 """Difference of area efficiency below which two values count as equal."""
 TRIED = 6
-"""Number of designs of different area efficiency; a search starts from the best of them."""
+"""Number of designs of different area efficiency that are simulated to find the start of a
+search."""
 COEFFICIENTS = 12
 """Number of coefficients of the free form."""
 SCENES: dict[str, dict[str, Any]] = {
@@ -47,19 +48,20 @@ SCENES: dict[str, dict[str, Any]] = {
     "6000 rpm": {"speed_rpm": 6000.0},
     "20 N m": {"load": {"torque_N_m": 20.0}},
 }
-"""Further scenes, as changes of the scene of the optimisation."""
+"""Further scenes by name, as changes of the section `scene` of the optimisation."""
 SEARCH = {"screening": 24, "starts": 4, "iterations": 40, "learning_rate": 0.06}
 SEARCH_FREE = {"screening": 0, "starts": 1, "iterations": 100, "learning_rate": 0.005}
 QUICK = ("cic", "arc")
-"""Families of a reduced run, with linear contact."""
+"""Families of a reduced run, which uses linear contact."""
 COARSE = {"fidelity": "map", "map_rolls": 192, "map_relatives": 12}
-"""Contact of the free form in a reduced run: with `linear`, its motion does not settle."""
+"""Settings for the contact of the free form in a reduced run. With `linear` contact, the motion of
+a free form does not settle."""
 
 
 def curvature(profile: Profile) -> dict[str, float]:
-    """Find the smallest radii of curvature (mm): of the addendum, and of two flanks in contact.
+    """Return the smallest radii of curvature (mm), by name: of the addendum, and of the contact.
 
-    The second is 1 / (1/ρ1 + 1/ρ2). Both are 0 at a cusp.
+    The radius of the contact of two flanks is 1 / (1/ρ1 + 1/ρ2). Both radii are 0 at a cusp.
     """
     addendum, relative = np.inf, np.inf
     for one in profile.segments():
@@ -81,9 +83,10 @@ def curvature(profile: Profile) -> dict[str, float]:
 
 
 def weighed(config: Config, response: dict[str, float], reference: dict[str, float]) -> Config:
-    """Weigh the forces so that the search minimises the average of both relative to `reference`.
+    """Set the weights of mean and peak force, so that the search minimises the wanted objective.
 
-    The search itself divides them by its baseline's `response`.
+    The objective is the average of both forces relative to `reference`. The search itself divides
+    the forces by its baseline's `response`, so the weights must differ.
     """
     shares = {key.split("_")[0]: response[key] / reference[key] for key in FORCES}
     total = sum(shares.values())
@@ -93,7 +96,8 @@ def weighed(config: Config, response: dict[str, float], reference: dict[str, flo
 
 
 def optimised(config: Config, reference: dict[str, float]) -> tuple[Config, int]:
-    """Optimise from the design of a config; return the best one and the number simulated."""
+    """Optimise from the design of a config. Return the config with the best design, and the number
+    of designs simulated."""
     start = evaluate(config)
     if not start.usable:
         return config, 1
@@ -105,17 +109,17 @@ def optimised(config: Config, reference: dict[str, float]) -> tuple[Config, int]
 
 
 def with_values(config: Config, design: ArrayLike) -> Config:
-    """Put another design into a config."""
+    """Return `config` with another `design` (d,), in config units."""
     return config.model_copy(update={"profile": with_design(config.profile, design)})
 
 
 def placed(
     base: Config, found: Reach, reference: Evaluation, quick: bool
 ) -> tuple[Config, bool, int]:
-    """Choose the start of a search among some designs of different area efficiency.
+    """Choose the start of a search among designs of different area efficiency, by simulation.
 
-    Returns the config with its limit of area efficiency, whether the family reaches the required
-    efficiency, and how many designs were simulated.
+    Returns the config of the start with its limit of area efficiency, whether the family reaches
+    the reference's efficiency, and the number of designs simulated.
     """
     bore, floor = (reference.geometry[key] for key in ("outer_radius_mm", "area_efficiency"))
     reached = found.efficiencies[-1] >= floor - EQUAL
@@ -134,7 +138,7 @@ def placed(
 
 
 def row_of(study: str, config: Config, reference: dict[str, float]) -> dict[str, Any]:
-    """List all numbers of one design."""
+    """Return a row with all numbers of one design; `study`: name of the housing."""
     check_geometry(config)
     profile = profile_of(config)
     here = evaluate(config)
@@ -162,13 +166,15 @@ def row_of(study: str, config: Config, reference: dict[str, float]) -> dict[str,
 
 @functools.cache
 def reference_of(path: str, quick: bool) -> tuple[Config, Evaluation]:
-    """Load and simulate a reference."""
+    """Load and simulate a reference config. Return config and evaluation."""
     config = load(path, ["solver.fidelity=linear"] if quick else [])
     return config, evaluate(config)
 
 
 def one_family(path: str, family: str, quick: bool) -> dict[str, Any] | None:
-    """Find a family's best design in the housing of a reference; `None` where it does not fit."""
+    """Return the row of a family's best design in the housing of the reference at `path`.
+
+    The result is `None` if the family does not fit."""
     began = time.perf_counter()
     reference, base = reference_of(path, quick)
     config = in_housing(of_family(reference, family), base.geometry["outer_radius_mm"], 0.0)
@@ -191,7 +197,7 @@ def one_family(path: str, family: str, quick: bool) -> dict[str, Any] | None:
 
 
 def free_form(path: str, best: dict[str, Any], quick: bool) -> dict[str, Any]:
-    """Optimise the free form that starts from the `best` of the families."""
+    """Optimise a free form, starting from the row `best` of the best family. Return its row."""
     began = time.perf_counter()
     _, base = reference_of(path, quick)
     config = parse(best["config"])
@@ -227,8 +233,9 @@ def run(
 ) -> dict[str, Any]:
     """Study all families in all housings, `jobs` at a time in their own processes.
 
-    `families`: by default the classical ones. Returns the records of the references, and a row per
-    design; the free forms come last. A reduced run takes the last housing and the families `QUICK`.
+    `paths`: reference configs; `families`: by default all classical families. Returns the records
+    of the references, and a row per design, with free forms last. A reduced run takes the last
+    housing and the families `QUICK`.
     """
     paths, families = (paths[-1:], QUICK) if quick else (paths, families or classical())
     references = {Path(path).stem: reference_of(path, quick)[1].record() for path in paths}

@@ -11,10 +11,10 @@ Row = dict[str, Any]
 
 
 def by_study(data: dict[str, Any]) -> dict[str, list[Row]]:
-    """Sort the rows of each housing, best first.
+    """Return the rows of each housing, sorted with the best first.
 
-    Rows that reach the reference's area efficiency come first, then the others, then those without
-    a periodic motion.
+    Designs that reach the reference's area efficiency come first, then designs that do not, then
+    designs without a periodic motion.
     """
     studies: dict[str, list[Row]] = {name: [] for name in data["references"]}
     for row in data["rows"]:
@@ -30,7 +30,7 @@ def is_missing(row: Row) -> bool:
 
 
 def title(name: str, reference: Row) -> str:
-    """Name a housing by its bore and area efficiency."""
+    """Return a title for a housing: bore, area efficiency, and `name` of the reference config."""
     shape = reference["geometry"]
     return (
         f"Bore {2 * shape['outer_radius_mm']:.1f} mm, area efficiency "
@@ -39,7 +39,7 @@ def title(name: str, reference: Row) -> str:
 
 
 def markdown(data: dict[str, Any]) -> str:
-    """Write the ranking of each housing, the designs, and the forces in the further scenes."""
+    """Return Markdown tables: ranking for each housing, designs, and forces in further scenes."""
     parts = []
     for name, rows in by_study(data).items():
         reference = data["references"][name]

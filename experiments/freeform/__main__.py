@@ -12,7 +12,7 @@ FIGURES = {"freeform.png": "freeform.png"}
 
 
 def body(run: Run) -> int:
-    """Optimise, write, print the designs and what they resemble."""
+    """Optimise, write results, print the designs and the families they resemble."""
     from experiments.freeform import figures, study
 
     results = study.run(run.quick, run.options.config)

@@ -10,7 +10,7 @@ from rootsopt.profiles.departure import flank_points
 
 
 def comparison(results: Results) -> Figure:
-    """Draw flanks, pressure angle, its share of every turn of the normal, and departure."""
+    """Draw flanks, pressure angle, rate at which the pressure angle falls, and departure."""
     start, found = results.start, results.found
     made, axes = sheet(11, 7, 2, 2)
     styles = {"best CIC": (start, "black", "--"), "free form from it": (found, BLUE, "-")}

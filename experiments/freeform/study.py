@@ -21,15 +21,16 @@ from rootsopt.scene.families import with_design
 
 CONFIG = "configs/free.yaml"
 COARSE = ("solver.fidelity=map", "solver.map_rolls=192", "solver.map_relatives=12")
-"""Contact of a reduced run. With `linear`, the motion of a free form does not settle."""
+"""Overrides for the contact of a reduced run. With `linear` contact, the motion of a free form does
+not settle."""
 MM, UM = 1e-3, 1e-6
 
 
 def signed_departures(profile: Profile, other: Profile) -> tuple[np.ndarray, np.ndarray]:
-    """Measure how far the flank of `profile` departs from that of `other`.
+    """Measure how far the flank of `profile` departs from the flank of `other`.
 
-    Returns radii (n,) in mm along the flank of `other`, and distances (n,) in µm along its normal,
-    NaN where the normal does not meet `profile`.
+    Returns radii (n,) in mm of points on the flank of `other`, and signed distances (n,) in µm from
+    these points along the normal. A distance is NaN if the normal does not meet `profile`.
     """
     points = flank_points(other) / MM @ [1, 1j]
     line = flank_points(profile) / MM @ [1, 1j]
@@ -50,8 +51,8 @@ def signed_departures(profile: Profile, other: Profile) -> tuple[np.ndarray, np.
 class Results:
     """Results of the study.
 
-    It holds the profiles before and after the search, its result, the config with the optimised
-    design, and the record of both designs beside the paper's.
+    Fields: the profiles before and after the search, the result of the search, the config with the
+    optimised design, and a record that compares both designs with the paper's.
     """
 
     start: Profile
@@ -63,7 +64,7 @@ class Results:
 def run(quick: bool, config: str = CONFIG) -> Results:
     """Optimise the free form of a config, and compare it with its baseline and the paper's CIC.
 
-    Raises `NoResultError` where the search finds nothing better.
+    Raises `NoResultError` if the search finds no better design.
     """
     settings = load(config, [*COARSE, "optimizer.iterations=4"] if quick else [])
     paper = evaluate(load(CIC, list(COARSE) if quick else []))

@@ -13,7 +13,7 @@ FIGURES: dict[str, str] = {}
 
 
 def body(run: Run) -> int:
-    """Compare, write, print the table."""
+    """Compare areas and inertias with polygons, write results, print the table."""
     from experiments._common.tables import show
     from experiments.geometry import figures, study
 
@@ -25,7 +25,7 @@ def body(run: Run) -> int:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the size and the seed of the draw."""
+    """Add options for the number of random designs and the seed."""
     parser.add_argument(
         "--draws", type=int, default=2000, help="designs drawn of each kind (default: 2000)"
     )

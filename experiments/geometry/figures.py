@@ -13,7 +13,7 @@ SERIES = {
     "reference_error": ("reference itself (estimate)", "x", GREY),
 }
 FLOOR = 1e-17
-"""Smallest error drawn."""
+"""Relative error below which an error is drawn at this value."""
 
 
 def errors(rows: list[Row]) -> Figure:

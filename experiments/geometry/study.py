@@ -1,9 +1,9 @@
 """Compares area and inertia of every profile family with polygons of its own outline.
 
-The study draws designs of each family and number of lobes over the whole range that a config
-allows, and keeps the valid ones. It compares `rootsopt.profiles.geometry` with polygons through
-points of the outline. The reference uses positions alone, neither arc lengths nor quadrature:
-polygons at four spacings, each half the last, extrapolated (Romberg).
+The study draws random designs of each family and number of lobes over the whole range that a config
+allows, and keeps valid designs. It compares `rootsopt.profiles.geometry` with polygons through
+points of the outline. This reference needs only positions, neither arc lengths nor quadrature: four
+polygons, each with half the spacing of the last, are extrapolated (Romberg).
 """
 
 import functools
@@ -28,26 +28,29 @@ RADIUS_MM = 33.0
 LOBES = (2, 3, 4, 5, 6)
 FAMILIES = tuple(family for family in FAMILY_KEYS if family != "outline")
 COEFFICIENTS = (3, 8, 24)
-"""Numbers of coefficients of a free form."""
+"""Numbers of coefficients for which free forms are drawn."""
 QUICK = ("cic", "ee", "arc"), (2, 3)
 """Families and lobes of a reduced run."""
 QUICK_DRAWS = 50
-"""Number of designs drawn of each in a reduced run."""
+"""Number of designs drawn per family and number of lobes in a reduced run."""
 _LEVELS = 4
 _SHORT, _SPAN, _WHOLE = 64, 512, 2048
-"""Sides of the finest polygon: per interval of a curve, knot span of a free form, segment."""
+"""Number of sides of the finest polygon: per interval of a curve, per knot span of a free form, and
+per segment."""
 _GRADED = 5
-"""Exponent with which points crowd at both ends of a segment, where an outline may have a root."""
+"""Exponent with which points are concentrated at both ends of a segment, where the outline may
+behave like a square root."""
 _LONGEST_INVOLUTE = 1.02
 """Longest involute that a config accepts, as a fraction of the longest possible."""
 _ROUNDING = 1e-9
-"""Margin, relative to its scale, below which it counts as 0."""
+"""Violation of a limit (relative to the limit's scale) below which a design still counts as
+valid."""
 
 
 def by_polygons(profile):
-    """Integrate area (m²) and polar moment of area (m⁴) from positions on the outline alone.
+    """Integrate area (m²) and polar moment of area (m⁴) of a profile from positions on its outline.
 
-    Returns both (2,), and an estimate of the larger of their relative errors.
+    Returns area and moment (2,), and an estimate of the larger of their relative errors.
     """
     x = np.arange(_SHORT + 1) / _SHORT
     if isinstance(profile, Curve):
@@ -75,7 +78,9 @@ def by_polygons(profile):
 
 
 def _polygon(places):
-    """Integrate ∫dA and ∫r² dA over the triangles between the axis and an open polygon's sides."""
+    """Return ∫dA and ∫r² dA over the triangles between the axis and the sides of an open polygon.
+
+    `places`: corners of the polygon (m)."""
     here, there = places[:, :-1], places[:, 1:]
     cross = here[..., 0] * there[..., 1] - here[..., 1] * there[..., 0]
     square = jnp.sum(here**2 + here * there + there**2, axis=-1)
@@ -83,10 +88,10 @@ def _polygon(places):
 
 
 def draw(family: str, lobes: int, count: int, random: np.random.Generator, size: int = 8):
-    """Draw `count` designs (count, d) of a family in config units; not all of them are valid.
+    """Draw random designs (count, d) of a family, in config units. Some designs may be invalid.
 
-    Half lie within the usual bounds. The others lie as far as a config allows, crowded towards the
-    limits. `size` is the number of coefficients of a free form.
+    Half of the designs lie within the usual bounds. The others cover the range that a config
+    allows, with a concentration at its limits. `size`: number of coefficients of a free form.
     """
     usual, wide = [np.zeros((count, 0))], [np.zeros((count, 0))]
     half = 90.0 / lobes
@@ -124,14 +129,15 @@ def draw(family: str, lobes: int, count: int, random: np.random.Generator, size:
 
 
 def _crowded(share, least):
-    """Crowd uniform shares towards both ends, down to the distance `least`."""
+    """Concentrate uniform shares (0 to 1) at both ends, down to the distance `least` from an
+    end."""
     near = 0.5 * (2 * least) ** (1 - np.abs(2 * share - 1))
     return np.where(share < 0.5, near, 1 - near)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def judged(family: str, lobes: int, designs):
-    """Return whether configs with these designs (n, d) are accepted, (n,)."""
+    """Return, for each of n designs (n, d), whether a config with this design is accepted."""
     return lax.map(functools.partial(_sound, family, lobes), designs)
 
 
@@ -160,9 +166,9 @@ def _sound(family: str, lobes: int, design):
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def compared(family: str, lobes: int, designs):
-    """Compare designs (n, d), in config units, with polygons.
+    """Compare area and polar moment of designs (n, d), in config units, with polygons.
 
-    Returns (n, 3): relative errors of area and polar moment, and the reference's own.
+    Returns (n, 3): relative errors of area and polar moment, and estimated error of the polygons.
     """
 
     def compare(design):
@@ -176,7 +182,9 @@ def compared(family: str, lobes: int, designs):
 
 
 def errors(family: str, lobes: int, count: int, random: np.random.Generator, size: int = 8):
-    """Draw `count` designs; return the valid ones (n, d) and their errors (n, 3)."""
+    """Draw `count` random designs. Return the n valid designs (n, d) and their errors (n, 3).
+
+    The errors are those of `compared`; `size`: number of coefficients of a free form."""
     # A family without parameters has one design.
     designs = draw(family, lobes, count if FAMILY_KEYS[family] else 1, random, size)
     kept = designs[np.asarray(judged(family, lobes, designs))]
@@ -193,9 +201,10 @@ def run(
     seed: int = 0,
     say: Callable[[str], None] = lambda text: None,
 ) -> list[Row]:
-    """Compare all families; return a row per family, size and number of lobes.
+    """Compare all families; return a row per family, number of coefficients and number of lobes.
 
-    A reduced run takes the families and lobes of `QUICK`, and few draws.
+    `draws`: number of random designs per row. A reduced run takes the families and lobes of
+    `QUICK`, and few designs.
     """
     families, lobes = (FAMILIES, LOBES) if not quick else QUICK
     random = np.random.default_rng(seed)
@@ -212,9 +221,10 @@ def run(
 
 
 def row_of(family: str, lobes: int, size: int, designs: np.ndarray, found: np.ndarray) -> Row:
-    """List the largest errors among valid designs (n, d), and the design that has the worst.
+    """Return a row with the largest errors among valid designs (n, d), and the design with the
+    worst.
 
-    `found` (n, 3) is as returned by `compared`; `size` is the number of coefficients, or 0.
+    `found` (n, 3): result of `compared`; `size`: number of coefficients of a free form, else 0.
     """
     row: Row = {
         "family": f"{family} {size}" if size else family,

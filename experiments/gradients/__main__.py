@@ -1,8 +1,8 @@
 """How accurate are the reported gradients?
 
-Writes gradients_K_of_N.csv (a part of the pairs, updated after each) and gradients.png, drawn from
-all parts in the result folder. The exit code is 3 if a tolerance gives no result where a looser one
-does, or if a gradient error exceeds what its check promises.
+Writes gradients_K_of_N.csv (a part of the pairs, updated after each pair) and gradients.png, drawn
+from all parts in the result folder. The exit code is 3 if a gradient error exceeds what its check
+promises, or if a pair has a result at one tolerance but none at a finer tolerance.
 """
 
 import argparse
@@ -18,7 +18,7 @@ FIGURES = {"gradients.png": "gradients.png"}
 
 
 def body(run: Run) -> int:
-    """Measure a part, write; draw and print the table of all parts."""
+    """Measure and write one part of the pairs, then draw and print the table of all parts."""
     from experiments.gradients import figures, study
 
     options = run.options
@@ -40,7 +40,7 @@ def body(run: Run) -> int:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add options for size, seed and part of the draw, and for drawing alone."""
+    """Add options for number, seed and part of the pairs, and for drawing without measuring."""
     parser.add_argument("--count", type=int, default=200, help="pairs (default: 200)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the draw (default: 0)")
     parser.add_argument(

@@ -11,7 +11,7 @@ from experiments.gradients.study import TOLERANCES, Row
 
 
 def errors_of(rows: Sequence[Row]) -> Figure:
-    """Draw the error over the check's own estimate, and its distribution at every tolerance."""
+    """Draw the gradient error over the estimate of its check, and its distribution by tolerance."""
     picture, axes = sheet(10, 4.2, 1, 2)
     left, right = axes[0]
     for rtol, color, marker in zip(TOLERANCES, COLORS[:3], "os^", strict=True):

@@ -1,10 +1,10 @@
 """Compares reported gradients of random designs and scenes with differences of orbits.
 
-The study draws designs (CIC with two and three lobes, arc and involute) and scenes (speed, load,
-backlash, gear, with gas and friction or a motor). It keeps those that settle on a periodic orbit,
-as many as possible with periods above one and some above four. It evaluates each at rtol 1e-8, 1e-9
-and 1e-10. The derivatives of the mean and peak force are compared with central differences of the
-forces of orbits closed with another method (dopri8) at 1e-12.
+A *pair* here is a random design (CIC with two and three lobes, arc, involute) in a random scene
+(speed, load, backlash, gear, with gas and friction or a motor). The study keeps pairs that settle
+on a periodic orbit, most of them with periods above one and some above four. It evaluates each pair
+at rtol 1e-8, 1e-9 and 1e-10. The derivatives of the mean and peak force are compared with central
+differences of the forces of orbits closed with another method (dopri8) at 1e-12.
 """
 
 import csv
@@ -29,12 +29,14 @@ from rootsopt.scene import Scene
 Row = dict[str, Any]
 TOLERANCES = (1e-8, 1e-9, 1e-10)
 STEP = 2e-5
-"""Relative step of the differences. Orbits are known to 1e-12, so differences are known to 1e-7."""
+"""Relative step of the central differences. Orbits are accurate to 1e-12, so differences are
+accurate to 1e-7."""
 CLOSER = 1e-4
-"""Disagreement above which the differences are repeated with a quarter of the step and extrapolated
-to step 0: close to a bifurcation, forces are strongly curved."""
+"""Relative difference between gradient and central differences above which the differences are
+repeated with a quarter of the step and extrapolated to step 0. Forces are strongly curved close to
+a bifurcation."""
 SHARE = 0.6
-"""Share of pairs with a period above one that a draw waits for."""
+"""Share of pairs with a period above one below which pairs of period one are discarded."""
 QUICK_COUNT = 4
 """Number of pairs of a reduced run."""
 KINDS: dict[str, tuple[str, list[str]]] = {
@@ -59,14 +61,14 @@ KINDS: dict[str, tuple[str, list[str]]] = {
     "cic, long periods": ("cic", []),
 }
 LONG = "cic, long periods"
-"""Kind of which only orbits of five periods or more are kept. They come from livelier scenes: one
-pair in twenty."""
+"""Kind of pairs of which only orbits of five mesh periods or more are kept. About one scene in
+twenty of this kind has such an orbit."""
 PATIENCE = 60
 """Maximum number of scenes of the kind `LONG` drawn for each pair wanted."""
 
 
 def pairs(seed: int, kind: str) -> Iterator[list[str]]:
-    """Yield overrides of configs/cic.yaml of one kind, without end."""
+    """Yield random pairs of one `kind` without end, each as overrides of configs/cic.yaml."""
     family, fixed = KINDS[kind]
     draw = np.random.default_rng([seed, list(KINDS).index(kind)])
     lobes = 2 if "2 lobes" in kind else 3
@@ -100,7 +102,9 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
 
 @eqx.filter_jit
 def forces(model: Scene, design, state, period, how: Integrator):
-    """Close an orbit; return (mean, peak) force, the residual and whether it was integrated."""
+    """Close an orbit. Return (mean, peak) force (N), the residual, and whether the solver
+    succeeded.
+    """
     pair = model.pair(design)
     orbit = close_orbit(pair, no_tangents(pair), state, period, Shots(how, check=False))
     return jnp.stack([orbit.response[0], orbit.response[2]]), orbit.residual, orbit.flow.solved
@@ -109,7 +113,7 @@ def forces(model: Scene, design, state, period, how: Integrator):
 def differences(evaluator: Evaluator, found: Evaluation, step: float = STEP) -> np.ndarray:
     """Differentiate mean and peak force by central differences of a relative `step`.
 
-    Returns (2, d), NaN where an orbit does not close.
+    Returns derivatives (2, d) in N per config unit, NaN where an orbit does not close.
     """
     how = Integrator("dopri8", jnp.asarray(1e-12), evaluator.scene.solver.orbit.max_steps)
     design = np.array(list(found.design.values()))
@@ -131,14 +135,17 @@ def differences(evaluator: Evaluator, found: Evaluation, step: float = STEP) -> 
 
 
 def evaluated(config: Config) -> Iterator[tuple[float, Evaluation]]:
-    """Evaluate the design at every tolerance, each from rest, the loosest first."""
+    """Yield (rtol, evaluation) of the config's design from rest, the loosest tolerance first."""
     evaluator = evaluator_of(config, give_up_early=True)
     for rtol in TOLERANCES:
         yield rtol, evaluator.at_tolerance(rtol)(series=False)
 
 
 def errors(found: Evaluation, truth: np.ndarray) -> list[float]:
-    """Return the largest error of each gradient, relative to its largest component."""
+    """Return the largest error of the gradients of mean and peak force, relative to the largest
+    entry of each gradient.
+
+    `truth` (2, d): gradients by central differences."""
     slopes = [np.array(list(found.gradient[measure].values())) for measure in FORCES]
     return [
         float(np.max(np.abs(slope - row)) / np.max(np.abs(row)))
@@ -173,7 +180,7 @@ def rows_of(
 
 @dataclasses.dataclass(frozen=True)
 class Draw:
-    """The pairs of a draw: how many, from which seed, and which part of the kinds.
+    """Choice of random pairs: their number, the seed, and a part of the kinds.
 
     `part` (k, n): every n-th kind, starting with the k-th.
     """
@@ -184,7 +191,9 @@ class Draw:
 
 
 def wanted_of(quick: bool, count: int) -> dict[str, int]:
-    """Distribute the pairs over the kinds; the first kind gets most of them."""
+    """Return the number of pairs of each kind. The first kind gets most pairs.
+
+    `count`: number of pairs of all kinds except `LONG`, which a reduced run omits."""
     kinds = [kind for kind in KINDS if kind != LONG][: 1 if quick else None]
     wanted = {
         kind: count * (2 if k == 0 else 1) // (len(kinds) + 1) for k, kind in enumerate(kinds)
@@ -199,9 +208,9 @@ def run(
     say: Callable[[str], None] = lambda text: None,
     keep: Callable[[list[Row]], None] = lambda rows: None,
 ) -> list[Row]:
-    """Measure the pairs of a draw; return three rows per pair, one per tolerance.
+    """Measure the pairs chosen by `draw`; return three rows per pair, one per tolerance.
 
-    `keep` is called with all rows so far after each pair. A reduced run measures four pairs of one
+    After each pair, `keep` is called with all rows so far. A reduced run measures four pairs of one
     kind.
     """
     draw = draw or Draw()
@@ -218,12 +227,12 @@ def run(
 def pairs_of_kind(
     kind: str, wanted: int, seed: int, say: Callable[[str], None]
 ) -> Iterator[list[Row]]:
-    """Yield the rows of each pair of a kind, until there are as many as wanted."""
+    """Yield the rows of each pair of a `kind`, until `wanted` pairs have been measured."""
     lively = plain = 0
     for number, overrides in enumerate(pairs(seed, kind)):
         if lively + plain >= wanted or (kind == LONG and number > PATIENCE * wanted):
             break
-        # Wait for rare longer periods, but not for ever.
+        # Wait for rare longer periods, but only for a limited number of scenes.
         patient = number < 6 * wanted
         config = load(CIC, overrides)
         series = evaluated(config)
@@ -243,7 +252,7 @@ def pairs_of_kind(
 
 
 def read(folder: Path) -> list[dict[str, Any]]:
-    """Read the rows of all parts."""
+    """Read the rows of all parts from the result folder."""
     rows = []
     for path in sorted(folder.glob("gradients_*.csv")):
         with open(path, newline="") as file:
@@ -253,11 +262,11 @@ def read(folder: Path) -> list[dict[str, Any]]:
 
 @dataclasses.dataclass(frozen=True)
 class Judgement:
-    """Pairs, counts of their periods, quantiles of the errors, and broken promises.
+    """Summary of all pairs: counts by period, quantiles of the errors, broken promises.
 
-    `errors`: rtol → (periodic pairs, all pairs, force → (median, 95 %, maximum, compared)).
-    `broken`: a line for each gradient whose error exceeds what its check promises, and for each
-    pair without a result at a tolerance although a looser one has one.
+    `errors`: rtol → (periodic pairs, all pairs, force → (median, 95 % quantile, maximum, number of
+    gradients compared)). `broken`: a line for each gradient whose error exceeds what its check
+    promises, and for each pair that has a result at one tolerance but none at a finer tolerance.
     """
 
     pairs: int
@@ -266,7 +275,7 @@ class Judgement:
     broken: list[str]
 
     def lines(self) -> Iterator[str]:
-        """Yield the table as text."""
+        """Yield the lines of the table, as text."""
         yield f"{self.pairs} pairs"
         yield f"periods: {self.periods}"
         for rtol, (good, count, forces) in self.errors.items():
@@ -282,7 +291,7 @@ class Judgement:
 
 
 def judge(rows: Sequence[Row]) -> Judgement:
-    """Compare the rows of all parts with the promises of the checks."""
+    """Summarise the rows of all parts, and compare errors with the promises of the checks."""
     scenes: dict[str, dict[float, Row]] = {}
     for row in rows:
         scenes.setdefault(row["scene"], {})[float(row["rtol"])] = row

@@ -13,7 +13,7 @@ FIGURES = {"landscape.png": "landscape.png"}
 
 
 def body(run: Run) -> int:
-    """Optimise and simulate the grid, write, print the comparison."""
+    """Optimise, simulate the grid, write results, print the comparison."""
     from experiments._common.tables import print_record
     from experiments.landscape import figures, study
 

@@ -22,7 +22,7 @@ from rootsopt.optimize.search import Search
 
 Row = dict[str, Any]
 GRID = 10
-"""Number of points of the first grid along each axis."""
+"""Number of points along each axis of the coarsest grid."""
 QUICK_GRID = 6
 """Number of points along each axis in a reduced run."""
 QUICK = (
@@ -31,14 +31,14 @@ QUICK = (
     "optimizer.starts=1",
     "optimizer.iterations=20",
 )
-"""Settings of a reduced run."""
+"""Overrides for a reduced run."""
 
 
 def feasible_grid(problem: Problem, wanted: int, first: int = GRID) -> np.ndarray:
     """Lay a regular grid over the unit box; return its points (n, 3) within the constraints.
 
-    The grid has `first` points along each axis, and is refined until at least `wanted` of them are
-    feasible. Raises `NoResultError` where the constraints leave hardly any design.
+    The first grid has `first` points along each axis. It is refined until at least `wanted` points
+    are feasible. Raises `NoResultError` if the constraints exclude nearly all designs.
     """
     look = jax.jit(jax.vmap(problem.space.slacks))
     for count in itertools.count(first, 2):
@@ -77,14 +77,14 @@ def survey(search: Search, points: np.ndarray, say: Callable[[str], None]) -> li
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """A row per design of the grid, and the optimiser's design and objective."""
+    """Results of the study: a row per design of the grid, and the optimum with its objective."""
 
     rows: list[Row]
     design: dict[str, float]
     objective: float
 
     def record(self) -> dict[str, Any]:
-        """Compare the optimum with the best of the grid."""
+        """Return a comparison of the optimum with the best design of the grid."""
         values = np.array([row["objective"] for row in self.rows])
         best = self.rows[int(np.nanargmin(values))]
         return {
@@ -105,7 +105,7 @@ def run(
 ) -> Results:
     """Optimise a config, and simulate a grid of at least `designs` designs.
 
-    Raises `NoResultError` where the optimiser finds nothing better than the baseline.
+    Raises `NoResultError` if the optimiser finds no design better than the baseline.
     """
     search = Search(load(config, list(QUICK) if quick else []))
     result = search.run()

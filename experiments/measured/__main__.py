@@ -12,7 +12,7 @@ FIGURES = {"measured.png": "outline.png"}
 
 
 def body(run: Run) -> int:
-    """Make and compare the rotor, write, print the numbers."""
+    """Make a measured rotor, compare it with its design, write results, print the numbers."""
     from experiments._common.tables import print_record
     from experiments.measured import figures, study
 

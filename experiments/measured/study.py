@@ -1,8 +1,9 @@
 """Compares a measured rotor with its design: form, gap in rolling, contact force.
 
-The study makes the points that a coordinate measuring machine may give of a slightly wrong rotor.
-They lie along the outline of the config's profile, with a form error of its addenda, another for
-each lobe, and noise, in clockwise order and turned. They are imported as family `outline`.
+The study makes points such as a coordinate measuring machine gives for a rotor with form errors.
+The points lie along the outline of the config's profile, with a form error of the addenda, an error
+of each lobe, and noise. They are in clockwise order, and turned by an angle. They are imported as
+family `outline`.
 """
 
 import dataclasses
@@ -22,19 +23,21 @@ from rootsopt.profiles import Profile, outline
 from rootsopt.scene import check_geometry, design_keys
 
 FORM, LOBES, NOISE = 20e-3, 3e-3, 1e-3
-"""Form error of the addenda, difference among the lobes, RMS noise (mm)."""
+"""Form error of the addenda, differences between lobes, and RMS noise of the points (mm)."""
 TURN = 17.0
-"""Angle (deg) of a lobe in the coordinates of the measurement."""
+"""Angle (deg) by which the measured points are turned."""
 MM = 1e-3
 
 
 def complex_points(profile: Profile, points: int) -> np.ndarray:
-    """Return a closed outline (mm) without its last point, counter-clockwise from a tip on +x."""
+    """Return the outline of a profile as complex numbers (mm), counter-clockwise from a tip on +x.
+
+    The outline is closed, but the last point, equal to the first, is omitted."""
     return np.asarray(outline(profile, points))[:-1] @ [1, 1j] / MM
 
 
 def measured(profile: Profile, seed: int = 0) -> np.ndarray:
-    """Return the points (n,) of the rotor as measured (mm)."""
+    """Return the measured points (n,) of the rotor, as complex numbers (mm)."""
     random = np.random.default_rng(seed)
     points = complex_points(profile, 240)
     along = np.roll(points, -1) - np.roll(points, 1)
@@ -48,7 +51,7 @@ def measured(profile: Profile, seed: int = 0) -> np.ndarray:
 
 
 def imported(config: Config, path: Path) -> Config:
-    """Replace a config's profile by the outline in a file."""
+    """Return `config` with the outline in the file `path` as its profile."""
     gone = dict.fromkeys(design_keys(config))
     found = {"family": "outline", "outline_file": str(path), "outline_smoothing_mm": NOISE}
     profile = config.profile.model_copy(update=gone | found)
@@ -56,7 +59,7 @@ def imported(config: Config, path: Path) -> Config:
 
 
 def off_um(points: np.ndarray, design: Profile) -> np.ndarray:
-    """Return the normal distance (µm) of points (mm) from a design."""
+    """Return the normal distances (µm) of points (complex, mm) from the outline of a design."""
     fine = np.asarray(outline(design, 2000)) / MM
     return 1e3 * signed_distance(np.stack([np.real(points), np.imag(points)], axis=1), fine)
 
@@ -65,8 +68,8 @@ def off_um(points: np.ndarray, design: Profile) -> np.ndarray:
 class Results:
     """Results of the study.
 
-    It holds both profiles, the points on the axes of the design (mm), the gaps in rolling by name,
-    and the record of all numbers.
+    Fields: both profiles, the measured points in the axes of the design (mm), the gaps in rolling
+    by name, and the record of all numbers.
     """
 
     config: Config

@@ -1,9 +1,9 @@
 """Which scene gives the paper's contact forces, and how far do they determine it?
 
 Writes paper.csv, paper_motions.csv, paper_definitions.csv, paper_slices.csv, paper_profile.csv,
-paper.json, paper_force.png, paper_spectrum.png and paper_uniqueness.png. With --search it searches
-for such scenes, and writes paper_search.csv, paper_search.json and paper_search.png. The exit code
-is then 3 if it finds none. Results: docs/paper.md.
+paper.json, paper_force.png, paper_spectrum.png and paper_uniqueness.png. With --search, it searches
+for further scenes instead, and writes paper_search.csv, paper_search.json and paper_search.png. The
+exit code is then 3 if no such scene is found. Results: docs/paper.md.
 """
 
 import argparse
@@ -22,7 +22,7 @@ FIGURES = {
 
 
 def print_forces(name: str, found: "Response") -> None:
-    """Print the values, forces and errors of a response."""
+    """Print values, forces and errors of a response, under the title `name`."""
     from experiments.paper.scene import FAMILIES, FORCES
 
     print(f"{name}: misfit {found.misfit:.2%}, values {[float(f'{v:.5g}') for v in found.values]}")
@@ -40,7 +40,7 @@ def print_forces(name: str, found: "Response") -> None:
 
 
 def reproduce(run: Run) -> int:
-    """Simulate the shipped values, write, print."""
+    """Simulate the values in the shipped configs, write results, print them."""
     import numpy as np
 
     from experiments.paper import figures, study
@@ -66,7 +66,7 @@ def reproduce(run: Run) -> int:
 
 
 def search(run: Run) -> int:
-    """Search for values, write, print the best."""
+    """Search for values of the quantities, write results, print the best values."""
     from experiments.paper import figures, study
     from experiments.paper.scene import FAMILIES, FORCES, QUANTITIES, summary
 
@@ -98,12 +98,12 @@ def search(run: Run) -> int:
 
 
 def body(run: Run) -> int:
-    """Reproduce the forces, or search."""
+    """Simulate the shipped values or, with --search, search for other values."""
     return search(run) if run.options.search else reproduce(run)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the search and its settings."""
+    """Add options for the search and its settings."""
     parser.add_argument("--search", action="store_true", help="search for other values")
     parser.add_argument("--seed", type=int, default=0, help="seed of the search (default: 0)")
     parser.add_argument(

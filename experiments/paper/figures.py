@@ -10,7 +10,7 @@ from experiments.paper.study import Found, Row
 from rootsopt.figures.force import plot_force, plot_spectrum
 
 LOWEST, HIGHEST = 0.1, 300.0
-"""Range of misfits (%) shown. Larger ones and non-periodic motions are at the upper edge."""
+"""Range of misfits (%) shown. Larger misfits and non-periodic motions are at the upper edge."""
 MARKS = "os^Dvp"
 
 
@@ -34,7 +34,7 @@ def force_figures(found: Response) -> tuple[Figure, Figure]:
 
 
 def uniqueness_figure(alone: list[Row], solved: list[Row]) -> Figure:
-    """Draw the misfit of a quantity changed alone, and with the others solved for again."""
+    """Draw the misfit over each quantity: changed alone, and with the others solved for again."""
     made, axes = sheet(11, 4.8, 1, 2 if solved else 1, sharey=True)
     panels = [(alone, "changed alone"), (solved, "the others solved for again")]
     for ax, (rows, title) in zip(axes[0], panels, strict=False):

@@ -1,4 +1,4 @@
-"""The quantities that the paper omits, as numbers to search and differentiate.
+"""The quantities that the paper does not state, as numbers to search and differentiate.
 
 `QUANTITIES` names them with plausible ranges. `Pairs` computes from their values the four forces of
 the paper's section 4, with derivatives on periodic orbits. `polished` uses these derivatives to
@@ -53,16 +53,19 @@ QUANTITIES = (
     Quantity("scene.timing_gear.backlash_mm", 0.02, 1.5, True, "gear backlash (mm)"),
     Quantity("contact.clearance_mm", 0.005, 0.5, True, "flank clearance (mm)"),
 )
-"""The order is that of all vectors of values (p,). Ranges and their reasons: docs/paper.md."""
+"""The p quantities, in the order of all vectors of values (p,). docs/paper.md explains the
+ranges."""
 FAMILIES = ("cic", "ee")
 PAPER = np.array([[102.4, 1973.3], [1047.1, 5661.4]])
-"""Mean and maximum contact force (N) by pair (`FAMILIES`), from the paper's section 4."""
+"""Mean and maximum contact force (N), a row per pair (`FAMILIES`), from the paper's section 4."""
 _NEAR = 0.1
 """Maximum step of `polished`, in logarithms of the quantities."""
 
 
 def config_of(family: str, values: ArrayLike | None = None, *overrides: str) -> Config:
-    """Load the pair's shipped config, with other values (p,) of the quantities (config units)."""
+    """Load the shipped config of a pair, with other `values` (p,) of the quantities (config units).
+
+    `overrides`: further changes, each `dotted.key=value`."""
     at: list[str] = []
     if values is not None:
         numbers = np.asarray(values, float).tolist()
@@ -83,8 +86,9 @@ def values_of(config: Config) -> NDArray[np.float64]:
 class Response:
     """Response of both pairs with one set of `values` (p,).
 
-    evaluations: in the order of `FAMILIES`; slopes (2, 2, p): derivatives of the logarithms of the
-    forces with respect to those of the quantities, `None` unless both motions are periodic.
+    `evaluations`: one per pair, in the order of `FAMILIES`; `slopes` (pair, mean and peak, p):
+    derivatives of log(force) with respect to log(quantity), `None` unless both motions are
+    periodic.
     """
 
     values: NDArray[np.float64]
@@ -93,38 +97,38 @@ class Response:
 
     @property
     def forces(self) -> NDArray[np.float64]:
-        """Return mean and peak force (N) by pair (2, 2), NaN where there is none."""
+        """Mean and peak force (N) by pair (2, 2), NaN if unknown."""
         return np.array(
             [[one.response.get(name, np.nan) for name in FORCES] for one in self.evaluations]
         )
 
     @property
     def errors(self) -> NDArray[np.float64]:
-        """Return the relative differences from the paper's forces (2, 2)."""
+        """Relative differences from the paper's forces, by pair (2, 2)."""
         return self.forces / PAPER - 1
 
     @property
     def misfit(self) -> float:
-        """Return the largest relative difference, infinite without forces."""
+        """Largest relative difference from the paper's forces; infinite without forces."""
         worst = np.max(np.abs(self.errors))
         return float(worst) if np.isfinite(worst) else np.inf
 
     @property
     def periods(self) -> tuple[int, ...]:
-        """Return the mesh periods after which each motion repeats; 0 where it does not."""
+        """Number of mesh periods after which the motion of each pair repeats; 0: no repetition."""
         return tuple(int(one.steady_state.get("period", 0)) for one in self.evaluations)
 
     @property
     def usable(self) -> bool:
-        """Return whether both motions are stable periodic orbits."""
+        """Whether both motions are stable periodic orbits."""
         return all(one.status is Status.PERIODIC for one in self.evaluations)
 
 
 class Pairs:
-    """Evaluates both pairs for values of the quantities; compiled programs are shared.
+    """Evaluates both pairs for values of the quantities, with shared compiled programs.
 
-    With `give_up_early`, a motion that settles late is given up. `overrides` of the configs are
-    each `dotted.key=value`.
+    `give_up_early`: whether to give up a motion that settles late; `overrides` of the configs, each
+    `dotted.key=value`.
     """
 
     def __init__(self, *overrides: str, give_up_early: bool = False):
@@ -136,7 +140,9 @@ class Pairs:
         slopes: bool = True,
         series: bool = False,
     ) -> Response:
-        """Simulate both pairs from rest with `values` (p,) in config units."""
+        """Simulate both pairs from rest with `values` (p,) in config units.
+
+        `slopes`, `series`: whether to compute derivatives and series."""
         values = np.asarray(values, float)
         evaluations, rows = [], []
         for family in FAMILIES:
@@ -167,7 +173,7 @@ def _slopes(evaluator: Evaluator, one: Evaluation, values) -> NDArray[np.float64
 
 
 def pair_of(model: Scene, design, values: Float[Array, " p"]) -> RotorPair:
-    """Return the rotor pair with these values of the quantities (config units)."""
+    """Return the rotor pair of a `design` with `values` (p,) of the quantities (config units)."""
     length, torque, stiffness, damping_ratio, backlash, clearance = values
     half = backlash * MM / (2 * model.pitch_radius)
     gear = eqx.tree_at(lambda g: (g.stiffness, g.half_backlash), model.gear, (stiffness, half))
@@ -202,11 +208,12 @@ def polished(
     steps: int = 12,
     target: NDArray[np.float64] = PAPER,
 ) -> Response:
-    """Solve for the values nearest to `values` that give the `target` forces; keep `held` ones.
+    """Solve for the values nearest to `values` (p,) that give the `target` forces (2, 2) in N.
 
-    It takes Gauss-Newton steps of minimum length in the logarithms, halved until the misfit falls
-    and both motions stay periodic. Both start at rest every time. It ends when the misfit is below
-    `within` or cannot be lowered. Returns the best response found, inside the plausible ranges.
+    `held`: indices of quantities that do not change. The method is Gauss-Newton steps of minimum
+    length in the logarithms. A step is halved until the misfit falls and both motions, from rest,
+    stay periodic. The search ends when the misfit is below `within` or cannot be lowered. Returns
+    the best response found, inside the plausible ranges.
     """
     free = [i for i in range(len(QUANTITIES)) if i not in held]
     low, high = (np.log([getattr(q, end) for q in QUANTITIES]) for end in ("low", "high"))
@@ -236,9 +243,11 @@ def polished(
 def compensated(
     values: NDArray[np.float64], slopes: NDArray[np.float64], number: int, factor: float
 ) -> NDArray[np.float64]:
-    """Multiply the `number`-th value by `factor`, and change the others (p,) as little as possible.
+    """Multiply the `number`-th value by `factor`, and change the others so that forces stay the
+    same.
 
-    To first order the forces stay the same. The others stay within their ranges.
+    This holds to first order, with the smallest possible changes. Returns values (p,) inside their
+    ranges.
     """
     others = [i for i in range(len(values)) if i != number]
     flat = slopes.reshape(-1, len(values))
@@ -256,7 +265,7 @@ def _least_step(slopes, wanted, free: Sequence[int]) -> NDArray[np.float64]:
 
 
 def summary(response: Response) -> dict[str, Any]:
-    """Record values, forces, errors and regimes."""
+    """Return values, forces, errors and regimes (periods of both motions) for the result file."""
     pairs = {}
     for family, one, row, errors in zip(
         FAMILIES, response.evaluations, response.forces, response.errors, strict=True

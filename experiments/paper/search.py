@@ -1,9 +1,9 @@
-"""Global search for the quantities that the paper omits, compiled by Numba.
+"""Global search for the quantities that the paper does not state, compiled by Numba.
 
 The search simulates thousands of scenes from rest with `experiments._common.engines.numba_pair` and
-rootsopt's contact map of each rotor, made once for all scenes. On a periodic motion this is within
-a percent or so of the package. SciPy's differential evolution minimises the distance of the four
-forces from the paper's over the whole box of plausible values.
+rootsopt's contact map of each rotor, made once for all scenes. On periodic motions, its forces
+differ from rootsopt's by about a percent. SciPy's differential evolution minimises the distance of
+the four forces from the paper's forces, over the whole box of plausible values.
 """
 
 import dataclasses
@@ -27,18 +27,20 @@ from rootsopt.contact.map import MapContact
 from rootsopt.profiles import geometry
 
 _DEEPEST = -0.035
-"""Relative rotation (rad) down to which the flanks are mapped: all plays, with a reserve."""
+"""Relative rotation (rad) below which the contact maps end. All plays lie inside, with a
+reserve."""
 _ROLLS, _RELATIVES = 1024, 96
 _SETTLE, _WINDOW, _RTOL = 32, 12, 1e-5
-"""Mesh periods before the forces count, mesh periods that count, tolerance of the motion."""
+"""Length of the transient (mesh periods), length of the window in which forces are measured (mesh
+periods), and tolerance of the motion."""
 _LONGEST = 6
-"""Longest repetition searched for (mesh periods)."""
+"""Longest period of a motion that is searched for (mesh periods)."""
 _REPEATS = 1e-2
 """Scaled difference below which a motion repeats."""
 _APERIODIC = 0.35
-"""Cost added for a pair that does not repeat, in logarithms of a force."""
+"""Cost added for a pair whose motion does not repeat (natural logarithm of a force ratio)."""
 _LOST = 5.0
-"""Cost of a scene whose lobes pass through each other."""
+"""Cost of a scene in which the lobes of a pair pass through each other."""
 
 
 class Rotors(NamedTuple):
@@ -54,8 +56,9 @@ class Rotors(NamedTuple):
 class Samples(NamedTuple):
     """n simulated scenes.
 
-    values: (n, p); forces: (n, 2, 2) by pair (N, NaN if lost); periods: (n, 2) in mesh periods, 0
-    where the motion does not repeat.
+    `values` (n, p) of the quantities; `forces` (scene, pair, mean and peak): in N, NaN if the lobes
+    pass through each other; `periods` (n, 2): mesh periods by pair, 0 if the motion does not
+    repeat.
     """
 
     values: NDArray[np.float64]
@@ -64,13 +67,13 @@ class Samples(NamedTuple):
 
     @property
     def misfits(self) -> NDArray[np.float64]:
-        """Return the largest relative difference of a force from the paper's (n,); inf if lost."""
+        """Largest relative difference of a force from the paper's (n,); inf without forces."""
         worst = np.max(np.abs(self.forces / PAPER - 1), axis=(1, 2))
         return np.where(np.isfinite(worst), worst, np.inf)
 
     @property
     def periodic(self) -> NDArray[np.bool_]:
-        """Return whether both motions repeat (n,)."""
+        """Whether the motions of both pairs repeat, for each scene (n,)."""
         return np.all(self.periods > 0, axis=1)
 
     @classmethod
@@ -79,7 +82,7 @@ class Samples(NamedTuple):
 
 
 def rotors_of(family: str) -> Rotors:
-    """Return what all scenes with a pair share."""
+    """Return the data of a pair that all scenes share; `family`: its profile family."""
     config = config_of(family, None, "solver.fidelity=map")
     profile = profile_of(config)
     contact = jax.jit(lambda p: MapContact.of(p, _DEEPEST, _ROLLS, _RELATIVES))(profile)  # pyright: ignore[reportArgumentType]
@@ -115,7 +118,7 @@ def rotors_of(family: str) -> Rotors:
 
 
 def motion_at(rotors: Rotors, values: NDArray[np.float64]) -> Motion:
-    """Return the constants of the motion with these values (p,) of the quantities."""
+    """Return the constants of the equation of motion with `values` (p,) of the quantities."""
     length, torque, stiffness, damping_ratio, backlash, clearance = map(float, values)
     scene = dataclasses.replace(
         rotors.scene,
@@ -131,9 +134,10 @@ def motion_at(rotors: Rotors, values: NDArray[np.float64]) -> Motion:
 
 @njit(nogil=True, error_model="numpy")
 def _simulate(rotor, motion, table, search, settle, window, rtol):
-    """Return mean and peak force (N) over the window from rest, and the period (0: no period).
+    """Simulate from rest. Return mean and peak force (N) over the window, and the period.
 
-    NaN if the lobes pass through each other.
+    The period (mesh periods) is 0 if the motion does not repeat. Forces are NaN if the lobes pass
+    through each other.
     """
     angle = rate = total = peak = 0.0
     states = np.zeros((window, 2))
@@ -173,7 +177,9 @@ def scan(pairs: list[Rotors], values: NDArray[np.float64]) -> Samples:
 
 
 def costs(samples: Samples) -> NDArray[np.float64]:
-    """Return the RMS of log(force / paper's) (n,), increased where a motion does not repeat."""
+    """Return the cost (n,): RMS of log(force / paper's force), increased if a motion does not
+    repeat.
+    """
     with np.errstate(invalid="ignore", divide="ignore"):
         away = np.log(np.maximum(samples.forces, 1e-3) / PAPER)
         cost = np.sqrt(np.mean(away**2, axis=(1, 2)))
@@ -197,10 +203,10 @@ def explore(
     quantities: Sequence[Quantity] = QUANTITIES,
     report: Callable[[Samples], None] = lambda samples: None,
 ) -> Samples:
-    """Return all scenes that differential evolution tries, starting from `seed`.
+    """Return all scenes that differential evolution tries, with the random `seed`.
 
-    It covers the box of the ranges of `quantities`, with `population` scenes per quantity in a
-    generation.
+    The search covers the box of the ranges of `quantities`, with `population` scenes per quantity
+    in each generation. `report` is called with the scenes of each evaluation.
     """
     pairs = [rotors_of(family) for family in FAMILIES]
     parts: list[Samples] = []
@@ -228,9 +234,10 @@ def explore(
 
 
 def regimes(samples: Samples, within: float) -> list[int]:
-    """Return the index of the best scene of every regime (periods of both motions), best first.
+    """Return the index of the best scene of every regime, best first.
 
-    Only scenes that repeat and have a misfit of at most `within` count.
+    A regime is a combination of the periods of both motions. Only scenes that repeat and have a
+    misfit of at most `within` count.
     """
     order = np.argsort(samples.misfits)
     found: dict[tuple[int, ...], int] = {}

@@ -1,7 +1,7 @@
 """Simulates the paper's scene, and studies how far its forces determine the omitted quantities.
 
-Section 4 of the paper gives the mean and maximum contact force of a CIC and an EE pair, but not the
-rotors' length, load, timing gear or backlash. `run` simulates the values of
+Section 4 of the paper gives the mean and maximum contact force of a CIC and an EE pair. It does not
+give the rotors' length, load, timing gear or backlash. `run` simulates the values of
 `configs/paper_cic.yaml` and `configs/paper_ee.yaml` from rest. It searches for coexisting motions,
 and applies other definitions of mean and maximum. It changes each quantity alone, then with the
 others solved for again. `look` searches for other values in the box of plausible ones.
@@ -37,31 +37,34 @@ from rootsopt.scene import design_vector
 from rootsopt.status import Status
 
 WINDOWS = ((0.0, 0.1), (0.0, 0.2), (0.05, 0.2), (0.1, 0.2), (0.1, 0.8))
-"""Windows (start, end in s) over which mean and maximum may have been taken."""
+"""Windows (start, end in s) over which the paper may have taken mean and maximum."""
 THINNINGS = (1, 3, 15)
-"""Thinning factors: each keeps every n-th sample of the window."""
+"""Sampling rates the paper may have used: every n-th sample of the window."""
 GRID = ("attractors.relatives=24", "attractors.rates=18")
-"""Grid of initial states for coexisting motions."""
+"""Overrides that set the grid of initial states in the search for coexisting motions."""
 OTHERS = {
     "tight play": (330.0, 5.6142, 7252.4, 0.77, 0.41829, 0.076577),
     "low gear damping": (361.942, 6.5715, 27871.46, 0.6085, 0.8734, 0.225),
     "short rotor": (253.46, 5.6804, 16489.5, 0.9866, 1.0063, 0.2879),
     "light load": (300.23, 0.21735, 31959.0, 0.93524, 0.99737, 0.29273),
 }
-"""Other values found by searches; they are solved again for the paper's forces."""
+"""Other values of the quantities, found by searches. The study solves them for the paper's forces
+again."""
 CHANGES = {False: (-0.1, -0.05, -0.02, -0.01, 0.01, 0.02, 0.05, 0.1), True: (-1e-3, 1e-3)}
-"""Relative changes of each quantity alone, in a full and in a reduced run."""
+"""Relative changes of each quantity alone. Keys: whether the run is reduced."""
 STEP, COUNT = 0.04, 6
-"""Step factor (minus 1) and maximum number of steps in each direction along the profile."""
+"""Relative step of a quantity along its profile (see `profile`), and maximum number of steps in
+each direction."""
 WITHIN, LIMIT = 5e-3, 0.03
-"""Misfit below which a point of the profile is accepted, and above which the profile ends."""
+"""Misfit below which a point of the profile is accepted, and misfit above which the profile
+ends."""
 GENERATIONS, POPULATION = 70, 16
 QUICK_SEARCH = 1, 2
-"""Generations and population of a reduced search."""
+"""Generations, and scenes per quantity in a generation, of a reduced search."""
 QUICK = ("solver.fidelity=linear",)
-"""Settings of a reduced run: they compile in half the time, and forces are some 3 % off."""
+"""Overrides for a reduced run. They halve the compilation time; forces deviate by about 3 %."""
 TARGET = 0.1
-"""Error of a force above which a search has no result."""
+"""Relative error of a force above which a search has no result."""
 POLISHED = 4
 """Number of regimes whose best scene is solved for the paper's forces."""
 Row = dict[str, Any]
@@ -69,7 +72,7 @@ Say = Callable[[str], None]
 
 
 def row_of(response: Response) -> Row:
-    """List values, forces, periods and misfit."""
+    """Return a row with values, forces, periods and misfit of a response."""
     row: Row = {q.key: v for q, v in zip(QUANTITIES, response.values, strict=True)}
     for family, (mean, peak), period, one in zip(
         FAMILIES, response.forces, response.periods, response.evaluations, strict=True
@@ -126,7 +129,7 @@ def definitions(values: ArrayLike) -> list[Row]:
 
 
 def slices(pairs: Pairs, values: ArrayLike, changes: Sequence[float], say: Say) -> list[Row]:
-    """Change each quantity alone by a share of itself; return a row per change."""
+    """Change each quantity alone by the relative `changes`; return a row per change."""
     rows = []
     for number, quantity in enumerate(QUANTITIES):
         for change in changes:
@@ -139,10 +142,10 @@ def slices(pairs: Pairs, values: ArrayLike, changes: Sequence[float], say: Say) 
 
 
 def profile(pairs: Pairs, found: Response, say: Say) -> list[Row]:
-    """Move each quantity away, and solve for the others again, starting from the last solution.
+    """Move each quantity away from its value, and solve for the other quantities again.
 
-    A quantity moves by factors of 1 ± `STEP`, at most `COUNT` times in each direction, until the
-    misfit stays above `LIMIT`. Returns a row per point.
+    Each solution starts from the last solution. A quantity moves by factors of 1 ± `STEP`, at most
+    `COUNT` times in each direction, until the misfit stays above `LIMIT`. Returns a row per point.
     """
     rows = []
     for number, quantity in enumerate(QUANTITIES):
@@ -164,10 +167,11 @@ def profile(pairs: Pairs, found: Response, say: Say) -> list[Row]:
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """The shipped values, other values solved for the paper's forces, and tables of rows.
+    """Responses with the shipped and with other values of the quantities, and tables of rows.
 
-    `alone`: each quantity changed alone. `solved`: with the others solved for again. `motions`,
-    `definitions`: results of these functions. In a reduced run only `alone` has rows.
+    `alone`: each quantity changed alone (`slices`); `solved`: with the others solved for again
+    (`profile`); `motions`, `definitions`: results of the functions of these names. In a reduced
+    run, only `alone` has rows.
     """
 
     shipped: Response
@@ -179,7 +183,7 @@ class Results:
 
     @property
     def tables(self) -> dict[str, list[Row]]:
-        """Return the rows by the name of their part, without the empty ones."""
+        """Return all tables that have rows, by the name of their part."""
         named = {
             "motions": self.motions,
             "definitions": self.definitions,
@@ -194,10 +198,10 @@ def run(
     say: Say = lambda text: None,
     tell: Callable[[str, Response], None] = lambda name, response: None,
 ) -> Results:
-    """Simulate the shipped values and study how far they are determined.
+    """Simulate the shipped values, and study how far the paper's forces determine them.
 
-    `tell` is called with each response and its name as soon as it is known. Raises `NoResultError`
-    unless both motions are periodic and both configs hold the same values.
+    `tell` is called with the name and each response as soon as the response is known. Raises
+    `NoResultError` unless both motions are periodic and both configs hold the same values.
     """
     settings = QUICK if quick else ()
     many = Pairs(*settings, give_up_early=True)
@@ -224,9 +228,10 @@ def run(
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """Results of a search: its scenes, seconds, and the best ones solved for the paper's forces.
+    """Results of a search: its scenes, its time (s), and the best scenes solved for the paper's
+    forces.
 
-    `polished`: periods of both motions → (misfit of the search, response).
+    `polished`: periods of both motions → (misfit in the search, response after solving).
     """
 
     values: NDArray[np.float64]
@@ -238,12 +243,12 @@ class Found:
 
     @property
     def periodic(self) -> NDArray[np.bool_]:
-        """Return whether both motions repeat (n,)."""
+        """Whether the motions of both pairs repeat, for each scene (n,)."""
         return np.all(self.periods > 0, axis=1)
 
     @property
     def enough(self) -> bool:
-        """Return whether some values give all four forces within `TARGET`."""
+        """Whether some values give all four forces within the relative error `TARGET`."""
         return any(response.misfit <= TARGET for _, response in self.polished.values())
 
 
@@ -253,9 +258,10 @@ def look(
     least_clearance: float = QUANTITIES[-1].low,
     say: Say = lambda text: None,
 ) -> Found:
-    """Search for other values, with no clearance (mm) below the least.
+    """Search for other values of the quantities.
 
-    A reduced run takes one generation, and solves for nothing.
+    `least_clearance` (mm): smallest clearance searched. A reduced run takes one generation, and
+    does not solve for the paper's forces.
     """
     # Numba is optional.
     from experiments.paper.search import explore, regimes

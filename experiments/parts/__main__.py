@@ -11,7 +11,7 @@ FIGURES: dict[str, str] = {}
 
 
 def body(run: Run) -> int:
-    """Measure, write, print the table."""
+    """Measure the cost of each part, write results, print the table."""
     from experiments._common.tables import show
     from experiments.parts import figures, study
 

@@ -1,9 +1,10 @@
 """Measures what each part of a scene costs.
 
-The study adds every part on its own to the smallest scene (contact driven at constant speed), and
-then all of them. It measures states, equations of the traced right-hand side, time of one
-right-hand side inside a compiled loop, and time of a simulation with gradient (warm, and the first
-with its compilation). Ratios are to the smallest scene in the same run.
+The smallest scene is contact alone, driven at constant speed. The study adds each part on its own,
+then all parts. It counts states, and equations in the traced right-hand side. It times one
+right-hand side inside a compiled loop. It also times the first simulation with gradient, which
+includes compilation, and later simulations. Ratios are relative to the smallest scene in the same
+run.
 """
 
 import statistics
@@ -22,7 +23,7 @@ from rootsopt.config import Config, load
 from rootsopt.scene import Scene, design_vector
 
 Row = dict[str, Any]
-# The flanks alone can hold a light load at high speed. At lower speed the lobes pass through.
+# The flanks alone hold a light load at high speed. At lower speed, the lobes pass each other.
 BARE = (
     "scene.timing_gear=null",
     "scene.speed_rpm=6000",
@@ -43,7 +44,7 @@ PARTS = {
 
 
 def equations(jaxpr) -> int:
-    """Count the equations of a traced program, including inner ones."""
+    """Count the equations of a traced program (jaxpr), including those of inner programs."""
     total = len(jaxpr.eqns)
     for equation in jaxpr.eqns:
         for value in jax.tree.leaves(equation.params, is_leaf=lambda v: hasattr(v, "jaxpr")):
@@ -76,7 +77,7 @@ def right_hand_side(config: Config, calls: int) -> dict[str, float]:
 
 
 def evaluation(config: Config, repeats: int) -> dict[str, float | str]:
-    """Time the first evaluation (s) and later ones (ms), with value and gradient."""
+    """Time evaluations with gradient: the first (s), with compilation, and later ones (ms)."""
     evaluator = evaluator_of(config)
     began = time.perf_counter()
     evaluator, found = evaluator.fit(series=False)

@@ -17,7 +17,7 @@ FIGURES = {"smoothing.png": "smoothing.png"}
 
 
 def body(run: Run) -> int:
-    """Measure, write after every kind, print the counts."""
+    """Measure all kinds of scenes, write results after every kind, and print the counts."""
     from experiments.smoothing import figures, study
 
     def keep(found: "list[Measured]") -> None:
@@ -36,7 +36,7 @@ def body(run: Run) -> int:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the size and the seed of the draw."""
+    """Add options for the number of random scenes and the seed."""
     parser.add_argument("--count", type=int, help="random scenes of CIC; fewer of the others")
     parser.add_argument("--seed", type=int, default=0, help="seed of the draw (default: 0)")
 

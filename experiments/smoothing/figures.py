@@ -1,4 +1,4 @@
-"""Figure of the bias and of the errors of gradients over the smoothing length."""
+"""Figure of the bias of forces and of the gradient errors over the smoothing length."""
 
 import numpy as np
 from matplotlib.figure import Figure

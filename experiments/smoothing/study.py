@@ -1,11 +1,11 @@
 """Measures what rounding the corners of contact law and timing gear changes, over many scenes.
 
-The scenes are random designs and scenes of both shipped pairs, the shipped configs, those of the
-paper, and a blower with all parts. They are simulated to their orbit at the default
-`contact.smoothing_mm`, which follows the scene. The orbit is closed again at this and at fixed
-smoothing lengths, at a tight tolerance. Bias is the largest relative difference of mean, peak and
-RMS force from those at the smallest length. Scenes whose orbit does not close at a length are
-counted. Derivatives are compared with central differences of tight orbits.
+The scenes are random designs and scenes of both shipped pairs, the shipped configs, the paper's
+configs, and a blower with all parts. Each scene is simulated to its orbit at the default
+`contact.smoothing_mm`, which depends on the scene. The orbit is then closed again at the default
+and at fixed smoothing lengths, at a tight tolerance. *Bias* is the largest relative difference of
+mean, peak and RMS force from the forces at the smallest length. Scenes whose orbit does not close
+at a length are counted. Derivatives are compared with central differences of tight orbits.
 """
 
 import dataclasses
@@ -35,19 +35,19 @@ Say = Callable[[str], None]
 DEFAULT = 0.0
 """Value that stands for the default of `contact.smoothing_mm` among the smoothing lengths (mm)."""
 WIDTHS = (1e-6, 1e-5, 3e-5, 1e-4, 1e-3, DEFAULT)
-"""Smoothing lengths (mm); the first is the reference."""
+"""Smoothing lengths (mm) at which orbits are closed. The first length is the reference."""
 COMPARED = (1e-6, 1e-5, DEFAULT)
 """Smoothing lengths (mm) at which gradients are compared."""
 LIMIT = 1e-4
 """Relative bias above which the default is too wide."""
 USUAL, TIGHT = (1e-6, 1e-8), (1e-8, 1e-10)
-"""Tolerances of transient and orbit: while an orbit is searched for, and while it is measured."""
+"""Tolerances (transient, orbit): first for finding an orbit, then for measuring its forces."""
 PERIODS = 200, 100
-"""Longest transients (mesh periods), in the same order."""
+"""Longest transients (mesh periods): first for finding an orbit, then for measuring its forces."""
 SAME = 0.02
 """Scaled distance at φ1 = 0 above which two orbits count as different motions."""
 FD_SHARE = 0.05
-"""Steps of the central differences, in units of `FD_STEPS`."""
+"""Size of the steps of central differences, as a fraction of `FD_STEPS`."""
 SHAKY = (
     "scene.speed_rpm=1700",
     "scene.load.torque_N_m=3",
@@ -58,7 +58,7 @@ SHAKY = (
     "profile.involute_length_mm=4",
     "profile.tip_arc_angle_deg=1.5",
 )
-"""A stable orbit of two mesh periods that is sensitive to changes."""
+"""Overrides that give a stable orbit of two mesh periods which is sensitive to changes."""
 KNOWN: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
     "cic": (("cic", ()), ("cic", SHAKY), ("paper_cic", ())),
     "ee": (("ee", ()), ("paper_ee", ())),
@@ -69,7 +69,9 @@ COUNTS = {"cic": 60, "ee": 30, "pump": 5}
 
 
 def drawn(kind: str, seed: int) -> Iterator[Config]:
-    """Yield random scenes of a kind without end, with random designs where it has parameters."""
+    """Yield random scenes of a `kind` (key of `COUNTS`) without end.
+
+    Designs are random as well if the profile family has parameters."""
     draw = np.random.default_rng([seed, *kind.encode()])
 
     def even_in_logarithm(low: float, high: float) -> float:
@@ -121,7 +123,10 @@ def _respond(models: Scene, designs, states, tolerances, periods, gradient: bool
 def responses(
     models: Scene, designs, states, tolerances: tuple[float, float], periods: int, slopes=True
 ) -> Batch:
-    """Simulate n scenes, each with its own design and initial scaled state."""
+    """Simulate n scenes, each with its own design and scaled initial state.
+
+    `models`: scenes, stacked along a leading axis; `tolerances` of transient and orbit; `periods`:
+    longest transient (mesh periods); `slopes`: whether to compute gradients."""
     leaves, structure = jax.tree.flatten(models)
 
     def work(designs, states, *leaves):
@@ -134,7 +139,7 @@ def responses(
 
 
 def rounded(models: Scene, width: float) -> Scene:
-    """Round all corners of the models over `width` (mm); `DEFAULT` leaves them unchanged."""
+    """Round all corners of the scenes `models` over `width` (mm); `DEFAULT` changes nothing."""
     if width == DEFAULT:
         return models
     length = np.full_like(models.pitch_radius, width * MM)
@@ -143,9 +148,9 @@ def rounded(models: Scene, width: float) -> Scene:
 
 
 def bias(found: Batch, truth: Batch) -> NDArray[np.float64]:
-    """Return the largest relative difference (n,) of mean, peak and RMS.
+    """Return the largest relative difference (n,) of mean, peak and RMS force.
 
-    NaN where one is unknown, or where the motions differ.
+    The result is NaN where a force is unknown, or where the motions differ.
     """
     same = np.max(np.abs(found.state - truth.state), axis=1) < SAME
     same &= found.usable & truth.usable & (found.period == truth.period)
@@ -154,9 +159,9 @@ def bias(found: Batch, truth: Batch) -> NDArray[np.float64]:
 
 
 def gradient_errors(models: Scene, designs, found: Batch) -> NDArray[np.float64]:
-    """Compare the gradients of mean, peak and RMS with central differences.
+    """Compare the gradients of mean, peak and RMS force with central differences.
 
-    Returns errors (n, 3), relative to the largest entry of each.
+    Returns errors (n, 3), relative to the largest entry of each gradient.
     """
     columns, same = [], np.asarray(found.usable)
     for k, step in enumerate(FD_STEPS):
@@ -178,8 +183,8 @@ def gradient_errors(models: Scene, designs, found: Batch) -> NDArray[np.float64]
 class Size:
     """Size of a run.
 
-    It holds the random scenes of each kind, smoothing lengths (mm), the lengths at which gradients
-    are compared, and the number of scenes with compared gradients.
+    Fields, in order: number of random scenes of each kind, smoothing lengths (mm), lengths (mm) at
+    which gradients are compared, and number of scenes whose gradients are compared.
     """
 
     counts: dict[str, int]
@@ -189,7 +194,9 @@ class Size:
 
 
 def size_of(quick: bool, count: int | None) -> Size:
-    """Choose the size of a run; `count`: random scenes of CIC, with fewer of the others."""
+    """Choose the size of a run. `count`: random scenes of the kind `cic`, with fewer of other
+    kinds.
+    """
     if quick:
         return Size({"cic": 5}, (1e-6, 1e-4, DEFAULT), (DEFAULT,), 2)
     share = 1.0 if count is None else count / COUNTS["cic"]
@@ -198,7 +205,7 @@ def size_of(quick: bool, count: int | None) -> Size:
 
 @dataclasses.dataclass(frozen=True)
 class Measured:
-    """Scenes of a kind that settle, and their orbit at every smoothing length."""
+    """Scenes of one kind that settle, and their orbits at every smoothing length."""
 
     kind: str
     tried: int
@@ -212,7 +219,9 @@ class Measured:
 
 
 def measure(kind: str, size: Size, seed: int, say: Say) -> Measured:
-    """Simulate the scenes of a kind to their orbits, then close these at other lengths."""
+    """Simulate the scenes of a kind to their orbits, then close the orbits at all smoothing
+    lengths.
+    """
     configs = scenes(kind, size.counts[kind], seed)
     models = stacked(configs, "float64")
     designs = np.stack([np.asarray(design_vector(config)) for config in configs])
@@ -237,7 +246,7 @@ def measure(kind: str, size: Size, seed: int, say: Say) -> Measured:
 
 
 def rows_of(measured: Measured) -> list[dict[str, Any]]:
-    """List every scene at every smoothing length."""
+    """List a row for every scene at every smoothing length."""
     rows = []
     for width, orbit in measured.orbits.items():
         for k, config in enumerate(measured.configs):
@@ -268,7 +277,7 @@ def rows_of(measured: Measured) -> list[dict[str, Any]]:
 
 
 def summary(measured: Measured) -> dict[str, Any]:
-    """Record counts, quantiles of the bias and of the gradient's error, by smoothing length."""
+    """Return counts, and quantiles of the bias and of the gradient errors, by smoothing length."""
     by_width = {}
     for width, orbit in measured.orbits.items():
         known = measured.bias(width)
@@ -299,7 +308,9 @@ def run(
     say: Say = lambda text: None,
     keep: Callable[[list[Measured]], None] = lambda found: None,
 ) -> list[Measured]:
-    """Measure all kinds of scenes; call `keep` with those so far after each."""
+    """Measure all kinds of scenes; after each kind, call `keep` with all results so far.
+
+    `count`: number of random scenes of the kind `cic`; `seed` of the random scenes."""
     size = size_of(quick, count)
     found: list[Measured] = []
     for kind in size.counts:
@@ -309,5 +320,5 @@ def run(
 
 
 def within_limit(found: list[Measured]) -> bool:
-    """Return whether the default's bias stays below the limit in all scenes."""
+    """Return whether the bias of the default smoothing stays below `LIMIT` in all scenes."""
     return bool(max(np.nanmax(one.bias(DEFAULT)) for one in found) < LIMIT)

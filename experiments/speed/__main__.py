@@ -12,7 +12,7 @@ FIGURES = {name: name for name in ("speed.png", "speed_objective.png", "speed_re
 
 
 def body(run: Run) -> int:
-    """Sweep and optimise, write, print the record."""
+    """Sweep and optimise, write results, print the record."""
     from experiments._common.tables import print_record
     from experiments.speed import figures, study
 

@@ -45,7 +45,7 @@ def over_speed(results: Results) -> Figure:
 
 
 def objectives(results: Results) -> Figure:
-    """Draw the objective of the optimised designs, relative to CIC at the same speed."""
+    """Draw the objective of the optimised designs over speed, relative to CIC at the same speed."""
     studies = results.studies
     made, axes = sheet(13, 4.6, 1, len(studies), sharey=True)
     styles = dict(zip(OPTIMISED, ((GREEN, "-", "o"), (PURPLE, "--", "s"),
@@ -78,7 +78,8 @@ def objectives(results: Results) -> Figure:
 
 
 def resonances(results: Results) -> Figure:
-    """Draw the peak force with crossings and maxima: shipped pairs, optimised CIC."""
+    """Draw peak force over speed, with resonance crossings and maxima: shipped pairs, optimised
+    CIC."""
     studies, rows, peaks = results.studies, results.resonances, results.peaks
     shown = {
         "CIC": BLUE,

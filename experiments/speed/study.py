@@ -2,8 +2,9 @@
 
 The study sweeps mean and peak contact force over speed, each speed from rest. Designs: the shipped
 CIC and EE pairs, and CIC optimised at 3000 rpm, over the range (weighted mean) and for its worst
-speed. Scenes: the shipped one, and one with less damping in the gear. It linearises the pair for
-its natural frequencies, and finds the speeds at which a harmonic of the mesh frequency meets one.
+speed. Scenes: the shipped scene, and a scene with less damping in the gear. The pair is linearised
+for its natural frequencies. A *crossing* is a speed at which a harmonic of the mesh frequency
+equals a natural frequency.
 """
 
 import dataclasses
@@ -35,36 +36,38 @@ OPTIMISED = {
     "over the range, mean": ("objective.over_speeds=weighted",),
     "over the range, worst": ("objective.over_speeds=worst",),
 }
-"""Settings of each optimisation."""
+"""Overrides of each optimisation, by its name."""
 QUICK = ("optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=1")
 PHASES = 240
 """Number of phases of a mesh period at which the pair is linearised."""
 ORDERS = 6
 """Number of harmonics of the mesh frequency considered."""
 PROMINENCE = 0.02
-"""Rise above the surroundings, relative to the height, above which a point is a maximum."""
+"""Prominence of a point of a force curve (relative to the force) above which it counts as a
+maximum.
+"""
 NEAR = 0.03
-"""Relative difference of speed above which a maximum does not lie at a crossing."""
+"""Relative difference of speed above which a maximum does not belong to a crossing."""
 
 
 def settings(scene: str, family: str, *more: str) -> Config:
-    """Load a shipped pair in one of the scenes."""
+    """Load the shipped config of a `family` in one of the scenes, with further overrides `more`."""
     return shipped(family, *SCENES[scene], *more)
 
 
 @Program
 def equilibria(pair: RotorPair, phases):
-    """Find the static equilibria at phases (n,) of the mesh period, rotor 1 held.
+    """Find the static equilibria of a pair at `phases` (n,) of the mesh period, with rotor 1 fixed.
 
-    Returns stiffness of the pair and of the flanks alone (N·m/rad), torque of the flanks (N·m) and
-    contact force (N), each (n,).
+    Returns four arrays (n,): stiffness of the pair and of the flanks alone (N·m/rad), torque of the
+    flanks (N·m), and contact force (N).
     """
     gear = pair.gear
     assert gear is not None
     still = jnp.asarray(0.0)
 
     def flank(phase, relative):
-        # Without the damping from sliding at speed.
+        # At zero penetration rate, so that there is no damping force.
         side = jnp.where(relative < 0, 1.0, -1.0)
         pose = -side * (2 * np.pi / pair.lobes * phase + relative / 2), side * relative
         gap, _, lever = pair.contact(*pose)
@@ -91,13 +94,13 @@ def equilibria(pair: RotorPair, phases):
 
 
 def linearised(pair: RotorPair) -> dict[str, float]:
-    """Find the natural frequencies (Hz) of the pair about its static equilibrium, rotor 1 held.
+    """Find the natural frequencies (Hz) of a pair about its static equilibrium, with rotor 1 fixed.
 
-    `contact`: of rotor 2 on the flanks, with their stiffness averaged over the phases in which they
-    carry most of the load, a share `contact_share` of all phases; `gear`: on the gear; `average`:
-    mean over all phases of the local frequency, with flanks and gear as they carry. `both_share`:
-    share of the phases in which flanks and gear both carry; `static_peak_N`, `static_mean_N`:
-    contact force.
+    Keys of the result. `contact`: frequency of rotor 2 on the flanks, whose stiffness is averaged
+    over the phases in which they carry most of the load; `contact_share`: share of these phases;
+    `gear`: frequency of rotor 2 on the gear; `average`: mean over all phases of the local frequency
+    on flanks and gear; `both_share`: share of the phases in which flanks and gear both carry;
+    `static_peak_N`, `static_mean_N`: contact force.
     """
     phases = (np.arange(PHASES) + 0.5) / PHASES
     stiffness, on_flank, torque, force = map(np.asarray, equilibria(pair, phases))
@@ -121,7 +124,12 @@ def linearised(pair: RotorPair) -> dict[str, float]:
 
 
 def crossings(found: dict[str, float], lobes: int, speeds) -> list[Row]:
-    """Find the speeds (rpm) at which a harmonic of the mesh frequency meets a natural frequency."""
+    """Find the crossings: speeds (rpm) at which a harmonic of the mesh frequency equals a natural
+    frequency.
+
+    `found`: result of `linearised`; `speeds`: speeds (rpm) of the sweep. Returns a row per
+    crossing.
+    """
     rows = []
     for mode in ("contact", "gear", "average"):
         for order in range(1, ORDERS + 1):
@@ -133,7 +141,9 @@ def crossings(found: dict[str, float], lobes: int, speeds) -> list[Row]:
 
 
 def maxima(parts: tuple[AtSpeed, ...], rows: list[Row]) -> list[Row]:
-    """Find the local maxima of mean and peak force over speed, each with the nearest crossing."""
+    """Find the local maxima of mean and peak force over speed.
+
+    `rows`: crossings. Returns a row per maximum, with the nearest crossing."""
     speeds = np.array([part.speed_rpm for part in parts])
     found = []
     for force in LABELS:
@@ -156,13 +166,17 @@ def maxima(parts: tuple[AtSpeed, ...], rows: list[Row]) -> list[Row]:
 
 
 def covered(rows: list[Row], speeds) -> float:
-    """Return the share of the speeds that lie at a crossing, as expected by chance alone."""
+    """Return the share of `speeds` at a crossing: the share of maxima expected there by chance.
+
+    `rows`: crossings."""
     at = np.array([row["speed_rpm"] for row in rows])
     return float(np.mean(np.min(np.abs(np.asarray(speeds)[:, None] / at - 1), axis=1) <= NEAR))
 
 
 def objective(config: Config, one: Evaluation, baseline: Evaluation) -> float:
-    """Return the objective at a speed; where the motion is not periodic, from averages."""
+    """Return the objective at one speed, also for motions that are not periodic.
+
+    The forces of such a motion are averages over a window. NaN without forces."""
     if not (one.response and baseline.response):
         return math.nan
     weights = objective_weights(config)
@@ -171,7 +185,8 @@ def objective(config: Config, one: Evaluation, baseline: Evaluation) -> float:
 
 @dataclasses.dataclass
 class Study:
-    """One scene: sweeps and linearised pairs by the design's name, optimisations, CIC's config."""
+    """Results for one scene: sweeps and natural frequencies by design, optimisations, CIC's
+    config."""
 
     config: Config
     designs: dict[str, tuple[AtSpeed, ...]]
@@ -181,14 +196,19 @@ class Study:
     def over(
         self, parts: tuple[AtSpeed, ...], baseline: tuple[AtSpeed, ...] | None = None
     ) -> np.ndarray:
-        """Return the objective (n,) of a sweep, relative to CIC's (default: over all speeds)."""
+        """Return the objective (n,) along a sweep, relative to a `baseline` sweep.
+
+        `parts`: the sweep; `baseline`: by default the sweep of CIC."""
         base = self.designs["CIC"] if baseline is None else baseline
         pairs = zip(parts, base, strict=True)
         return np.array([objective(self.config, p.evaluation, b.evaluation) for p, b in pairs])
 
 
 def study(scene: str, speeds, listed, quick: bool) -> Study:
-    """Sweep, optimise and linearise the pairs in a scene."""
+    """Sweep, optimise and linearise all pairs in one scene.
+
+    `speeds`: speeds (rpm) of the sweep; `listed`: speeds (rpm) of the objective; `quick`: whether
+    the run is reduced."""
     small = QUICK if quick else ()
     evaluators = {f: evaluator_of(settings(scene, f, *small)) for f in ("cic", "ee")}
     found = Study(evaluators["cic"].config, {}, {}, [])
@@ -220,7 +240,7 @@ def study(scene: str, speeds, listed, quick: bool) -> Study:
 
 
 def worth(along: np.ndarray, speeds) -> Row:
-    """Summarise an objective (n,) over the speeds of the sweep."""
+    """Return a summary of an objective (n,) over the speeds (rpm) of the sweep."""
     return {
         "at_3000_rpm": along[int(np.argmin(np.abs(np.asarray(speeds) - 3000)))],
         "mean_over_sweep": float(np.nanmean(along)),
@@ -232,9 +252,10 @@ def worth(along: np.ndarray, speeds) -> Row:
 
 @dataclasses.dataclass
 class Results:
-    """Scenes by name, speeds (rpm) of the objective, and rows of sweeps, crossings and maxima.
+    """Results of the study: scenes by name, speeds (rpm) of the objective, and tables of rows.
 
-    `chance`: share of the maxima expected at a crossing by chance, by scene and design.
+    The tables are sweeps, crossings and maxima. `chance`: share of the maxima expected at a
+    crossing by chance, by scene and design.
     """
 
     studies: dict[str, Study]
@@ -245,7 +266,7 @@ class Results:
     chance: dict[str, float]
 
     def record(self) -> dict[str, Any]:
-        """Summarise frequencies, optimisations, maxima and statuses."""
+        """Return a summary of frequencies, optimisations, maxima and statuses."""
         return {
             "linearised": {scene: found.linear for scene, found in self.studies.items()},
             "optimisations": [row for found in self.studies.values() for row in found.outcomes],

@@ -11,7 +11,7 @@ FIGURES = {"work_precision.png": "work_precision.png"}
 
 
 def body(run: Run) -> int:
-    """Measure, write, print the table."""
+    """Measure errors and times, write results, print the table."""
     from experiments._common.tables import show
     from experiments.work_precision import figures, study
 

@@ -54,15 +54,15 @@ STYLES = ("search", "map 384x16", "map 192x12", "map 768x24", "linear", "nodes 1
 
 
 def style_of(curve: Curve) -> int:
-    """Return the number of a contact's colour and mark.
+    """Return the number of the colour and mark of a curve, which depend on its contact.
 
-    Search with dopri8 uses those of nodes 100, which is never in the same panel.
+    Search with dopri8 has the same number as nodes 100, which is never in the same panel.
     """
     return STYLES.index(curve.contact if curve.method == "tsit5" else "nodes 100")
 
 
 def draw_curve(ax: Axes, number: int, label: str, rows: list[Row], name: str) -> None:
-    """Draw one curve without the runs that did not end on the reference's orbit."""
+    """Draw one curve: error over run time. Omit runs that did not end on the reference's orbit."""
     good = [row for row in rows if row["status"] == "periodic"]
     ax.plot(
         [1e3 * row["seconds"] for row in good],

@@ -1,10 +1,10 @@
 """Measures error of mean and peak force against run time.
 
 There are three scenes: the shipped CIC and EE pairs, and a lively CIC pair (more backlash, less
-damping, lower speed). A curve is one choice of contact, solver and precision. Along it the
-tolerance of transient and orbit runs from coarse to fine. The time is that of one whole evaluation
-of a design, warm: transient, closed orbit, forces and gradient. The reference is the search at
-every call with dopri8 at a tolerance of 1e-11. Its own error is estimated from other tolerances and
+damping, lower speed). A curve is one choice of contact, solver and precision, with tolerances of
+transient and orbit from coarse to fine. The time is that of one whole evaluation of a design, after
+compilation: transient, closed orbit, forces and gradient. The reference uses contact by search with
+dopri8 at a tolerance of 1e-11. The reference's own error is estimated from other tolerances and
 another solver.
 
 The study `smoothing` measures the effect of rounding the corners of contact law and timing gear.
@@ -45,24 +45,26 @@ FORCES = {"mean": "mean_force_N", "peak": "peak_force_N"}
 REPEATS = 5
 FINE = tuple(10.0**-k for k in range(3, 11))
 ROUGH = FINE[:5]
-"""Tolerances of contacts whose own error is far larger than the solver's."""
+"""Tolerances for contacts whose own error is far larger than the solver's error."""
 NODES = FINE[:4]
-"""Tolerances of nodes. Nodes leave steps in the force, at which a finer tolerance stalls."""
+"""Tolerances for contact by nodes. The force has steps there, at which a finer tolerance stalls."""
 PERIODS = 64
 """Longest transient (mesh periods); all scenes settle within a few."""
 PATIENCE = 3.0
-"""Time (s) of a setting's runs above which it is not repeated."""
+"""Time (s) of all runs of a setting above which no further run is made."""
 SINGLE = (1e-3, 1e-4, 1e-5, 2e-6)
-"""Tolerances of single precision; it allows none finer."""
+"""Tolerances for single precision, which allows no finer tolerance."""
 REFERENCE_RTOL = 1e-11
 FLOOR = 1e-12
-"""Smallest relative error drawn."""
+"""Relative error below which an error is drawn at this value."""
 OTHER_ORBIT = 0.3
-"""Scaled distance from the reference's orbit at φ = 0 above which an orbit counts as another."""
+"""Scaled distance from the reference's orbit at φ1 = 0 above which a result is on another orbit."""
 
 
 def contact(name: str) -> tuple[str, ...]:
-    """Return the overrides of a contact: search, linear, map ROLLSxRELATIVES, nodes COUNT."""
+    """Return the overrides that select a contact.
+
+    `name`: "search", "linear", "map ROLLSxRELATIVES" or "nodes COUNT"."""
     kind, _, size = name.partition(" ")
     choice = (f"solver.fidelity={kind}",)
     if kind == "map":
@@ -75,8 +77,9 @@ def contact(name: str) -> tuple[str, ...]:
 class Curve:
     """One choice of contact, solver and precision in a scene, over its tolerances.
 
-    `panels`: where it is drawn. `transient`: tolerance of the transient, if it differs from that of
-    the orbit. Curves with the same `compiled` share a compiled program.
+    `panels`: names of the panels in which the curve is drawn; `transient`: tolerance of the
+    transient, if it differs from the orbit's. Curves with the same `compiled` share a compiled
+    program.
     """
 
     scene: str
@@ -89,11 +92,11 @@ class Curve:
 
     @property
     def compiled(self) -> tuple[str, str, str, bool]:
-        """Return what determines the compiled program."""
+        """Everything that determines the compiled program."""
         return self.contact, self.method, self.precision, self.scene == "ee"
 
     def label(self, panel: str) -> str:
-        """Name the curve in a legend."""
+        """Return the name of the curve in the legend of a `panel`."""
         parts = [self.contact]
         if panel == "solver" or self.method != "tsit5":
             parts.append(self.method)
@@ -104,13 +107,13 @@ class Curve:
         return ", ".join(parts)
 
     def evaluator(self) -> Evaluator:
-        """Make an evaluator at the config's tolerances."""
+        """Make the evaluator of the curve, at the config's tolerances."""
         choice = (f"solver.method={self.method}", f"solver.precision={self.precision}")
         return evaluator(self.scene, *contact(self.contact), *choice)
 
 
 def evaluator(scene: str, *overrides: str) -> Evaluator:
-    """Make an evaluator of a scene with more overrides."""
+    """Make the evaluator of a `scene` (its name) with further `overrides`."""
     name, settings = SCENES[scene]
     periods = f"solver.max_mesh_periods={PERIODS}"
     return evaluator_of(shipped(name, *settings, periods, *overrides))
@@ -145,7 +148,7 @@ QUICK = (Curve("cic", ("contact",), "linear", tolerances=(1e-3, 1e-7, 1e-9)),)
 
 
 def warm_up(curves: Iterable[Curve], say: Say) -> float:
-    """Compile every program, two at a time; return the seconds."""
+    """Compile the programs of all curves, two at a time; return the time taken (s)."""
     began = time.perf_counter()
     different = {curve.compiled: curve for curve in curves}
     count = itertools.count(1)
@@ -162,24 +165,24 @@ def warm_up(curves: Iterable[Curve], say: Say) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """Evaluation of the reference and its own relative error, by force."""
+    """Evaluation of the reference, and the reference's own relative error by name of the force."""
 
     found: Evaluation
     error: dict[str, float]
 
 
 def errors(found: Evaluation, truth: Evaluation) -> dict[str, float]:
-    """Compare mean and peak force, relative to the truth."""
+    """Return the errors of mean and peak force, by name, relative to `truth`."""
     return {
         name: abs(found.response[key] / truth.response[key] - 1) for name, key in FORCES.items()
     }
 
 
 def reference(scene: str, curve: Curve, check: Curve, say: Say) -> Reference:
-    """Evaluate a scene as tightly as `curve`'s program can.
+    """Evaluate a scene as accurately as the program of `curve` can.
 
-    Its error is the difference from itself at ten times the tolerance, and from `check`'s solver.
-    Raises `NoResultError` unless the orbit is periodic.
+    The reference's error is estimated from an evaluation at ten times the tolerance, and from the
+    solver of `check`. Raises `NoResultError` unless the orbit is periodic.
     """
     found = at(curve.evaluator(), REFERENCE_RTOL)(series=False)
     if not found.usable:
@@ -192,7 +195,8 @@ def reference(scene: str, curve: Curve, check: Curve, say: Say) -> Reference:
 
 
 def verdict(found: Evaluation, truth: Evaluation) -> str:
-    """Return the status of an evaluation, or that its orbit is not the reference's."""
+    """Return the status of an evaluation as text, or a note that it is not on the reference's
+    orbit."""
     if not found.usable:
         return found.status.label
     same = found.steady_state["period"] == truth.steady_state["period"]
@@ -236,7 +240,7 @@ def measure(curve: Curve, truth: Evaluation, repeats: int) -> list[dict[str, Any
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """Curves with their rows, references by scene, and seconds of compiling."""
+    """Curves with their rows, references by scene, and time of compilation (s)."""
 
     measured: list[tuple[Curve, list[Row]]]
     references: dict[str, Reference]
@@ -244,7 +248,7 @@ class Results:
 
     @property
     def rows(self) -> list[Row]:
-        """Return the rows of all curves."""
+        """Rows of all curves."""
         return [row for _, part in self.measured for row in part]
 
 

@@ -1,11 +1,12 @@
 """Follow a curve of solutions through its folds by pseudo-arclength continuation.
 
 n equations in n + 1 unknowns, the last of which is the parameter, have curves of solutions. From a
-point on a curve, the next one is predicted along the tangent. Newton's method in the plane normal
-to the tangent then corrects it (Keller 1977). So a fold, where the parameter turns back, is a point
-like any other. The caller gives the equations; this module does not know their meaning.
+point on a curve, the next point is predicted along the tangent. Newton's method in the plane normal
+to the tangent then corrects the prediction (Keller 1977). A fold, where the parameter turns back,
+therefore needs no special treatment. The equations are an argument, and can be any equations.
 
-One evaluation of the equations and their Jacobian is called a *look*.
+One evaluation of the equations and their Jacobian is called a *look*. The vector (n + 1,) of all
+unknowns is called a *place*; a *spot* is a place on the curve, with its tangent.
 """
 
 import dataclasses
@@ -18,26 +19,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 _TOLERANCE = 2e-11
-"""Residual up to which a point lies on the curve."""
+"""Residual above which a place does not lie on the curve."""
 _NEAR = 1e-6
-"""Newton step below which every look repeats the computation of the last one (`Look.memory`)."""
+"""Newton step below which every look repeats the computation of the previous look, with the same
+solver steps (`Look.memory`)."""
 _FARTHEST = 0.05
-"""Longest Newton step."""
+"""Length above which a Newton step is shortened."""
 _PATIENCE = 4
-"""Number of looks for one point after which looks are careful (see `SolutionCurve`)."""
+"""Number of looks for one spot above which looks are more careful (see `SolutionCurve`)."""
 _MOST = 14
-"""Maximum number of looks for one point."""
+"""Maximum number of looks for one spot."""
 _TURN, _STRAIGHT = 0.9, 0.99
-"""Cosine between the tangents of two successive points: below the first a step is rejected, above
-the second the next step grows."""
+"""Cosine of the angle between the tangents of successive spots below which a step is rejected, and
+cosine above which the next step grows."""
 _ASTRAY = 0.5
-"""Distance from prediction to point, in steps, above which the point lies on another curve."""
+"""Distance (steps) from the predicted to the corrected spot above which the spot is taken to lie on
+another curve."""
 _CORNER = 3e-5, 1e-4, 3e-4, 1e-3
-"""Distances at which the curve is searched for beyond a corner."""
+"""Distances from a corner at which the continuation of the curve is searched for, shortest
+first."""
 _SAME = 1e-6
-"""Distance below which two points are the same."""
+"""Distance below which two spots count as the same."""
 _CLOSING = 8
-"""Number of points above which the curve may close at its first point."""
+"""Number of spots above which a curve is checked for closing at its first spot."""
 
 
 CORNER = "CORNER"
@@ -65,7 +69,7 @@ class End(enum.Enum):
 
 
 class StoppedError(Exception):
-    """A point of the curve cannot be computed, for the reason `end`."""
+    """The next spot of the curve cannot be computed; `end` is the reason."""
 
     def __init__(self, end: End):
         super().__init__(end.value)
@@ -75,10 +79,9 @@ class StoppedError(Exception):
 class Look(NamedTuple):
     """The equations evaluated at a place.
 
-    `residual` (n,); `jacobian` (n, n + 1); `memory`: passed to the curve again, it makes the curve
-    repeat the same computation, such as the same solver steps. The residual is then a smooth
-    function. `memory` is None if the residual is smooth anyway. `data`: anything else the curve
-    returns.
+    `residual` (n,) and `jacobian` (n, n + 1) of the equations; `memory`: pass this to the curve to
+    repeat the same computation, such as the same solver steps; `data`: further results of the
+    curve. A repeated computation makes the residual smooth. `memory` is None if it always is.
     """
 
     residual: NDArray[np.float64]
@@ -88,14 +91,16 @@ class Look(NamedTuple):
 
 
 SolutionCurve = Callable[[NDArray[np.float64], Any, bool], Look]
-"""Function that evaluates the equations: from a place (n + 1,), a memory or None, and whether to
-compute more carefully than usual, to a `Look`. It raises `StoppedError` where it has no result."""
+"""Type of the function that evaluates the equations. Arguments: a place (n + 1,), a memory or None,
+and whether to compute more carefully than usual. It returns a `Look`, or raises `StoppedError` if
+there is no result."""
 
 
 class Spot(NamedTuple):
-    """A point of the curve.
+    """A place on the curve, with its tangent.
 
-    `place` (n + 1,); `tangent` (n + 1,): unit vector; `look`: the last one; `looks`: their number.
+    `place` (n + 1,): unknowns; `tangent` (n + 1,): unit vector; `look`: the last evaluation there;
+    `looks`: number of evaluations that Newton's method took.
     """
 
     place: NDArray[np.float64]
@@ -108,8 +113,8 @@ class Spot(NamedTuple):
 class StepSizes:
     """Range and step sizes of a curve.
 
-    `low`, `high`: range of the parameter; `first`, `least`, `greatest`: steps, as Euclidean
-    distances of the unknowns; `points`: maximum number of points.
+    `low`, `high`: range of the parameter; `first`, `least`, `greatest`: first, least and greatest
+    step, as Euclidean distances of the unknowns; `points`: maximum number of spots.
 
     Raises ValueError if `low` is not less than `high`, if the steps are not positive and ascending,
     or if `points` is less than 1.
@@ -140,8 +145,9 @@ class StepSizes:
 class Path(NamedTuple):
     """A followed curve.
 
-    `spots` in order; `crossings`: spots at which a test is zero or the curve has a corner, as
-    (index of the last spot before, name of the test, spot); `end`: why the curve ends.
+    `spots` in order; `crossings`: spots at which a test is zero or the curve has a corner, each as
+    (index of the last spot before it, name of the test or `CORNER`, spot); `end`: why the curve
+    ends.
     """
 
     spots: list[Spot]
@@ -155,10 +161,11 @@ def corrected(
     across: NDArray[np.float64],
     along: NDArray[np.float64],
 ) -> Spot:
-    """Return the point of the curve in the plane through `guess` normal to `across` (n + 1,).
+    """Return the spot in the plane through the place `guess` (n + 1,) normal to `across` (n + 1,).
 
-    Its tangent points in the direction of `along` (n + 1,). Raises `StoppedError` if Newton's
-    method does not converge, or if the curve has no result."""
+    The tangent of the spot points in the direction of `along` (n + 1,). Raises `StoppedError` if
+    Newton's method does not converge, or if the curve has no result.
+    """
     place, memory, careful = guess, None, False
     last, grown = math.inf, 0
     for looks in range(1, _MOST + 1):
@@ -202,7 +209,7 @@ def follow_curve(
     """Follow the curve from `start` in the direction of its tangent, and return the path.
 
     A step is halved until Newton's method converges and the tangent turns little. `tests`:
-    functions of a spot, by name. Their zeros are located.
+    functions of a spot, by name; the spots at which they are zero become `Path.crossings`.
     """
     tests = tests or {}
     spots, crossings = [start], []
@@ -230,21 +237,22 @@ def follow_curve(
         spots.append(new)
         if _back_at_first(curve, spots):
             return Path(spots, crossings, End.CLOSED)
-        # Many looks do not shrink the step: near a grazing contact every point needs as many.
+        # The step does not shrink after many looks: near a grazing contact every spot needs many.
         if new.tangent @ old.tangent > _STRAIGHT:
             step = min(1.5 * step, steps.greatest)
 
 
 def _leaves(spot: Spot, steps: StepSizes) -> bool:
-    """Return whether the curve leaves the range here."""
+    """Return whether `spot` is at an end of the range and its tangent points out of the range."""
     value, way = float(spot.place[-1]), float(spot.tangent[-1])
     return (value <= steps.low and way < 0) or (value >= steps.high and way > 0)
 
 
 def _next(curve: SolutionCurve, old: Spot, step: float, steps: StepSizes) -> Spot:
-    """Return the spot after `old`, at most at the end of the range.
+    """Return the spot one `step` after `old`, or at the end of the range if that is closer.
 
-    Raises `StoppedError` if there is none, or if it may lie on another curve."""
+    Raises `StoppedError` if no spot is found, or if the spot may lie on another curve.
+    """
     new = None
     guess = old.place + step * old.tangent
     if steps.low <= guess[-1] <= steps.high:
@@ -268,7 +276,7 @@ def _next(curve: SolutionCurve, old: Spot, step: float, steps: StepSizes) -> Spo
 def _around_corner(curve: SolutionCurve, old: Spot, steps: StepSizes) -> Spot | None:
     """Return a spot close to `old` beyond a corner too sharp for a step to follow, or None.
 
-    It must lie ahead of `old`, not behind. It does if the tangent there, with the same orientation,
+    The spot must lie ahead of `old`. That is so if its tangent, with the orientation of `old`,
     points away from `old`.
     """
     for size in _CORNER:
@@ -292,7 +300,7 @@ def _orientation(spot: Spot) -> float:
 
 
 def _back_at_first(curve: SolutionCurve, spots: list[Spot]) -> bool:
-    """Return whether the first spot lies on the last step."""
+    """Return whether the last step has passed the first spot, so that the curve is closed."""
     first, old, new = spots[0], spots[-2], spots[-1]
     chord = new.place - old.place
     share = (first.place - old.place) @ chord / (chord @ chord)
@@ -308,7 +316,9 @@ def _back_at_first(curve: SolutionCurve, spots: list[Spot]) -> bool:
 
 
 def _located(curve: SolutionCurve, old: Spot, new: Spot, test: Callable[[Spot], float]) -> Spot:
-    """Return the spot between two at which `test` is zero, by regula falsi (Illinois variant)."""
+    """Return the spot between `old` and `new` at which `test` is zero.
+
+    The method is regula falsi, Illinois variant."""
     chord = new.place - old.place
     across = chord / np.linalg.norm(chord)
     low, high = 0.0, 1.0

@@ -2,7 +2,8 @@
 
 A branch begins at a known orbit (`Evaluation.state` and its period). It is a solution curve of the
 equations in `orbits`, followed by pseudo-arclength continuation (`arclength`). Unstable orbits,
-which a simulation does not show, are followed like stable ones, and flagged.
+which a simulation does not show, are followed like stable orbits; `BranchPoint.stable` tells them
+apart.
 """
 
 import dataclasses
@@ -36,11 +37,11 @@ from rootsopt.dynamics.verdict import RESIDUAL
 from rootsopt.errors import InputError
 
 _HALVED = 0.004
-"""Distance (in the unit of `StepSizes`) from the state half an orbit later, below which a branch
-that ends for no other reason counts as HALVED."""
+"""Distance (unit of `StepSizes`) between the states at the start and middle of an orbit below which
+the end of a branch without other reason is `End.HALVED`."""
 _SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
-"""Distances (in the unit of `StepSizes`) from a period doubling at which the doubled orbit is
-searched for."""
+"""Distances (unit of `StepSizes`) from a period doubling at which the orbit of twice the period is
+searched for, in this order."""
 
 
 class Kind(enum.Enum):
@@ -56,7 +57,8 @@ class Kind(enum.Enum):
 class Bifurcation:
     """A bifurcation of a branch.
 
-    `kind`; `point`: the orbit there; `after`: index of the branch's last point before it.
+    `kind` of bifurcation; `point`: the orbit at the bifurcation; `after`: index of the branch's
+    last point before the bifurcation.
     """
 
     kind: Kind
@@ -65,7 +67,7 @@ class Bifurcation:
 
     @property
     def value(self) -> float:
-        """Value of the parameter at the bifurcation (config's unit)."""
+        """Value of the parameter at the bifurcation, in the config's unit."""
         return self.point.value
 
 
@@ -73,9 +75,10 @@ class Bifurcation:
 class Branch:
     """Orbits of one period along a parameter.
 
-    `config`: that of the start; `parameter`: its name; `period` (mesh periods); `points`: the
-    orbits, in order; `bifurcations`; `ends`: why the branch begins and ends where it does;
-    `limits`: range and steps (in the config's unit).
+    `config` of the orbit from which the branch was followed; `parameter`: name of the parameter;
+    `period` of all orbits (mesh periods); `points`: the orbits, in order; `bifurcations` on the
+    branch; `ends`: why the branch begins and ends where it does; `limits`: range (config's unit)
+    and step sizes.
     """
 
     config: Config
@@ -87,9 +90,10 @@ class Branch:
     limits: StepSizes
 
     def at(self, value: float) -> list[BranchPoint]:
-        """Return all orbits of the branch at a value of the parameter, each closed there.
+        """Return all orbits of the branch at one `value` of the parameter (config's unit).
 
-        The list is empty if the branch does not pass this value."""
+        Each orbit is closed again at exactly this value. The list is empty if the branch does not
+        pass the value."""
         orbits = Orbits(self.config, self.parameter, self.period, self.limits)
         found = []
         for old, new in zip(self.points[:-1], self.points[1:], strict=True):
@@ -118,9 +122,9 @@ def follow(
 ) -> Branch:
     """Follow the orbit of `period` mesh periods near the scaled `state` (n,) along a parameter.
 
-    `limits`: range of the parameter in the config's unit, which must contain the config's own
-    value; and step sizes. A step of length 1 spans the range, or changes the scaled state by
-    `SPAN`. `ways`: first along falling (-1) and then along rising (1) values, or only one of these.
+    `limits`: range of the parameter (config's unit), which must contain the config's own value, and
+    step sizes. A step of length 1 spans the range, or changes the scaled state by `SPAN`. `ways`:
+    directions to follow, -1 for falling and 1 for rising values of the parameter.
 
     Raises `InputError` for an unknown parameter, a value outside the limits, single precision, or a
     wrong `period` or `ways`; also if there is no orbit to start from.
@@ -161,11 +165,11 @@ def follow(
 def follow_doubled(
     branch: Branch, bifurcation: Bifurcation, limits: StepSizes | None = None
 ) -> Branch | None:
-    """Follow the branch of twice the period that is born at a period doubling of `branch`.
+    """Follow the branch of twice the period that begins at a period doubling of `branch`.
 
-    It begins a little away from the bifurcation, displaced along the eigenvector of the multiplier
-    -1. `limits`: by default those of `branch`. The result is None if only the orbit of single
-    period is found, or if twice the period exceeds 8 mesh periods.
+    The first orbit is searched for a little away from the bifurcation, displaced along the
+    eigenvector of the multiplier -1. `limits`: by default the limits of `branch`. The result is
+    None if only the orbit of single period is found, or if twice the period exceeds 8 mesh periods.
 
     Raises `ValueError` for another kind of bifurcation.
     """
@@ -202,7 +206,7 @@ def follow_doubled(
 
 
 def _branch(orbits: Orbits, path: Path) -> Branch:
-    """Return the branch of a path."""
+    """Return the branch that consists of the spots of `path`, with its bifurcations."""
     end = path.end
     if end is End.STEP_TOO_SMALL and orbits.period % 2 == 0:
         half_way = path.spots[-1].look.data.half_way
@@ -210,7 +214,7 @@ def _branch(orbits: Orbits, path: Path) -> Branch:
     bifurcations = []
     for after, name, spot in path.crossings:
         kind, point = Kind[name], orbits.point(spot)
-        # Two real multipliers with product 1 are a neutral saddle, no bifurcation.
+        # Two real multipliers with product 1 are a neutral saddle, which is not a bifurcation.
         real = np.all(np.abs(point.multipliers.imag) < 1e-9)
         if kind is not Kind.NEIMARK_SACKER or not real:
             bifurcations.append(Bifurcation(kind, point, after))
@@ -226,7 +230,7 @@ def _branch(orbits: Orbits, path: Path) -> Branch:
 
 
 def _joined(falling: Branch, rising: Branch) -> Branch:
-    """Join two branches that begin at the same point, the first reversed."""
+    """Join two branches that begin at the same point, with the points of `falling` reversed."""
     count = len(falling.points) - 1
     points = tuple(
         dataclasses.replace(point, slope=-point.slope) for point in falling.points[:0:-1]

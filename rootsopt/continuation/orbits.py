@@ -1,8 +1,9 @@
 """Periodic orbits as the solutions of equations in a state and a parameter.
 
-The unknowns are the state at φ1 = 0, always in the units of the first config, and the parameter.
-The equations require that the state returns after k mesh periods. Their derivatives come from the
-linearised steps of the motion. `rootsopt.continuation.branch` follows the curves.
+The unknowns are the parameter and the state at φ1 = 0, in the units of the first config at every
+value of the parameter. The equations require that the state returns after k mesh periods. Their
+derivatives come from the linearised steps of the motion. `rootsopt.continuation.branch` follows
+the curves of solutions.
 """
 
 import dataclasses
@@ -43,20 +44,21 @@ PLACES = {
     "backlash_mm": "scene.timing_gear.backlash_mm",
     "damping_ratio": "scene.timing_gear.damping_ratio",
 }
-"""Scene parameters that can be followed, in the config's units, and their config keys. Design
-parameters can be followed too; their keys are in `profile`."""
+"""Names of the scene parameters along which orbits can be followed, and their config keys. Orbits
+can also be followed along design parameters, whose keys are in the section `profile`."""
 _GEAR = ("backlash_mm", "damping_ratio")
 SPAN = 20.0
 """Change of the scaled state that counts as much as the whole range of the parameter."""
 _LOOKS = 504
 """Number of uniform times of an orbit at which contact is checked."""
 LONGEST = 8
-"""Longest orbit (mesh periods)."""
+"""Longest orbit that can be followed (mesh periods)."""
 _STEP = 1 / 256
-"""Target for the longest step (mesh periods). Steps may be slightly longer."""
+"""Length (mesh periods) above which solver steps are divided. Steps may stay slightly longer."""
 _SAME = 1e-5
-"""Distance (in the unit of `StepSizes`) from the state half an orbit later, below which an orbit is
-one of half the period. States between steps are interpolated, so it is not zero."""
+"""Distance (unit of `StepSizes`) between the states at the start and the middle of an orbit, below
+which the orbit has half the period. States between steps are interpolated, so the limit is not 0.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +68,7 @@ class BranchPoint:
     `value` of the parameter (config's unit); `state` (n,) at φ1 = 0, scaled for the config with
     that value, so that an `Evaluator` can start there; `period` (mesh periods); `mean`, `peak`,
     `rms` of the contact force (N); `multipliers` (n,): Floquet multipliers; `residual`: greatest
-    entry of |Φ(z) - z|, relative to that of |z| if this exceeds one; `slope`: derivative of the
+    entry of |Φ(z) - z|, divided by the greatest entry of |z| if above 1; `slope`: derivative of the
     parameter, as a fraction of its range, with respect to arclength; `gap_time`: longest time (mesh
     periods) in which neither flanks nor gear touch; `depth`: greatest penetration (m); `reach`:
     greatest |ε| (rad); `looks`: number of integrations.
@@ -93,7 +95,7 @@ class BranchPoint:
 
 
 def parameters(config: Config) -> tuple[str, ...]:
-    """Return the names of the parameters that can be followed for `config`."""
+    """Return the names of the parameters along which orbits of `config` can be followed."""
     gear = _GEAR if config.scene.timing_gear is not None else ()
     gas = config.scene.load.pressure_difference_Pa is not None
     load = "pressure_difference_Pa" if gas else "torque_N_m"
@@ -114,14 +116,15 @@ def value_of(config: Config, parameter: str) -> float:
 
 
 def place_of(parameter: str) -> str:
-    """Return the config key of a parameter."""
+    """Return the dotted config key of a parameter."""
     return PLACES.get(parameter, f"profile.{parameter}")
 
 
 def with_value(config: Config, parameter: str, value: float) -> Config:
-    """Return `config` with another value of a parameter.
+    """Return `config` with another `value` of a parameter, in the config's unit.
 
-    Raises `InputError` for an unknown parameter or a value out of bounds."""
+    Raises `InputError` for an unknown parameter or a value out of bounds.
+    """
     _check(config, parameter)
     if parameter in design_keys(config):
         return parse(_with_design(config, parameter, value).to_yaml())
@@ -148,11 +151,12 @@ def _check(config: Config, parameter: str) -> None:
 
 
 class _Shot(NamedTuple):
-    """k mesh periods from a state.
+    """Result of integrating k mesh periods from a state.
 
-    `out`: the flow; `grid`: its steps, with ends added where the equation is not smooth; `lost`:
-    whether the mesh was lost; `touching`: whether there is contact, at uniform times; `scale`
-    (rad): angle scale of the config.
+    `out`: the flow; `grid`: solver steps of the flow, with step ends added where the equation is
+    not smooth; `lost`: whether the pair was lost (`RotorPair.lost`); `touching`: whether there is
+    contact, at uniform times; `scale` (rad): unit of ε in the config at this value of the
+    parameter.
     """
 
     out: Flow
@@ -163,10 +167,10 @@ class _Shot(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """Data of an orbit at a look, in addition to residual and Jacobian.
+    """Data of an orbit in `Look.data`, in addition to residual and Jacobian.
 
-    `statistics`: mean, peak and RMS force (N); `half_way`: distance (in the unit of `StepSizes`)
-    from the state half an orbit later; the others: see `BranchPoint`.
+    `statistics`: mean, peak and RMS force (N); `half_way`: distance (unit of `StepSizes`) between
+    the states at the start and the middle of the orbit. For the other fields, see `BranchPoint`.
     """
 
     monodromy: NDArray[np.float64]
@@ -180,10 +184,10 @@ class _Seen(NamedTuple):
 
 
 class Orbits:
-    """Orbits of k mesh periods as a `SolutionCurve`.
+    """Equations for orbits of k mesh periods, as a `SolutionCurve`.
 
-    A place (n + 1,) is the scaled state divided by `SPAN`, then the parameter as a fraction of its
-    range.
+    The unknowns (n + 1,), called a *place*, are the scaled state divided by `SPAN`, then the
+    parameter as a fraction of its range.
 
     Raises `InputError` for single precision.
     """
@@ -202,7 +206,7 @@ class Orbits:
         self.integrator = integrators(config)[1]
         self.width = limits.high - limits.low
         self.steps = dataclasses.replace(limits, low=0.0, high=1.0)
-        # The unit of ε is that of the first config, while the parameter changes.
+        # Keep the unit of ε of the first config while the parameter changes.
         self.unit = float(_unit(self.scene, self.names, self.values))
 
     def value(self, place: NDArray[np.float64]) -> float:
@@ -211,7 +215,9 @@ class Orbits:
         return float(self.limits.high if share == 1 else self.limits.low + share * self.width)
 
     def place(self, state: ArrayLike, value: float) -> NDArray[np.float64]:
-        """Return the place of an orbit, from its state as scaled for the config with `value`."""
+        """Return the place of an orbit at a `value` of the parameter (config's unit).
+
+        `state` (n,): scaled for the config with this value."""
         scale = float(_unit(self.scene, self.names, self._values(value)))
         share = (value - self.limits.low) / self.width
         return np.append(np.asarray(state) * (scale / self.unit / SPAN), share)
@@ -222,9 +228,9 @@ class Orbits:
         return values
 
     def closed(self, guess: NDArray[np.float64]) -> BranchPoint:
-        """Return the orbit near the place `guess`, at the same value of the parameter.
+        """Return the orbit near the place `guess` (n + 1,), at the same value of the parameter.
 
-        Raises `StoppedError` if there is none."""
+        Raises `StoppedError` if no orbit is found."""
         fixed = np.eye(len(guess))[-1]
         return self.point(corrected(self, guess, fixed, fixed))
 
@@ -284,7 +290,7 @@ class Orbits:
         )
 
     def _check_design(self, value: float) -> None:
-        """Raise `StoppedError` where no profile can be made."""
+        """Raise `StoppedError` if the design has no valid profile at this `value`."""
         if self.parameter in design_keys(self.config):
             try:
                 check_geometry(_with_design(self.config, self.parameter, value))
@@ -292,7 +298,7 @@ class Orbits:
                 raise StoppedError(End.NO_GEOMETRY) from None
 
     def point(self, spot: Spot) -> BranchPoint:
-        """Return the orbit at a spot."""
+        """Return the orbit at a `spot` of the curve."""
         seen: _Seen = spot.look.data
         mean, peak, rms = map(float, seen.statistics)
         return BranchPoint(
@@ -324,7 +330,7 @@ def _longest_gap(touching: NDArray[np.bool_]) -> float:
 def _build(
     scene: Scene, names: tuple[str, ...], values: Float[Array, " p"]
 ) -> tuple[RotorPair, Float[Array, ""]]:
-    """Return the pair with these parameter values (config's units), and its angle scale (rad)."""
+    """Return the pair with these parameter `values` (config's units), and its unit of ε (rad)."""
     at = dict(zip(names, values, strict=True))
     gear = scene.gear
     if gear is not None:
@@ -362,11 +368,11 @@ def _shoot(  # Eleven parameters, since a compiled program takes its arrays one 
     repeat: Bool[Array, ""],
     refine: Bool[Array, ""],
 ) -> _Shot:
-    """Integrate from a `state` in the fixed `unit` (rad), with derivatives.
+    """Integrate `period` mesh periods from a `state` with ε in the fixed `unit` (rad).
 
-    These are with respect to the state and along `direction` (p,) of the parameters. If `repeat`,
-    the steps are those of `grid`. If `refine`, the returned grid has step ends added where the
-    equation is not smooth, and in long steps.
+    Derivatives are with respect to the state and along `direction` (p,) of the parameters. If
+    `repeat`, the steps of `grid` are repeated. If `refine`, step ends are added to the returned
+    grid where the equation is not smooth, and in long steps.
     """
 
     def build(values):
@@ -400,10 +406,10 @@ def _shoot(  # Eleven parameters, since a compiled program takes its arrays one 
 
 
 def _without_long(grid: Float[Array, " steps"], period: Float[Array, ""]) -> Float[Array, " steps"]:
-    """Return `grid` with ends added in steps much longer than `_STEP`.
+    """Return `grid` with step ends added in steps much longer than `_STEP`.
 
-    In free flight, the error control takes steps so long that a short contact may or may not be
-    seen. The flow would then jump between neighbouring states.
+    In free flight, the error control takes steps so long that a short contact may be missed. The
+    flow would then jump between neighbouring states.
     """
     ends = _STEP * jnp.arange(1, LONGEST / _STEP)
     after = jnp.searchsorted(grid, ends)

@@ -33,7 +33,7 @@ class Strobe(NamedTuple):
 
 
 class Flow(NamedTuple):
-    """A stretch of motion over whole mesh periods, with scaled states.
+    """Result of integrating a motion over whole mesh periods. States are scaled.
 
     `end`: final state; `mean` (N), `mean_square` (N²), `peak` (N) of the contact force;
     `peak_time` (mesh periods); `depth`: greatest penetration at the sampled times (m; negative:
@@ -42,8 +42,8 @@ class Flow(NamedTuple):
     rejected solver steps; `solved`: whether the solver succeeded; `strain`: greatest error estimate
     of a repeated step, in tolerances (0 if the pair is not `smooth`); `others`: values of
     `Measures` after mean and mean square; `slope`: derivatives of (`end`, `mean`, `mean_square`,
-    `peak`, `others`). Its columns are the n entries of the initial state and the d requested
-    directions, or there are none.
+    `peak`, `others`), with n + d columns: the n entries of the initial state, then d parameter
+    directions. `slope` has no columns if no derivatives were requested.
     """
 
     end: Float[Array, " n"]
@@ -96,9 +96,11 @@ class Flow(NamedTuple):
 def strobe(
     pair: RotorPair, state: Float[Array, " n"], periods: int, integrator: Integrator
 ) -> Strobe:
-    """Integrate the scaled `state` (n,) alone over `periods` mesh periods, from φ1 = 0.
+    """Integrate the scaled `state` (n,) over `periods` mesh periods from φ1 = 0.
 
-    Steps end exactly at the end of each mesh period. Interpolated states would have an error far
+    The contact force is not evaluated for statistics, unlike in `flow`.
+
+    A step ends exactly at the end of each mesh period. Interpolated states would have an error far
     above the tolerance, which could hide that the motion repeats.
     """
     number = state.dtype.type
@@ -135,11 +137,12 @@ class _Equation(eqx.Module):
     """The equation of motion together with the integrals of the measures, in the solver's units.
 
     The unknown y holds the state (n,), then the integrals, then the time if rotor 1 is free.
-    Methods take the numbers of the pair (`dynamic`) as an argument, to be differentiated with
-    respect to them.
+    Methods take the floating-point arrays of the pair as the argument `dynamic`, so that JAX can
+    differentiate with respect to them.
 
-    `static`: the rest of the pair; `measures`; `force_unit` (N); `top`: roughly the greatest force,
-    in `force_unit`; `states`: their number n; `solver`: the method of integration.
+    `static`: the rest of the pair; `measures`: averages to integrate; `force_unit` (N); `top`:
+    roughly the greatest force, in `force_unit`; `states`: number n of states; `solver`: the method
+    of integration.
     """
 
     static: Any = eqx.field(static=True)
@@ -150,7 +153,7 @@ class _Equation(eqx.Module):
     solver: diffrax.AbstractSolver
 
     def start(self, state: Float[Array, " n"], free: bool) -> Float[Array, " m"]:
-        """Return y at the start."""
+        """Return y at the start: the scaled `state`, then zeros for the integrals."""
         return jnp.pad(state, (0, self.measures.count + free))
 
     def derivative(self, tau, y, dynamic, marked: bool = False) -> Float[Array, " m"]:
@@ -177,7 +180,7 @@ class _Equation(eqx.Module):
         return after[:-MARKS] + moved, slopes[-1, :-MARKS]
 
     def with_force(self, begin, end, y, dynamic) -> Float[Array, " rows"]:
-        """Return y after one step, followed by the contact force there (in `force_unit`)."""
+        """Return y at the end of one step, followed by the contact force (`force_unit`) there."""
         after, slope = self.advanced(begin, end, y, dynamic)
         free = eqx.combine(dynamic, self.static).free
         force = slope[self.states]
@@ -210,8 +213,9 @@ class _Recorded(NamedTuple):
 class _Peak(NamedTuple):
     """The instant of the peak force.
 
-    `holds`: index of the step that contains it; `time` (mesh periods); `beside`: times relative to
-    it (mesh periods) at which the force is evaluated; `noise`: relative rounding of the force.
+    `holds`: index of the step that contains the peak; `time` of the peak (mesh periods); `beside`:
+    times relative to `time` (mesh periods) at which the force is evaluated; `noise`: relative
+    rounding error of the force.
     """
 
     holds: Int[Array, ""]
@@ -239,12 +243,12 @@ def flow(  # Eleven parameters: adaptive steps, repeated steps and reverse mode 
     under the same error control as the motion; `top` (N): roughly the greatest force, for the
     p-norm; `samples`: number of uniform samples, between which the peak is located.
 
-    `tangents`: directions of the pair's parameters, stacked along a leading axis (there may be
-    none). With them, every step is linearised, which gives `slope`. The derivatives include the
-    moving instants of contact jumps. `adjoint`: for reverse mode instead. Where the contact may
-    jump, it only selects reverse mode, and the steps themselves are differentiated.
+    `tangents`: d directions of the pair's parameters, stacked along a leading axis; d may be 0. If
+    given, every step is linearised, and the result has `slope`. The derivatives include the moving
+    instants of contact jumps. `adjoint`: makes the flow differentiable in reverse mode. If the
+    contact may jump, the steps themselves are differentiated instead of using `adjoint`.
 
-    `grid`: steps to repeat if `repeat`; otherwise steps are chosen adaptively.
+    `grid`: ends of steps to repeat if `repeat` is true; otherwise steps are chosen adaptively.
     """
     count, dtype = state.shape[0], state.dtype
     measures = Measures() if measures is None else measures
@@ -329,7 +333,7 @@ def _solved(
     samples: int,
     adjoint: diffrax.AbstractAdjoint,
 ) -> _Recorded:
-    """Integrate from y = `start` over `periods` mesh periods and record every step."""
+    """Integrate from y = `start` over `periods` mesh periods, and return all accepted steps."""
     dtype, count = start.dtype, equation.states
 
     def whole(share, y, dynamic):
@@ -380,7 +384,7 @@ def _solved(
 def _retraced(
     equation: _Equation, taken: _Recorded, start: Float[Array, " m"], dynamic: Any
 ) -> _Recorded:
-    """Repeat the recorded steps, so that reverse mode includes the moving instants of jumps."""
+    """Repeat the steps in `taken`, so that reverse mode includes the moving instants of jumps."""
 
     @jax.checkpoint
     def again(y, step):

@@ -24,19 +24,18 @@ IMPLICIT = ("kvaerno3", "kvaerno5")
 
 
 _STAGES = 1e5
-"""Finest tolerance for the stages of an implicit method, in rounding errors. The gap is the
-difference of lengths ten thousand times a penetration, and the force is a power of the gap. With a
-finer tolerance, the iterations never end, and a repeated step cannot be made shorter. The last
-iteration gains more than requested, because each one is a full step of Newton's method."""
+"""Minimum tolerance (rounding errors) of Newton's method for the stages of an implicit step. The
+gap is a difference of lengths ten thousand times a penetration, and the force is a power of the
+gap. With a finer tolerance, the iterations would never end, and a repeated step cannot be made
+shorter. The result is better than this tolerance, because every iteration is a full Newton step."""
 _FIRST_STEP = 1e-3, 0.05
-"""First step: the shorter of the first number, in mesh periods, and the second, in `swing` of
-`Timescales`. The error control rejects a first step that is too long."""
+"""Length of the first step: the smaller of an absolute limit (mesh periods) and a limit in units of
+`Timescales.swing`. The error control rejects a first step that is too long."""
 _LONGEST = 1 / 32, 1 / 8, 4.0
-"""Longest step: the shorter of the first number, in mesh periods, and the second, in times of a
-fall through the play. In free flight, the error control would let a step skip a short contact of
-the gear without a stage inside it. The limit from the fall is at least the third number, in mesh
-periods per `max_steps`: such steps alone use at most a quarter of the allowed number. An implicit
-method takes far longer steps where the pair does not fly."""
+"""Longest step: the smaller of an absolute limit (mesh periods) and a limit in units of
+`Timescales.fall`. In free flight, the error control alone would let a step skip a short contact of
+the gear. The third number, divided by `max_steps`, is a lower bound (mesh periods) on the second
+limit: steps of this length use at most a quarter of `max_steps` per mesh period."""
 
 
 class Integrator(eqx.Module):
@@ -52,7 +51,7 @@ class Integrator(eqx.Module):
     max_steps: int = eqx.field(static=True)
 
     def tolerance(self, dtype: Any) -> Float[Array, ""]:
-        """Return `rtol` for states of type `dtype`, raised to at least 20 rounding errors."""
+        """Return `rtol` for states of type `dtype`, but at least 20 rounding errors of it."""
         floor = 20 * float(jnp.finfo(dtype).eps)
         return jnp.maximum(self.rtol, floor).astype(dtype)
 
@@ -66,8 +65,8 @@ class Integrator(eqx.Module):
             return method(scan_kind=loops)
         least = _STAGES * float(jnp.finfo(dtype).eps)
         rtol: Any = jnp.maximum(self.tolerance(dtype), least).astype(dtype)
-        # A new Jacobian for every iteration: with the one from the start of the step, iterations do
-        # not converge across a kink, and a repeated step cannot be made shorter.
+        # Compute a new Jacobian for every iteration. With the Jacobian from the start of the step,
+        # iterations do not converge across a kink, and a repeated step cannot be made shorter.
         return method(scan_kind=loops, root_finder=optimistix.Newton(rtol=rtol, atol=rtol))
 
     def controller(
@@ -78,8 +77,9 @@ class Integrator(eqx.Module):
     ) -> "diffrax.PIDController | LandingControl":
         """Return the step size control for states of type `dtype`.
 
-        `periods`: mesh periods per unit of the independent variable; `pair`: the rotor pair, whose
-        timescales limit the steps, if known."""
+        `periods`: mesh periods per unit of the independent variable; `pair`: rotor pair whose
+        `timescales`, if known, limit the steps. The result is a `LandingControl` if they are known,
+        else a plain `diffrax.PIDController`."""
         rtol = self.tolerance(dtype)
         longest = _LONGEST[0]
         if pair is not None and pair.timescales is not None:
@@ -93,7 +93,7 @@ class Integrator(eqx.Module):
 
 
 def first_step(pair: RotorPair, dtype: Any) -> Float[Array, ""]:
-    """Return the first step (mesh periods) to try."""
+    """Return the length (mesh periods) of the first step that the solver tries for `pair`."""
     longest, share = _FIRST_STEP
     if pair.timescales is None:
         return jnp.asarray(longest, dtype)
@@ -102,11 +102,11 @@ def first_step(pair: RotorPair, dtype: Any) -> Float[Array, ""]:
 
 
 class StepGrid(diffrax.AbstractAdaptiveStepSizeController):
-    """Step size control with adaptive steps, or with recorded steps that are repeated.
+    """Step size control that either chooses steps adaptively or repeats recorded steps.
 
     On repeated steps the discrete flow is a smooth function of state and parameters, so Newton's
     method converges to rounding. `pid`: control of adaptive steps; `ends`: ends of the recorded
-    steps (inf beyond the last); `repeat`: whether to repeat these.
+    steps (inf beyond the last); `repeat`: whether to repeat the recorded steps.
     """
 
     pid: diffrax.PIDController | LandingControl

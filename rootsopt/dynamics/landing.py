@@ -1,11 +1,12 @@
 """Step size control that ends steps where a flank or the timing gear may begin to touch.
 
-In free flight the motion is a parabola, on which a high-order method sees no error. Its steps grow
-until one of them, between two stages, skips a whole contact, at any tolerance. Two integrations
-whose steps differ by rounding alone then differ by the impulse of that contact.
+In free flight the motion is a parabola, for which a high-order method estimates no error. Steps
+grow until one of them skips a whole contact between two stages, at any tolerance. Two integrations
+whose steps differ only by rounding then differ by the impulse of that contact.
 
-Therefore a step ends where the parabola through the last step reaches an edge of free flight, and
-the next step starts short. A step that has passed an edge by too much is repeated.
+Therefore a step ends where the parabola through the last step reaches an edge of free flight: a
+value of ε at which contact may begin. The next step starts short. A step that has passed an edge
+by too much is repeated.
 """
 
 import diffrax
@@ -16,7 +17,7 @@ from jaxtyping import Array, Float
 from rootsopt.dynamics.pair import RotorPair
 
 _BEYOND = 1e-4
-"""Time (mesh periods) by which a step is meant to pass an edge. A shorter contact may be missed."""
+"""Time (mesh periods) past an edge at which a step should end. A shorter contact may be missed."""
 _LATE = 10.0
 """Time past an edge, in units of `_BEYOND`, above which a step is repeated."""
 _AFTER = 5.0
@@ -25,8 +26,8 @@ _CLOSE = 0.05
 """Distance (scaled ε) from an edge to the vertex of the parabola below which a step ends at the
 vertex."""
 _INSIDE = 1 / 128
-"""Longest step (mesh periods) where the instant of contact also depends on the rotation: with the
-clearance taken up, or with displaced axes."""
+"""Longest step (mesh periods) where ε alone does not determine whether flanks touch: beyond the
+clearance, or with displaced axes."""
 
 
 class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
@@ -99,7 +100,7 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         return keep, start, start + following, jump, new, result
 
     def _passed(self, before, after, step):
-        """Return whether a step has passed an edge, and how long (mesh periods) before its end."""
+        """Return whether a step has passed an edge, and the time (mesh periods) since then."""
         passed = (before[0] - self.edges) * (after[0] - self.edges) < 0
         rate = jnp.maximum(jnp.abs(after[1]), jnp.abs(after[0] - before[0]) / step)
         ago = jnp.abs(after[0] - self.edges) / rate
@@ -125,5 +126,5 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
 
 
 def _known(x):
-    """Return x with zeros replaced by infinity."""
+    """Return x with zeros replaced by infinity, for use as a divisor."""
     return jnp.where(x == 0, jnp.inf, x)

@@ -1,7 +1,7 @@
-"""Linear algebra with a few unknowns, in plain arithmetic.
+"""Linear algebra with a few unknowns, in plain arithmetic instead of LAPACK.
 
-LAPACK is avoided for two reasons. A call costs more than solving two equations, and a compiled
-program that contains one cannot be stored for other processes.
+A LAPACK call costs more than solving two equations. Besides, a compiled program that contains
+such a call cannot be stored for other processes.
 """
 
 import jax.numpy as jnp
@@ -9,13 +9,13 @@ from jax import lax
 from jaxtyping import Array, Complex, Float
 
 _SQUARINGS = 40
-"""Squarings of a matrix after which its growth no longer depends on the norm."""
+"""Number of squarings after which a matrix's growth rate no longer depends on the norm used."""
 _SWEEPS = 40
 """Maximum number of QR iterations per eigenvalue."""
 
 
 def solved(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """Return the solution of a few linear equations, by elimination with row pivoting."""
+    """Return the solution X (n, m) of `matrix` X = `right`, by elimination with row pivoting."""
     rows = jnp.concatenate([matrix, right], axis=1)
     count = matrix.shape[0]
     place = jnp.arange(count)
@@ -32,8 +32,8 @@ def solved(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Arr
 def spectral_radius(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
     """Return the greatest modulus of the eigenvalues, in real arithmetic.
 
-    For two rows it follows from trace and determinant. For more rows it is the growth rate of the
-    powers of the matrix. Repeated squaring takes the powers so far that the norm does not matter.
+    For two rows, the result follows from trace and determinant. For more rows, the result is the
+    growth rate of the powers of the matrix, computed by repeated squaring.
     """
     if matrix.shape[0] == 2:
         half = jnp.trace(matrix) / 2
@@ -59,7 +59,7 @@ def eigenvalues(matrix: Float[Array, "n n"]) -> Complex[Array, " n"]:
 
     In a conjugate pair, the value with positive imaginary part comes first. The method is QR
     iteration with Wilkinson's shift and deflation (Golub and Van Loan, Matrix Computations, section
-    7.5). It works on the full matrix, because there are at most about twelve states.
+    7.5). There is no reduction to Hessenberg form, since the matrices have at most about 12 rows.
     """
     count = matrix.shape[0]
     work = matrix.astype(jnp.result_type(matrix.dtype, jnp.complex64))
@@ -68,8 +68,8 @@ def eigenvalues(matrix: Float[Array, "n n"]) -> Complex[Array, " n"]:
     small = float(jnp.finfo(matrix.dtype).eps)
 
     def shift_of(work, size):
-        """Return that eigenvalue of the active part's last 2 x 2 block which is nearest to the
-        block's last entry."""
+        """Return Wilkinson's shift: the eigenvalue of the active block's last 2 x 2 block that is
+        nearest to its last entry."""
         low, high = size - 1, jnp.maximum(size - 2, 0)
         a, b, c, d = work[high, high], work[high, low], work[low, high], work[low, low]
         half = (a - d) / 2
@@ -110,6 +110,7 @@ def eigenvalues(matrix: Float[Array, "n n"]) -> Complex[Array, " n"]:
 
 
 def _of_two(matrix: Float[Array, "2 2"]) -> Complex[Array, " 2"]:
+    """Return the eigenvalues of a 2 x 2 matrix from its trace and determinant."""
     half = jnp.trace(matrix) / 2
     determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
     square = half**2 - determinant
@@ -123,7 +124,7 @@ def _of_two(matrix: Float[Array, "2 2"]) -> Complex[Array, " 2"]:
 
 
 def _orthogonal(matrix: Complex[Array, "n n"]) -> tuple[Complex[Array, "n n"], ...]:
-    """Return the factors Q and R of a matrix, by the Gram-Schmidt method with a second pass."""
+    """Return the QR factors (Q, R) of a matrix, by the Gram-Schmidt method with a second pass."""
     count = matrix.shape[0]
     columns, right = [], jnp.zeros_like(matrix)
     for k in range(count):

@@ -20,7 +20,7 @@ class Measures(eqx.Module):
     """The averages to compute in addition to mean and mean square.
 
     `orders` (lines,): spectral lines, in multiples of the mesh frequency. A motion of k mesh
-    periods has the line if k times the order is a whole number. `norm`: p of the p-norm
+    periods contains a line if k times its order is a whole number. `norm`: p of the p-norm
     (mean of F^p)^(1/p) ≤ max F, a smooth substitute for the peak; None: no p-norm.
     """
 
@@ -87,12 +87,12 @@ class Measures(eqx.Module):
         return jnp.stack(sizes) if sizes else jnp.zeros(0), rows
 
     def named(self, response: Any, period: int) -> dict[str, tuple[float, Any]]:
-        """Return the response of a closed orbit, by the names used in the result file.
+        """Return the response of a closed orbit as a dict whose keys are names in the result file.
 
-        `response` (r, 1 + d): rows mean, mean square, peak, then the other `values`; the value is
-        in the first column, its derivatives in the others. `period`: k in mesh periods. Each name
-        maps to its value (N) and derivatives (d,). The amplitude is 0 for an order that is not a
-        line of the motion.
+        `response` (r, 1 + d): rows mean, mean square, peak, then the other `values`. The first
+        column holds the value, the other d columns its derivatives. `period` of the orbit (mesh
+        periods). Each name maps to a pair: the value (N) and its derivatives (d,). The amplitude is
+        0 for an order that is not a line of the motion.
         """
         rows = np.asarray(response, np.float64)
         mean, square, peak, *others = rows

@@ -1,8 +1,9 @@
 """Close a periodic orbit by shooting, and differentiate it.
 
-Newton's method on the k-fold stroboscopic map closes the orbit. Its monodromy matrix tells whether
-it is stable, and the implicit function theorem gives the derivatives. Where there is no orbit, the
-same loop integrates a window of the motion (`rootsopt.dynamics.window`).
+Newton's method on the k-fold stroboscopic map closes an orbit of k mesh periods. The monodromy
+matrix tells whether the orbit is stable, and the implicit function theorem gives its derivatives.
+Where there is no orbit, the same loop integrates a window of the motion
+(`rootsopt.dynamics.window`).
 
 The solver steps of an orbit are recorded as a *grid*, and repeated once Newton's method is close.
 A *kink* is an instant at which the equation of motion is not smooth; grid steps end there.
@@ -32,27 +33,27 @@ of each mesh period."""
 _NEWTON_STEPS = 24
 """Default limit of integrations per orbit."""
 _CLOSED = 4000, 1e-3, 1e-10
-"""Residual (scaled) at which Newton's method stops. It is the larger of two: the first number, in
-rounding errors (1e-12 in double precision), and the second, in tolerances, limited by the third."""
+"""Limits (rounding errors, tolerances, scaled) that give the residual at which Newton's method
+stops. It is the second limit, but at most the third and at least the first (1e-12 in float64)."""
 _KEPT = 4
-"""Integrations after which the solver steps are kept, however large the Newton step is."""
+"""Number of integrations after which the solver steps are kept, however large the Newton step."""
 _LOOKS = 6
 """Maximum number of searches for kinks while an orbit is closed."""
 _DRIFT = 30.0, 1e-9, 1e-6
-"""Distance (scaled) from the orbit of the last search for kinks, above which kinks are searched for
-again: in tolerances, and its limits. Kinks may lie this far outside their steps, which causes an
-error of first order."""
+"""Change (tolerances) of the orbit's start since the last search for kinks above which the search
+is repeated, with lower and upper limit (scaled). Kinks may lie this far outside their steps, which
+causes an error of first order."""
 _STRAIN = 10.0
 """Error of a repeated step, in tolerances, above which the solver steps are chosen anew."""
 _AFTER = 3
-"""Integrations that must remain before a new search for kinks or a new choice of steps. With fewer,
-an orbit that is already closed could be lost."""
+"""Number of remaining integrations below which an orbit that is already closed keeps its steps. A
+new search for kinks, or a new choice of steps, would then risk losing the orbit."""
 _AGREE = 10.0, 1e-3, 3e-2
-"""Largest accepted difference of the derivatives on a grid and on the same grid with halved steps:
-in square roots of the tolerance, and its limits."""
+"""Relative difference (square roots of the tolerance) between derivatives on a grid and on halved
+steps above which the derivatives are not reported, with lower and upper limit."""
 _SMALL = 1e-9, 1e-3
-"""Limits of the Newton step (scaled) below which the solver steps are kept. Between them, it is a
-thousand tolerances."""
+"""Lower and upper limit (scaled) of the Newton step below which the solver steps are kept. Between
+these limits, the threshold is a thousand tolerances."""
 
 
 class Orbit(NamedTuple):
@@ -62,10 +63,10 @@ class Orbit(NamedTuple):
     `monodromy`: dΦ/dz; `multiplier`: greatest modulus of the Floquet multipliers, its eigenvalues;
     `response`: mean (N), mean square (N²), peak (N) and the other measures; `sensitivity` (r, d):
     derivatives of `response` with respect to the design, along the family of orbits; `moved`
-    (n, d): those of `state`; `newton_steps`: integrations for Newton's method; `drift`: distance
-    (scaled) from the orbit along which kinks were last searched for; `defect`: residual (scaled) on
-    a grid with halved steps; `disagreement`: relative difference of the derivatives on both grids.
-    The last two are 0 if there was no check.
+    (n, d): derivatives of `state`; `newton_steps`: integrations for Newton's method; `drift`:
+    change of `state` since the last search for kinks (scaled); `defect`: residual (scaled) on a
+    grid with halved steps; `disagreement`: relative difference of the derivatives on both grids.
+    `defect` and `disagreement` are 0 if there was no check.
     """
 
     state: Float[Array, " n"]
@@ -83,9 +84,9 @@ class Orbit(NamedTuple):
 
     @classmethod
     def empty(cls, state: Float[Array, " n"], directions: int, flow: Flow) -> "Orbit":
-        """Return an orbit from `state` that has not been integrated yet.
+        """Return a placeholder for an orbit from the scaled `state` (n,), before any integration.
 
-        `directions`: number d of design directions; `flow`: what `Flow.empty` returns."""
+        `directions`: number d of design directions; `flow`: result of `Flow.empty`."""
         count, dtype = state.shape[0], state.dtype
         infinite = jnp.asarray(jnp.inf, dtype)
         return cls(
@@ -108,12 +109,12 @@ class _Closing(NamedTuple):
     """State of the loop that closes an orbit or integrates a window.
 
     `orbit`, `window`: results so far; `state` and `grid` of the next integration; `repeat`: whether
-    it repeats the steps of `grid`; `held`: whether the last one repeated its steps; `improving`:
-    whether the last one at least halved the residual, or the grid is new; `base`: the steps without
-    those added for kinks;
-    `best`: least residual on this grid; `looks`: searches for kinks so far; `looked`: initial state
-    of the orbit along which the last search was; `refined`: how often the steps were halved because
-    derivatives disagreed; `checked`: whether the derivatives were compared.
+    the next integration repeats the steps of `grid`; `held`: whether the last integration repeated
+    its steps; `improving`: whether the last integration at least halved the residual, or the grid
+    is new; `base`: the grid without the step ends added for kinks; `best`: least residual on this
+    grid; `looks`: number of searches for kinks so far; `looked`: initial state at the last search;
+    `refined`: how often the steps were halved because derivatives disagreed; `checked`: whether
+    the derivatives were compared.
     """
 
     orbit: Orbit
@@ -132,7 +133,9 @@ class _Closing(NamedTuple):
 
 
 class _Closer(eqx.Module):
-    """Arguments of `orbit_or_window`. Its loop is `start`, `go_on` and `step`."""
+    """The loop of `orbit_or_window`, as methods of its arguments.
+
+    `start` gives the loop's first state, `go_on` its condition, `step` its body."""
 
     pair: RotorPair
     tangents: RotorPair
@@ -174,11 +177,11 @@ class _Closer(eqx.Module):
         """Return whether Newton's method continues."""
         done = now.orbit.newton_steps
         left = (now.orbit.residual > self.closed) & ((done < 3) | now.improving)
-        # Steps that are not repeated depend on the state, which leaves a floor under the residual.
+        # Adaptive steps depend on the state, so the residual cannot fall below their noise.
         return (left | ~now.held) & (done < self.shots + now.refined * self.shots // 2)
 
     def go_on(self, now: _Closing) -> Bool[Array, ""]:
-        """Return whether anything is left to integrate."""
+        """Return whether the loop continues: something is left to integrate."""
         sound = now.held & now.orbit.flow.solved & jnp.isfinite(now.orbit.residual)
         closing = self.is_open(now) | (sound & ~now.checked & self.check)
         alive = now.window.solved & jnp.all(jnp.isfinite(now.window.end))
@@ -218,8 +221,10 @@ class _Closer(eqx.Module):
         )
 
     def _newton(self, now: _Closing, start, checking, out: Flow) -> _Closing:
-        """Return the loop's state after the flow `out` from `start`: the Newton step, and the grid
-        of the next integration."""
+        """Return the loop's state after the flow `out` from `start`.
+
+        This takes the Newton step, or evaluates the check of the orbit if `checking`. It also
+        chooses the grid of the next integration."""
         count, dtype = start.shape[0], start.dtype
         monodromy = out.slope[:count, :count]
         miss = out.end - start
@@ -270,8 +275,8 @@ class _Closer(eqx.Module):
         )
 
     def _kept(self, now: _Closing, start, out: Flow, size, residual, improving):
-        """Return three flags: keep the steps of `out` from now on; search for kinks along `out`;
-        give up the steps kept so far."""
+        """Return three flags: whether to keep the steps of `out` from now on, whether to search for
+        kinks along `out`, and whether to discard the steps kept so far."""
         done, smooth = now.orbit.newton_steps + 1, self.pair.smooth
         known = size < jnp.clip(1000 * self.tolerance, *_SMALL)
         following = now.repeat | known | (done >= jnp.minimum(self.shots // 3, _KEPT))
@@ -279,7 +284,7 @@ class _Closer(eqx.Module):
         few = now.looks < _LOOKS
         stalled = now.repeat & ~improving & (residual > self.closed) & few
         again = now.repeat & (residual <= self.closed) & few & (done + _AFTER <= self.shots)
-        # A jump without a switch stays at the same steps, so it cannot stray.
+        # If the pair is not smooth, kinks are not searched for again because the orbit has moved.
         far = jnp.clip(_DRIFT[0] * self.tolerance, *_DRIFT[1:])
         strayed = again & (jnp.max(jnp.abs(start - now.looked)) > far) & smooth
         strained = again & ~(out.strain <= _STRAIN)
@@ -289,7 +294,7 @@ class _Closer(eqx.Module):
         return following, look, strayed | strained
 
     def _steps(self, now: _Closing, out: Flow, renewed, finer):
-        """Return the steps without those added for kinks, and the next grid."""
+        """Return the grid without step ends for kinks, and the grid of the next integration."""
         base = jnp.where(now.repeat, now.base, out.grid)
         base = lax.cond(finer, lambda: halved(base), lambda: base)
         length = self.period.astype(out.end.dtype)
@@ -305,10 +310,11 @@ class _Closer(eqx.Module):
 class Shots(eqx.Module):
     """Settings for closing an orbit.
 
-    `integrator`; `measures` of the force; `count`: maximum number of integrations; `closed`:
-    residual (scaled) at which Newton's method may stop; `samples`: number of samples of an orbit, a
-    multiple of its period; `check`: compare orbit and derivatives with those on a grid with halved
-    steps. If they disagree, the orbit is closed once more, on the finer grid.
+    `integrator` of the motion; `measures`: averages of the force; `count`: maximum number of
+    integrations; `closed`: residual (scaled) at which Newton's method may stop; `samples`: number
+    of uniform samples of an orbit, a multiple of its period; `check`: whether to compare orbit and
+    derivatives with those on a grid with halved steps. If the derivatives disagree, the orbit is
+    closed once more, on the finer grid.
     """
 
     integrator: Integrator
@@ -326,9 +332,9 @@ def close_orbit(
     period: Int[Array, ""],
     shots: Shots,
 ) -> Orbit:
-    """Close the orbit of `period` mesh periods near the scaled `state`, and differentiate it.
+    """Close the orbit of `period` mesh periods near the scaled `state` (n,), and differentiate it.
 
-    This is `orbit_or_window` without the window.
+    `tangents`: d pair / d design, stacked along a leading axis. See `orbit_or_window`.
     """
     return orbit_or_window(pair, tangents, state, period, shots)[0]
 
@@ -343,16 +349,16 @@ def orbit_or_window(
     periods: int = 0,
 ) -> tuple[Orbit, Window]:
     """Close and differentiate an orbit or, if `windowed`, integrate a window of `periods` mesh
-    periods from `state`.
+    periods from `state`. Return both; whichever was not computed is a placeholder.
 
     The orbit is the solution of Φ(z) = z near the scaled `state` (n,), where Φ is the flow over
     `period` mesh periods. Newton shooting finds it, and the implicit function theorem gives its
     derivatives. `tangents` holds d pair / d design, stacked along a leading axis.
 
-    Newton's method stops after `shots.count` integrations or at the residual `shots.closed`, but
-    not below `_CLOSED`. Once the Newton step is small, the solver steps are kept, with step ends
-    added at kinks. So the map is smooth and closes to rounding, and its derivative is as accurate
-    as the motion.
+    Newton's method stops after `shots.count` integrations (half as many more if the steps were
+    halved), or at the residual `shots.closed`, limited below by `_CLOSED`. Once the Newton step is
+    small, the solver steps are kept, with step ends added at kinks. Φ is then smooth and closes to
+    rounding, and its derivative is as accurate as the motion.
     """
     count, dtype = state.shape[0], state.dtype
     tolerance = shots.integrator.tolerance(dtype)
@@ -370,12 +376,12 @@ def orbit_or_window(
         tolerance=tolerance,
         windowed=jnp.asarray(windowed),
         samples=shots.samples,
-        # No check where the contact may jump anywhere: there the derivatives are those of the
-        # steps, not of the motion.
+        # No check for a pair that is not smooth: its derivatives are those of the steps, not of
+        # the motion.
         check=shots.check and pair.smooth,
         periods=periods,
     )
-    # The loop holds the only copy of the integration: one shot is compiled, not two.
+    # The integration occurs only once, inside the loop, so that it is compiled once.
     found = lax.while_loop(
         lambda now: closer.go_on(now), lambda now: closer.step(now), closer.start(state)
     )
@@ -396,8 +402,9 @@ def choose(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
 
 
 def agreement(tolerance: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the largest `disagreement` at which derivatives of an orbit are still reported, for a
-    relative `tolerance`."""
+    """Return the `disagreement` above which an orbit's derivatives are not reported.
+
+    `tolerance`: relative tolerance of the orbit's integration."""
     scale, least, most = _AGREE
     return jnp.clip(scale * jnp.sqrt(tolerance), least, most)
 
@@ -407,9 +414,10 @@ def disagreement(
 ) -> Float[Array, ""]:
     """Return the largest relative difference of two estimates of an orbit's derivatives.
 
-    Compared are (I - M)⁻¹ and the derivatives of the state, of the mean and of the mean square
-    force with respect to the design. Each kind is relative to its greatest entry in `first`.
-    `first` and `second`: `Flow.slope` on two grids; `count`: number of states.
+    The estimates are compared in (I - M)⁻¹, where M is the monodromy matrix, and in derivatives
+    with respect to the design: of state, mean force and mean square force. Differences are relative
+    to the greatest entry of the same quantity in `first`. `first` and `second`: `Flow.slope` on two
+    grids; `count`: number of states.
     """
 
     def derivatives(slope):
@@ -440,12 +448,14 @@ def reverse_sensitivity(
 ) -> Float[Array, "r d"]:
     """Return `Orbit.sensitivity` (r, d) computed by reverse mode.
 
-    The derivatives go through diffrax's checkpointed adjoint. It cannot handle jumps of the
-    contact; where these are possible, derivatives go through the steps themselves. `grid`: the
-    steps of the closed orbit; `top`: its peak (N).
+    `build`: function from the `design` (d,) to a pair; `state` (n,), `period` and `grid`: scaled
+    start, mesh periods and steps of the closed orbit; `measures`: averages of the force; `top`:
+    peak force of the orbit (N).
 
-    Let v be the cotangent of a response and w that of the end state. By the implicit function
-    theorem, (I - M)ᵀ w = R_zᵀ v, and dR/dp = R_pᵀ v + Φ_pᵀ w.
+    The derivatives use diffrax's checkpointed adjoint or, where the contact may jump, the steps
+    themselves. Let R be the response, Φ the flow, M = dΦ/dz, v the cotangent of R and w the
+    cotangent of the end state. By the implicit function theorem, (I - M)ᵀ w = R_zᵀ v, and
+    dR/dp = R_pᵀ v + Φ_pᵀ w.
     """
     count = state.shape[0]
     length = period.astype(state.dtype)

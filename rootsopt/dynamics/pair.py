@@ -44,9 +44,10 @@ class FlankForce(NamedTuple):
     """Contact of the flanks at one or several instants.
 
     `drive`, `coast`: normal force (N) on each flank; `depth`: greatest penetration (m; negative:
-    gap); `closing`: its rate (m/s); `lever1`, `lever2`: levers (m) of the deeper flank; `torque1`,
-    `torque2`: torques (N·m) on the rotors, each positive in its rotor's sense of rotation; `push`:
-    force (N) on rotor 2, None if no part lets the axes move. Rotor 1 feels the opposite force.
+    gap); `closing`: rate of `depth` (m/s); `lever1`, `lever2`: levers (m) of the deeper flank;
+    `torque1`, `torque2`: contact torques (N·m) on the rotors, each positive in its rotor's sense of
+    rotation; `push`: contact force (N) on rotor 2 in x and y, None if no part lets the axes move.
+    The force on rotor 1 is opposite.
     """
 
     drive: Float[Array, "*n"]
@@ -66,10 +67,10 @@ class FlankForce(NamedTuple):
 
 
 class _Sliding(NamedTuple):
-    """What friction and supports need to know of a contact.
+    """Data of a contact that only friction and supports need.
 
-    `point`: its place; `speed` (m/s) at which rotor 1 slides on rotor 2; `normal` and `tangent`:
-    unit vectors, None if no part lets the axes move.
+    `point`: position of the contact; `speed` (m/s) at which rotor 1 slides on rotor 2; `normal` and
+    `tangent`: unit vectors (x, y), None if no part lets the axes move.
     """
 
     point: ContactPoint
@@ -79,10 +80,10 @@ class _Sliding(NamedTuple):
 
 
 class _Touch(NamedTuple):
-    """A flank at a pose.
+    """The flanks of one side at a pose (angles of both rotors and positions of their axes).
 
-    `depth`: penetration (m); `closing`: its rate (m/s); `roll`: roll coordinate (rad); `approach`:
-    what the contact found at the pose; `sliding`: None unless a part needs it.
+    `depth`: penetration (m); `closing`: rate of `depth` (m/s); `roll`: roll coordinate (rad);
+    `approach`: gap and levers that the contact found; `sliding`: None unless a part needs it.
     """
 
     depth: Float[Array, ""]
@@ -98,12 +99,12 @@ class RotorPair(eqx.Module):
     `contact`: gap and levers at a pose; `law`: contact force; `clearance` (m) added to
     every flank gap; `inertia` of one rotor (kg·m²); `drive`, `load`, `gear`, `friction`,
     `supports`: parts that the scene names; `angle_scale` (rad) and `force_scale` (N): units the
-    solver works in; `timescales`: how quickly the pair can change, None if unknown.
-    `two_sided`: whether drive and coast flanks can touch at once. At the nominal centre distance
-    they cannot. `parts`: all other parts. A part that is absent is None and costs nothing.
+    solver works in; `timescales` of oscillation and free flight, None if unknown; `two_sided`:
+    whether drive and coast flanks can touch at once. They cannot at the nominal centre distance
+    without negative clearance. `parts`: all other parts. An absent part is None and costs nothing.
 
-    Raises InputError if two parts let the axes move; if a part lets them move but `two_sided` is
-    False; if the pair is two-sided but the contact is not (see `Contact.two_sided`).
+    Raises InputError if two parts let the axes move; if one part does but `two_sided` is False; if
+    the pair is two-sided but the contact is not (see `Contact.two_sided`).
     """
 
     lobes: int = eqx.field(static=True)
@@ -154,14 +155,14 @@ class RotorPair(eqx.Module):
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """Names of the states, with their units before scaling."""
+        """Names of the states, with the units they have before scaling."""
         first = ("relative rotation (rad)", "relative speed (rad/s)")
         speed = ("excess of the speed of rotor 1 over the drive's (rad/s)",) * self.free
         return (*first, *speed, *(name for part in self.all_parts for name in part.states))
 
     @property
     def states(self) -> int:
-        """Number of states: ε, its rate, rotor 1's speed if it is free, and those of the parts."""
+        """Number of states: ε, its rate, the speed of a free rotor 1, and the parts' own states."""
         return 2 + self.free + sum(len(part.states) for part in self.all_parts)
 
     @property
@@ -184,7 +185,7 @@ class RotorPair(eqx.Module):
 
     @property
     def jumps(self) -> bool:
-        """Whether the contact force may jump where no other part does."""
+        """Whether the contact force may jump (see `Contact.jumps`)."""
         return self.contact.jumps
 
     def rounding(self, depth: Float[Array, ""]) -> Float[Array, ""]:
@@ -197,9 +198,10 @@ class RotorPair(eqx.Module):
         return force_rounding(depth, self.law.exponent, length)
 
     def at_start(self, first: Float[np.ndarray, "*k 2"]) -> Float[np.ndarray, "*k n"]:
-        """Return scaled states (…, n) from the scaled ε and dε/dt in `first` (…, 2).
+        """Return scaled states (…, n) for the start of a motion, from ε and dε/dt.
 
-        All other states have their value at the start of a motion."""
+        `first` (…, 2): ε and dε/dt, scaled. All other states get their starting value (scaled: 0).
+        """
         return np.pad(first, [(0, 0)] * (first.ndim - 1) + [(0, self.states - 2)])
 
     def speed(self, state: Float[Array, "*k n"]) -> Float[Array, "*#k"]:
@@ -212,7 +214,8 @@ class RotorPair(eqx.Module):
         """Return the time that a mesh period of rotation takes at a scaled state, relative to
         `mesh_period`.
 
-        A stalled motor is taken to creep on at half the speed below which it counts as stalled."""
+        The speed of rotor 1 is limited below to half of `STALLED`, so that the time stays finite.
+        """
         creep = STALLED / 2 * self.drive.speed
         return self.drive.speed / jnp.maximum(self.speed(state), creep)
 
@@ -241,7 +244,7 @@ class RotorPair(eqx.Module):
         return self._moving(tau, state)[0]
 
     def _moving(self, tau, state):
-        """Return `motion`, and the parts with their own states (SI units)."""
+        """Return the `motion`, and a list of (part, its own states in SI units)."""
         tau, state = (jnp.asarray(x, self.angle_scale.dtype) for x in (tau, state))
         relative = self.angle_scale * state[..., 0]
         rate = self.angle_scale * state[..., 1] / self.mesh_period
@@ -293,8 +296,8 @@ class RotorPair(eqx.Module):
         """Return the contact of the flanks at a motion.
 
         A pair that is not two-sided has the nominal centre distance and no negative clearance. Then
-        only the drive flank can touch when ε < 0, and only the coast flank when ε > 0. So one
-        search is enough, and the force is exactly zero on both sides of ε = 0.
+        only the drive flank can touch when ε < 0, and only the coast flank when ε > 0. One search
+        for the gap is therefore enough.
         """
         if self.two_sided:
             sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)
@@ -317,7 +320,9 @@ class RotorPair(eqx.Module):
         )
 
     def _flank_force(self, side: Float[Array, ""], motion: Motion) -> FlankForce:
-        """Return the contact on one side (1 drive, -1 coast), its force in the field `drive`."""
+        """Return the contact on one side (1 drive, -1 coast).
+
+        The normal force of either side is in the field `drive`; `coast` is zero."""
         touch = self._touch(side, motion)
         force = self.law(touch.depth, touch.closing)
         _, lever1, lever2, _ = touch.approach
@@ -347,12 +352,12 @@ class RotorPair(eqx.Module):
         )
 
     def _touch(self, side: Float[Array, ""], motion: Motion) -> _Touch:
-        """Return the pose of the flanks of one side (1 drive, -1 coast).
+        """Return the geometry of the flanks of one side (1 drive, -1 coast) at a motion.
 
-        Let n be the drive side's normal from rotor 1 to rotor 2, and the tangent t a quarter turn
-        ahead of it. Rotor 1 slides along rotor 2 at the speed ω1 h1 - ω2 h2 + (v1 - v2)·t. The
-        coast side is the mirror image. With displaced axes, the pair is one at another centre
-        distance, turned by the angle θ of its line of centres: φ1 - θ and φ2 + θ.
+        Let n be the drive side's normal from rotor 1 to rotor 2, and t the tangent, n turned by
+        +90°. Rotor 1 slides along rotor 2 at the speed ω1 h1 - ω2 h2 + (v1 - v2)·t. The coast side
+        is the mirror image. Let θ be the angle of the displaced line of centres. A pair with
+        displaced axes equals a pair at another centre distance with the angles φ1 - θ and φ2 + θ.
         """
         contact, line, relative = self.contact, None, motion.relative
         if motion.shift is not None:
@@ -386,12 +391,12 @@ class RotorPair(eqx.Module):
     def switches(
         self, tau: Float[Array, ""], state: Float[Array, " n"]
     ) -> tuple[Bool[Array, " s"], Bool[Array, " s"]]:
-        """Return flags that tell on which smooth piece the equation is, and a mask of those that
-        matter.
+        """Return flags that change wherever the equation has a kink or a jump, and a mask of the
+        flags that matter.
 
-        A flag changes where the equation has a kink or a jump: in the side of contact, the piece of
-        the flank, the contact law or a part. The mask excludes flanks out of contact. Both are
-        taken at rotation `tau` (mesh periods) and scaled `state`."""
+        The flags describe the side of contact, the flank segment, the contact law and the parts, at
+        rotation `tau` (mesh periods) and scaled `state`. The mask excludes flanks out of contact.
+        """
         motion, acting = self._moving(tau, state)
 
         def of_flank(side):
@@ -441,12 +446,12 @@ class RotorPair(eqx.Module):
         slope = jnp.concatenate(slopes)
         if self.free:
             slope = self.lapse(state) * slope
-        # A pair that has lost its mesh is held still, so that it does not run to infinity. The
-        # caller reports the loss.
+        # A pair that is `lost` gets derivative zero, so that its states stay finite. The caller
+        # reports the loss.
         return jnp.where(lax.stop_gradient(self._lost(state, acting)), 0.0, slope), contact
 
     def _loads(self, motion: Motion, acting, contact: FlankForce) -> Loads:
-        """Return all loads on the rotors; `acting`: the parts with their own states."""
+        """Return the sums of all loads; `acting`: list of (part, its own states in SI units)."""
         torque1 = axes = None
         if self.free:
             torques = (part.torque_on_1(motion, own) for part, own in acting)
@@ -460,14 +465,14 @@ class RotorPair(eqx.Module):
         return Loads(torque1, torque2, axes)
 
     def lost(self, state: Float[Array, " n"]) -> Bool[Array, ""]:
-        """Return whether a scaled state is no longer that of a running pair.
+        """Return whether a pair in this scaled state no longer runs as a pair.
 
-        The lobes have passed through each other, the motor has stalled, or a part reports a loss
-        (an axis displaced too far)."""
+        Either the lobes have passed through each other, the motor has stalled, or a part reports a
+        loss, such as an axis displaced too far."""
         return self._lost(state, zip(self.all_parts, self.own_states(state), strict=True))
 
     def _lost(self, state, acting) -> Bool[Array, ""]:
-        """Return `lost`, from the parts and their own states."""
+        """Return `lost` for a scaled state; `acting`: (part, its own states in SI units)."""
         lost = ~(jnp.abs(self.angle_scale * state[0]) < self.angle_limit)
         for part, own in acting:
             gone = part.lost(own)
@@ -475,8 +480,8 @@ class RotorPair(eqx.Module):
         return lost | self.stalled(state) if self.free else lost
 
     def stalled(self, state: Float[Array, " n"]) -> Bool[Array, ""]:
-        """Return whether the motor has stalled: rotor 1 turns slower than `STALLED` of the drive's
-        speed."""
+        """Return whether the motor has stalled: rotor 1 is slower than `STALLED` times the drive's
+        speed. Always False at prescribed speed."""
         if not self.free:
             return jnp.zeros((), bool)
         return self.speed(state) < STALLED * self.drive.speed

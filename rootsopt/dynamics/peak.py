@@ -10,28 +10,30 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.pair import RotorPair
 
 _RIVALS, _CLOSER, _ROUNDS = 4, 16, 10
-"""Refinement of the peak: number of maxima refined (of the samples, and of the ends of steps),
-number of places tried around each, and number of rounds."""
+"""Settings for refining the peak: number of maxima refined (among samples, and again among ends of
+steps), number of times tried around each maximum, and number of rounds."""
 _INNER = 2 * _RIVALS * _CLOSER - 2
-"""Samples or ends of steps that one turn scans: the number of places, less one neighbour on either
-side."""
+"""Number of samples or ends of steps that one turn of the loop scans. A turn also evaluates one
+neighbour on either side."""
 _WIDE = 64
-"""Distance of the outermost times in `BESIDE`."""
+"""Distance of the outermost times in `BESIDE` from the peak, in units of `BESIDE_UNIT`."""
 BESIDE = (0.0, -1.0, -2.0, 1.0, 2.0, -_WIDE, _WIDE)
-"""Times just before and after a peak, in units of `BESIDE_UNIT`."""
+"""Times at and around a located peak at which the force is evaluated, in units of `BESIDE_UNIT`."""
 BESIDE_UNIT = {8: 2e-8, 4: 1e-3}
 """Unit of `BESIDE` (mesh periods), by bytes per number."""
 _FARTHEST = {8: 32.0, 4: 1 / 16}
-"""Distance from the located peak to the vertex of the parabola, in units of `_WIDE`, above which
-the vertex is rejected. Where the states bend between samples, the peak is located only to about
-1e-5."""
+"""Distance (units of `_WIDE`) from the located peak to the vertex of the parabola above which the
+vertex is rejected, by bytes per number. Peaks are located only to about 1e-5 mesh periods where the
+states bend between samples."""
 _ROUNDINGS = 1e5
-"""Bend of the force over `_WIDE`, in rounding errors of the force, above which it is real."""
+"""Second difference of the force over `_WIDE` (rounding errors of the force) above which it counts
+as curvature, not rounding."""
 _NOISES = 10.0
-"""The same limit in multiples of the force's noise. It is also the allowed scatter of the forces
-beside a smooth peak."""
+"""Second difference of the force over `_WIDE` (multiples of the force's noise) above which it
+counts as curvature. Forces beside a smooth peak may also scatter by this much."""
 _LEAST = 1e-9
-"""Relative fall of the force beside a corner below which the fall may be rounding."""
+"""Relative fall of the force on both sides of a peak below which the peak is not a corner: the fall
+may be rounding."""
 
 
 def motion(
@@ -40,10 +42,11 @@ def motion(
     place: Float[Array, ""],
     width: Float[Array, ""],
 ) -> Float[Array, " n"]:
-    """Return the state between uniform samples a `width` (mesh periods) apart.
+    """Return the scaled state between uniform samples a `width` (mesh periods) apart.
 
-    `place`: position, counted in samples. ε comes from the quintic through the three nearest
-    samples and their rates, the other states from the quartic through the five nearest samples."""
+    `place`: position, counted in samples. ε is a quintic through the three nearest samples and
+    their rates, dε/dt its derivative. Other states are a quartic through the five nearest samples.
+    """
     middle = jnp.clip(jnp.round(place).astype(int), 2, states.shape[0] - 3)
     near = lax.dynamic_slice_in_dim(states, middle - 2, 5)
     three = near[1:4]
@@ -84,7 +87,7 @@ class Steps(NamedTuple):
     """Steps that a solver has taken.
 
     `begins`, `ends`: start and end of each step (mesh periods; inf beyond the last); `before`,
-    `after`: scaled states there; `count`: number of steps.
+    `after`: scaled states at the start and end of each step; `count`: number of steps.
     """
 
     begins: Float[Array, " steps"]
@@ -108,13 +111,16 @@ class Steps(NamedTuple):
         return _state(pair, swing, slope, (1 - x) * before[2:] + x * after[2:])
 
     def reaches(self, tau: Float[Array, ""], width: Float[Array, ""]) -> Bool[Array, ""]:
-        """Return whether `motion` at `tau` is as accurate as a polynomial through samples a `width`
-        (mesh periods) apart: `tau` is close enough to an end of its step."""
+        """Return whether `motion` at `tau` (mesh periods) is as accurate as interpolated samples.
+
+        That is so if `tau` is close enough to an end of its step; `width` (mesh periods): distance
+        of the samples."""
         _, step, x = self._place(tau)
         return x * (1 - x) * step**2 < width**2
 
     def _place(self, tau):
-        """Return the index of the step at `tau`, its length, and the fraction of it completed."""
+        """Return the index and length of the step that contains `tau`, and the fraction of the step
+        completed at `tau`."""
         k = jnp.clip(jnp.searchsorted(self.ends, tau), 0, self.count - 1)
         step = self.ends[k] - self.begins[k]
         return k, step, (tau - self.begins[k]) / step
@@ -127,11 +133,11 @@ def blended(
     tau: Float[Array, ""],
     width: Float[Array, ""],
 ) -> Float[Array, " n"]:
-    """Return the state at `tau` (mesh periods) from samples and solver steps.
+    """Return the scaled state at `tau` (mesh periods) from samples and solver steps.
 
     `states`: samples a `width` (mesh periods) apart. A polynomial through samples on both sides of
-    a corner smooths it away. Solver steps are short there, so their cubics are used wherever they
-    are as accurate."""
+    a corner would smooth the corner away. Solver steps are short there, so the cubic of a step is
+    used wherever it is as accurate as the samples."""
     sampled = motion(pair, states, tau / width, width)
     return jnp.where(steps.reaches(tau, width), steps.motion(pair, tau), sampled)
 
@@ -141,13 +147,13 @@ def locate_peak(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the time (mesh periods) of the greatest force, and the greatest penetration (m) seen.
 
-    `states`: samples at uniform times over `length` mesh periods; `steps`: those of the solver.
+    `states`: samples at uniform times over `length` mesh periods; `steps`: solver steps.
 
     An impact's peak can be narrower than the sampling, and has a corner where the damping
     saturates. The greatest sample need not be next to the greatest peak, so several maxima of the
     samples are refined, by ever closer scans around each. An impact can also fall between two
-    samples, so the maxima at the ends of steps are refined as well. Inside a long step the state is
-    less accurate. Places there count only if steps are about as dense as samples, or if the motion
+    samples, so the maxima at the ends of steps are refined as well. The state inside a long step is
+    less accurate. Such times count only if steps are about as dense as samples, or if the motion
     can oscillate between samples.
     """
     last = jnp.stack([jnp.asarray(states.shape[0]), steps.count]) - 1  # of samples, of steps
@@ -208,20 +214,21 @@ def locate_peak(
 def one_sided(
     forces: Float[Array, "7"], noise: Float[Array, ""] | float = 0.0
 ) -> tuple[Float[Array, ""], Float[Array, "7"]]:
-    """Return the peak, and the weights with which the derivatives of `forces` sum to its own.
+    """Return the peak force, and weights (7,). The derivative of the peak is the weighted sum of
+    the derivatives of `forces`.
 
-    `forces`: contact force at the times `BESIDE` the located peak; `noise`: their relative error
-    beyond rounding. There are three cases:
+    `forces`: contact force at the times `BESIDE` around the located peak, in any unit; `noise`:
+    relative error of `forces` beyond rounding. There are three cases:
 
-    Smooth peak: the derivative of the peak is that at a fixed instant (envelope theorem). The
-    instant is the vertex of the parabola through the forces, because rounding hides the exact
-    maximum.
+    Smooth peak: the derivative of the peak is the derivative of the force at a fixed instant
+    (envelope theorem). This instant is the vertex of the parabola through the forces, because
+    rounding hides the exact maximum.
 
-    Corner: the peak moves with the corner. Its derivative is that weighted mean of the derivatives
-    on both sides for which the force is stationary in time.
+    Corner: the peak moves with the corner. Its derivative is a weighted mean of the derivatives on
+    both sides. With the same weights, the derivative of the force with respect to time is zero.
 
     Jump (such as with the `linear` contact): rounding decides on which side of the jump the located
-    instant lies. The higher side counts.
+    instant lies. The side with the greater force is used.
     """
     here, before, earlier, after, later, left, right = forces
     none, one = jnp.zeros_like(here), jnp.ones_like(here)

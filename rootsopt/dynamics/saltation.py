@@ -18,22 +18,22 @@ from jaxtyping import Array, Float
 from rootsopt.dynamics.pair import FlankForce
 
 LONGEST = 4e-6
-"""Length of a step (mesh periods) above which it is not searched for a jump. All steps made around
-a switch are shorter."""
+"""Length of a step (mesh periods) above which the step is not checked for a jump. All steps made
+around a switch are shorter."""
 _FASTER = 20.0
-"""Lever change (pitch radii per mesh period) above which it is a jump. Along a flank of the EE
-family it is at most 2π, for any number of lobes."""
+"""Rate of change of a lever (pitch radii per mesh period) above which the lever jumps. Along a
+flank of the EE family the rate is at most 2π, for any number of lobes."""
 _ROUNDINGS = 300
 """Lever changes below this many rounding errors are not jumps."""
 _ALIKE = 0.05
-"""Difference of the levers on one side of a jump, as a fraction of the jump, above which it is not
-a jump. If a lever changes fast but continuously, some stages of the step lie in between."""
+"""Distance (fraction of the jump) of any stage's levers from both end values of a step, above which
+the change is not a jump. If a lever changes fast but continuously, some stages lie in between."""
 MARKS = 4
-"""Number of `marks`, by which a jump is recognised, appended to the slope of a motion."""
+"""Number of `marks`: values appended to the slope of a motion, by which a jump is recognised."""
 
 
 def marks(contact: FlankForce) -> Float[Array, "4"]:
-    """Return penetration (m), its rate (m/s), and both levers (m)."""
+    """Return penetration (m), its rate (m/s) and both levers (m), by which a jump is recognised."""
     return jnp.stack([contact.depth, contact.closing, contact.lever1, contact.lever2])
 
 

@@ -21,8 +21,8 @@ BLOCK = 4
 _MEMORY = 20
 """Number of stroboscopic states stored: more than twice the longest cycle searched for."""
 _PATIENCE = 32, 1e-5
-"""Mesh periods after which an unsettled transient continues with finer steps, and the largest
-tolerance of these. The noise of coarser steps can hide that the motion repeats."""
+"""Length (mesh periods) of a transient above which its steps are finer, and the largest tolerance
+of the finer steps. The noise of coarser steps can hide that the motion repeats."""
 NOISE = 100.0
 """Noise of the stroboscopic states from adaptive steps, in tolerances, relative to the states."""
 
@@ -30,10 +30,11 @@ NOISE = 100.0
 class Transient(NamedTuple):
     """End of a transient.
 
-    `state`: last stroboscopic state (scaled); `period`: its cycle length k in mesh periods, 0 if
-    not settled; `nearest`: the k with which the last states repeat best; `spread`: their scaled
-    difference for that k; `periods`: mesh periods simulated; `lost`: see `RotorPair.lost`;
-    `solved`: whether the solver succeeded; `steps`: number of solver steps.
+    `state`: last stroboscopic state (scaled); `period`: length k of the cycle (mesh periods), 0 if
+    not settled; `nearest`: the k with which the last states repeat best; `spread`: scaled
+    difference of states that are `nearest` periods apart; `periods`: mesh periods simulated;
+    `lost`: see `RotorPair.lost`; `solved`: whether the solver succeeded; `steps`: number of solver
+    steps.
     """
 
     state: Float[Array, " n"]
@@ -61,12 +62,12 @@ def settle(
     max_periods: Int[Array, ""],
     max_orbit: int,
 ) -> Transient:
-    """Integrate from the scaled `state` until the stroboscopic states repeat with some period k.
+    """Integrate from the scaled `state` (n,) until the stroboscopic states repeat with a period k.
 
-    Settled means: the last k + 1 states differ from those k periods earlier by less than
-    `tolerance` (scaled). For large states, the noise of the steps is allowed if it is greater. k is
-    the smallest such period, at most `max_orbit` ≤ 8. After `_PATIENCE`, the steps are finer. After
-    `max_periods` mesh periods, the transient is given up.
+    The motion has settled if the last k + 1 states differ from the states k periods earlier by less
+    than `tolerance` (scaled). For large states, the noise of the steps is the limit if it is
+    greater. k is the smallest such period, at most `max_orbit` ≤ 8. Steps become finer after
+    `_PATIENCE`. The transient ends unsettled after `max_periods` mesh periods.
     """
     orders = jnp.arange(1, max_orbit + 1)
     age = jnp.arange(_MEMORY)[::-1]

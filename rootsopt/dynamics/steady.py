@@ -1,9 +1,9 @@
 """The steady motion that a state leads to, with its status and derivatives, as a pure function.
 
-The transient is simulated (`settle`). The cycle it ends on is closed and differentiated
-(`orbit_or_window`), then checked (`verdict`). If a check fails, the next attempt is finer. Where
-there is no orbit, a window of the motion tells chaos from a long transient. All attempts are turns
-of one loop, so that the compiled program holds one copy of every part.
+The transient is simulated until the motion repeats (`settle`). The orbit near its end is closed and
+differentiated (`orbit_or_window`), then checked (`verdict`). If a check fails, the next attempt
+uses finer tolerances. Where there is no orbit, a window of the motion tells chaos from a long
+transient. All attempts are turns of one loop, so that each part is compiled only once.
 """
 
 import dataclasses
@@ -29,25 +29,26 @@ _NEARLY = 0.05
 """Scaled difference below which states nearly repeat. Newton's method then decides whether there is
 an orbit, or an orbit of a shorter period."""
 _CLOSEST = 1e-12
-"""Scaled difference below which states repeat exactly: finer attempts would show no more."""
+"""Scaled difference below which no finer attempt is made: the states repeat to rounding."""
 _TRUSTED = 1e-8
-"""Finest tolerance to which an orbit is refined beyond the one requested, if it does not close or
-its derivatives are uncertain."""
+"""Tolerance below which an orbit is not refined, unless the config requests a finer tolerance. An
+orbit is refined if it does not close or its derivatives are uncertain."""
 
 
 class Solver(eqx.Module):
     """Settings for finding a steady motion.
 
-    `transient`, `orbit`: their integrators; `measures`: averages of the force to compute;
-    `max_periods`: maximum length of the transient (mesh periods); `examine`: 1 to integrate
-    a window of a motion that does not settle, 0 to give it up; `max_orbit`: longest period searched
-    for (mesh periods), at most 8; `precision`: float64 or float32. `max_periods` and `examine` are
-    floats, as are all leaves.
+    `transient`, `orbit`: integrators of the transient and of the orbit; `measures`: averages of the
+    force to compute; `max_periods`: maximum length of the transient (mesh periods); `examine`: 1 to
+    integrate a window of a motion that does not settle, 0 to skip the window; `max_orbit`: longest
+    period searched for (mesh periods), at most 8; `precision`: float64 or float32. `max_periods`
+    and `examine` are floats, as are all leaves.
 
-    Coarse surveys of many designs change the others. `shots`: maximum number of integrations to
-    close an orbit; `closed`: residual, in tolerances, at which it may count as closed; `samples`:
-    number of its samples; `check`: compare the derivatives with those on halved steps; `attempts`:
-    maximum number of attempts; `windows`: mesh periods of a window, a multiple of 16; 0: no window.
+    The other settings have defaults, which coarse surveys of many designs replace. `shots`: maximum
+    number of integrations to close an orbit; `closed`: residual (tolerances) at which an orbit may
+    count as closed; `samples`: number of uniform samples of an orbit; `check`: whether to compare
+    the derivatives with those on halved steps; `attempts`: maximum number of attempts; `windows`:
+    length of a window (mesh periods), a multiple of 16; 0: no window.
     """
 
     transient: Integrator
@@ -68,10 +69,10 @@ class Solver(eqx.Module):
 class Steady(NamedTuple):
     """The steady motion that a state leads to.
 
-    `status`: code of a `Status`; `orbit`: the last one kept; `period`: its mesh periods; `rtol`:
-    its tolerance; `verdict` on it; `window` of a motion that did not settle; `settled`: end of the
-    transient; `used`: mesh periods of all transients; `steps`: solver steps of transients and
-    orbits.
+    `status`: code of a `Status`; `orbit`: the last orbit accepted; `period` (mesh periods), `rtol`
+    and `verdict`: length, tolerance and checks of this orbit; `window` of a motion that did not
+    settle; `settled`: end of the transient; `used`: mesh periods of all transients; `steps`: solver
+    steps of transients and orbits.
     """
 
     status: Int[Array, ""]
@@ -86,10 +87,10 @@ class Steady(NamedTuple):
 
     @property
     def forces(self) -> Float[Array, " r"]:
-        """Mean (N), mean square (N²), peak (N) and the other measures of the force.
+        """Mean (N), mean square (N²), peak (N) and the other measures of the contact force.
 
-        They are those of the orbit, or of the window if there is one (other measures NaN). They are
-        0 without contact, and NaN in all other cases."""
+        The values are those of a closed orbit or a whole window (other measures: NaN). They are 0
+        without contact, and NaN in all other cases."""
         closed = self.orbit.response
         unknown = jnp.full_like(closed, jnp.nan)
         found = jnp.where(among(self.status, CLOSED), closed, unknown)
@@ -117,10 +118,10 @@ def among(code: Int[Array, "*n"], statuses: tuple[Status, ...]) -> Bool[Array, "
 class _Search(NamedTuple):
     """State of the loop over attempts: the result so far, and the next turn.
 
-    `found`: result so far; `shorter`: period to try next (0: none); `windowed`: whether a window is
-    next. Otherwise a transient and its orbit are next: from `state`, at the tolerances `coarse`
-    (transient) and `fine` (orbit), until states repeat `within` a scaled distance. `tries`:
-    refinements made; `over`: whether the loop ends.
+    `found`: result so far; `shorter`: period (mesh periods) of an orbit to try next, 0 for none;
+    `windowed`: whether a window is next. In all other turns, a transient and its orbit are next.
+    They start from `state`, at the tolerances `coarse` (transient) and `fine` (orbit), until states
+    repeat `within` a scaled distance. `tries`: refinements made; `over`: whether the loop ends.
     """
 
     found: Steady
@@ -135,7 +136,9 @@ class _Search(NamedTuple):
 
 
 class _Attempts(eqx.Module):
-    """Arguments of `steady_motion`. Its loop is `start` and `step`."""
+    """The loop of `steady_motion`, as methods of its arguments.
+
+    `start` gives the loop's first state, `step` its body, `final` the result."""
 
     pair: RotorPair
     tangents: RotorPair
@@ -184,8 +187,8 @@ class _Attempts(eqx.Module):
         steps = found.steps + jnp.where(fresh, settled.steps, 0)
         settled = choose(fresh, settled, found.settled)
         failure = transient_status(self.pair, settled)
-        # The transient is at its limit, but the motion nearly repeats. The rest may be noise of the
-        # coarse steps; Newton's method decides.
+        # The transient has reached its limit, but the motion nearly repeats. The difference may be
+        # noise of the coarse steps: let Newton's method decide.
         nearly = (failure == Status.NOT_SETTLED.code) & (settled.spread < _NEARLY) & fresh
         within = jnp.where(nearly, settled.spread, now.within)
         settled = settled._replace(period=jnp.where(nearly, settled.nearest, settled.period))
@@ -228,8 +231,8 @@ class _Attempts(eqx.Module):
         candidate = self._shorter(new, now.shorter)
         looks = (new.status == Status.PERIODIC.code) & ~shortened & ~now.windowed & ~lost
         # Newton's method left the neighbourhood, or found an orbit that is unstable or has
-        # uncertain derivatives. The motion was not steady yet, or known too coarsely: continue the
-        # transient with finer tolerances.
+        # uncertain derivatives. Either the motion was not steady yet, or the steps were too coarse:
+        # continue the transient with finer tolerances.
         late = (new.used >= solver.max_periods) | (within < _CLOSEST)
         late |= now.tries + 1 >= solver.attempts
         weak = among(new.status, (Status.NOT_SETTLED, Status.INACCURATE)) & ~now.windowed
@@ -253,9 +256,9 @@ class _Attempts(eqx.Module):
         )
 
     def _judged(self, orbit: Orbit, start, fine, within) -> tuple[Verdict, Int[Array, ""]]:
-        """Return the verdict on an orbit integrated at the tolerance `fine`, and its status.
+        """Return the `Verdict` on an orbit integrated at the tolerance `fine`, and a status code.
 
-        The accuracy of its forces is checked later, in `final`."""
+        `final` checks the accuracy of the forces later."""
         pair, solver, dtype = self.pair, self.solver, start.dtype
         closing = dataclasses.replace(solver.orbit, rtol=fine)
         rtols = solver.transient.tolerance(dtype), closing.tolerance(dtype)
@@ -278,8 +281,8 @@ class _Attempts(eqx.Module):
     def _shorter(self, found: Steady, beyond) -> Int[Array, ""]:
         """Return a shorter period after which the orbit nearly repeats, or 0.
 
-        It is the least such period above `beyond` that divides the period of the orbit. Noise of
-        the transient can hide that a motion repeats sooner."""
+        The result is the least such period above `beyond` that divides the orbit's period. Noise of
+        the transient can hide this repetition."""
         periods = jnp.arange(1, max(self.solver.max_orbit // 2, 1) + 1)
         place = periods * self.solver.samples // found.period
         states = found.orbit.flow.states[jnp.minimum(place, self.solver.samples - 1)]
@@ -295,8 +298,9 @@ class _Attempts(eqx.Module):
         return window_status(self.pair, window)
 
     def final(self, found: Steady) -> Steady:
-        """Return `found`, with its status changed if the forces of its orbit are not valid: the
-        flanks penetrate too deep, or errors are too large."""
+        """Return `found`, with another status if the forces of its orbit are not valid.
+
+        Then the status is TOO_DEEP (flanks penetrate too deep) or UNRESOLVED (errors too large)."""
         orbit, judged = found.orbit, found.verdict
         closed = among(found.status, (Status.PERIODIC, Status.INACCURATE))
         deep = orbit.flow.depth > TOO_DEEP * self.radius
@@ -306,7 +310,7 @@ class _Attempts(eqx.Module):
 
 
 def transient_status(pair: RotorPair, settled: Transient) -> Int[Array, ""]:
-    """Return the status code of a transient that leads to no orbit, or -1 if it has settled."""
+    """Return the status code of a transient that has not settled, or -1 if it has settled."""
     return _first(
         (~settled.solved, Status.SOLVER_FAILED),
         (~jnp.all(jnp.isfinite(settled.state)), Status.NON_FINITE),
@@ -334,7 +338,7 @@ def window_status(pair: RotorPair, window: Window) -> Int[Array, ""]:
 
 
 def _first(*cases: tuple[Bool[Array, ""], Status], default: int) -> Int[Array, ""]:
-    """Return the status code of the first case that holds, or `default`."""
+    """Return the status code of the first of `cases` whose condition is true, or `default`."""
     conditions, statuses = zip(*cases, strict=True)
     return jnp.select(conditions, [jnp.asarray(s.code) for s in statuses], jnp.asarray(default))
 
@@ -348,8 +352,8 @@ def steady_motion(
 ) -> Steady:
     """Find the steady motion of `pair` that the scaled `state` (n,) at φ1 = 0 leads to.
 
-    `tangents`: directions of the pair's parameters, stacked along a leading axis, for the
-    derivatives; `radius`: pitch radius (m), to which penetrations are compared.
+    `tangents`: directions of the pair's parameters, stacked along a leading axis, along which to
+    differentiate; `radius`: pitch radius (m), for judging penetrations; `solver`: settings.
     """
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     attempts = _Attempts(pair, tangents, solver, radius)

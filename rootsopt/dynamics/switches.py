@@ -4,7 +4,7 @@ Inside a step, a kink of the equation reduces a high-order method to low order. 
 equation's derivatives (where contact moves to the next flank segment) harms the linearised motion
 far more than the motion itself.
 
-A *change* below is an instant at which a flag of `RotorPair.switches` changes.
+A *change* in this file is an instant at which a flag of `RotorPair.switches` changes.
 """
 
 import jax
@@ -17,33 +17,35 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.peak import Steps, blended
 
 _LOOKS, _LONGEST = 252, 8
-"""Number of places per mesh period at which changes are searched for, in addition to the ends of
-steps, and the maximum number of mesh periods."""
+"""Number of times per mesh period, in addition to the ends of steps, at which flags are compared to
+find changes; and the maximum number of mesh periods."""
 _CHANGES = 1024
-"""Maximum number of changes found in one stretch of motion. A mesh period has about 20 to 100."""
+"""Maximum number of changes found in one motion. A mesh period has about 20 to 100."""
 _LANES = 16
-"""Number of places evaluated together."""
+"""Number of times at which flags are evaluated together, as arrays."""
 _HALVINGS = 26
 """Number of bisections that locate a change."""
 _BRIEF, _PARTS = 0.05, 8
-"""Distance of two changes (mesh periods) below which the second number of steps lies between them.
-"""
+"""Distance (mesh periods) of two changes below which the interval between them is divided, and the
+number of steps into which it is divided."""
 _ASIDE = 1e-9, 1e-6
-"""Limits of half the step (mesh periods) that holds a change. Between them it is `_LOOSE` times the
-tolerance of the motion. The error of the gradients is proportional to it."""
+"""Lower and upper limit (mesh periods) of half the length of the short step around a change. The
+error of the gradients is proportional to this length."""
 _LOOSE = 1e3
+"""Half the length of the short step around a change, in tolerances, between the limits `_ASIDE`."""
 _ROUNDINGS = 16.0
-"""Minimum of the same half step, in rounding errors of the time. It governs in single precision."""
+"""Half length (rounding errors of the time) below which the short step around a change is not made.
+This limit applies in single precision."""
 _SHARE = 1e-4
-"""Maximum of the same half step, as a fraction of the time to the next change. Where the curvature
-changes inside a rounded corner, the error of the gradients is proportional to the square of this
-fraction."""
+"""Half length of the short step around a change (fraction of the time to the nearest other change)
+above which the step is shortened. Where the curvature changes inside a rounded corner, the error of
+the gradients is proportional to the square of this fraction."""
 _GRADES = 8.0, 64.0
-"""Distances of further step ends from a change, in units of that half step. They keep the steps
-short around a change that lies slightly outside its step."""
+"""Distances of further step ends from a change, in half lengths of the short step around the
+change. They keep the steps short around a change that lies slightly outside its short step."""
 _HOLDS = 2.5
-"""Length of a step, in units of the longest half step that holds a change, up to which it is never
-halved."""
+"""Length of a step (greatest half lengths of a short step around a change) up to which the step is
+never halved."""
 _APART = 1e-10
 """Distance (mesh periods) below which two step ends are merged."""
 
@@ -55,10 +57,10 @@ def with_switches(
     tolerance: Float[Array, ""],
     base: Float[Array, " steps"] | None = None,
 ) -> Float[Array, " steps"]:
-    """Return the grid `base` with step ends added at the changes along `out`.
+    """Return the grid `base` with step ends added around the changes along the motion `out`.
 
-    `out`: the motion, integrated over `periods` mesh periods at a relative `tolerance`; `base`: by
-    default its own grid."""
+    `out` was integrated over `periods` mesh periods at the relative `tolerance`. `base`: ends of
+    steps (mesh periods), by default the grid of `out`."""
     width = periods / out.states.shape[0]
     before = jnp.concatenate([out.states[:1], out.corners[:-1]])
     begins = jnp.concatenate([jnp.zeros_like(out.grid[:1]), out.grid[:-1]])
@@ -74,8 +76,8 @@ def with_switches(
         return pair.switches(tau, blended(pair, out.states, steps, tau, width))
 
     def changes(seen, counts):
-        """Return the number of changes, and for each one its flag, the flag's value before, and
-        both ends of the interval. Flags count if they matter on either side."""
+        """Return the number of changes, then for each change the index of its flag, the flag's
+        value before, and both ends of the interval. Flags count if they matter at either end."""
         differ = (seen[1:] != seen[:-1]) & (counts[1:] | counts[:-1])
         differ &= (jnp.arange(1, places.shape[0]) < known)[:, None]
         interval, which = jnp.nonzero(differ, size=_CHANGES, fill_value=0)
@@ -111,12 +113,12 @@ def with_switches(
     listed = lax.while_loop(go_on, look, (jnp.zeros((), int), nothing, unseen, unseen))[1]
     number, *_, high = listed
     found = jnp.sort(jnp.where(jnp.arange(_CHANGES) < number, high, jnp.inf))
-    # Between two close changes the contact crosses a whole flank segment: short steps there.
+    # Between two close changes the contact crosses a whole flank segment: make short steps there.
     brief = jnp.diff(found, append=jnp.inf)
     share = jnp.arange(1, _PARTS, dtype=found.dtype) / _PARTS
     inside = found[:, None] + jnp.where(brief < _BRIEF, brief, jnp.inf)[:, None] * share
-    # Each change lies inside a step too short to matter. No stage is evaluated right at it, where
-    # rounding would decide the side.
+    # Each change lies inside a step too short to matter. No stage is evaluated right at the change,
+    # where rounding would decide the side.
     apart = jnp.minimum(brief, jnp.diff(found, prepend=-jnp.inf))
     aside = jnp.minimum(jnp.clip(_LOOSE * tolerance, *_ASIDE), _SHARE * apart)
     # A minimum length: two changes at almost the same instant would give steps of zero length.
@@ -132,10 +134,10 @@ def with_switches(
 
 
 def halved(grid: Float[Array, " steps"]) -> Float[Array, " steps"]:
-    """Return the grid with its steps halved; if there is no room for all, only the longest ones.
+    """Return `grid` with its steps halved, or only the longest steps if there is no room for all.
 
-    Steps that hold a change stay whole: the change is at their middle, and there rounding would
-    decide on which side the derivatives are taken.
+    The short steps around changes stay whole. A change lies in the middle of such a step, and
+    rounding would decide on which side of the change the derivatives are taken.
     """
     lengths, whole = _lengths(grid)
     taken = grid < jnp.inf
@@ -147,13 +149,13 @@ def halved(grid: Float[Array, " steps"]) -> Float[Array, " steps"]:
 
 
 def has_room(grid: Float[Array, " steps"]) -> Bool[Array, ""]:
-    """Return whether the grid has room for `halved` to halve all steps that hold no change."""
+    """Return whether `grid` has room for `halved` to halve all steps that contain no change."""
     lengths, whole = _lengths(grid)
     return jnp.sum(grid < jnp.inf) + jnp.sum(lengths > whole) <= grid.shape[0]
 
 
 def _lengths(grid):
-    """Return the lengths of the steps, and the length up to which a step may hold a change."""
+    """Return the lengths of all steps, and the greatest length of a short step around a change."""
     taken = grid < jnp.inf
     begins = jnp.concatenate([jnp.zeros_like(grid[:1]), grid[:-1]])
     lengths = jnp.where(taken, grid - jnp.where(taken, begins, 0.0), 0.0)

@@ -1,9 +1,9 @@
 """Derivatives of a motion from the steps a solver has taken.
 
-Once the steps of a motion are known, each can be linearised independently. Many are linearised
-together, as arrays, instead of one after another along with the motion. Only the product of the
-small matrices is sequential. The result is the derivative of the discrete motion on these steps,
-exact to rounding: the variational equation, solved by the same method.
+Once the steps of a motion are known, each step can be linearised independently. Many steps are
+therefore linearised together, as arrays. Only the product of the small matrices is sequential. The
+result is the derivative of the discrete motion on these steps, exact to rounding: the variational
+equation, solved by the same method.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 _CHUNK = 32
-"""Number of steps linearised together: enough for vector speed, few enough to waste little where
+"""Number of steps linearised together. A larger number is faster per step, but wastes more where
 the motion ends inside a chunk."""
 
 
@@ -29,9 +29,10 @@ def one_step(
     y: Float[Array, " m"],
     args: Any,
 ) -> tuple[Float[Array, " m"], Float[Array, "stages m"]]:
-    """Take one step of `solver` and return y at its end, and dy/dτ at its stages.
+    """Take one step of `solver` from `begin` to `end`. Return y at `end`, and dy/dτ at the stages.
 
-    The step goes from `begin` to `end`. The first stage is at `begin`, the last at `end`."""
+    `y` (m,): at `begin`. The first stage is at `begin`, the last at `end`. For an implicit solver,
+    only these two slopes are returned."""
     if not isinstance(solver, diffrax.AbstractERK):
         memory = solver.init(term, begin, end, y, args)
         after = solver.step(term, begin, end, y, args, memory, made_jump=False)[0]
@@ -75,7 +76,9 @@ class Linear(NamedTuple):
     by_parameters: Float[Array, "rows d"]
 
     def after(self, before: Float[Array, "n columns"]) -> Float[Array, "rows columns"]:
-        """Return the derivatives along the n + d columns, given those of the state (`before`)."""
+        """Return the derivatives of the values along the n + d columns (chain rule).
+
+        `before` (n, n + d): derivatives of the state along the same columns."""
         # A sum: for matrices this small, calling a matrix product costs more.
         moved = jnp.sum(self.by_state[:, :, None] * before[None], axis=1)
         return moved.at[:, self.by_state.shape[1] :].add(self.by_parameters)
@@ -90,8 +93,8 @@ def linearized(
 ) -> Linear:
     """Return the value of `function(y, parameters)` with its derivatives.
 
-    They are with respect to the first `count` = n entries of y, and along the `directions` of the
-    parameters (stacked along a leading axis; there may be none)."""
+    Derivatives are with respect to the first `count` = n entries of y, and along d `directions` of
+    the parameters (stacked along a leading axis; d may be 0)."""
     # All directions in one pass, so that common terms are computed once.
     number = jax.tree.leaves(directions)[0].shape[0]
     unit = jnp.eye(count + number, y.shape[0], dtype=y.dtype).at[count:].set(0.0)
@@ -113,17 +116,20 @@ def propagated(
     branch: Int[Array, ""],
     aside: int,
 ) -> tuple[Float[Array, "m columns"], Float[Array, "n columns"], Linear]:
-    """Return derivatives after a sequence of linearised steps, and at side steps from one of them.
+    """Return derivatives after a sequence of linearised steps, and after side steps from one of
+    them.
 
     `linear_step(k, there)` linearises step k. Its rows are y, then any further values. y holds the
-    n entries of the state, then integrals, on which no row depends. `start`: derivatives of y
-    before the first step (m, n + d), along n directions of the initial state and d parameters.
+    n entries of the state, then integrals, on which no row depends. `start` (m, n + d): derivatives
+    of y before the first step, along n directions of the initial state and d parameters.
 
-    Side steps do not belong to the motion. Step -1 starts where the step `branch` starts. `aside`
-    more steps, numbered -2, -3 …, start at its end, which they get as `there` (zero until then).
+    Side steps do not belong to the motion. Side step -1 starts where the step `branch` starts.
+    `aside` further side steps, numbered -2, -3 …, start at the end of side step -1. They receive
+    the rows there as `there`, which is zero for all earlier calls.
 
-    The results are the derivatives of y after the step `last`, those of the state after step -1,
-    and the side steps -2, -3 … (stacked).
+    The result has three members: the derivatives of y (m, n + d) after the step `last`; the
+    derivatives of the state (n, n + d) after side step -1; and the linearised side steps -2, -3 …
+    (stacked).
     """
     shape = jax.eval_shape(linear_step, last, start[:, 0])
     count = shape.by_state.shape[1]
@@ -135,7 +141,7 @@ def propagated(
         moved = step.after(y[:count])[: y.shape[0]].at[count:].add(y[count:])
         return (jnp.where((k >= 0) & (k <= last), moved, y), held), None
 
-    # Step -1 comes first. The other side steps follow once it is known.
+    # Side step -1 comes first, since the other side steps need its result.
     lanes = jnp.arange(_CHUNK)
 
     def chunk(carry):

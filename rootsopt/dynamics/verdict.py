@@ -14,31 +14,33 @@ from rootsopt.dynamics.orbit import Orbit, agreement
 from rootsopt.dynamics.settle import NOISE
 
 RESIDUAL = {"float64": 1e-9, "float32": 1e-3}
-"""Largest residual (scaled) of an orbit that counts as closed, by precision."""
+"""Residual (scaled) above which an orbit does not count as closed, by precision."""
 TOO_DEEP = 0.02
-"""Penetration (pitch radii) above which no contact law holds."""
+"""Penetration (pitch radii) above which the forces of an orbit are not valid."""
 UNRESOLVED = 1e-2
-"""Relative error of the greatest force, from rounding of the gap, above which it is unresolved."""
+"""Relative error of the greatest force, from rounding of the gap, above which an orbit's forces
+count as unresolved."""
 _UNKNOWN = 0.1
 """Estimated error of an orbit (scaled) above which the orbit is rejected."""
 _FREE = 1e-6
 """Distance of a Floquet multiplier from 1 below which it counts as 1."""
 _DEFECT = 1e3
-"""Residual on halved steps above which an orbit's derivatives are uncertain: in tolerances, times
-the greatest entry of the monodromy matrix."""
+"""Residual on halved steps (tolerances, times the greatest entry of the monodromy matrix if above
+1) above which an orbit's derivatives are uncertain."""
 _DRIFT = 1e3, 1e-5
-"""Distance (scaled) from the orbit of the last search for kinks, above which derivatives are
-uncertain: the first in tolerances, but at least the second. Some kinks then lie inside long steps.
-"""
+"""Change of an orbit's start since the last search for kinks above which derivatives are uncertain,
+because some kinks may lie inside long steps. First in tolerances, then its minimum (scaled)."""
 _STRAINED = 100.0
-"""Reject an orbit if a replayed step's error exceeds this many tolerances."""
+"""Error of a repeated step (tolerances) above which an orbit is rejected."""
 
 
 class Verdict(NamedTuple):
     """Results of the checks of a closed orbit.
 
-    `idle`: see `is_idle`; `steady`: see `judged`; `rounding`: relative error of the greatest force
-    (see `force_rounding`); `consistent`: see `is_consistent`; `certain`: see `is_certain`.
+    `idle`: whether no flank ever touches (`is_idle`); `steady`: whether the orbit is the stable
+    motion that the transient led to (`judged`); `rounding`: relative error of the greatest force
+    (`force_rounding`); `consistent`: whether mean ≤ RMS ≤ peak (`is_consistent`); `certain`:
+    whether the derivatives are reliable (`is_certain`).
     """
 
     idle: Bool[Array, ""]
@@ -56,10 +58,10 @@ def verdict(
     residual: Float[Array, ""] | float,
     scales: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]],
 ) -> Verdict:
-    """Return the verdict on an orbit.
+    """Return the results of all checks of an `orbit`.
 
-    `scales`: exponent of the contact law, pitch radius (m), unit of force (N). The other arguments
-    are those of `judged`."""
+    `scales`: exponent of the contact law, pitch radius (m), unit of force (N). For the other
+    arguments, see `judged`."""
     exponent, radius, force = scales
     rounding = force_rounding(orbit.flow.depth, exponent, radius)
     steady = judged(orbit, state, within, rtols, residual)
@@ -77,10 +79,9 @@ def is_idle(
 ) -> Bool[Array, ""]:
     """Return whether no flank ever touches. Forces up to `least` (N) count as rounding.
 
-    Such a pair is idle in two cases. Either the orbit is `steady`: the timing gear holds the pair.
-    Or nothing brings a displaced pair back: it can rest anywhere, and neither Newton's method nor a
-    derivative has an answer. In any other case, an orbit without contact says nothing about the
-    motion.
+    An orbit without contact is idle in two cases. Either it is `steady`, because the timing gear
+    holds the pair. Or no torque brings a displaced pair back (Floquet multiplier 1 or unknown), and
+    the pair can rest anywhere. In any other case, such an orbit says nothing about the motion.
     """
     free = jnp.isnan(orbit.multiplier) | (orbit.multiplier > 1 - _FREE)
     return (orbit.flow.mean <= least) & (orbit.flow.peak <= least) & (free | steady)
@@ -95,9 +96,9 @@ def judged(
 ) -> Bool[Array, ""]:
     """Return whether an orbit is the stable motion that a transient led to.
 
-    `rtols`: tolerances of transient and orbit; `state` (n,): end of the transient, which repeated
-    `within` some distance; `residual`: limit for a closed orbit. All are scaled, and relative to
-    states greater than 1. There are four conditions:
+    `rtols`: tolerances of transient and orbit; `state` (n,): end of the transient, whose states
+    repeated to the distance `within`; `residual`: limit for a closed orbit. All values are scaled;
+    limits grow in proportion to states greater than 1. There are four conditions:
 
     - The orbit closes to `residual`, on steps that the solver would accept.
     - Its Floquet multipliers lie inside the unit circle.
@@ -116,10 +117,10 @@ def judged(
 
 
 def is_consistent(orbit: Orbit, least: Float[Array, ""]) -> Bool[Array, ""]:
-    """Return whether mean ≤ RMS ≤ peak force, within 1 % and forces of the size `least` (N).
+    """Return whether mean ≤ RMS ≤ peak force, up to about 1 % and forces of the size `least` (N).
 
-    This holds for every force. Steps too coarse for short impacts violate it: their mean square can
-    even be negative.
+    A violation shows that the steps were too coarse for short impacts. The computed mean square can
+    then even be negative.
     """
     mean, square, peak = orbit.response[:3]
     ordered = (square + least**2 >= 0.98 * mean**2) & (peak**2 + least**2 >= 0.98 * square)
@@ -129,8 +130,8 @@ def is_consistent(orbit: Orbit, least: Float[Array, ""]) -> Bool[Array, ""]:
 def is_certain(orbit: Orbit, rtol: Float[Array, ""]) -> Bool[Array, ""]:
     """Return whether the derivatives of an orbit integrated at `rtol` are reliable.
 
-    On halved steps, the orbit must close as well as the tolerance promises, and the derivatives
-    must agree. The kinks must lie where they were searched for."""
+    The orbit must close to a multiple of the tolerance on halved steps, and the derivatives must
+    agree there. Since the last search for kinks, the orbit may only have moved a little."""
     size = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.state)))
     gain = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.monodromy)))
     closes = orbit.defect <= _DEFECT * rtol * size * gain

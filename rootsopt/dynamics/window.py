@@ -1,7 +1,7 @@
 """A window of a motion that has not settled: its forces, and its largest Lyapunov exponent.
 
-The exponent tells chaos from a long transient. It is the growth of a tangent vector that is
-renormalised every mesh period (Benettin et al., Meccanica 15 (1980) 9-20).
+The exponent tells chaos from a long transient. It is the mean logarithmic growth rate of a tangent
+vector that is renormalised every mesh period (Benettin et al., Meccanica 15 (1980) 9-20).
 """
 
 from typing import Any, NamedTuple
@@ -21,24 +21,24 @@ from rootsopt.dynamics.pair import RotorPair
 PERIODS = 128
 """Length of a window (mesh periods)."""
 _BATCHES = 16
-"""Number of batches of a window, whose means give the standard error of the exponent."""
+"""Number of batches into which a window is divided to estimate the exponent's standard error."""
 _KEPT = 105
 """Number of states stored per mesh period."""
 _SAMPLES = 630
-"""Uniform samples of a mesh period from which its peak is located; a multiple of `_KEPT`."""
+"""Number of uniform samples per mesh period for locating the peak force; a multiple of `_KEPT`."""
 
 _Arrays = Array | np.ndarray
-"""JAX arrays, or NumPy arrays once a window has left the device."""
+"""Array type of a window: JAX arrays, or NumPy arrays after a copy from the device."""
 
 
 class Window(NamedTuple):
     """A motion over p mesh periods, of which the first `done` are known.
 
     `growth` (p,): logarithm of the tangent vector's growth factor in each mesh period; `response`
-    (p, 3): mean (N), mean square (N²) and peak (N) of the contact force in each; `states`
-    (p, s, n): uniform samples, scaled; `depth`: greatest penetration (m; negative: least gap);
-    `solved`: whether the solver succeeded; `end` (n,): last scaled state; `direction` (n,): unit
-    tangent vector there.
+    (p, 3): mean (N), mean square (N²) and peak (N) of the contact force in each mesh period;
+    `states` (p, s, n): uniform samples, scaled; `depth`: greatest penetration (m; negative: least
+    gap); `solved`: whether the solver succeeded; `end` (n,): last scaled state; `direction` (n,):
+    unit tangent vector at `end`.
     """
 
     growth: Float[Array, " p"]
@@ -52,7 +52,8 @@ class Window(NamedTuple):
 
     @classmethod
     def empty(cls, state: Float[Array, " n"], periods: int) -> "Window":
-        """Return a window from the scaled `state` (n,), of which no period is known yet."""
+        """Return a window of `periods` mesh periods from the scaled `state` (n,), before any
+        integration."""
         count, dtype = state.shape[0], state.dtype
         return cls(
             growth=jnp.zeros(periods, dtype),
@@ -105,7 +106,9 @@ class Window(NamedTuple):
 
 
 def _numpy_of(array: Any) -> Any:
-    """Return NumPy for NumPy arrays, so that nothing is compiled for them, else jax.numpy."""
+    """Return the module NumPy if `array` is a NumPy array, else jax.numpy.
+
+    NumPy operations need no compilation."""
     return np if isinstance(array, np.ndarray) else jnp
 
 
@@ -124,8 +127,9 @@ def lyapunov(
 
 
 def no_tangents(pair: RotorPair) -> RotorPair:
-    """Return an empty stack of parameter directions for `pair`, so that a flow has derivatives with
-    respect to the state only."""
+    """Return an empty stack of parameter directions for `pair`.
+
+    With it, `flow` computes derivatives with respect to the state only."""
     return jax.tree.map(
         lambda x: jnp.zeros((0, *x.shape), x.dtype), eqx.filter(pair, eqx.is_inexact_array)
     )

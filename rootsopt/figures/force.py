@@ -26,9 +26,10 @@ def plot_force(
 ) -> Sequence[Axes] | NDArray:
     """Draw the contact force over time, one panel per design, all on one scale.
 
-    Mean and peak come from `responses` (`mean_force_N`, `peak_force_N`), which are more exact than
-    the samples. All panels are as long as the shortest window, a few revolutions at most, and
-    include the largest force. Time counts from the start of the panel.
+    `series` and `responses`: by name of the design. Mean and peak come from `responses`
+    (`mean_force_N`, `peak_force_N`), which are more exact than the samples. All panels are as long
+    as the shortest window, a few revolutions at most, and include the largest force. Time counts
+    from the start of the panel.
     """
     turns = min(_MOST_TURNS, *(np.ptp(run.rotation) / (2 * np.pi) for run in series.values()))
     for ax, (name, run) in zip(axes, series.items(), strict=True):
@@ -62,12 +63,13 @@ def _flank_force(ax, time, force, color, label):
 
 
 def number(value: float) -> str:
-    """Format with four significant digits, keeping final zeros."""
+    """Format `value` with four significant digits, keeping final zeros."""
     return f"{value:#.4g}".rstrip(".")
 
 
 def _around_peak(run: Series, turns: float) -> slice:
-    """Return a slice of `turns` revolutions around the largest force, as far as samples exist."""
+    """Return a slice of samples: `turns` revolutions around the largest force, or fewer at an
+    end."""
     count = len(run.time)
     shown = min(count, round(count * turns * 2 * np.pi / np.ptp(run.rotation)))
     start = 0 if shown == count else int(np.argmax(run.force)) - shown // 2
@@ -78,10 +80,10 @@ def _around_peak(run: Series, turns: float) -> slice:
 def amplitude_spectrum(
     signal: ArrayLike, step: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return frequencies (1/unit of `step`) above 0 and one-sided amplitudes of a signal (n,).
+    """Return frequencies above 0 (1/unit of `step`) and one-sided amplitudes of a `signal` (n,).
 
-    The samples must be uniform and cover whole periods, without the end point. A cosine of
-    amplitude a then gives one line of height a, and no window function is needed.
+    The samples must be uniform, a `step` apart, and cover whole periods, without the end point. A
+    cosine of amplitude a then gives one line of height a, without a window function.
     """
     signal = np.asarray(signal)
     amplitude = 2 * np.abs(np.fft.rfft(signal)) / len(signal)

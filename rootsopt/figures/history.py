@@ -24,12 +24,12 @@ def plot_history(
     history: Sequence[Mapping[str, Any]],
     keys: Sequence[str] = DESIGN_KEYS,
 ) -> Sequence[Axes] | NDArray:
-    """Draw the objective with its best so far, then the design parameters, over the evaluations.
+    """Draw the objective and its best value so far, then the design parameters, over evaluations.
 
-    `axes` has one panel more than `keys`, the parameters of the config's family. A list of
-    parameters shares a panel, which shows local searches only. A row without `start`, or with a
-    negative one, belongs to the screening. Unusable designs (objective not finite) are crosses at
-    the top.
+    `keys`: names of the design parameters; `axes`: a panel for the objective and one for each key.
+    `history`: one row per evaluation. A row whose `start` is absent or negative belongs to the
+    screening. A key whose values are lists has one panel, which omits the screening. Unusable
+    designs (objective not finite) are crosses at the top.
     """
     keys = ("objective", *keys)
     for ax, key in zip(axes, keys, strict=True):
@@ -56,7 +56,7 @@ def _label(key: str) -> str:
 
 
 def _traces(ax, rows, key):
-    """Draw the entries of a list of parameters over the evaluations of a local search."""
+    """Draw each entry of a list-valued parameter over the evaluations of a local search."""
     rows = [row for row in rows if _start(row) >= 0]
     if not rows:
         return
@@ -71,7 +71,7 @@ def _traces(ax, rows, key):
 
 
 def _starts(history) -> Iterator[tuple[list[Mapping[str, Any]], dict[str, Any]]]:
-    """Yield rows and line style of the screening and of each start."""
+    """Yield (rows, line style) for the screening and for the local search from each start."""
     groups: dict[Any, list] = {}
     for row in history:
         groups.setdefault(_start(row), []).append(row)
@@ -123,7 +123,7 @@ def _best(axes, keys, history):
 
 
 def _outside(ax, history):
-    """Set limits that a few bad designs cannot stretch, and mark the values outside them."""
+    """Set axis limits that ignore a few bad designs, and mark the values outside these limits."""
     values = _values(history, "objective")
     x = _values(history, "evaluation")
     known = values[np.isfinite(values)]

@@ -13,7 +13,7 @@ from rootsopt.figures.style import COLORS, DASHES, GREY, ORANGE, SKY, VERMILION
 def plot_profiles(
     ax: Axes, outlines: Mapping[str, NDArray[np.float64]], pitch_radius_mm: float
 ) -> Axes:
-    """Draw closed outlines (n, 2) in mm on top of each other, with the pitch circle."""
+    """Draw closed outlines (n, 2) in mm, by name, on top of each other, with the pitch circle."""
     _overlay(ax, outlines, pitch_radius_mm)
     reach = 1.06 * max(np.max(np.hypot(*points.T)) for points in outlines.values())
     ax.plot(0, 0, "+", color="black", markersize=9)
@@ -24,7 +24,10 @@ def plot_profiles(
 def plot_flank(
     ax: Axes, outlines: Mapping[str, NDArray[np.float64]], lobes: int, pitch_radius_mm: float
 ) -> Axes:
-    """Draw one flank from tip (+x axis) to root, enlarged; the rest follows by symmetry."""
+    """Draw one flank of each outline from tip (on the +x axis) to root, enlarged.
+
+    `outlines`: closed outlines (n, 2) in mm, by name. The rest of an outline follows by symmetry.
+    """
     _overlay(ax, outlines, pitch_radius_mm)
     flanks = []
     for points in outlines.values():
@@ -60,7 +63,9 @@ def plot_meshing(
     pitch_radius_mm: float,
     angles_deg: Sequence[float] | NDArray[np.float64],
 ) -> Sequence[Axes] | NDArray:
-    """Draw the meshing pair at several angles of rotor 1, one panel each."""
+    """Draw the meshing pair at several angles of rotor 1, one panel per angle.
+
+    `outline_mm` (n, 2): outline of either rotor."""
     center = 2 * pitch_radius_mm
     for ax, angle in zip(axes, angles_deg, strict=True):
         turn = np.radians(angle)
@@ -78,8 +83,10 @@ def plot_meshing(
 
 
 def plot_conjugacy(ax: Axes, gaps: Mapping[str, tuple[NDArray, NDArray]]) -> Axes:
-    """Draw the gap (µm) of pairs in perfect rolling over rotor 1's angle (deg), which is 0 where
-    its tip passes the line of centres."""
+    """Draw the gap (µm) of pairs in perfect rolling over rotor 1's angle (deg).
+
+    `gaps`: (angles, gaps) by name of the pair. The angle is 0 where a tip of rotor 1 passes the
+    line of centres."""
     for (name, (angle, gap)), color, dashes in zip(gaps.items(), COLORS, DASHES * 2, strict=False):
         ax.plot(angle, gap, color=color, linestyle=dashes, linewidth=1.6, label=name)
     ax.axhline(0, color="black", linewidth=0.8)

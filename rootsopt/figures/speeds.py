@@ -17,15 +17,15 @@ from rootsopt.response.speeds import AtSpeed
 _MARKERS = {"periodic": "o", "averaged": "s", "chaotic": "x", "not_settled": "+"}
 _NO_FORCE = "v"
 _FEW = 24
-"""Number of speeds up to which each speed is marked."""
+"""Number of speeds above which single speeds are not marked."""
 LABELS = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
 
 
 def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[AtSpeed]], force: str) -> Axes:
-    """Draw `force` (a key of the responses) over speed, one line per design.
+    """Draw `force` (a key of `Evaluation.response`) over speed, one line per design.
 
-    Lines connect steady motions. Other motions are single markers; those without a force are at the
-    bottom.
+    `designs`: evaluations at all speeds, by name. Lines connect steady motions. Other motions are
+    single markers, at the bottom if the force is not known.
     """
     for (name, parts), color, dashes in zip(designs.items(), COLORS, DASHES * 2, strict=False):
         speeds = np.array([part.speed_rpm for part in parts])
@@ -33,7 +33,7 @@ def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[AtSpeed]], force: str) 
         usable = np.array([part.evaluation.usable for part in parts])
         line = np.where(usable, values, np.nan)
         ax.plot(speeds, line, color=color, linestyle=dashes, linewidth=1.5, label=name)
-        # A single steady motion between others gives no line, so it is marked.
+        # A steady motion between two motions that are not steady gives no line, so it is marked.
         beside = np.concatenate([[False], usable, [False]])
         marked = ~usable | (len(parts) <= _FEW) | ~(beside[:-2] | beside[2:])
         for part, value, mark in zip(parts, values, marked, strict=True):
@@ -78,7 +78,7 @@ def legend_entries(designs: Mapping[str, Sequence[AtSpeed]]) -> list[Line2D]:
 def speed_figure(
     folder: ResultFolder, designs: Mapping[str, Sequence[AtSpeed]], title: str
 ) -> list[str]:
-    """Write speeds.png, mean and peak force over speed; return its name."""
+    """Write speeds.png: mean and peak force over speed. Return the names of the files written."""
     made, axes = figure(9, 6.6, 2, 1, sharex=True)
     for ax, force in zip(axes[:, 0], LABELS, strict=True):
         plot_speeds(ax, designs, force).set_ylim(0, None)

@@ -1,4 +1,4 @@
-"""The palette of all figures, and figures that need no display."""
+"""Colours and line styles of all figures, and a function for figures without a display."""
 
 from typing import Any
 
@@ -18,7 +18,9 @@ DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), "-.")
 def figure(
     width: float, height: float, rows: int = 1, columns: int = 1, **options: Any
 ) -> tuple[Figure, NDArray]:
-    """Return a headless figure (sizes in inches) and its (rows, columns) array of axes."""
+    """Return a figure that needs no display, and its array of axes (rows, columns).
+
+    `width`, `height` (inches); `options` are passed to `Figure.subplots`."""
     made = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(made)
     return made, made.subplots(rows, columns, squeeze=False, **options)

@@ -1,4 +1,4 @@
-"""Gradient-based optimisation of a rotor pair: problem, search, command line."""
+"""Gradient-based optimisation of a rotor pair: problem, search, verification."""
 
 from collections.abc import Sequence
 

@@ -1,9 +1,9 @@
 """Verify the result of a search whose objective is an average over an ensemble.
 
-The best of many noisy objectives is best partly by luck. So the objectives of the search do not
-count in the decision. A few candidates are averaged again, over a larger ensemble of other motions.
-The best of them and the baseline are then averaged over yet another ensemble. The design is
-accepted only if it is better by more than `SIGNIFICANT` combined standard errors.
+The best of many noisy objectives is partly lucky, so the decision does not use the objectives of
+the search. A few candidates are averaged again, over a larger ensemble of other motions. The best
+candidate and the baseline are then averaged over a third ensemble. The design is accepted only if
+it is better by more than `SIGNIFICANT` combined standard errors.
 """
 
 import dataclasses
@@ -27,9 +27,10 @@ _CANDIDATES = 3
 class Verification(NamedTuple):
     """Outcome of a verification.
 
-    `baseline`: evaluation by the last ensemble; `problem`: relative to it; `optimized`: evaluation
-    of the design, None if it was not accepted; `record`: entries for the result file. Without a
-    usable candidate, `problem` and `baseline` are those of the search.
+    `baseline`: evaluation of the baseline by the last ensemble; `problem`: the design problem
+    relative to this evaluation; `optimized`: evaluation of the best candidate, None if it was not
+    accepted; `record`: entries for the result file. Without a usable candidate, `problem` and
+    `baseline` are those of the search.
     """
 
     problem: Problem
@@ -42,7 +43,7 @@ def standard_error(problem: Problem, evaluation: Evaluation) -> float:
     """Return the standard error of the objective of an evaluation; NaN if it is not usable.
 
     The error of the baseline is not included. The value is the weighted sum of the responses'
-    standard errors. This is an upper bound, and a close one, since mean and peak rise together.
+    standard errors. This is a close upper bound, since mean and peak rise together.
     """
     steady = evaluation.steady_state
     errors = {name: steady.get(key, float("nan")) for name, key in ERRORS.items()}
@@ -50,15 +51,19 @@ def standard_error(problem: Problem, evaluation: Evaluation) -> float:
 
 
 def add_errors(rows: list[dict[str, Any]], trials: Sequence, problem: Problem) -> None:
-    """Add the standard error of the objective to the rows of a history, one row per trial."""
+    """Add the standard error of the objective to the `rows` of a history, in place.
+
+    `rows` and `trials` correspond one to one."""
     for row, trial in zip(rows, trials, strict=True):
         row["objective_standard_error"] = standard_error(problem, trial.evaluation)
 
 
 def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> Verification:
-    """Choose the best candidate by one larger ensemble; compare it with the baseline by another.
+    """Choose the best candidate by a larger ensemble; compare it with the baseline by a third one.
 
-    Gradients come from ensembles of the search's size."""
+    `problem`, `evaluator` and `trials` of the search. Gradients come from ensembles of the search's
+    size.
+    """
     chooser, judge = (evaluator.independent(k).without_gradient() for k in (1, 2))
     settings = judge.settings
     record: dict[str, Any] = {
@@ -103,7 +108,7 @@ def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> 
 
 
 def _with_gradient(evaluation: Evaluation, other: Evaluation) -> Evaluation:
-    """Return `evaluation` with the gradient of the `other` one and its standard error."""
+    """Return `evaluation` with the gradient of `other` and the gradient's standard error."""
     key = "gradient_standard_error"
     errors = {key: other.steady_state[key]} if key in other.steady_state else {}
     steady = evaluation.steady_state | errors
@@ -114,8 +119,8 @@ def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[
     """Return the most promising points of the unit box, each with an averaged objective.
 
     The points are at least `_NEAR` apart. The objective is the average over the trials near a
-    point. Points are ranked by this average plus its standard error, so a single lucky trial among
-    worse ones does not rank high.
+    point. Points are ranked by this average plus its standard error, so a lucky trial among worse
+    trials does not rank high.
     """
     # The first trial of a descent repeats a screening trial, with the same noise: count it once.
     usable = {tuple(trial.point): trial for trial in trials if trial.candidate}
@@ -147,9 +152,9 @@ def most_promising(problem: Problem, trials: Sequence) -> Any:
 
 
 def message(record: dict[str, Any]) -> str:
-    """Return the message for a verification over an ensemble that no design has passed.
+    """Return the message that no design has passed a verification over an ensemble.
 
-    It is empty if the verification was not over an ensemble."""
+    `record`: `Verification.record`. The message is empty if there was no such verification."""
     if "required_standard_errors" not in record:
         return ""
     advice = (

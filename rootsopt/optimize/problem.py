@@ -25,10 +25,10 @@ from rootsopt.scene import Scene
 _NO_LINE = 1e-9
 """Amplitude of a spectral line, relative to the mean force, below which there is no line."""
 _DRAWN = 5
-"""Maximum number of times that an infeasible point is moved half way towards a feasible one."""
+"""Maximum number of times that an infeasible point is moved half way towards a feasible point."""
 _ACTIVE = 1e-6
-"""Scaled violation of a constraint below which a point counts as feasible. It is also the distance
-from a bound of the unit box below which the bound counts as active."""
+"""Scaled violation of a constraint below which a point counts as feasible, and distance from a
+bound of the unit box below which the bound counts as active."""
 
 
 @Program
@@ -39,7 +39,9 @@ def _nearest(space: Space, design):
 
 @Program
 def _ranges(space: Space, design):
-    """Return the ranges of the parameters whose range depends on the others, without bounds."""
+    """Return the ranges of the parameters whose range depends on other parameters.
+
+    The bounds of the config are not included."""
     return space.ranges(design)
 
 
@@ -50,8 +52,9 @@ _slacks_of = Program(Space.slacks_of)
 class Problem:
     """A config's design problem, relative to its evaluated baseline.
 
-    `config`; `baseline`: its evaluation; `space`: unit box of the design parameters, with the
-    constraints. A *point* below is a point (d,) of this box.
+    `config` of the problem; `baseline`: evaluation of the config's own design; `space`: unit box of
+    the design parameters, with the constraints. In all methods, a *point* is a point (d,) of this
+    box.
     """
 
     config: Config
@@ -60,10 +63,10 @@ class Problem:
 
     @classmethod
     def of(cls, config: Config, scene: Scene, baseline: Evaluation) -> "Problem":
-        """Return the problem with the constraint limits of the config or of the `baseline`.
+        """Return the problem; limits that the config leaves open come from the `baseline`.
 
-        Raises `InputError` if a measure in the objective is 0 for the baseline, since measures are
-        relative to the baseline's."""
+        Raises `InputError` if a measure in the objective is 0 for the baseline, since the objective
+        divides each measure by its value for the baseline."""
         orders = {line_name(order): order for order in config.objective.line_weights}
         counting = [part for part in at_speeds(baseline) if part.share > 0]
         for name, part in itertools.product(objective_weights(config), counting):
@@ -87,17 +90,19 @@ class Problem:
         return cls(config, baseline, Space.of(config, scene, baseline.geometry["area_efficiency"]))
 
     def objective(self, evaluation: Evaluation) -> float:
-        """Return the objective: the weighted measures relative to the baseline's, over all speeds.
+        """Return the objective: weighted measures over all speeds, each divided by its value for
+        the baseline.
 
-        It is 1 at the baseline, and NaN for a design without a usable steady state."""
+        The objective is 1 at the baseline, and NaN for a design without a usable steady state."""
         if not evaluation.usable:
             return float("nan")
         return sum(share * self._value(*pair) for share, *pair in self._counted(evaluation))
 
     def by_speed(self, evaluation: Evaluation) -> list[dict[str, float]]:
-        """Return the objective at each speed by itself; empty unless there are several speeds.
+        """Return the objective at each single speed; empty unless there are several speeds.
 
-        It is NaN where a measure of the baseline is 0, which occurs only at a speed without share.
+        The objective is NaN if a measure of the baseline is 0, which is possible only at a speed
+        without share.
         """
         parts = zip(at_speeds(evaluation), at_speeds(self.baseline), strict=True)
         return [
@@ -111,7 +116,10 @@ class Problem:
         ]
 
     def look(self, point) -> tuple[NDArray[np.float64], ...]:
-        """Return design, its Jacobian, slacks of the constraints, and their Jacobian at a point."""
+        """Return four arrays at a point (d,): the design (d,), its Jacobian (d, d), the slacks of
+        the c constraints (c,), and their Jacobian (c, d).
+
+        A slack is negative where its constraint is violated."""
         return self._look_at(tuple(np.asarray(point, dtype=np.float64)))
 
     @functools.cached_property
@@ -135,11 +143,13 @@ class Problem:
         return counted(self.config, evaluation, self.baseline, self._value)
 
     def _value(self, evaluation: Evaluation, baseline: Evaluation) -> float:
-        """Return the weighted measures of the force at one speed, relative to the baseline's."""
+        """Return the weighted sum of the measures at one speed, each divided by the baseline's."""
         return sum(w * evaluation.response[k] for k, w in self._weights(baseline).items())
 
     def _weights(self, baseline: Evaluation) -> dict[str, float]:
-        """Return the weights (1/N) of the measures at one speed, NaN where the baseline's is 0."""
+        """Return the weight of each measure at one speed, divided by the baseline's measure (1/N).
+
+        The weight is NaN if the baseline's measure is 0."""
         weights = objective_weights(self.config)
         forces = {key: baseline.response[key] or math.nan for key in weights}
         return {key: weight / forces[key] for key, weight in weights.items()}
@@ -179,9 +189,9 @@ class Problem:
     def toward(self, point, inside) -> NDArray[np.float64]:
         """Return a feasible point near `point`, as `project` does, with a fallback to `inside`.
 
-        In a family without limits on its parameters, a profile may not even exist at `point`. If
-        `project` then finds nothing feasible, the point moves towards `inside`, a feasible point,
-        until it does."""
+        `inside`: a feasible point. If `project` finds no feasible point, the point is moved half
+        way towards `inside`, up to `_DRAWN` times. A profile may not even exist at `point`.
+        """
         found = self.project(point)
         if self.space.family.by_limits:
             return found
@@ -239,7 +249,8 @@ class Problem:
         return np.asarray(_slacks_of(self.space, design))
 
     def _range_rows(self, optimized: Evaluation) -> list[dict]:
-        """Return rows for the upper limits of parameters whose range depends on the others."""
+        """Return rows for the upper limits of parameters whose range depends on other
+        parameters."""
         design = np.asarray(list(optimized.design.values()), dtype=np.float64)
         rows = []
         for key, (_, most) in _ranges(self.space, design).items():

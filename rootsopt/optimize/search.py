@@ -2,10 +2,10 @@
 
 Screening chooses the starts from a Sobol sample of feasible designs. From each start, an optax
 update rule descends in the unit box. The gradient is first projected onto the directions that
-active constraints allow; each step is projected back onto the feasible set. The last orbit is the
-first guess for the next. The best design so far is kept, and simulated again from rest at a tighter
-tolerance before it is reported. A search can be stopped at any time (`stop`). It then verifies the
-best design found so far.
+active constraints allow; each step is projected back onto the feasible set. Each orbit is the
+first guess for the next orbit. The best design is simulated again from rest at a tighter tolerance
+before it is reported. A search can be stopped at any time (`stop`), and then verifies the best
+design found so far.
 """
 
 import dataclasses
@@ -39,9 +39,9 @@ RULES: dict[str, Callable[..., optax.GradientTransformation]] = {
     "sgd": optax.sgd,
 }
 _PATIENCE = 4
-"""Number of steps without a gain above which a descent ends."""
+"""Number of successive steps without a gain above which a descent ends."""
 _GAIN = 1e-4
-"""Relative decrease of the best objective below which a step counts as no gain."""
+"""Relative decrease of the best objective below which a step is not a gain."""
 _STATIONARY = 1e-3
 """Norm of the projected gradient in the unit box below which a descent ends."""
 _HOLDS_UP = 0.01
@@ -50,7 +50,8 @@ _POLL = 0.05
 """Interval (s) at which a waiting thread checks whether to stop."""
 
 Progress = Callable[[int, int, float], None]
-"""Called with (evaluations done, evaluations expected, best objective)."""
+"""Type of a progress callback, with arguments (evaluations done, evaluations expected, best
+objective)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,8 +59,8 @@ class Trial:
     """One evaluated design of a search.
 
     `point` (d,) of the unit box; `start`: number of the descent (-1: screening); `iteration`: steps
-    from its start; `evaluation`; `objective`: NaN without a usable steady state; `feasible`:
-    whether all constraints are satisfied.
+    since the start of the descent; `evaluation` of the design; `objective`: NaN without a usable
+    steady state; `feasible`: whether all constraints are satisfied.
     """
 
     point: NDArray[np.float64]
@@ -79,11 +80,12 @@ class Trial:
 class Optimization:
     """Outcome of a search.
 
-    `problem`: None if the baseline has no usable steady state; `baseline`: its evaluation;
-    `optimized`: evaluation of the best design, None if no design better than the baseline was
-    confirmed; `history`: one row per trial; `verification`: objective in the search and in the
-    verification; `interrupted`: whether the search was stopped. `verification["holds_up"]` is None
-    if the search was stopped before the best design could be verified.
+    `problem`: the design problem, None if the baseline has no usable steady state; `baseline`:
+    evaluation of the baseline; `optimized`: evaluation of the best design, None if no design better
+    than the baseline was confirmed; `history`: one row per trial; `verification`: objective in the
+    search and in the verification; `interrupted`: whether the search was stopped.
+    `verification["holds_up"]` is None if the search was stopped before the best design could be
+    verified.
     """
 
     problem: Problem | None
@@ -104,7 +106,7 @@ class Optimization:
 
     @property
     def improvement(self) -> dict[str, float]:
-        """Reductions relative to the baseline, as fractions."""
+        """Reductions of objective and forces, as fractions of the baseline's values."""
         if self.problem is None or self.optimized is None:
             return {}
         gains = {"objective": 1 - self.problem.objective(self.optimized)}
@@ -156,7 +158,7 @@ class Search:
             self.settings.iterations + 1
         )
         self.exact = evaluator_for(config)
-        # If every objective is noisy, steps without a gain are no reason to end a descent.
+        # If objectives are noisy, steps without a gain do not show that a descent has converged.
         self.noisy = config.objective.motion == "ensemble"
         self.patience = np.inf if self.noisy else _PATIENCE
         self.stop = threading.Event() if stop is None else stop
@@ -212,8 +214,8 @@ class Search:
     def so_far(self) -> Optimization | None:
         """Return what the search has found so far, without verification.
 
-        It is None until the baseline has been simulated. Another thread can call this during the
-        search."""
+        The result is None until the baseline has been simulated. Another thread can call this
+        method during the search."""
         if self._baseline is None:
             return None
         trials = self._in_order()
@@ -240,15 +242,15 @@ class Search:
         return Optimization(self.problem, self._baseline, best.evaluation, rows, verification, True)
 
     def _in_order(self) -> list[Trial]:
-        """Return all trials so far: screening first, then descent by descent."""
+        """Return all trials so far: the screening first, then one descent after another."""
         with self._lock:
             return sorted(self._trials, key=lambda trial: (trial.start, trial.iteration))
 
     def _side_by_side(self, work: Callable[..., list[Trial]], tasks: Sequence) -> list[Trial]:
         """Return the trials of `work(*task)` for all tasks, in the order of the tasks.
 
-        If `stop` is set before all tasks end, the result is empty, and nobody waits for evaluations
-        that still run."""
+        If `stop` is set before all tasks end, the result is empty, and running evaluations are not
+        waited for."""
         pool = ThreadPoolExecutor(os.cpu_count())
         tasks = tasks if not self.stop.is_set() else []
         done = [pool.submit(work, *task) for task in tasks]
@@ -263,9 +265,9 @@ class Search:
             pool.shutdown(wait=not self.stop.is_set(), cancel_futures=True)
 
     def _feasible(self, baseline_point) -> list[NDArray[np.float64]]:
-        """Return the baseline's point and a Sobol sample, made feasible; drop the infeasible ones.
+        """Return feasible points: the baseline's and a Sobol sample, each projected if necessary.
 
-        Raises InputError if no point is feasible."""
+        Points that stay infeasible are dropped. Raises InputError if no point is feasible."""
         start = self.problem.project(baseline_point)
         count, seed = self.settings.screening, self.settings.seed
         sample = sobol(count, seed, len(baseline_point))
@@ -294,7 +296,7 @@ class Search:
         return chosen
 
     def _descend(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
-        """Descend from `point` and return the trials; `number`: that of the descent."""
+        """Descend from `point` (d,) and return the trials; `number`: index of the descent."""
         settings = self.settings
         rule = settings.method, settings.learning_rate, settings.iterations
         state = _init(*rule, point)
@@ -340,7 +342,7 @@ class Search:
     def _verify(self, trials: list[Trial]) -> tuple[Evaluation | None, dict[str, Any]]:
         """Simulate the best designs again, from rest at a tight tolerance, until one is confirmed.
 
-        Return its evaluation, or None, and the record for the result file."""
+        Return the evaluation of the confirmed design, or None, and a record for the result file."""
         ranked = sorted(filter(_candidate, trials), key=_objective)
         tried: list[np.ndarray] = []
         failures = []
@@ -370,8 +372,8 @@ def until_stopped(work: Callable[[], T], stop: threading.Event, patience: float)
     """Run `work()` in its own thread and return its result; return None if it does not end in time.
 
     The thread makes the wait interruptible even during compiled code. `stop`: an event that asks
-    `work` to end; it then has `patience` (s) left. A `KeyboardInterrupt` sets `stop`; a second one
-    is raised."""
+    `work` to end. After that, the wait lasts at most `patience` (s). The first `KeyboardInterrupt`
+    sets `stop`; a second one is raised."""
     future: Future[T] = Future()
 
     def do() -> None:
@@ -414,7 +416,7 @@ def _update(method, learning_rate, iterations, slope, state):
 
 
 def _near(point: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> bool:
-    """Return whether a point of the unit box practically coincides with one of the others."""
+    """Return whether `point` (d,) practically coincides with one of the points `others`."""
     return any(np.linalg.norm(point - other) < 0.02 for other in others)
 
 
@@ -423,7 +425,7 @@ _objective = operator.attrgetter("objective")
 
 
 def _history(trials: list[Trial]) -> list[dict[str, Any]]:
-    """Return the rows of the history, with the best objective so far."""
+    """Return the rows of the history, one per trial, each with the best objective so far."""
     rows, best = [], float("nan")
     for number, trial in enumerate(trials, start=1):
         if trial.candidate:

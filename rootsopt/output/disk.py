@@ -1,7 +1,7 @@
 """File operations used for everything that is written.
 
-They are thin on purpose: a test makes each of these calls fail, or ends the process there, one
-after the other. Standard library only.
+Each function does little on purpose: tests make every one of these calls fail in turn, or end the
+process there. Only the standard library is used.
 """
 
 import ctypes
@@ -18,8 +18,9 @@ _UNSUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 
 
 def create(path: Path, data: bytes) -> None:
-    """Write a new file with the user's usual permissions and flush it to the disk; on failure
-    leave no file."""
+    """Write a new file with the user's usual permissions and flush it to the disk.
+
+    If that fails, no file is left behind."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     file = os.open(path, flags, 0o666)
     try:
@@ -41,7 +42,7 @@ def make_folder(path: Path) -> None:
 
 
 def make_folders(folder: Path, made: list[Path]) -> None:
-    """Create a folder and its parents; append the new ones to `made` as they appear."""
+    """Create a folder and its missing parents; append each new folder to `made` at once."""
     missing = []
     while not folder.is_dir():
         missing.append(folder)
@@ -59,7 +60,7 @@ def make_folders(folder: Path, made: list[Path]) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Flush the names in a folder to the disk, where the file system can do that."""
+    """Flush a folder's list of names to the disk, if the file system supports that."""
     try:
         folder = os.open(path, os.O_RDONLY)
     except PermissionError:  # where folders cannot be opened
@@ -74,17 +75,17 @@ def sync_folder(path: Path) -> None:
 
 
 def move(source: Path, target: Path) -> None:
-    """Rename a folder in one step; an empty folder at `target` is replaced."""
+    """Rename the folder `source` to `target` in one step, replacing an empty folder there."""
     os.rename(source, target)
 
 
 def replace(source: Path, target: Path) -> None:
-    """Rename a file in one step; a file at `target` is replaced."""
+    """Rename the file `source` to `target` in one step, replacing a file there."""
     os.replace(source, target)
 
 
 def exchange(first: Path, second: Path) -> bool:
-    """Exchange two folders in one step; return `False` where the system cannot do that."""
+    """Exchange two folders in one step. Return `False` if the system cannot exchange folders."""
     call = _renameat2()
     if call is None:
         return False
@@ -116,7 +117,7 @@ def _exchanged(call, first: bytes, second: bytes) -> int:
 
 @functools.cache
 def _renameat2():
-    """Return the C library's function, or `None`."""
+    """Return the C library's function `renameat2`, or `None` if it does not exist."""
     try:
         call = ctypes.CDLL(None, use_errno=True).renameat2
     except (OSError, AttributeError, TypeError):
@@ -127,7 +128,7 @@ def _renameat2():
 
 
 def adopt_mode(path: Path, model: Path) -> None:
-    """Give a folder the permissions of another, as far as allowed."""
+    """Give the folder `path` the permissions of the folder `model`, as far as allowed."""
     try:
         os.chmod(path, stat.S_IMODE(os.stat(model).st_mode))
     except OSError:

@@ -1,8 +1,8 @@
 """Result files, written completely or not at all, into a folder checked before the work starts.
 
-Every file is written under a temporary name in its folder, then renamed in one step. A reader, or a
-killed run, sees the old file or the new one, never half of it. Commands write whole folders in the
-same way (`rootsopt.output.runs`).
+Every file is written under a temporary name in its folder, then renamed in one step. A reader
+therefore sees the old file or the whole new file, even after a killed run. Commands write whole
+folders in the same way (`rootsopt.output.runs`).
 """
 
 import csv
@@ -40,7 +40,7 @@ _LIBRARIES = ("jax", "jaxlib", "diffrax", "optax", "equinox", "numpy")
 class ResultFolder:
     """A folder for result files, created with its parents if it does not exist.
 
-    Raises `InputError` if it cannot be created or written to; it then leaves nothing behind.
+    Raises `InputError` if the folder cannot be created or written to; new folders are then removed.
     """
 
     def __init__(self, path: str | os.PathLike):
@@ -63,11 +63,13 @@ class ResultFolder:
 
     @property
     def place(self) -> Path:
-        """Folder where files are written."""
+        """Folder into which files are written."""
         return self.path
 
     def write_bytes(self, name: str, data: bytes) -> Path:
-        """Write `data` as `name`, which may include a subfolder (`figures/force.png`)."""
+        """Write `data` to the file `name`, which may include a subfolder (`figures/force.png`).
+
+        Return the file's path. Raises `InputError` if the file cannot be written."""
         target = self.path / name
         temporary = target.with_name(_temporary(target.name))
         try:
@@ -86,7 +88,9 @@ class ResultFolder:
         return target
 
     def write_text(self, name: str, text: str) -> Path:
-        """Write `text` as UTF-8."""
+        """Write `text` as UTF-8 to the file `name`; return the file's path.
+
+        Raises `InputError` if the text or the file cannot be written."""
         try:
             data = text.encode("utf-8")
         except UnicodeEncodeError as error:
@@ -97,12 +101,12 @@ class ResultFolder:
         return self.write_bytes(name, data)
 
     def write_json(self, name: str, data: Any) -> Path:
-        """Write `data` as strict JSON: non-finite numbers become null."""
+        """Write `data` as strict JSON (non-finite numbers become null); return the file's path."""
         text = json.dumps(_plain(data), indent=2, allow_nan=False, ensure_ascii=False)
         return self.write_text(name, text + "\n")
 
     def write_csv(self, name: str, columns: Mapping[str, ArrayLike]) -> Path:
-        """Write columns of equal length below a header line, floats with 10 digits.
+        """Write columns (n,), by name, below a header line, floats with 10 digits; return the path.
 
         Text, truth values (`true`, `false`) and `None` (empty) may be mixed with numbers.
         Raises `ValueError` for columns that differ in length or are not one-dimensional.
@@ -110,7 +114,7 @@ class ResultFolder:
         return self.write_text(name, _csv(columns))
 
     def write_figure(self, name: str, figure: "Figure") -> Path:
-        """Write a matplotlib figure as PNG."""
+        """Write a matplotlib figure as PNG; return the file's path."""
         image = io.BytesIO()
         figure.savefig(image, format="png", dpi=DPI)
         return self.write_bytes(name, image.getvalue())
@@ -166,8 +170,10 @@ def _cell(value: Any) -> str:
 
 
 def write_config(folder: ResultFolder, config: "Config") -> None:
-    """Write config.yaml, and next to it a copy of the outline file that it names. The folder can
-    then be moved."""
+    """Write config.yaml, and a copy of the outline file that it names, into `folder`.
+
+    The config names the copy, so that the folder can be moved. Raises `InputError` if the outline
+    file cannot be read."""
     profile = config.profile
     if profile.outline_file is not None:
         source = sources.regular_file(profile.outline_file, "an outline")
@@ -204,10 +210,10 @@ def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
 def row_columns(
     rows: Sequence[Mapping[str, Any]], keys: Iterable[str] | None = None
 ) -> dict[str, NDArray]:
-    """Return columns from dict rows such as the optimisation history; an absent entry is `None`.
+    """Return columns, by name, from `rows` such as the optimisation history.
 
-    `keys` orders the columns (default: order of appearance). It also gives the header when there
-    are no rows.
+    An absent entry becomes `None`. `keys`: order of the columns, by default the order of
+    appearance; without rows, `keys` still gives the header.
     """
     if keys is None:
         keys = dict.fromkeys(key for row in rows for key in row)

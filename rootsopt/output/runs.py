@@ -1,9 +1,10 @@
-"""The result folder of one run of a command: written aside, then put in place complete.
+"""The result folder of one run of a command: written aside, then moved to its final name.
 
 A run writes into its own folder beside the target, `.NAME.PROCESS-XXXXXXXX.rootsopt`. When all
-files are written, that folder takes the target's name in one step. The target is therefore the
-earlier run or this one, never a mixture. A lock file beside it, `.NAME.rootsopt`, keeps a second
-process out. Both disappear with the run. The next run removes the remains of a killed one.
+files are written, this folder takes the target's name in one step. The target therefore holds the
+earlier run or the new run, never a mixture. A lock file beside the target, `.NAME.rootsopt`, keeps
+a second process out. Folder and lock file disappear when the run ends. The next run removes the
+remains of a killed run.
 
 The content of the target decides what happens:
 
@@ -42,18 +43,19 @@ _CONFIG = "config.yaml"
 _SUFFIX = ".rootsopt"
 _STAGE = re.compile(r"(\..+)\.\d+-[0-9a-f]{8}" + re.escape(_SUFFIX))
 _LONGEST = 150
-"""Length (bytes) of a folder's name above which temporary names contain its digest instead."""
+"""Length (bytes) of a folder's name above which temporary names contain a digest of the name."""
 _PATIENCE = 10.0
-"""Time (s) that a write in progress has left when the process is stopped."""
+"""Time (s) after a request to stop above which a write in progress is no longer waited for."""
 _State = Literal["absent", "empty", "ours", "more", "foreign"]
 
 
 class RunFolder(ResultFolder):
-    """A `ResultFolder` that appears complete, with `put_in_place`, or not at all.
+    """A `ResultFolder` that appears at its final path only when complete, by `put_in_place`.
 
-    `path` is its final place. Use it as a context manager: a folder that is not in place at the end
-    is removed. Raises `InputError` where the folder cannot be used: another process writes into it,
-    it holds files of others, it is not a folder, or its parent cannot be written to.
+    `path`: the final path. Use as a context manager: a folder that is not in place at the end is
+    removed. Raises `InputError` if the path cannot be used: another process writes there, the
+    folder holds files that belong to no run, the path is not a folder, or its parent is not
+    writable.
     """
 
     def __init__(self, path: str | os.PathLike, command: str = "", overwrite: bool = False):
@@ -95,7 +97,7 @@ class RunFolder(ResultFolder):
         )
 
     def _refuse_places(self) -> None:
-        """Raise `InputError` where a finished run cannot replace the target."""
+        """Raise `InputError` if the target is something that a finished run cannot replace."""
         target = self.target
         if os.path.lexists(target) and not target.is_dir():
             raise InputError(f"{str(self.path)!r}: is not a folder; choose another output folder")
@@ -133,8 +135,8 @@ class RunFolder(ResultFolder):
             )
 
     def _clear(self) -> None:
-        """Finish a killed run that was complete but not in place; remove the remains of other
-        killed runs in the parent folder."""
+        """Put a killed run that was complete in place, and remove the remains of all other killed
+        runs in the parent folder."""
         for name in sorted(os.listdir(self.target.parent)):
             found = _STAGE.fullmatch(name)
             if found is None:
@@ -153,8 +155,8 @@ class RunFolder(ResultFolder):
                 other.release()
 
     def _state(self) -> _State:
-        """Return the state of the target: `ours`: an earlier run and nothing else; `more`: an
-        earlier run with other files."""
+        """Return what the target is: `absent`, `empty`, `ours` (an earlier run and nothing else),
+        `more` (an earlier run and other files) or `foreign` (anything else)."""
         if not os.path.lexists(self.target):
             return "absent"
         if not self.target.is_dir():
@@ -171,12 +173,13 @@ class RunFolder(ResultFolder):
 
     @property
     def place(self) -> Path:
-        """Folder where files are written for now."""
+        """Folder into which files are written: a temporary folder until the run is in place."""
         return self.stage
 
     def write_bytes(self, name: str, data: bytes) -> Path:
-        """Write `data` as `name`, which may include a subfolder (`figures/force.png`); return its
-        final path."""
+        """Write `data` to the file `name`, which may include a subfolder (`figures/force.png`).
+
+        Return the final path of the file. Raises `InputError` if the file cannot be written."""
         with self._busy, self._failing(name):
             file = self.stage / name
             disk.make_folders(file.parent, [])
@@ -187,16 +190,19 @@ class RunFolder(ResultFolder):
         return self.path / name
 
     def write_json(self, name: str, data: Any) -> Path:
-        """Write as `ResultFolder.write_json`; `result.json` is written last, listing all files."""
+        """Write `data` as strict JSON; return the final path of the file.
+
+        `put_in_place` writes `result.json`, with a list of all files."""
         if name != RESULT:
             return super().write_json(name, data)
         self._result = data
         return self.path / name
 
     def put_in_place(self) -> list[str]:
-        """Put the folder in its place; return what the user should know, one sentence each.
+        """Move the finished folder to its final path. Return messages for the user, one sentence
+        each.
 
-        Raises `InputError` if that fails; the target is then unchanged."""
+        Raises `InputError` if moving fails; the target is then unchanged."""
         with self._busy:
             files = sorted(self._written | {RESULT})
             run = {"run": {"command": self.command, "files": files}}
@@ -217,7 +223,9 @@ class RunFolder(ResultFolder):
                 disk.adopt_mode(self.stage, self.target)
             disk.move(self.stage, self.target)
             return []
-        if state == "foreign":  # It was not when the run started. Do not throw away a long run.
+        if (
+            state == "foreign"
+        ):  # The target was different at the start of the run. Do not throw away a long run.
             self.target = self.path = self._free()
             disk.move(self.stage, self.target)
             return [f"the requested folder now holds other files; this run is in {self.path}"]
@@ -234,7 +242,7 @@ class RunFolder(ResultFolder):
         return [note]
 
     def _replace(self) -> None:
-        """Replace the run in the target, which is removed."""
+        """Replace the run in the target, and remove the old run."""
         if disk.exchange(self.stage, self.target):
             older = self.stage
         else:
@@ -243,7 +251,7 @@ class RunFolder(ResultFolder):
         disk.discard_tree(older)
 
     def _push_aside(self, aside: Path) -> None:
-        """Replace the run in the target, which moves to `aside`."""
+        """Replace the run in the target, and move the old run to `aside`."""
         if not disk.can_exchange(self.stage):
             self._swap_by(aside)
             return
@@ -283,7 +291,8 @@ class RunFolder(ResultFolder):
             ) from None
 
     def close(self) -> None:
-        """Remove a folder that is not in place, release the lock; a second call does nothing."""
+        """Remove a folder that is not in place, and release the lock. A second call does
+        nothing."""
         with self._busy:
             if not self.placed and hasattr(self, "stage"):
                 disk.discard_tree(self.stage)
@@ -294,8 +303,9 @@ class RunFolder(ResultFolder):
                     disk.discard(folder)
 
     def abandon(self) -> str:
-        """Close for good, from another thread: the run can write nothing more. Return what has
-        become of the folder."""
+        """Stop the run from writing anything more, and close the folder. Call from another thread.
+
+        Return a message on what has become of the folder."""
         if self._busy.acquire(timeout=_PATIENCE):
             self.close()
         return f"{self.path} is {'complete' if self.placed else 'unchanged'}"
@@ -313,14 +323,14 @@ class RunFolder(ResultFolder):
 
 
 def _base(name: str) -> str:
-    """Return the start of a folder's temporary names."""
+    """Return the common start of the temporary names that belong to the folder `name`."""
     if len(os.fsencode(name)) > _LONGEST:
         name = hashlib.sha256(os.fsencode(name)).hexdigest()
     return f".{name}"
 
 
 def _files_in(folder: Path) -> set[str]:
-    """Return all files below a folder, by their relative names; empty folders too."""
+    """Return the relative names of all files and empty folders below a folder."""
     found: set[str] = set()
     for place, folders, files in os.walk(folder):
         inside = Path(place).relative_to(folder)
@@ -331,7 +341,7 @@ def _files_in(folder: Path) -> set[str]:
 
 
 def _listed(result: Path) -> set[str]:
-    """Return the files of a run as listed in its result file; empty if it has no list."""
+    """Return the names of a run's files, as listed in its `result` file; empty without a list."""
     try:
         names = json.loads(result.read_bytes())["run"]["files"]
         return {name for name in names if isinstance(name, str)}
@@ -340,7 +350,7 @@ def _listed(result: Path) -> set[str]:
 
 
 def _complete(stage: Path) -> bool:
-    """Return whether a killed run had written all its files."""
+    """Return whether the killed run in the folder `stage` had written all its files."""
     listed = _listed(stage / RESULT)
     return bool(listed) and _files_in(stage) == listed
 

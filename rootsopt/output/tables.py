@@ -48,8 +48,8 @@ def comparison_table(
 ) -> RenderableType:
     """Compare the optimised design with the baseline; changes are in % of the baseline.
 
-    A constraint is a row {name, baseline, optimized, limit, unit, sense, satisfied, active}.
-    `improvement` holds the reductions of objective, mean and peak as fractions.
+    `constraints`: rows {name, baseline, optimized, limit, unit, sense, satisfied, active};
+    `improvement`: reductions of objective, mean and peak force, as fractions of the baseline.
     """
     table = _table("Optimised rotor against baseline", "baseline", "optimised", "change")
     first, second = baseline.record(), optimized.record()
@@ -94,7 +94,7 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
 
 
 def sweep_table(rows: list[dict[str, Any]]) -> RenderableType:
-    """Show one design at many speeds, one row each, with `rows` from `speeds.Part.row`."""
+    """Show one design at many speeds. `rows`: one per speed, made by `AtSpeed.row`."""
     columns = "mean, N", "peak, N", "period", "multiplier", "status"
     table = _table("Contact force over speed", *columns)
     table.columns[0].header = Text("speed, rpm")
@@ -111,8 +111,8 @@ def speeds_table(
 ) -> RenderableType:
     """Compare the optimised design with the baseline at the speeds of the objective, one row each.
 
-    Without an optimised design, show the baseline alone. Rows are those of the result file's
-    `speeds` and `objective_by_speed`.
+    Without an optimised design, show the baseline alone. `baseline`, `optimized`: rows of the
+    result file's `speeds`; `objectives`: rows of its `objective_by_speed`.
     """
     if not optimized:
         return sweep_table(baseline)
@@ -127,16 +127,16 @@ def speeds_table(
 
 
 def _word(row: Mapping[str, Any]) -> Text:
-    """Return the status of a row."""
+    """Return the status of a `row` as coloured text."""
     usable = Status[row["status"].upper()].usable
     return Text(row["status"], style="bold green" if usable else "bold red")
 
 
 def attractor_table(rows: list[dict[str, Any]], lost: Mapping[str, float]) -> RenderableType:
-    """Show coexisting motions, one column each.
+    """Show coexisting motions, one column per motion.
 
-    `rows` holds {attractor, share, reached, status, ...}; `lost` the shares of initial states that
-    lead to none of them.
+    `rows`: one {attractor, share, reached, status, ...} per motion; `lost`: shares of the initial
+    states that lead to no motion, by status label.
     """
     table = _table("Coexisting motions", *(f"motion {row['attractor']}" for row in rows))
     labels = {
@@ -167,8 +167,9 @@ def geometry_table(record: Mapping[str, Any]) -> RenderableType:
 
 
 def likeness_table(rows: list[dict[str, Any]]) -> RenderableType:
-    """Show the nearest member of each family, nearest first; rows are those of the result file's
-    `resembles`."""
+    """Show the design of each profile family that is nearest to the profile, nearest first.
+
+    `rows`: entry `resembles` of the result file."""
     table = _table("The optimised profile resembles", "largest distance, um", "nearest member")
     for row in rows:
         design = ", ".join(f"{key} {_number(value)}" for key, value in row["design"].items())
@@ -185,7 +186,7 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _group(table: Table, name: str, rows: _Rows) -> None:
-    """Add a heading and its rows; dashes if there are no rows."""
+    """Add a heading and its `rows` to a table, or the heading with dashes if there are no rows."""
     rows = list(rows) or [("none", *[DASH] * (len(table.columns) - 1))]
     table.add_section()
     table.add_row(Text(name, style="bold"))
@@ -208,7 +209,7 @@ def _pairs(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple[st
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries that are not tables; tables are in the result file only."""
+    """Return the entries with single values. Nested tables appear only in the result file."""
     tables = Mapping, list, tuple
     return {key: value for key, value in values.items() if not isinstance(value, tables)}
 
@@ -237,7 +238,9 @@ def _status(evaluation: Evaluation) -> Text:
 
 
 def _gradients(*gradients: Mapping[str, Mapping[str, float]]) -> list[tuple]:
-    """Return (heading, rows of each gradient) per response; one empty group if there are none."""
+    """Return (heading, rows of each gradient) for each response.
+
+    Without gradients, return one empty group."""
     found = dict.fromkeys(response for gradient in gradients for response in gradient)
     groups = []
     for response in found:
@@ -248,14 +251,14 @@ def _gradients(*gradients: Mapping[str, Mapping[str, float]]) -> list[tuple]:
 
 
 def _errors(*steady_states: Mapping[str, Any]) -> list[tuple]:
-    """Return the same groups of the standard errors; empty if there are none."""
+    """Return groups as `_gradients` does, for standard errors; empty without standard errors."""
     errors = [steady.get("gradient_standard_error", {}) for steady in steady_states]
     groups = _gradients(*errors) if any(errors) else []
     return [(f"standard error of the {heading}", *rows) for heading, *rows in groups]
 
 
 def _per_unit(row: Mapping[str, float], unit: str) -> dict[str, float]:
-    """Label the row, for example "d/d(pressure angle), N/deg"."""
+    """Return `row` with labels as keys, for example "d/d(pressure angle), N/deg"."""
     labels = ((key, *_split(key)) for key in row)
     return {
         f"d/d({name}), {f'{unit}/{per}' if per else unit}": row[key] for key, name, per in labels
@@ -263,7 +266,7 @@ def _per_unit(row: Mapping[str, float], unit: str) -> dict[str, float]:
 
 
 def _split(key: str) -> tuple[str, str]:
-    """Return name in words and unit of a result key."""
+    """Return (name in words, unit) of a result key."""
     if key in _NAMES:
         return _NAMES[key]
     for suffix, unit in _UNITS.items():
@@ -295,7 +298,7 @@ def _change(first: Any, second: Any) -> str:
 
 
 def _number(value: Any) -> str:
-    """Format with five significant digits; exponents only far from one."""
+    """Format with five significant digits, with an exponent only for very large or small values."""
     if value is None:
         return DASH
     if isinstance(value, bool | str):

@@ -38,7 +38,7 @@ _TRIES = 24
 _DEPTHS = 3.0
 """Depth of the grid into the flanks, in static penetrations."""
 _LOST = (Status.PASSED_THROUGH, Status.STALLED, Status.SOLVER_FAILED, Status.NON_FINITE)
-"""Statuses of initial states that lead to no motion."""
+"""Statuses of motions that do not count as attractors: the mesh or the simulation was lost."""
 _GONE = tuple(status.code for status in _LOST)
 
 
@@ -46,8 +46,9 @@ _GONE = tuple(status.code for status in _LOST)
 class Attractor:
     """One of several coexisting motions.
 
-    `evaluation` of the motion; `share` of the grid's initial states that lead to it; `reached`:
-    whether it is the motion from rest; `cycle` (k, n): its stroboscopic states, scaled.
+    `evaluation` of the motion; `share` of the grid's initial states that lead to this motion;
+    `reached`: whether the start from rest leads to this motion; `cycle` (k, n): stroboscopic states
+    of the motion, scaled.
     """
 
     evaluation: Evaluation
@@ -61,11 +62,11 @@ class Basins:
     """The motions that a grid of initial states leads to.
 
     `relative` (rad) and `rate` (rad/s): axes of the grid; `leads_to` (rates, relatives): index of
-    the attractor, or -1 where the motion is lost; `attractors`: closed orbits first, then chaotic
-    or unsettled motions (see their status), each kind by falling share; `rest`: evaluation
-    from rest; `lost`: shares of initial states that lead to no motion, by status label. The label
-    `not_settled` is for motions that could not be told from the others. `angle_scale` (rad),
-    `mesh_period` (s): units of scaled states.
+    the attractor for each initial state, or -1 if it leads to none; `attractors`: closed orbits
+    first, then chaotic or unsettled motions (see their status), each kind by falling share; `rest`:
+    evaluation from rest; `lost`: shares of initial states that lead to no attractor, by status
+    label; `angle_scale` (rad), `mesh_period` (s): units of scaled states. In `lost`, the label
+    `not_settled` is for motions that could not be assigned to an attractor.
     """
 
     relative: NDArray[np.float64]
@@ -79,8 +80,8 @@ class Basins:
 
     @property
     def status(self) -> Status:
-        """PERIODIC if every initial state leads to a stable periodic motion, and at least one of
-        these has contact; else the status that prevents it."""
+        """PERIODIC if every initial state leads to a stable periodic motion, and at least one such
+        motion has contact; else the status of a motion that violates this."""
         for status in _LOST:
             if self.lost.get(status.label):
                 return status
@@ -126,8 +127,8 @@ def find(
     """Find the attractors of `design` (config units; default: the config's own) and their basins.
 
     The config's `attractors` section sets the grid. `known`: further initial states (n,), scaled,
-    on motions of a neighbouring design, whose basins the grid may miss. `evaluator` evaluates the
-    attractors, with their `series` on request.
+    on motions of a neighbouring design, whose basins the grid may miss. `evaluator` evaluates each
+    attractor; `series`: whether to compute the series of each attractor.
     """
     return find_fitted(evaluator, design, known, series)[1]
 
@@ -138,7 +139,7 @@ def find_fitted(
     known: Iterable[NDArray[np.float64]] = (),
     series: bool = False,
 ) -> tuple[Evaluator, Basins]:
-    """Return what `find` returns, and before it an evaluator fitted to the motion from rest."""
+    """Return an evaluator fitted to the motion from rest, and the result of `find`."""
     config = evaluator.config
     design = design_vector(config) if design is None else jnp.asarray(design)
     evaluator, rest = evaluator.fit(design, None, series)
@@ -186,8 +187,9 @@ def closed(evaluation: Evaluation) -> bool:
 class _Sorter:
     """Assigns each transient to the motion it has led to.
 
-    `evaluations` and `cycles`: the known motions; `numbers` and `lost`: for each transient the
-    number of its motion, or -1 and the label of its failure.
+    `evaluations` and `cycles`: the known motions and their stroboscopic states; `numbers`: for each
+    transient the number of its motion, or -1 after a failure; `lost`: for each transient the label
+    of its failure, or "".
     """
 
     def __init__(self, evaluator: Evaluator, design, series: bool):
@@ -202,7 +204,9 @@ class _Sorter:
         return closed(self.evaluations[number])
 
     def add(self, evaluation: Evaluation, end) -> int:
-        """Return the number of the motion of an evaluation that began at `end`, new or known."""
+        """Return the number of an evaluated motion; add the motion to the list if it is new.
+
+        `end` (n,): scaled state from which the evaluation began."""
         cycle = np.atleast_2d(end)
         if closed(evaluation):
             pair = self.evaluator.pair(self.design)
@@ -241,8 +245,8 @@ class _Sorter:
         return (-1, status.label) if status in _LOST else (number, "")
 
     def _same(self, state) -> int | None:
-        """Return the number of the known cycle that `state` is on, within the accuracy of a
-        transient; None: a new one."""
+        """Return the number of the known cycle that contains `state` (scaled), within the accuracy
+        of a transient; None if no known cycle does."""
         tolerance = float(settled_within(self.evaluator.scene.solver.transient.rtol))
         best, number = np.inf, None
         for i in filter(self.periodic, range(len(self.evaluations))):
@@ -254,7 +258,7 @@ class _Sorter:
         return number
 
     def _like(self, status: Status) -> int | None:
-        """Return the number of the known motion without a cycle that has this status, or None."""
+        """Return the number of the known non-periodic motion with this `status`, or None."""
         for i, evaluation in enumerate(self.evaluations):
             if evaluation.status is status and not self.periodic(i):
                 return i
@@ -262,11 +266,11 @@ class _Sorter:
 
 
 def _axes(config: Config, pair: RotorPair) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the initial ε (rad) and dε/dt (rad/s) of the grid.
+    """Return the axes of the grid: the initial ε (rad) and dε/dt (rad/s).
 
     By default ε covers the play and `_DEPTHS` static penetrations. |dε/dt| goes up to twice the
-    greater of two speeds: that at which the load closes the play, and that which crosses the play
-    within a mesh period.
+    greater of two speeds: the speed at which the load closes the play, and the speed that crosses
+    the play within a mesh period.
     """
     wanted = config.attractors
     radius = config.profile.pitch_radius_mm * MM
@@ -284,14 +288,14 @@ def _axes(config: Config, pair: RotorPair) -> tuple[NDArray[np.float64], NDArray
 
 
 def _spread(low: float, high: float, count: int) -> NDArray[np.float64]:
-    """Return `count` equidistant numbers from `low` to `high`; a single one is in the middle."""
+    """Return `count` equidistant numbers from `low` to `high`; a single number is in the middle."""
     return np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
 
 
 def _settled(evaluator: Evaluator, pair: RotorPair, starts) -> tuple[Transient, Any]:
-    """Return the ends of the transients from scaled states (m, n), and their `transient_status`.
+    """Return the ends of the transients from m scaled states, and their `transient_status`.
 
-    Both have a leading axis (m,)."""
+    `starts` (m, n): scaled states. Both results have a leading axis (m,)."""
     integrator = evaluator.scene.solver.transient
     dtype = pair.angle_scale.dtype
     limit = np.asarray(max(evaluator.config.solver.max_mesh_periods // 4, 8 * BLOCK))
@@ -323,7 +327,7 @@ def _together(pair, states, *settings):
 
 @Program
 def _cycle(pair: RotorPair, state, integrator: Integrator):
-    """Return the states at the start of each of `_LONGEST` mesh periods."""
+    """Return the scaled states (`_LONGEST`, n) at the start of successive mesh periods."""
     return jnp.concatenate([state[None], strobe(pair, state, _LONGEST - 1, integrator).states])
 
 
@@ -331,30 +335,31 @@ def _cycle(pair: RotorPair, state, integrator: Integrator):
 class AttractorEvaluator(Wrapper):
     """Evaluates a design by all its coexisting motions.
 
-    With `objective.motion: worst`, the motion with the greatest weighted sum of the objective's
-    measures counts. Each measure is relative to the `reference` of `single`: a response, usually
-    the baseline's. The default reference is the greatest value among the motions.
+    With `objective.motion: worst`, the result describes the motion with the greatest weighted sum
+    of the objective's measures. Each measure is relative to the `reference` of `single`: a
+    response, usually the baseline's. The default reference is the greatest value among the motions.
 
-    With `weighted`, response and gradient are averages, weighted by the shares of initial states.
-    The gradient treats these shares as constant. A motion without contact contributes force 0 and
-    gradient 0.
+    With `objective.motion: weighted`, response and gradient are averages, weighted by the shares of
+    initial states. The gradient treats these shares as constant. A motion without contact
+    contributes force 0 and gradient 0.
 
-    If some initial states lead to no stable periodic motion, the design has the status of that
-    motion, and no gradient.
+    If an initial state leads to a motion that is not stable and periodic, the evaluation has the
+    status of that motion, and no gradient.
     """
 
     single: Evaluator
 
     def fit(self, design=None, start=None, series=True) -> tuple["AttractorEvaluator", Evaluation]:
-        """Evaluate a design, and return another evaluator too, as `Evaluator.fit` does.
+        """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
 
-        `start`: scaled states (m, n) on motions of a neighbouring design."""
+        `design` (d,): in config units, by default the config's own; `start` (m, n): scaled states
+        on motions of a neighbouring design; `series`: whether to compute the series."""
         known = () if start is None else tuple(np.atleast_2d(start))
         single, basins = find_fitted(self.single, design, known, series)
         return dataclasses.replace(self, single=single), self._of(basins)
 
     def _of(self, basins: Basins) -> Evaluation:
-        """Return the evaluation that combines the motions."""
+        """Return the evaluation that combines all motions as `objective.motion` says."""
         usable = [a for a in basins.attractors if a.evaluation.usable]
         if not usable:
             return basins.rest

@@ -1,9 +1,8 @@
-"""Many designs at once: one compiled program over a batch, from the same function that a single
-evaluation uses.
+"""Evaluate many designs at once, with one compiled program.
 
-A batch is for surveys. Each design gets one attempt, its orbit is closed to a tenth of the
-tolerance, and its derivatives are not checked on halved steps. A design that needs more is reported
-as not settled or inaccurate; give it to an `Evaluator`.
+A batch is for surveys. Each design gets one attempt: the orbit is closed to a tenth of the
+tolerance, and derivatives are not checked on halved steps. A design that needs more attempts is
+reported as not settled or inaccurate. Give such a design to an `Evaluator`.
 """
 
 import dataclasses
@@ -29,7 +28,8 @@ SAMPLES = 840
 class Batch(NamedTuple):
     """Responses of n designs with d parameters.
 
-    `response` (n, 3): mean, peak and RMS force (N); `gradient` (n, 3, d) of these per config unit;
+    `response` (n, 3): mean, peak and RMS force (N); `gradient` (n, 3, d): derivatives of
+    `response` (N per config unit);
     `state` (n, s): scaled state of the orbit at φ1 = 0, a start for neighbouring designs;
     `period` (mesh periods); `multiplier`: greatest modulus of the Floquet multipliers; `residual`
     of the closed orbit; `deepest`: least ε (rad) on the orbit; `steps` of the solver; `status`:
@@ -61,8 +61,9 @@ def coarse(
 ) -> Solver:
     """Return the settings with which a batch finds the steady motions of a `scene`.
 
-    `transient`, `orbit`: their integrators; `max_periods`: maximum length of the transient (mesh
-    periods); `max_orbit`: longest period searched for (mesh periods)."""
+    `transient`, `orbit`: integrators of the transient and of the orbit; `max_periods`: maximum
+    length of the transient (mesh periods); `max_orbit`: longest period searched for (mesh periods).
+    """
     return dataclasses.replace(
         scene.solver,
         transient=transient,
@@ -86,9 +87,11 @@ def respond(
     solver: Solver,
     gradient: bool = True,
 ) -> Batch:
-    """Return the steady response of one design from the scaled `state`, as a pure function.
+    """Return the steady response of one design, started from a scaled state.
 
-    Traceable: map it over `design`, `state` or the leaves of `scene`.
+    `design` (d,): in config units; `state` (s,): scaled state at φ1 = 0; `solver`: see `coarse`;
+    `gradient`: whether to compute derivatives. This is a pure function: JAX can map it over
+    `design`, `state` or the leaves of `scene`.
     """
     if gradient:
         pair, tangents, _ = scene.pair_and_tangents(design)
@@ -123,10 +126,12 @@ def respond_many(
     solver: Solver,
     gradient: bool = True,
 ) -> Batch:
-    """Return the responses of designs (n, d) in config units, from their own scaled states (n, s).
+    """Return the responses of n designs, each started from its own scaled state.
 
-    On CPUs one thread per core takes the designs one by one. If designs were stepped together, each
-    would wait for the slowest at every turn. On other devices they are stepped together.
+    `designs` (n, d): in config units; `states` (n, s): scaled states at φ1 = 0; `solver`: see
+    `coarse`; `gradient`: whether to compute derivatives. On CPUs one thread per core evaluates one
+    design at a time, so that no design waits for a slower one. On other devices all designs are
+    stepped together.
     """
     if jax.default_backend() != "cpu":
         return _together(scene, designs, states, solver, gradient)

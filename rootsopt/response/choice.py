@@ -1,13 +1,13 @@
 """`solver.fidelity: auto`: choose the cheapest settings that meet a stated error.
 
 The config's design is first simulated from rest with the reference settings: contact by search, at
-a tolerance far below the requested error. Then cheaper settings are tried, cheapest first. The
-first whose mean and peak force agree with the reference are kept, for every further design of the
-run and in the resolved config. With several speeds in the objective, they must agree at every
-speed. `rootsopt sweep` uses the chosen settings at all its speeds.
+a tolerance far below the requested error. Cheaper settings are then tried, cheapest first. The
+first settings whose mean and peak force agree with the reference are chosen. They must agree at
+every speed of the objective. The chosen settings are used for all further designs of the run, and
+in the resolved config. `rootsopt sweep` uses the chosen settings at all its speeds.
 
-The error is a measured difference, which holds where a rule of thumb about tolerances would not. It
-costs two or three simulations of one design.
+Measuring the difference costs two or three simulations of one design. In return, the error does not
+depend on a rule of thumb about tolerances.
 """
 
 import dataclasses
@@ -21,7 +21,8 @@ from rootsopt.status import Status
 
 _JUDGED = ("mean_force_N", "peak_force_N")
 _LONG = 64
-"""Length of the transient (mesh periods) above which a contact map saves time."""
+"""Length of the transient (mesh periods) above which contact maps are tried: they then save
+time."""
 _MARGIN = 0.5
 """Largest accepted difference from the reference, as a fraction of the requested error."""
 
@@ -30,9 +31,10 @@ _MARGIN = 0.5
 class Choice:
     """Chosen settings and their measured error.
 
-    `config`: the config with the settings in place of `auto`; `requested`: requested error;
-    `error`: largest relative error of mean and peak force, None if the scene has no periodic steady
-    state to compare; `tried`: every candidate with its difference from the reference.
+    `config`: the config with the settings in place of `auto`; `requested`: requested relative
+    error; `error`: largest relative error of mean and peak force, None if the scene has no periodic
+    steady state to compare; `tried`: all tried settings, each with its difference from the
+    reference.
     """
 
     config: Config
@@ -58,13 +60,13 @@ class Choice:
 def choose(config: Config) -> Choice:
     """Choose settings for `config`, whose fidelity is `auto`, that meet `solver.accuracy`.
 
-    The reference's settings are chosen if no cheaper ones agree with it, or if the reference itself
-    finds no periodic orbit. Coarser simulations may disagree because they end on another of several
-    coexisting orbits.
+    The reference's settings are chosen if no cheaper settings agree with the reference, or if the
+    reference itself finds no periodic orbit. Cheaper settings can also disagree because the motion
+    settles on another of several coexisting orbits.
     """
     wanted = config.solver.accuracy
     tried: list[dict[str, Any]] = []
-    # Noise of the steps can keep a motion from settling or excite it: then try a finer tolerance.
+    # Noise of the steps can excite a motion or keep it from settling: then try a finer tolerance.
     for share in (1e-4, 1e-6):
         reference = _with(config, fidelity="search", rtol=share * wanted)
         truth = _evaluations(reference)
@@ -94,9 +96,9 @@ def _evaluations(config: Config) -> list[Evaluation]:
 
 
 def resolve(config: Config) -> tuple[Config, dict[str, Any]]:
-    """Return `config` without `auto`, and the choice for the result file.
+    """Return `config` with chosen settings in place of `auto`, and a record for the result file.
 
-    The latter is empty if the config's fidelity is not `auto`."""
+    The record is empty if the config's fidelity is not `auto`."""
     if config.solver.fidelity != "auto":
         return config, {}
     choice = choose(config)
@@ -104,9 +106,10 @@ def resolve(config: Config) -> tuple[Config, dict[str, Any]]:
 
 
 def _candidates(config: Config, wanted: float, long: bool) -> Iterator[Config]:
-    """Yield the candidates, cheapest first.
+    """Yield the settings to try, as configs, cheapest first.
 
-    A contact map saves more time than it costs only if the transient is `long`."""
+    `wanted`: requested relative error; `long`: whether the transient is long, so that a contact map
+    saves more time than it costs."""
     loose, tight = 1e-2 * wanted, 1e-3 * wanted
     searched = bool(config.needs_search)
     if wanted >= 3e-3 and not searched:

@@ -16,11 +16,14 @@ _COLUMNS = {
     "force": ("contact_force_N", "N", "contact force: sum of the normal forces", 1.0),
     "depth": ("penetration_m", "m", "greatest penetration; negative: least gap", 1.0),
 }
-"""Fields of a series: name as in the response's CSV file, unit, long name, factor from SI units."""
+"""Fields of a series. Each has a name as in the CSV file of the response, a unit, a long name, and
+a factor from SI units."""
 
 
 def dataset(evaluation: "Evaluation") -> xarray.Dataset:
-    """Return the series of an `evaluation` over time, with units and long names."""
+    """Return the series of an `evaluation` as a dataset over time, with units and long names.
+
+    Design, geometry, response and status are attributes of the dataset."""
     series = evaluation.series
     assert series is not None
     columns = {

@@ -54,17 +54,18 @@ from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 
 _RTOL = 1e-6
-"""Finest tolerance used. The standard errors of an ensemble are far larger than the error of such
-steps (docs/chaos.md)."""
+"""Tolerance below which the motions of an ensemble are not integrated. The standard errors of an
+ensemble are far larger than the error of such steps (docs/chaos.md)."""
 _AGAIN = 4
-"""Divisor of `ensemble.settle_periods` for motions that start where those of a neighbouring design
-ended."""
+"""Divisor of `ensemble.settle_periods` for motions that start from the last states of a
+neighbouring design's motions."""
 _MAPS = 5
 """Maximum number of contact maps tried for one ensemble."""
 VERIFYING = 4
-"""Factor on the number of members for the verification of a search's winner."""
+"""Factor by which the number of members is larger when the best design of a search is verified."""
 SIGNIFICANT = 3.0
-"""Difference, in combined standard errors, above which it is significant."""
+"""Difference of two averages (combined standard errors) above which the difference is
+significant."""
 ERRORS = {name: name.replace("_N", "_standard_error_N") for name in RESPONSES}
 """Keys of the standard errors in `steady_state`, by response."""
 
@@ -73,9 +74,9 @@ ERRORS = {name: name.replace("_N", "_standard_error_N") for name in RESPONSES}
 class EnsembleEvaluator(Wrapper):
     """Evaluates designs by an ensemble of motions in the scene of `single`.
 
-    A call takes `start` (members, n): scaled states to begin from, such as the `state` of a
-    neighbouring design's evaluation. By default they are spread over the play. `differentiate`:
-    whether to compute the gradient, which takes most of the time.
+    Argument `start` (members, n) of a call: scaled initial states, such as the `state` of a
+    neighbouring design's evaluation. By default the initial states are spread over the play.
+    `differentiate`: whether to compute the gradient, which takes most of the time.
 
     An evaluation with the status AVERAGED holds:
 
@@ -89,10 +90,10 @@ class EnsembleEvaluator(Wrapper):
       zero, `ensemble.settle_periods` is too short, or members still pass between coexisting motions
       of several kinds.
     - `state` (members, n): last scaled states, a `start` for a neighbouring design.
-    - `series`: that of one member.
+    - `series` of one member.
 
-    The orbit tolerance is not used, since averages need no closed orbit. A survey does not compute
-    the Lyapunov exponent.
+    The orbit tolerance is not used, since averages need no closed orbit. The Lyapunov exponent is
+    not computed in surveys.
     """
 
     single: Evaluator
@@ -100,7 +101,7 @@ class EnsembleEvaluator(Wrapper):
 
     @property
     def integrator(self) -> Integrator:
-        """Integrator of the motions: that of the transient, but no finer than `_RTOL`."""
+        """Integrator of the motions: the transient's integrator, but no finer than `_RTOL`."""
         transient = self.scene.solver.transient
         return dataclasses.replace(transient, rtol=jnp.maximum(transient.rtol, _RTOL))
 
@@ -114,10 +115,10 @@ class EnsembleEvaluator(Wrapper):
         return dataclasses.replace(self, differentiate=False)
 
     def independent(self, number: int) -> "EnsembleEvaluator":
-        """Return another evaluator to judge a design that this one has chosen.
+        """Return another evaluator, to judge designs that were chosen with this evaluator.
 
-        It has the seed increased by `number` and `VERIFYING` times as many members. It shares the
-        scene and the compiled programs."""
+        Its seed is larger by `number`, and it has `VERIFYING` times as many members. Scene and
+        compiled programs are shared."""
         settings = self.settings
         larger = {"members": VERIFYING * settings.members, "seed": settings.seed + number}
         ensemble = settings.model_copy(update=larger)
@@ -139,9 +140,12 @@ class EnsembleEvaluator(Wrapper):
         return now
 
     def fit(self, design=None, start=None, series=True) -> tuple["EnsembleEvaluator", Evaluation]:
-        """Evaluate a design, and return another evaluator too, as `Evaluator.fit` does.
+        """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
 
-        `start` (members, n): initial states, see the class. Raises ValueError for another shape."""
+        `design` (d,): in config units, by default the config's own; `start` (members, n): scaled
+        initial states; `series`: whether to compute the series of a member.
+
+        Raises ValueError for a `start` of another shape."""
         began = time.perf_counter()
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now, outcome = self._fitted(design, lambda now: now._attempt(design, start))
@@ -237,9 +241,9 @@ class EnsembleEvaluator(Wrapper):
         )
 
     def _kind(self, pair, members: Members, with_series):
-        """Return the kind of motion, for `steady_state`, and the series of one member.
+        """Return the entries of `steady_state` for the kind of motion, and the series of a member.
 
-        The Lyapunov exponent is that of a member that does not repeat, if there is one.
+        The Lyapunov exponent is computed for a member that does not repeat, if there is one.
         """
         every = np.all(members.repeats, axis=0)
         kind: dict[str, Any] = {"kind": "transient"}
@@ -256,10 +260,10 @@ class EnsembleEvaluator(Wrapper):
         return steady | (kind if every.any() else {}), series
 
     def _slopes(self, design, members: Members) -> tuple[Status, NDArray[np.float64] | None]:
-        """Return a status, and the gradients of the responses and their standard errors (2, 3, d).
+        """Return a status, and gradients of the responses with their standard errors (2, 3, d).
 
-        Both are per config unit; they are None unless the status is AVERAGED. All neighbours start
-        from the same states, where the members of the design ended.
+        Gradients and errors are in N per config unit. They are None unless the status is AVERAGED.
+        All neighbours start from the last states of the design's own members.
         """
         space = self._space(design)
         points, steps = neighbours(np.asarray(_point(space, design)), self.settings)
@@ -283,7 +287,7 @@ class EnsembleEvaluator(Wrapper):
         return Status.AVERAGED, np.stack(found)
 
     def _space(self, design) -> Space:
-        """Return the unit box of the search, extended where the design lies outside."""
+        """Return the unit box of the design parameters, extended if `design` lies outside."""
         space = Space.of(self.config, self.scene, 0.0)
         lower, upper = np.minimum(space.lower, design), np.maximum(space.upper, design)
         bounds = jnp.asarray(lower), jnp.asarray(upper)
@@ -292,9 +296,10 @@ class EnsembleEvaluator(Wrapper):
 
 @dataclasses.dataclass(frozen=True)
 class _Outcome:
-    """Outcome of one or several designs.
+    """Simulated ensembles of one or several designs.
 
-    `pair`, `shape`: rotor pair and geometry of the first design; `runs`: members of every design.
+    `pair`, `shape`: rotor pair and geometry of the first design; `runs`: the `Members` of every
+    design.
     """
 
     pair: RotorPair
@@ -303,25 +308,25 @@ class _Outcome:
 
     @property
     def status(self) -> Status:
-        """First failure, or AVERAGED."""
+        """Status of the first design that has failed, or AVERAGED."""
         statuses = (run.status for run in self.runs)
         return next((s for s in statuses if s is not Status.AVERAGED), Status.AVERAGED)
 
     @property
     def reached(self) -> float:
-        """Largest |ε| (rad)."""
+        """Largest |ε| (rad) of all motions."""
         return max(float(np.max(run.reach)) for run in self.runs)
 
 
 def neighbours(
     point: NDArray[np.float64], settings: EnsembleConfig
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return points of the unit box in opposite pairs, and the steps between them and the middle.
+    """Return random points (2n, d) of the unit box around `point` (d,), and their steps (n, d).
 
-    The points (2n, d) are the middle plus the n steps (n, d), then the middle minus the steps. The
-    steps are normally distributed with standard deviation `spread`, and shortened where a pair
+    The points are a middle plus the n steps, then the middle minus the steps. The steps are
+    normally distributed with standard deviation `settings.spread`, and shortened where a point
     would leave the box. The middle is `point`, moved to at least one standard deviation inside the
-    box, since at a bound there are no opposite neighbours.
+    box, since a point at a bound has no opposite neighbours.
     """
     from scipy.stats import norm, qmc
 
@@ -359,10 +364,10 @@ def fitted_slope(
 def per_config_unit(
     slope: NDArray[np.float64], covariance: NDArray[np.float64], jacobian: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return slopes (r, d) per config unit and their standard errors (r, d).
+    """Convert slopes from the unit box to config units. Return slopes and standard errors (r, d).
 
-    `slope` (r, d) and `covariance` (r, d, d): those in the unit box; `jacobian` (d, d): derivatives
-    of the design with respect to the point of the box."""
+    `slope` (r, d) and `covariance` (r, d, d): slopes in the unit box and their covariances;
+    `jacobian` (d, d): derivatives of the design with respect to the point of the box."""
     inverse = np.linalg.inv(jacobian)
     spread = np.einsum("ik,rij,jl->rkl", inverse, covariance, inverse)
     return slope @ inverse, np.sqrt(np.diagonal(spread, axis1=1, axis2=2))

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 _MAPS = 5
-"""Maximum number of contact maps tried for one motion."""
+"""Maximum number of contact maps tried for one design."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,8 +67,8 @@ class Evaluation:
     unit): by the result file's keys. `gradient` is empty unless it can be trusted. `steady_state`:
     kind of motion and its properties; `status` and `message`: outcome and advice; `statistics`:
     effort and accuracy; `series`: whole orbits over at least one revolution, or a window of a
-    motion that does not settle; `state`: `start` for a neighbouring design, None if not known. For
-    one motion it is the scaled state of the orbit at φ1 = 0 (n,).
+    motion that does not settle; `state`: use as `start` for a neighbouring design, None if not
+    known. For a single motion, `state` is the scaled state (n,) of the orbit at φ1 = 0.
     """
 
     design: dict[str, float]
@@ -120,12 +120,13 @@ class Evaluation:
 class Evaluator:
     """Evaluates designs of one config in its `scene`. All designs share compiled programs.
 
-    An evaluator is immutable: methods that return "another evaluator" leave this one unchanged.
+    An evaluator is immutable. Methods that return "another evaluator" do not change the evaluator
+    on which they are called.
 
-    `survey`: whether to give up a design that does not settle within a quarter of the allowed
-    transient; `reference`: response to which forces are relative where motions are compared;
-    `fitted`: whether the contact map has been fitted to a motion; `map_error`: error of the contact
-    map, relative to the static penetration, NaN if unknown.
+    `survey`: whether the evaluator is for a search over many designs (see `surveying`);
+    `reference`: response to which forces are relative where motions are compared; `fitted`: whether
+    the contact map has been fitted to a motion; `map_error`: error of the contact map, relative to
+    the static penetration, NaN if unknown.
     """
 
     config: Config
@@ -153,7 +154,7 @@ class Evaluator:
     def surveying(self) -> "Evaluator":
         """Return another evaluator for a search over many designs.
 
-        A search needs gradients and a ranking, not the last digits."""
+        It gives up sooner on a design that does not settle."""
         least = max(self.config.solver.max_mesh_periods // 4, 8 * BLOCK)
         hasty = self._solving(
             lambda solver: (solver.max_periods, solver.examine),
@@ -166,7 +167,7 @@ class Evaluator:
         return dataclasses.replace(self, scene=scene)
 
     def relative_to(self, baseline: Evaluation) -> "Evaluator":
-        """Return another evaluator that compares motions by their forces relative to those of the
+        """Return another evaluator that compares coexisting motions by force relative to the
         `baseline`."""
         return dataclasses.replace(self, reference=baseline.response)
 
@@ -175,7 +176,7 @@ class Evaluator:
         return dataclasses.replace(self, scene=at_speed(self.scene, speed_rpm))
 
     def without_gradient(self) -> "Evaluator":
-        """Return an evaluator that skips a costly gradient: this one, whose gradient is cheap."""
+        """Return this evaluator unchanged: its gradient is cheap. (Ensembles skip the gradient.)"""
         return self
 
     @property
@@ -202,10 +203,10 @@ class Evaluator:
         start: NDArray[np.float64] | None = None,
         series: bool = True,
     ) -> tuple["Evaluator", Evaluation]:
-        """Evaluate a design, and return another evaluator too, for neighbouring designs.
+        """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
 
-        Arguments are those of a call. The other evaluator's contact map has the size and the range
-        that this design's motion needs."""
+        Arguments: see `__call__`. The contact map of the returned evaluator has the size and the
+        range that the motion of this design needs."""
         began = time.perf_counter()
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now = other = self._sized(design)
@@ -248,10 +249,10 @@ class Evaluator:
         return now
 
     def _sized(self, design) -> "Evaluator":
-        """Return another evaluator whose contact map is large enough for `design`.
+        """Return another evaluator whose contact map has enough nodes for `design`.
 
-        A size that the config sets is kept. An open size only grows, so that neighbouring designs
-        share a program. A survey keeps the size it has.
+        A size set in the config is kept. Any other size only grows, so that neighbouring designs
+        share a program. In a survey, the present size is kept.
         """
         solver, scene = self.config.solver, self.scene
         given = solver.map_rolls, solver.map_relatives
@@ -266,11 +267,11 @@ class Evaluator:
         return dataclasses.replace(self, scene=scene, map_error=wanted.error / depth)
 
     def _refitted(self, pair: RotorPair, found: Steady) -> "Evaluator | None":
-        """Return another evaluator with a contact map that fits the motion; None if this one fits.
+        """Return another evaluator whose contact map fits the motion `found`, or None if the
+        present map fits.
 
-        A motion that leaves the map is not described by it. A motion that uses a small part of the
-        map wastes its resolution. The latter is checked only once, so that neighbouring designs
-        share a map.
+        A map must cover the motion. A map of which the motion uses only a small part wastes
+        resolution, so it is replaced, but only once: neighbouring designs then share a map.
         """
         status, reached = Status.of(found.status), _reached(pair, found)
         return self.reaching(reached, status is Status.PERIODIC, pair.angle_limit)
@@ -278,8 +279,8 @@ class Evaluator:
     def reaching(self, reached: float, steady: bool, most: Any) -> "Evaluator | None":
         """Return another evaluator with a contact map for motions that reach |ε| = `reached` (rad).
 
-        The map covers at most `most` (rad). The result is None if this evaluator's map fits, or if
-        it has no map. The map shrinks only for a `steady` motion."""
+        The map covers at most `most` (rad). The result is None if the present map fits, or if there
+        is no map. The map shrinks only if `steady`: the motion is periodic."""
         covered = -float(self.scene.deepest)
         if self.scene.fidelity != "map" or not np.isfinite(reached):
             return None
@@ -293,7 +294,8 @@ class Evaluator:
     def _report(self, design, built, found: Steady, began: float, series: bool) -> Evaluation:
         """Return the evaluation of the motion `found`.
 
-        `built`: rotor pair and geometry; `began`: start time of the evaluation."""
+        `built`: rotor pair and geometry; `began`: clock at the start of the evaluation (s);
+        `series`: whether to compute the series."""
         seconds = time.perf_counter() - began
         (pair, shape), status, orbit = built, Status.of(found.status), found.orbit
         period = int(found.period)
@@ -351,7 +353,7 @@ class Evaluator:
     def _terms(self, design, response, gradient):
         """Return the values of the objective's further terms, and their gradients.
 
-        The gradients are NaN where those of the forces are not known."""
+        A gradient is NaN if it needs a gradient of the forces that is not known."""
         names = [name for name in self.config.objective.terms if name not in response]
         if not names:
             return {}, {}
@@ -367,7 +369,7 @@ class Evaluator:
         }
 
     def _map_statistics(self) -> dict[str, int | float]:
-        """Return size and error of the contact map, if there is one."""
+        """Return size and error of the contact map; empty without a contact map."""
         if self.scene.fidelity != "map":
             return {}
         rolls, relatives = self.scene.map_size
@@ -398,7 +400,9 @@ def at_speed(scene: Scene, speed_rpm: float) -> Scene:
 
 
 def _reached(pair: RotorPair, found: Steady) -> float:
-    """Return the largest |ε| (rad) of the steady motion, as far as it is known."""
+    """Return the largest |ε| (rad) of the motion `found`.
+
+    The motion is the orbit, else the window, else only the last state of the transient."""
     scale = float(pair.angle_scale)
     if Status.of(found.status) in (*CLOSED, Status.IDLE):
         return scale * float(np.max(np.abs(found.orbit.flow.states[:, 0])))
@@ -408,7 +412,7 @@ def _reached(pair: RotorPair, found: Steady) -> float:
 
 
 def _orbit_statistics(found: Steady) -> dict[str, int | float]:
-    """Return the effort for a closed orbit and its accuracy."""
+    """Return the result file's statistics of a closed orbit: effort and accuracy."""
     orbit = found.orbit
     statistics: dict[str, int | float] = {
         "newton_steps": int(orbit.newton_steps),
@@ -489,9 +493,9 @@ def objective_weights(config: Config) -> dict[str, float]:
 
 
 def floquet(monodromy) -> list[list[float]]:
-    """Return the Floquet multipliers, as [real, imaginary], greatest modulus first.
+    """Return the Floquet multipliers as [real, imaginary], greatest modulus first.
 
-    They are the eigenvalues of the `monodromy` matrix (n, n)."""
+    `monodromy` (n, n): its eigenvalues are the Floquet multipliers."""
     values = np.linalg.eigvals(np.asarray(monodromy, np.float64))
     ordered = sorted(values, key=lambda z: (-abs(z), -z.imag))
     return [[float(z.real), float(z.imag)] for z in ordered]
@@ -543,7 +547,7 @@ def _series(pair: RotorPair, tau, states) -> Series:
 
 
 def _orbit_series(pair: RotorPair, orbit: Orbit, period: int) -> Series:
-    """Return the series of the orbit, repeated in whole cycles over at least one revolution."""
+    """Return the series of the orbit, repeated to cover at least one revolution of rotor 1."""
     samples = orbit.flow.states.shape[0]
     cycles = -(-pair.lobes // period)
     tau = period * np.arange(cycles * samples) / samples
@@ -553,9 +557,9 @@ def _orbit_series(pair: RotorPair, orbit: Orbit, period: int) -> Series:
 def unsettled(
     pair: RotorPair, status: Status, window: Window, series: bool
 ) -> tuple[dict[str, Any], dict[str, float], Series | None]:
-    """Return steady state, response and, on request, series of a motion that has not settled.
+    """Return `steady_state`, `response` and `series` of an `Evaluation` that has not settled.
 
-    `window`: a window of the motion; `status`: its status."""
+    `window` and `status` of the motion; `series`: whether to compute the series (else None)."""
     steady = {"kind": _KINDS.get(status, "transient")} | _of_window(window)
     if status not in (Status.CHAOTIC, Status.NOT_SETTLED, Status.IDLE):
         return steady, {}, None

@@ -20,7 +20,7 @@ from rootsopt.runtime.programs import Program
 from rootsopt.status import Status
 
 _SAMPLES = 63
-"""Uniform samples of a mesh period from which its peak is located."""
+"""Number of uniform samples per mesh period for locating the peak force."""
 _MEMBERS = 4
 """Number of members in one call of the compiled program."""
 _MEMORY = 17
@@ -32,7 +32,7 @@ _REPEATS = 1e-2
 class Members(NamedTuple):
     """Results of m motions of one design.
 
-    `means` (m, 3): mean force (N), mean square (N²) and mean of the peaks of the mesh periods (N);
+    `means` (m, 3): mean force (N), mean square (N²) and mean over the peaks of mesh periods (N);
     `drift`: mean force in the second half of the window minus that in the first (N); `greatest`:
     greatest force (N); `reach`: greatest |ε| (rad); `depth`: greatest penetration (m; negative:
     least gap); `states` (m, n): last scaled states; `repeats` (m, 8): whether the last states
@@ -53,7 +53,9 @@ class Members(NamedTuple):
 
     @property
     def status(self) -> Status:
-        """First failure among the members, or AVERAGED."""
+        """AVERAGED, or the failure of some member: solver, finite forces, stall, passing lobes.
+
+        The kinds of failure are checked in this order."""
         if not np.all(self.solved):
             return Status.SOLVER_FAILED
         if not np.all(np.isfinite(self.means)):
@@ -66,8 +68,8 @@ class Members(NamedTuple):
     def responses(self) -> NDArray[np.float64]:
         """Mean, peak and RMS force (N) in rows, with their standard errors, (3, 2).
 
-        The members are independent, so each standard error is that of the mean over members. For
-        the RMS it is correct to first order.
+        The standard errors are those of means over independent members. The standard error of the
+        RMS is correct to first order.
         """
         values, errors = mean_and_error(np.asarray(self.means, np.float64))
         mean, square, peak = values
@@ -77,7 +79,8 @@ class Members(NamedTuple):
 
 
 def mean_and_error(values: NDArray[np.float64]):
-    """Return the mean of independent values over the first axis, and its standard error."""
+    """Return the mean of independent `values` over the first axis, and the mean's standard
+    error."""
     spread = np.std(values, axis=0, ddof=1)
     return np.mean(values, axis=0), spread / np.sqrt(len(values))
 
@@ -85,8 +88,8 @@ def mean_and_error(values: NDArray[np.float64]):
 def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float64]:
     """Return scaled states (members, n): a scrambled Sobol sequence of ε and dε/dt.
 
-    |ε| goes up to `angle_scale` (play and static penetration), |dε/dt| up to the speed after a fall
-    under the load through that whole range.
+    |ε| goes up to `angle_scale` (play and static penetration). |dε/dt| goes up to the speed after a
+    fall under the load through the whole range of ε.
     """
     from scipy.stats import qmc
 
@@ -99,8 +102,7 @@ def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float
 
 
 def prepare_members(pair: RotorPair, integrator: Integrator) -> None:
-    """Compile the program that `run_members` needs on CPUs for pairs like this one, in the
-    background."""
+    """Compile in the background the program that `run_members` needs on CPUs for `pair`."""
     states = jax.ShapeDtypeStruct((_MEMBERS, pair.states), pair.angle_scale.dtype)
     count = jax.ShapeDtypeStruct((), int)
     _in_turn.prepare(pair, states, count, count, integrator)
@@ -116,8 +118,8 @@ def run_members(
     """Return the `Members` of each of `pairs`, all from the same scaled `states` (m, n).
 
     `settle`: mesh periods before the window; `periods`: mesh periods of the window. On CPUs one
-    thread per core takes a few members at a time. If all were stepped together, each would wait for
-    the slowest at every turn. On other devices they are stepped together.
+    thread per core simulates a few members at a time, so that few members wait for a slower one. On
+    other devices all members are stepped together.
     """
     states = np.asarray(states, pairs[0].angle_scale.dtype)
     counts = np.asarray(settle), np.asarray(periods)
@@ -145,9 +147,10 @@ def run_members(
 def member(
     pair: RotorPair, state: Float[Array, " n"], settle: Any, periods: Any, integrator: Integrator
 ) -> Members:
-    """Return the result of one motion from the scaled `state` (n,), without the axis m.
+    """Return the result of one motion from the scaled `state` (n,), as a pure function.
 
-    This is a pure function. `settle`, `periods`: as in `run_members`."""
+    `settle`, `periods`: mesh periods before and in the window. The fields of the result lack the
+    leading axis of `Members`."""
     dtype = state.dtype
     one, none, low = jnp.ones((), dtype), jnp.zeros((), dtype), jnp.full((), -jnp.inf, dtype)
 

@@ -30,7 +30,7 @@ _STEADY = (
 class AtSpeed(NamedTuple):
     """The evaluation at one speed.
 
-    `speed_rpm` (rpm); `share` of this speed in the objective; `evaluation`.
+    `speed_rpm` of rotor 1; `share` of this speed in the objective; `evaluation` at this speed.
     """
 
     speed_rpm: float
@@ -50,11 +50,11 @@ class AtSpeed(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SpeedsEvaluation(Evaluation):
-    """An `Evaluation` at the scene's own speed, with the evaluations at all speeds simulated.
+    """An `Evaluation` at the scene's own speed, together with the evaluations at all speeds.
 
-    `parts`: one for each speed; `status`: that of the first part that is not usable. There is then
-    no gradient. `state` (m, 1 + n): one row for each known motion, the number of its part followed
-    by the scaled state.
+    `parts`: one for each speed; `status`: status of the first part that is not usable, if any, and
+    then there is no gradient; `state` (m, 1 + n): a row for each known motion, which holds the
+    number of its part, then the scaled state.
     """
 
     parts: tuple[AtSpeed, ...] = ()
@@ -67,26 +67,28 @@ class SpeedsEvaluation(Evaluation):
 
 @dataclasses.dataclass(frozen=True)
 class SpeedsEvaluator(Wrapper):
-    """Evaluates designs at every speed of `objective.speeds_rpm` and at the scene's own.
+    """Evaluates designs at every speed of `objective.speeds_rpm` and at the scene's own speed.
 
-    `single`: the evaluator for each speed; `baseline`: per-speed parts of the evaluation to which
-    the forces at each speed are relative.
+    `single`: the evaluator used at each speed; `baseline`: per-speed parts of the evaluation to
+    which the forces at each speed are relative.
 
-    The response is reported at the scene's speed. If this is not a speed of the objective, it has
-    no share in the objective, but its status counts.
+    The response is reported at the scene's own speed. If `objective.speeds_rpm` does not contain
+    this speed, its share in the objective is 0, but its status counts.
     """
 
     baseline: tuple["AtSpeed", ...] = ()
 
     def relative_to(self, baseline: Evaluation) -> "SpeedsEvaluator":
-        """Return another evaluator that compares motions at each speed by their forces relative to
-        those of the `baseline` at that speed."""
+        """Return another evaluator that compares coexisting motions at each speed by force relative
+        to the `baseline` at the same speed."""
         return dataclasses.replace(self, baseline=at_speeds(baseline))
 
     def fit(self, design=None, start=None, series=True) -> tuple["SpeedsEvaluator", Evaluation]:
-        """Evaluate a design, and return another evaluator too, as `Evaluator.fit` does.
+        """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
 
-        `start`: the `state` of a neighbouring design's evaluation."""
+        `design` (d,): in config units, by default the config's own; `start`: the `state` of a
+        neighbouring design's evaluation; `series`: whether to compute the series at the scene's own
+        speed."""
         config, now = self.config, self.single
         own = config.scene.speed_rpm
         parts = []
@@ -133,7 +135,7 @@ def _rows(start: NDArray[np.float64], number: int) -> NDArray[np.float64]:
 
 
 def alone(config: Config, speed_rpm: float | None = None) -> Config:
-    """Return `config` with a single speed (rpm), by default the scene's own."""
+    """Return `config` with the single speed `speed_rpm`, by default the scene's own speed."""
     speed = config.scene.speed_rpm if speed_rpm is None else speed_rpm
     none = {"speeds_rpm": (), "speed_weights": (), "over_speeds": "weighted"}
     return config.model_copy(
@@ -147,7 +149,7 @@ def alone(config: Config, speed_rpm: float | None = None) -> Config:
 def shares(config: Config) -> dict[float, float]:
     """Return the speeds (rpm) that a config's objective needs, ascending, with their shares.
 
-    The scene's own speed is included. Its share is 0 if it is not a speed of the objective."""
+    The scene's own speed is included, with share 0 if the objective does not contain this speed."""
     objective = config.objective
     speeds = objective.speeds_rpm or (config.scene.speed_rpm,)
     weights = objective.speed_weights or (1.0,) * len(speeds)
@@ -203,8 +205,8 @@ def sweep(
 ) -> tuple[AtSpeed, ...]:
     """Evaluate `design` (config units; default: the config's own) at each of the speeds, from rest.
 
-    `evaluator`: one for a single speed. `progress` is called with (speeds done, all). All parts of
-    the result have equal shares.
+    `evaluator`: an evaluator for a single speed; `progress` is called with (speeds done, number of
+    speeds). All parts of the result have equal shares.
     """
     parts: list[AtSpeed] = []
 
@@ -220,8 +222,8 @@ def sweep(
 
 
 def overall(parts: Sequence[AtSpeed]) -> tuple[Status, str]:
-    """Return status and message of the first part that is not usable; if all are usable, those of
-    the first part."""
+    """Return status and message of the first part that is not usable, or of the first part if all
+    are usable."""
     for part in parts:
         if not part.evaluation.usable:
             return part.evaluation.status, f"At {part.speed_rpm:g} rpm: {part.evaluation.message}"

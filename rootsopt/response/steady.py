@@ -2,8 +2,8 @@
 
 The derivative of an orbit comes from the implicit function theorem: JAX never differentiates
 through the search for the orbit. All requested derivatives are columns of one matrix, computed with
-the orbit. JAX transformations only multiply with this matrix. So forward and reverse mode agree to
-rounding, and derivatives that are not requested are not computed.
+the orbit. JAX transformations only multiply with this matrix. Therefore forward and reverse mode
+agree to rounding. Derivatives that are not requested are not computed.
 """
 
 from typing import Any, NamedTuple
@@ -30,16 +30,16 @@ class Response(NamedTuple):
     """The steady response of one design in one scene; with leading axes if it was mapped.
 
     `mean`, `peak`, `rms`: contact force (N); `lines` (lines,): amplitudes (N) of the spectral lines
-    that the scene requests, in their order (0 if the motion does not have the line); `peak_norm`:
-    p-norm (N), None unless the scene requests it; `period`: mesh periods of the orbit;
+    that the scene requests, in the same order (0 if the motion lacks the line); `peak_norm`: p-norm
+    (N), None unless the scene requests it; `period`: mesh periods of the orbit;
     `multipliers` (n,): Floquet multipliers, greatest modulus first; `residual`: distance (scaled)
     by which the orbit does not close; `status`: code of a `Status` (`Status.of(code)`); `state`
     (n,) at φ1 = 0 in SI units: ε (rad), dε/dt (rad/s), then the states of parts, such as the excess
     of a motor's speed over the scene's (rad/s).
 
-    The forces are those of the orbit, or 0 without contact. For a motion that does not settle, they
-    are those of a window of 128 mesh periods. Otherwise they are NaN. If the motion is not
-    periodic, `period` is 0, and `multipliers` and `residual` are NaN.
+    The forces are those of the orbit, or 0 without contact. If the motion does not settle, the
+    forces are those of a window of 128 mesh periods. In all other cases, the forces are NaN. If the
+    motion is not periodic, `period` is 0, and `multipliers` and `residual` are NaN.
     """
 
     mean: Float[Array, ""]
@@ -60,7 +60,7 @@ def steady_response(
     """Return the steady response of a `design` (d,) in config units, in a `scene`.
 
     `start` (n,): state at φ1 = 0 from which the motion begins (SI units, as `Response.state`); by
-    default at rest. The response does not depend on it, as long as it leads to the same motion.
+    default at rest. All values of `start` that lead to the same motion give the same response.
 
     This is a pure function. It works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and `jacrev`,
     with respect to the design and to every physical quantity of the scene. The derivatives of
@@ -115,8 +115,8 @@ def _response_jvp(primals, tangents):
 def _moved(scene: Any, design: Any) -> tuple[list[tuple[int, Array]], list[Array]]:
     """Return the tangents that are not None (zero), in two lists.
 
-    The first has those of differentiable leaves, each with the number of its leaf in `_leaves`. The
-    second has those of a measured outline, with respect to which there are no derivatives."""
+    The first list holds (number of the leaf in `_leaves`, tangent) for differentiable leaves. The
+    second list holds the tangents of a measured outline, for which there are no derivatives."""
     numbers, leaves = [], []
     for number, (path, leaf) in enumerate(_leaves((scene, design))):
         if leaf is None:
@@ -132,11 +132,11 @@ def _moved(scene: Any, design: Any) -> tuple[list[tuple[int, Array]], list[Array
 
 
 _SETTINGS = ("solver", "deepest")
-"""Fields of a scene on which the response does not depend, so that their tangents are ignored."""
+"""Fields of a scene that are numerical settings, not physical quantities; tangents are ignored."""
 
 
 def _leaves(tree: Any) -> list[tuple[Any, Any]]:
-    """Return all leaves with their paths, including those that are None."""
+    """Return (path, leaf) for all leaves of `tree`, including leaves that are None."""
     return jax.tree_util.tree_flatten_with_path(tree, is_leaf=lambda x: x is None)[0]
 
 
@@ -151,7 +151,8 @@ def _split(values, response: Response):
 def _solved(scene: Scene, design, start, along: tuple[int, ...]) -> tuple[Response, Array]:
     """Return the response, and the derivatives (rows, m) of its differentiated fields.
 
-    They are with respect to the m entries of the leaves numbered `along`."""
+    `along`: numbers of the leaves of scene and design to differentiate with respect to, m entries
+    in all."""
     arguments = scene, design, start, along
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
         return _inline(*arguments)
@@ -179,16 +180,16 @@ def _solve(scene: Scene, design, start, numbers: tuple[int, ...]) -> tuple[Respo
 
 
 def _on_map(scene: Scene, pair: RotorPair, found: Steady) -> Steady:
-    """Return the motion, with the status OFF_MAP if it has left the contact map."""
+    """Return the motion `found`, with the status OFF_MAP if the motion has left the contact map."""
     reached = pair.angle_scale * jnp.max(jnp.abs(found.orbit.flow.states[:, 0]))
     left = among(found.status, CLOSED) & (reached > -scene.deepest)
     return found._replace(status=jnp.where(left, Status.OFF_MAP.code, found.status))
 
 
 def _state(pair: RotorPair, tangents: RotorPair, found: Steady):
-    """Return the state (n,) in SI units and the derivatives (n, m) of the orbit's state.
+    """Return the state (n,) in SI units, and its derivatives (n, m) along the family of orbits.
 
-    The state is that of the orbit or, without an orbit, that at the end of the transient."""
+    The state is on the orbit or, without an orbit, at the end of the transient."""
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
 
     def in_si(dynamic, state):

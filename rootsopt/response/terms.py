@@ -30,24 +30,24 @@ class Forces(NamedTuple):
 
 
 class Term(eqx.Module):
-    """A quantity to be minimised, named with its weight in `objective.terms`.
+    """A quantity to be minimised, with a name and a weight in `objective.terms`.
 
-    To add a term, write `value`. Store numbers in fields that hold arrays or are static. The
-    objective uses a term relative to its value for the baseline, which must be greater than 0.
+    To add a term, subclass and write `value`. Store numbers in fields that hold arrays or are
+    static. The objective divides a term by its value for the baseline, which must be positive.
     """
 
     @abc.abstractmethod
     def value(
         self, scene: Scene, profile: Profile, shape: Geometry, forces: Forces
     ) -> Float[Array, ""]:
-        """Return the term for one design, computed by operations that JAX can differentiate.
+        """Return the value of the term for one design, by operations that JAX can differentiate.
 
-        `profile` and `shape`: the design's profile and its geometry (SI units); `forces`: those of
-        its steady motion in the `scene`."""
+        `profile` and `shape`: profile and geometry of the design (SI units); `forces` (N): mean,
+        peak and RMS of the steady contact force in the `scene`."""
 
 
 class GeometryTerm(Term):
-    """The field named `field` of `Geometry`, divided by `unit`."""
+    """A term that is the field named `field` of `Geometry` (SI units), divided by `unit`."""
 
     field: str = eqx.field(static=True)
     unit: float = eqx.field(static=True)
@@ -58,7 +58,7 @@ class GeometryTerm(Term):
 
 
 class InertiaTerm(Term):
-    """Polar moment of inertia of one rotor (kg·m²)."""
+    """A term that is the polar moment of inertia of one rotor (kg·m²)."""
 
     def value(self, scene, profile, shape, forces):
         del profile, forces
@@ -66,7 +66,7 @@ class InertiaTerm(Term):
 
 
 class ForceTerm(Term):
-    """The field named `field` of `Forces` (N)."""
+    """A term that is the field named `field` of `Forces` (N)."""
 
     field: str = eqx.field(static=True)
 

@@ -1,4 +1,4 @@
-"""The protocol of all evaluators, and the base class of those that wrap another evaluator."""
+"""The protocol of all evaluators, and the base class of evaluators that wrap another evaluator."""
 
 import dataclasses
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -11,8 +11,8 @@ from rootsopt.response.evaluation import Evaluation
 from rootsopt.scene import Scene
 
 W = TypeVar("W", bound="Wrapper")
-"""Class of a wrapper, which its methods return. (Not `Self`: tests check the types of single
-methods at run time.)"""
+"""Type variable for the class of a wrapper, which its methods return. (`Self` does not work with
+the run-time type checks of the tests.)"""
 
 
 @runtime_checkable
@@ -32,21 +32,26 @@ class Evaluates(Protocol):
     def __call__(
         self, design: Any = None, start: NDArray | None = None, series: bool = True
     ) -> Evaluation:
-        """Evaluate a design."""
+        """Evaluate `design` (d,), in config units; by default the config's own.
+
+        `start`: scaled states to begin from, such as the `state` of a neighbouring design's
+        evaluation; `series`: whether to compute the series."""
         ...
 
     def fit(
         self, design: Any = None, start: NDArray | None = None, series: bool = True
     ) -> tuple["Evaluates", Evaluation]:
-        """Evaluate a design, and return another evaluator too, fitted to its motion."""
+        """Evaluate a design. Return another evaluator, fitted to its motion, and the evaluation."""
         ...
 
     def prepare(self, design: Any = None, series: bool = True) -> "Evaluates":
-        """Compile the programs for a design in the background; return an evaluator sized for it."""
+        """Compile the programs for `design` in the background.
+
+        Return another evaluator, with a contact map sized for `design`."""
         ...
 
     def pair(self, design: ArrayLike) -> RotorPair:
-        """Return the rotor pair of a design."""
+        """Return the rotor pair of `design` (config units)."""
         ...
 
     def at_speed(self, speed_rpm: float) -> "Evaluates":
@@ -62,19 +67,20 @@ class Evaluates(Protocol):
         ...
 
     def relative_to(self, baseline: Evaluation) -> "Evaluates":
-        """Return another evaluator that compares motions by their forces relative to a baseline."""
+        """Return another evaluator that compares coexisting motions by force relative to a
+        `baseline`."""
         ...
 
     def without_gradient(self) -> "Evaluates":
-        """Return an evaluator that skips the gradient if it takes most of the time."""
+        """Return an evaluator that skips the gradient if the gradient takes most of the time."""
         ...
 
 
 @dataclasses.dataclass(frozen=True)
 class Wrapper:
-    """An evaluator that combines evaluations of another one, `single`.
+    """Base class of evaluators that combine several evaluations by another evaluator, `single`.
 
-    All methods pass on to `single`. A subclass writes `fit`.
+    A subclass writes `fit`. A call is `fit` without the evaluator; other methods apply to `single`.
     """
 
     single: Evaluates
@@ -94,7 +100,7 @@ class Wrapper:
         return self.fit(design, start, series)[1]
 
     def fit(self: W, design=None, start=None, series=True) -> tuple[W, Evaluation]:
-        """Evaluate a design, and return another evaluator too, fitted to its motion."""
+        """Evaluate a design. Return another evaluator, fitted to its motion, and the evaluation."""
         raise NotImplementedError
 
     def pair(self, design: ArrayLike) -> RotorPair:
@@ -118,7 +124,8 @@ class Wrapper:
         return self._around(self.single.surveying())
 
     def relative_to(self: W, baseline: Evaluation) -> W:
-        """Return another evaluator that compares motions by forces relative to a `baseline`."""
+        """Return another evaluator that compares coexisting motions by force relative to a
+        `baseline`."""
         return self._around(self.single.relative_to(baseline))
 
     def without_gradient(self: W) -> W:

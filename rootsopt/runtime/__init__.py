@@ -1,1 +1,1 @@
-"""Process and programs: precision, environment, threads, compiled programs and their cache."""
+"""Set-up of the process, and compiled programs: environment, precision, threads, cache, timing."""

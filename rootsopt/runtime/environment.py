@@ -1,9 +1,9 @@
 """Protect commands from environment variables that change results.
 
-A command owns its process: it computes in double precision with JAX's own defaults. Variables that
-only choose a device, a cache or a log are respected. Variables that change numbers, or stop a run
-on purpose, are ignored and named on stderr. Settings that cannot work raise `InputError` before
-anything is computed, because XLA ends the whole process at a flag it does not know.
+A command owns its process and computes in double precision with JAX's own defaults. Variables that
+only choose a device, a cache or a log are respected. Variables that change numbers, or make JAX
+stop on purpose, are ignored and named on stderr. Settings that cannot work raise `InputError`
+before anything is computed, because XLA ends the whole process at an unknown flag.
 """
 
 import contextlib
@@ -48,11 +48,12 @@ _REQUIRED = {
     "jax_no_tracing": False,
     "jax_no_execution": False,
 }
-"""Settings of JAX that every result relies on. The programs produce NaN on purpose."""
+"""Settings of JAX that every result relies on. Checks for NaN are off: programs use NaN on
+purpose."""
 
 _XLA_FLAGS = "XLA_FLAGS"
 _CHECKED = "ROOTSOPT_XLA_FLAGS_CHECKED"
-"""Holds the XLA_FLAGS that were tested, for processes started from this one."""
+"""Name of the variable that tells child processes which XLA_FLAGS have been tested."""
 
 # On a CPU, XLA compiles a loop to one function if its buffers are small. Otherwise it calls one
 # function per operation and iteration, which here costs several times the arithmetic itself.
@@ -78,12 +79,13 @@ try:
 except (AttributeError, TypeError):
     pass
 """
-"""Script that compiles one operation, with only the parts of JAX needed for that."""
+"""Script that compiles one operation to test XLA_FLAGS. It imports only the necessary parts of
+JAX."""
 _TRIAL_SECONDS = 60.0
 _LOG_PREFIX = re.compile(r"^[IWEF]\d{4} \S+\s+\d+ \S+\] ")
 
 _NARROWEST = 40
-"""Columns below which a table would lose its numbers; COLUMNS is then ignored."""
+"""Terminal width (columns) below which COLUMNS is ignored: a table would lose its numbers."""
 
 _noticed: set[str] = set()
 
@@ -98,16 +100,18 @@ def say(text: str) -> None:
 
 
 def shortened(value: str, longest: int = 80) -> str:
-    """Return a value for a message, with control characters escaped, at most `longest` long."""
+    """Return `value` for use in a message: control characters escaped, at most `longest`
+    characters.
+    """
     text = repr(value)
     return text if len(text) <= longest else f"{text[: longest - 4]}...{text[-1]}"
 
 
 def own_process() -> None:
-    """Override environment settings that would disturb a command. Call this first.
+    """Override environment settings that would disturb a command. Call this before anything else.
 
-    Warnings never become errors, tables are wide enough to read, figures need no display, and
-    equinox checks are off. `use_float64` handles the variables of JAX.
+    Afterwards, warnings never become errors, tables are wide enough to read, figures need no
+    display, and equinox checks are off. `use_float64` handles the variables of JAX.
     """
     if any(option.lower().startswith("e") for option in sys.warnoptions):
         for entry in [entry for entry in warnings.filters if entry[0] == "error"]:
@@ -128,9 +132,9 @@ def own_process() -> None:
 
 
 def use_float64() -> None:
-    """Import JAX and start its device in double precision, with all settings that results rely on.
+    """Import JAX, choose double precision and all settings that results rely on, start the device.
 
-    Raises `InputError` where the environment prevents JAX from starting.
+    Raises `InputError` if the environment prevents JAX from starting.
     """
     aside = {} if "jax" in sys.modules else _without_settings()
     flags = os.environ.get(_XLA_FLAGS, "").strip()
@@ -172,7 +176,7 @@ def use_compiled_loops() -> None:
 
 @contextlib.contextmanager
 def explained() -> Iterator[None]:
-    """Turn a lack of memory, also in XLA, into `InputError`."""
+    """Raise `InputError` in place of an out-of-memory error of Python or XLA."""
     try:
         yield
     except MemoryError:
@@ -200,7 +204,7 @@ def _set_aside(named: list[str]) -> None:
 
 
 def _without_settings() -> dict[str, str]:
-    """Remove variables of JAX that are not respected from the environment; return them."""
+    """Remove JAX variables that are not respected from the environment; return names and values."""
     names = [
         name for name in os.environ if name.startswith("JAX_") and not name.startswith(_RESPECTED)
     ]
@@ -208,7 +212,7 @@ def _without_settings() -> dict[str, str]:
 
 
 def _agrees(setting: object, value: str) -> bool:
-    """Return whether a variable agrees with the setting in force."""
+    """Return whether the `value` of a variable means the same as the JAX `setting` in force."""
     words = {"1": "true", "t": "true", "yes": "true", "y": "true", "on": "true"}
     words |= {"0": "false", "f": "false", "no": "false", "n": "false", "off": "false", "": "false"}
     said, force = value.strip().lower(), str(getattr(setting, "value", setting)).lower()
@@ -216,7 +220,9 @@ def _agrees(setting: object, value: str) -> bool:
 
 
 def _require(config) -> list[tuple[str, object]]:
-    """Put the required settings in force; return names and values of those that differed."""
+    """Apply the required settings of JAX.
+
+    Return (name, former value) of each setting that differed, except double precision."""
     changed = []
     for name, needed in _REQUIRED.items():
         if name not in config.values:  # gone in this version of JAX
@@ -230,7 +236,7 @@ def _require(config) -> list[tuple[str, object]]:
 
 
 def _start_device(jax) -> None:
-    """Start the platform named in JAX_PLATFORMS, or the CPU. Raises `InputError`."""
+    """Start the platform named in JAX_PLATFORMS, or the CPU. Raises `InputError` on failure."""
     chosen = os.environ.get("JAX_PLATFORMS")
     before = jax.config.values.get("jax_platforms")
     jax.config.update("jax_platforms", "cpu" if chosen is None else chosen)
@@ -252,14 +258,14 @@ def _start_device(jax) -> None:
 
 
 def _reason(error: BaseException) -> str:
-    """Shorten another library's message to one line, without its advice in brackets."""
+    """Return the message of another library's error in one line, without its advice in brackets."""
     text = re.sub(r"\s*\((?:set|you may need)\b[^)]*\)", "", str(error))
     text = " ".join(text.split()).rstrip(".")
     return text if len(text) <= 300 else f"{text[:297]}..."
 
 
 def _check_flags(flags: str) -> None:
-    """Test XLA_FLAGS in a separate process. Raises `InputError`."""
+    """Test the XLA_FLAGS `flags` in a separate process. Raises `InputError` if they cannot work."""
     if os.environ.get(_CHECKED) == flags:
         return
     advice = "correct the flag or unset XLA_FLAGS"
@@ -292,7 +298,7 @@ def _check_flags(flags: str) -> None:
 
 
 def _complaint(log: str) -> str:
-    """Extract XLA's complaint about its flags from the log of the process it ended."""
+    """Return XLA's complaint about its flags, from the `log` of a process that XLA has ended."""
     lines = [line for line in log.splitlines() if line.strip()]
     marked = [line for line in lines if re.match(r"^[EF]\d{4} ", line)]
     options = [line for line in lines if line.startswith("xla: ")]

@@ -1,4 +1,4 @@
-"""Check of the precision JAX computes in, which a command or script chooses, never the library."""
+"""Check of JAX's precision. A command or a script chooses the precision; the library never does."""
 
 import jax
 

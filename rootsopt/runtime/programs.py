@@ -1,8 +1,8 @@
 """Compiled programs: made ahead, in parallel, and cached between processes.
 
-Tracing and compiling take longer than everything else here. JAX's own cache stores compiled code,
-but every process still traces and lowers a function to find it there. A `Program` finds it by name,
-source and kinds of arguments alone.
+Tracing and compiling take longer than the computations themselves. JAX's own cache stores compiled
+code, but every process must trace and lower a function before it can look up the code. A `Program`
+looks up the code by name, source and kinds of arguments alone.
 """
 
 import contextlib
@@ -49,8 +49,8 @@ _SETTINGS = (
 """Settings of JAX that change what is traced or compiled."""
 _VARIABLES = ("XLA_FLAGS", "EQX_ON_ERROR")
 OPTIONS: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
-"""Compiler options on CPUs. The older code generator for fused operations compiles in two thirds of
-the time, and its code is as fast."""
+"""Compiler options on CPUs. They select the older code generator for fused operations, which
+compiles in two thirds of the time; its code is as fast."""
 _PACKAGE = Path(__file__).parents[1]
 _store: Store | None = None
 # Tracing runs in Python, so it is done one function at a time, in the order of requests. The
@@ -61,8 +61,8 @@ _tracing = threading.RLock()
 def keep_in(folder: Path | None) -> str | None:
     """Cache programs in `folder` from now on; `None` turns the cache off.
 
-    A folder that cannot be used turns the cache off silently. If others could replace the programs
-    in it, the cache is off too, and the reason is returned.
+    If the folder cannot be used, the cache is off and the result is None. If other users could
+    replace the programs in the folder, the cache is off and the result is the reason.
     """
     global _store
     _store = None
@@ -78,10 +78,10 @@ def keep_in(folder: Path | None) -> str | None:
 
 
 class _Kind(NamedTuple):
-    """What a program is compiled for.
+    """Kind of arguments that a program is compiled for.
 
-    tree: structure of the arguments; shapes: (shape, dtype) of each array, None for other leaves;
-    others: type and value of each other leaf.
+    `tree`: structure of the arguments; `shapes`: (shape, dtype) of each array, None for other
+    leaves; `others`: type and value of each other leaf.
     """
 
     tree: Any
@@ -90,14 +90,14 @@ class _Kind(NamedTuple):
 
 
 class _Made(NamedTuple):
-    """A compiled program, called with the arrays alone, and its result with structs for arrays."""
+    """A compiled program, which takes only the arrays, and its result with structs for arrays."""
 
     call: Callable[..., Any]
     result_shape: Any
 
 
 class Program:
-    """A function of trees, compiled once for each kind of arguments.
+    """A function whose arguments are JAX trees, compiled once for each kind of arguments.
 
     As with `equinox.filter_jit`, arrays are traced. Everything else is static and must be hashable.
     """
@@ -121,15 +121,17 @@ class Program:
         return jax.tree.map(lambda x: next(results) if _is_array(x) else x, made.result_shape)
 
     def prepare(self, *args: Any) -> None:
-        """Compile in the background for arguments like these; arrays may be
-        `jax.ShapeDtypeStruct`. If that fails, the call that needs the program raises the error."""
+        """Compile in the background for arguments of the same kind as `args`.
+
+        Arrays may be `jax.ShapeDtypeStruct`. If compilation fails, the call that needs the program
+        raises the error."""
         _, kind = _split(args)
         future, new = self._future(kind)
         if new:
             threading.Thread(target=self._make, args=(future, kind)).start()
 
     def result_shape(self, *args: Any) -> Any:
-        """Return the result with `jax.ShapeDtypeStruct` for arrays, without compiling."""
+        """Return the result with `jax.ShapeDtypeStruct` in place of arrays, without compiling."""
         _, kind = _split(args)
         place = self._place(kind)
         kept = place is not None and place.kept
@@ -141,7 +143,9 @@ class Program:
         return jax.tree.map(_outline, eqx.filter_eval_shape(self.function, *args))
 
     def _future(self, kind: _Kind) -> tuple[Future[_Made], bool]:
-        """Return the future program of a kind, and whether the caller must make it."""
+        """Return the future program for a `kind` of arguments.
+
+        Return also whether the caller must compile it."""
         with self._lock:
             new = kind not in self._made
             return self._made.setdefault(kind, Future()), new
@@ -175,7 +179,7 @@ class Program:
         return made
 
     def _place(self, kind: _Kind) -> "_Place | None":
-        """Return where a program of this kind is cached; `None`: it is not cached."""
+        """Return the cache entry for a program of this `kind`, or `None` if it cannot be cached."""
         if _store is None or jax.default_backend() != "cpu":
             return None
         if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
@@ -213,7 +217,7 @@ def _outline(leaf: Any) -> Any:
 
 
 def _split(args: tuple) -> tuple[list, _Kind]:
-    """Return the arrays among the leaves of `args`, and the kind of arguments."""
+    """Return the arrays among the leaves of `args`, and the kind of the arguments."""
     leaves, tree = jax.tree.flatten(args)
     shapes = tuple(
         (x.shape, str(jax.dtypes.canonicalize_dtype(x.dtype))) if _is_array(x) else None
@@ -224,8 +228,9 @@ def _split(args: tuple) -> tuple[list, _Kind]:
 
 
 def _finished(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-    """Compile with those of `OPTIONS` that XLA_FLAGS does not set, or without options where this
-    compiler does not know them."""
+    """Compile a lowered program, with the `OPTIONS` that XLA_FLAGS does not set.
+
+    If the compiler does not know these options, compile without options."""
     said = os.environ.get("XLA_FLAGS", "")
     options = {name: value for name, value in OPTIONS.items() if name not in said}
     if options and jax.default_backend() == "cpu":
@@ -235,7 +240,7 @@ def _finished(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
 
 
 def _joined(kind: _Kind, arrays: Iterator) -> tuple:
-    """Reverse `_split`."""
+    """Return the arguments from their `kind` and `arrays`: the inverse of `_split`."""
     others = iter(kind.others)
     leaves = [next(arrays) if shape else next(others)[1] for shape in kind.shapes]
     return jax.tree.unflatten(kind.tree, leaves)
@@ -251,7 +256,7 @@ def _save(place: _Place, made: _Made, number: int) -> None:
 
 
 def _loaded(place: _Place | None) -> _Made | None:
-    """Return a cached program, or `None` if there is no working one."""
+    """Return the cached program at `place`, or `None` if there is no working program."""
     if place is None:
         return None
     try:
@@ -270,7 +275,7 @@ def _loaded(place: _Place | None) -> _Made | None:
 
 
 def _modules(kind: _Kind) -> set[str]:
-    """Return the modules that define the types in the arguments."""
+    """Return the names of the modules that define the types in the arguments."""
     found = {of.__module__ for of, _ in kind.others}
     trees = [kind.tree]
     while trees:
@@ -282,8 +287,10 @@ def _modules(kind: _Kind) -> set[str]:
 
 
 def _sources(modules: set[str]) -> list[str] | None:
-    """Return digests of this package's sources, and of the files of modules outside it and outside
-    packages with a known version; `None` if such a module has no file."""
+    """Return digests of the source files that a program depends on.
+
+    These are all sources of this package, and the files of those `modules` that belong to no
+    package with a known version. The result is `None` if such a module has no file."""
     digests = [_package_digest()]
     for name in sorted(modules):
         top = name.partition(".")[0]
@@ -310,7 +317,7 @@ def _package_digest() -> str:
 
 @functools.cache
 def _machine() -> list[str]:
-    """Describe the processor and its instructions."""
+    """Return a description of the processor and its instruction set."""
     try:
         lines = Path("/proc/cpuinfo").read_text("utf-8", errors="replace").splitlines()
         processor = next(line for line in lines if line.startswith(("flags", "Features")))
@@ -321,13 +328,13 @@ def _machine() -> list[str]:
 
 @functools.cache
 def _versions() -> list[str]:
-    """Return the versions of everything that traces and compiles."""
+    """Return the versions of all libraries that trace or compile programs."""
     packages = [f"{name} {metadata.version(name)}" for name in _PACKAGES]
     return [platform.python_implementation(), platform.python_version(), *packages]
 
 
 def _settings() -> list[str]:
-    """Return the current settings that change what is traced or compiled."""
+    """Return the current values of the settings that change what is traced or compiled."""
     variables = [f"{name}={os.environ.get(name, '')}" for name in _VARIABLES]
     variables.append(f"{sorted(OPTIONS.items())}")
     return variables + [f"{name}={getattr(jax.config, name, None)}" for name in _SETTINGS]

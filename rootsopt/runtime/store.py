@@ -1,8 +1,8 @@
 """Files of compiled programs: owned by the user, signed, and limited in size.
 
-Programs read here are executed, so nobody else may be able to change them. The folder, every file
-in it and every folder above must be out of the reach of others. Each entry is signed under its name
-and purpose, with a key in the user's own state folder. An entry that is damaged, exchanged or not
+Programs read here are executed, so other users must not be able to change them. This holds for the
+folder, every file in it and every folder above. Each entry is signed together with its name and
+purpose, with a key in the user's own state folder. An entry that is damaged, exchanged or not
 signed is ignored.
 """
 
@@ -33,7 +33,9 @@ _MAC_BYTES = hashlib.sha256().digest_size
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _OTHERS_AT_ALL = stat.S_IRWXG | stat.S_IRWXO
 _NEW_SECONDS = 2.0
-"""Age (s) of an unfinished file below which its process may not have locked it yet."""
+"""Age (s) of an unfinished file below which the file is kept: its process may not have locked it
+yet.
+"""
 # With these flags, a symbolic link is not followed and a named pipe does not block.
 _SAFELY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 _HAS_OWNERS = hasattr(os, "geteuid")
@@ -41,15 +43,15 @@ _IN_FOLDER = {os.open, os.unlink, os.stat, os.rename} <= os.supports_dir_fd
 
 
 class UnsafeFolderError(Exception):
-    """A folder that others can change; the message says which, and what to do."""
+    """A folder can be changed by other users. The message names the folder and the remedy."""
 
 
 class Folder:
     """A folder of the user's own, created if it does not exist, and held open.
 
-    Files are reached through the open folder, not by its path, which may point elsewhere later.
-    Raises `UnsafeFolderError` if others could write to it or exchange it, `OSError` if it cannot be
-    created or opened.
+    Files are opened through the folder's descriptor, because its path may point elsewhere later.
+    Raises `UnsafeFolderError` if other users could write to the folder or exchange it, `OSError` if
+    the folder cannot be created or opened.
     """
 
     def __init__(self, path: Path):
@@ -81,42 +83,42 @@ class Folder:
         return name if self._open is not None else os.fspath(self.path / name)
 
     def open(self, name: str, flags: int) -> int:
-        """Return a descriptor of a file in the folder; a new file is for the user alone."""
+        """Open a file in the folder and return its descriptor. A new file is for the user alone."""
         return os.open(self._at(name), flags | _SAFELY, 0o600, dir_fd=self._open)
 
     def stat(self, name: str) -> os.stat_result:
-        """Return the status of the file itself, not of the target of a link."""
+        """Return the `os.stat` result of the file itself, not of the target of a link."""
         return os.stat(self._at(name), dir_fd=self._open, follow_symlinks=False)
 
     def exists(self, name: str) -> bool:
-        """Return whether there is a regular file of this name."""
+        """Return whether the folder contains a regular file called `name`."""
         try:
             return stat.S_ISREG(self.stat(name).st_mode)
         except OSError:
             return False
 
     def unlink(self, name: str) -> None:
-        """Remove a file, if it can be removed."""
+        """Remove the file `name`; do nothing if it cannot be removed."""
         with contextlib.suppress(OSError):
             os.unlink(self._at(name), dir_fd=self._open)
 
     def link(self, name: str, other: str) -> None:
-        """Give a file a second name. Raises `FileExistsError` where that name is taken."""
+        """Give the file `name` a second name, `other`. Raises `FileExistsError` if it exists."""
         os.link(self._at(name), self._at(other), src_dir_fd=self._open, dst_dir_fd=self._open)
 
     def replace(self, name: str, other: str) -> None:
-        """Rename a file in one step; a file of the new name is replaced."""
+        """Rename the file `name` to `other` in one step, replacing an existing file."""
         os.replace(self._at(name), self._at(other), src_dir_fd=self._open, dst_dir_fd=self._open)
 
     def names(self) -> list[str]:
-        """Return the names of everything in the folder."""
+        """Return the names of all entries of the folder."""
         return os.listdir(self.path if self._open is None else self._open)
 
     def read(self, name: str, most: int, forbidden: int = _OTHERS_WRITE) -> bytes | None:
-        """Return the content of a regular file of the user's own.
+        """Return the content of a regular file that belongs to the user.
 
-        Return `None` for anything else, for a file larger than `most` bytes, and for one that gives
-        others a `forbidden` permission.
+        Return `None` for any other file, for a file larger than `most` bytes, and for a file with
+        one of the `forbidden` permission bits.
         """
         try:
             file = self.open(name, os.O_RDONLY)
@@ -140,9 +142,10 @@ class Folder:
 
     @contextlib.contextmanager
     def unfinished(self, name: str, data: bytes) -> Iterator[str]:
-        """Create a file with `data` under a temporary name; remove it afterwards if not renamed.
+        """Create a file with `data` and yield its temporary name. On exit, remove the file if it
+        has not been renamed.
 
-        The file is locked until then, so that `sweep` can tell it from one of a dead process.
+        The file is locked meanwhile, so that `sweep` can tell it from the file of a dead process.
         """
         own = f".{name}.{secrets.token_hex(8)}"
         file = self.open(own, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
@@ -179,8 +182,8 @@ class Folder:
 class Store:
     """Signed entries in a folder.
 
-    Raises `UnsafeFolderError` if others could change the entries or know the key, `OSError` if the
-    folder cannot be used.
+    Raises `UnsafeFolderError` if other users could change the entries or read the key, `OSError` if
+    the folder cannot be used.
     """
 
     def __init__(self, path: Path):
@@ -192,7 +195,7 @@ class Store:
         return self._folder.exists(name + SUFFIX)
 
     def read(self, name: str, purpose: str) -> bytes | None:
-        """Return the data written under this name for this purpose, or `None`."""
+        """Return the data written as `name` for this `purpose`, or `None` without a valid entry."""
         found = self._folder.read(name + SUFFIX, MOST_BYTES)
         if found is None:
             return None
@@ -203,7 +206,7 @@ class Store:
         return data
 
     def write(self, name: str, purpose: str, data: bytes) -> None:
-        """Write an entry completely or not at all. Raises `OSError` if that fails."""
+        """Write the entry `name` completely or not at all. Raises `OSError` if writing fails."""
         signed = _HEADER + self._mac(name, purpose, data) + data
         target = name + SUFFIX
         with self._folder.unfinished(target, signed) as made:
@@ -218,7 +221,7 @@ class Store:
         return mac.digest()
 
     def _prune(self) -> None:
-        """Remove the least recently used entries until the rest is below `MOST_BYTES`."""
+        """Remove the least recently used entries until the others are below `MOST_BYTES` in all."""
         kept = []
         for name in self._folder.names():
             # Only our own files: the folder may hold others.
@@ -236,14 +239,16 @@ class Store:
 
 
 def key_folder() -> Path:
-    """Return the folder of the key: the user's state folder, wherever the programs are."""
+    """Return the folder of the signing key, in the user's state folder."""
     import platformdirs
 
     return Path(platformdirs.user_state_dir("rootsopt", appauthor=False))
 
 
 def _key() -> bytes:
-    """Return the user's key; create one if there is no valid key. Raises `UnsafeFolderError`."""
+    """Return the user's signing key, created if there is no valid key.
+
+    Raises `UnsafeFolderError` if the key cannot be kept from other users."""
     path = key_folder()
     try:
         if not path.is_absolute():
@@ -288,7 +293,7 @@ def _there(folder: Folder) -> bool:
 
 
 def _make(path: Path) -> None:
-    """Create a folder and those above it, for the user alone."""
+    """Create a folder and missing folders above it, with access for the user alone."""
     missing = []
     while not os.path.lexists(path):
         missing.append(path)
@@ -299,7 +304,7 @@ def _make(path: Path) -> None:
 
 
 def _check(path: Path, found: os.stat_result) -> None:
-    """Raise `UnsafeFolderError` if others own a folder, can change it, or can replace it."""
+    """Raise `UnsafeFolderError` if others own the folder `path`, or can change or replace it."""
     if not _HAS_OWNERS:
         return  # On such systems, folders below the user's home are the user's by default.
     me = os.geteuid()

@@ -13,10 +13,11 @@ _COMPILE_EVENTS = (
 
 
 class CompileClock:
-    """Time spent tracing, lowering and compiling while entered, as reported by JAX.
+    """Context manager that measures the time spent on tracing, lowering and compiling.
 
-    Programs compile in parallel and traces are nested. `seconds` counts the time during which at
-    least one of these was running, so it never exceeds the elapsed time.
+    JAX reports the single times. Programs compile in parallel and traces are nested. `seconds`
+    counts the time during which at least one of them was running, so it never exceeds the elapsed
+    time.
     """
 
     def __init__(self) -> None:
@@ -25,7 +26,7 @@ class CompileClock:
 
     @property
     def seconds(self) -> float:
-        """Return the total so far (s)."""
+        """Total time so far (s)."""
         total, reached = 0.0, float("-inf")
         for begin, end in sorted(self._spans):
             total += max(0.0, end - max(begin, reached))

@@ -1,8 +1,8 @@
-"""Independent engines: the same scene simulated with other tools, for CIC rotors.
+"""Independent simulators of a CIC pair, for comparison with rootsopt.
 
-`scipy_nodes` is SciPy with node-to-segment contact. `numba_pair` is compiled by Numba. Both
-differentiate by central differences. This module holds what they share: the scene in SI units, the
-constants of rotor and motion, and the result. `transient` is rootsopt's own integration without
+`scipy_nodes` uses SciPy with node-to-segment contact. `numba_pair` is compiled by Numba. Both
+differentiate by central differences. This module contains what both share: the scene in SI units,
+the constants of rotor and motion, and the result. `transient` is rootsopt's own integration without
 closed orbits.
 """
 
@@ -20,22 +20,22 @@ _MM = 1e-3
 _DEG = math.pi / 180
 
 Design = Sequence[float]
-"""Pressure angle (deg), involute length (mm), tip arc angle (deg)."""
+"""A CIC design: pressure angle (deg), involute length (mm), tip arc angle (deg)."""
 
 FD_STEPS = (0.05, 0.025, 0.05)
-"""Steps (deg, mm, deg) of the central differences. Around the paper's baseline their truncation
-error is 1e-4 of the gradient, at worst 1e-3. Tolerances looser than 1e-7 are noisy and need steps
-two to four times as long."""
+"""Steps (deg, mm, deg) of the central differences. Around the paper's baseline, the truncation
+error is 1e-4 of the gradient, at worst 1e-3. Forces at tolerances looser than 1e-7 are noisy and
+need steps two to four times as long."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
     """Everything except the design, in SI units.
 
-    It holds lobes, pitch radius (m), rotor length (m), density (kg/m³). Contact: IMPACT stiffness
+    Rotors: lobes, pitch radius (m), rotor length (m), density (kg/m³). Contact: IMPACT stiffness
     (N/m^e), exponent, damping (N·s/m), depth of full damping (m), smoothing (m), clearance (m).
-    Operation: speed of rotor 1 (rad/s), load torque (N·m). Timing gear: stiffness (0: no gear),
-    half its backlash and the rounding of its edges (rad).
+    Operation: speed of rotor 1 (rad/s), load torque (N·m). Timing gear: stiffness (N·m/rad; 0: no
+    gear), half the backlash (rad), rounding of the ends of the backlash (rad).
     """
 
     lobes: int
@@ -94,9 +94,9 @@ class Scene:
 class Rotor(NamedTuple):
     """Constants of a CIC rotor (m, rad); see `rootsopt.profiles.cic`.
 
-    land_end: normal angle at which the land ends and the arc starts; arc_radius, arc_center: radius
-    of the arc, and radius at which its centre lies; arc_end, involute_end: normal angles at which
-    arc and involute end.
+    `land_end`: normal angle at which the land ends and the arc starts; `arc_radius`, `arc_center`:
+    radius of the arc, and distance of its centre from the axis; `arc_end`, `involute_end`: normal
+    angles at which arc and involute end.
     """
 
     lobes: int
@@ -134,9 +134,9 @@ def rotor_of(scene: Scene, design: Design) -> Rotor:
 class Motion(NamedTuple):
     """Constants of the equation of motion.
 
-    period: mesh period (s), the unit of time; angle_scale: unit of ε (rad); force_scale: unit of
-    force (N); turn: rotation (rad) of rotor 1 in a period; agility: scaled acceleration per torque
-    (N·m).
+    `period`: mesh period (s), the unit of time; `angle_scale`: unit of ε (rad); `force_scale`: unit
+    of force (N); `turn`: rotation (rad) of rotor 1 in a mesh period; `agility`: scaled acceleration
+    per torque (1/(N·m)).
     """
 
     period: float
@@ -193,8 +193,8 @@ def motion_of(scene: Scene, polar_area_moment: float) -> Motion:
 class Result:
     """Result of one simulation.
 
-    It holds mean, peak and RMS contact force (N) over the window, solver steps (including rejected
-    ones), evaluations of the right-hand side, and the largest |ε| (rad) in the window.
+    Fields: mean, peak and RMS contact force (N) over the window, number of accepted and rejected
+    solver steps, evaluations of the right-hand side, and the largest |ε| (rad) in the window.
     """
 
     mean: float
@@ -206,12 +206,12 @@ class Result:
 
     @property
     def response(self) -> NDArray[np.float64]:
-        """Return (mean, peak, RMS) in N."""
+        """Mean, peak and RMS contact force (3,) in N."""
         return np.array([self.mean, self.peak, self.rms])
 
 
 class Simulator(Protocol):
-    """Interface of both competitors."""
+    """Interface of the SciPy and Numba simulators."""
 
     def simulate(self, design: Design) -> Result:
         """Start from ε = 0, dε/dt = 0 at φ = 0, settle, then average over the window."""
@@ -227,7 +227,10 @@ class Simulator(Protocol):
 def central_differences(
     simulate: Callable[[Design], Result], design: Design, steps: Sequence[float]
 ) -> tuple[Result, NDArray[np.float64]]:
-    """Return the result at `design` and its (3, 3) derivative from six more simulations."""
+    """Return the result at `design`, and d(mean, peak, RMS) / d(design) (3, 3) in N per config
+    unit.
+
+    Central differences need six further simulations; `steps`: in config units."""
     columns = []
     for i, step in enumerate(steps):
         ends = []

@@ -1,10 +1,10 @@
-"""Competitor (b): the rotor pair compiled by Numba, gradients by central differences.
+"""The rotor pair compiled by Numba, with gradients by central differences (competitor b).
 
 All code is scalar: CIC flanks in closed form, Tsitouras 5(4) with a PI controller. No array is
 allocated inside the time loop. There are two contacts, as in rootsopt. `map` tabulates the gap over
-roll coordinate × ε and interpolates it by bicubic B-splines. `search` finds the closest approach at
-every right-hand side by Newton's method from the last root. Poses and signs are those of
-`rootsopt.contact.closest`.
+roll coordinate × ε and interpolates by bicubic B-splines. `search` finds the closest approach at
+every right-hand side by Newton's method from the last root. `rootsopt.contact.closest` defines
+poses and signs.
 """
 
 import dataclasses
@@ -92,7 +92,9 @@ _INVOLUTE_NODES = 12
 
 @_compiled
 def _mate(rotor, normal):
-    """Return facing angle and lever of rotor 2's flank point ν2, each followed by its slope."""
+    """Return facing angle (rad) and lever (m) of rotor 2's flank point at the normal angle ν2.
+
+    Each value is followed by its derivative with respect to ν2."""
     if normal > rotor.arc_end:
         return math.pi - 2 * rotor.alpha - normal, -1.0, rotor.base_radius, 0.0
     turn = normal - rotor.land_end
@@ -123,7 +125,7 @@ def _offset(rotor, normal, roll, relative):
 
 @_compiled
 def _contact_at(rotor, normal, roll, relative):
-    """Return the gap (m) and both levers (m) at ν2."""
+    """Return the gap (m) and both levers (m) at rotor 2's flank point with the normal angle ν2."""
     facing, _, lever2, _ = _mate(rotor, normal)
     reach = rotor.radius * math.sin(rotor.alpha)
     if normal > rotor.arc_end:
@@ -147,9 +149,9 @@ def _contact_at(rotor, normal, roll, relative):
 
 @_compiled
 def _newton(rotor, roll, relative, low, high, guess):
-    """Return the root of T in (low, high) where T falls through zero.
+    """Return the root in (low, high) at which the tangential offset T falls through zero.
 
-    Newton's method runs inside a shrinking bracket. NaN if it ends where T does not fall.
+    Newton's method runs inside a shrinking bracket. The result is NaN if T does not fall there.
     """
     normal = guess
     for _ in range(60):
@@ -170,10 +172,10 @@ def _newton(rotor, roll, relative, low, high, guess):
 
 
 class Search(NamedTuple):
-    """Nodes and start of the search.
+    """Data of the search for the closest approach.
 
-    nodes (n, 5) on rotor 2's flank: ν2, facing angle, its sine and cosine, lever (m); root (1,):
-    the last root ν2, where the next search starts.
+    `nodes` (n, 5) on rotor 2's flank: ν2, facing angle, its sine and cosine, lever (m); `root`
+    (1,): the last root ν2, at which the next search starts.
     """
 
     nodes: NDArray[np.float64]
@@ -182,7 +184,7 @@ class Search(NamedTuple):
 
 @_compiled
 def search_of(rotor):
-    """Return the nodes for a rotor; the search starts in the middle of the flank."""
+    """Return the search data of a rotor, with the middle of the flank as start."""
     involute = rotor.involute_end - rotor.arc_end
     nodes = np.empty((_EDGE_NODES + _ARC_NODES + _INVOLUTE_NODES + 1, 5))
     for place in range(nodes.shape[0]):
@@ -201,7 +203,7 @@ def search_of(rotor):
 
 @_compiled
 def _scan(rotor, nodes, roll, relative):
-    """Return the deepest falling root of T, bracketed on the nodes; NaN if there is none."""
+    """Return the falling root of T with the least gap, bracketed by nodes; NaN without a root."""
     best, depth = math.nan, math.inf
     # Use sines of sums, so that a node needs no trigonometry.
     sin, cos = math.sin(roll - relative / 2), math.cos(roll - relative / 2)
@@ -230,9 +232,9 @@ def _scan(rotor, nodes, roll, relative):
 
 @_compiled
 def closest(rotor, search, roll, relative):
-    """Search for the gap (m), both levers (m) and whether the flanks have a common normal.
+    """Return the gap (m), both levers (m) and whether the flanks have a common normal.
 
-    Roll coordinate and ε are in rad, ε ≤ 0.
+    `roll`: roll coordinate (rad); `relative`: ε (rad), at most 0.
     """
     half = rotor.half_pitch
     centered = roll - half
@@ -261,7 +263,9 @@ def closest(rotor, search, roll, relative):
 
 @_compiled
 def gaps(rotor, rolls, relatives):
-    """Return gap and levers (n, 3) in m at many poses, NaN without a common normal."""
+    """Return gap and both levers (n, 3) in m at n poses, NaN without a common normal.
+
+    `rolls`, `relatives` (n,): roll coordinate and ε (rad)."""
     search = Search(*search_of(rotor))
     out = np.full((rolls.size, 3), np.nan)
     for i in range(rolls.size):
@@ -275,7 +279,7 @@ def gaps(rotor, rolls, relatives):
 
 
 class Table(NamedTuple):
-    """B-spline coefficients of the gap (m) over roll coordinate × ε (rad)."""
+    """Contact map: B-spline coefficients of the gap (m) over roll coordinate × ε (rad)."""
 
     coefficients: NDArray[np.float64]
     first_roll: float
@@ -290,7 +294,7 @@ NO_TABLE = Table(np.zeros((4, 4)), 0.0, 1.0, 0.0, 1.0)
 
 @_compiled
 def _spline(values, out):
-    """Compute cubic B-spline coefficients (n + 2) of values (n ≥ 8) at uniform knots.
+    """Write the cubic B-spline coefficients (n + 2,) of `values` (n ≥ 8) at uniform knots to `out`.
 
     The ends are not-a-knot, which fixes c₂ = (8 v₁ - v₀ - v₂) / 6. Thomas' algorithm solves for the
     interior.
@@ -341,7 +345,10 @@ def tabulate(rotor, deepest, rolls, relatives):
 
 @_compiled
 def _weights(t):
-    """Return the weights of the four coefficients around a cell and their slopes."""
+    """Return the weights of the four coefficients around a cell, and the derivatives of the
+    weights.
+
+    `t`: position inside the cell, 0 to 1."""
     u = 1 - t
     early, late = (3 * t - 6) * t * t / 6 + 2 / 3, (3 * u - 6) * u * u / 6 + 2 / 3
     value = u * u * u / 6, early, late, t * t * t / 6
@@ -401,14 +408,14 @@ def _smooth_step(x):
 
 @_compiled
 def _balanced_ramp(x, width):
-    """Return `_ramp` with the integral of max(0, x)."""
+    """Return a smooth ramp, as `_ramp`, but with the same integral as max(0, x)."""
     t = min(max(x, 0.0) / width, 1.0) if width > 0 else 1.0
     return max(x, 0.0) if t == 1 else width * t * t * (4.5 - 6 * t + 2.5 * t * t)
 
 
 @_compiled
 def _balanced_step(x):
-    """Return `_smooth_step` with the integral of a step at 0."""
+    """Return a smooth step, as `_smooth_step`, but with the same integral as a step at 0."""
     t = min(max(x, 0.0), 1.0)
     return t * t * (18 - 32 * t + 15 * t * t)
 
@@ -427,7 +434,7 @@ def _impact(motion, depth, rate):
 
 @_compiled
 def _slope(rotor, motion, table, search, tau, angle, rate):
-    """Return scaled acceleration and contact force (N) at τ and the scaled state."""
+    """Return scaled acceleration and contact force (N) at the time τ in a scaled state."""
     relative = motion.angle_scale * angle
     speed2 = motion.angle_scale * rate / motion.period
     side = 1.0 if relative < 0 else -1.0
@@ -614,7 +621,7 @@ def integrate(rotor, motion, table, search, start, stop, angle, rate, rtol, stat
 
 @_compiled
 def _run(rotor, motion, table, settle, window, rtol):
-    """Settle, then collect statistics over the window."""
+    """Integrate the transient, then return statistics over the window."""
     search = Search(*search_of(rotor))
     angle, rate, _, _, _, _, steps, calls = integrate(
         rotor, motion, table, search, 0.0, float(settle), 0.0, 0.0, rtol, False
@@ -632,10 +639,11 @@ def _run(rotor, motion, table, settle, window, rtol):
 class NumbaPair:
     """Compiled simulator of a scene.
 
-    contact: map or search; rtol: relative tolerance, also the absolute one of the scaled state;
-    settle, window: mesh periods; rolls, relatives: points of the map (at least 8); deepest: its
-    depth (rad, < 0), by default ten static contact forces deep. A map that the motion leaves is
-    built again, deeper. `fitted` builds a map that is deep enough from the start.
+    `contact`: map or search; `rtol`: relative tolerance, also absolute tolerance of the scaled
+    state; `settle`, `window`: mesh periods before and in the window; `rolls`, `relatives`: points
+    of the map along both axes (at least 8); `deepest`: lowest ε of the map (rad, < 0), by default
+    for ten times the static contact force. A map that the motion leaves is built again, deeper.
+    `fitted` builds a map that is deep enough from the start.
     """
 
     scene: Scene
@@ -669,7 +677,7 @@ class NumbaPair:
         return central_differences(self.simulate, design, steps)
 
     def fitted(self, design: Design) -> "NumbaPair":
-        """Return a simulator with a map just deep enough for the motion of a design."""
+        """Return another simulator with a map just deep enough for the motion of `design`."""
         reached = self.simulate(design).reached
         return dataclasses.replace(self, deepest=-1.3 * reached)
 

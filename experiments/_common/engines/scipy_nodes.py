@@ -1,10 +1,10 @@
-"""Competitor (a): SciPy's `solve_ivp` with a node-to-segment contact in NumPy.
+"""SciPy's `solve_ivp` with a node-to-segment contact in NumPy (competitor a).
 
-Contact is the paper's Eq. 9: nodes of rotor 1's flank against the segments of its mate on rotor 2.
-Segments are straight, or bulge with the flank's curvature, which is as fast and far more accurate.
-Only one flank pair can touch at a pose. On it the search covers a window around the last contact; a
-coarse search along the whole flank finds a contact elsewhere. Gradients are central differences.
-Poses and signs are those of `rootsopt.contact.closest`; points are complex numbers.
+Contact is the paper's Eq. 9: nodes of rotor 1's flank against segments of the mating flank of
+rotor 2. Segments are straight, or bulge with the flank's curvature, which is as fast and far more
+accurate. Only one flank pair can touch at a pose. The search covers a window around the last
+contact; a coarse search along the whole flank finds a contact elsewhere. Gradients are central
+differences. `rootsopt.contact.closest` defines poses and signs. Points are complex numbers.
 """
 
 import cmath
@@ -41,10 +41,10 @@ NODES_1E3: dict[str, Any] = {"method": "LSODA", "nodes": 800, "rtol": 3e-5, "set
 
 @dataclasses.dataclass(frozen=True)
 class _Addendum:
-    """Points of the addendum at normal angles.
+    """Points of the addendum at given normal angles.
 
-    Fields: roll angle β, r sin ψ, r cos ψ, distance s from the pitch point, and arc length per
-    normal angle there and on the mating dedendum.
+    Fields: roll angle β, r sin ψ, r cos ψ, distance s from the pitch point, arc length per normal
+    angle on the addendum, and arc length per normal angle on the mating dedendum.
     """
 
     beta: NDArray[np.float64]
@@ -85,10 +85,10 @@ def polar_area_moment(rotor: Rotor) -> float:
 
 
 def _flank(rotor: Rotor, nodes: int) -> NDArray[np.complex128]:
-    """Return the flank (m) from the end of the tip land to that of the root land.
+    """Return points of the flank (m), from the end of the tip land to the end of the root land.
 
-    It has an odd number of about `nodes` points. The k-th from one end meshes with the k-th from
-    the other.
+    There are about `nodes` points, an odd number. The k-th point from one end meshes with the k-th
+    point from the other end of the mating flank.
     """
     start, stop = rotor.land_end, rotor.involute_end
     fine = np.linspace(start, stop, 513)
@@ -113,7 +113,8 @@ _WINDOW = 8
 _COARSE = 64
 """Number of nodes of the coarse search along the whole flank."""
 _PAD = 4
-"""Segments in excess of nodes on either side: how far the contact may slide in one call."""
+"""Number of segments by which the window of segments exceeds the window of nodes on either side.
+The contact may slide by this distance between two calls."""
 
 
 class _Segments(NamedTuple):
@@ -147,11 +148,11 @@ def _segments(corners: NDArray[np.complex128], curved: bool) -> _Segments:
 
 
 class NodeContact:
-    """Gap of a flank of rotor 1 against its mate on rotor 2, each of about `nodes` nodes.
+    """Gap between a flank of rotor 1 and the mating flank of rotor 2, each of about `nodes` nodes.
 
-    With `curved`, the segments bulge by the flank's curvature, and the deepest point is that of the
-    parabola through three nodes. The gap is then more accurate and smoother. Otherwise segments are
-    straight and the deepest node counts, as in Eq. 9.
+    If `curved`, the segments bulge by the flank's curvature, and the deepest point is the vertex of
+    the parabola through three nodes: the gap is more accurate and smoother. Otherwise segments are
+    straight and the gap is that of the deepest node, as in Eq. 9.
     """
 
     def __init__(self, rotor: Rotor, nodes: int, curved: bool = True):
@@ -184,10 +185,10 @@ class NodeContact:
         return self._search(shift, turn)
 
     def _search(self, shift: complex, turn: complex) -> tuple[float, float, float]:
-        """Return gap and levers.
+        """Return gap (m) and both levers (m).
 
-        Search near the last contact; if it is not there, search everywhere with windows that narrow
-        down.
+        Search near the last contact. If the contact is not there, search the whole flank, with
+        windows that become narrower.
         """
         if self.last is not None:
             window = self._window(shift, turn, *self.last, 1)
@@ -220,7 +221,8 @@ class NodeContact:
         return _Window(low + i * stride, i, first, nodes, gaps, nearest, feet)
 
     def _contact(self, window: "_Window", shift: complex) -> tuple[float, float, float]:
-        """Return gap and levers at the deepest point of a window, and remember that point."""
+        """Return gap (m) and both levers (m) at the deepest point of a window, and store the point
+        for the next search."""
         i, gap = window.i, window.gap
         if not gap < 1.0:
             self.last = None
@@ -239,7 +241,8 @@ class NodeContact:
         return gap, lever1, lever2
 
     def _levers(self, window: "_Window", i: int, shift: complex) -> tuple[float, float]:
-        """Return the distances of the normal at a node's foot from both axes."""
+        """Return both levers (m): the distances from the axes to the normal at the foot of node
+        i."""
         segment, point = window.segment(i), complex(window.nodes[i])
         towards = complex(self.segments.towards[segment])
         if self.curved:
@@ -252,8 +255,9 @@ class NodeContact:
 class _Window(NamedTuple):
     """Nodes of a window, seen from rotor 2.
 
-    The deepest is the i-th, number `node` of the flank. Fields: their gaps (m), their nearest
-    segments, counted from `first`, and their feet (m) on these.
+    Fields: gaps of the nodes (m), the segment nearest to each node (counted from `first`), the foot
+    of each node on its segment (m), the index i of the deepest node in the window, and its number
+    `node` on the flank.
     """
 
     node: int
@@ -279,7 +283,7 @@ class _Window(NamedTuple):
 
 
 def _signed_distances(nodes, segments):
-    """Return each node's signed distance to the nearest segment, that segment and the foot on it.
+    """Return, for each node, the signed distance to the nearest segment, the segment, and the foot.
 
     The distance is inf for a node whose foot would lie beyond either end of the segments.
     """
@@ -314,13 +318,13 @@ def _smooth_step(x: float) -> float:
 
 
 def _balanced_ramp(x: float, width: float) -> float:
-    """Return `_ramp` with the integral of max(0, x)."""
+    """Return a smooth ramp, as `_ramp`, but with the same integral as max(0, x)."""
     t = min(max(x, 0.0) / width, 1.0) if width > 0 else 1.0
     return max(x, 0.0) if t == 1 else width * t * t * (4.5 - 6 * t + 2.5 * t * t)
 
 
 def _balanced_step(x: float) -> float:
-    """Return `_smooth_step` with the integral of a step at 0."""
+    """Return a smooth step, as `_smooth_step`, but with the same integral as a step at 0."""
     t = min(max(x, 0.0), 1.0)
     return t * t * (18 - 32 * t + 15 * t * t)
 
@@ -347,8 +351,9 @@ def _gear(motion: Motion, relative: float, rate: float) -> float:
 
 
 class _Equation:
-    """Right-hand side for the scaled state, or for the state with the integrals of force and
-    force² (scaled)."""
+    """Right-hand side of the equation of motion in scaled states.
+
+    The state may be followed by the integrals of force and force² (scaled)."""
 
     def __init__(self, motion: Motion, contact: NodeContact):
         self.motion, self.contact = motion, contact
@@ -383,8 +388,9 @@ class _Equation:
 class ScipyNodes:
     """Simulator of a scene with SciPy.
 
-    nodes (per flank), curved: see `NodeContact`; method: that of `solve_ivp`; rtol: relative
-    tolerance, also the absolute one of the scaled state; settle, window, max_step: mesh periods.
+    `nodes` (per flank), `curved`: see `NodeContact`; `method` of `solve_ivp`; `rtol`: relative
+    tolerance, also absolute tolerance of the scaled state; `settle`, `window`: mesh periods before
+    and in the window; `max_step`: longest step (mesh periods).
     """
 
     scene: Scene
@@ -439,7 +445,8 @@ class ScipyNodes:
 
 
 def _peak(equation: _Equation, run) -> float:
-    """Return the largest force (N) of the accepted motion: at the steps' ends, then between."""
+    """Return the largest force (N) of the solution: found at the ends of steps, then refined
+    between them."""
 
     def forces(times):
         states = run.sol(times).T[:, :2].tolist()

@@ -1,7 +1,7 @@
-"""The plain way to a steady state, for comparison with closed orbits.
+"""Steady state by plain integration, for comparison with closed orbits.
 
-It integrates until the transient has passed, then averages over one more repetition. Derivatives
-are carried along throughout.
+The motion is integrated until the transient has passed, then averaged over one mesh period.
+Derivatives are carried along throughout.
 """
 
 from typing import Any
@@ -16,14 +16,15 @@ from rootsopt.dynamics.orbit import SAMPLES
 from rootsopt.scene import Scene
 
 _FEW = 64
-"""Number of samples in a mesh period whose peak is not needed."""
+"""Number of samples per mesh period of the transient, whose peak force is not needed."""
 
 
 @eqx.filter_jit
 def averaged(model: Scene, design: Any, settle: Any, how: Integrator) -> tuple[Any, Any]:
-    """Average the mesh period after `settle` others from rest.
+    """Average the contact force over one mesh period, after a transient of `settle` mesh periods.
 
-    Returns (mean, peak) in N, and their derivatives (2, d) per config unit.
+    The motion starts from rest. Returns (mean, peak) in N, and their derivatives (2, d) in N per
+    config unit. `how`: integrator.
     """
     pair, tangents, _ = model.pair_and_tangents(design)
     one = jnp.asarray(1.0)

@@ -53,8 +53,8 @@ class Units(NamedTuple):
 class Context(NamedTuple):
     """The scene that a part is prepared for.
 
-    `inertia` (kg·m²) and `mass` (kg) of one rotor; `pitch_radius` (m); `angle` (rad): unit of ε;
-    `load_torque` (N·m): mean on rotor 2; `speed` (rad/s) of the drive.
+    `inertia` (kg·m²) and `mass` (kg) of one rotor; `pitch_radius` (m); `angle` (rad): the solver's
+    unit of ε; `load_torque` (N·m): mean load torque against rotor 2; `speed` (rad/s) of the drive.
     """
 
     inertia: Float[Array, ""]
@@ -66,8 +66,8 @@ class Context(NamedTuple):
 
 
 class Part(eqx.Module):
-    """Something that acts on a rotor pair: by torques, by forces on the axes or by drag at the
-    flanks. It can have states of its own.
+    """A component that acts on a rotor pair by torques, forces on the axes, or drag at the flanks.
+    A part can have states of its own.
 
     Override the methods that apply to your part. A method you leave out costs nothing: no state, no
     computation. Store every number in a field that holds an array: a response is differentiable
@@ -84,12 +84,12 @@ class Part(eqx.Module):
 
     @property
     def free(self) -> bool:
-        """Whether the part sets rotor 1 free, which makes the speed of rotor 1 a state."""
+        """Whether the speed of rotor 1 is a state instead of prescribed."""
         return False
 
     @property
     def displaces(self) -> bool:
-        """Whether the part lets the axes move (see `axes`). At most one part of a scene may."""
+        """Whether the part lets the axes move (see `axes`). Only one part of a scene can do so."""
         return False
 
     @property
@@ -103,7 +103,9 @@ class Part(eqx.Module):
         return None
 
     def prepare(self: _Part, context: Context) -> _Part:
-        """Return the part with the values it needs from the scene; keep them differentiable."""
+        """Return the part, completed with values from the scene's `context`.
+
+        Keep these values differentiable: store them as JAX arrays."""
         del context
         return self
 
@@ -111,39 +113,40 @@ class Part(eqx.Module):
     # with the difference from `start`, divided by `scales`.
 
     def scales(self, units: Units) -> Float[Array, " m"]:
-        """Return the typical size of each of the part's own states, which the solver divides it by.
+        """Return the typical size (m,) of each of the part's own states, in SI units.
 
-        Raises NotImplementedError for a part that has states but does not override this."""
+        The solver divides states by these sizes. Raises NotImplementedError for a part that has
+        states but does not override this method."""
         raise NotImplementedError(f"`{type(self).__name__}` has states, but no `scales`")
 
     def start(self, units: Units) -> Float[Array, " m"] | None:
-        """Return the part's own states at the start of a motion; None: zero."""
+        """Return the part's own states (m,) at the start of a motion, in SI units; None: zero."""
         del units
         return None
 
     def rates(self, motion: Motion, own: Own, loads: Loads) -> Float[Array, " m"]:
-        """Return the time derivatives of the part's own states `own`.
+        """Return the time derivatives (m,) of the part's own states `own` (SI units).
 
-        Raises NotImplementedError for a part that has states but does not override this."""
+        Raises NotImplementedError for a part that has states but does not override this method."""
         raise NotImplementedError(f"`{type(self).__name__}` has states, but no `rates`")
 
     def axes(
         self, own: Float[Array, "*k m"] | Float[np.ndarray, "*k m"]
     ) -> tuple[Float[Array, "*k 2 2"], Float[Array, "*k 2 2"]]:
-        """Return the displacements (m) of the axes and their velocities (m/s) (rotor, x and y).
+        """Return the displacements (m) and the velocities (m/s) of the axes (rotor, x and y).
 
-        Raises NotImplementedError for a part that `displaces` but does not override this."""
+        Raises NotImplementedError for a part that `displaces` but does not override this method."""
         raise NotImplementedError(f"`{type(self).__name__}` displaces the axes, but has no `axes`")
 
     def lost(self, own: Own) -> Bool[Array, ""] | None:
-        """Return whether a pair with these states no longer runs; None: it always runs."""
+        """Return whether the part's own states stop the pair from running; None: they never do."""
         del own
         return None
 
     # Loads from the part. None: no load.
 
     def torque_on_1(self, motion: Motion, own: Own) -> Float[Array, ""] | None:
-        """Return the torque (N·m) on rotor 1. It is called only where rotor 1 is free."""
+        """Return the torque (N·m) on rotor 1. This method is called only where rotor 1 is free."""
         del motion, own
         return None
 
@@ -155,28 +158,28 @@ class Part(eqx.Module):
     def force_on_axes(self, motion: Motion, own: Own) -> Float[Array, "2 2"] | None:
         """Return the forces (N) on the axes (rotor, x and y).
 
-        It is called only where a part `displaces` the axes."""
+        This method is called only where a part `displaces` the axes."""
         del motion, own
         return None
 
     def drag(self, force: Float[Array, ""], sliding: Float[Array, ""]) -> Float[Array, ""]:
         """Return the tangential force (N) at a contact with the normal `force` (N).
 
-        It has the sign of `sliding`, the speed (m/s) at which rotor 1 slides on rotor 2.
+        The result has the sign of `sliding`, the speed (m/s) at which rotor 1 slides on rotor 2.
 
-        Raises NotImplementedError for a part that `rubs` but does not override this."""
+        Raises NotImplementedError for a part that `rubs` but does not override this method."""
         raise NotImplementedError(f"`{type(self).__name__}` rubs, but has no `drag`")
 
-    # Flags of the smooth piece that the part's equations are on. One flag changes at each kink or
-    # jump. If a flag is missing, integrals lose accuracy and derivatives are wrong.
+    # Flags that change at each kink or jump of the part's equations. If a flag is missing,
+    # integrals lose accuracy and derivatives are wrong.
 
     def switches(self, motion: Motion, own: Own) -> Bool[Array, " s"]:
-        """Return flags of the smooth piece that the torques, forces and rates are on."""
+        """Return flags (s,) that change where the part's loads or rates are not smooth."""
         del motion, own
         return jnp.zeros(0, bool)
 
     def drag_switches(self, sliding: Float[Array, ""]) -> Bool[Array, " s"]:
-        """Return flags of the smooth piece that the drag is on at the speed `sliding` (m/s)."""
+        """Return flags (s,) that change where the drag is not smooth in `sliding` (m/s)."""
         del sliding
         return jnp.zeros(0, bool)
 
@@ -184,8 +187,8 @@ class Part(eqx.Module):
 
     @property
     def play(self) -> Float[Array, ""] | None:
-        """Half the range of ε (rad) over which the part leaves the rotors loose; None for a part
-        that never holds them."""
+        """Half the range of ε (rad) over which the part does not hold the rotors together; None for
+        a part that never holds them."""
         return None
 
     @property
@@ -199,7 +202,8 @@ class Part(eqx.Module):
         return None
 
     def quickest(self, inertia: Float[Array, ""]) -> Float[Array, ""] | None:
-        """Return 1/ω (s) of the part's fastest oscillation, on rotors of this `inertia` (kg·m²);
-        None: it has no oscillation of its own."""
+        """Return 1/ω (s) of the part's fastest oscillation; None: no oscillation of its own.
+
+        `inertia` (kg·m²) of one rotor."""
         del inertia
         return None

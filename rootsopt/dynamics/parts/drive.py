@@ -26,7 +26,7 @@ class MotorDrive(Drive):
     """A motor on rotor 1 with a straight torque-speed line.
 
     `torque` (N·m) at `speed` (rad/s); `slope` (N·m·s/rad): loss of torque for each rad/s above
-    `speed`; `inertia` (kg·m²) of the motor, which is added to that of rotor 1.
+    `speed`; `inertia` (kg·m²) of the motor, which is added to the inertia of rotor 1.
     """
 
     speed: Float[Array, ""]

@@ -10,9 +10,9 @@ from rootsopt.dynamics.parts.base import Part
 class Friction(Part):
     """Coefficient of friction as a function of the sliding speed, as in multibody programs.
 
-    It rises from -`static` to `static` between -`stiction_speed` and `stiction_speed` (m/s). It
-    falls to `kinetic` at `friction_speed` (m/s). Both changes are cubic steps, so the coefficient
-    is continuously differentiable. The price: flanks never stick, they creep slowly.
+    The coefficient rises from -`static` to `static` between -`stiction_speed` and `stiction_speed`
+    (m/s). It falls to `kinetic` at `friction_speed` (m/s). Both changes are cubic steps, so the
+    coefficient is continuously differentiable. As a consequence, flanks never stick: they creep.
     """
 
     static: Float[Array, ""]
@@ -35,6 +35,7 @@ class Friction(Part):
         return self(sliding) * force
 
     def drag_switches(self, sliding: Float[Array, ""]) -> Bool[Array, "4"]:
-        """Return flags of the smooth piece that the coefficient is on."""
+        """Return flags (4,) that change where the coefficient is not smooth: at ±`stiction_speed`
+        and ±`friction_speed`."""
         speeds = jnp.stack([self.stiction_speed, self.friction_speed])
         return sliding > jnp.concatenate([speeds, -speeds])

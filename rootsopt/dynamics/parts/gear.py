@@ -12,10 +12,10 @@ class TimingGear(Part):
 
     The torque is zero for |ε| ≤ `half_backlash` (rad). Beyond that, it is `stiffness` (N·m/rad)
     times the excess plus `damping` (N·m·s/rad) times dε/dt. Both ends of the backlash are rounded
-    over the first `rounding` (rad) of the excess. The rounding keeps the integral of the torque
-    over ε: a motion that crosses it loses the same energy to the spring, and the same momentum to
-    the damper, as at a sharp edge. `offset` (rad): ε at the middle of the backlash, for a gear
-    mounted out of phase; None: no offset.
+    over the first `rounding` (rad) of the excess. The rounding preserves integrals over ε: a motion
+    through the rounding loses the same energy to the spring, and the same momentum to the damper,
+    as at a sharp edge. `offset` (rad): ε at the middle of the backlash, for a gear mounted out of
+    phase; None: no offset.
     """
 
     stiffness: Float[Array, ""]
@@ -58,10 +58,11 @@ class TimingGear(Part):
         return self.stiffness
 
     def switches(self, motion: Motion, own) -> Bool[Array, "2"]:
-        """Return flags of the smooth piece that the gear is on: engaged, beyond the rounding."""
+        """Return flags (2,): whether the gear is engaged, and whether it is beyond the rounding."""
         del own
         excess = jnp.abs(self._from_middle(motion.relative)) - self.half_backlash
         return excess > jnp.stack([jnp.zeros_like(self.rounding), self.rounding])
 
     def _from_middle(self, relative):
+        """Return ε (rad) relative to the middle of the backlash."""
         return relative if self.offset is None else relative - self.offset

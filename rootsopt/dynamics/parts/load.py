@@ -72,11 +72,11 @@ class GasLoad(Load):
 
         T = Δp L (r_a² - ρ²) / 2.
 
-    ρ is that of perfect rolling at φ1; ε would change it only by terms of order ε. Averaged over a
-    turn, the torques on both rotors together equal the displaced volume times Δp / 2π. This is
-    exact unless a whole tip arc meshes at one instant (a canonical CIC profile). There ρ jumps, and
-    the jump is spread over `_BRIEF`. The pressure at a wide gap does not jump, and the derivatives
-    of a jump that moves with the design would need separate treatment.
+    ρ is computed for perfect rolling at φ1; the effect of ε on ρ, of order ε, is neglected.
+    Averaged over a turn, the torques on both rotors together equal the displaced volume times
+    Δp / 2π. This is exact unless a whole tip arc meshes at one instant (a canonical CIC profile).
+    There ρ jumps, and the jump is spread over `_BRIEF`. The pressure at a wide gap does not jump,
+    and the derivatives of a jump that moves with the design would need separate treatment.
 
     `pressure_length` (N/m): pressure difference Δp (Pa) times the rotor's length L (m); `profile`;
     `outer_radius` r_a (m); `torque`: mean torque against one rotor (N·m).
