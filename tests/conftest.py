@@ -51,6 +51,7 @@ _OPTIMISED = (
     "experiments",
     "gradients",
     "optimize",
+    "response",
 )
 """Files that compute longer than they compile."""
 

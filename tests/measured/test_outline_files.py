@@ -177,12 +177,12 @@ def test_senseless_entities(tmp_path, name):
 SPLINES = {
     "equal knots": ({"knots": [1.0] * 8}, "equal knots"),
     "falling knots": ({"knots": [0, 0, 0, 0, 1, 1, 1, 0.5]}, "rising order"),
-    "few knots": ({"knots": [0, 0, 1, 1]}, "1 of 1 SPLINE make no sense .*knot value count: 4 < 8"),
+    "few knots": ({"knots": [0, 0, 1, 1]}, "1 of 1 SPLINE are not valid .*knot value count: 4 < 8"),
     "no weight": ({"weights": [0.0] * 4}, "weights above 0"),
-    "two weights": ({"weights": [1.0, 1.0]}, "make no sense .*weight count: 2 != 4"),
+    "two weights": ({"weights": [1.0, 1.0]}, "are not valid .*weight count: 2 != 4"),
     "few points": (
         {"control_points": [(0, 0), (1, 1)]},
-        "make no sense .*control point count: 2 < 4",
+        "are not valid .*control point count: 2 < 4",
     ),
 }
 
@@ -337,7 +337,7 @@ def test_what_does_not_belong_to_the_outline(tmp_path):
 
     loop = drawn(tmp_path / "clean.dxf", clean)
     assert sorted(loop.points, key=np.angle) == pytest.approx(sorted(ROTOR, key=np.angle))
-    with pytest.raises(InputError, match=r"in one way from point to point, but 3 ends meet at \("):
+    with pytest.raises(InputError, match=r"must not branch, but 3 ends meet at \("):
         drawn(tmp_path / "chord.dxf", draw)
 
 
