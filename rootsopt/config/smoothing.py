@@ -30,8 +30,8 @@ def following_mm(
 
     `load_torque` (N·m): torque on rotor 2. `gear_stiffness` (N·m/rad): stiffness of the timing
     gear, `None` without a gear. `contact`: stiffness (N/mm^e), exponent and depth of full damping
-    (mm) of the flanks. `precision`: `float64` or `float32`. The length changes every force by less
-    than 1e-4 of its value (`python -m experiments.smoothing`).
+    (mm) of the flanks. `precision`: `float64` or `float32`. Rounding over this length changes every
+    force by less than 1e-4 of its value (`python -m experiments.smoothing`).
     """
     torque = max(load_torque, _LEAST_LOAD)
     stiffness, exponent, full = contact

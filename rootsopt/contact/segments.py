@@ -64,8 +64,7 @@ class NodeContact(Contact):
 
     @classmethod
     def of(cls, profile: Profile, nodes: int) -> "NodeContact":
-        """Return the contact of `profile` with `nodes` per whole flank, of which half on the
-        addendum.
+        """Return the contact of `profile` with `nodes` per flank, half of them on the addendum.
 
         Nodes are evenly spaced with respect to the longer of the two mating arc elements plus a
         constant. The constant ensures enough nodes at the pitch crossing of EE, where the flank is

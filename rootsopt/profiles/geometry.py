@@ -24,7 +24,7 @@ error, 1e-13."""
 class Geometry(eqx.Module):
     """Geometry of one rotor's cross-section (SI units).
 
-    `outer_radius`, `root_radius`: greatest and least distance of the outline from the axis (m).
+    `outer_radius` r_a, `root_radius`: greatest and least distance of the outline from the axis (m).
     `area`: A (m²). `area_efficiency`: 1 - A/(π r_a²). `polar_area_moment`: ∫r² dA about the axis
     (m⁴). `undercut_margin`: least `Profile.dedendum_speed` (m per rad). `seal_width`: arc length of
     the whole tip land (m).

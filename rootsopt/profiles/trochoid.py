@@ -10,9 +10,7 @@ from rootsopt.profiles.curve import Curve, RollPiece
 def extended_cycloid(
     lobes: int, pitch_radius: Float[ArrayLike, ""], trochoid_ratio: Float[ArrayLike, ""]
 ) -> Curve:
-    """Return an epicycloid whose tracing point changes its distance from the rolling circle.
-
-    That distance is measured from the rolling circle's centre.
+    """Return an epicycloid traced by a point at varying distance from the rolling circle's centre.
 
     `lobes`: N; `pitch_radius`: r (m). With r_e = r / 2N the curve is
     P(θ) = e^{iθ} [r + r_e + λ(θ) r_e e^{2iNθ}], from the tip (θ = 0) to the pitch crossing
