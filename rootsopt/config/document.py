@@ -110,8 +110,8 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def _count(self, nodes: int, height: int, mark) -> None:
-        """Count a complete node towards its parent: the number of its `nodes`, its `height` in
-        levels."""
+        """Count a complete node, with its number of `nodes` and levels (`height`), in its
+        parent."""
         if len(self._open) + height > _DEEPEST:
             raise _wrong(f"there are more than {_DEEPEST} nested levels", mark)
         if not self._open:

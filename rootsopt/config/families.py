@@ -97,8 +97,8 @@ class Parameter:
         return self.radii[0] * pitch_radius_mm, self.radii[1] * pitch_radius_mm
 
     def usually(self, pitch_radius_mm: float, lobes: int) -> Pair:
-        """Return the usual range (low, high) for this pitch radius and these lobes, in the key's
-        unit."""
+        """Return the usual range (low, high), in the key's unit, for this size and number of
+        lobes."""
         del lobes
         if self.usual is not None and self.radii is None:
             return self.usual
@@ -108,8 +108,7 @@ class Parameter:
         return _ANY_ANGLE if self.key.endswith("_deg") else _ANY_NUMBER
 
     def bounds(self, profile: "ProfileConfig") -> Pair:
-        """Return the bounds (low, high), in the key's unit, of an optimisation without given
-        bounds.
+        """Return the bounds (low, high), in the key's unit, that apply if the config gives none.
 
         The field `default_bounds` is not used here: it is the default in the config."""
         if self.usual is not None:
@@ -124,8 +123,7 @@ class Parameter:
         reject some."""
 
     def field(self, families: list[str]) -> tuple[Any, Any]:
-        """Return (annotation, pydantic field) of the key; `families` are named in its
-        description."""
+        """Return (annotation, pydantic field) of the key; its description names the `families`."""
         limits = between(self.lowest, self.highest)
         if self.below:
             limits = Field(ge=self.lowest, lt=self.highest)

@@ -158,8 +158,7 @@ class RotorConfig(Section):
 
 
 class FrictionConfig(Section):
-    """Coulomb friction between the flanks, with stiction and friction transition speeds as in
-    multibody programs."""
+    """Coulomb friction between the flanks, with transition speeds as in multibody programs."""
 
     static: Annotated[float, Field(ge=0, le=2)] = Field(0.2, description="static coefficient")
     kinetic: Annotated[float, Field(ge=0, le=2)] = Field(0.1, description="kinetic coefficient")

@@ -62,8 +62,7 @@ def _interpolation_matrix(count: int) -> NDArray[np.float64]:
 
 
 def _weights(t):
-    """Return (values, first derivatives, second derivatives) of 4 B-splines at fraction t of a
-    cell."""
+    """Return (values, slopes, second derivatives) of the 4 B-splines at fraction t of a cell."""
     u = 1 - t
     value = jnp.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]) / 6
     slope = jnp.stack([-(u**2), 3 * t**2 - 4 * t, -3 * u**2 + 4 * u, t**2]) / 2

@@ -134,8 +134,7 @@ class _Seen(NamedTuple):
 
 
 class _Look:
-    """Compares the member of a `family` that has a given design with a `profile`; caches
-    results."""
+    """Compares the member of a `family` with a given design to a `profile`; caches results."""
 
     def __init__(self, profile: Profile, family: str):
         self.family, self.lobes, self.radius = family, profile.lobes, profile.pitch_radius

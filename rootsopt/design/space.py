@@ -148,7 +148,7 @@ class Space(eqx.Module):
         return dict(self.family.dependent(self.scene.lobes, radius, **named))
 
     def _within(self, values):
-        """Yield (index in the design, low, high) for parameters in `ranges`, limited to their
+        """Yield (index in the design, low, high) for parameters in `ranges`, within their
         bounds."""
         for key, (least, most) in self.ranges(values).items():
             place = self.family.keys.index(key)

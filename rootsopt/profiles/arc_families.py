@@ -12,8 +12,7 @@ from rootsopt.profiles.arcs import Arcs
 
 
 def arc(lobes: int, pitch_radius: Float[ArrayLike, ""], arc_center: Float[ArrayLike, ""]) -> Arcs:
-    """Return a lobe of one circular arc through both pitch crossings ("single arc" in the
-    literature).
+    """Return a lobe of one circular arc through both pitch crossings (literature: "single arc").
 
     `lobes`: N; `pitch_radius`: r (m). `arc_center`: b (m), distance of the arc's centre from the
     rotor's axis, along the lobe's axis. The arc's radius is √(r² + b² - 2 r b cos π/2N)."""

@@ -91,8 +91,7 @@ class Arcs(Profile):
         return tuple(parts)
 
     def _arc(self, nu):
-        """Return the index of the arc at `nu`; the end arcs continue beyond the tip and the
-        crossing."""
+        """Return the index of the arc at `nu`; the first and last arcs extend beyond their ends."""
         return jnp.sum(nu[..., None] > self.joints[1:-1], axis=-1)
 
     def lever(self, nu):

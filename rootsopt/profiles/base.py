@@ -128,8 +128,7 @@ class Profile(eqx.Module):
         return Quadrature(64, True, 128)
 
     def _cut(self, segment: Segment, place: Float[Array, ""]) -> tuple[Segment, Segment]:
-        """Split a segment at the normal angle `place` (rad), which is first clipped to the
-        segment."""
+        """Split a segment at the normal angle `place` (rad), clipped to the segment's range."""
         name, start, stop, land = segment
         middle = jnp.clip(lax.stop_gradient(place), start, stop)
         return Segment(name, start, middle, land), Segment(name, middle, stop, land)

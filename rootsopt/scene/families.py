@@ -60,8 +60,7 @@ def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:
 
 
 def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, float]:
-    """Return (config of a free form fitted to a profile, greatest distance (m) between both
-    flanks).
+    """Return (config of a free form fitted to a profile, greatest distance (m) from it).
 
     `config`: config of the given profile; `count`: number of coefficients. Raises `InputError` for
     an outline from a file."""
