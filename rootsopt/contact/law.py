@@ -32,7 +32,7 @@ class ContactLaw(eqx.Module):
         The result must be differentiable with respect to the force and the law."""
 
     def switches(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Bool[Array, " s"]:
-        """Return flags (s,) that identify the law's smooth piece; by default, one flag: contact."""
+        """Return flags (s,) that identify the law's smooth piece; by default, whether it acts."""
         del rate
         return jnp.stack([depth > 0])
 
