@@ -1,7 +1,7 @@
-"""Configuration: YAML in, typed settings out.
+"""Reads a config from YAML and returns typed settings.
 
 Only this package knows the config's file format. Each key carries its unit; `rootsopt.scene`
-converts to SI. Raises `InputError` for a wrong file, key or value: one message that names the key,
+converts to SI. A wrong file, key or value raises `InputError`, with one message that names the key,
 the value and what is allowed.
 """
 
@@ -12,7 +12,7 @@ from rootsopt.config.study import EnsembleConfig, SolverConfig
 from rootsopt.config.units import hint
 
 load_config = load
-"""Name of `load` in the package `rootsopt`."""
+"""Alias of `load`: the name under which the package `rootsopt` exports it."""
 DESIGN_KEYS = FAMILY_KEYS["cic"]
 """Config keys of the design parameters of a CIC rotor."""
 

@@ -1,4 +1,4 @@
-"""The built-in profile families, registered like any other."""
+"""Registers the built-in profile families, in the same way as any other family."""
 
 import dataclasses
 import math
@@ -11,16 +11,17 @@ if TYPE_CHECKING:
     from rootsopt.config.scene import ProfileConfig
 
 _LONGEST = 5e4
-"""Length (mm) above which a config's parameter is rejected."""
+"""Length (mm) above which a config is rejected, whatever its pitch radius."""
 _SHARES = 0.002, 10.0
-"""Lengths of a profile (pitch radii) below and above which a config is rejected."""
+"""Least and greatest length (pitch radii) of a profile; a config outside this range is rejected."""
 _NO_FLOOR = 0.0, 10.0
-"""Range that replaces `_SHARES` for a length whose only lower limit is the one of its key (mm)."""
+"""Range (pitch radii) that replaces `_SHARES` for a length whose lower limit is set by its key (in
+mm) or by its family."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _LandAngle(Parameter):
-    """Half angle of a tip land; its bounds must stay below a quarter of the lobe pitch."""
+    """Half angle of a tip land. Its bounds must stay below a quarter of the lobe pitch."""
 
     def usually(self, pitch_radius_mm: float, lobes: int) -> Pair:
         return 0.0, 45.0 / lobes
@@ -35,7 +36,7 @@ class _LandAngle(Parameter):
 
 
 class _Dependent(Parameter):
-    """Length without default bounds: the `ranges` of its family limit a search instead."""
+    """Length without default bounds. Instead, the `ranges` of its family limit a search."""
 
     def bounds(self, profile: "ProfileConfig") -> Pair:
         del profile

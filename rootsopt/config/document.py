@@ -1,8 +1,9 @@
 """Reads one YAML document as plain data, within size limits.
 
-The language is YAML 1.1 as PyYAML reads it, without its surprises in a config. `1e5` is a number;
-`1:30`, `2020-01-01`, `yes` and `off` are words; `010` is ten. A key may appear once in a section.
-Tags yield plain data only. Anchors, aliases and merge keys work while their expansion is small.
+The language is YAML 1.1 as PyYAML reads it, with some exceptions that suit a config. `1e5` is a
+number; `1:30`, `2020-01-01`, `yes` and `off` are words; `010` is ten. A key may appear once in a
+section. Tags yield plain data only. Anchors, aliases and merge keys work while their expansion is
+small.
 """
 
 import re
@@ -17,17 +18,18 @@ from rootsopt.config.words import clipped, named, sentence, shown
 from rootsopt.errors import InputError
 
 MOST_BYTES = 128 * 1024
-"""Text size (bytes) above which a document is rejected; a config has some 2000 bytes."""
+"""Text size (bytes) above which a document is rejected. A typical config has about 2000 bytes."""
 _MOST_NODES = 5000
-"""Number of keys, values, lists and sections, aliases expanded, above which a document is rejected.
+"""Number of keys, values, lists and sections above which a document is rejected. Aliases are
+expanded before counting.
 """
 _DEEPEST = 32
-"""Levels of nested sections and lists above which a document is rejected."""
+"""Number of nested levels (sections and lists) above which a document is rejected."""
 _LONGEST_VALUE = 4096
 """Length of a scalar (characters) above which a document is rejected."""
 _MOST_DIGITS = 400
-"""Length of a number (characters) above which a document is rejected; a double has at most 309
-digits before its point."""
+"""Length of a number (characters) above which a document is rejected. A double has at most 309
+digits before its decimal point."""
 
 _TAG = "tag:yaml.org,2002:"
 _MERGE = _TAG + "merge"
@@ -37,7 +39,7 @@ def read_document(text: str, source: str) -> Any:
     """Return a YAML text as dictionaries, lists and plain values.
 
     `source` names the text in messages. No dictionary or list appears twice in the result.
-    Raises `InputError` where the text is too large or not valid."""
+    Raises `InputError` if the text is too large or not valid."""
     if len(text.encode("utf-8", "surrogatepass")) > MOST_BYTES:
         raise InputError(
             f"{source}: must have at most {MOST_BYTES} bytes, but has more; is that a config?"
@@ -51,7 +53,7 @@ def read_document(text: str, source: str) -> Any:
 
 
 def _told(error: Exception) -> str:
-    """Return the line number and the problem of a YAML reader's error, as text for a message."""
+    """Return the line number and the problem of a YAML error, as text for a message."""
     mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
     place = f" (line {mark.line + 1})" if mark is not None else ""
     problem = getattr(error, "problem", None)
@@ -108,7 +110,8 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def _count(self, nodes: int, height: int, mark) -> None:
-        """Add a complete node (`nodes` in total, `height` levels) to the node that contains it."""
+        """Count a complete node, with its number of `nodes` and levels (`height`), in its
+        parent."""
         if len(self._open) + height > _DEEPEST:
             raise _wrong(f"there are more than {_DEEPEST} nested levels", mark)
         if not self._open:
@@ -207,9 +210,9 @@ def _real(text: str) -> float:
 
 
 def _scalar(kind: str, read: Callable[[str], Any]) -> None:
-    """Make `read` the function for scalars of a `kind`.
+    """Use `read` to convert scalars of a `kind`.
 
-    It must raise `ValueError`, `KeyError` or `OverflowError` for text that is not valid."""
+    `read` must raise `ValueError`, `KeyError` or `OverflowError` for text that is not valid."""
 
     def construct(loader, node):
         text = loader.construct_scalar(node)

@@ -13,14 +13,14 @@ from rootsopt.config.units import hint, unit_of
 from rootsopt.config.words import named, shown
 
 _MOST_NAMES = 12
-"""Greatest number of valid keys that a message lists."""
+"""Number of valid keys above which a message lists only the first ones."""
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
     """Return one sentence on the problem that pydantic's `error` reports in a config.
 
-    `model`: type of the config. Of several problems, report the first unknown key, or else the
-    first problem."""
+    `model`: type of the config. If there are several problems, report the first unknown key. If no
+    key is unknown, report the first problem."""
     problems = error.errors(include_url=False)
     first = next((p for p in problems if p["type"] in _UNKNOWN), problems[0])
     place, rest = _split(model, first["loc"])
@@ -50,7 +50,7 @@ _UNKNOWN = ("extra_forbidden", "invalid_key")
 
 
 def _split(model: type[BaseModel], location: tuple) -> tuple[list[Any], list[Any]]:
-    """Split pydantic's location of an error into the config's keys and the parts after them."""
+    """Split the location of a pydantic error into the config's keys and the parts after them."""
     place: list[Any] = []
     inner: type[BaseModel] | None = model
     for number, part in enumerate(location):
@@ -63,9 +63,9 @@ def _split(model: type[BaseModel], location: tuple) -> tuple[list[Any], list[Any
 
 
 def _branch(first, problems, place):
-    """Return the problem to report for a key that takes a word or a number.
+    """Return the problem to report for a key that accepts a word or a number.
 
-    If its value is a number, report what is wrong with the number, not that it is not a word."""
+    For a number, this is what is wrong with the number, not that it is not a word."""
     if first["type"] != "literal_error" or not _is_number(first.get("input")):
         return first
     size = len(place)
@@ -121,7 +121,7 @@ def _allowed(kind: str, value: Any, context: dict, message: str, field: FieldInf
 
 
 def _advice(place: list, kind: str, value: Any, field: FieldInfo | None) -> str:
-    """Return the end of a message, with a guess at what the user meant; "" without a guess."""
+    """Return the end of a message: a guess at what the user meant, or "" if there is none."""
     if field is None:
         return ""
     if kind in ("greater_than_equal", "less_than_equal", "less_than") and _is_number(value):
@@ -181,7 +181,7 @@ def _unknown(model: type[BaseModel], place: list) -> str:
 
 
 def all_keys(model: type[BaseModel], prefix: str = ""):
-    """Yield the dotted names of all sections and keys of a `model`, each after the `prefix`."""
+    """Yield the dotted names of all sections and keys of a `model`, each preceded by `prefix`."""
     for name, field in model.model_fields.items():
         inner = _model_of(field.annotation)
         yield f"{prefix}{name}"
@@ -201,7 +201,7 @@ class Limits(NamedTuple):
     def ends(self) -> tuple[float, float]:
         """Ends (low, high) of the range, infinite where there is no limit.
 
-        An end that the range excludes (`gt`, `lt`) is given like any other."""
+        An end that is excluded from the range (`gt`, `lt`) is also returned."""
         low = self.ge if self.ge is not None else self.gt
         high = self.le if self.le is not None else self.lt
         return (float("-inf") if low is None else low, float("inf") if high is None else high)

@@ -1,7 +1,7 @@
-"""The table of profile families: names, parameters, limits, default bounds and help of each.
+"""The table of profile families, with the name, parameters, limits, bounds and help of each family.
 
-A family is one `Family` object. `register_family` adds it to the table, also for the built-in
-families (`rootsopt.config.catalogue`). The table determines config keys, `--help`,
+A family is one `Family` object. `register_family` adds it to the table; the built-in families
+(`rootsopt.config.catalogue`) are added in the same way. The table determines config keys, `--help`,
 messages, the optimiser's bounds and the checks that a profile is sound. Nothing here needs JAX: a
 function that makes profiles may be named as "module:function" and is loaded when first needed.
 """
@@ -34,34 +34,35 @@ if TYPE_CHECKING:
 MARGINS = (
     *("turning", "convexity", "reach", "fall", "rolling", "order", "undercut", "star", "root"),
 )
-"""Names of the margins that a sound profile has ≥ 0; `rootsopt.profiles.validity` defines them."""
+"""Names of the margins that are ≥ 0 in a sound profile (see `rootsopt.profiles.validity`)."""
 ENTRY_POINTS = "rootsopt.families"
-"""Entry-point group in which an installed package offers families, each under its name."""
+"""Entry-point group in which installed packages offer families, each under its own name."""
 _ANY_LENGTH, _ANY_ANGLE, _ANY_NUMBER = (0.01, 1.5), (0.0, 90.0), (0.0, 2.0)
-"""Usual ranges of a length (pitch radii), an angle (°) and a number, for a parameter without its
-own."""
+"""Usual ranges of a length (pitch radii), an angle (°) and a plain number, for parameters that
+specify no usual range."""
 _AROUND = (0.5, 1.5)
 """Default bounds of a parameter without a usual range, as multiples of the config's own value."""
 _WORD = re.compile(r"[a-z][a-z0-9_]*")
 
 Pair = tuple[float, float]
 Hook = Callable[..., Any] | str
-"""A function, or the name to import it by: "module:function"."""
+"""A function, or its import name "module:function"."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
     """A design parameter in the config, shared by all families that name it.
 
-    `key`: name in the config; its ending is the unit, `_mm`, `_deg` or none.
-    `help`: meaning, a few words.
-    `lowest`, `highest`: least and greatest value in a config; `below`: exclude `highest` itself.
+    `key`: name in the config; it ends in the unit, `_mm` or `_deg`, if there is one.
+    `help`: meaning, in a few words.
+    `lowest`, `highest`: least and greatest value in a config.
+    `below`: whether `highest` itself is excluded.
     `radii`: for a length that scales with the rotor, its least and greatest value in pitch radii.
     `usual`: usual range, in pitch radii if `radii` is given; also the default bounds of an
     optimisation. `None`: the default bounds are 0.5 to 1.5 times the config's own value.
     `default_bounds`: default bounds that replace `usual` and are written out in every config.
-    `bounds_limits`: limits of the bounds, where narrower than `lowest` and `highest`.
-    `bounds_note`: text on the default bounds for `--help`, instead of the generated one.
+    `bounds_limits`: limits of the bounds, if they are narrower than `lowest` and `highest`.
+    `bounds_note`: text for `--help` that replaces the generated description of the default bounds.
     `count`: least and greatest length if the key holds a list of parameters; `None`: one number.
     """
 
@@ -79,7 +80,7 @@ class Parameter:
 
     @property
     def argument(self) -> str:
-        """Name of the matching argument of a family's maker: the key without its unit."""
+        """Name of the corresponding argument of `Family.maker`: the key without its unit."""
         return self.key.removesuffix("_mm").removesuffix("_deg")
 
     @property
@@ -88,15 +89,16 @@ class Parameter:
         return si_unit(self.key)
 
     def limits(self, pitch_radius_mm: float) -> Pair | None:
-        """Return the least and greatest length (mm) at a pitch radius (mm).
+        """Return the least and greatest length (mm) allowed at this pitch radius.
 
-        `None`: the limits do not depend on the rotor's size."""
+        `None`: the limits do not depend on the pitch radius."""
         if self.radii is None:
             return None
         return self.radii[0] * pitch_radius_mm, self.radii[1] * pitch_radius_mm
 
     def usually(self, pitch_radius_mm: float, lobes: int) -> Pair:
-        """Return the usual range (low, high), in the key's unit, for a rotor of this size."""
+        """Return the usual range (low, high), in the key's unit, for this size and number of
+        lobes."""
         del lobes
         if self.usual is not None and self.radii is None:
             return self.usual
@@ -106,7 +108,9 @@ class Parameter:
         return _ANY_ANGLE if self.key.endswith("_deg") else _ANY_NUMBER
 
     def bounds(self, profile: "ProfileConfig") -> Pair:
-        """Return the default bounds (low, high) of an optimisation, in the key's unit."""
+        """Return the bounds (low, high), in the key's unit, that apply if the config gives none.
+
+        The field `default_bounds` is not used here: it is the default in the config."""
         if self.usual is not None:
             return self.usually(profile.pitch_radius_mm, profile.lobes)
         value = abs(getattr(profile, self.key))
@@ -115,10 +119,11 @@ class Parameter:
     def check_bounds(self, bounds: Pair, lobes: int) -> None:
         """Raise `InputError` for bounds that are impossible with this number of lobes.
 
-        By default all bounds are accepted. A subclass may reject some."""
+        `bounds`: (low, high) in the key's unit. By default, all bounds are accepted. A subclass may
+        reject some."""
 
     def field(self, families: list[str]) -> tuple[Any, Any]:
-        """Return (annotation, pydantic field) of the key; the field's help names the `families`."""
+        """Return (annotation, pydantic field) of the key; its description names the `families`."""
         limits = between(self.lowest, self.highest)
         if self.below:
             limits = Field(ge=self.lowest, lt=self.highest)
@@ -130,7 +135,7 @@ class Parameter:
         return kind | None, Field(None, description=f"{', '.join(families)}: {self.help}")
 
     def bounds_field(self) -> tuple[Any, Any]:
-        """Return (annotation, pydantic field) of the key's bounds."""
+        """Return (annotation, pydantic field) of the bounds of this parameter."""
         least, most = self.bounds_limits or (self.lowest, self.highest)
         note = f"{self._bounds_words()}; from {least:g} to {most:g}"
         kind: Any = Pair if self.default_bounds is not None else Pair | None
@@ -152,15 +157,16 @@ class Family:
     """A profile family: its config keys and how its profiles are made.
 
     `name`: the word in `profile.family`; `help`: one line on the curves of its addendum.
-    `maker`: makes a `Profile` from `lobes`, `pitch_radius` (m) and the parameters in SI units.
-    Each argument is a key without its unit: `maker(lobes, pitch_radius, arc_center=0.03)`.
-    `None`: the profile is in a file.
-    `parameters`: design parameters in the order of a design; a list comes last.
-    `example`: a sound design for three lobes and a pitch radius of 33 mm, by key.
+    `maker`: function that returns a `Profile` from `lobes`, `pitch_radius` (m) and the parameters
+    in SI units. Each parameter is passed under its key without the unit, as in
+    `maker(lobes, pitch_radius, arc_center=0.03)`. `None`: the profile is read from a file.
+    `parameters`: design parameters, in the order of their values in a design; a list comes last.
+    `example`: values, by key, of a sound design with three lobes and a pitch radius of 33 mm.
     `remedy`: what to change if a profile is not sound; completes a message, without a full stop.
-    `inherent`: those of `MARGINS` that may be negative in this family.
-    `limits`: called with the `ProfileConfig`; raises `InputError` where a closed-form limit is
-    violated. `by_limits`: these limits ensure a sound profile, so the margins are not checked.
+    `inherent`: names from `MARGINS` of the margins that may be negative in this family.
+    `limits`: called with the `ProfileConfig`; raises `InputError` if a closed-form limit is
+    violated.
+    `by_limits`: whether these limits ensure a sound profile, so that the margins are not checked.
     `ranges`: called with `lobes`, `pitch_radius_mm` and the values by key; returns (low, high) by
     key for parameters whose range depends on the others. The optimiser searches such a parameter
     as a fraction of this range, within its bounds.
@@ -185,32 +191,33 @@ class Family:
         return tuple(parameter.key for parameter in self.parameters)
 
     def split(self, design: Any) -> list[Any]:
-        """Split a design (d,) into one value per parameter: a number, or a slice for a list."""
+        """Split a design (d,) into one entry per parameter: a number, or for a list a slice."""
         places = enumerate(self.parameters)
         return [design[k] if one.count is None else design[k:] for k, one in places]
 
     @property
     def classical(self) -> bool:
-        """Whether every design parameter is one named number: neither a list nor a file."""
+        """Whether profiles are made from named numbers only, not from a list or a file."""
         lists = any(parameter.count is not None for parameter in self.parameters)
         return self.maker is not None and not lists
 
     def make(self, lobes: int, pitch_radius: Any, **parameters: Any) -> Any:
         """Return the `Profile` with a `pitch_radius` (m) and `parameters` (SI units).
 
-        `parameters`: by the names of the maker's arguments. Raises `TypeError` for a family whose
-        profiles are in files."""
+        The names of the `parameters` are the keys without units. Raises `TypeError` for a family
+        whose profiles are read from files."""
         return _found(self.maker)(lobes, pitch_radius, **parameters)
 
     def check(self, profile: "ProfileConfig") -> None:
-        """Raise `InputError` where a profile violates a closed-form limit."""
+        """Raise `InputError` if a profile violates a closed-form limit."""
         if self.limits is not None:
             _found(self.limits)(profile)
 
     def dependent(self, lobes: int, pitch_radius_mm: Any, **values: Any) -> Mapping[str, Any]:
         """Return {key: (low, high)} for the parameters whose range depends on the others.
 
-        `values`: all parameters by key. Values and ranges are in the units of the keys."""
+        `pitch_radius_mm`: pitch radius (mm); `values`: all parameters by key. Values and ranges are
+        in the units of the keys."""
         if self.ranges is None:
             return {}
         return _found(self.ranges)(lobes, pitch_radius_mm, **values)
@@ -225,9 +232,9 @@ FAMILY_KEYS: dict[str, tuple[str, ...]] = {}
 
 
 def register_family(family: Family) -> Family:
-    """Add a family to the table, for configs, commands and the optimiser, and return it.
+    """Add a family to the table, which configs, commands and the optimiser use, and return it.
 
-    Raises `ValueError` where the family is incomplete, its name is taken, or one of its keys has
+    Raises `ValueError` if the family is incomplete, its name is taken, or one of its keys has
     another meaning in another family.
     """
     _check(family)
@@ -258,12 +265,12 @@ def is_list(key: str) -> bool:
 
 
 def users_of(key: str) -> list[str]:
-    """Return the names of the families that take a key."""
+    """Return the names of the families that have a parameter with this key."""
     return [family.name for family in _families.values() if key in family.keys]
 
 
 def follow(update: Callable[[], None]) -> None:
-    """Register `update`, to be called after each change of the table of families.
+    """Register a function `update` that is called after each change to the table of families.
 
     Functions are called in the order in which they were registered."""
     _followers.append(update)
@@ -271,9 +278,9 @@ def follow(update: Callable[[], None]) -> None:
 
 @contextlib.contextmanager
 def for_a_time() -> Iterator[None]:
-    """Remove the families registered inside a `with` block when it ends; for tests.
+    """Return a context manager that removes, on exit, families registered inside it; for tests.
 
-    Programs compiled for these families stay in memory: do not use their names again."""
+    Programs compiled for these families stay in memory: do not reuse the families' names."""
     before = dict(_families)
     try:
         yield
@@ -286,9 +293,9 @@ def for_a_time() -> Iterator[None]:
 
 
 def find_installed(name: str) -> None:
-    """Load the installed package that offers a family under this `name`, if there is one.
+    """Load any installed package that offers a family with this `name`.
 
-    Raises `InputError` where loading fails."""
+    Raises `InputError` if loading fails."""
     from importlib.metadata import entry_points  # Slow: scans all installed packages.
 
     for point in entry_points(group=ENTRY_POINTS):
@@ -421,7 +428,8 @@ def _wrong(argument: str, wanted: str, found: Any) -> ValueError:
 def replace_fields(model: Any, fields: Mapping[str, Any]) -> None:
     """Replace all fields of a pydantic `model` in place.
 
-    `fields`: by name, a complete `FieldInfo`, or a pair (annotation, field) to make one from."""
+    `fields`: maps each name to a complete `FieldInfo`, or to a pair (annotation, field) from which
+    one is created."""
     new = {name: field for name, field in fields.items() if not isinstance(field, FieldInfo)}
     made = create_model("Fields", **new).model_fields
     found = {name: made.get(name, field) for name, field in fields.items()}
@@ -431,9 +439,9 @@ def replace_fields(model: Any, fields: Mapping[str, Any]) -> None:
 
 
 def import_named(name: str) -> None:
-    """Import a module by name, or a Python file by path, once; it may register families.
+    """Import a module by name, or a Python file by path, unless this has been done before.
 
-    Raises `InputError` where the import fails."""
+    The module may register families. Raises `InputError` if the import fails."""
     with _explained(f"`--import` {placed(name)}"):
         if not (name.endswith(".py") or Path(name).is_file()):
             importlib.import_module(name)
@@ -455,7 +463,7 @@ def import_named(name: str) -> None:
 
 @contextlib.contextmanager
 def _explained(what: str) -> Iterator[None]:
-    """Turn any error of an outside module into a one-line `InputError`."""
+    """Turn any error that an outside module raises into a one-line `InputError`."""
     try:
         yield
     # Any exception here is caused by that module.

@@ -1,4 +1,4 @@
-"""The whole config, and the functions that read it from YAML."""
+"""The complete config, and the functions that read it from YAML."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -42,7 +42,7 @@ from rootsopt.config.words import named, placed, sentence, shown
 from rootsopt.errors import InputError
 
 _MOST_PARTS = 8
-"""Number of dotted parts of a key above which an override is rejected; config keys have at most 3.
+"""Number of dotted parts in a key above which an override is rejected. Config keys have at most 3.
 """
 
 
@@ -77,7 +77,9 @@ class Config(Section):
         return self.profile.design_keys
 
     def replaced(self, values: Mapping[str, Any]) -> "Config":
-        """Return the config with new `values` by dotted key, checked like a file.
+        """Return a copy of the config with new `values`, checked in the same way as a file.
+
+        `values`: maps dotted keys to values.
 
         Raises `InputError` for an unknown key or a value that is not allowed."""
         data = self.model_dump(mode="json", exclude_none=True)
@@ -96,8 +98,8 @@ class Config(Section):
     def needs_search(self) -> tuple[str, ...]:
         """Keys set in this config that need fidelity `search`.
 
-        Friction and supports need the point of contact. An outline or a centre distance error
-        needs a gap without perfect rolling. Only the search provides these."""
+        Friction and supports need the point of contact. An outline or a centre distance error needs
+        the gap of flanks that do not roll perfectly. Only the search provides these."""
         parts = {
             "contact.friction": self.contact.friction,
             "scene.supports": self.scene.supports,
@@ -108,9 +110,10 @@ class Config(Section):
 
     @property
     def load_torque(self) -> float:
-        """Load torque on rotor 2 (N·m); for a gas load, an estimate of its mean to set scales.
+        """Load torque on rotor 2 (N·m); for a gas load, an estimate of its mean.
 
-        The estimate assumes an outer radius of 1.4 pitch radii and an area efficiency of 0.45."""
+        The estimate serves to set scales. It assumes an outer radius of 1.4 pitch radii and an area
+        efficiency of 0.45."""
         load = self.scene.load
         if load.torque_N_m is not None:
             return load.torque_N_m
@@ -173,7 +176,7 @@ follow(lambda: replace_fields(Config, dict(Config.model_fields)))
 def load(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Config:
     """Read a config file and apply `dotted.key=value` overrides.
 
-    Raises `InputError` where the file, a key or a value is wrong.
+    Raises `InputError` if the file, a key or a value is wrong.
     """
     return parse(_read(Path(path)), overrides, source=str(path), folder=Path(path).parent)
 
@@ -186,10 +189,10 @@ def parse(
 ) -> Config:
     """Read a config from YAML text and apply `dotted.key=value` overrides.
 
-    `source`: name of the text in messages. Paths in the text are relative to `folder`, paths in
-    `overrides` to the current folder. The returned config has absolute paths.
+    `source`: name of the text in messages. Paths in the text are relative to `folder`; paths in
+    `overrides` are relative to the current folder. The returned config has absolute paths.
 
-    Raises `InputError` where the text, a key or a value is wrong."""
+    Raises `InputError` if the text, a key or a value is wrong."""
     name = placed(source)
     data = read_document(text, name)
     if data is None:
@@ -211,7 +214,7 @@ def parse(
 
 
 def _find_family(data: dict) -> None:
-    """Load the installed package that offers the config's family, unless it is registered."""
+    """Load the installed package that offers the config's family, unless already registered."""
     profile = data.get("profile")
     name = profile.get("family") if isinstance(profile, dict) else None
     if isinstance(name, str) and bare(name) not in map(bare, families()):

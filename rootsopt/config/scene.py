@@ -20,15 +20,15 @@ from rootsopt.config.units import hint
 from rootsopt.config.words import shown
 
 _USUAL = 0.01, 2.0
-"""Usual range of a profile's lengths (pitch radii). Where a length out of limits would be in this
-range in another unit, the message suggests that unit."""
+"""Usual range of a profile's lengths (pitch radii). If a length outside its limits would lie in
+this range when read in another unit, the message suggests that unit."""
 
 
 class ProfileConfig(Section):
     """The rotor profile.
 
-    The parameters of all registered families are further keys. Each is `None` unless it belongs to
-    the config's own `family`."""
+    The parameters of all registered families are additional keys. Each is `None` unless it belongs
+    to the config's own `family`."""
 
     family: str = Field(description="profile family; outline: read from a file")
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
@@ -158,8 +158,7 @@ class RotorConfig(Section):
 
 
 class FrictionConfig(Section):
-    """Coulomb friction between the flanks, with the stiction and friction transition speeds of
-    multibody programs."""
+    """Coulomb friction between the flanks, with transition speeds as in multibody programs."""
 
     static: Annotated[float, Field(ge=0, le=2)] = Field(0.2, description="static coefficient")
     kinetic: Annotated[float, Field(ge=0, le=2)] = Field(0.1, description="kinetic coefficient")
@@ -212,7 +211,7 @@ class ContactConfig(Section):
 
     @property
     def rounding_mm(self) -> float:
-        """Smoothing length (mm) of a complete config, which always has one."""
+        """Smoothing length (mm), which is always set in a complete config."""
         assert self.smoothing_mm is not None
         return self.smoothing_mm
 
@@ -236,7 +235,7 @@ class LoadConfig(Section):
 
 
 class MotorConfig(Section):
-    """Motor on rotor 1 with a linear torque-speed characteristic, for `drive: torque`."""
+    """The motor on rotor 1 for `drive: torque`, with a linear torque-speed characteristic."""
 
     torque_N_m: Torque | None = Field(
         None, description="torque at scene.speed_rpm; absent: equal to the load there"
@@ -261,7 +260,7 @@ class SupportsConfig(Section):
 
 
 class TimingGearConfig(Section):
-    """Timing gear between the rotors: torsional stiffness, damping and backlash."""
+    """The timing gear between the rotors: torsional stiffness, damping and backlash."""
 
     stiffness_N_m_per_rad: Annotated[float, between(1e-2, 1e10)] = Field(
         description="torsional stiffness"

@@ -1,4 +1,4 @@
-"""Base class and number types of the config's sections."""
+"""Base class of the config's sections, and the number types that they use."""
 
 import re
 import types
@@ -8,27 +8,27 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 def between(low: float, high: float) -> Any:
-    """Return the pydantic limits of a finite number from `low` to `high`, ends included."""
+    """Return a pydantic field that restricts a finite number to `low` … `high`, both included."""
     return Field(ge=low, le=high, allow_inf_nan=False)
 
 
 Speed = Annotated[float, between(1e-2, 1e6)]
-"""Speed of rotation, rpm."""
+"""Speed of rotation (rpm)."""
 Radius = Annotated[float, between(1, 5000)]
-"""Radius of a rotor, mm."""
+"""Radius of a rotor (mm)."""
 Weight = Annotated[float, between(0, 1e6)]
-"""Weight in a sum; 0 leaves its term out."""
+"""Weight of a term in a sum; a weight of 0 leaves the term out."""
 Order = Annotated[float, between(1e-2, 1e3)]
-"""Order of a spectral line, in mesh frequencies."""
+"""Order of a spectral line: its frequency as a multiple of the mesh frequency."""
 Torque = Annotated[float, between(0, 1e7)]
-"""Magnitude of the torque of a load or motor, N·m."""
+"""Magnitude of a load or motor torque (N·m)."""
 
 
 class Section(BaseModel):
-    """A config section: frozen, without unknown keys or type conversion.
+    """A config section: immutable; it rejects unknown keys and converts no types.
 
-    A word from a list of choices may be in any case, with spaces, `-` or `_` between its parts.
-    The section stores the word as listed."""
+    A word from a list of choices may be in upper or lower case, with spaces, `-` or `_` between its
+    parts. The section stores the word as listed."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -61,7 +61,7 @@ def choices(annotation: Any) -> tuple[str, ...]:
 
 
 def bare(word: str) -> str:
-    """Return a word in lower case without spaces, `-` and `_`, to compare choices."""
+    """Return a word in lower case, without spaces, `-` and `_`, for comparison with choices."""
     return re.sub(r"[-_\s]", "", word.casefold())
 
 

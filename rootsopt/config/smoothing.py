@@ -1,20 +1,22 @@
-"""Default of the smoothing length, chosen from the scene where the config gives none."""
+"""Chooses a default smoothing length to suit the scene if the config gives none."""
 
 import math
 
 _LONGEST = 1e-4
-"""Greatest smoothing length (mm), used unless a limit of `_SHARES` is smaller."""
+"""Greatest default smoothing length (mm), used unless a limit from `_SHARES` is smaller."""
 _SHARES = {"twist": 0.05, "depth": 0.02, "damping": 0.1}
-"""Greatest smoothing length as a fraction of three lengths.
+"""Greatest default smoothing length as a fraction of each of three lengths.
 
-`twist`: the timing gear's deflection at the pitch radius under the full load; beyond the limit, the
-gear rests inside its rounded edge and has another stiffness. `depth`: the flanks' penetration under
-the full load. `damping`: the depth of full damping."""
+`twist`: the timing gear's deflection at the pitch radius under the full load. With a longer
+smoothing length, the gear would operate in the rounded zone at the edge of its backlash, where its
+stiffness differs. `depth`: the flanks' penetration under the full load. `damping`: the depth of
+full damping."""
 _LEAST = {"float64": 1e-6, "float32": 1e-5}
-"""Least smoothing length (mm), by precision. A shorter length costs solver steps and accuracy of
-the gradient. In single precision the rounding error of the gap is about 4e-6 mm."""
+"""Least default smoothing length (mm), by precision. A shorter length would need more solver steps
+and make the gradient less accurate. In single precision, the gap has a rounding error of about 4e-6
+mm."""
 _LEAST_LOAD = 1e-3
-"""Load (N·m) below which the smoothing length no longer depends on the load."""
+"""Load torque (N·m) below which the smoothing length does not depend on the load."""
 
 
 def following_mm(
@@ -28,8 +30,8 @@ def following_mm(
 
     `load_torque` (N·m): torque on rotor 2. `gear_stiffness` (N·m/rad): stiffness of the timing
     gear, `None` without a gear. `contact`: stiffness (N/mm^e), exponent and depth of full damping
-    (mm) of the flanks. `precision`: `float64` or `float32`. The length changes every force by less
-    than 1e-4 of its value (`python -m experiments.smoothing`).
+    (mm) of the flanks. `precision`: `float64` or `float32`. Rounding over this length changes every
+    force by less than 1e-4 of its value (`python -m experiments.smoothing`).
     """
     torque = max(load_torque, _LEAST_LOAD)
     stiffness, exponent, full = contact

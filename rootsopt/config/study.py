@@ -1,4 +1,4 @@
-"""Config sections that define solver, objective, reports, sweep, constraints and optimiser."""
+"""Config sections that define the solver, objective, reports, sweep, constraints and optimiser."""
 
 from typing import Annotated, Literal
 
@@ -11,7 +11,7 @@ from rootsopt.config.words import shown
 
 _Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 _LEAST_WEIGHT = 1e-6
-"""Sum of an objective's weights below which the objective is rejected as empty."""
+"""Sum of the weights below which an objective is rejected as empty."""
 _MOST_LINES = 32
 """Number of spectral lines above which an objective is rejected."""
 
@@ -176,7 +176,7 @@ class ObjectiveConfig(Section):
 
 
 class ResponseConfig(Section):
-    """Quantities reported besides mean, peak and RMS of the contact force."""
+    """Quantities reported in addition to the mean, peak and RMS of the contact force."""
 
     lines: tuple[Order, ...] = Field(
         (), description="spectral lines of the force, orders in mesh frequencies, as [1, 2]"
@@ -235,7 +235,7 @@ class AttractorsConfig(Section):
 
 
 class EnsembleConfig(Section):
-    """Settings of an ensemble: motions averaged where one motion is not representative (chaos)."""
+    """Settings of an ensemble of motions, averaged if one motion is not representative (chaos)."""
 
     members: Annotated[int, Field(ge=4, le=100_000)] = Field(
         16, description="motions from different initial states, per design"
@@ -312,7 +312,7 @@ class ConstraintsConfig(Section):
 
 
 class BoundsConfig(Section):
-    """Bounds of the search, (low, high) for each design parameter of the family.
+    """Bounds of the search: (low, high) for each design parameter of the family.
 
     The keys are the parameters of all registered families."""
 

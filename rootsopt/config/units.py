@@ -1,4 +1,4 @@
-"""Units in the names of keys, and hints where a value seems to be in another unit."""
+"""Units in the names of keys, and hints for values that seem to be in another unit."""
 
 import math
 
@@ -45,7 +45,8 @@ def si_unit(key: str) -> float:
 def hint(key: object, value: float, low: float, high: float) -> str:
     """Return the end of a message that asks whether an out-of-range `value` is in another unit.
 
-    A unit fits if the converted value lies between `low` and `high`. Return "" if no unit fits."""
+    A unit fits if the converted value lies between `low` and `high`. For a key without a unit, ask
+    whether the value is a percentage. Return "" if nothing fits."""
     name = str(key)
     for end, (_, others) in _UNITS.items():
         if name.endswith(end):

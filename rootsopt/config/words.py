@@ -4,13 +4,13 @@ import reprlib
 from typing import Any
 
 LONGEST = 500
-"""Greatest length (characters) of a message about a config."""
+"""Length (characters) above which a message about a config is shortened."""
 _VALUE, _NAME, _PATH = 80, 60, 160
-"""Greatest length (characters) of a value, of a key and of a path in a message."""
+"""Lengths (characters) above which a string value, a key and a path in a message are shortened."""
 
 
 class _Bounded(reprlib.Repr):
-    """A `repr` that shortens long values without reading the part that it leaves out."""
+    """A `repr` that shortens long values without processing the part that it leaves out."""
 
     def __init__(self):
         super().__init__()
@@ -28,7 +28,7 @@ _repr = _Bounded().repr
 
 
 def shown(value: Any) -> str:
-    """Return a value for a message: its `repr`, shortened."""
+    """Return a value as text for a message: its `repr`, shortened."""
     return clipped(_repr(value), 2 * _VALUE)
 
 

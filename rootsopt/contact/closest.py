@@ -4,23 +4,24 @@ The pose is the pair of roll coordinate x and relative rotation ε = φ2 - φ1 (
 the mean angle φ = (φ1 + φ2)/2, a *drive* flank of rotor 1 (the one that pushes rotor 2
 forward) has x = -φ. At ε = 0 the pair touches at roll angle β = x, 0 ≤ x ≤ π/N.
 
-Both flanks are described by the normal angle of an addendum point: ν1 on rotor 1 and ν2
-for the dedendum point of rotor 2 that meshes with it in perfect rolling. Where the two
-normals are parallel, ν1 = ν2 - 2(β(ν2) - x), and with the pressure angle λ of that
-common direction
+Both flanks are described by the normal angle of an addendum point. On rotor 1 this angle is ν1. On
+rotor 2, ν2 denotes the dedendum point that meshes with the addendum point ν2 in perfect rolling. If
+the two normals are parallel, ν1 = ν2 - 2(β(ν2) - x), and with the pressure angle λ of that common
+direction
 
     T = E cos λ - q1(ν1) - q2(ν2)      tangential offset of the two points,
     G = E sin λ - h1(ν1) - h2(ν2)      normal gap (negative: penetration),
 
-q the levers, h the support functions, E the centre distance. The closest approach is
-the root of T. Newton's method searches for it from the point of perfect rolling. It may not
-converge, or might find another root. The search then brackets the root on a fixed set of nodes and
-refines it inside its bracket. It cannot lose the root where curvature jumps or the flanks conform.
-A root at which T falls with growing ν2 is a minimum of the gap. By the envelope theorem
-∂G/∂φ1 = -q1 and ∂G/∂φ2 = q2, which is also the virtual work of a unit contact force.
+where q are the levers, h the support functions and E is the centre distance. The closest approach
+is the root of T. Newton's method searches for it from the point of perfect rolling. It may fail to
+converge, or find another root. The search then brackets the root between two of a fixed set of
+nodes and refines it inside this bracket, so that it cannot lose the root where curvature jumps or
+the flanks conform. A root at which T falls with increasing ν2 is a minimum of the gap. By the
+envelope theorem, ∂G/∂φ1 = -q1 and ∂G/∂φ2 = q2. These derivatives also give the virtual work of a
+unit contact force.
 
-Bracketing on all nodes needs no trigonometric function per node and pose. The pose turns every
-node by the same angle, so that sines and cosines follow from the addition theorem.
+Bracketing on all nodes needs no trigonometric function per node and pose. A pose turns all nodes by
+the same angle, so that their sines and cosines follow from the addition theorem.
 
 Exchanging the rotors maps x to π/N - x. The search therefore covers only the half with rotor 1's
 addendum in rotor 2's dedendum. Coast flanks follow from mirror symmetry, x → -x, ε → -ε.
@@ -71,8 +72,9 @@ class ClosestApproach(NamedTuple):
     `lever1`, `lever2`: moment arms (m) of the common normal about rotor 1 and rotor 2, so that
     d gap = -lever1 dφ1 + lever2 dφ2.
     `normal1`, `normal2`: ν1 and ν2 (rad).
-    `found`: whether a common normal was found. Otherwise the gap is a pitch radius and the levers
-    are zero. The search is skipped where the flanks cannot touch yet, see `contact_begins`.
+    `found`: whether a common normal was found. Otherwise, the gap is the pitch radius and the
+    levers are zero. The search is skipped at poses at which the flanks cannot touch yet (see
+    `contact_begins`).
     """
 
     gap: Float[Array, ""]
@@ -130,7 +132,8 @@ class FlankPair(eqx.Module):
 
         `center_distance`: E (m), by default the distance of perfect rolling, 2r. At other
         distances, drive and coast flanks can touch at the same time: set `two_sided`. The search
-        then also covers lands up to the lobe's axis. The flank on the other side covers the rest.
+        then also covers the half of a land up to the lobe's axis. The other half belongs to the
+        flank on the other side.
         """
         frozen = lax.stop_gradient(profile)
         segments = [s for s in frozen.segments() if two_sided or not s.land]
@@ -195,11 +198,11 @@ class FlankPair(eqx.Module):
         return half - jnp.abs(centered), centered > 0
 
     def switches(self, roll: Float[Array, ""], found: ClosestApproach) -> Bool[Array, " s"]:
-        """Return flags (s,) that identify the pieces of the flanks at the closest approach.
+        """Return flags (s,) that identify the smooth pieces on which the closest approach lies.
 
-        `roll`: x (rad); `found`: result at this pose. Where a flag changes, derivatives of the gap
-        jump: second derivatives with respect to the pose, and first derivatives of the levers with
-        respect to the design."""
+        `roll`: x (rad); `found`: closest approach at this pose. Where a flag changes, derivatives
+        of the gap jump: second derivatives with respect to the pose, and first derivatives of the
+        levers with respect to the design."""
         ends = jnp.stack([segment.stop for segment in self.frozen.segments()[:-1]] or [0.0])
         normals = jnp.stack([found.normal1, found.normal2])
         beyond = (normals[:, None] > ends).ravel()
@@ -284,12 +287,12 @@ class FlankPair(eqx.Module):
     def _search(self, roll, relative, attempt=0):
         """Return (number of attempts, closest approach) at a folded `roll`.
 
-        Attempt 0 is Newton's method from the point of perfect rolling. Where its result is not
-        reliable, attempts 1 and 2 follow. Two minima occur away from the nominal centre distance
-        and next to a cusp. They lie in the last and the first interval of nodes where T falls
-        through zero; the deeper minimum is returned. Flanks that are not conjugate may have more
-        minima; the attempts then try the two that are deepest at the nodes. All attempts share one
-        loop, which is compiled once.
+        Attempt 0 is Newton's method from the point of perfect rolling. If its result is not
+        reliable, attempts 1 and 2 follow. The gap may have two minima next to a cusp, or if the
+        centre distance is not the nominal one. They lie in the last and the first interval of nodes
+        where T falls through zero; the deeper minimum is returned. If the flanks are not conjugate,
+        the gap may have more minima; the attempts then try the two that are deepest at the nodes.
+        All attempts share one loop, which is compiled once.
         """
         nothing = jnp.zeros_like(roll)
         none = ClosestApproach(
@@ -330,9 +333,10 @@ class FlankPair(eqx.Module):
     def _bracket(self, attempt, roll, relative):
         """Return an interval between nodes where T falls through zero.
 
-        On conjugate flanks, attempt 1 takes the last interval and attempt 2 the first. On other
-        flanks, they take the deepest and the second deepest. The result is ((low, high), first
-        guess, whether such an interval exists, whether there is at most one)."""
+        For conjugate flanks, attempt 1 takes the last such interval and attempt 2 the first. For
+        other flanks, they take the intervals with the least and the second least gap. The result is
+        ((low, high), first guess, whether such an interval exists, whether there is at most
+        one)."""
         profile, nodes = self.profile, self.nodes
         turned = _rotate(nodes.turned, 2 * profile.turn_ratio * roll)
         normal1 = nodes.facing + 2 * roll
@@ -368,9 +372,9 @@ class FlankPair(eqx.Module):
     def _root(self, bracket, guess, guarded, roll, relative):
         """Return (root of T by Newton's method from `guess`, whether the method converged).
 
-        `guarded`: T falls through zero in the bracket, which shrinks around the root. The bracket
-        is halved where Newton's step leaves it or is longer than half the last step. Halving is
-        needed because T has a kink where ν1 crosses a segment's end.
+        `guarded`: whether T falls through zero in the bracket. The bracket then shrinks around the
+        root, and is halved if Newton's step leaves it or is longer than half the previous step.
+        Halving is needed because T has a kink where ν1 crosses a segment's end.
         """
         tolerance = _CONVERGED[guess.dtype.itemsize]
         limit = jnp.where(guarded, _GUARDED_STEPS, _NEWTON_STEPS)
@@ -401,10 +405,10 @@ class FlankPair(eqx.Module):
 
 
 def _search_one_by_one(pair: FlankPair, roll, relative):
-    """Return the closest approach at a folded `roll`, searched on the profile without derivatives.
+    """Return the closest approach at a folded `roll`, from a search without derivatives.
 
-    On a CPU many poses are searched one by one. A single pose rarely needs the nodes, but a batch
-    of poses nearly always does."""
+    On a CPU, the poses of a batch are searched one by one. A single pose rarely needs the nodes,
+    but a batch searched as a whole nearly always does."""
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
 
     def search(dynamic, roll, relative):
@@ -418,18 +422,18 @@ def _search_one_by_one(pair: FlankPair, roll, relative):
 
 
 def contact_begins(relative: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the roll coordinate (rad) below which flanks that overlap by ε ≤ 0 (rad) cannot touch.
+    """Return the roll coordinate (rad) below which flanks cannot touch at ε = `relative` ≤ 0 (rad).
 
-    Contact starts about √|ε| before the tip passes the line of centres."""
+    Contact starts about √|ε| (rad) before the tip passes the line of centres."""
     return -(2 * jnp.sqrt(jnp.maximum(-relative, 0.0)) + 0.02)
 
 
 def _materialized(tree, true):
     """Return `tree` unchanged, but keep XLA from fusing its arrays with the code that uses them.
 
-    Otherwise XLA would recompute sines of the nodes at every pose. On CPUs XLA drops optimisation
-    barriers, but it must run a loop of unknown length. `true`: a traced value that is always true,
-    which the compiler does not know."""
+    Otherwise, XLA would recompute the sines of the nodes at every pose. On CPUs, XLA drops
+    optimisation barriers, but it must execute a loop of unknown length. `true`: a traced value that
+    is always true, which the compiler does not know."""
 
     def copy(carry):
         return carry[0] + 1, tree
@@ -444,12 +448,14 @@ def _circle(angle):
 
 
 def _share(before, after):
-    """Return the fraction of an interval at which a linear function falls through zero."""
+    """Return the fraction of an interval at which a function, if linear, falls through zero.
+
+    `before`, `after`: values of the function at the interval's ends."""
     fall = before - after
     return jnp.clip(before / jnp.where(fall > 0, fall, 1.0), 0.0, 1.0)
 
 
 def _rotate(directions, angle):
-    """Return cosines and sines (2, n) of angles turned by one common `angle` (rad)."""
+    """Return the cosines and sines (2, n) of angles that are all increased by one `angle` (rad)."""
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     return cos * directions[0] - sin * directions[1], cos * directions[1] + sin * directions[0]

@@ -15,7 +15,8 @@ class Approach(NamedTuple):
     """Gap and levers of two flanks at a pose.
 
     `gap`: gap (m), negative when the flanks penetrate; `lever1`, `lever2`: levers (m) of rotor 1
-    and rotor 2; `place`: result that the contact's `point` and `switches` need, or `None`."""
+    and rotor 2; `place`: further result of the contact that its `point` and `switches` use, or
+    `None`."""
 
     gap: Float[Array, ""]
     lever1: Float[Array, ""]
@@ -31,8 +32,8 @@ class Contact(eqx.Module):
     d gap = -lever1 dφ1 + lever2 dφ2, so that forces come from a potential. The gap's period in x is
     2π/N. The coast flanks follow by x → -x, ε → -ε.
 
-    A scene may also need the point of contact or other centre distances. By default a contact
-    rejects these with `InputError`.
+    A scene may also need the point of contact or another centre distance. By default, a contact
+    raises `InputError` for these.
     """
 
     @abc.abstractmethod
@@ -58,27 +59,27 @@ class Contact(eqx.Module):
     def two_sided(self) -> bool:
         """Whether the gap is also valid for flanks turned away from each other (ε > 0).
 
-        They can touch where axes are displaced or flanks are not conjugate."""
+        Such flanks can touch if the axes are displaced or the flanks are not conjugate."""
         return False
 
     @property
     def length_scale(self) -> Float[Array, ""] | None:
-        """Length (m) with the same rounding error as the gap: about the pitch radius.
+        """Length (m) whose rounding error is that of the gap: about the pitch radius.
 
-        The levers are about as long, too. `None`: the gap's rounding error is negligible."""
+        The levers have about the same length. `None`: the gap's rounding error is negligible."""
         return None
 
     @property
     def center_distance(self) -> Float[Array, ""]:
         """Distance between the rotors' axes (m).
 
-        Raises `InputError` where a contact supports the nominal distance only."""
+        Raises `InputError` if a contact supports the nominal distance only."""
         raise self._lacks("another centre distance", "displaced axes need")
 
     def at_distance(self, distance: Float[Array, ""]) -> "Contact":
         """Return the contact of the same flanks at another centre `distance` (m).
 
-        Raises `InputError` where a contact supports the nominal distance only."""
+        Raises `InputError` if a contact supports the nominal distance only."""
         del distance
         raise self._lacks("another centre distance", "displaced axes need")
 
@@ -93,7 +94,7 @@ class Contact(eqx.Module):
     ) -> ContactPoint:
         """Return position and direction of the contact that `approach` has found at this pose.
 
-        `roll`, `relative`: x and ε (rad). Raises `InputError` where a contact cannot compute the
+        `roll`, `relative`: x and ε (rad). Raises `InputError` if the contact cannot compute the
         point."""
         del roll, relative, approach
         raise self._lacks("the point of contact", "friction and supports need")

@@ -6,9 +6,9 @@ Eq. 10 cannot have exponent 2.2) is
     F = max(0, K δ^e + C · step(δ; 0, 0, d, 1) · dδ/dt),   step = 3 x² - 2 x³, x = δ/d.
 
 Two corners are rounded over the smoothing length h. At the onset of contact, a ramp replaces δ; it
-is zero up to δ = 0 and exactly δ from δ = h. At the release, the same ramp over the force
-h/d · K δ^e replaces max(0, ·). Outside these two zones the law is unchanged. The force is never
-adhesive, and exactly zero without penetration.
+is zero up to δ = 0 and exactly δ from δ = h. At the release, the same ramp replaces max(0, ·); its
+width is the force h/d · K δ^e. Outside these two zones the law is unchanged. The force is never
+adhesive, and is exactly zero without penetration.
 """
 
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ def smooth_step(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def balanced_ramp(x: Float[Array, "*n"], width: Float[Array, "*#n"]) -> Float[Array, "*n"]:
-    """Return max(0, x), with its corner rounded on 0 < x < w = `width` and its integral kept.
+    """Return max(0, x), with its corner rounded on 0 < x < w = `width` and the same integral.
 
     Beyond the rounded zone, a spring with this force stores the same energy as with a sharp corner.
     The function is C¹: `ramp` plus the multiple of t² (1 - t)² that restores the integral, which is
@@ -48,11 +48,11 @@ def balanced_ramp(x: Float[Array, "*n"], width: Float[Array, "*#n"]) -> Float[Ar
 
 
 def balanced_step(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return a step from 0 to 1 on 0 < x < 1, C¹, with the integral of a sharp step at 0.
+    """Return a C¹ step from 0 to 1 on 0 < x < 1, with the same integral as a sharp step at 0.
 
-    With this onset, a damper takes the same momentum from a motion that crosses the zone as with a
-    sharp onset. The step therefore exceeds 1 inside the zone, by up to half. It is never negative.
-    `smooth_step` was rejected, because it omits half a width of damping on every crossing.
+    With this onset, a damper removes the same momentum from a motion that crosses the zone as with
+    a sharp onset. The step therefore exceeds 1 inside the zone, by up to half. It is never
+    negative. `smooth_step` would omit half a width of damping on every crossing.
     """
     t = jnp.clip(x, 0.0, 1.0)
     return t**2 * (18 - 32 * t + 15 * t**2)
@@ -63,9 +63,9 @@ def force_rounding(
 ) -> Float[Array, ""]:
     """Return the relative rounding error of the force at a penetration `depth` (m).
 
-    The gap is a difference of lengths about as large as the pitch `radius` (m), and has their
-    rounding error. The force is a power of the gap with the law's `exponent`. Without contact the
-    error is 0.
+    The gap is a difference between lengths of about the pitch `radius` (m), and has their rounding
+    error. The force is a power of the gap, with the law's `exponent`. Without contact, the error is
+    0.
     """
     deep = jnp.where(depth > 0, depth, jnp.inf)
     return exponent * float(jnp.finfo(depth.dtype).eps) * radius / deep
@@ -106,7 +106,7 @@ class ImpactLaw(ContactLaw):
         return jnp.concatenate([depth > depths, positive & (total > limits)])
 
     def _parts(self, depth, rate):
-        """Return contact flag, elastic force (N), total force (N) before release, and width.
+        """Return (whether in contact, elastic force (N), total force (N) before release, width).
 
         The width is the fraction of the elastic force over which the release is rounded. The
         damping force is added to the elastic force; their quotient is used only near the release.

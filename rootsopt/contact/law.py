@@ -1,4 +1,4 @@
-"""Base class of all contact laws: normal force over penetration and its rate."""
+"""Base class of all contact laws: normal force as a function of penetration and its rate."""
 
 import abc
 
@@ -12,9 +12,9 @@ class ContactLaw(eqx.Module):
     """Normal force between two flanks (SI units).
 
     The force is zero without penetration, never adhesive, and continuous. Where one of its
-    derivatives jumps, an entry of `switches` must change. All numbers of a law are arrays; a
-    response is differentiable with respect to them. `exponent`: exponent of the penetration in the
-    static force, exact or approximate.
+    derivatives jumps, an entry of `switches` must change. All numbers of a law are arrays, with
+    respect to which responses are differentiable. `exponent`: exact or approximate exponent of the
+    penetration in the static force.
     """
 
     exponent: eqx.AbstractVar[Float[Array, ""]]

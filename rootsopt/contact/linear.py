@@ -5,9 +5,9 @@ has the moment arm r cos ψ(x) about both axes. To first order in ε the gap is 
 
     G = r cos ψ(x) · ε,
 
-exact for involute on involute. Levers are the derivatives of this gap, so that forces
-come from a potential. The error is of second order in ε over the smooth segments. It
-grows towards a tip arc centred on the pitch circle, all of which meshes at one instant.
+which is exact where an involute meets an involute. Levers are the derivatives of this gap, so that
+forces come from a potential. The error is of second order in ε on smooth segments. It
+grows towards a tip arc centred on the pitch circle, because all of that arc meshes at one instant.
 """
 
 import jax
@@ -45,7 +45,7 @@ class LinearContact(Contact):
 
         Contact starts with the first point of the flank that can carry torque (the end of the tip
         land). Before that point, there is no contact: the gap is the pitch radius and the levers
-        are zero. The penetration starts from zero, unless the whole tip arc meshes at once.
+        are zero. The penetration starts at zero, unless the whole tip arc meshes at once.
         """
         profile = self.profile
         half = profile.half_pitch

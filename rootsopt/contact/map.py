@@ -35,7 +35,7 @@ def first_roll(deepest: Float[Array, ""] | float, half_pitch: float) -> Float[Ar
 def continued_gap(
     pair: FlankPair, roll: Float[Array, ""], relative: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Return the gap (m) at x = `roll` and ε = `relative` (rad), continued past its domain.
+    """Return the gap (m) at x = `roll` and ε = `relative` (rad), also where it is not defined.
 
     Where the tip land passes, the flanks have no common normal. A parabola then continues the gap
     from the land's end.
@@ -62,7 +62,7 @@ def _interpolation_matrix(count: int) -> NDArray[np.float64]:
 
 
 def _weights(t):
-    """Return (values, first, second derivatives) of the 4 B-splines at the fraction t of a cell."""
+    """Return (values, slopes, second derivatives) of the 4 B-splines at fraction t of a cell."""
     u = 1 - t
     value = jnp.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]) / 6
     slope = jnp.stack([-(u**2), 3 * t**2 - 4 * t, -3 * u**2 + 4 * u, t**2]) / 2
@@ -74,11 +74,12 @@ class MapContact(Contact):
     """Gap and levers of a flank pair at a pose, from a spline map.
 
     Call an instance with roll coordinate x and relative rotation ε (rad), see `Contact`. Below
-    ε = `deepest` the gap continues linearly in ε. A simulation then goes on, so that the caller can
-    see that the map must be larger.
+    ε = `deepest` the gap continues linearly in ε. A simulation can therefore continue, and its
+    caller can see that the map must be larger.
 
-    `coefficients` (m, n): of the B-spline (m); `first_roll`, `deepest`: roll and ε (rad) of the
-    first grid point; `roll_step`, `relative_step`: grid steps (rad); `half_pitch`: π/2N (rad).
+    `coefficients` (m, n): coefficients of the B-spline, in metres; `first_roll`, `deepest`: roll
+    and ε (rad) of the first grid point; `roll_step`, `relative_step`: grid steps (rad);
+    `half_pitch`: π/2N (rad).
     """
 
     coefficients: Float[Array, "m n"]
@@ -165,8 +166,8 @@ def _local(coefficients, i, j):
 def _sums(local, across, along):
     """Return f, ∂x f, ∂y f, ∂x∂y f as sums Σ c w(x) v(y).
 
-    (w, v) are the values and first derivatives in `across` and `along`. The compiler fuses such
-    sums, while a matrix product would be a library call."""
+    w is a value or first derivative from `across`, v one from `along`, c an entry of `local`. The
+    compiler fuses such sums, while a matrix product would be a library call."""
     value, slope = (jnp.sum(local * w, axis=1) for w in along[:2])
     return (
         jnp.sum(across[0] * value),

@@ -1,8 +1,8 @@
-"""Node-against-segment gap of two outlines: the paper's Eq. 9, and the reference for tests.
+"""Gap between the nodes of one outline and the segments of another: Eq. 9 of the paper.
 
-This method is slow but free of assumptions, and checks the fast search. It uses only two closed
-outlines and a pose, not roll angles or conjugacy. It needs NumPy and SciPy only, and nothing here
-is differentiated.
+Tests use this method as the reference for the fast search. It is slow, but assumes neither roll
+angles nor conjugacy: it needs only two closed outlines and a pose. It uses only NumPy and SciPy,
+and nothing here is differentiated.
 """
 
 import numpy as np
@@ -103,8 +103,8 @@ def pair_gap(
     """Return the least signed distance between the two rotors at one pose, in the outline's unit.
 
     `outline`, `lobes`, `center_distance`, `phi1`, `phi2`: as in `place_pair`. `refine`: as in
-    `signed_distance`. `reach`: distance from rotor 2's outer circle beyond which nodes of rotor 1
-    are ignored; by default 0.05 outer radii, which includes all nodes that can touch.
+    `signed_distance`. `reach`: distance beyond rotor 2's outer circle above which a node of rotor 1
+    is ignored. The default, 0.05 outer radii, includes all nodes that can touch.
     """
     first, second = place_pair(outline, lobes, center_distance, phi1, phi2)
     outer = np.max(np.hypot(outline[:, 0], outline[:, 1]))

@@ -11,7 +11,7 @@ from rootsopt.contact.closest import ClosestApproach, FlankPair
 class ContactPoint(NamedTuple):
     """Position and direction of a flank contact.
 
-    n is the common normal from rotor 1 to rotor 2, O1 and O2 are the axes.
+    n is the common normal, directed from rotor 1 to rotor 2; O1 and O2 are the axes.
     `support1`: (P - O1)·n (m), distance of the contact P from axis 1 along n.
     `support2`: (O2 - P)·n (m), distance from axis 2 along n.
     `radial`: component of n along the line of centres.

@@ -1,4 +1,4 @@
-"""Contact by a search for the closest approach at every call: the reference fidelity."""
+"""Contact found by a search for the closest approach at every call: the reference fidelity."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from rootsopt.profiles.base import Profile
 
 
 class SearchContact(Contact):
-    """Gap and levers by a search for the closest approach at every call: the reference.
+    """Gap and levers of a flank pair, from a search for the closest approach at every call.
 
     `pair`: the flanks; `sides`: 1, or 2 if the search also covers flanks turned away from each
     other.
@@ -32,7 +32,7 @@ class SearchContact(Contact):
 
     @property
     def jumps(self) -> bool:
-        """Whether the levers may jump from one minimum of the gap to another of equal depth."""
+        """Whether levers may jump where two minima of the gap are equally deep."""
         return self.pair.profile.cusp or not self.pair.rolling
 
     @property

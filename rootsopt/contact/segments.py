@@ -1,9 +1,9 @@
-"""Node against straight segment: the paper's own contact, its Eq. 9.
+"""Contact of nodes with straight segments: the paper's own method, Eq. 9.
 
 Each flank is a polyline from tip to root. The gap is the least (p - q) · n over the nodes p of one
 flank and the segments (q, n) of the other that face them. The paper tests the nodes of rotor 2
-only. Here the nodes of both flanks are tested against the other's segments, so that the result does
-not change when the rotors are exchanged.
+only. Here, the nodes of each flank are tested against the segments of the other, so that the result
+does not change when the rotors are exchanged.
 
 A segment faces the nodes between the bisectors at its two ends. On a bisector the distances to both
 segments agree. The gap is therefore continuous over the pose, its derivatives are the levers, and
@@ -40,14 +40,15 @@ _DEEPEST = 0.1
 class NodeContact(Contact):
     """Gap and levers of a flank pair at a pose, from two polylines.
 
-    Call an instance with roll coordinate x and relative rotation ε (rad), see `Contact`. Fields
-    have rotor 1 first, rotor 2 second, each in its own rotor's frame. `nodes` (2, n, 2): in m;
-    `tangent` (2, n, 2): unit tangents at the nodes, normal to the bisectors; `normal`
-    (2, n - 1, 2): outward unit normals of the segments; `pitch_radius`: r (m); `half_pitch`: π/2N
-    (rad).
+    Call an instance with roll coordinate x and relative rotation ε (rad), see `Contact`. The first
+    axis of each array is the rotor (1, 2); coordinates are in that rotor's frame. `nodes` (2, n,
+    2): nodes (m); `tangent` (2, n, 2): unit tangents at the nodes, normal to the bisectors;
+    `normal` (2, n - 1, 2): outward unit normals of the segments; `pitch_radius`: r (m);
+    `half_pitch`: π/2N (rad).
 
-    Tip lands carry no torque and have no nodes. The flank of rotor 1 is its addendum and a little
-    more, that of rotor 2 its mate. The rest of the mesh follows by exchange of the rotors.
+    Tip lands carry no torque and have no nodes. The flank of rotor 1 is its addendum, extended a
+    little beyond the pitch crossing and, unless there is a land, over the tip. The flank of rotor 2
+    is its mate. The rest of the mesh follows by exchange of the rotors.
     """
 
     nodes: Float[Array, "2 n 2"]
@@ -63,11 +64,11 @@ class NodeContact(Contact):
 
     @classmethod
     def of(cls, profile: Profile, nodes: int) -> "NodeContact":
-        """Return the contact of `profile` with `nodes` per whole flank, half on the addendum.
+        """Return the contact of `profile` with `nodes` per flank, half of them on the addendum.
 
-        Nodes are evenly spaced in the longer of the two mating arc elements plus a constant. The
-        constant resolves the sharp spot at the pitch crossing of EE. Raises `ValueError` for fewer
-        than 16 nodes.
+        Nodes are evenly spaced with respect to the longer of the two mating arc elements plus a
+        constant. The constant ensures enough nodes at the pitch crossing of EE, where the flank is
+        sharp. Raises `ValueError` for fewer than 16 nodes.
         """
         if nodes < 16:
             raise ValueError(f"Argument `nodes` must be at least 16, but is {nodes}.")
@@ -148,10 +149,10 @@ def _facing(
 ) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
     """Return (signed distance in m, segment index) for each point and the segment that faces it.
 
-    Where no segment faces a point, the distance is inf. Bisection over the nodes finds the segment.
-    A point near the flank is ahead of the bisectors on the tip's side of its segment, and behind
-    all others. This holds because the chord between any two nodes of a flank stays within a right
-    angle of the tangents at both.
+    Where no segment faces a point, the distance is inf. The segment is found by bisection over the
+    nodes. A point near the flank is ahead of all bisectors on the tip's side of its segment, and
+    behind all others. This holds because the chord between any two nodes of a flank stays within a
+    right angle of the tangents at both.
     """
     x, y = points[:, 0], points[:, 1]
     offset = jnp.sum(nodes * tangent, axis=1)

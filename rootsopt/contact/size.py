@@ -1,4 +1,4 @@
-"""Finds the size that a contact map needs for a stated error.
+"""Finds the size that a contact map needs for a given error.
 
 The gap is computed by search along a few fine lines through the map. For each of a fixed list of
 sizes, the map's spline is fitted to this gap (SciPy, one dimension at a time). The error is that of
@@ -21,16 +21,17 @@ from rootsopt.runtime.programs import Program
 ROLLS = (96, 128, 192, 256, 384, 512, 768, 1024, 1536)
 RELATIVES = (16, 24, 32, 48)
 _FINE = 3073, 193
-"""Points on a line along the roll, and on a line along ε."""
+"""Number of points on a line along the roll, and on a line along ε."""
 _LINES = 5, 33
-"""Lines along the roll, at geometrically spaced ε; lines along ε, at uniform rolls."""
+"""Number of lines along the roll, at geometrically spaced ε, and of lines along ε, at evenly spaced
+rolls."""
 
 
 class MapSize(NamedTuple):
     """Size of a contact map.
 
-    `rolls`, `relatives`: points over roll and over ε; `error`: error (m) of the penetration;
-    `enough`: whether the map meets the requested error."""
+    `rolls`, `relatives`: number of points over roll and over ε; `error`: error (m) of the
+    penetration; `enough`: whether the map meets the requested error."""
 
     rolls: int
     relatives: int
@@ -74,7 +75,9 @@ def _smallest(
     probed: tuple[Array, Array],
     error: float,
 ) -> tuple[int, float]:
-    """Return (smallest number of points in `ladder` with at most this `error` (m), its error).
+    """Return (least number of points in `ladder` with at most this `error` (m), its error (m)).
+
+    If none meets the error, the number is the least whose error is at most 1.5 times the best.
 
     `start`, `stop`: range of the map (rad); `probed`: points and gap on fine lines."""
     from scipy.interpolate import CubicSpline  # Imported for maps only: it takes 0.5 s.

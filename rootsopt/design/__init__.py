@@ -1,1 +1,1 @@
-"""The design space: bounds of the parameters, the unit box they span, constraints."""
+"""The design space: bounds of the parameters, the unit box that they define, and constraints."""

@@ -5,9 +5,9 @@ from rootsopt.config.families import Parameter, family_of
 
 
 def bounds_of(config: Config) -> list[tuple[float, float]]:
-    """Return the bounds (low, high) of every design parameter of a config, in config units.
+    """Return the bounds (low, high) of each design parameter of a config, in config units.
 
-    Raises `InputError` where a bound is impossible, such as a tip land wider than the lobe."""
+    Raises `InputError` if a bound is impossible, such as a tip land wider than the lobe."""
     found = []
     for parameter in family_of(config.profile.family).parameters:
         values = getattr(config.profile, parameter.key)

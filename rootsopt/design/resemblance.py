@@ -1,4 +1,8 @@
-"""Finds the nearest member of each classical family to a profile, and its distance."""
+"""Finds the member of each classical family that is nearest to a profile, and its distance.
+
+A *member* of a family is a profile with some values of the family's parameters. A family is
+*classical* if its profiles are made from single numbers, not from a list or a file.
+"""
 
 import functools
 import math
@@ -21,18 +25,18 @@ from rootsopt.runtime.programs import Program
 from rootsopt.scene.families import classical, profile_of
 
 _NODES = 96
-"""Nodes on each side of the pitch circle in the search."""
+"""Number of nodes on each side of the pitch circle at which a search measures distances."""
 _SAMPLE = 128
-"""Number of sampled members of a family; searches start from the best of them."""
+"""Number of sampled members of a family; the searches start from the best of them."""
 _STARTS = 3
 """Number of searches per family."""
 _PROGRAMS, _LONGEST, _SHORTEST = 80, 0.2, 1e-9
-"""Greatest number of linear programs in a search; longest and shortest step of a program, as a
-fraction of the parameters' usual ranges."""
+"""Number of linear programs after which a search ends; greatest step of a program, and the step
+size below which a search ends, both as fractions of the parameters' usual ranges."""
 _UNSOUND_WEIGHT = 10.0
 """Weight of a negative margin (relative to its scale) against the distance (pitch radii)."""
 _UNSOUND = 1e-6
-"""Size of a negative margin (relative to its scale) above which a member of a family is unsound."""
+"""Magnitude of a negative margin (relative to its scale) above which a member counts as unsound."""
 
 
 class Likeness(NamedTuple):
@@ -46,7 +50,7 @@ class Likeness(NamedTuple):
     departure: float
 
     def record(self) -> dict[str, Any]:
-        """Return the record for the result file."""
+        """Return the fields as a dictionary for the result file, with the departure in µm."""
         return {
             "family": self.family,
             "design": self.design,
@@ -55,11 +59,11 @@ class Likeness(NamedTuple):
 
 
 def likenesses(profile: Profile) -> list[Likeness]:
-    """Return the nearest member of every classical family to `profile`, nearest first.
+    """Return the member of each classical family that is nearest to `profile`, nearest first.
 
-    The nearest member minimises the greatest distance between the flanks. The search starts from
-    the best of a Sobol sample, so that it may miss a nearer member. Families in which the search
-    finds no sound member are left out.
+    The nearest member minimises the greatest distance between its flank and that of `profile`. The
+    search starts from the best members of a Sobol sample, and may therefore miss a nearer member.
+    Families in which the search finds no sound member are left out.
     """
     found = []
     for family in classical():
@@ -104,7 +108,7 @@ class _Seen(NamedTuple):
 
     @property
     def finite(self) -> bool:
-        """Whether all numbers are finite."""
+        """Whether all numbers in the fields are finite."""
         return all(np.all(np.isfinite(part)) for part in self)
 
     @property
@@ -114,9 +118,10 @@ class _Seen(NamedTuple):
 
     @property
     def fault(self) -> float:
-        """Value that a search minimises: the greatest distance plus the weighted worst margin.
+        """Value that a search minimises: the greatest distance (pitch radii) plus a penalty.
 
-        The distance is in pitch radii. Only a negative margin counts."""
+        The penalty is the magnitude of the worst margin, if negative, times its weight. The value
+        is infinite if any number is not finite."""
         if not self.finite:
             return math.inf
         lacking = max(0.0, -float(np.min(self.margin)))
@@ -124,12 +129,12 @@ class _Seen(NamedTuple):
 
     @property
     def away(self) -> float:
-        """Greatest distance (pitch radii); infinite for an unsound member."""
+        """Greatest distance (pitch radii) between the flanks; infinite for an unsound member."""
         return float(np.max(np.abs(self.distance))) if self.sound else math.inf
 
 
 class _Look:
-    """Function of a design: compares the member of a `family` with a `profile`; caches results."""
+    """Compares the member of a `family` with a given design to a `profile`; caches results."""
 
     def __init__(self, profile: Profile, family: str):
         self.family, self.lobes, self.radius = family, profile.lobes, profile.pitch_radius
@@ -146,10 +151,10 @@ class _Look:
 
 
 def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
-    """Return the design near `start` with the least `fault`.
+    """Return a design near `start` with a locally least `fault`.
 
-    A sequence of linear programs finds the design. Each program finds the best step to first order,
-    at most a fraction of `width`, the parameters' usual ranges."""
+    The search is a sequence of linear programs. Each finds the step that is best to first order and
+    at most a fraction of `width`, the widths of the parameters' usual ranges."""
     design, size = start, _LONGEST
     for _ in range(_PROGRAMS):
         seen = look(design)
@@ -166,8 +171,8 @@ def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
 def _promising(seen: _Seen, width, size: float) -> NDArray[np.float64]:
     """Return the step (d,), in units of `width`, with the least fault to first order.
 
-    No entry of the step exceeds `size`. The linear program minimises a bound t on all distances
-    plus a weighted bound u on negative margins."""
+    No entry of the step exceeds `size`. The linear program minimises a bound on all distances plus
+    a weighted bound on negative margins."""
     count, distances, soundness = len(width), len(seen.distance), len(seen.margin)
     by_step = np.concatenate([seen.distance_slope, -seen.distance_slope, -seen.margin_slope])
     one, none = np.ones((2 * distances, 1)), np.zeros((2 * distances, 1))
@@ -185,7 +190,7 @@ def _promising(seen: _Seen, width, size: float) -> NDArray[np.float64]:
 def _target(profile: Profile):
     """Return (normal angles (n,) in rad, points (2, n, 2) in m, outward unit normals (2, n, 2)).
 
-    The first axis of points and normals is addendum, dedendum."""
+    The first axis of points and normals has two entries: addendum and dedendum."""
     nu = profile.pitch_normal * jnp.linspace(0.0, 1.0, _NODES)
     points = [side(nu) for side in (profile.addendum, profile.dedendum)]
     places = jnp.stack([profile.position(point) for point in points])

@@ -1,9 +1,9 @@
 """The unit box of the design parameters, and the constraints in it.
 
-Design parameters map linearly from their bounds onto the sides of the box. A parameter whose range
-depends on the others is a fraction of that range instead. Constraints depend on geometry alone and
-are cheap. For families whose closed-form limits do not ensure a sound profile, the margins of
-`rootsopt.profiles.validity` are further constraints.
+Each design parameter is mapped linearly from its bounds to the range 0 … 1. If its range depends on
+the other parameters, it is mapped from that range within its bounds instead. Constraints depend on
+the geometry alone and are cheap. For families whose closed-form limits do not ensure a sound
+profile, the margins of `rootsopt.profiles.validity` are further constraints.
 """
 
 import importlib
@@ -36,15 +36,15 @@ _SOUND = (
     ("star shape", "star", "mm", 0.0, MM, MM),
     ("root above the axis", "root", "mm", 0.0, MM, MM),
 )
-"""Margins of a sound profile, besides its undercut margin."""
+"""Constraints that keep a profile sound, in addition to that on the undercut margin."""
 
 
 class Constraint(eqx.Module):
     """A constraint: value ≥ limit, or value ≤ limit for a `ceiling`.
 
-    `name`: in reports; `quantity`: a field of `Geometry`, or of `Margins` if `margin` is true;
-    `limit`: in SI units; `scale`: divides the slack, to make it of order one; `unit`: reported
-    unit; `factor`: SI value of one such unit.
+    `name`: name in reports; `quantity`: name of a field of `Geometry`, or of `Margins` if `margin`
+    is true; `limit`: limit in SI units; `scale`: divisor that makes the slack of order one; `unit`:
+    unit in reports; `factor`: SI value of one such unit.
     """
 
     name: str = eqx.field(static=True)
@@ -58,13 +58,14 @@ class Constraint(eqx.Module):
 
     @property
     def sign(self) -> float:
-        """+1 for a floor, -1 for a ceiling."""
+        """+1 if `limit` is a least value, -1 if it is a greatest value."""
         return -1.0 if self.ceiling else 1.0
 
     def slack(self, shape: Geometry, found: Margins | None = None) -> Float[Array, ""]:
-        """Return the scaled distance from the limit, ≥ 0 where the constraint is satisfied.
+        """Return the scaled distance from the limit, ≥ 0 if the constraint is satisfied.
 
-        `shape`, `found`: geometry and margins of the design."""
+        `shape`, `found`: geometry and margins of the design. `found` is needed only if `margin` is
+        true."""
         value = getattr(found if self.margin else shape, self.quantity)
         return self.sign * (value - self.limit) / self.scale
 
@@ -83,9 +84,9 @@ class Space(eqx.Module):
 
     @classmethod
     def of(cls, config: Config, scene: Scene, area_efficiency: float) -> "Space":
-        """Return the space of a config whose baseline has this `area_efficiency`.
+        """Return the design space of a config whose baseline design has this `area_efficiency`.
 
-        Raises `InputError` where the config's bounds are impossible."""
+        Raises `InputError` if the config's bounds are impossible."""
         limits, family = config.constraints, family_of(config.profile.family)
         rows = bounds_of(config)
         floor = limits.area_efficiency_min
@@ -128,9 +129,9 @@ class Space(eqx.Module):
         return jnp.stack(values)
 
     def point(self, design: Float[Array, " d"]) -> Float[Array, " d"]:
-        """Return the point (d,) of the unit box for a design in config units.
+        """Return the point (d,) of the unit box for a design (d,) in config units.
 
-        A design outside the bounds is moved to them."""
+        Parameters outside their bounds are first moved to the nearest bound."""
         values = jnp.clip(design, self.lower, self.upper)
         limits = zip(self.lower, self.upper, values, strict=True)
         shares = [(value - low) / (high - low) for low, high, value in limits]
@@ -147,7 +148,8 @@ class Space(eqx.Module):
         return dict(self.family.dependent(self.scene.lobes, radius, **named))
 
     def _within(self, values):
-        """Yield (index in the design, low, high), within the bounds, of parameters in `ranges`."""
+        """Yield (index in the design, low, high) for parameters in `ranges`, within their
+        bounds."""
         for key, (least, most) in self.ranges(values).items():
             place = self.family.keys.index(key)
             most = jnp.minimum(most, self.upper[place])

@@ -1,4 +1,4 @@
-"""Rotor profiles: the roll-angle core and one file per family."""
+"""Rotor profiles: the common roll-angle description, and one module per family."""
 
 from rootsopt.profiles.arc_families import arc, arcs_epicycloid, five_arcs, four_arcs
 from rootsopt.profiles.arcs import Arcs

@@ -44,10 +44,11 @@ class Arcs(Profile):
     ) -> "Arcs":
         """Return n tangent arcs from the tip to the pitch crossing.
 
-        `pitch_radius`: r (m). `center`: distance (m) of the first arc's centre from the rotor's
-        axis, along the lobe's axis; `None`: the first arc is a land. `radii` (n - 1,): of all arcs
-        but the last (m). `joints` (n - 1,): normal angles (rad) at which these arcs end. The last
-        arc's radius follows from the pitch crossing. `names` (n,): names of the arcs."""
+        `lobes`: N; `pitch_radius`: r (m). `center`: distance (m) of the first arc's centre from the
+        rotor's axis, along the lobe's axis; `None`: the first arc is a land. `radii` (n - 1,):
+        radii (m) of all arcs except the last. `joints` (n - 1,): normal angles (rad) at which these
+        arcs end. The last arc's radius follows from the pitch crossing. `names` (n,): names of the
+        arcs."""
         r = jnp.asarray(pitch_radius)
         half = jnp.pi / (2 * lobes)
         crossing = r * jnp.stack([jnp.cos(half), jnp.sin(half)])
@@ -90,7 +91,7 @@ class Arcs(Profile):
         return tuple(parts)
 
     def _arc(self, nu):
-        """Return the index of the arc at `nu`; the first and last arc extend beyond their ends."""
+        """Return the index of the arc at `nu`; the first and last arcs extend beyond their ends."""
         return jnp.sum(nu[..., None] > self.joints[1:-1], axis=-1)
 
     def lever(self, nu):

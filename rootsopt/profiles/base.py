@@ -1,4 +1,4 @@
-"""The roll-angle core: one description of a conjugate flank for every profile family.
+"""The roll-angle form: one description of a conjugate flank for all profile families.
 
 Two identical rotors with `N` lobes roll 1:1 on pitch circles of radius `r`. A family
 describes only the *addendum* of one flank, as a function of the normal angle `nu`. This is the
@@ -34,15 +34,16 @@ from jax import lax
 from jaxtyping import Array, Float
 
 _BRACKETS = 16
-"""Intervals per segment that bracket the normal angle at a roll angle."""
+"""Number of intervals per segment, one of which brackets the normal angle at a given roll angle."""
 _STEPS = 10
-"""Safeguarded Newton steps for the normal angle at a roll angle; a step that leaves the bracket is
-replaced by a bisection."""
+"""Number of safeguarded Newton steps in the search for the normal angle at a given roll angle. A
+step that leaves the bracket is replaced by a bisection."""
 _POLISH = 3
-"""Plain Newton steps after the safeguarded ones; they carry derivatives up to this order."""
+"""Number of plain Newton steps after the safeguarded ones; also the greatest order of derivatives
+that they carry."""
 _FLAT = 1e-9
-"""Least dβ/dν by which a Newton step divides. The true value is 0 on an arc centred on the pitch
-circle."""
+"""Value of dβ/dν below which a Newton step divides by this value instead. The true value is 0 on an
+arc centred on the pitch circle."""
 
 
 class RollPoint(NamedTuple):
@@ -60,9 +61,9 @@ class RollPoint(NamedTuple):
 class Segment(NamedTuple):
     """A smooth part of the addendum between two normal angles.
 
-    `name`: for figures and messages; `start`, `stop`: normal angles (rad); `land`: whether the
-    segment is concentric with the rotor (ψ = π/2). A land transmits no torque, so that the search
-    for flank contact skips it.
+    `name`: name in figures and messages; `start`, `stop`: normal angles (rad) at its ends; `land`:
+    whether the segment is concentric with the rotor (ψ = π/2). A land transmits no torque, so the
+    search for flank contact usually skips it.
     """
 
     name: str
@@ -74,7 +75,7 @@ class Segment(NamedTuple):
 class Quadrature(NamedTuple):
     """Rule for integrals over one smooth part of a profile (see `Profile.stretches`).
 
-    `nodes`: number of Gauss-Legendre nodes; `graded`: whether they crowd towards both ends;
+    `nodes`: number of Gauss-Legendre nodes; `graded`: whether they are denser near both ends;
     `between`: number of equal intervals whose ends are also checked for undercut."""
 
     nodes: int
@@ -115,19 +116,19 @@ class Profile(eqx.Module):
 
         A segment is cut where only a few derivatives are continuous, and at a minimum of the
         pressure angle. At a minimum, a normal may almost touch the pitch circle, where ψ has a
-        square-root singularity. The default is no cut."""
+        square-root singularity. By default, no segment is cut."""
         return self.segments()
 
     @property
     def quadrature(self) -> Quadrature:
         """Rule for integrals over each part in `stretches`.
 
-        By default nodes crowd towards the ends. They resolve a square-root singularity of ψ to
-        rounding, even one that lies 1e-4 of the part's length beyond an end."""
+        By default, nodes are denser near the ends. They integrate a square-root singularity of ψ to
+        rounding error, even if it lies 1e-4 of the part's length beyond an end."""
         return Quadrature(64, True, 128)
 
     def _cut(self, segment: Segment, place: Float[Array, ""]) -> tuple[Segment, Segment]:
-        """Split a segment at the normal angle `place` (rad); outside it, one part is empty."""
+        """Split a segment at the normal angle `place` (rad), clipped to the segment's range."""
         name, start, stop, land = segment
         middle = jnp.clip(lax.stop_gradient(place), start, stop)
         return Segment(name, start, middle, land), Segment(name, middle, stop, land)
@@ -189,16 +190,17 @@ class Profile(eqx.Module):
 
     @property
     def search_nodes(self) -> int:
-        """Nodes per segment on which the contact search brackets the closest approach.
+        """Number of nodes per segment on which the contact search brackets the closest approach.
 
-        They need to be just dense enough to separate the minima of the gap."""
+        The nodes must be dense enough to separate the minima of the gap."""
         return 32
 
     @property
     def turn_ratio(self) -> float:
         """Factor κ of the angle κν whose cosine and sine `lever_from` receives.
 
-        The contact search gets both from the addition theorem, without a call per node."""
+        The contact search computes both by the addition theorem, without a trigonometric function
+        per node."""
         return 1.0
 
     @property
@@ -246,7 +248,7 @@ class Profile(eqx.Module):
         )
 
     def roll_rate(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return dβ/dν, between 0 (tip arc centred on the pitch circle) and 1 (involute)."""
+        """Return dβ/dν: 0 on a tip arc centred on the pitch circle, 1 on an involute."""
         return jax.jvp(self.roll_angle, (nu,), (jnp.ones_like(nu),))[1]
 
     def speeds(
@@ -279,7 +281,7 @@ class Profile(eqx.Module):
 
 
 def _inverse(profile: Profile, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return the greatest normal angle (rad) with this roll angle, by safeguarded Newton.
+    """Return the greatest normal angle (rad) at this roll angle, by safeguarded Newton steps.
 
     The search is not differentiated. The plain Newton steps after it carry the derivatives with
     respect to roll angle and design, and continue the flank analytically beyond its ends."""

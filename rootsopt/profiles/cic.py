@@ -14,7 +14,7 @@ def arc_involute(
     pressure_angle: Float[ArrayLike, ""],
     involute_length: Float[ArrayLike, ""],
 ) -> "CIC":
-    """Return a CIC rotor without a tip land: arc and involute. Arguments as for `CIC`."""
+    """Return a CIC rotor without a tip land: arc and involute. The arguments are those of `CIC`."""
     return CIC(lobes, pitch_radius, pressure_angle, involute_length, 0.0)
 
 
@@ -28,7 +28,8 @@ class CIC(Profile):
     the outer radius c + ρ follows from them. For u = `longest_involute` the arc is centred on the
     pitch circle (c = r), as in the textbook CIC.
 
-    `longest_involute`: u_max = r sin α (π/2N - θ1) (m), above which the roll angle turns back.
+    `longest_involute`: u_max = r sin α (π/2N - θ1) (m); with a longer involute, the roll angle
+    turns back.
     `base_radius`: r cos α (m). `involute_start`: β_u (rad). `arc_center_radius`: c (m).
     `arc_radius`: ρ (m). `arc_end`: normal angle (rad) at which the arc meets the involute.
     `involute_end`: normal angle (rad) at which the involute meets the pitch circle.
@@ -92,7 +93,7 @@ class CIC(Profile):
         return c * jnp.cos(turn) - jnp.sqrt(r**2 - (c * jnp.sin(turn)) ** 2)
 
     def _arc_turn(self, nu):
-        """Return the normal angle (rad) from the arc's start, clipped to the arc."""
+        """Return the normal angle (rad) from the arc's start, limited to the arc."""
         return jnp.clip(nu, self.tip_arc_angle, self.arc_end) - self.tip_arc_angle
 
     def roll_angle(self, nu):

@@ -1,4 +1,4 @@
-"""Addenda given as curves; the roll angle follows from their normals by the law of gearing."""
+"""Addenda given as curves, whose normals determine the roll angle by the law of gearing."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -15,12 +15,14 @@ from jaxtyping import Array, Float
 from rootsopt.profiles.base import Profile, Quadrature, Segment
 
 INTERVALS = 48
-"""Intervals per piece; one quintic per interval deviates from a smooth curve by about 1e-11 r."""
+"""Number of intervals per piece. With one quintic per interval, the deviation from a smooth curve
+is about 1e-11 r."""
 _STEPS = 4
-"""Newton steps for the normal angle at a roll angle, from a table accurate to about 1e-4."""
+"""Number of Newton steps in the search for the normal angle at a given roll angle. The search
+starts from a table accurate to about 1e-4."""
 _GAUSS = np.polynomial.legendre.leggauss(4)
-"""Gauss-Legendre nodes and weights for one interval or a part of it; the integral is exact to
-rounding."""
+"""Gauss-Legendre nodes and weights for an interval or a part of it. The integral is exact to
+rounding error."""
 
 
 class Piece(NamedTuple):
@@ -58,8 +60,8 @@ class Curve(Profile):
     `node` (n,): normal angles (rad); `series` (n, 6): coefficients of ψ (rad) in powers of the
     distance from the node; `value` (n,): support function (m) at the node; `ends` (m,): joints
     (rad) between the pieces, from 0 to the pitch crossing. A joint has one node of each piece,
-    because dψ/dν may jump there. Beyond the pitch crossing ψ continues as a parabola, over the tip
-    by symmetry.
+    because dψ/dν may jump there. Beyond the pitch crossing, ψ continues as a parabola; over the
+    tip, it continues by symmetry.
     """
 
     lobes: int = eqx.field(static=True)
@@ -84,7 +86,8 @@ class Curve(Profile):
         """Return the addendum made of `pieces`, with `intervals` quintics each.
 
         The pieces extend from the lobe's axis to the pitch crossing and have the same normal where
-        they meet. `pitch_radius`: r (m). `sharp`: whether the last piece ends in a cusp."""
+        they meet. `lobes`: N; `pitch_radius`: r (m). `sharp`: whether the last piece ends in a
+        cusp."""
         r = jnp.asarray(pitch_radius)
         t = jnp.arange(intervals + 1, dtype=r.dtype) / intervals
         turning = [functools.partial(_turning, _rolling(piece, r)) for piece in pieces]
@@ -231,7 +234,7 @@ def _rolling(piece, pitch_radius):
 
 
 def _turning(roll, t):
-    """Return (ν in rad, ψ in rad, dψ/dν, d²ψ/dν²) at t of the piece with the function `roll`."""
+    """Return (ν in rad, ψ in rad, dψ/dν, d²ψ/dν²) at t, from a piece's function `roll`."""
     one = jnp.ones_like(t)
 
     def angles(t):

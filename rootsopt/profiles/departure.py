@@ -9,13 +9,15 @@ from rootsopt.profiles.base import Profile
 from rootsopt.runtime.programs import Program
 
 _NODES = 400
-"""Nodes per side of the pitch circle; the chords then deviate from the flank by about 1e-7 r."""
+"""Number of nodes on each side of the pitch circle. Chords then deviate from the flank by about
+1e-7 r."""
 
 
 def departure(profile: Profile, other: Profile, nodes: int = _NODES) -> float:
-    """Return the greatest distance (m) between two flanks from tip to root, measured both ways.
+    """Return the greatest distance (m) between the flanks of two profiles, from tip to root.
 
-    `nodes`: nodes on each side of the pitch circle."""
+    The distance is measured from each flank to the other; the greater result counts. `nodes`: least
+    number of points on each side of the pitch circle."""
     first, second = (flank_points(one, nodes) for one in (profile, other))
     return float(max(distances(first, second).max(), distances(second, first).max()))
 

@@ -1,4 +1,4 @@
-"""Check that the edge between a tip land and an arc is not too sharp."""
+"""Checks that the edge between a tip land and an arc is not too sharp."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -9,12 +9,12 @@ if TYPE_CHECKING:
     from rootsopt.config.scene import ProfileConfig
 
 _SHARPEST = 0.002
-"""Radius of an edge (pitch radii) below which a config is rejected. On so sharp an edge, nodes of
-outline and contact coincide."""
+"""Edge radius (pitch radii) below which a config is rejected. On a sharper edge, nodes of the
+outline and of the contact would coincide."""
 
 
 def check(profile: "ProfileConfig") -> None:
-    """Raise `InputError` where the edge radius is below `_SHARPEST` pitch radii."""
+    """Raise `InputError` if the edge radius is below `_SHARPEST` pitch radii."""
     edge: Any = profile.parameters["edge_radius_mm"]
     least = _SHARPEST * profile.pitch_radius_mm
     if edge < least:

@@ -11,7 +11,8 @@ class EE(Profile):
     """The EE rotor: rolling radius r/2N, ψ = N |π/2N - β|, s = (r/N) sin(N(π/2N - β)).
 
     These are the paper's Eqs. 7 and 8 with two misprints corrected: sine and cosine of Eq. 7 are
-    swapped, and the undefined τ of Eq. 8 is γ. The size is the only parameter.
+    swapped, and the undefined τ of Eq. 8 is γ. Apart from the number of lobes, the pitch radius is
+    the only parameter.
     """
 
     lobes: int = eqx.field(static=True)

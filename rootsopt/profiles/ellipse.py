@@ -13,7 +13,7 @@ def ellipse(
     ellipse_center: Float[ArrayLike, ""],
     ellipse_height: Float[ArrayLike, ""],
 ) -> Curve:
-    """Return a lobe that is an arc of an ellipse through both pitch crossings.
+    """Return a lobe formed by an arc of an ellipse through both pitch crossings.
 
     `lobes`: N; `pitch_radius`: r (m). `ellipse_center`: b (m), distance of the ellipse's centre
     from the rotor's axis, along the lobe's axis. `ellipse_height`: A (m), semi-axis along the

@@ -15,11 +15,11 @@ class TippedEpicycloid(Profile):
     ψ = κ (π/2N - β) and s = 2 r_e sin ψ, so that ds/dβ = -r cos ψ. Its conjugate is the hypocycloid
     of the same circle. EE has r_e = r / 2N, with which ψ reaches π/2 on the lobe's axis. The tip
     arc is tangent to the epicycloid at the joint, and its centre C lies on the lobe's axis. With
-    normal ν and pressure angle ψ at the joint, C is c = r cos ψ / sin ν from the rotor's axis.
-    No epicycloid with r_e < r is undercut: the arc length of its conjugate per ν is
+    normal ν and pressure angle ψ at the joint, C lies at the distance c = r cos ψ / sin ν from the
+    rotor's axis. No epicycloid with r_e < r is undercut: the arc length of its conjugate per ν is
     4 r_e (r - r_e) sin ψ / (r + 2 r_e). (Derivation; no source of the formulas was available.)
 
-    `rolling_radius`: r_e (m). `joint`: normal angle (rad) at which the arc ends.
+    `rolling_radius`: r_e (m). `joint`: normal angle (rad) at which the tip arc ends.
     `arc_center_radius`: c (m). `arc_radius`: radius of the tip arc (m). `land`: whether the arc is
     centred on the rotor's axis (c = 0). `lobes`: N; `pitch_radius`: r (m).
     """
@@ -73,7 +73,7 @@ class TippedEpicycloid(Profile):
         return (self.pitch_radius + 2 * self.rolling_radius) * jnp.sin(self._psi(nu))
 
     def _on_arc(self, nu):
-        """Return (whether `nu` is on the arc, `nu` on the arc and 0 elsewhere)."""
+        """Return (whether `nu` is on the arc, `nu` if it is on the arc and 0 otherwise)."""
         on_arc = nu < self.joint
         return on_arc, jnp.where(on_arc, nu, 0.0)
 
@@ -127,7 +127,9 @@ def circle_epicycloid(
 def hypo_epicycloid(
     lobes: int, pitch_radius: Float[ArrayLike, ""], tip_arc_angle: Float[ArrayLike, ""]
 ) -> TippedEpicycloid:
-    """Return complete half arches of hypocycloid and epicycloid, with a land at tip and root.
+    """Return a flank of half an epicycloid arch and half a hypocycloid arch, between lands.
+
+    One land is at the tip, the other at the root.
 
     `lobes`: N; `pitch_radius`: r (m). The land has the half angle `tip_arc_angle` θ1 (rad). For
     identical rotors at 1:1, the rolling circle of both arches is the same. ψ must be π/2 where the

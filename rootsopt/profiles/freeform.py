@@ -1,4 +1,4 @@
-"""Free form: a flank given by a B-spline of how fast its pressure angle falls."""
+"""Free form: a flank given by a B-spline for the rate at which its pressure angle falls."""
 
 import functools
 import itertools
@@ -17,17 +17,18 @@ _DEGREE = 2
 """Degree of the B-spline."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _STEPS = 8
-"""Safeguarded Newton steps for the normal angle at a roll angle; a step that leaves the bracket is
-replaced by a bisection."""
+"""Number of safeguarded Newton steps in the search for the normal angle at a given roll angle. A
+step that leaves the bracket is replaced by a bisection."""
 _POLISH = 3
-"""Plain Newton steps after the safeguarded ones; they carry derivatives up to this order."""
+"""Number of plain Newton steps after the safeguarded ones; also the greatest order of derivatives
+that they carry."""
 _SAMPLES = 40
-"""Points per knot span in the least-squares fit of a free form."""
+"""Number of points per knot span in the least-squares fit of a free form."""
 _FIRMLY = 1e3
-"""Weight of the pitch crossing in the fit of a free form; all other points have weight 1."""
+"""Weight of the pitch crossing in the fit of a free form; all other points have a weight of 1."""
 _FLAT = 1e-9
-"""Least dβ/dν by which a Newton step divides. The true value is 0 on an arc centred on the pitch
-circle."""
+"""Value of dβ/dν below which a Newton step divides by this value instead. The true value is 0 on an
+arc centred on the pitch circle."""
 
 
 class FreeForm(Profile):
@@ -37,10 +38,11 @@ class FreeForm(Profile):
     dψ = -τ dν. The rate τ(ν) is a quadratic B-spline with even knots from the end of the land to
     the pitch crossing. ψ(ν) is a cubic B-spline that starts at π/2.
 
-    If no coefficient exceeds 1 (an arc centred on the pitch circle), the roll angle does not turn
-    back. If no coefficient is below 0 (an involute), ψ falls steadily. Where τ < 0, ψ rises, as in
-    a single arc towards the pitch circle. In an EE rotor without a land all coefficients are
-    N / (1 + N). The length of the spline follows from the roll angle of the pitch crossing,
+    If no coefficient exceeds 1 (the value on an arc centred on the pitch circle), the roll angle
+    does not turn back. If no coefficient is below 0 (the value on an involute), ψ never rises.
+    Where τ < 0, ψ rises, as in a single arc towards the pitch circle. All coefficients of an EE
+    rotor, which has no land, are N / (1 + N). The length of the spline follows from the roll angle
+    of the pitch crossing,
 
         (ν_p - θ1) (1 - mean of τ) = π/2N - θ1,
 
@@ -155,7 +157,7 @@ class FreeForm(Profile):
         want = roll_angle - starts[span]
 
         def short(c, width, want, share):
-            """Return β minus the wanted β (rad) at a fraction of the span, and its derivative."""
+            """Return β minus the required β (rad) at a fraction of the span, and its derivative."""
             rise = share * (width + c[1] + share * (c[2] + share * c[3]))
             slope = width + c[1] + share * (2 * c[2] + 3 * share * c[3])
             return rise - want, jnp.maximum(slope, _FLAT * width)
@@ -178,8 +180,8 @@ class FreeForm(Profile):
 def project(profile: Profile, count: int) -> FreeForm:
     """Return the free form of `count` coefficients nearest to a `profile`, with the same tip land.
 
-    `count`: at least 3. A least-squares fit of the pressure angle over the normal angle, linear in
-    the coefficients, gives their values. They stay between -1 and 1.
+    `count`: number of coefficients, at least 3. The coefficients come from a linear least-squares
+    fit of the pressure angle as a function of the normal angle. They are kept between -1 and 1.
     """
     from scipy.optimize import lsq_linear  # Imported here only: it takes 0.2 s.
 

@@ -24,7 +24,7 @@ error, 1e-13."""
 class Geometry(eqx.Module):
     """Geometry of one rotor's cross-section (SI units).
 
-    `outer_radius`, `root_radius`: greatest and least distance of the outline from the axis (m).
+    `outer_radius` r_a, `root_radius`: greatest and least distance of the outline from the axis (m).
     `area`: A (m²). `area_efficiency`: 1 - A/(π r_a²). `polar_area_moment`: ∫r² dA about the axis
     (m⁴). `undercut_margin`: least `Profile.dedendum_speed` (m per rad). `seal_width`: arc length of
     the whole tip land (m).
@@ -44,7 +44,7 @@ def geometry(profile: Profile) -> Geometry:
 
     Area and inertia follow from Green's theorem on the roll-angle form. With the support function
     h = P·n and the arc length element dl, dA = h dl / 2 and ∫r² dA = ∫ |P|² h dl / 4 over the
-    outline. An `Outline` brings its own values, measured when its file was read.
+    outline. The values of an `Outline` are those measured when its file was read.
     """
     if isinstance(profile, Outline):
         return _given(profile)
@@ -87,7 +87,7 @@ def geometry(profile: Profile) -> Geometry:
 
 @functools.cache
 def _rule(quadrature: Quadrature) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (fractions, weights) to integrate over one smooth part of a profile.
+    """Return (nodes as fractions of the part's length, weights) for one smooth part of a profile.
 
     Points that are only checked for undercut have weight 0."""
     nodes, weights = np.polynomial.legendre.leggauss(quadrature.nodes)
@@ -147,7 +147,7 @@ def _element(profile, nu):
     """Return the node density over the normal angle (m/rad).
 
     The longer of the two conjugate arc elements resolves both flanks evenly. An added constant
-    resolves sharp spots such as the pitch crossing of EE."""
+    ensures enough nodes at sharp spots, such as the pitch crossing of EE."""
     _, addendum, dedendum = profile.speeds(nu)
     longest = jnp.maximum(jnp.abs(addendum), jnp.abs(dedendum))
     return longest + 0.3 * profile.pitch_radius

@@ -22,10 +22,10 @@ _CLEAR = 1e-6
 rejected. At the limit, the tip arc's centre is on the pitch circle for the second time."""
 _LEAST_INVOLUTE = 0.002
 """Involute length (fraction of the longest) below which a config is rejected. A shorter involute
-changes nothing, and was probably given in metres."""
+has no effect, and its length was probably given in metres."""
 _SHORTEST = 0.1
-"""Involute length (fraction of the longest) below which a search does not go; a config can only
-raise this bound."""
+"""Least involute length (fraction of the longest) in a search. The bounds in a config can only
+raise this limit."""
 
 
 def ranges(
@@ -35,7 +35,7 @@ def ranges(
     involute_length_mm: Float[Array, ""],
     tip_arc_angle_deg: Float[Array, ""] | float = 0.0,
 ) -> dict[str, tuple[Float[Array, ""], Float[Array, ""]]]:
-    """Return {"involute_length_mm": (shortest, longest)} (mm), the range that a search may use.
+    """Return {"involute_length_mm": (shortest, longest)}, the range (mm) that a search may use.
 
     The other parameters determine this range. The longest involute is `CIC.longest_involute`, so
     that u ≤ u_max holds by construction."""

@@ -12,8 +12,8 @@ class Table(eqx.Module):
     """k functions of x as cubic Hermite interpolants.
 
     `node` (n,): values of x, not decreasing; `value`, `slope` (n, k): values and derivatives of the
-    functions at the nodes. Where a node is given twice, the slopes may jump. Beyond the ends, the
-    first and the last cubic continue.
+    functions at the nodes. The slopes may jump at a node that is given twice. Beyond the ends, the
+    first and the last cubic are continued.
     """
 
     node: Float[Array, " n"]
@@ -39,14 +39,14 @@ class Table(eqx.Module):
 class Outline(Profile):
     """A flank from a drawing or a measurement.
 
-    `crown`: support function h and lever q (m) of the addendum over its normal angle ν, from the
-    tip to the pitch circle. The addendum is convex, so that ν identifies its points. `valley`:
-    normal direction F from the valley's axis (rad), h and q (m) of the dedendum. The table's
-    parameter runs from 0 at the root to `pitch_normal` at the pitch circle. F cannot replace this
-    parameter, because a dedendum may be convex and concave. dh = -q dF, and dq = h dF minus the arc
-    length element along the tangent.
+    `crown`: support function h and lever q (m) of the addendum as functions of its normal angle ν,
+    from the tip to the pitch circle. The addendum is convex, so that ν identifies its points.
+    `valley`: normal direction F from the valley's axis (rad), h and q (m) of the dedendum. The
+    table's parameter runs from 0 at the root to `pitch_normal` at the pitch circle. F cannot
+    replace this parameter, because a dedendum may have convex and concave parts. dh = -q dF, and dq
+    = h dF minus the arc length element along the tangent.
 
-    Beyond its ends, the addendum continues with its circles of curvature, over the tip with its
+    Beyond its ends, the addendum is continued by its circles of curvature; over the tip, by its
     mirror image. The law of gearing is not assumed: `mate` is the given dedendum. Roll angle and
     contact distance are those at which each curve's own normals meet the pitch circle.
 

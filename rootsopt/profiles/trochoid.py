@@ -10,20 +10,19 @@ from rootsopt.profiles.curve import Curve, RollPiece
 def extended_cycloid(
     lobes: int, pitch_radius: Float[ArrayLike, ""], trochoid_ratio: Float[ArrayLike, ""]
 ) -> Curve:
-    """Return an epicycloid traced by a point whose distance from the rolling circle's centre
-    varies.
+    """Return an epicycloid traced by a point at varying distance from the rolling circle's centre.
 
     `lobes`: N; `pitch_radius`: r (m). With r_e = r / 2N the curve is
     P(θ) = e^{iθ} [r + r_e + λ(θ) r_e e^{2iNθ}], from the tip (θ = 0) to the pitch crossing
-    (θ = π/2N). The ratio λ goes from `trochoid_ratio` λ0 at the tip to 1 at the crossing:
+    (θ = π/2N). The ratio λ varies from `trochoid_ratio` λ0 at the tip to 1 at the crossing:
     λ = 1 + (λ0 - 1) u³ (10 - 15 u + 6 u²) with u = 1 - 2Nθ/π. This quintic has zero first and
     second derivatives at both ends. The idea comes from Hsieh and Hwang (J. Mech. Des. 129 (2007)
     1278), whose own formulas were not available. λ0 = 1 gives EE. The outer radius is
     r + (1 + λ0) r_e.
 
-    The crossing is a cusp: dP/dθ vanishes with δ = π/2N - θ. All terms of the normal are therefore
-    computed with their power of δ divided out. In the frame turned by θ, with w = e^{-2iNδ}, the
-    normal is (X δ + iY) / M, with M = |X δ + iY| and
+    The crossing is a cusp: dP/dθ vanishes in proportion to δ = π/2N - θ. Powers of δ are therefore
+    divided out of the terms of the normal. In the frame turned by θ, with w = e^{-2iNδ}, the normal
+    is (X δ + iY) / M, with M = |X δ + iY| and
 
         X δ + iY = (r + r_e) (1 - λ w) / δ + i r_e w λ′ / δ.
 

@@ -11,11 +11,11 @@ from rootsopt.runtime.programs import Program
 PURE = ("turning", "rolling", "order")
 """Names of the margins that are angles or ratios, not lengths."""
 _POINTS = 400
-"""Points per segment at which margins are evaluated."""
+"""Number of points per segment at which margins are evaluated."""
 
 
 class Margins(NamedTuple):
-    """Margins of a flank: least values along it, positive where the profile is sound.
+    """Margins of a flank: least values along it, not negative if the profile is sound.
 
     `turning`: range of normal angles of a segment (rad), negative where joints are out of order.
     `convexity`: radius of curvature of the addendum (m).
@@ -48,7 +48,8 @@ class Margins(NamedTuple):
 def margins(profile: Profile) -> Margins:
     """Return the margins of a profile, each the least value over `_POINTS` points per segment.
 
-    Both sides of a joint are evaluated. Minima between points are found by a parabola."""
+    Both sides of a joint are evaluated. A minimum between points is that of the parabola through
+    three points."""
     segments = profile.segments()
     start = jnp.stack([s.start for s in segments])[:, None]
     length = jnp.stack([s.stop for s in segments])[:, None] - start

@@ -1,6 +1,6 @@
-"""The scene: everything except the design. A scene builds a rotor pair from a design.
+"""The scene: everything that is simulated except the design. It builds a rotor pair from a design.
 
-A design is a vector of the config's design parameters in the config's own units. Gradients are
+A design is a vector of the config's design parameters, in the config's own units. Gradients are
 therefore per config unit. A family without parameters (EE) has an empty design.
 """
 
@@ -46,18 +46,18 @@ from rootsopt.scene import families, reading
 class Scene(eqx.Module):
     """Everything except the design, in SI units: builds a rotor pair from a design.
 
-    Physical quantities are leaves, and responses are differentiable with respect to them. Choices
-    are static, so that one compiled program serves every scene of the same kind.
+    Physical quantities are leaves, with respect to which responses are differentiable. Choices are
+    static, so that one compiled program serves all scenes with the same choices.
 
     `family`, `lobes`, `pitch_radius` (m): profile; `design_size`: number d of its parameters.
     `fidelity`, `map_size`, `nodes`: contact model and its resolution.
-    `precision`: number type of the integration; `solver`: finds the steady motion.
+    `precision`: number type of the integration; `solver`: solver for the steady motion.
     `straight`: whether the rotors have no helix.
     `length` (m), `density` (kg/m³), `bore_radius` (m, `None`: no bore): body of a rotor.
     `law`, `clearance` (m): contact law, and distance added to every flank gap.
     `speed` (rad/s), `load_torque` (N·m), `pressure` (Pa, `None`: constant torque): operation.
     `gear`, `gear_damping_ratio`, `motor`, `friction`, `supports`: optional parts.
-    `deepest`: relative rotation (rad, negative) that a contact map must reach.
+    `deepest`: relative rotation (rad, negative) down to which a contact map must extend.
     `center_distance_error`: centre distance minus twice the pitch radius (m), or `None`.
     `outline`: profile read from a file, or `None`; `extra`: further parts.
     """
@@ -94,12 +94,12 @@ class Scene(eqx.Module):
     def from_config(cls, config: Config, deepest: float | None = None) -> "Scene":
         """Return the scene of a config.
 
-        `deepest`: relative rotation (rad, negative) that the contact map must reach; by default an
-        estimate. If the config does not give the map's size, use a medium size. (`evaluate` chooses
-        the size from `solver.map_error` instead.)
+        `deepest`: relative rotation (rad, negative) down to which the contact map must extend; by
+        default, an estimate. If the config does not give the map's size, use a default size.
+        (`evaluate` chooses the size from `solver.map_error` instead.)
 
-        Raises `RuntimeError` where JAX is not set to the precision that the config needs, and
-        `InputError` where an outline file cannot be used."""
+        Raises `RuntimeError` if JAX is not set to the precision that the config needs, and
+        `InputError` if an outline file cannot be used."""
         check_precision(config.solver.precision)
         if deepest is None:
             deepest = reading.expected_rotation(config)
@@ -136,14 +136,14 @@ class Scene(eqx.Module):
         return float(self.law.depth_at(force))
 
     def inertia(self, shape: Geometry) -> Float[Array, ""]:
-        """Return the moment of inertia (kg·m²) about its axis of one rotor with this geometry."""
+        """Return the moment of inertia (kg·m²) of one rotor of this geometry about its axis."""
         moment = shape.polar_area_moment
         if self.bore_radius is not None:
             moment = moment - jnp.pi / 2 * self.bore_radius**4
         return self.density * self.length * moment
 
     def mass(self, shape: Geometry) -> Float[Array, ""]:
-        """Return the mass (kg) of one rotor with this geometry."""
+        """Return the mass (kg) of one rotor of this geometry."""
         area = shape.area
         if self.bore_radius is not None:
             area = area - jnp.pi * self.bore_radius**2
@@ -153,14 +153,15 @@ class Scene(eqx.Module):
     def two_sided(self) -> bool:
         """Whether drive and coast flanks may touch at the same time.
 
-        This is so where the axes can leave the nominal centre distance or flanks are not conjugate.
+        This is the case if the axes can leave the nominal centre distance or the flanks are not
+        conjugate.
         """
         odd = self.supports, self.center_distance_error, self.outline
         moved = any(part.displaces for part in self.extra)
         return moved or any(part is not None for part in odd)
 
     def with_parts(self, *parts: Part) -> "Scene":
-        """Return this scene with further `parts`, whose states come last in the state of a motion.
+        """Return this scene with further `parts`; their states come last in the state of a motion.
 
         Numbers in the parts' fields become arrays, so that responses are differentiable with
         respect to them."""
@@ -195,7 +196,7 @@ class Scene(eqx.Module):
         return SearchContact.of(profile, distance, two_sided=True)
 
     def _drive(self, load: Load) -> Drive:
-        """Return the drive; a motor without a torque of its own gets the load's torque."""
+        """Return the drive. A motor for which no torque is given gets the torque of the load."""
         motor = self.motor
         if motor is None:
             return PrescribedDrive(self.speed)
@@ -233,8 +234,8 @@ class Scene(eqx.Module):
     def pair_and_shape(self, design: Float[Array, " d"]) -> tuple[RotorPair, Geometry]:
         """Return (rotor pair, geometry of one rotor) for a design (d,) in config units.
 
-        Raises `InputError` for twisted rotors. Along their length all phases of the mesh occur at
-        the same time, which this package does not model."""
+        Raises `InputError` for twisted rotors. Along the length of such rotors, all phases of the
+        mesh occur at the same time, which this package does not model."""
         if not self.straight:
             raise InputError(
                 "`rotor.helix_deg` must be 0, because only straight rotors are simulated; set it "
@@ -300,8 +301,8 @@ def along(
     """Return (pair, derivatives of the pair along `directions`, geometry) of `build(primal)`.
 
     `build`: function that returns a rotor pair and the geometry of one rotor. `directions`: tree
-    with the structure of `primal` and a leading axis, which may be empty. The derivatives have the
-    pair's own structure with the same leading axis."""
+    with the structure of `primal` and a leading axis, which may have length 0. The derivatives have
+    the pair's own structure with the same leading axis."""
 
     def parted(primal):
         pair, shape = build(primal)
@@ -320,7 +321,7 @@ def along(
 
 
 class _Static(eqx.Module):
-    """Carries a value that is not an array through a transformation."""
+    """Carries a value that is not an array through a JAX transformation."""
 
     value: Any = eqx.field(static=True)
 
@@ -330,5 +331,5 @@ def _single(leaf):
 
 
 def _as_arrays(tree):
-    """Return `tree` with its numbers as arrays."""
+    """Return `tree` with its numbers converted to arrays."""
     return jax.tree.map(lambda x: jnp.asarray(x, float) if isinstance(x, int | float) else x, tree)

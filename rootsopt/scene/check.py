@@ -1,4 +1,4 @@
-"""Checks a config's geometry, and draws its outline."""
+"""Checks a config's geometry, and computes its outline."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -35,7 +35,7 @@ def _shape(scene: Scene, design):
 
 
 def outline_mm(config: Config, design: ArrayLike | None = None) -> NDArray[np.float64]:
-    """Return the closed counter-clockwise outline (n, 2) in mm of a design.
+    """Return the closed counter-clockwise outline (n, 2), in mm, of a design.
 
     `design`: in config units, by default the config's own."""
     design = design_vector(config) if design is None else jnp.asarray(design)

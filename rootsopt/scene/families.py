@@ -1,4 +1,4 @@
-"""Makes and checks profiles from the config's family names, keys and units."""
+"""Makes and checks profiles, given family names, keys and units as in a config."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +17,7 @@ from rootsopt.profiles.validity import PURE, margins
 from rootsopt.runtime.programs import Program
 
 _ROUNDING = 1e-9
-"""Size of a negative margin (relative to its scale) below which it counts as 0."""
+"""Magnitude of a negative margin (relative to its scale) up to which the margin counts as 0."""
 
 
 def classical() -> tuple[str, ...]:
@@ -40,7 +40,7 @@ def profile_of(
 
 
 def keys_of(config: ProfileConfig) -> tuple[str, ...]:
-    """Return the names of the design parameters of a config."""
+    """Return the names of a config's design parameters, the entries of a list numbered from 1."""
     return config.design_keys
 
 
@@ -60,9 +60,10 @@ def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:
 
 
 def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, float]:
-    """Return (a config's profile as a free form, greatest distance (m) between the two flanks).
+    """Return (config of a free form fitted to a profile, greatest distance (m) from it).
 
-    `count`: number of coefficients. Raises `InputError` for an outline from a file."""
+    `config`: config of the given profile; `count`: number of coefficients. Raises `InputError` for
+    an outline from a file."""
     if config.from_file:
         raise InputError(
             "`profile.family` must not be read from a file for a projection onto a free form, but "
@@ -89,7 +90,7 @@ def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, floa
 def outline(config: ProfileConfig) -> Outline | None:
     """Return the profile of a config that names an outline file, `None` for any other config.
 
-    Raises `InputError` where the file does not hold a usable outline."""
+    Raises `InputError` if the file does not hold a usable outline."""
     if not config.from_file:
         return None
     from rootsopt.measured.source import outline_of  # Imported for outlines only: it takes 0.5 s.
@@ -100,7 +101,7 @@ def outline(config: ProfileConfig) -> Outline | None:
 def check(config: ProfileConfig) -> None:
     """Raise `InputError` unless the profile is sound.
 
-    For an outline from a file, raise it where the flanks never face each other."""
+    For an outline from a file, raise it only if the flanks never face each other."""
     if (given := outline(config)) is not None:
         conjugacy(given)
         return
@@ -127,7 +128,7 @@ def check(config: ProfileConfig) -> None:
 def margins_of(config: ProfileConfig) -> dict[str, float]:
     """Return the margins of a config's profile for the result file; {} for an outline from a file.
 
-    Each key is the name of a margin and its unit, as in `order_deg`."""
+    Each key is the name of a margin followed by its unit, as in `order_deg`."""
     if config.from_file:
         return {}
     radius = jnp.asarray(config.pitch_radius_mm * MM)

@@ -1,4 +1,4 @@
-"""Converts a config to the pieces of a scene: SI quantities, contact law, parts, solver."""
+"""Converts a config into the pieces of a scene: SI quantities, contact law, parts, solver."""
 
 import math
 from typing import Any
@@ -17,9 +17,10 @@ from rootsopt.dynamics.steady import Solver
 from rootsopt.scene import families
 
 _ORBIT_STEPS = 4
-"""Greatest number of steps for a whole orbit, as a multiple of the number for a mesh period."""
+"""Number of solver steps allowed for a whole orbit, as a multiple of the number that the config
+allows per mesh period."""
 _ROLLS, _RELATIVES = 384, 16
-"""Default size of a contact map: points over roll and over relative rotation."""
+"""Default size of a contact map: number of points over roll and over relative rotation."""
 
 
 def design_vector(config: Config) -> Float[Array, " d"]:
@@ -33,7 +34,7 @@ def design_keys(config: Config) -> tuple[str, ...]:
 
 
 def quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
-    """Return the physical quantities of a config in SI units, by their names in `Scene`."""
+    """Return the physical quantities of a config in SI units, keyed by `Scene` field names."""
     rotor, scene, gear = config.rotor, config.scene, config.scene.timing_gear
     return {
         "pitch_radius": jnp.asarray(config.profile.pitch_radius_mm * MM),
@@ -78,7 +79,7 @@ def gear_of(config: Config) -> TimingGear | None:
 
 
 def parts_of(config: Config) -> dict[str, Any]:
-    """Return motor, friction and supports of a config, as far as present, by their `Scene` names.
+    """Return those of motor, friction and supports that a config has, keyed by `Scene` field names.
 
     Numbers that `Scene` sets later, such as those that depend on the design, are NaN."""
     scene, friction = config.scene, config.contact.friction
@@ -110,17 +111,17 @@ def parts_of(config: Config) -> dict[str, Any]:
 
 
 def map_size(config: Config) -> tuple[int, int]:
-    """Return the number of points of the contact map over roll angle and relative rotation."""
+    """Return the numbers of points of the contact map over roll angle and relative rotation."""
     solver = config.solver
     return solver.map_rolls or _ROLLS, solver.map_relatives or _RELATIVES
 
 
 def expected_rotation(config: Config) -> float:
-    """Return an estimate of the greatest relative rotation (rad, negative) in a scene.
+    """Return an estimate (rad, negative) of the relative rotation of largest magnitude in a scene.
 
-    The length is 1.3 times clearance and half backlash, plus 1.5 times the penetration under 20
-    times the static contact force. The angle is this length over the pitch radius, at most a
-    quarter of π/2N."""
+    Its magnitude is a length divided by the pitch radius, but at most a quarter of π/2N. The length
+    is 1.3 times the sum of clearance and half the backlash, plus 1.5 times the penetration under 20
+    times the static contact force."""
     contact, scene = config.contact, config.scene
     radius = config.profile.pitch_radius_mm
     play = contact.clearance_mm
@@ -132,7 +133,7 @@ def expected_rotation(config: Config) -> float:
 
 
 def integrators(config: Config) -> tuple[Integrator, Integrator]:
-    """Return (integrator of the transient, integrator of the orbit) with the config's settings.
+    """Return (integrator of the transient, integrator of the orbit), with the config's settings.
 
     An orbit is allowed more steps, because it has several mesh periods and many short steps near
     its kinks."""
