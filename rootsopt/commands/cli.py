@@ -186,7 +186,7 @@ def _in_folder(command: str, body: Body, config: Config, options: argparse.Names
 
 @contextlib.contextmanager
 def waiting(console: "Console", what: str) -> Iterator[None]:
-    """Show the text `what` during a `with` block if `console` is a terminal; otherwise nothing."""
+    """Show the text `what` during a `with` block. If `console` is not a terminal, show nothing."""
     if not console.is_terminal:
         yield
         return

@@ -195,7 +195,7 @@ def _nowhere(number: int) -> None:
 
 @contextlib.contextmanager
 def _streams(own: bool) -> Iterator[_Stream]:
-    """Replace stdout and stderr by `_Stream` objects during the `with` block; yield stdout.
+    """Replace stdout and stderr with `_Stream` objects during the `with` block; yield stdout.
 
     `own`: whether the command runs as its own process. If so, closed standard streams are first
     redirected to the null device."""

@@ -31,7 +31,7 @@ class Drawing:
 
     @classmethod
     def of(cls, config: Config, profile: Profile, design: dict[str, float]) -> "Drawing":
-        """Return the drawing of a rotor with this `profile` and the length and bore of `config`.
+        """Return the drawing of a rotor with this `profile` and the dimensions in `config`.
 
         `design`: values of the design parameters (config units) by config key, for the notes."""
         shape: Geometry = _shape(profile)

@@ -88,8 +88,8 @@ class Arc:
 class Spline:
     """A cubic B-spline from its first control point to its last.
 
-    `knots` (n + 4,): knots, each about the arc length there (mm), fourfold at the ends; `controls`
-    (n,): control points (mm).
+    `knots` (n + 4,): knots (mm), close to the arc length and with multiplicity 4 at the ends;
+    `controls` (n,): control points (mm).
     """
 
     knots: Float64[np.ndarray, " m"]
@@ -318,7 +318,7 @@ class _Stretch:
 def _merged(pieces: list[DrawnPiece], tolerance: float) -> list[DrawnPiece]:
     """Join adjacent arcs of the same circle, also the last piece with the first.
 
-    `tolerance`: difference between two circles (mm) up to which they are the same."""
+    `tolerance`: difference between two circles (mm) up to which they count as the same."""
     merged: list[DrawnPiece] = []
     for piece in pieces:
         if merged and (joined := _joined(merged[-1], piece, tolerance)):

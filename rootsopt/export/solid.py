@@ -51,7 +51,7 @@ def rotor(pieces: list[DrawnPiece], length: float, bore: float | None, helix: fl
     """Return the solid of one rotor between z = 0 and z = `length` (mm).
 
     `pieces`: closed outline (mm) at z = 0; `bore`: bore diameter (mm), `None` for no bore;
-    `helix`: angle (rad) by which the outline at z = `length` is turned against that at z = 0.
+    `helix`: angle (rad) by which the outline at z = `length` is turned from that at z = 0.
     """
     from build123d import Axis, Edge, Face, Shell, Solid, Vector, Wire
 

@@ -136,9 +136,9 @@ def through(
     """Return the curve through `points` (mm), or at an RMS distance `smoothing` (mm) from them.
 
     `joints`: mask of the points at which curvature may jump; `pitch_radius`: in mm. If `smoothing`
-    is 0, the curve has one spline between each two joints, quintic if there are enough points.
-    Points at which the polygon's own curvature jumps are joints, too. Otherwise the curve is a
-    single quintic spline, and `joints` is ignored.
+    is 0, the curve has one spline between every two successive joints, quintic if there are enough
+    points. Points at which the polygon's own curvature jumps are joints, too. If `smoothing` is
+    greater than 0, the curve is a single quintic spline and `joints` is ignored.
 
     Raises `InputError` if the points are too few or scattered, or if `smoothing` is too small.
     """

@@ -22,7 +22,7 @@ from rootsopt.measured.loop import Loop
 _FEWEST = 24
 """Minimum number of sampling intervals on an arc or spline."""
 _MOST = 100_000
-"""Number of sampling intervals above which the length of an arc or spline adds no more."""
+"""Maximum number of sampling intervals derived from the length of an arc or spline."""
 _PER_SPAN = 4
 """Minimum number of sampling intervals between two adjacent knots of a spline."""
 _DEGREES = 25

@@ -21,8 +21,8 @@ compiled program serves all outlines."""
 _PIECES = NODES // 4
 """Number of smooth pieces of an addendum or dedendum above which an outline is rejected."""
 _BEYOND = 0.3
-"""Polar angle (fraction of the angle from tip to root) beyond the tip and beyond the root up to
-which points are included in the fit of a flank."""
+"""Polar angle (fraction of the angle from tip to root) by which the points used to fit a flank
+extend beyond its tip and beyond its root."""
 _SHARES = 400
 """Number of points at which two flanks are compared."""
 _FOLD = 1e-3
@@ -74,11 +74,13 @@ def imported(
 ) -> tuple[Outline, Checks]:
     """Return (profile, deviations) of the outline of a rotor with N = `lobes` lobes.
 
-    `loop`: points of the outline; `smoothing_mm`: RMS scatter of the points (mm), 0 to pass through
-    them. The profile is made from one flank: the leading flank of the lobe next to +x, for a rotor
-    that turns counter-clockwise. The other flanks are compared with this flank. Before, the loop is
-    made counter-clockwise and turned to put a lobe's axis on +x. The phase of the N-th moment
-    ∬ z^N dA gives this axis.
+    `loop`: points of the outline; `pitch_radius_mm`: pitch radius; `smoothing_mm`: RMS scatter of
+    the points (mm), 0 for a curve through them.
+
+    First, the loop is made counter-clockwise and turned to put a lobe's axis on +x. The phase of
+    the N-th moment ∬ z^N dA gives this axis. Then the profile is made from one flank: the leading
+    flank of the lobe next to +x, for a rotor that turns counter-clockwise. The other flanks are
+    compared with this flank.
 
     Raises `InputError` if the loop does not have this number of lobes, or if such a rotor cannot be
     simulated.

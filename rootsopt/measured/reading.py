@@ -19,7 +19,8 @@ which a loop is rejected as open."""
 _BYTES = 50_000_000
 """Size (bytes) above which a file is rejected."""
 _POINTS = 500_000
-"""Number of points above which an outline is rejected: it takes about 20 µs per point."""
+"""Number of points above which an outline is rejected. Reading and fitting take about 20 µs per
+point."""
 _SIZES = 0.1, 1e5
 """Size (mm) below which, and size above which, an outline is rejected, because its units must be
 wrong."""

@@ -44,7 +44,8 @@ _CONFIG = "config.yaml"
 _SUFFIX = ".rootsopt"
 _STAGE = re.compile(r"(\..+)\.\d+-[0-9a-f]{8}" + re.escape(_SUFFIX))
 _LONGEST = 150
-"""Length (bytes) of a folder's name above which temporary names contain a digest in its place."""
+"""Length (bytes) of a folder's name above which temporary names contain a digest of the name
+instead of the name itself."""
 _PATIENCE = 10.0
 """Time (s) after a request to stop above which the temporary folder is left behind, because a write
 is still in progress."""

@@ -183,8 +183,7 @@ class Program:
         return made
 
     def _place(self, kind: _Kind) -> "_Place | None":
-        """Return the cache entry of the program for this `kind`, or `None` if it cannot be cached.
-        """
+        """Return the cache entry for a program of this `kind`, or `None` if it cannot be cached."""
         if _store is None or jax.default_backend() != "cpu":
             return None
         if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
