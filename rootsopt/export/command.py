@@ -68,9 +68,9 @@ def write(
 ) -> list[str]:
     """Write drawings of a `design` into `folder`; return the names of the files.
 
-    `formats`: keys of `FORMATS`; `design`: values of the design parameters (config units) by config
-    key. If `series` holds a simulated motion, the GIF shows `periods` mesh periods of it. Otherwise
-    the GIF shows perfect rolling.
+    `formats`: keys of `FORMATS`; `design`: values of the design parameters (config units), keyed by
+    config key. If `series` holds a simulated motion, the GIF shows `periods` mesh periods of it.
+    Otherwise the GIF shows perfect rolling.
     """
     if not formats:
         return []

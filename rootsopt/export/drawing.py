@@ -33,7 +33,8 @@ class Drawing:
     def of(cls, config: Config, profile: Profile, design: dict[str, float]) -> "Drawing":
         """Return the drawing of a rotor with this `profile` and the dimensions in `config`.
 
-        `design`: values of the design parameters (config units) by config key, for the notes."""
+        `design`: values of the design parameters (config units), keyed by config key, for the
+        notes."""
         shape: Geometry = _shape(profile)
         outer, root = float(shape.outer_radius) * _MM, float(shape.root_radius) * _MM
         rotor, radius = config.rotor, config.profile.pitch_radius_mm

@@ -26,10 +26,10 @@ def plot_force(
 ) -> Sequence[Axes] | NDArray:
     """Draw the contact force over time, one panel per design, all on one scale.
 
-    `series`, `responses`: simulated motion and response of each design, by its name. Mean and peak
-    are taken from the response (`mean_force_N`, `peak_force_N`), which is more accurate than the
-    samples. All panels cover the same number of revolutions, at most a few, and each includes the
-    largest force of its design. Time is 0 at the start of each panel.
+    `series`, `responses`: simulated motion and response of each design, keyed by its name. Mean and
+    peak are taken from the response (`mean_force_N`, `peak_force_N`), which is more accurate than
+    the samples. All panels cover the same number of revolutions, at most a few, and each includes
+    the largest force of its design. Time is 0 at the start of each panel.
     """
     turns = min(_MOST_TURNS, *(np.ptp(run.rotation) / (2 * np.pi) for run in series.values()))
     for ax, (name, run) in zip(axes, series.items(), strict=True):
@@ -103,8 +103,8 @@ def plot_spectrum(
 ) -> Sequence[Axes] | NDArray:
     """Draw the amplitude spectrum of the contact force, one panel per design, all on one scale.
 
-    `series`: simulated motion of each design, by its name; `harmonics`: number of multiples of the
-    mesh frequency that the axis covers. The mean (0 Hz) is omitted.
+    `series`: simulated motion of each design, keyed by its name; `harmonics`: number of multiples
+    of the mesh frequency that the axis covers. The mean (0 Hz) is omitted.
     """
     limit = (harmonics + 0.5) * mesh_frequency_Hz
     top = 0.0

@@ -109,9 +109,9 @@ def _values(rows, key) -> NDArray[np.float64]:
 
 
 def _best(axes, keys, history):
-    """Draw the best objective so far as a line, and mark the best design with a star in each panel.
+    """Draw the best objective so far as a line, and mark the best design with a star.
 
-    Panels of list-valued parameters have no star."""
+    The panels of list-valued parameters have no star."""
     x, best = [row["evaluation"] for row in history], _values(history, "best_objective")
     axes[0].step(x, best, where="post", color="black", linewidth=1.8, label="best so far")
     if not np.isfinite(best).any():

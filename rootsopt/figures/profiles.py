@@ -15,7 +15,7 @@ def plot_profiles(
 ) -> Axes:
     """Draw closed outlines on top of each other, with the pitch circle.
 
-    `outlines`: points (n, 2) in mm of each outline, by its name."""
+    `outlines`: points (n, 2) in mm of each outline, keyed by its name."""
     _overlay(ax, outlines, pitch_radius_mm)
     reach = 1.06 * max(np.max(np.hypot(*points.T)) for points in outlines.values())
     ax.plot(0, 0, "+", color="black", markersize=9)
@@ -28,8 +28,8 @@ def plot_flank(
 ) -> Axes:
     """Draw one flank of each outline from the tip (on the +x axis) to the root, enlarged.
 
-    `outlines`: points (n, 2) in mm of each closed outline, by its name; `lobes`: number of lobes.
-    The rest of an outline follows by symmetry.
+    `outlines`: points (n, 2) in mm of each closed outline, keyed by its name; `lobes`: number of
+    lobes. The rest of an outline follows by symmetry.
     """
     _overlay(ax, outlines, pitch_radius_mm)
     flanks = []
@@ -89,8 +89,8 @@ def plot_meshing(
 def plot_conjugacy(ax: Axes, gaps: Mapping[str, tuple[NDArray, NDArray]]) -> Axes:
     """Draw the gap of one or more pairs in perfect rolling over the angle of rotor 1.
 
-    `gaps`: (angles (n,) in degrees, gaps (n,) in µm) of each pair, by its name. The angle is 0 when
-    a tip of rotor 1 is on the line of centres."""
+    `gaps`: (angles (n,) in degrees, gaps (n,) in µm) of each pair, keyed by its name. The angle is
+    0 when a tip of rotor 1 is on the line of centres."""
     for (name, (angle, gap)), color, dashes in zip(gaps.items(), COLORS, DASHES * 2, strict=False):
         ax.plot(angle, gap, color=color, linestyle=dashes, linewidth=1.6, label=name)
     ax.axhline(0, color="black", linewidth=0.8)

@@ -24,9 +24,9 @@ LABELS = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
 def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[AtSpeed]], force: str) -> Axes:
     """Draw a force over speed, one line per design.
 
-    `designs`: evaluations of each design at all speeds, by its name; `force`: key of the force in
-    `Evaluation.response`. Lines connect steady motions. Other motions are drawn as single markers,
-    at the bottom if their force is not known.
+    `designs`: evaluations of each design at all speeds, keyed by its name; `force`: key of the
+    force in `Evaluation.response`. Lines connect steady motions. Other motions are drawn as single
+    markers, at the bottom if their force is not known.
     """
     for (name, parts), color, dashes in zip(designs.items(), COLORS, DASHES * 2, strict=False):
         speeds = np.array([part.speed_rpm for part in parts])

@@ -112,7 +112,7 @@ def can_exchange(folder: Path) -> bool:
 
 
 def _exchanged(call, first: bytes, second: bytes) -> int:
-    """Exchange two folders by the function `call`; return the error number, 0 for success."""
+    """Exchange two folders with the C function `call`; return the error number, 0 for success."""
     done = call(_AT_FDCWD, first, _AT_FDCWD, second, _RENAME_EXCHANGE)
     return ctypes.get_errno() if done else 0
 

@@ -145,7 +145,7 @@ class RunFolder(ResultFolder):
         """Deal with the temporary folders of killed runs in the parent folder.
 
         A complete run of this target is put in place if the target does not exist. Complete runs of
-        other targets are kept. All others are removed."""
+        other targets are kept. All other folders of killed runs are removed."""
         for name in sorted(os.listdir(self.target.parent)):
             found = _STAGE.fullmatch(name)
             if found is None:

@@ -304,7 +304,7 @@ def _change(first: Any, second: Any) -> str:
 
 
 def _number(value: Any) -> str:
-    """Format a value: floats with five significant digits, `None` and non-finite as a dash."""
+    """Format a float with five significant digits, and `None` or a non-finite number as a dash."""
     if value is None:
         return DASH
     if isinstance(value, bool | str):

@@ -134,7 +134,9 @@ def own_process() -> None:
 
 
 def use_float64() -> None:
-    """Import JAX, set double precision and all settings that results rely on, and start the device.
+    """Import JAX, apply the settings that results rely on, and start the device.
+
+    The settings include double precision.
 
     Raises `InputError` if the environment prevents JAX from starting.
     """

@@ -1,8 +1,8 @@
 """Compiled programs: compiled ahead of use, in parallel, and cached between processes.
 
 Tracing and compiling take longer than the computations themselves. JAX's own cache stores compiled
-code, but every process must trace and lower a function before it can look up the code. A `Program`
-needs only the function's name, its source and the kinds of its arguments for this.
+code, but every process must trace and lower a function before it can look up the code. For the
+lookup, a `Program` needs only the function's name, its source and the kinds of its arguments.
 """
 
 import contextlib
