@@ -57,7 +57,7 @@ _PUBLIC = {
     "steady_response": "rootsopt.response.steady:steady_response",
     "sweep_scenes": "rootsopt.response.scenes:sweep_scenes",
 }
-"""Public names, each with the module and attribute it stands for."""
+"""Public names, each with the module and attribute to which it refers."""
 __all__ = ["__version__", *_PUBLIC]  # pyright: ignore[reportUnsupportedDunderAll]
 
 

@@ -2,7 +2,7 @@
 
 
 class InputError(ValueError):
-    """Invalid input. The message names the key or file, the value, and what to change.
+    """Raised for invalid input. The message names the key or file, the value, and what to change.
 
     The command line prints the message and exits with code 2.
     """

@@ -1,4 +1,4 @@
-"""Statuses of results. Every result carries one status."""
+"""Statuses of results. Every result has one status."""
 
 import enum
 import operator
@@ -6,7 +6,7 @@ from typing import SupportsIndex
 
 
 class Status(enum.Enum):
-    """Outcome of a simulation or a search. The value is the explanation and advice for the user."""
+    """Outcome of a simulation or a search. Each value explains the status and advises the user."""
 
     PERIODIC = "The pair settled on a stable periodic orbit."
     AVERAGED = (
@@ -74,14 +74,14 @@ class Status(enum.Enum):
 
     @property
     def code(self) -> int:
-        """Number that stands for the status in arrays."""
+        """Number that represents the status in arrays."""
         return list(Status).index(self)
 
     @classmethod
     def of(cls, code: SupportsIndex) -> "Status":
         """Return the status with this `code`.
 
-        Raises ValueError for a number that is not a code."""
+        Raises `ValueError` if there is no such status."""
         number = operator.index(code)
         if not 0 <= number < len(cls):
             raise ValueError(
@@ -91,7 +91,7 @@ class Status(enum.Enum):
 
     @property
     def usable(self) -> bool:
-        """Whether the numbers describe a steady state with a gradient."""
+        """Whether a result with this status has a steady state with a gradient."""
         return self in (Status.PERIODIC, Status.AVERAGED)
 
     @property

@@ -42,19 +42,20 @@ class Outcome(NamedTuple):
 
 
 Body = Callable[[Config, argparse.Namespace, "RunFolder"], Outcome]
-"""Function that runs a command: it gets config, options and result folder, and writes the files."""
+"""Function that does a command's work: it takes the config, the options and the result folder, and
+writes the files."""
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """Print `message` as one line on stderr and exit with code 2, as for other bad input."""
+        """Print `message` as one line on stderr and exit with code 2, as with any bad input."""
         self.exit(BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
 def parser(command: str, purpose: str) -> argparse.ArgumentParser:
     """Return a parser with the arguments that every command takes.
 
-    `command`: its name; `purpose`: first line of its help."""
+    `command`: name of the command; `purpose`: text that describes it in its help."""
     result = _Parser(
         prog=f"rootsopt {command}",
         description=purpose,
@@ -108,7 +109,7 @@ def _add_import(arguments: argparse.ArgumentParser) -> None:
 def _import_extensions(command: str, argv: Sequence[str] | None) -> None:
     """Import the files and modules that `--import` names, before config keys are listed and read.
 
-    Raises `InputError` where an import fails."""
+    Raises `InputError` if an import fails."""
     early = _Parser(prog=f"rootsopt {command}", add_help=False, allow_abbrev=False)
     _add_import(early)
     names = early.parse_known_args(argv)[0].imports
@@ -128,8 +129,11 @@ def run(
     """Run a command and return its exit code.
 
     Parse the arguments `argv` (`None`: those of the process), load the config and choose float64.
-    Then run `body` in a new folder, put the folder in place and print. `InputError` becomes exit
-    code 2. `add_options` adds the command's own arguments.
+    Then call `body` with a new result folder, put the folder in place and print the result.
+    `InputError` and `OSError` become exit code 2.
+
+    `command`, `purpose`: as in `parser`; `add_options`: function that adds the command's own
+    arguments to the parser.
     """
     environment.own_process()
     try:
@@ -182,7 +186,7 @@ def _in_folder(command: str, body: Body, config: Config, options: argparse.Names
 
 @contextlib.contextmanager
 def waiting(console: "Console", what: str) -> Iterator[None]:
-    """Show the text `what` on a terminal during a `with` block; show nothing in a pipe."""
+    """Show the text `what` during a `with` block. If `console` is not a terminal, show nothing."""
     if not console.is_terminal:
         yield
         return
@@ -193,8 +197,9 @@ def waiting(console: "Console", what: str) -> Iterator[None]:
 def use_cache() -> None:
     """Cache compiled programs between processes, in the user's cache folder.
 
-    A folder that cannot be used is not an error: the programs are compiled again. If others could
-    change its content, one line on stderr says so.
+    The environment variable ROOTSOPT_CACHE may name another folder, or turn the cache off. If the
+    folder cannot be used, the programs are compiled again. If other users could change its content,
+    the folder is not used and one line on stderr says so.
     """
     import platformdirs
 

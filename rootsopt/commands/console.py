@@ -49,5 +49,5 @@ def _called(arguments: list[str]) -> int:
 
 
 def console() -> None:
-    """Run `rootsopt` as its own process, and end the process with the exit code."""
+    """Run `rootsopt` with the arguments of the process, and end the process with the exit code."""
     door.leave(main())

@@ -1,9 +1,9 @@
-"""The edge of the process: signals, standard streams, exit code.
+"""Signals, standard streams and exit code of a command's process.
 
-A command line owns these, and a library must leave them alone. Everything here is active only while
-a command runs as its own process (`main()` without arguments). Called from Python with arguments, a
-command touches neither signals nor file descriptors. This module imports little, so that an
-interrupt works even while the rest is being imported.
+A program may change these settings of its process, but a library must leave them alone. A command
+therefore changes signal handlers and file descriptors only while it runs as its own process
+(`main()` without arguments), not if it is called from Python with arguments. This module imports
+little, so that an interrupt is handled even while other modules are being imported.
 """
 
 import contextlib
@@ -18,18 +18,18 @@ from typing import Any
 OK, BAD_INPUT, NO_RESULT = 0, 2, 3
 _NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 _GONE = (errno.EPIPE, errno.EBADF, errno.ESHUTDOWN)
-"""Error numbers of a stream without a reader; the exit code ignores them."""
+"""Error numbers of a write to a stream that nobody reads. They do not change the exit code."""
 _WAITING = "rootsopt signals"
 _SHOW_CURSOR = "\x1b[?25h"
 
 
 class Signals:
-    """Response of a run to SIGINT and SIGTERM.
+    """Handling of SIGINT and SIGTERM during a run of `command`.
 
     A thread waits for the signals, because the main thread may stay in compiled code for a long
-    time. The first signal stops the run at once: `abandon` removes unfinished files, one line says
-    so, and the exit code is 3. With `patient`, the first signal only sets `stop` and tells the user
-    the `promise`. The second signal stops the run.
+    time. The first signal stops the run at once: `abandon` is called to remove unfinished files,
+    one line on stderr says what happened, and the exit code is 3. If `patient` is true, the first
+    signal only sets the event `stop` and prints `promise`; the second signal stops the run.
     """
 
     def __init__(self, command: str):
@@ -43,7 +43,9 @@ class Signals:
         self._wakeup = -1
 
     def install(self) -> None:
-        """Take over the signals that have their default handler; leave others alone."""
+        """Handle the signals that have their default handler; leave other handlers in place.
+
+        Outside the main thread, do nothing."""
         if threading.current_thread() is not threading.main_thread():
             return
         for number in _NAMES:
@@ -86,7 +88,7 @@ class Signals:
         os._exit(NO_RESULT)
 
     def say(self, text: str) -> None:
-        """Write one line to stderr; a stream that cannot be written is not an error."""
+        """Write `text` as one line to stderr; ignore an `OSError`."""
         shown = f"rootsopt {self.command}".rstrip()
         try:
             start = f"\r{_SHOW_CURSOR}" if os.isatty(2) else ""
@@ -96,7 +98,7 @@ class Signals:
 
 
 def _nothing(number: int, frame: object) -> None:
-    """Let the main thread continue after a signal."""
+    """Do nothing on a signal in the main thread, so that it continues."""
 
 
 _running: Signals | None = None
@@ -104,10 +106,10 @@ _running: Signals | None = None
 
 @contextlib.contextmanager
 def patience(promise: str) -> Iterator[threading.Event]:
-    """Yield an event that the first signal sets instead of stopping the run.
+    """Yield an event. The first signal sets this event and does not stop the run.
 
-    `promise`: text that tells the user what happens after the signal. In a command that is not its
-    own process, nothing sets the event.
+    `promise`: text that tells the user what the run does after the signal. If the command does not
+    run as its own process, no signal sets the event.
     """
     signals = _running
     if signals is None:
@@ -121,7 +123,8 @@ def patience(promise: str) -> Iterator[threading.Event]:
 def leaving(abandon: Callable[[], str]) -> Iterator[None]:
     """Call `abandon` if a signal stops the process during the `with` block.
 
-    `abandon` cleans up and returns a text for the user."""
+    `abandon`: function that cleans up and returns a text for the user. If the command does not run
+    as its own process, it is not called."""
     signals = _running
     if signals is None:
         yield
@@ -134,7 +137,10 @@ def leaving(abandon: Callable[[], str]) -> Iterator[None]:
 
 
 class _Stream:
-    """A standard stream whose errors do not end the run, but are stored in `error`."""
+    """A standard stream whose errors do not end the run.
+
+    An `OSError` is stored in `error`, unless it only means that nobody reads the stream. Later
+    output is discarded."""
 
     def __init__(self, stream: Any, number: int | None):
         self.stream, self.number = stream, number
@@ -142,7 +148,7 @@ class _Stream:
         self.closed_early = False
 
     def write(self, text: str) -> int:
-        """Write `text` and return its length; an `OSError` is not raised."""
+        """Write `text` and return its length. An `OSError` is not raised."""
         if not self.closed_early:
             self._guarded(lambda: self.stream.write(text))
         return len(text)
@@ -152,7 +158,7 @@ class _Stream:
             self.write(line)
 
     def flush(self) -> None:
-        """Flush the stream; an `OSError` is not raised."""
+        """Flush the stream. An `OSError` is not raised."""
         if not self.closed_early:
             self._guarded(self.stream.flush)
 
@@ -179,7 +185,7 @@ class _Stream:
 
 
 def _nowhere(number: int) -> None:
-    """Redirect a file descriptor to the null device."""
+    """Redirect the file descriptor `number` to the null device."""
     with contextlib.suppress(OSError):
         null = os.open(os.devnull, os.O_RDWR)
         if null != number:
@@ -189,9 +195,10 @@ def _nowhere(number: int) -> None:
 
 @contextlib.contextmanager
 def _streams(own: bool) -> Iterator[_Stream]:
-    """Yield a guarded stdout; stdout and stderr are `_Stream` objects during the `with` block.
+    """Replace stdout and stderr with `_Stream` objects during the `with` block; yield stdout.
 
-    `own`: the streams are the process's own, so that closed streams are opened first."""
+    `own`: whether the command runs as its own process. If so, closed standard streams are first
+    redirected to the null device."""
     if own:
         for number in (0, 1, 2):
             try:
@@ -218,10 +225,11 @@ def _streams(own: bool) -> Iterator[_Stream]:
 
 
 def through(command: str, work: Callable[[], int], own: bool) -> int:
-    """Run a command's `work` and return its exit code; guard the edges of the process.
+    """Run a command's `work` and return its exit code, with signals and streams handled.
 
-    `own`: the process is the command's own. A missing reader (as in `| true`) does not change the
-    exit code. If stdout cannot take the output, the exit code is 2.
+    `command`: name of the command in messages; `work`: function that returns the exit code; `own`:
+    whether the command runs as its own process. If nobody reads stdout (as in `| true`), the exit
+    code does not change. If writing to stdout fails for another reason, the exit code is 2.
     """
     global _running
     if not own or _running is not None:
@@ -260,10 +268,10 @@ def _code(command: str, code: int, out: _Stream) -> int:
 
 
 def leave(code: int) -> None:
-    """End the process with exit `code`, which a signal during the exit does not change.
+    """End the process with the exit code `code`, even if a signal arrives meanwhile.
 
-    If other threads are still running, end at once without waiting for them. Shutting Python down
-    around them can abort the process with another exit code.
+    If other threads are still running, end the process without waiting for them. If Python shut
+    down while they run, the process could abort with a different exit code.
     """
     for number in _NAMES:
         with contextlib.suppress(ValueError, OSError):

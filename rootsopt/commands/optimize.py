@@ -19,14 +19,14 @@ PURPOSE = "Optimise the design parameters for low contact force and compare with
 
 
 _PATIENCE = 5.0
-"""Time (s) after an interrupt above which a search is not waited for any longer. In this time the
-best design so far may be simulated again from rest."""
+"""Time (s) after an interrupt above which the command stops waiting for the search to end. In this
+time, the search may simulate the best design so far again from rest."""
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Run `rootsopt optimize`: check the config, search, and write files into `folder`.
 
-    Return the `Outcome`. Raises `InputError` for a wrong config or option."""
+    Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
     began = time.perf_counter()
     from rich.console import Console
 
@@ -82,9 +82,11 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
 
 def _searched(config: "Config", progress, stop: threading.Event):
-    """Run the search; return (config without `auto`, record of the chosen settings, result).
+    """Run the search; return (config, record of the settings chosen for `auto`, result).
 
-    The result is `None` if the search was stopped before the baseline was simulated.
+    In the returned config, chosen settings replace `auto`. The result is `None` if the search was
+    stopped before the baseline was simulated. `progress`: function as from `_progress`, or `None`;
+    `stop`: event that stops the search.
     """
     from rootsopt.optimize.search import Search, until_stopped
     from rootsopt.response.choice import resolve
@@ -121,9 +123,9 @@ def _nothing_known(config: "Config", folder: "RunFolder") -> "Outcome":
 
 
 def _alike(config: "Config", result) -> dict:
-    """Return the classical families nearest to an optimised free form, for the result file.
+    """Return {"resembles": classical designs nearest to an optimised free form}.
 
-    Return {} for a classical family and without an optimised design."""
+    Return {} if the optimised family is itself classical, or if there is no optimised design."""
     from rootsopt.config.families import family_of
 
     if family_of(config.profile.family).classical or result.optimized is None:
@@ -139,7 +141,7 @@ def _alike(config: "Config", result) -> dict:
 
 
 def _message(result) -> str:
-    """Return status and advice, as text, for a search that was interrupted or found nothing."""
+    """Return the status and advice of a search that was interrupted or found nothing, as text."""
     return f"{result.status.label}: {_advice(result)}"
 
 
@@ -163,7 +165,7 @@ def _advice(result) -> str:
 
 
 def _interrupted(result) -> str:
-    """Return sentences on how far an interrupted search got."""
+    """Return one or two sentences on how far an interrupted search has come."""
     count = len(result.history)
     begin = f"The search was stopped after {count} design{'s' if count != 1 else ''}"
     if not result.baseline.usable:
@@ -231,9 +233,9 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
 
 @contextlib.contextmanager
 def _progress(console) -> Iterator:
-    """Yield a function (done, expected, best objective) that moves a progress bar.
+    """Yield a function (done, expected, best objective) that updates a progress bar.
 
-    Yield `None` without a terminal, where there is no bar."""
+    Yield `None` if the console is not a terminal; there is no progress bar then."""
     if not console.is_terminal:
         yield None
         return

@@ -19,13 +19,14 @@ PURPOSE = (
     "solids or an animation."
 )
 EXPORT = "dxf,svg"
-"""Default formats of the command. Drawings take less than a second; a solid takes ten seconds."""
+"""Default value of `--export` for this command. Drawings are fast (less than 1 s); a solid takes
+10 s."""
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Run `rootsopt profile`: check the config, compute the geometry, write files into `folder`.
 
-    Return the `Outcome`. Raises `InputError` for a wrong config or option."""
+    Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
     from rootsopt import export
     from rootsopt.commands import cli
     from rootsopt.measured import report as outline_report
@@ -74,9 +75,9 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
 
 def _coefficients(given: str | None) -> int | None:
-    """Return the number given to `--project`, `None` if it is absent.
+    """Return the value of `--project` as a number, or `None` if the option is absent.
 
-    Raises `InputError` unless the number is from 3 to 64."""
+    Raises `InputError` unless the value is a whole number from 3 to 64."""
     from rootsopt.errors import InputError
 
     if given is None:
@@ -90,9 +91,9 @@ def _coefficients(given: str | None) -> int | None:
 
 
 def _projected(folder: "RunFolder", config: "Config", count: int) -> str:
-    """Write free_form.yaml, the config with its profile as a free form of `count` coefficients.
+    """Write free_form.yaml: the config with its profile converted to a free form.
 
-    Return the text for the user."""
+    `count`: number of coefficients of the free form. Return a message for the user."""
     from rootsopt.scene.families import free_form_of
 
     profile, away = free_form_of(config.profile, count)

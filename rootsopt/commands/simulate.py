@@ -18,7 +18,7 @@ PURPOSE = "Simulate one design in one scene: steady state, contact force, its gr
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Run `rootsopt simulate`: check the config, simulate, and write files into `folder`.
 
-    Return the `Outcome`. Raises `InputError` for a wrong config or option."""
+    Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
     from rich.console import Console
 
     from rootsopt import export

@@ -19,7 +19,7 @@ PURPOSE = "Simulate one design at many speeds, each from rest: contact force and
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Run `rootsopt sweep`: check the config, simulate all speeds, and write files into `folder`.
 
-    Return the `Outcome`. Raises `InputError` for a wrong config."""
+    Return the `Outcome`. Raises `InputError` if the config is invalid."""
     from rich.console import Console
 
     from rootsopt.commands import cli
@@ -64,7 +64,9 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
 @contextlib.contextmanager
 def _progress(console) -> Iterator[Callable[[int, int], None]]:
-    """Yield a function (done, expected) that moves a progress bar, which only a terminal shows."""
+    """Yield a function (done, expected) that updates a progress bar.
+
+    If the console is not a terminal, there is no progress bar and the function does nothing."""
     if not console.is_terminal:
         yield lambda done, expected: None
         return

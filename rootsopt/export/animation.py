@@ -1,4 +1,4 @@
-"""GIF of the meshing pair with the point of contact and the force on rotor 2."""
+"""GIF of the meshing pair, with the contact point and the force on rotor 2."""
 
 import dataclasses
 import io
@@ -37,7 +37,7 @@ class Contacts:
     """Contacts at n rotations φ of rotor 1.
 
     `point` (n, 2): contact points (mm, fixed frame); `normal` (n, 2): unit normals from rotor 1 to
-    rotor 2; `present` (n,): whether there is a contact.
+    rotor 2; `present` (n,): mask of the rotations at which there is a contact.
     """
 
     point: NDArray[np.float64]
@@ -47,7 +47,9 @@ class Contacts:
 
 @Program
 def _rolling(profile, roll):
-    """Return (pressure angle (rad), distance from the pitch point (m)) at a flank's roll angle."""
+    """Return (pressure angles (rad), signed distances from the pitch point (m)) of contacts.
+
+    `roll` (n,): roll angles of the flank (rad)."""
     half = profile.half_pitch
     beyond = roll > half
     point = profile.addendum(profile.normal_at(jnp.where(beyond, 2 * half - roll, roll)))
@@ -57,12 +59,14 @@ def _rolling(profile, roll):
 def rolling_contacts(
     profile: Profile, rotation: Float[np.ndarray, " n"], coast: bool = False
 ) -> Contacts:
-    """Return the contacts of the drive (or coast) flanks in perfect rolling, at rotations φ (rad).
+    """Return the contacts of the drive (or `coast`) flanks in perfect rolling.
 
-    A drive flank touches at the roll angle β = -φ, for 0 ≤ β ≤ π/N in every lobe pitch. Outside
-    this range, return the point of the nearer end, marked as not present. The contact is
-    (r + s sin ψ, s cos ψ), its normal (sin ψ, cos ψ). A coast flank is the mirror image, with
-    β = φ.
+    `rotation` (n,): rotations φ of rotor 1 (rad). A drive flank is in contact while its roll angle
+    β = -φ is between 0 and π/N, once in every lobe pitch. At other rotations, the contact at the
+    nearer end of this range is returned, marked as not present. The contact point is
+    (r + s sin ψ, s cos ψ) and the normal is (sin ψ, cos ψ), with the pitch radius r, the pressure
+    angle ψ and the distance s from the pitch point. The contact of a coast flank is the mirror
+    image in the line of centres, with β = φ.
     """
     half = np.pi / (2 * profile.lobes)
     roll = (rotation if coast else -rotation) - half
@@ -76,8 +80,8 @@ def rolling_contacts(
 def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
     """Return the content of a GIF of the pair in perfect rolling over one lobe pitch.
 
-    The GIF shows the contact and the direction of its force, not the size of the force, which needs
-    a simulation.
+    The GIF shows the contact and the direction of its force. It does not show the size of the
+    force, which only a simulation can give.
     """
     rotation = 2 * np.pi / profile.lobes * np.arange(_FRAMES) / _FRAMES
     flanks = [rolling_contacts(profile, rotation, coast) for coast in (False, True)]
@@ -96,10 +100,11 @@ def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
 
 
 def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: int) -> bytes:
-    """Return the content of a GIF of a simulated motion over `periods` mesh periods (4 at most).
+    """Return the content of a GIF of a simulated motion over `periods` mesh periods.
 
-    The GIF shows the contacts and the force over the rotation. An arrow's length is proportional to
-    the largest force in the time interval of its frame.
+    `periods` is limited to 4 and to the length of `series`. The GIF shows the contacts, and the
+    force over the rotation. An arrow's length is proportional to the largest force in the time
+    interval of its frame.
     """
     pitch = 2 * np.pi / profile.lobes
     whole = max(1, round(float(np.ptp(series.rotation)) / pitch))
@@ -131,7 +136,9 @@ def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: 
 
 
 def _force_panel(ax: Axes, series: Series, samples: int):
-    """Draw flank forces over the rotation; return the line that marks the frame's rotation."""
+    """Draw the flank forces over the rotation; return the line that marks a frame's rotation.
+
+    `samples`: number of samples of `series` that are drawn."""
     shown = slice(0, samples)
     degrees = np.degrees(series.rotation[shown] - series.rotation[0])
     forces = series.drive_force[shown], series.coast_force[shown]
@@ -150,7 +157,7 @@ def _force_panel(ax: Axes, series: Series, samples: int):
 
 
 class _Arrow:
-    """Point and arrow for the contact and its force on one kind of flank."""
+    """A point that marks the contact, and an arrow for its force, on one kind of flank."""
 
     def __init__(self, ax: Axes, color: str, longest: float):
         self.longest = longest
@@ -165,7 +172,7 @@ class _Arrow:
         )  # fmt: skip
 
     def show(self, point, normal, share: float) -> None:
-        """Show the arrow at `point` along `normal`.
+        """Show the arrow at `point` (mm) in the direction of `normal`.
 
         `share`: length as a fraction of the longest arrow; 0 hides the arrow and its point."""
         self.point.set_data([point[0]], [point[1]])
@@ -176,7 +183,7 @@ class _Arrow:
 
 
 class _Scene:
-    """Matplotlib axes with both rotors, which `turn` rotates for each frame."""
+    """Matplotlib axes with both rotors; call `turn` for each frame."""
 
     def __init__(self, ax: Axes, drawing: Drawing):
         points = polyline(drawing.pieces, _CHORD * drawing.outer_radius)
@@ -194,7 +201,7 @@ class _Scene:
         self.arrows = [_Arrow(ax, color, _ARROW * drawing.pitch_radius) for _, color in _FLANKS]
 
     def _rotor(self, ax, drawing, color, name, x):
-        """Draw a rotor with its axis at `x` (mm); return the patch that turns."""
+        """Draw a rotor with its axis at `x` (mm); return the patch of its outline."""
         line = {"edgecolor": "black", "linewidth": 0.8}
         (patch,) = ax.fill(*self.outline.T, facecolor=color, alpha=0.75, **line)
         circle = np.exp(1j * np.linspace(0, 2 * np.pi, 181))
@@ -218,9 +225,9 @@ class _Scene:
 
 
 def _gif(made: Figure, draw, count: int) -> bytes:
-    """Return the content of an endless GIF with frames 0 to `count` - 1.
+    """Return the content of a GIF that repeats frames 0 to `count` - 1 endlessly.
 
-    `draw`: function that draws a frame by its number. All frames share one palette."""
+    `draw`: function that draws the frame with a given number. All frames share one palette."""
     made.set_dpi(_DPI)
     canvas = FigureCanvasAgg(made)
     pictures: list[Image.Image] = []

@@ -1,4 +1,4 @@
-"""The `--export` option of the commands: choose formats and write the files."""
+"""The option `--export` of the commands: choose formats and write the files."""
 
 import argparse
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ FORMATS = {
     "stl": "rotor.stl and pair.stl, triangles (needs the [cad] extra)",
     "gif": "figures/meshing.gif, the pair in motion with contact and force",
 }
-"""Formats and the files they write; lengths are in mm."""
+"""Formats, each with the files that are written and what they contain. Lengths are in mm."""
 _SOLID = ("step", "stl")
 
 
 def add_option(parser: argparse.ArgumentParser, default: str) -> None:
-    """Add the option `--export` to a command; `default`: formats without the option."""
+    """Add the option `--export` to a command. `default`: its value if the option is not given."""
     formats = "; ".join(f"{name}: {files}" for name, files in FORMATS.items())
     parser.add_argument(
         "--export",
@@ -35,9 +35,10 @@ def add_option(parser: argparse.ArgumentParser, default: str) -> None:
 
 
 def chosen(text: str) -> tuple[str, ...]:
-    """Return the formats that `text`, the value of `--export`, names.
+    """Return the formats named in `text`, the value of `--export`.
 
-    Raises `InputError` for an unknown format, and for a solid if the CAD kernel is not installed.
+    Raises `InputError` if a format is unknown, or if it is a solid and the CAD kernel is not
+    installed.
     """
     names = tuple(name.strip() for name in text.lower().split(",") if name.strip())
     if names == ("none",):
@@ -67,8 +68,9 @@ def write(
 ) -> list[str]:
     """Write drawings of a `design` into `folder`; return the names of the files.
 
-    `design`: parameters by key (config units); `formats`: keys of `FORMATS`. With the `series` of a
-    simulation, the GIF shows `periods` mesh periods of the simulated motion.
+    `formats`: keys of `FORMATS`; `design`: values of the design parameters (config units), keyed by
+    config key. If `series` holds a simulated motion, the GIF shows `periods` mesh periods of it.
+    Otherwise the GIF shows perfect rolling.
     """
     if not formats:
         return []
@@ -109,7 +111,7 @@ def write_simulated(
 ) -> list[str]:
     """Write drawings of a simulated design as `write` does; return the names of the files.
 
-    The GIF shows the simulated motion. Without a motion, no GIF is written."""
+    The GIF shows the simulated motion. If `evaluation` has no motion, no GIF is written."""
     series = evaluation.series
     if series is None:
         formats = tuple(name for name in formats if name != "gif")
@@ -118,7 +120,7 @@ def write_simulated(
 
 
 def _solids(drawing, formats, place) -> dict[str, bytes]:
-    """Return the content of the STEP and STL files by name; each solid is made once.
+    """Return the contents of the STEP and STL files by file name. Each solid is made only once.
 
     `place`: folder for temporary files."""
     import math

@@ -13,11 +13,11 @@ _shape = Program(geometry)
 
 @dataclasses.dataclass(frozen=True)
 class Drawing:
-    """One rotor to draw.
+    """Everything that a drawing shows of one rotor.
 
-    `pieces`: closed outline; `pitch_radius`, `outer_radius`: radii (mm); `lobes`: number of lobes;
-    `length`: axial length (mm); `helix_deg`: twist over the length (°); `bore`: diameter (mm),
-    `None` without a bore; `notes`: lines of text with the design's numbers.
+    `pieces`: closed outline (mm); `pitch_radius`, `outer_radius`: radii (mm); `lobes`: number of
+    lobes; `length`: axial length (mm); `helix_deg`: twist over the length (°); `bore`: bore
+    diameter (mm), `None` for a rotor without a bore; `notes`: lines of text with the dimensions.
     """
 
     pieces: list[DrawnPiece]
@@ -31,9 +31,10 @@ class Drawing:
 
     @classmethod
     def of(cls, config: Config, profile: Profile, design: dict[str, float]) -> "Drawing":
-        """Return the drawing of `profile`.
+        """Return the drawing of a rotor with this `profile` and the dimensions in `config`.
 
-        `design`: the profile's parameters by key (config units), for the notes."""
+        `design`: values of the design parameters (config units), keyed by config key, for the
+        notes."""
         shape: Geometry = _shape(profile)
         outer, root = float(shape.outer_radius) * _MM, float(shape.root_radius) * _MM
         rotor, radius = config.rotor, config.profile.pitch_radius_mm

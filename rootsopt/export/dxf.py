@@ -1,4 +1,4 @@
-"""DXF drawing of one rotor: true arcs and splines on layers, millimetres."""
+"""DXF drawing of one rotor in millimetres: true arcs and splines on layers."""
 
 import io
 import logging

@@ -1,9 +1,9 @@
 """The outline of a rotor as true arcs and cubic splines, from which every drawing is made.
 
 Each smooth segment of the flank becomes an arc or a spline. A circular arc is recognised by its
-points and normals. Otherwise a cubic B-spline is fitted through exact points with exact end
-tangents. It is refined until it deviates by at most `TOLERANCE`. Adjacent pieces share their joint
-exactly or, at the end of an arc, to rounding. A corner or cusp is a joint and is not smoothed.
+points and normals. Any other segment becomes a cubic B-spline through exact points with exact end
+tangents, refined until it deviates by at most `TOLERANCE`. Adjacent pieces meet exactly or, at the
+end of an arc, to within rounding. A corner or cusp is not smoothed: two pieces meet there.
 
 Lengths are in millimetres, angles in radians. Points are complex numbers x + iy in the rotor frame,
 with a lobe tip on +x.
@@ -23,19 +23,21 @@ from rootsopt.runtime.programs import Program
 
 TOLERANCE = 1e-7
 """Deviation (pitch radii) of a spline from the true flank above which the spline is refined. The
-deviation times the perimeter bounds the error in area, which is below 1e-6 for every rotor."""
+error in area is at most the deviation times the perimeter, which for every rotor is less than 1e-6
+of the area."""
 ROUND = 1e-9
-"""Deviation (pitch radii) from a circle above which a segment does not count as an arc."""
+"""Deviation (pitch radii) from a circle above which a segment is not drawn as an arc."""
 _MM = 1e3
 _SAMPLES = 65
 """Number of points at which a segment is compared with a circle."""
 _BETWEEN = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
-"""Positions between two nodes at which a spline is compared with the true flank."""
+"""Positions between two nodes (fractions of their distance) at which a spline is compared with the
+true flank."""
 _MOST_NODES = 4096
 _UNEVEN = 100
-"""Ratio of a spline's longest to its shortest span above which it is split in two. Spans shrink
-towards a cusp. Programs that integrate a whole edge by a fixed rule are then off by more than
-1e-6."""
+"""Ratio of a spline's longest to its shortest knot span above which the spline is split in two.
+Spans shrink towards a cusp. At a higher ratio, programs that integrate a whole edge by a fixed rule
+are off by more than 1e-6."""
 _BLOCK = 512
 """Number of points evaluated at once. It is constant, so that one compiled program serves all."""
 _GAUSS = np.polynomial.legendre.leggauss(8)
@@ -55,7 +57,7 @@ class Arc:
     sweep: float
 
     def at(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
-        """Return points (mm) at fractions 0 to 1 of the arc."""
+        """Return the points (mm) at `share` of the arc, from 0 at its start to 1 at its end."""
         angle = self.begin + np.asarray(share) * self.sweep
         return np.asarray(self.center + self.radius * np.exp(1j * angle))
 
@@ -86,15 +88,17 @@ class Arc:
 class Spline:
     """A cubic B-spline from its first control point to its last.
 
-    `knots` (n + 4,): approximate arc length (mm), fourfold at the ends; `controls` (n,): control
-    points (mm).
+    `knots` (n + 4,): knots (mm), close to the arc length and with multiplicity 4 at the ends;
+    `controls` (n,): control points (mm).
     """
 
     knots: Float64[np.ndarray, " m"]
     controls: Complex128[np.ndarray, " n"]
 
     def at(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
-        """Return points (mm) at fractions 0 to 1 of the parameter, which is nearly arc length."""
+        """Return the points (mm) at `share` of the parameter, from 0 at the start to 1 at the end.
+
+        The parameter is nearly the arc length."""
         first, last = self.knots[0], self.knots[-1]
         return np.asarray(BSpline(self.knots, self.controls, 3)(first + share * (last - first)))
 
@@ -120,7 +124,7 @@ class Spline:
         return Spline(knots, np.conj(self.controls[::-1]))
 
     def beziers(self) -> Complex128[np.ndarray, "k 4"]:
-        """Return the same curve as k cubic Bézier curves: 4 control points (mm) per row."""
+        """Return the same curve as k cubic Bézier curves, each a row of 4 control points (mm)."""
         curve = BSpline(self.knots, self.controls, 3)
         ends = np.unique(self.knots)
         points, third = curve(ends), np.diff(ends) / 3
@@ -136,10 +140,12 @@ DrawnPiece = Arc | Spline
 def outline_pieces(profile: Profile) -> list[DrawnPiece]:
     """Return the pieces of the closed counter-clockwise outline (mm).
 
-    The outline starts at the root before the lobe on +x, or slightly earlier if arcs are joined.
+    Every piece starts at the end of the previous piece. The outline starts at the root before the
+    lobe on +x. If the arcs on both sides of this root are joined, it starts at the beginning of the
+    joined arc.
 
-    Every piece starts at the end of the previous piece. Raises `InputError` where a segment of the
-    flank needs too many nodes to come within `TOLERANCE` of the true flank.
+    Raises `InputError` if a segment of the flank needs too many nodes to come within `TOLERANCE` of
+    the true flank.
     """
     flank = _flank(profile)
     lobe = [piece.mirrored() for piece in reversed(flank)] + flank
@@ -154,7 +160,9 @@ def area(pieces: list[DrawnPiece]) -> float:
 
 
 def polyline(pieces: list[DrawnPiece], chord: float) -> Complex128[np.ndarray, " n"]:
-    """Return a closed polygon with about `chord` mm between points; the first point is repeated."""
+    """Return a closed polygon with points about `chord` (mm) apart or closer.
+
+    The first point is repeated at the end."""
     parts = []
     for piece in pieces:
         count = max(2, int(np.ceil(piece.length / chord)))
@@ -163,7 +171,7 @@ def polyline(pieces: list[DrawnPiece], chord: float) -> Complex128[np.ndarray, "
 
 
 def _swept(piece: DrawnPiece) -> float:
-    """Return ∫ (x dy - y dx) / 2 along a piece."""
+    """Return ∫ (x dy - y dx) / 2 along a piece (mm²)."""
     if isinstance(piece, Arc):
         across = np.imag(np.conj(piece.center) * (piece.stop - piece.start))
         return float(across + piece.radius**2 * piece.sweep) / 2
@@ -177,7 +185,7 @@ def _swept(piece: DrawnPiece) -> float:
 
 
 def _flank(profile: Profile) -> list[DrawnPiece]:
-    """Return the pieces of one flank, from the tip's centre to the root's."""
+    """Return the pieces of one flank, from the centre of the tip to the centre of the root."""
     size = float(profile.pitch_radius) * _MM
     segments = [(float(s.start), float(s.stop)) for s in profile.segments()]
     stretches = [_Stretch(profile, start, stop, False) for start, stop in segments]
@@ -190,9 +198,9 @@ def _flank(profile: Profile) -> list[DrawnPiece]:
 
 @Program
 def _points(profile, nu):
-    """Return two tuples, of the addendum and of the dedendum, at the normal angles `nu` (rad).
+    """Return one tuple for the addendum and one for the dedendum, at normal angles `nu` (rad).
 
-    A tuple is (points (m), directions of the outward normal (rad), arc length per `nu` (m/rad))."""
+    Each is (points (m), directions of the outward normal (rad), arc length per `nu` (m/rad))."""
     _, addendum, dedendum = profile.speeds(nu)
     below = profile.dedendum(nu)
     turned = below.beta + jnp.pi / 2 - below.psi
@@ -210,10 +218,10 @@ class _Stretch:
     dedendum: bool
 
     def look(self, share: NDArray[np.float64]):
-        """Return (points (mm), unit normals, arc length per share (mm)) at each share.
+        """Return (points (mm), unit normals, arc length per unit of share (mm)) at `share` (n,).
 
-        A share is a fraction (0 to 1) of the range of normal angles. Each end is evaluated just
-        inside, so that it belongs to its segment.
+        A share is a fraction (0 to 1) of the range of normal angles. At 0 and 1, the segment is
+        evaluated just inside its ends, so that neighbouring segments have no influence.
         """
         inside = np.clip(share, 1e-12, 1 - 1e-12)
         inside = np.pad(inside, (0, -len(share) % _BLOCK), mode="edge")
@@ -231,7 +239,7 @@ class _Stretch:
     def pieces(self, size: float) -> list[DrawnPiece]:
         """Return the segment as one arc, one spline or two splines.
 
-        `size`: pitch radius (mm). Raises `InputError` where a spline needs too many nodes."""
+        `size`: pitch radius (mm). Raises `InputError` if a spline needs too many nodes."""
         if arc := self._arc(ROUND * size):
             return [arc]
         spline = self._spline(TOLERANCE * size)
@@ -246,9 +254,10 @@ class _Stretch:
         return [part._spline(TOLERANCE * size) for part in parts]
 
     def _arc(self, tolerance: float) -> Arc | None:
-        """Return the segment as an arc; `None` unless all sampled points are within `tolerance`.
+        """Return the segment as an arc, or `None` if it is not one.
 
-        The circle P = C + ρ n is the nearest to a sample of points and normals. `tolerance`: mm."""
+        The circle P = C + ρ n is fitted to sampled points P and normals n by least squares. A
+        point that is farther than `tolerance` (mm) from the circle excludes an arc."""
         points, normals, _ = self.look(np.linspace(0, 1, _SAMPLES))
         spread = normals - normals.mean()
         turning = np.sum(np.abs(spread) ** 2)
@@ -266,7 +275,7 @@ class _Stretch:
     def _spline(self, tolerance: float) -> Spline:
         """Return a cubic spline over arc length, within `tolerance` (mm) of the segment.
 
-        Nodes are added until this is so. Raises `InputError` where too many are needed."""
+        Nodes are added until it is within `tolerance`. Raises `InputError` if it needs too many."""
         nodes = np.linspace(0, 1, 5)
         while len(nodes) <= _MOST_NODES:
             spline, error = self._fitted(nodes)
@@ -282,7 +291,9 @@ class _Stretch:
         )
 
     def _fitted(self, nodes: NDArray[np.float64]) -> tuple[Spline, NDArray[np.float64]]:
-        """Return (spline through `nodes`, its largest deviation (mm) in each interval)."""
+        """Return (spline through the points at `nodes`, its largest deviation (mm) per interval).
+
+        `nodes` (n,): shares as in `look`."""
         width = np.diff(nodes)
         gauss, weights = _GAUSS
         at = nodes[:-1, None] + width[:, None] * (1 + gauss) / 2
@@ -305,7 +316,9 @@ class _Stretch:
 
 
 def _merged(pieces: list[DrawnPiece], tolerance: float) -> list[DrawnPiece]:
-    """Join adjacent arcs of the same circle; the first piece may then start earlier."""
+    """Join adjacent arcs of the same circle, also the last piece with the first.
+
+    `tolerance`: difference between two circles (mm) up to which they count as the same."""
     merged: list[DrawnPiece] = []
     for piece in pieces:
         if merged and (joined := _joined(merged[-1], piece, tolerance)):
@@ -329,7 +342,7 @@ def _joined(one: DrawnPiece, other: DrawnPiece, tolerance: float) -> Arc | None:
 def _closed(pieces: list[DrawnPiece]) -> list[DrawnPiece]:
     """Move the ends of every spline onto the ends of the adjacent pieces.
 
-    Before, they differ by rounding."""
+    Before this step, the ends differ by rounding errors."""
     closed = list(pieces)
     for i, piece in enumerate(closed):
         if isinstance(piece, Spline):

@@ -1,4 +1,4 @@
-"""Solids of one rotor and of the pair: STEP with true arcs and B-splines, STL for printing.
+"""Solids of one rotor and of the pair, as STEP (true arcs and B-splines) and STL (for printing).
 
 This is the only module that uses the CAD kernel (build123d on Open CASCADE), an optional
 dependency. Lengths are in millimetres, angles in radians.
@@ -29,16 +29,17 @@ CHORD = 0.005
 TURN = 0.05
 """Greatest angle (rad) between neighbouring facets of a curved face of an STL file."""
 _STEP = np.pi / 48
-"""Twist (rad) between the knots of a helical face. With this step, a cubic spline of the rotation
-is off by 5e-8 of the radius."""
+"""Greatest twist (rad) between adjacent knots of a helical face. With this step, a cubic spline of
+the rotation is off by 5e-8 of the radius."""
 _SPANS = 8
-"""Minimum number of knot spans along a face. A straight rotor needs only one span. But most
-programs compute a volume with the kernel's Gauss quadrature, which is finer with more knots. With a
-single span the volume is off by 2e-4 next to a cusp, where the solid itself is exact to 1e-8."""
+"""Minimum number of knot spans of a face along the rotor's axis. A straight rotor would need only
+one span. But most programs compute a volume with the kernel's Gauss quadrature, which is finer with
+more spans. With one span, their volume is off by 2e-4 next to a cusp, although the solid itself is
+exact to 1e-8."""
 
 
 def require_kernel() -> None:
-    """Raise `InputError` where the CAD kernel is not installed."""
+    """Raise `InputError` if the CAD kernel is not installed."""
     if importlib.util.find_spec("build123d") is None:
         raise InputError(
             "`--export` step and stl need the CAD kernel build123d, which is not installed; "
@@ -47,10 +48,10 @@ def require_kernel() -> None:
 
 
 def rotor(pieces: list[DrawnPiece], length: float, bore: float | None, helix: float) -> "Solid":
-    """Return one rotor between z = 0 and `length` (mm).
+    """Return the solid of one rotor between z = 0 and z = `length` (mm).
 
-    `pieces`: closed outline at z = 0; `helix`: angle (rad) by which the outline turns up to
-    z = `length`; `bore`: diameter (mm), `None`: no bore.
+    `pieces`: closed outline (mm) at z = 0; `bore`: bore diameter (mm), `None` for no bore;
+    `helix`: angle (rad) by which the outline at z = `length` is turned from that at z = 0.
     """
     from build123d import Axis, Edge, Face, Shell, Solid, Vector, Wire
 
@@ -77,9 +78,9 @@ def pair(
 ) -> "Compound":
     """Return both rotors as one assembly, at rotation φ = 0.
 
-    Rotor 1 is at the origin with a lobe on +x. Rotor 2 is at (`center_distance` (mm), 0), with a
-    valley that faces this lobe, and is twisted the other way. `pieces`, `length`, `bore`, `helix`:
-    as in `rotor`.
+    Rotor 1 is at the origin with a lobe on +x. Rotor 2 is at x = `center_distance` (mm), has a
+    valley opposite this lobe, and is twisted the other way. `lobes`: number of lobes of a rotor;
+    `pieces`, `length`, `bore`, `helix`: as in `rotor`.
     """
     from build123d import Axis, Compound, Vector
 
@@ -102,8 +103,8 @@ def step_bytes(shape: "Shape") -> bytes:
 def stl_bytes(shape: "Shape", place: Path | None = None) -> bytes:
     """Return the content of a binary STL file (mm) within `CHORD` and `TURN` of the shape.
 
-    The kernel writes a temporary file in the folder `place` (`None`: the system's folder). Raises
-    `InputError` where the kernel fails to make triangles.
+    The kernel writes a temporary file in the folder `place` (`None`: the system's folder for
+    temporary files). Raises `InputError` if the kernel fails to make triangles.
     """
     from build123d import export_stl
 
@@ -132,8 +133,8 @@ def _edge(piece: DrawnPiece) -> "Edge":
 def _side(piece: DrawnPiece, length: float, helix: float) -> "Face":
     """Return the side face of the rotor over one piece of the outline.
 
-    Over an arc of a straight rotor the face is a cylinder, otherwise a B-spline surface. The
-    kernel's own twisted sweeps were rejected: they are off by 1e-4 near a cusp.
+    The face is a cylinder over an arc of a straight rotor, otherwise a B-spline surface. The
+    kernel's own twisted sweeps are not used: they are off by 1e-4 near a cusp.
     """
     from build123d import Face, Vector
 
@@ -171,7 +172,7 @@ def _rational(piece: DrawnPiece):
 
 
 def _quarters(piece: DrawnPiece) -> list[DrawnPiece]:
-    """Split a piece so that no arc is longer than a quarter of a circle."""
+    """Split an arc into parts of at most a quarter of a circle; return a spline unchanged."""
     if not isinstance(piece, Arc):
         return [piece]
     count = int(np.ceil(abs(piece.sweep) / (np.pi / 2) - 1e-9))
@@ -183,8 +184,8 @@ def _quarters(piece: DrawnPiece) -> list[DrawnPiece]:
 def _surface(degrees, knots, points, heights, weights) -> "Face":
     """Return a face on a rational B-spline surface (mm).
 
-    `points`, `heights`, `weights` (n, m): x + iy, z and weight of the control points. `degrees`,
-    `knots`: pairs, along the outline and along the axis."""
+    `points`, `heights`, `weights` (n, m): x + iy, z and weight of each control point. `degrees`,
+    `knots`: pairs of values, the first along the outline and the second along the axis."""
     from build123d import Face
     from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeFace
     from OCP.collections import Array1_double, Array1_int, Array2_double, Array2_gp_Pnt

@@ -16,7 +16,7 @@ _STYLE = (
 def svg_text(drawing: Drawing) -> str:
     """Return the content of an SVG file of one rotor.
 
-    One user unit is a millimetre; y points up in the drawing."""
+    One user unit is 1 mm. The rotor's y axis points up on the page."""
     reach = drawing.reach + 1
     size = _number(2 * reach)
     corner = _number(-reach)
@@ -42,7 +42,7 @@ def svg_text(drawing: Drawing) -> str:
 
 
 def outline_path(pieces: list[DrawnPiece]) -> str:
-    """Return the closed outline as path data: arcs as arcs, splines as Bézier curves."""
+    """Return the closed outline as SVG path data, with splines as Bézier curves."""
     return f"M{_point(pieces[0].start)}" + "".join(map(_command, pieces)) + "Z"
 
 
@@ -66,5 +66,5 @@ def _point(z: complex) -> str:
 
 
 def _number(value: float) -> str:
-    """Format a number with at most ten decimals."""
+    """Format a number with at most ten decimal places, without trailing zeros."""
     return f"{value + 0.0:.10f}".rstrip("0").rstrip(".")

@@ -24,8 +24,9 @@ _PANELS = 6
 
 
 def plot_basins(ax: Axes, basins: Basins) -> Axes:
-    """Draw which motion each initial state leads to. Mark the state of each motion at the start of
-    every mesh period."""
+    """Draw a map that shows to which motion each initial state leads.
+
+    Points mark the state of each motion at the start of every mesh period."""
     colors = [_LOST, *_colors(basins)]
     bounds = np.arange(len(colors) + 1) - 1.5
     pale = [_pale(color) for color in colors]
@@ -54,9 +55,10 @@ def plot_basins(ax: Axes, basins: Basins) -> Axes:
 
 
 def plot_motions(axes: Sequence[Axes], attractors: Sequence[Attractor], colors, lobes: int) -> None:
-    """Draw the contact force of each motion over the same mesh periods, one panel per motion.
+    """Draw the contact force of each motion over time (mesh periods), one panel per motion.
 
-    `colors`: one colour per motion; `lobes`: number of lobes of a rotor."""
+    All panels cover the same number of mesh periods. `axes`, `colors`: one for each motion;
+    `lobes`: number of lobes of a rotor."""
     longest = max(one.evaluation.steady_state.get("period", lobes) for one in attractors)
     shown = max(longest, 2)
     for ax, one, color in zip(axes, attractors, colors, strict=True):
@@ -114,8 +116,9 @@ def _pale(color: str) -> str:
 
 
 def basin_figures(folder: ResultFolder, basins: Basins, config: Config) -> list[str]:
-    """Write basins.png; return the names of the files written. Only the motions with the largest
-    shares get a panel."""
+    """Write basins.png; return the names of the files written.
+
+    Only the motions with the largest shares get a panel that shows their force."""
     pairs = list(zip(basins.attractors, _colors(basins), strict=True))
     shown = [(one, color) for one, color in pairs if one.evaluation.series is not None][:_PANELS]
     made = Figure(figsize=(13, 6.6), layout="constrained")

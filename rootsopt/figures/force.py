@@ -1,4 +1,4 @@
-"""Contact force over time and frequency. Each function draws on the given axes."""
+"""Figures of the contact force over time and over frequency, drawn on given axes."""
 
 from collections.abc import Mapping, Sequence
 
@@ -26,10 +26,10 @@ def plot_force(
 ) -> Sequence[Axes] | NDArray:
     """Draw the contact force over time, one panel per design, all on one scale.
 
-    `series` and `responses`: by name of the design. Mean and peak come from `responses`
-    (`mean_force_N`, `peak_force_N`), which are more exact than the samples. All panels are as long
-    as the shortest window, a few revolutions at most, and include the largest force. Time counts
-    from the start of the panel.
+    `series`, `responses`: simulated motion and response of each design, keyed by its name. Mean and
+    peak are taken from the response (`mean_force_N`, `peak_force_N`), which is more accurate than
+    the samples. All panels cover the same number of revolutions, at most a few, and each includes
+    the largest force of its design. Time is 0 at the start of each panel.
     """
     turns = min(_MOST_TURNS, *(np.ptp(run.rotation) / (2 * np.pi) for run in series.values()))
     for ax, (name, run) in zip(axes, series.items(), strict=True):
@@ -68,8 +68,9 @@ def number(value: float) -> str:
 
 
 def _around_peak(run: Series, turns: float) -> slice:
-    """Return a slice of samples: `turns` revolutions around the largest force, or fewer at an
-    end."""
+    """Return a slice of the samples of `run`: `turns` revolutions around the largest force.
+
+    Near an end of the run, the slice is shifted to lie within the run."""
     count = len(run.time)
     shown = min(count, round(count * turns * 2 * np.pi / np.ptp(run.rotation)))
     start = 0 if shown == count else int(np.argmax(run.force)) - shown // 2
@@ -80,10 +81,11 @@ def _around_peak(run: Series, turns: float) -> slice:
 def amplitude_spectrum(
     signal: ArrayLike, step: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return frequencies above 0 (1/unit of `step`) and one-sided amplitudes of a `signal` (n,).
+    """Return (frequencies above 0, one-sided amplitudes at them) of a `signal` (n,).
 
-    The samples must be uniform, a `step` apart, and cover whole periods, without the end point. A
-    cosine of amplitude a then gives one line of height a, without a window function.
+    The samples must be a constant `step` apart and cover whole periods, without repeating the first
+    sample at the end. No window function is used: a cosine of amplitude a gives one line of height
+    a. The unit of frequency is 1 / (unit of `step`).
     """
     signal = np.asarray(signal)
     amplitude = 2 * np.abs(np.fft.rfft(signal)) / len(signal)
@@ -101,7 +103,8 @@ def plot_spectrum(
 ) -> Sequence[Axes] | NDArray:
     """Draw the amplitude spectrum of the contact force, one panel per design, all on one scale.
 
-    The axis ends at `harmonics` times the mesh frequency. The mean (0 Hz) is omitted.
+    `series`: simulated motion of each design, keyed by its name; `harmonics`: number of multiples
+    of the mesh frequency that the axis covers. The mean (0 Hz) is omitted.
     """
     limit = (harmonics + 0.5) * mesh_frequency_Hz
     top = 0.0

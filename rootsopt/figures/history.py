@@ -24,12 +24,12 @@ def plot_history(
     history: Sequence[Mapping[str, Any]],
     keys: Sequence[str] = DESIGN_KEYS,
 ) -> Sequence[Axes] | NDArray:
-    """Draw the objective and its best value so far, then the design parameters, over evaluations.
+    """Draw the objective, its best value so far and the design parameters over the evaluations.
 
-    `keys`: names of the design parameters; `axes`: a panel for the objective and one for each key.
-    `history`: one row per evaluation. A row whose `start` is absent or negative belongs to the
-    screening. A key whose values are lists has one panel, which omits the screening. Unusable
-    designs (objective not finite) are crosses at the top.
+    `keys`: names of the design parameters; `axes`: a panel for the objective, followed by one for
+    each key. `history`: one row per evaluation. A row whose `start` is absent or negative belongs
+    to the screening. The entries of a list-valued parameter share one panel, which omits the
+    screening. Crosses at the top mark unusable designs, whose objective is not finite.
     """
     keys = ("objective", *keys)
     for ax, key in zip(axes, keys, strict=True):
@@ -56,7 +56,9 @@ def _label(key: str) -> str:
 
 
 def _traces(ax, rows, key):
-    """Draw each entry of a list-valued parameter over the evaluations of a local search."""
+    """Draw each entry of the list-valued parameter `key` over the evaluations of a local search.
+
+    For rows of the screening, draw nothing."""
     rows = [row for row in rows if _start(row) >= 0]
     if not rows:
         return
@@ -71,7 +73,7 @@ def _traces(ax, rows, key):
 
 
 def _starts(history) -> Iterator[tuple[list[Mapping[str, Any]], dict[str, Any]]]:
-    """Yield (rows, line style) for the screening and for the local search from each start."""
+    """Yield (rows, line style) for the screening, then for the local search from each start."""
     groups: dict[Any, list] = {}
     for row in history:
         groups.setdefault(_start(row), []).append(row)
@@ -92,7 +94,7 @@ def _start(row) -> int:
 
 
 def _trace(ax, rows, key, style):
-    """Draw values over evaluations; hollow markers violate a constraint."""
+    """Draw the values of `key` over the evaluations; hollow markers mean a violated constraint."""
     x, y = _values(rows, "evaluation"), _values(rows, key)
     met = np.asarray([bool(row.get("feasible", True)) for row in rows])
     ax.plot(x, y, **(style | {"marker": "", "label": None}), alpha=0.6)
@@ -107,7 +109,9 @@ def _values(rows, key) -> NDArray[np.float64]:
 
 
 def _best(axes, keys, history):
-    """Draw the best objective so far as a line, and a star on the best design in every panel."""
+    """Draw the best objective so far as a line, and mark the best design with a star.
+
+    The panels of list-valued parameters have no star."""
     x, best = [row["evaluation"] for row in history], _values(history, "best_objective")
     axes[0].step(x, best, where="post", color="black", linewidth=1.8, label="best so far")
     if not np.isfinite(best).any():
@@ -123,7 +127,7 @@ def _best(axes, keys, history):
 
 
 def _outside(ax, history):
-    """Set axis limits that ignore a few bad designs, and mark the values outside these limits."""
+    """Set axis limits that exclude a few bad designs, and mark these designs at the top edge."""
     values = _values(history, "objective")
     x = _values(history, "evaluation")
     known = values[np.isfinite(values)]

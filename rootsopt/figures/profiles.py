@@ -1,4 +1,4 @@
-"""Rotor profiles, meshing and conjugacy. Each function draws on the given axes."""
+"""Figures of rotor profiles, of meshing and of conjugacy, drawn on given axes."""
 
 from collections.abc import Mapping, Sequence
 
@@ -13,7 +13,9 @@ from rootsopt.figures.style import COLORS, DASHES, GREY, ORANGE, SKY, VERMILION
 def plot_profiles(
     ax: Axes, outlines: Mapping[str, NDArray[np.float64]], pitch_radius_mm: float
 ) -> Axes:
-    """Draw closed outlines (n, 2) in mm, by name, on top of each other, with the pitch circle."""
+    """Draw closed outlines on top of each other, with the pitch circle.
+
+    `outlines`: points (n, 2) in mm of each outline, keyed by its name."""
     _overlay(ax, outlines, pitch_radius_mm)
     reach = 1.06 * max(np.max(np.hypot(*points.T)) for points in outlines.values())
     ax.plot(0, 0, "+", color="black", markersize=9)
@@ -24,9 +26,10 @@ def plot_profiles(
 def plot_flank(
     ax: Axes, outlines: Mapping[str, NDArray[np.float64]], lobes: int, pitch_radius_mm: float
 ) -> Axes:
-    """Draw one flank of each outline from tip (on the +x axis) to root, enlarged.
+    """Draw one flank of each outline from the tip (on the +x axis) to the root, enlarged.
 
-    `outlines`: closed outlines (n, 2) in mm, by name. The rest of an outline follows by symmetry.
+    `outlines`: points (n, 2) in mm of each closed outline, keyed by its name; `lobes`: number of
+    lobes. The rest of an outline follows by symmetry.
     """
     _overlay(ax, outlines, pitch_radius_mm)
     flanks = []
@@ -65,7 +68,8 @@ def plot_meshing(
 ) -> Sequence[Axes] | NDArray:
     """Draw the meshing pair at several angles of rotor 1, one panel per angle.
 
-    `outline_mm` (n, 2): outline of either rotor."""
+    `axes`: one for each of `angles_deg`; `outline_mm` (n, 2): closed outline, equal for both
+    rotors."""
     center = 2 * pitch_radius_mm
     for ax, angle in zip(axes, angles_deg, strict=True):
         turn = np.radians(angle)
@@ -83,10 +87,10 @@ def plot_meshing(
 
 
 def plot_conjugacy(ax: Axes, gaps: Mapping[str, tuple[NDArray, NDArray]]) -> Axes:
-    """Draw the gap (µm) of pairs in perfect rolling over rotor 1's angle (deg).
+    """Draw the gap of one or more pairs in perfect rolling over the angle of rotor 1.
 
-    `gaps`: (angles, gaps) by name of the pair. The angle is 0 where a tip of rotor 1 passes the
-    line of centres."""
+    `gaps`: (angles (n,) in degrees, gaps (n,) in µm) of each pair, keyed by its name. The angle is
+    0 when a tip of rotor 1 is on the line of centres."""
     for (name, (angle, gap)), color, dashes in zip(gaps.items(), COLORS, DASHES * 2, strict=False):
         ax.plot(angle, gap, color=color, linestyle=dashes, linewidth=1.6, label=name)
     ax.axhline(0, color="black", linewidth=0.8)

@@ -1,4 +1,4 @@
-"""Figures of a run of a command, written into the run's result folder."""
+"""Writes the figures of a command's run into the run's result folder."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +20,10 @@ from rootsopt.scene import design_keys, outline_mm
 
 
 def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, Any]) -> list[str]:
-    """Write profiles.png and meshing.png of one result record; return the file names."""
+    """Write the figures of one design's profile; return the file names.
+
+    `record`: the design's record in the result file. The figures are profiles.png, meshing.png and,
+    for a profile read from a file, conjugacy.png."""
     points = _outline(config, record.get("design", {}))
     names = [
         _write(folder, "profiles", _profiles({config.profile.family.upper(): points}, config)),
@@ -39,7 +42,7 @@ def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, A
 
 
 def simulation_figures(folder: ResultFolder, evaluation: Evaluation, config: Config) -> list[str]:
-    """Write the figures of one evaluation; return the file names."""
+    """Write the figures of one evaluation, of profile and force; return the file names."""
     names = profile_figures(folder, config, evaluation.record())
     return names + _force_figures(folder, {config.profile.family.upper(): evaluation}, config)
 
@@ -51,7 +54,9 @@ def optimization_figures(
     history: Sequence[Mapping[str, Any]],
     config: Config,
 ) -> list[str]:
-    """Write the figures of an optimisation; return the file names."""
+    """Write the figures of an optimisation; return the file names.
+
+    `history`: one row per evaluation, as in `plot_history`; if empty, its figure is omitted."""
     designs = {"baseline": baseline, "optimised": optimized}
     outlines = {name: _outline(config, one.design) for name, one in designs.items()}
     names = [

@@ -17,15 +17,16 @@ from rootsopt.response.speeds import AtSpeed
 _MARKERS = {"periodic": "o", "averaged": "s", "chaotic": "x", "not_settled": "+"}
 _NO_FORCE = "v"
 _FEW = 24
-"""Number of speeds above which single speeds are not marked."""
+"""Number of speeds above which steady motions are not marked one by one on the line."""
 LABELS = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
 
 
 def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[AtSpeed]], force: str) -> Axes:
-    """Draw `force` (a key of `Evaluation.response`) over speed, one line per design.
+    """Draw a force over speed, one line per design.
 
-    `designs`: evaluations at all speeds, by name. Lines connect steady motions. Other motions are
-    single markers, at the bottom if the force is not known.
+    `designs`: evaluations of each design at all speeds, keyed by its name; `force`: key of the
+    force in `Evaluation.response`. Lines connect steady motions. Other motions are drawn as single
+    markers, at the bottom if their force is not known.
     """
     for (name, parts), color, dashes in zip(designs.items(), COLORS, DASHES * 2, strict=False):
         speeds = np.array([part.speed_rpm for part in parts])
@@ -52,7 +53,7 @@ def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[AtSpeed]], force: str) 
 
 
 def legend_entries(designs: Mapping[str, Sequence[AtSpeed]]) -> list[Line2D]:
-    """Return legend entries for the designs and the markers."""
+    """Return legend entries for the lines of the designs and for the markers of the statuses."""
     entries = []
     for name, color, dashes in zip(designs, COLORS, DASHES * 2, strict=False):
         entries.append(Line2D([], [], color=color, linestyle=dashes, linewidth=1.5, label=name))
@@ -78,7 +79,9 @@ def legend_entries(designs: Mapping[str, Sequence[AtSpeed]]) -> list[Line2D]:
 def speed_figure(
     folder: ResultFolder, designs: Mapping[str, Sequence[AtSpeed]], title: str
 ) -> list[str]:
-    """Write speeds.png: mean and peak force over speed. Return the names of the files written."""
+    """Write speeds.png, mean and peak force over speed; return the names of the files written.
+
+    `designs`: as in `plot_speeds`."""
     made, axes = figure(9, 6.6, 2, 1, sharex=True)
     for ax, force in zip(axes[:, 0], LABELS, strict=True):
         plot_speeds(ax, designs, force).set_ylim(0, None)

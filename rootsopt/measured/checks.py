@@ -8,16 +8,17 @@ class Checks:
     """Deviations and margins of an imported outline.
 
     `points`: number of points of the outline as read, without repeated points.
-    `turned_deg`: rotation (°) that put a lobe on +x.
-    `reversed`: whether the points ran clockwise.
+    `turned_deg`: angle (°) by which the outline was turned to put a lobe on +x.
+    `reversed`: whether the points ran clockwise as read.
     `axis_offset_um`: distance of the centroid from the origin (µm).
-    `lobe_deviation_um`: greatest normal distance of a flank from the same flank of the mean lobe
-    (µm).
-    `flank_deviation_um`: greatest normal distance of the mean trailing flank, mirrored, from the
-    mean leading flank (µm).
+    `lobe_deviation_um`: greatest normal distance between a flank and the mean of the same flank of
+    all lobes (µm).
+    `flank_deviation_um`: greatest normal distance between the mean leading flank and the mirrored
+    mean trailing flank (µm).
     `fit_deviation_um`: RMS distance of the leading flank's points from the fitted curve (µm); 0 if
     the curve passes through them.
-    `star_margin_mm`: least distance of a tangent from the axis (mm).
+    `star_margin_mm`: least distance between a tangent and the axis (mm), negative if a tangent
+    passes the axis on the wrong side.
     `convexity_margin_mm`: least radius of curvature of the addendum (mm).
     """
 

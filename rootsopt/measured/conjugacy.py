@@ -1,4 +1,4 @@
-"""Measures how far the flanks of a profile are from conjugate, by their gap in pure rolling."""
+"""Measures how far the flanks of a profile are from being conjugate: their gap in pure rolling."""
 
 import dataclasses
 
@@ -20,13 +20,13 @@ _POSES = 361
 
 @dataclasses.dataclass(frozen=True)
 class Conjugacy:
-    """Gap of a pair that rolls at relative rotation ε = 0 and nominal centre distance.
+    """Gap of a pair in pure rolling: relative rotation ε = 0, nominal centre distance.
 
-    `roll` (n,): angle (rad) of rotor 1 from where its tip passes the line of centres, over a
-    quarter of a lobe pitch. The rest of the mesh repeats this quarter with rotors or flanks
-    exchanged.
-    `gap` (n,): lesser gap (m) of drive and coast flanks, negative where flanks overlap. It is NaN
-    where no points of the flanks face each other.
+    `roll` (n,): roll angle (rad) of rotor 1 over a quarter of a lobe pitch, 0 with a tip of rotor 1
+    on the line of centres. By symmetry, the other quarters repeat this one, with the rotors or the
+    flanks exchanged.
+    `gap` (n,): gap (m) of the drive flanks or of the coast flanks, whichever is smaller; negative
+    if they overlap, NaN if neither pair of flanks has points that face each other.
     """
 
     roll: Float64[np.ndarray, " n"]
@@ -34,7 +34,7 @@ class Conjugacy:
 
     @property
     def least(self) -> float:
-        """Least gap (m)."""
+        """Least gap (m), negative if flanks overlap."""
         return float(np.nanmin(self.gap))
 
     @property
@@ -45,9 +45,10 @@ class Conjugacy:
     def record(self) -> dict[str, float]:
         """Return the gap's statistics for the result file.
 
-        `mesh_gap_min_um`, `mesh_gap_max_um`: least and greatest gap (µm), with their roll angles
-        (°). `interference_um`: greatest overlap (µm). `backlash_um`: twice the least gap (µm), the
-        normal backlash of a lobe between both of its neighbours."""
+        `mesh_gap_min_um`, `mesh_gap_max_um`: least and greatest gap (µm). `mesh_gap_min_at_deg`,
+        `mesh_gap_max_at_deg`: roll angles (°) of these gaps. `interference_um`: greatest overlap
+        (µm), 0 without overlap. `backlash_um`: twice the least gap (µm), 0 with overlap; it is the
+        normal backlash of a lobe between its two neighbours."""
         return {
             "mesh_gap_min_um": self.least / _MICRON,
             "mesh_gap_min_at_deg": float(np.degrees(self.roll[np.nanargmin(self.gap)])),
@@ -59,9 +60,9 @@ class Conjugacy:
 
 
 def conjugacy(profile: Profile) -> Conjugacy:
-    """Return the gap between the flanks of `profile` over a mesh, in pure rolling.
+    """Return the gap between the flanks of two equal rotors in pure rolling.
 
-    Raises `InputError` where the flanks never face each other."""
+    `profile`: profile of both rotors. Raises `InputError` if the flanks never face each other."""
     roll = float(profile.half_pitch) * (np.arange(_POSES) + 0.5) / _POSES
     gap, found = map(np.asarray, _gaps(profile, jnp.asarray(roll)))
     found = found & np.isfinite(gap)
@@ -83,5 +84,5 @@ def _gaps(profile, roll):
 
 
 def gaps_um(found: Conjugacy) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (roll angles (n,) in degrees, gaps (n,) in µm) for a figure."""
+    """Return (roll angles (n,) in degrees, gaps (n,) in µm) of `found`, for a figure."""
     return np.degrees(found.roll), found.gap / _MICRON

@@ -1,8 +1,9 @@
 """Smooth curves through the points of a flank, split into pieces where its curvature jumps.
 
-Points are complex numbers x + iy (mm). The parameter combines the polygon's length with its
-turning, so that it stays regular where a radius of curvature vanishes (EE at the pitch circle).
-For measured points, whose turning is noise, the parameter is the length alone.
+Points are complex numbers x + iy (mm). A curve's parameter t combines the length of the polygon
+through its points with the polygon's turning. It therefore stays regular where a radius of
+curvature vanishes (EE at the pitch circle). The turning of measured points is noise; for them, the
+parameter is the length alone.
 """
 
 import dataclasses
@@ -17,26 +18,28 @@ from rootsopt.errors import InputError
 from rootsopt.measured.guard import guarded
 
 _TURNING = 0.3
-"""Length (pitch radii) that counts in a curve's parameter as much as a turn of 1 rad."""
+"""Length (pitch radii) that contributes as much to a curve's parameter as a turn of 1 rad."""
 _JUMP, _ABOVE = 0.02, 20.0
-"""Change of curvature above which the curvature jumps: as a fraction of the curvature, and as a
+"""Two limits on the change of curvature at a point, above which the point becomes a joint. The
+first is a fraction of the sum of the curvatures (absolute values) on both sides. The second is a
 multiple of the median change at the points around. Both must be exceeded."""
 _BESIDE, _AROUND = 3, 12
-"""Points on each side that a joint affects; points on each side from which the median is taken."""
+"""Number of points on each side whose change of curvature a joint affects; number of points on each
+side from which the median for `_ABOVE` is taken, without those affected."""
 _WINDING = 7.0
-"""Sum of the turns (rad) between successive steps along a flank above which its points are rejected
-as scattered."""
+"""Sum of the turns (rad, absolute values) between successive steps along a flank above which its
+points are rejected as scattered. With smoothing, there is no limit."""
 _SHORTEST = 4
-"""Number of intervals between points below which a piece is not split off."""
+"""Number of intervals between points below which a piece is too short to be split off."""
 _MOST_KNOTS, _NO_ROOM = 500, 1
-"""Number of knots above which a smoothing spline is rejected because it follows the noise; the flag
-by which FITPACK says so."""
+"""Number of knots above which a smoothing spline is rejected because it follows the noise; flag
+that FITPACK returns in this case."""
 _KEY = "`profile.outline_file`"
 _UNEVEN = "remove points that are much closer together than others"
 _CUSP, _SPARED = 2e-2, 2
-"""Speed at the end of a piece (fraction of the mean speed) below which the end is a cusp; number of
-knot intervals next to a cusp that are not sampled. Sampling also starts no closer to the cusp than
-where the curve reaches this speed."""
+"""Speed |z′| (fraction of the mean speed) below which the end of a piece is a cusp; number of knot
+intervals next to a cusp that are not sampled. Points that are slower than this speed are not
+sampled either."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,11 +52,13 @@ class MeasuredCurve:
     pieces: tuple[BSpline, ...]
 
     def derivatives(self, t: NDArray[np.float64], place: int) -> NDArray[np.complex128]:
-        """Return z, z′, z″, z‴ (4, n) at `t` (n,) on the piece with index `place`."""
+        """Return z and its derivatives z′, z″, z‴ with respect to t: (4, n) at `t` (n,).
+
+        `place`: index of the piece that is evaluated."""
         return np.stack([self.pieces[place](t, order) for order in range(4)])
 
     def __call__(self, t: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return z, z′, z″, z‴ (4, n) at `t` (n,), each value on its own piece."""
+        """Return z, z′, z″, z‴ (4, n) at `t` (n,), each from the piece that contains its `t`."""
         place = np.clip(np.searchsorted(self.ends, t, side="right") - 1, 0, len(self.pieces) - 1)
         found = np.empty((4, len(t)), complex)
         for k in map(int, np.unique(place)):
@@ -61,9 +66,9 @@ class MeasuredCurve:
         return found
 
     def between(self, start: float, stop: float) -> list[tuple[int, float, float]]:
-        """Return (index, low, high) of each piece between the parameters `start` and `stop`.
+        """Return (index, low, high) of each piece that overlaps the interval `start` ≤ t ≤ `stop`.
 
-        `low` and `high` are the parameters at the ends of the piece's part in between."""
+        `low` and `high` are the values of t at the ends of the overlap."""
         parts = []
         for k, (low, high) in enumerate(zip(self.ends[:-1], self.ends[1:], strict=True)):
             low, high = max(low, start), min(high, stop)
@@ -76,8 +81,8 @@ class MeasuredCurve:
 class Frame:
     """Points and tangents of a curve that runs from the tip towards the root.
 
-    `z` (n,): points (mm); `tangent` (n,): unit tangents; `speed` (n,): |z′| (mm per parameter);
-    `turning` (n,): turn of the tangent (rad per parameter)."""
+    `z` (n,): points (mm); `tangent` (n,): unit tangents; `speed` (n,): |z′| (mm per unit of t);
+    `turning` (n,): rate at which the tangent turns (rad per unit of t)."""
 
     z: NDArray[np.complex128]
     tangent: NDArray[np.complex128]
@@ -86,17 +91,18 @@ class Frame:
 
     @property
     def normal(self) -> NDArray[np.complex128]:
-        """Outward unit normal."""
+        """Outward unit normals (n,)."""
         return -1j * self.tangent
 
 
 def stretch(
     curve: MeasuredCurve, place: int, low: float, high: float, count: int
 ) -> tuple[NDArray[np.float64], Frame]:
-    """Return (`count` parameters from `low` to `high`, `Frame` at them) on the piece `place`.
+    """Return (parameters, `Frame` at them): `count` samples of one piece of `curve`.
 
-    At a cusp, where z′ vanishes, the points of the last intervals hardly determine the curve. These
-    intervals are not sampled, and tangent and turning are extrapolated to the cusp.
+    The samples run from t = `low` to t = `high`; `place`: index of the piece. Next to a cusp, where
+    z′ vanishes, the data hardly determine the curve. The last intervals before the cusp are
+    therefore not sampled, and the tangent and its turning are extrapolated to the cusp.
     """
     ends = np.array([low, high])
     speed = np.abs(curve.derivatives(np.linspace(low, high, count), place)[1])
@@ -129,11 +135,12 @@ def through(
 ) -> MeasuredCurve:
     """Return the curve through `points` (mm), or at an RMS distance `smoothing` (mm) from them.
 
-    `joints` marks the points at which curvature may jump. Without smoothing the curve has one
-    spline, quintic where the points suffice, between two joints. Points where the polygon's own
-    curvature jumps are joints, too. `pitch_radius`: in mm.
+    `joints`: mask of the points at which curvature may jump; `pitch_radius`: in mm. If `smoothing`
+    is 0, the curve has one spline between every two successive joints, quintic if there are enough
+    points. Points at which the polygon's own curvature jumps are joints, too. If `smoothing` is
+    greater than 0, the curve is a single quintic spline and `joints` is ignored.
 
-    Raises `InputError` where points are too few or scattered.
+    Raises `InputError` if the points are too few or scattered, or if `smoothing` is too small.
     """
     if len(points) < 8:
         raise InputError(
@@ -166,7 +173,7 @@ def through(
 
 
 def _smoothed(points: NDArray[np.complex128], smoothing: float) -> MeasuredCurve:
-    """Return the smoothest spline at an RMS distance `smoothing` (mm) from the points."""
+    """Return the smoothest quintic spline at an RMS distance `smoothing` (mm) from the points."""
     t = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points)))])
     sides = [np.real(points), np.imag(points)]
     squares = len(points) * smoothing**2
@@ -188,9 +195,9 @@ def _smoothed(points: NDArray[np.complex128], smoothing: float) -> MeasuredCurve
 
 
 def _parameter(points: NDArray[np.complex128], weight: float) -> NDArray[np.float64]:
-    """Return parameters (n,) of the points of a smooth piece, from 0.
+    """Return the parameters (n,) of the points of a smooth piece, starting at 0.
 
-    `weight`: length (mm) that counts as much as a turn of 1 rad."""
+    `weight`: length (mm) that contributes as much as a turn of 1 rad."""
     bend, lengths = _curvature(points)
     # Extrapolate the curvature to the ends, as the next piece turns differently.
     first, last = 2 * bend[0] - bend[1], 2 * bend[-1] - bend[-2]
@@ -200,14 +207,14 @@ def _parameter(points: NDArray[np.complex128], weight: float) -> NDArray[np.floa
 
 
 def _curvature(points: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (curvature at a polygon's inner corners in 1/mm, lengths of its sides in mm)."""
+    """Return (curvatures at a polygon's inner corners in 1/mm, lengths of its sides in mm)."""
     steps = np.diff(points)
     lengths = np.abs(steps)
     return 2 * np.angle(steps[1:] / steps[:-1]) / (lengths[1:] + lengths[:-1]), lengths
 
 
 def _jumps(points: NDArray[np.complex128]) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the points at which the polygon's curvature jumps or has a cusp."""
+    """Return a mask (n,) of the points at which the polygon has a jump of curvature or a cusp."""
     found = np.zeros(len(points), bool)
     if len(points) < 2 * _AROUND:
         return found

@@ -19,20 +19,21 @@ with silenced():  # Importing ezdxf writes to its log.
     from ezdxf.lldxf.tagger import binary_tags_loader
 
 _SPACING = 1 / 400
-"""Distance between points on arcs and splines, as a fraction of the drawing's size."""
+"""Approximate distance between points on arcs and splines, as a fraction of the drawing's size."""
 _LAYER = "OUTLINE"
 _KINDS = ("LINE", "ARC", "SPLINE", "ELLIPSE", "LWPOLYLINE", "POLYLINE")
 _CURVES = ("LINE", "ARC", "SPLINE", "ELLIPSE")
 _PARTS = ("VERTEX", "INSERT")
 _ENTITIES = 100_000
-"""Number of entities (vertices of a POLYLINE included) above which a drawing is rejected."""
+"""Number of entities (including block inserts and the vertices of a POLYLINE) above which a drawing
+is rejected."""
 _POINTS = 500_000
-"""Number of points on all entities above which a drawing is rejected."""
+"""Total number of points on all entities above which a drawing is rejected."""
 _DEEPEST = 8
-"""Depth of nested blocks above which a drawing is rejected."""
+"""Depth of nesting of blocks above which a drawing is rejected."""
 _LARGEST = 1e9
-"""Magnitude of a number in an entity (drawing units) above which a drawing is rejected as damaged.
-"""
+"""Absolute value of a number in an entity (drawing units) above which a drawing is rejected as
+damaged. A drawing of this size or larger (mm) is rejected, too."""
 _BINARY = b"AutoCAD Binary DXF\r\n\x1a\x00"
 _NOT = "is not a DXF file that can be read"
 _AGAIN = "export it again (DXF R2000 or newer) or save the outline as CSV"
@@ -61,14 +62,15 @@ _UNITS = {
     23: 3 * _SURVEY_FOOT,
     24: 5280 * _SURVEY_FOOT,
 }
-"""Length (mm) of each unit that $INSUNITS may name; astronomical units (17 to 20) are rejected."""
+"""Length (mm) of each unit by its code in $INSUNITS. Other codes, such as those of astronomical
+units (17 to 20), are rejected."""
 
 
 def from_dxf(data: bytes, name: str) -> Loop:
-    """Return the closed loop (mm) of the largest area in a drawing.
+    """Return the closed loop of the largest area in a drawing, in mm.
 
-    `data`: content of the file; `name`: name of the file in messages. Raises `InputError` where the
-    drawing cannot be read or holds no closed loop."""
+    `data`: content of the file; `name`: name of the file in messages. Raises `InputError` if the
+    drawing cannot be read, is too large or contains no closed loop."""
     binary = data.startswith(_BINARY)
     counted = _check_tags(data, binary, name)
     with guarded(name, _NOT, _AGAIN):
@@ -122,9 +124,9 @@ def from_dxf(data: bytes, name: str) -> Loop:
 def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
     """Check the raw tags of a DXF file; return the number of entities of each kind.
 
-    Raises `InputError` unless the file is complete and the numbers of its entities are valid. This
-    check is needed because the library reads "1,5" as 1. The library also accepts a number that is
-    cut off at the end of the file.
+    Raises `InputError` if the file is incomplete, if a number of an entity is invalid, or if there
+    are too many entities. This check is needed because the library reads "1,5" as 1, and accepts a
+    number that is cut off at the end of the file.
     """
     tags = binary_tags_loader(data) if binary else recover.bytes_loader(io.BytesIO(data))
     counted: Counter[str] = Counter()
@@ -168,10 +170,10 @@ def _raw(value: Any) -> bytes:
 
 
 def _chosen(document: Drawing, name: str) -> list[Any]:
-    """Return the entities that may be the outline.
+    """Return the entities that may form the outline: the first of these groups that is not empty.
 
-    Entities on the layer OUTLINE come first. Without them, return the entities drawn directly, and
-    if there are none, those in blocks."""
+    The groups are: entities on the layer OUTLINE drawn directly; entities on this layer in blocks;
+    all entities drawn directly; all entities in blocks. Raises `InputError` if all are empty."""
     with guarded(name, _NOT, _AGAIN):
         everything = list(document.modelspace())
     direct = [e for e in everything if e.dxftype() in _KINDS]
@@ -199,7 +201,7 @@ def _on_layer(entities: list[Any], name: str) -> list[Any]:
 
 
 def _exploded(inserts: list[Any], name: str) -> list[Any]:
-    """Return the entities of inserted blocks and of the blocks inside, where they appear."""
+    """Return the entities of inserted and nested blocks, placed as they appear in the drawing."""
     found: list[Any] = []
     stack = [(insert, 1) for insert in reversed(inserts)]
     handled = 0

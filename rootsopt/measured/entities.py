@@ -1,7 +1,8 @@
 """Points on the entities of a drawing (mm, as x + iy).
 
-An entity is a chain of segments: corners joined by straight lines, arcs, ellipses, splines. Each
-segment gives its number of intervals before it is sampled, so that every array has a bounded size.
+An entity is a chain of segments. A segment is a polygonal line, an arc of a circle or ellipse, or a
+spline. Each segment states its number of intervals before it is sampled, so that the size of every
+array is known in advance.
 """
 
 import abc
@@ -19,25 +20,26 @@ from rootsopt.measured.guard import guarded, short
 from rootsopt.measured.loop import Loop
 
 _FEWEST = 24
-"""Least number of intervals of an arc or spline."""
+"""Minimum number of sampling intervals on an arc or spline."""
 _MOST = 100_000
-"""Greatest number of intervals of an arc or spline."""
+"""Maximum number of sampling intervals derived from the length of an arc or spline."""
 _PER_SPAN = 4
-"""Least number of intervals between two knots of a spline."""
+"""Minimum number of sampling intervals between two adjacent knots of a spline."""
 _DEGREES = 25
 """Degree above which a spline is rejected."""
 _FITTED = 5_000
 """Number of fit points above which a spline without control points is rejected."""
 _SAME_KNOT = 1e-9
-"""Difference of knots (fraction of their range) below which they are one knot."""
+"""Difference between adjacent knots (fraction of their range) below which they become one knot."""
 _FULL = 1e-9
 """Sweep (rad) below which an ELLIPSE is read as a full ellipse."""
 _STRAIGHT = 1e-12
-"""Bulge below which a side of a polyline is straight."""
+"""Absolute value of the bulge below which a side of a polyline is read as a straight line."""
 _FRAME = 16
-"""DXF flag of a vertex that controls a spline-fitted polyline and does not lie on its curve."""
+"""DXF flag of a vertex that is a control point of a spline-fitted polyline, not a point on it."""
 _TILT = 1e-6
-"""Tilt (rad) of an entity's plane against the drawing's above which the entity is rejected."""
+"""Angle (rad) between an entity's plane and the drawing's plane above which the entity is rejected.
+"""
 
 
 class Stroke(abc.ABC):
@@ -46,22 +48,25 @@ class Stroke(abc.ABC):
     curved: bool
     """Whether the segment's ends are joints (see `Loop`)."""
     least: int
-    """Number of intervals with which the segment's extent is measured."""
+    """Number of intervals with which the segment is sampled to measure its extent."""
 
     @abc.abstractmethod
     def intervals(self, spacing: float) -> int:
-        """Return the number of intervals for points at a distance of `spacing` (mm)."""
+        """Return the number of intervals needed for points about `spacing` (mm) apart.
+
+        A polygonal line ignores `spacing` and returns its number of corners."""
 
     @abc.abstractmethod
     def points(self, count: int) -> NDArray[np.complex128]:
-        """Return points (mm, as x + iy) from end to end: at least `count` + 1 on a curve.
+        """Return points (mm, as x + iy) from end to end.
 
-        On straight lines, return the corners, whatever `count` is."""
+        `count`: number of intervals. A spline may return more points than `count` + 1. A polygonal
+        line ignores `count` and returns its corners."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Corners(Stroke):
-    """Points joined by straight lines."""
+    """A polygonal line: corners joined by straight lines."""
 
     corners: NDArray[np.complex128]
     curved = False
@@ -78,7 +83,7 @@ class _Corners(Stroke):
 
 @dataclasses.dataclass(frozen=True)
 class _Ellipse(Stroke):
-    """Elliptic or circular arc: center + major cos t + minor sin t, start ≤ t ≤ start + sweep."""
+    """Elliptic or circular arc: center + major cos t + minor sin t, t = start to start + sweep."""
 
     center: complex
     major: complex
@@ -124,9 +129,9 @@ def _bounded(count: float) -> int:
 
 
 def chain(parts: list[Stroke], spacing: float) -> Loop:
-    """Return points on the segments of one entity, about `spacing` (mm) apart.
+    """Return the points on one entity, about `spacing` (mm) apart on curves, as an open `Loop`.
 
-    The ends of the entity's curves are joints."""
+    `parts`: the entity's segments in order. The ends of arcs and splines are joints."""
     points, joints = [], []
     for segment in parts:
         own = segment.points(segment.intervals(spacing))
@@ -145,7 +150,7 @@ class Entity:
     """One entity of a drawing, in the drawing's units.
 
     `kind`: its DXF type; `what`: its name in messages; `normal`: normal of its plane; `data`:
-    arguments of the function that makes its segments."""
+    first arguments of the function in `_KINDS` that makes its segments."""
 
     kind: str
     what: str
@@ -156,7 +161,7 @@ class Entity:
     def of(cls, entity: Any, name: str) -> "Entity":
         """Build the entity from the library's object; `name` names the drawing in messages.
 
-        Raises `InputError` where the object cannot be read."""
+        Raises `InputError` if the object cannot be read."""
         kind = entity.dxftype()
         with guarded(name, f"{kind} cannot be read", "repair or remove it in the drawing"):
             handle = short(entity.dxf.handle or "unknown", 20)
@@ -165,9 +170,9 @@ class Entity:
         return cls(kind, f"{name}: {kind} (handle {handle})", normal, data)
 
     def segments(self, scale: float) -> list[Stroke]:
-        """Return the entity's segments (mm); an entity without extent has none.
+        """Return the entity's segments in mm, or an empty list if it has no extent.
 
-        `scale`: mm per drawing unit. Raises `InputError` for an entity that is not valid.
+        `scale`: mm per drawing unit. Raises `InputError` if the entity is not valid.
         """
         fault, across = _Fault(self.what), abs(self.normal[2])
         if self.kind not in _SPATIAL and math.hypot(*self.normal[:2]) > _TILT * across:
@@ -182,21 +187,21 @@ class Entity:
 
 @dataclasses.dataclass(frozen=True)
 class _Plane:
-    """An entity's plane: `scale` mm per drawing unit, seen from above or from `below`."""
+    """An entity's plane. `scale`: mm per drawing unit; `below`: whether it is seen from below."""
 
     scale: float
     below: bool
 
     def __call__(self, z: Any) -> Any:
-        """Convert a point or vector from the entity's plane to the drawing's (mm).
+        """Convert a point or vector x + iy from the entity's plane to the drawing's plane (mm).
 
-        In a plane seen from below, which CAD uses for mirrored entities, x and y mean -x and y."""
+        CAD stores mirrored entities in a plane seen from below, whose x axis is reversed."""
         return self.scale * (-np.conj(z) if self.below else z)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Fault:
-    """Makes the errors of an entity; `what`: name of the entity in messages."""
+    """Makes the errors that an entity raises. `what`: name of the entity in messages."""
 
     what: str
 
@@ -208,7 +213,7 @@ class _Fault:
 
 
 def _plain(points: Iterable[Any]) -> NDArray[np.complex128]:
-    """Return the library's points as x + iy, without z."""
+    """Return points (x, y) or (x, y, z) of the library as complex numbers x + iy."""
     rows = np.array([(p[0], p[1]) for p in points], float).reshape(-1, 2)
     return rows[:, 0] + 1j * rows[:, 1]
 
@@ -309,7 +314,7 @@ def _read_polyline(entity: Any):
 
 
 def _polyline(corners, bulges, closed, spatial, plane, fault) -> list[Stroke]:
-    """Return straight runs and arcs; a bulge is the tangent of a quarter of an arc's angle."""
+    """Return the straight runs and arcs of a polyline. An arc's bulge is tan(its angle / 4)."""
     del fault
     corners = plane.scale * corners if spatial else plane(corners)
     bulges = -bulges if plane.below and not spatial else bulges
@@ -340,5 +345,5 @@ _KINDS = {
     "LWPOLYLINE": (_read_polyline, _polyline),
     "POLYLINE": (_read_polyline, _polyline),
 }
-"""Per kind: the function that reads an entity's data, called inside the guard, and the function
-that makes segments from it."""
+"""Two functions for each kind of entity. The first reads an entity's data from the library's object
+and is called inside `guarded`; the second makes segments from the data."""

@@ -16,39 +16,45 @@ from rootsopt.profiles.outline import Outline, Table
 
 _MM = 1e-3
 NODES = 1536
-"""Nodes of each table. The number is fixed, so that one compiled program serves all outlines."""
+"""Number of nodes in each table, of the addendum and of the dedendum. It is fixed, so that one
+compiled program serves all outlines."""
 _PIECES = NODES // 4
 """Number of smooth pieces of an addendum or dedendum above which an outline is rejected."""
 _BEYOND = 0.3
-"""Polar angle by which the points of a flank extend beyond tip and root (fraction of the angle from
-tip to root)."""
+"""Polar angle (fraction of the angle from tip to root) by which the points used to fit a flank
+extend beyond its tip and beyond its root."""
 _SHARES = 400
 """Number of points at which two flanks are compared."""
 _FOLD = 1e-3
-"""Angle (rad), seen from the axis, above which an outline that turns back is rejected. Smaller
-angles are noise and rounding."""
+"""Polar angle (rad) of a backward run of the outline above which the outline is rejected. Smaller
+angles are noise and rounding. Also the distance (pitch radii) between the axis and a tangent that
+passes it on the wrong side, above which the outline is rejected."""
 _OFF = 0.02
-"""Deviation between flanks (pitch radii) above which an outline is rejected; also the greatest
-smoothing."""
+"""Deviation between flanks (pitch radii) above which an outline is rejected. A larger smoothing is
+rejected, too."""
 _LAND = 1e-3, 0.5 * np.pi / 180
-"""Lever (pitch radii) below which points from the tip on belong to a land; normal angle (rad) below
-which such a land does not count."""
+"""Two limits for the tip land, which is an arc about the rotor's axis. The first is the moment arm
+of the normal about the axis (pitch radii) above which the land ends. The second is the range of
+normal angles on one flank (rad) below which the land is ignored."""
 _CORNER = 1e-2
-"""Change of direction (rad) at a joint above which the joint is a corner."""
+"""Change of the normal's direction (rad) at a joint below which the change is averaged out. A joint
+with a larger change is a corner."""
 _AT = 1e-6
-"""Distance (pitch radii) from the pitch circle below which a joint counts as on the circle."""
+"""Distance (pitch radii) from the pitch circle below which a joint is taken as the point where the
+flank crosses the circle."""
 _FAR = 1e3
 """Ratio of an outline's greatest radius to the pitch radius, or its inverse, above which an outline
-is rejected for its units."""
+is rejected because its units must be wrong."""
 _GAUSS = np.polynomial.legendre.leggauss(12)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Flank:
-    """A flank in its own lobe's frame, tip on +x; a trailing flank is mirrored.
+    """A flank in the frame of its lobe, with the tip on +x. A trailing flank is mirrored.
 
-    `curve`: curve of the flank (mm); `tip`, `pitch`, `root`: the curve's parameters at tip, pitch
-    circle and root; `off`: RMS distance of the points from the curve (mm)."""
+    `curve`: curve of the flank (mm); `tip`, `pitch`, `root`: the curve's parameters at the tip, the
+    pitch circle and the root; `off`: RMS distance of the points from the curve (mm), 0 without
+    smoothing."""
 
     curve: MeasuredCurve
     tip: float
@@ -57,22 +63,27 @@ class _Flank:
     off: float
 
     def at(self, share: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return z, z′, z″, z‴ (4, n) at fractions 0 to 1 of the parameter from tip to root."""
+        """Return z, z′, z″, z‴ (4, n) at `share` (n,): 0 at the tip, 1 at the root.
+
+        A share is a fraction of the range of the curve's parameter."""
         return self.curve(self.tip + (self.root - self.tip) * share)
 
 
 def imported(
     loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: float
 ) -> tuple[Outline, Checks]:
-    """Return (profile, deviations) of an outline given as a closed `loop` of points.
+    """Return (profile, deviations) of the outline of a rotor with N = `lobes` lobes.
 
-    The profile is made from one flank: the leading flank of the lobe next to +x, for a rotor that
-    turns counter-clockwise. The other flanks are compared with this flank. The loop is first made
-    counter-clockwise and turned until a lobe's axis is on +x. The phase of the N-th moment
-    ∬ z^N dA gives this axis.
+    `loop`: points of the outline; `pitch_radius_mm`: pitch radius; `smoothing_mm`: RMS scatter of
+    the points (mm), 0 for a curve through them.
 
-    Raises `InputError` where the loop does not have this number of lobes, or where such a rotor
-    cannot be simulated.
+    First, the loop is made counter-clockwise and turned to put a lobe's axis on +x. The phase of
+    the N-th moment ∬ z^N dA gives this axis. Then the profile is made from one flank: the leading
+    flank of the lobe next to +x, for a rotor that turns counter-clockwise. The other flanks are
+    compared with this flank.
+
+    Raises `InputError` if the loop does not have this number of lobes, or if such a rotor cannot be
+    simulated.
     """
     if smoothing_mm > _OFF * pitch_radius_mm:
         raise InputError(
@@ -165,7 +176,7 @@ def _check_lobes(points, lobes, radius):
 
 
 def _moment(points, order):
-    """Return ∬ z^order dA of a polygon, exact: by Green's theorem ∮ z̄ z^order dz / 2i."""
+    """Return the exact ∬ z^order dA of a polygon, by Green's theorem as ∮ z̄ z^order dz / 2i."""
     start, step = points, np.roll(points, -1) - points
     nodes, weights = np.polynomial.legendre.leggauss(order // 2 + 2)
     z = start[:, None] + step[:, None] * (1 + nodes) / 2
@@ -173,9 +184,10 @@ def _moment(points, order):
 
 
 def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
-    """Return the leading (`side` 1) or trailing (-1) flank of a lobe.
+    """Return the leading (`side` = 1) or trailing (-1) flank of the lobe with index `lobe`.
 
-    The flank's curve also fits points beyond tip and root, where the neighbouring flanks start."""
+    The curve is also fitted to points beyond tip and root, which belong to neighbouring flanks.
+    Raises `InputError` if the points do not include the tip, the root and the pitch crossing."""
     local = points * np.exp(-2j * np.pi * lobe / lobes)
     if side < 0:
         local, joints = np.conj(local)[::-1], joints[::-1]
@@ -232,7 +244,9 @@ def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
 
 
 def _distances(flank: _Flank, own: _Flank) -> NDArray[np.float64]:
-    """Return the normal distances (n,) of a `flank` from `own` (mm, positive outside)."""
+    """Return the distances (n,) of points on `flank` from the flank `own` (mm, positive outside).
+
+    They are measured along the normals of `own`."""
     share = np.linspace(0.0, 1.0, _SHARES)
     place = flank.at(share)[0]
     for _ in range(4):
@@ -249,7 +263,8 @@ def _distances(flank: _Flank, own: _Flank) -> NDArray[np.float64]:
 def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray[np.float64], Frame]]:
     """Return (parameters, `Frame` at them) for each piece of a flank from `start` to `stop`.
 
-    All pieces together have `NODES` parameters, with each joint twice."""
+    The pieces have `NODES` parameters in total; those of a joint occur in both its pieces. Raises
+    `InputError` if there are too many pieces."""
     parts = flank.curve.between(start, stop)
     if len(parts) > _PIECES:
         raise InputError(
@@ -269,7 +284,8 @@ def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray[np.
 def _outline(flank: _Flank, lobes: int, radius: float) -> tuple[Outline, float, float]:
     """Return (profile, star margin in mm, convexity margin in mm) of a rotor with this flank.
 
-    The margins are defined in `Checks`. Raises `InputError` where the flank folds."""
+    The margins are defined in `Checks`. Raises `InputError` if the addendum is not convex or the
+    flank folds back."""
     upper = _stretch(flank, flank.tip, flank.pitch)
     lower = _stretch(flank, flank.pitch, flank.root)
     t, z, direction, speed, turning = (
@@ -328,9 +344,9 @@ def _row(part: tuple[NDArray[np.float64], Frame]) -> tuple[NDArray, ...]:
 
 
 def _agreed(t: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the directions of the normal (rad), averaged over both sides of a joint.
+    """Return the directions of the normal (rad), averaged over both sides of each joint.
 
-    A joint with a larger difference is a corner and stays as it is."""
+    A joint at which they differ by `_CORNER` or more is a corner and is left unchanged."""
     joint = np.flatnonzero((np.diff(t) == 0) & (np.abs(np.diff(direction)) < _CORNER))
     agreed = direction.copy()
     agreed[joint] = agreed[joint + 1] = (direction[joint] + direction[joint + 1]) / 2
@@ -342,7 +358,7 @@ def _table(node: NDArray, value: NDArray, slope: NDArray) -> Table:
 
 
 def _land(nu, lever, curvature_radius, radius) -> float:
-    """Return the arc length (mm) of the whole tip land, 0 if there is none."""
+    """Return the arc length (mm) of the tip land on both sides of the tip; 0 without a land."""
     miss, turn = _LAND
     beyond = np.flatnonzero(np.abs(lever) > miss * radius)
     end = beyond[0] if len(beyond) else len(nu) - 1

@@ -1,7 +1,7 @@
-"""Boundary around libraries that read files from outside.
+"""Guards for calls to libraries that read a user's files.
 
-Any exception of a library becomes one `InputError`. The library's log records and warnings stay off
-the console. Put only calls of the library inside, so that errors of this package stay visible.
+Any exception raised by a library becomes an `InputError`. The library's log records and warnings
+stay off the console. Guard only calls to the library, so that errors of this package stay visible.
 """
 
 import contextlib
@@ -16,11 +16,11 @@ from rootsopt.errors import InputError
 
 _LOGGER = "ezdxf"
 _REASON = 120
-"""Greatest length (characters) of a library's own message that is shown."""
+"""Length (characters) above which a library's own message is cut."""
 
 
 def short(value: object, width: int = 60) -> str:
-    """Return a value as printable text for a message, cut to about `width` characters."""
+    """Return `value` as printable text for a message, cut to about `width` characters."""
     text = value if isinstance(value, str) else str(value)
     size = len(text)
     text = text[:width] if size > width else text
@@ -48,10 +48,10 @@ def silenced() -> Iterator[None]:
 
 @contextlib.contextmanager
 def guarded(name: str, fault: str, remedy: str) -> Iterator[None]:
-    """Turn any exception in a `with` block into an `InputError`; call a library inside.
+    """Turn any exception in the `with` block, which calls a library, into an `InputError`.
 
     The message reads "`name`: `fault`: (the exception's message); `remedy`". `MemoryError` and
-    `RecursionError` are included; an `InputError` passes unchanged."""
+    `RecursionError` are converted, too; an `InputError` passes unchanged."""
     try:
         with silenced():
             yield
@@ -62,9 +62,10 @@ def guarded(name: str, fault: str, remedy: str) -> Iterator[None]:
 
 
 def each(items: Iterator[Any], name: str, fault: str, remedy: str) -> Iterator[Any]:
-    """Yield the items of a library's iterator; its exceptions become `InputError` as in `guarded`.
+    """Yield the items of a library's iterator.
 
-    Exceptions in the code that uses the items pass unchanged."""
+    Exceptions raised by the iterator become `InputError`, with `name`, `fault` and `remedy` as in
+    `guarded`. Exceptions raised by the code that uses the items pass unchanged."""
     while True:
         try:
             item = next(items)

@@ -1,4 +1,7 @@
-"""Joins a drawing's entities to closed loops."""
+"""Joins a drawing's entities into closed loops.
+
+A chain is the points on one entity. A link is a chain whose ends are at different vertices.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,20 +13,21 @@ from rootsopt.errors import InputError
 from rootsopt.measured.loop import Loop, place, signed_area
 
 TOGETHER = 1e-3
-"""Distance (mm) below which ends of entities count as one point."""
+"""Distance (mm) below which two ends of entities are joined at one vertex."""
 _CROWDED = 50
-"""Mean number of ends within `TOGETHER` of an end above which a drawing is rejected."""
+"""Mean number of other ends within `TOGETHER` of an end above which a drawing is rejected."""
 
 
 def joined(chains: list[Loop], layer: str, name: str) -> Loop:
     """Join `chains` of points at their ends; return the closed loop of the largest area.
 
     A chain may run in either direction. A chain given twice counts once. Chains that lead to a dead
-    end, such as centre lines, belong to no loop. `layer`, `name`: names of layer and drawing in
-    messages.
+    end, such as centre lines, belong to no loop. `layer`: layer that messages recommend for the
+    outline; `name`: name of the drawing in messages.
 
-    Raises `InputError` in three cases: there is no closed loop, open chains would enclose more than
-    the largest loop, or more than two ends meet in a possible outline.
+    Raises `InputError` in four cases: there is no closed loop; open chains, if closed, would
+    enclose a larger area than any loop; more than two ends meet at a vertex of a possible outline;
+    too many ends are close together.
     """
     remedy = f"join them in the drawing, on a layer {layer}"
     ends = np.array([chain.points[[0, -1]] for chain in chains]).reshape(-1, 2)
@@ -81,7 +85,7 @@ def _where(chains: list[Loop], which: NDArray) -> list[Loop]:
 
 
 def _closing(joints: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the joint marks of a closed chain without its last point, which repeats the first."""
+    """Return a closed chain's mask of joints without the last point, which repeats the first."""
     joints = joints.copy()
     joints[0] |= joints[-1]
     return joints[:-1]
@@ -92,7 +96,9 @@ def _extent(points: NDArray[np.complex128]) -> float:
 
 
 def _clusters(points: NDArray[np.complex128], name: str) -> NDArray[np.intp]:
-    """Return the cluster number of each point; points closer than `TOGETHER` share a cluster."""
+    """Return the cluster number of each point. Points closer than `TOGETHER` share a cluster.
+
+    Raises `InputError` if too many points are close together."""
     unique, which = np.unique(points, return_inverse=True)
     tree = KDTree(np.stack([unique.real, unique.imag], axis=1))
     # Count the pairs before listing them: there may be n².
@@ -111,9 +117,9 @@ def _components(pairs: NDArray[np.intp], count: int) -> NDArray[np.intp]:
 
 
 def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> NDArray[np.intp]:
-    """Return the indices of the chains, without chains that repeat an earlier chain.
+    """Return the indices of the chains, except those that repeat an earlier chain.
 
-    A repeated chain has the same ends and the same points between."""
+    A chain repeats another if their ends and the points of `_quarters` coincide."""
     if not chains:
         return np.zeros(0, np.intp)
     quarters = np.array(
@@ -128,7 +134,7 @@ def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> N
 
 
 def _quarters(points: NDArray[np.complex128], backwards: bool) -> NDArray[np.complex128]:
-    """Return the points (3,) at a quarter, half and three quarters of a chain's length."""
+    """Return the points (3,) at one quarter, one half and three quarters of a chain's length."""
     points = points[::-1] if backwards else points
     if len(points) == 2:
         return points[0] + (points[1] - points[0]) * np.array([0.25, 0.5, 0.75])
@@ -137,7 +143,7 @@ def _quarters(points: NDArray[np.complex128], backwards: bool) -> NDArray[np.com
 
 
 def _in_loops(vertex: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the indices of the links that remain after repeatedly removing those at dead ends."""
+    """Return the indices of the links that remain after repeatedly removing links at dead ends."""
     at: dict[int, set[int]] = {}
     for link, (a, b) in enumerate(vertex.tolist()):
         at.setdefault(a, set()).add(link)
@@ -156,7 +162,7 @@ def _in_loops(vertex: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def _groups(vertex: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Return the indices of the links in each connected group of links, in order."""
+    """Return the indices of the links in each connected group, ordered by the first index."""
     if not len(vertex):
         return []
     _, which = np.unique(vertex, return_inverse=True)
@@ -170,7 +176,9 @@ def _groups(vertex: NDArray[np.intp]) -> list[NDArray[np.intp]]:
 def _walked(
     chains: list[Loop], members: NDArray[np.intp], vertex: NDArray[np.intp]
 ) -> tuple[NDArray[np.complex128], NDArray[np.bool_]]:
-    """Return (points, joint marks) of links that form one loop or one open path, in order."""
+    """Return (points, mask of joints) along the links of one loop or one open path.
+
+    `members`: indices of the links, in any order."""
     at: dict[int, list[int]] = {}
     for link in members.tolist():
         for v in vertex[link].tolist():
@@ -197,7 +205,7 @@ def _walked(
 def _widest_gap(
     ends: NDArray[np.complex128], vertex: NDArray[np.intp], links: NDArray[np.intp]
 ) -> tuple[float, complex]:
-    """Return (distance in mm, point) of the dead end that is farthest from any other dead end."""
+    """Return the largest distance (mm) from a dead end to the nearest other one, and its point."""
     places = ends[links].ravel()
     numbers = vertex[links].ravel()
     single = np.flatnonzero(np.bincount(numbers)[numbers] == 1)

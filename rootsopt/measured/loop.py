@@ -1,4 +1,4 @@
-"""A closed outline as points."""
+"""The points of a closed outline."""
 
 import dataclasses
 
@@ -8,9 +8,9 @@ from jaxtyping import Bool, Complex128
 
 @dataclasses.dataclass(frozen=True)
 class Loop:
-    """A closed outline as points in order, the first not repeated.
+    """The points of a closed outline in order; the first point is not repeated at the end.
 
-    `points` (n,): points (mm) as x + iy; `joints` (n,): marks the ends of a drawing's arcs and
+    `points` (n,): points (mm) as x + iy; `joints` (n,): mask of the points at the ends of arcs and
     splines, where curvature may jump. The readers also use this class for open chains of points.
     """
 

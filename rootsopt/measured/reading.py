@@ -14,16 +14,19 @@ from rootsopt.measured.table import from_csv
 __all__ = ["Loop", "read", "signed_area"]
 
 _WIDEST = 5.0
-"""Distance from the last point to the first (multiple of the longest other step) above which a loop
-is rejected as open."""
+"""Distance between the last and the first point (multiple of the longest step between others) above
+which a loop is rejected as open."""
 _BYTES = 50_000_000
 """Size (bytes) above which a file is rejected."""
 _POINTS = 500_000
-"""Number of points above which an outline is rejected: each takes some 20 µs to read and fit."""
+"""Number of points above which an outline is rejected. Reading and fitting take about 20 µs per
+point."""
 _SIZES = 0.1, 1e5
-"""Sizes (mm) below and above which an outline is rejected, because its units must be wrong."""
+"""Size (mm) below which, and size above which, an outline is rejected, because its units must be
+wrong."""
 _SAME = 1e-9
-"""Distance (fraction of the outline's size) below which two points are one."""
+"""Distance (fraction of the outline's greatest coordinate) below which successive points are merged
+into one."""
 _NOT_FILES = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a pipe"),
@@ -33,17 +36,18 @@ _NOT_FILES = (
 
 
 def read(path: Path) -> Loop:
-    """Return the outline in a CSV or DXF file as a closed loop (mm).
+    """Return the outline in a CSV (.csv, .txt) or DXF file as a closed loop (mm).
 
-    CSV: x and y in mm, split by commas, semicolons, tabs or blanks, with or without a header. The
-    columns are those that the header names x and y (or `x_mm`, `y_mm`), else the first two.
+    CSV: x and y in mm, separated by commas, semicolons, tabs or blanks, with or without a header.
+    The columns are those that the header calls x and y (or `x_mm`, `y_mm`), or else the first two.
 
     DXF, text or binary: the closed loop of the largest area formed by LINE, ARC, ELLIPSE, SPLINE,
     LWPOLYLINE and POLYLINE. Only entities on the layer OUTLINE count. If there are none, entities
-    drawn directly count, or else those in blocks. Lengths are in the unit that the file states, or
-    else in mm. The ends of a LINE and the corners of a polyline are points of a smooth curve.
+    drawn directly count; if there are none of these either, those in blocks count. Lengths are in
+    the unit that the file states, otherwise in mm. The ends of a LINE and the corners of a polyline
+    are read as points on a smooth curve, not as corners of the outline.
 
-    Raises `InputError` where the file cannot be read or holds no closed outline.
+    Raises `InputError` if the file cannot be read or contains no closed outline.
     """
     name, kind = short(path.name), path.suffix.lower()
     if kind not in (".csv", ".txt", ".dxf"):
@@ -60,9 +64,10 @@ def read(path: Path) -> Loop:
 
 
 def _bytes(path: Path, name: str) -> bytes:
-    """Return the content of a regular file.
+    """Return the content of a regular file. `name`: name of the file in messages.
 
-    Raises `InputError` where the file is of another kind, unreadable, too large or empty."""
+    Raises `InputError` if `path` is not a regular file, or the file is unreadable, too large or
+    empty."""
     try:
         found = path.stat()
         kind = next((what for test, what in _NOT_FILES if test(found.st_mode)), None)
@@ -97,7 +102,7 @@ def _bytes(path: Path, name: str) -> bytes:
 def _closed(loop: Loop, name: str) -> Loop:
     """Return the loop without repeated points.
 
-    Raises `InputError` where the loop is open, or its size or number of points is out of range."""
+    Raises `InputError` if the loop is open, or if its size or number of points is out of range."""
     points = loop.points
     if len(points) > _POINTS:
         raise InputError(

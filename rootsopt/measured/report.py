@@ -1,4 +1,4 @@
-"""Report of the commands on an imported outline."""
+"""What the commands report about an imported outline."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +10,9 @@ if TYPE_CHECKING:
 
 
 def record(config: Config) -> dict[str, Any]:
-    """Return {"outline": checks and conjugacy} for the result file.
+    """Return {"outline": {...}} for the result file: the records of `Checks` and `Conjugacy`.
 
-    Return {} for a profile that is not read from a file."""
+    Return {} if the profile is not read from a file."""
     if not config.profile.from_file:
         return {}
     from rootsopt.measured.source import outline_of

@@ -1,4 +1,4 @@
-"""Reads and fits the profile of a config's outline file, once per file."""
+"""Makes a profile from the outline file that a config names, and keeps recent results."""
 
 import functools
 from pathlib import Path
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
     from rootsopt.config.scene import ProfileConfig
 
 _NOTABLE = 1.0
-"""Deviation between flanks (µm) above which the user gets a note."""
+"""Deviation between flanks (µm) at or above which the user gets a note."""
 
 
 def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
     """Return (profile, deviations) of the outline file that a config names.
 
-    A file that has not changed is read once. Raises `InputError` where the file does not hold the
-    outline of a rotor that can be simulated."""
+    Recent results are kept, so that an unchanged file is not read again. Raises `InputError` if the
+    file does not contain the outline of a rotor that can be simulated."""
     path = Path(config.outline_file or "")
     try:
         found = path.stat()
@@ -38,9 +38,9 @@ def _kept(path: Path, stamp: tuple[int, ...], lobes: int, radius: float, smoothi
 
 
 def note(checks: Checks) -> str | None:
-    """Return a note for the user if the flanks differ by `_NOTABLE` or more, else `None`.
+    """Return a note for the user if the flanks differ by `_NOTABLE` or more, otherwise `None`.
 
-    The profile is made from one flank, so that differences between flanks are lost."""
+    The note is needed because the profile is made from one flank and ignores such differences."""
     worst = max(checks.lobe_deviation_um, checks.flank_deviation_um)
     if worst < _NOTABLE:
         return None

@@ -13,7 +13,7 @@ from rootsopt.measured.guard import guarded, short
 from rootsopt.measured.loop import Loop
 
 _LONGEST = 100_000
-"""Length of a line (characters) above which a table is rejected."""
+"""Number of characters in a line above which a table is rejected."""
 _REMEDY = "save the points as x,y in mm, one pair per line, as UTF-8 text"
 _HEADER = r"[\s_/]*(?:\(mm\)|\[mm\]|mm)?"
 _NAMES = tuple(re.compile(f"{axis}{_HEADER}", re.IGNORECASE) for axis in "xy")
@@ -21,9 +21,9 @@ _WIDE = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 
 
 def from_csv(data: bytes, name: str) -> Loop:
-    """Return the points (mm) of a table in the order of its lines.
+    """Return the points (mm) of a table, in the order of its lines and without joints.
 
-    `data`: content of the file; `name`: name of the file in messages. Raises `InputError` where the
+    `data`: content of the file; `name`: name of the file in messages. Raises `InputError` if the
     table cannot be read or a line is not a point."""
     text = _text(data, name)
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
@@ -79,7 +79,8 @@ def _cells(line: str, split: str | None) -> list[str]:
 def _number(cell: str, split: str | None) -> float | None:
     """Convert a cell to float; return `None` for text that is not a number.
 
-    `split`: character between cells. A decimal comma is accepted unless commas separate cells."""
+    `split`: character that separates cells, `None` for blanks. A decimal comma is accepted unless
+    commas separate the cells."""
     cell = cell.strip()
     if split != "," and cell.count(",") == 1 and "." not in cell:
         cell = cell.replace(",", ".")
@@ -92,7 +93,7 @@ def _number(cell: str, split: str | None) -> float | None:
 def _columns(header: list[str]) -> tuple[int, int]:
     """Return the indices of the columns of x and y, from their names in the `header`.
 
-    Without unique names, return 0 and 1."""
+    If the names do not identify both columns, return 0 and 1."""
     names = [cell.strip() for cell in header]
     found = [[k for k, cell in enumerate(names) if test.fullmatch(cell)] for test in _NAMES]
     if all(len(places) == 1 for places in found):

@@ -1,7 +1,7 @@
 """File operations used for everything that is written.
 
-Each function does little on purpose: tests make every one of these calls fail in turn, or end the
-process there. Only the standard library is used.
+Each function is small on purpose: tests make every one of these calls fail in turn, or end the
+process at this call. Only the standard library is used.
 """
 
 import ctypes
@@ -18,9 +18,9 @@ _UNSUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 
 
 def create(path: Path, data: bytes) -> None:
-    """Write a new file with the user's usual permissions and flush it to the disk.
+    """Write `data` to a new file with the user's usual permissions, and flush it to the disk.
 
-    If that fails, no file is left behind."""
+    If this fails, raise the error and leave no file behind."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     file = os.open(path, flags, 0o666)
     try:
@@ -37,12 +37,12 @@ def create(path: Path, data: bytes) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Make one new folder."""
+    """Create one folder. Its parent must exist."""
     os.mkdir(path)
 
 
 def make_folders(folder: Path, made: list[Path]) -> None:
-    """Create a folder and its missing parents; append each new folder to `made` at once."""
+    """Create a folder and its missing parents. Append each to `made` as soon as it is created."""
     missing = []
     while not folder.is_dir():
         missing.append(folder)
@@ -60,7 +60,7 @@ def make_folders(folder: Path, made: list[Path]) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Flush a folder's list of names to the disk, if the file system supports that."""
+    """Flush the list of a folder's entries to the disk, if the file system supports this."""
     try:
         folder = os.open(path, os.O_RDONLY)
     except PermissionError:  # where folders cannot be opened
@@ -75,17 +75,19 @@ def sync_folder(path: Path) -> None:
 
 
 def move(source: Path, target: Path) -> None:
-    """Rename the folder `source` to `target` in one step, replacing an empty folder there."""
+    """Rename the folder `source` to `target` in one step. An empty folder there is replaced."""
     os.rename(source, target)
 
 
 def replace(source: Path, target: Path) -> None:
-    """Rename the file `source` to `target` in one step, replacing a file there."""
+    """Rename the file `source` to `target` in one step. An existing file there is replaced."""
     os.replace(source, target)
 
 
 def exchange(first: Path, second: Path) -> bool:
-    """Exchange two folders in one step. Return `False` if the system cannot exchange folders."""
+    """Exchange the names of two folders in one step; return `False` if the system cannot do this.
+
+    Raises `OSError` if the exchange fails for another reason."""
     call = _renameat2()
     if call is None:
         return False
@@ -110,7 +112,7 @@ def can_exchange(folder: Path) -> bool:
 
 
 def _exchanged(call, first: bytes, second: bytes) -> int:
-    """Return the error number of an exchange, 0 for success."""
+    """Exchange two folders with the C function `call`; return the error number, 0 for success."""
     done = call(_AT_FDCWD, first, _AT_FDCWD, second, _RENAME_EXCHANGE)
     return ctypes.get_errno() if done else 0
 
@@ -128,7 +130,7 @@ def _renameat2():
 
 
 def adopt_mode(path: Path, model: Path) -> None:
-    """Give the folder `path` the permissions of the folder `model`, as far as allowed."""
+    """Give the folder `path` the permissions of the folder `model`, if the system allows it."""
     try:
         os.chmod(path, stat.S_IMODE(os.stat(model).st_mode))
     except OSError:
@@ -147,5 +149,5 @@ def discard(path: Path) -> None:
 
 
 def discard_tree(path: Path) -> None:
-    """Remove a folder and its content, as far as possible."""
+    """Remove a folder and its contents, as far as possible; ignore errors."""
     shutil.rmtree(path, ignore_errors=True)

@@ -1,8 +1,8 @@
-"""Result files, written completely or not at all, into a folder checked before the work starts.
+"""Result files, written completely or not at all. Their folder is checked before the work starts.
 
 Every file is written under a temporary name in its folder, then renamed in one step. A reader
-therefore sees the old file or the whole new file, even after a killed run. Commands write whole
-folders in the same way (`rootsopt.output.runs`).
+therefore sees either the old file or the whole new file, even after a killed run. Commands write
+whole folders in the same way (`rootsopt.output.runs`).
 """
 
 import csv
@@ -38,9 +38,10 @@ _LIBRARIES = ("jax", "jaxlib", "diffrax", "optax", "equinox", "numpy")
 
 
 class ResultFolder:
-    """A folder for result files, created with its parents if it does not exist.
+    """The folder `path` for result files, created with its parents if it does not exist.
 
-    Raises `InputError` if the folder cannot be created or written to; new folders are then removed.
+    Raises `InputError` if the folder cannot be created or written to. Folders that were created are
+    then removed.
     """
 
     def __init__(self, path: str | os.PathLike):
@@ -101,20 +102,23 @@ class ResultFolder:
         return self.write_bytes(name, data)
 
     def write_json(self, name: str, data: Any) -> Path:
-        """Write `data` as strict JSON (non-finite numbers become null); return the file's path."""
+        """Write `data` as strict JSON to the file `name`; return the file's path.
+
+        Non-finite numbers become null. Raises `InputError` if the file cannot be written."""
         text = json.dumps(_plain(data), indent=2, allow_nan=False, ensure_ascii=False)
         return self.write_text(name, text + "\n")
 
     def write_csv(self, name: str, columns: Mapping[str, ArrayLike]) -> Path:
-        """Write columns (n,), by name, below a header line, floats with 10 digits; return the path.
+        """Write `columns` {heading: values (n,)} to the CSV file `name`; return the file's path.
 
-        Text, truth values (`true`, `false`) and `None` (empty) may be mixed with numbers.
-        Raises `ValueError` for columns that differ in length or are not one-dimensional.
+        Floats have 10 significant digits, truth values become `true` and `false`, and `None`
+        becomes an empty cell. A column may mix these with text. Raises `ValueError` if the columns
+        differ in length or are not one-dimensional, `InputError` if the file cannot be written.
         """
         return self.write_text(name, _csv(columns))
 
     def write_figure(self, name: str, figure: "Figure") -> Path:
-        """Write a matplotlib figure as PNG; return the file's path."""
+        """Write a matplotlib figure as PNG to the file `name`; return the file's path."""
         image = io.BytesIO()
         figure.savefig(image, format="png", dpi=DPI)
         return self.write_bytes(name, image.getvalue())
@@ -125,7 +129,7 @@ def _temporary(name: str) -> str:
 
 
 def _plain(data: Any) -> Any:
-    """Convert `data` to JSON's own types."""
+    """Convert `data` to types that JSON has; non-finite numbers become `None`."""
     if isinstance(data, Mapping):
         return {str(key): _plain(value) for key, value in data.items()}
     if isinstance(data, (list, tuple)):
@@ -170,10 +174,10 @@ def _cell(value: Any) -> str:
 
 
 def write_config(folder: ResultFolder, config: "Config") -> None:
-    """Write config.yaml, and a copy of the outline file that it names, into `folder`.
+    """Write config.yaml into `folder`, with a copy of the outline file if the config names one.
 
-    The config names the copy, so that the folder can be moved. Raises `InputError` if the outline
-    file cannot be read."""
+    The written config names the copy, so that the folder can be moved. Raises `InputError` if the
+    outline file cannot be read, or a file cannot be written."""
     profile = config.profile
     if profile.outline_file is not None:
         source = sources.regular_file(profile.outline_file, "an outline")
@@ -189,13 +193,13 @@ def write_config(folder: ResultFolder, config: "Config") -> None:
 
 
 def profile_columns(outline_mm: ArrayLike) -> dict[str, NDArray[np.float64]]:
-    """Return the columns of `profile_*.csv` from a closed outline (n, 2) in mm."""
+    """Return the columns of `profile_*.csv` for a closed outline (n, 2) in mm."""
     outline = np.asarray(outline_mm)
     return {"x_mm": outline[:, 0], "y_mm": outline[:, 1]}
 
 
 def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
-    """Return the columns of `response_*.csv`: motion and forces over the reported window."""
+    """Return the columns of `response_*.csv`: motion and forces over the time of `series`."""
     return {
         "time_s": series.time,
         "rotation_deg": np.degrees(series.rotation),
@@ -210,10 +214,10 @@ def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
 def row_columns(
     rows: Sequence[Mapping[str, Any]], keys: Iterable[str] | None = None
 ) -> dict[str, NDArray]:
-    """Return columns, by name, from `rows` such as the optimisation history.
+    """Return {key: column} from `rows`, for example from the optimisation history.
 
-    An absent entry becomes `None`. `keys`: order of the columns, by default the order of
-    appearance; without rows, `keys` still gives the header.
+    An absent entry becomes `None`. `keys`: keys of the columns in order; by default, all keys of
+    `rows` in the order of their first appearance.
     """
     if keys is None:
         keys = dict.fromkeys(key for row in rows for key in row)
@@ -225,6 +229,6 @@ def row_columns(
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python, this package and the libraries that affect its numbers."""
+    """Return the versions of Python, this package and the libraries that affect its results."""
     found = {"python": platform.python_version(), "rootsopt": rootsopt.__version__}
     return found | {name: importlib.metadata.version(name) for name in _LIBRARIES}

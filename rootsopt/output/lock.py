@@ -1,7 +1,7 @@
 """A lock that one process at a time can hold, released when the process ends.
 
-The package `filelock` was rejected, because it empties the lock file even if it does not get the
-lock. The number of the process that holds the lock would be lost.
+The package `filelock` is not used, because it empties the lock file even if it does not get the
+lock. The ID of the process that holds the lock would be lost.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ _TAKEN = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
 
 
 class TakenError(InputError):
-    """Another process holds the lock. `process`: number of this process, or `None` if unknown."""
+    """Raised if another process holds the lock. `process`: its process ID, `None` if unknown."""
 
     def __init__(self, process: int | None):
         super().__init__("the lock is held by another process")
@@ -30,9 +30,9 @@ class TakenError(InputError):
 class Lock:
     """An advisory lock on the file `path`, which exists only while the lock is held.
 
-    The system releases the lock when the process ends, for whatever reason. If the file system has
-    no locks, `held` is False and the run continues without a lock. Raises `TakenError` if another
-    process holds the lock, and `OSError` if the file cannot be created.
+    The system releases the lock when the process ends, for whatever reason. If the system has no
+    such locks, `held` is `False` and no error is raised. Raises `TakenError` if another process
+    holds the lock, and `OSError` if the file cannot be created.
     """
 
     def __init__(self, path: Path):

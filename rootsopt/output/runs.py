@@ -1,19 +1,20 @@
-"""The result folder of one run of a command: written aside, then moved to its final name.
+"""The result folder of one run of a command: first temporary, then moved to its final path.
 
-A run writes into its own folder beside the target, `.NAME.PROCESS-XXXXXXXX.rootsopt`. When all
-files are written, this folder takes the target's name in one step. The target therefore holds the
-earlier run or the new run, never a mixture. A lock file beside the target, `.NAME.rootsopt`, keeps
-a second process out. Folder and lock file disappear when the run ends. The next run removes the
-remains of a killed run.
+The target is the folder that the user names. A run writes into its own temporary folder beside the
+target, `.NAME.PROCESS-XXXXXXXX.rootsopt`. When all files are written, this folder takes the
+target's name in one step. The target therefore contains the earlier run or the new run, never a
+mixture. A lock file beside the target, `.NAME.rootsopt`, keeps other processes out. The temporary
+folder and the lock file disappear when the run ends. The next run removes the remains of a killed
+run.
 
-The content of the target decides what happens:
+What happens depends on the content of the target:
 
 - nothing: the new run takes its place;
 - an earlier run: it is moved to `NAME.1`, `NAME.2` …; with `overwrite` it is replaced, unless it
-  holds files that are not its own;
+  contains files that are not its own;
 - anything else: the target is refused.
 
-Where the file system can exchange two folders (Linux), the target exists at any time. Elsewhere the
+If the file system can exchange two folders (Linux), the target exists at all times. Otherwise the
 earlier run is moved away first. If the process is killed at that moment, the next run puts the
 finished folder in place.
 """
@@ -38,24 +39,28 @@ from rootsopt.output.files import ResultFolder
 from rootsopt.output.lock import Lock, TakenError
 
 RESULT = "result.json"
-"""Name of the file that is written last and lists all others."""
+"""Name of the file that is written last and lists all files of a run."""
 _CONFIG = "config.yaml"
 _SUFFIX = ".rootsopt"
 _STAGE = re.compile(r"(\..+)\.\d+-[0-9a-f]{8}" + re.escape(_SUFFIX))
 _LONGEST = 150
-"""Length (bytes) of a folder's name above which temporary names contain a digest of the name."""
+"""Length (bytes) of a folder's name above which temporary names contain a digest of the name
+instead of the name itself."""
 _PATIENCE = 10.0
-"""Time (s) after a request to stop above which a write in progress is no longer waited for."""
+"""Time (s) after a request to stop above which the temporary folder is left behind, because a write
+is still in progress."""
 _State = Literal["absent", "empty", "ours", "more", "foreign"]
 
 
 class RunFolder(ResultFolder):
-    """A `ResultFolder` that appears at its final path only when complete, by `put_in_place`.
+    """A `ResultFolder` that appears at its final path only when it is complete.
 
-    `path`: the final path. Use as a context manager: a folder that is not in place at the end is
-    removed. Raises `InputError` if the path cannot be used: another process writes there, the
-    folder holds files that belong to no run, the path is not a folder, or its parent is not
-    writable.
+    `path`: the final path; `command`: name of the command, for the result file; `overwrite`:
+    whether to replace an earlier run. Use it as a context manager and call `put_in_place` at the
+    end; otherwise the folder is removed.
+
+    Raises `InputError` if the path cannot be used. For example, another process writes there, it
+    contains files that belong to no run, it is not a folder, or its parent is not writable.
     """
 
     def __init__(self, path: str | os.PathLike, command: str = "", overwrite: bool = False):
@@ -97,7 +102,7 @@ class RunFolder(ResultFolder):
         )
 
     def _refuse_places(self) -> None:
-        """Raise `InputError` if the target is something that a finished run cannot replace."""
+        """Raise `InputError` if a finished run could not replace what is at the target's path."""
         target = self.target
         if os.path.lexists(target) and not target.is_dir():
             raise InputError(f"{str(self.path)!r}: is not a folder; choose another output folder")
@@ -115,7 +120,9 @@ class RunFolder(ResultFolder):
             )
 
     def _claim(self) -> None:
-        """Take the lock, remove the remains of killed runs, and check the target."""
+        """Take the lock, remove the remains of killed runs, and check the target.
+
+        Raises `InputError` if the lock is taken or the target contains other files."""
         try:
             self._lock = Lock(self._base.with_name(self._base.name + _SUFFIX))
         except TakenError as taken:
@@ -135,8 +142,10 @@ class RunFolder(ResultFolder):
             )
 
     def _clear(self) -> None:
-        """Put a killed run that was complete in place, and remove the remains of all other killed
-        runs in the parent folder."""
+        """Deal with the temporary folders of killed runs in the parent folder.
+
+        A complete run of this target is put in place if the target does not exist. Complete runs of
+        other targets are kept. All other folders of killed runs are removed."""
         for name in sorted(os.listdir(self.target.parent)):
             found = _STAGE.fullmatch(name)
             if found is None:
@@ -155,8 +164,10 @@ class RunFolder(ResultFolder):
                 other.release()
 
     def _state(self) -> _State:
-        """Return what the target is: `absent`, `empty`, `ours` (an earlier run and nothing else),
-        `more` (an earlier run and other files) or `foreign` (anything else)."""
+        """Return what is at the target's path.
+
+        `absent`: nothing; `empty`: an empty folder; `ours`: an earlier run and nothing else;
+        `more`: an earlier run and other files; `foreign`: anything else."""
         if not os.path.lexists(self.target):
             return "absent"
         if not self.target.is_dir():
@@ -173,7 +184,7 @@ class RunFolder(ResultFolder):
 
     @property
     def place(self) -> Path:
-        """Folder into which files are written: a temporary folder until the run is in place."""
+        """Temporary folder into which files are written."""
         return self.stage
 
     def write_bytes(self, name: str, data: bytes) -> Path:
@@ -190,19 +201,20 @@ class RunFolder(ResultFolder):
         return self.path / name
 
     def write_json(self, name: str, data: Any) -> Path:
-        """Write `data` as strict JSON; return the final path of the file.
+        """Write `data` as strict JSON to the file `name`; return the final path of the file.
 
-        `put_in_place` writes `result.json`, with a list of all files."""
+        The file `result.json` is written later by `put_in_place`, which adds a list of all files.
+        Raises `InputError` if the file cannot be written."""
         if name != RESULT:
             return super().write_json(name, data)
         self._result = data
         return self.path / name
 
     def put_in_place(self) -> list[str]:
-        """Move the finished folder to its final path. Return messages for the user, one sentence
-        each.
+        """Write `result.json` and move the finished folder to its final path.
 
-        Raises `InputError` if moving fails; the target is then unchanged."""
+        Return messages for the user, if any. Raises `InputError` if this fails; the target is then
+        unchanged."""
         with self._busy:
             files = sorted(self._written | {RESULT})
             run = {"run": {"command": self.command, "files": files}}
@@ -242,7 +254,7 @@ class RunFolder(ResultFolder):
         return [note]
 
     def _replace(self) -> None:
-        """Replace the run in the target, and remove the old run."""
+        """Put this run in place of the earlier run, and remove the earlier run."""
         if disk.exchange(self.stage, self.target):
             older = self.stage
         else:
@@ -251,7 +263,7 @@ class RunFolder(ResultFolder):
         disk.discard_tree(older)
 
     def _push_aside(self, aside: Path) -> None:
-        """Replace the run in the target, and move the old run to `aside`."""
+        """Put this run in place of the earlier run, and move the earlier run to `aside`."""
         if not disk.can_exchange(self.stage):
             self._swap_by(aside)
             return
@@ -265,7 +277,7 @@ class RunFolder(ResultFolder):
             raise
 
     def _swap_by(self, older: Path) -> None:
-        """Move the target to `older`, then this run to the target."""
+        """Move the earlier run to `older`, then this run to the target's path."""
         disk.move(self.target, older)
         try:
             disk.move(self.stage, self.target)
@@ -274,7 +286,7 @@ class RunFolder(ResultFolder):
             raise
 
     def _free(self) -> Path:
-        """Return the first of `NAME.1`, `NAME.2` … that does not exist."""
+        """Return the first path of `NAME.1`, `NAME.2` … that does not exist."""
         number = 1
         while os.path.lexists(found := self.target.with_name(f"{self.target.name}.{number}")):
             number += 1
@@ -291,8 +303,9 @@ class RunFolder(ResultFolder):
             ) from None
 
     def close(self) -> None:
-        """Remove a folder that is not in place, and release the lock. A second call does
-        nothing."""
+        """Remove the temporary folder unless it has been put in place, and release the lock.
+
+        A second call does nothing."""
         with self._busy:
             if not self.placed and hasattr(self, "stage"):
                 disk.discard_tree(self.stage)
@@ -303,9 +316,10 @@ class RunFolder(ResultFolder):
                     disk.discard(folder)
 
     def abandon(self) -> str:
-        """Stop the run from writing anything more, and close the folder. Call from another thread.
+        """Prevent the run from writing anything more, and close the folder.
 
-        Return a message on what has become of the folder."""
+        Call this from another thread than the run's. Return a message that says whether the final
+        folder is complete or unchanged."""
         if self._busy.acquire(timeout=_PATIENCE):
             self.close()
         return f"{self.path} is {'complete' if self.placed else 'unchanged'}"
@@ -323,14 +337,14 @@ class RunFolder(ResultFolder):
 
 
 def _base(name: str) -> str:
-    """Return the common start of the temporary names that belong to the folder `name`."""
+    """Return the common prefix of the temporary names that belong to the folder `name`."""
     if len(os.fsencode(name)) > _LONGEST:
         name = hashlib.sha256(os.fsencode(name)).hexdigest()
     return f".{name}"
 
 
 def _files_in(folder: Path) -> set[str]:
-    """Return the relative names of all files and empty folders below a folder."""
+    """Return the relative paths of all files, links and empty folders inside a folder."""
     found: set[str] = set()
     for place, folders, files in os.walk(folder):
         inside = Path(place).relative_to(folder)
@@ -341,7 +355,7 @@ def _files_in(folder: Path) -> set[str]:
 
 
 def _listed(result: Path) -> set[str]:
-    """Return the names of a run's files, as listed in its `result` file; empty without a list."""
+    """Return the names of a run's files from the list in its `result` file; empty if none."""
     try:
         names = json.loads(result.read_bytes())["run"]["files"]
         return {name for name in names if isinstance(name, str)}
@@ -350,13 +364,13 @@ def _listed(result: Path) -> set[str]:
 
 
 def _complete(stage: Path) -> bool:
-    """Return whether the killed run in the folder `stage` had written all its files."""
+    """Return whether a killed run had written all its files into its temporary folder `stage`."""
     listed = _listed(stage / RESULT)
     return bool(listed) and _files_in(stage) == listed
 
 
 def _mount_points() -> set[str]:
-    """Return the folders on which something is mounted, also from the same file system (Linux)."""
+    """Return the mount points on Linux, including bind mounts; empty on other systems."""
     try:
         lines = Path("/proc/self/mountinfo").read_bytes().splitlines()
         places = [line.split()[4] for line in lines]

@@ -1,6 +1,6 @@
-"""Tables for the terminal: one evaluation, one geometry, or optimised against baseline.
+"""Tables for the terminal: evaluations, geometries, sweeps, and comparisons with the baseline.
 
-Plain ASCII, at most 80 columns wide, so that they look the same in a pipe or a log.
+They are plain ASCII and fit into 80 columns, so that they look the same in a pipe or a log.
 """
 
 import math
@@ -46,10 +46,11 @@ def comparison_table(
     constraints: list[dict[str, Any]],
     improvement: Mapping[str, float],
 ) -> RenderableType:
-    """Compare the optimised design with the baseline; changes are in % of the baseline.
+    """Return a table that compares the optimised design with the baseline.
 
-    `constraints`: rows {name, baseline, optimized, limit, unit, sense, satisfied, active};
-    `improvement`: reductions of objective, mean and peak force, as fractions of the baseline.
+    Changes are in % of the baseline. `constraints`: one row {name, baseline, optimized, limit,
+    unit, sense, satisfied, active} per constraint; `improvement`: reductions of the objective, the
+    mean force and the peak force, as fractions of the baseline.
     """
     table = _table("Optimised rotor against baseline", "baseline", "optimised", "change")
     first, second = baseline.record(), optimized.record()
@@ -77,7 +78,7 @@ def comparison_table(
 
 
 def evaluation_table(evaluation: Evaluation) -> RenderableType:
-    """Show one design in one scene."""
+    """Return a table of the results of one design in one scene."""
     record = evaluation.record()
     table = _table("Simulation of the rotor pair", "value")
     _group(table, "design", _singles(record["design"]))
@@ -94,7 +95,9 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
 
 
 def sweep_table(rows: list[dict[str, Any]]) -> RenderableType:
-    """Show one design at many speeds. `rows`: one per speed, made by `AtSpeed.row`."""
+    """Return a table of one design at many speeds.
+
+    `rows`: one per speed, made by `AtSpeed.row`."""
     columns = "mean, N", "peak, N", "period", "multiplier", "status"
     table = _table("Contact force over speed", *columns)
     table.columns[0].header = Text("speed, rpm")
@@ -109,10 +112,11 @@ def speeds_table(
     optimized: list[dict[str, Any]] = (),  # type: ignore[assignment]
     objectives: list[dict[str, float]] = (),  # type: ignore[assignment]
 ) -> RenderableType:
-    """Compare the optimised design with the baseline at the speeds of the objective, one row each.
+    """Return a table that compares the optimised design with the baseline, one row per speed.
 
-    Without an optimised design, show the baseline alone. `baseline`, `optimized`: rows of the
-    result file's `speeds`; `objectives`: rows of its `objective_by_speed`.
+    Without an optimised design, the table shows the baseline alone. `baseline`, `optimized`: one
+    row per speed, as in the entry `speeds` of the result file; `objectives`: one row per speed, as
+    in its entry `objective_by_speed`.
     """
     if not optimized:
         return sweep_table(baseline)
@@ -127,16 +131,16 @@ def speeds_table(
 
 
 def _word(row: Mapping[str, Any]) -> Text:
-    """Return the status of a `row` as coloured text."""
+    """Return the status label of a `row` as coloured text."""
     usable = Status[row["status"].upper()].usable
     return Text(row["status"], style="bold green" if usable else "bold red")
 
 
 def attractor_table(rows: list[dict[str, Any]], lost: Mapping[str, float]) -> RenderableType:
-    """Show coexisting motions, one column per motion.
+    """Return a table of coexisting motions, one column per motion.
 
-    `rows`: one {attractor, share, reached, status, ...} per motion; `lost`: shares of the initial
-    states that lead to no motion, by status label.
+    `rows`: one {attractor, share, reached, status, ...} per motion; `lost`: share of the initial
+    states that lead to no motion, for each status label.
     """
     table = _table("Coexisting motions", *(f"motion {row['attractor']}" for row in rows))
     labels = {
@@ -153,7 +157,7 @@ def attractor_table(rows: list[dict[str, Any]], lost: Mapping[str, float]) -> Re
 
 
 def geometry_table(record: Mapping[str, Any]) -> RenderableType:
-    """Show the geometry of one profile, from its result record."""
+    """Return a table of the geometry of one profile, from its result record."""
     table = _table("Rotor profile", "value")
     _group(table, "design", _singles(record.get("design", {})))
     _group(table, "geometry", _singles(record.get("geometry", {})))
@@ -167,9 +171,9 @@ def geometry_table(record: Mapping[str, Any]) -> RenderableType:
 
 
 def likeness_table(rows: list[dict[str, Any]]) -> RenderableType:
-    """Show the design of each profile family that is nearest to the profile, nearest first.
+    """Return a table of the classical designs that are nearest to the optimised profile.
 
-    `rows`: entry `resembles` of the result file."""
+    `rows`: one per profile family, as in the entry `resembles` of the result file."""
     table = _table("The optimised profile resembles", "largest distance, um", "nearest member")
     for row in rows:
         design = ", ".join(f"{key} {_number(value)}" for key, value in row["design"].items())
@@ -186,7 +190,7 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _group(table: Table, name: str, rows: _Rows) -> None:
-    """Add a heading and its `rows` to a table, or the heading with dashes if there are no rows."""
+    """Add a heading and its `rows` to a table. Without rows, add one row "none" of dashes."""
     rows = list(rows) or [("none", *[DASH] * (len(table.columns) - 1))]
     table.add_section()
     table.add_row(Text(name, style="bold"))
@@ -209,7 +213,7 @@ def _pairs(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple[st
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries with single values. Nested tables appear only in the result file."""
+    """Return the entries of `values` except lists and mappings, which only the result file has."""
     tables = Mapping, list, tuple
     return {key: value for key, value in values.items() if not isinstance(value, tables)}
 
@@ -238,9 +242,9 @@ def _status(evaluation: Evaluation) -> Text:
 
 
 def _gradients(*gradients: Mapping[str, Mapping[str, float]]) -> list[tuple]:
-    """Return (heading, rows of each gradient) for each response.
+    """Return one group (heading, rows of each gradient) per response.
 
-    Without gradients, return one empty group."""
+    If there are no gradients, return a single group without rows."""
     found = dict.fromkeys(response for gradient in gradients for response in gradient)
     groups = []
     for response in found:
@@ -251,14 +255,16 @@ def _gradients(*gradients: Mapping[str, Mapping[str, float]]) -> list[tuple]:
 
 
 def _errors(*steady_states: Mapping[str, Any]) -> list[tuple]:
-    """Return groups as `_gradients` does, for standard errors; empty without standard errors."""
+    """Return groups as in `_gradients` for the gradients' standard errors; [] if there are none."""
     errors = [steady.get("gradient_standard_error", {}) for steady in steady_states]
     groups = _gradients(*errors) if any(errors) else []
     return [(f"standard error of the {heading}", *rows) for heading, *rows in groups]
 
 
 def _per_unit(row: Mapping[str, float], unit: str) -> dict[str, float]:
-    """Return `row` with labels as keys, for example "d/d(pressure angle), N/deg"."""
+    """Return `row` with keys replaced by labels, for example "d/d(pressure angle), N/deg".
+
+    `unit`: unit of the response."""
     labels = ((key, *_split(key)) for key in row)
     return {
         f"d/d({name}), {f'{unit}/{per}' if per else unit}": row[key] for key, name, per in labels
@@ -266,7 +272,7 @@ def _per_unit(row: Mapping[str, float], unit: str) -> dict[str, float]:
 
 
 def _split(key: str) -> tuple[str, str]:
-    """Return (name in words, unit) of a result key."""
+    """Return (name in words, unit) for a key of the result file."""
     if key in _NAMES:
         return _NAMES[key]
     for suffix, unit in _UNITS.items():
@@ -298,7 +304,7 @@ def _change(first: Any, second: Any) -> str:
 
 
 def _number(value: Any) -> str:
-    """Format with five significant digits, with an exponent only for very large or small values."""
+    """Format a float with five significant digits, and `None` or a non-finite number as a dash."""
     if value is None:
         return DASH
     if isinstance(value, bool | str):

@@ -1,1 +1,1 @@
-"""Set-up of the process, and compiled programs: environment, precision, threads, cache, timing."""
+"""Set-up of the process (environment, precision, threads), compiled programs and their cache."""

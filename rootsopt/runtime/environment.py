@@ -3,7 +3,7 @@
 A command owns its process and computes in double precision with JAX's own defaults. Variables that
 only choose a device, a cache or a log are respected. Variables that change numbers, or make JAX
 stop on purpose, are ignored and named on stderr. Settings that cannot work raise `InputError`
-before anything is computed, because XLA ends the whole process at an unknown flag.
+before anything is computed, because XLA ends the whole process if it finds an unknown flag.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ _RESPECTED = (
     "JAX_ONEAPI_VISIBLE_DEVICES",
     "JAX_PJRT_CLIENT_CREATE_OPTIONS",
 )
-"""Prefixes of variables that choose a device, a cache or a log."""
+"""Prefixes of the JAX variables that are respected: they choose a device, a cache or a log."""
 
 _REQUIRED = {
     "jax_enable_x64": True,
@@ -60,7 +60,7 @@ _CHECKED = "ROOTSOPT_XLA_FLAGS_CHECKED"
 _LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 
 _UNSOUND = re.compile(r"--?(xla_cpu_enable_fast_math)(?:=(?:true|1|t|yes|y))?(?=\s|$)", re.I)
-"""Flags that make the compiler assume that NaN and infinity never occur."""
+"""Pattern of the flags that make the compiler assume that NaN and infinity never occur."""
 
 _TRIAL = """
 import sys
@@ -85,13 +85,14 @@ _TRIAL_SECONDS = 60.0
 _LOG_PREFIX = re.compile(r"^[IWEF]\d{4} \S+\s+\d+ \S+\] ")
 
 _NARROWEST = 40
-"""Terminal width (columns) below which COLUMNS is ignored: a table would lose its numbers."""
+"""Value of the variable COLUMNS (terminal width in characters) below which the variable is ignored:
+tables of that width would lose their numbers."""
 
 _noticed: set[str] = set()
 
 
 def say(text: str) -> None:
-    """Print one line on stderr, once per process."""
+    """Print `text` as one line on stderr; do nothing if the process has already printed it."""
     if text in _noticed:
         return
     _noticed.add(text)
@@ -100,8 +101,9 @@ def say(text: str) -> None:
 
 
 def shortened(value: str, longest: int = 80) -> str:
-    """Return `value` for use in a message: control characters escaped, at most `longest`
-    characters.
+    """Return `value` in quotation marks for a message, with control characters escaped.
+
+    `longest`: number of characters above which the text is shortened.
     """
     text = repr(value)
     return text if len(text) <= longest else f"{text[: longest - 4]}...{text[-1]}"
@@ -110,8 +112,8 @@ def shortened(value: str, longest: int = 80) -> str:
 def own_process() -> None:
     """Override environment settings that would disturb a command. Call this before anything else.
 
-    Afterwards, warnings never become errors, tables are wide enough to read, figures need no
-    display, and equinox checks are off. `use_float64` handles the variables of JAX.
+    Afterwards, warnings do not become errors, tables are wide enough to read, figures need no
+    display, and the runtime checks of equinox are off. `use_float64` handles the variables of JAX.
     """
     if any(option.lower().startswith("e") for option in sys.warnoptions):
         for entry in [entry for entry in warnings.filters if entry[0] == "error"]:
@@ -132,7 +134,9 @@ def own_process() -> None:
 
 
 def use_float64() -> None:
-    """Import JAX, choose double precision and all settings that results rely on, start the device.
+    """Import JAX, apply the settings that results rely on, and start the device.
+
+    The settings include double precision.
 
     Raises `InputError` if the environment prevents JAX from starting.
     """
@@ -163,8 +167,10 @@ def use_float64() -> None:
 
 
 def use_compiled_loops() -> None:
-    """Make XLA compile every loop to a single function on CPUs. Call this before JAX computes
-    anything. Existing XLA_FLAGS take precedence."""
+    """Make XLA compile every loop into a single function on CPUs.
+
+    Call this before JAX computes anything. If XLA_FLAGS already sets these options, it is left
+    unchanged."""
     flags = os.environ.get(_XLA_FLAGS, "")
     if "xla_backend_extra_options" not in flags:
         checked = flags.strip() in ("", os.environ.get(_CHECKED))
@@ -176,7 +182,7 @@ def use_compiled_loops() -> None:
 
 @contextlib.contextmanager
 def explained() -> Iterator[None]:
-    """Raise `InputError` in place of an out-of-memory error of Python or XLA."""
+    """Turn an out-of-memory error of Python or XLA in the `with` block into an `InputError`."""
     try:
         yield
     except MemoryError:
@@ -204,7 +210,7 @@ def _set_aside(named: list[str]) -> None:
 
 
 def _without_settings() -> dict[str, str]:
-    """Remove JAX variables that are not respected from the environment; return names and values."""
+    """Remove the JAX variables not in `_RESPECTED` from the environment; return {name: value}."""
     names = [
         name for name in os.environ if name.startswith("JAX_") and not name.startswith(_RESPECTED)
     ]
@@ -212,7 +218,7 @@ def _without_settings() -> dict[str, str]:
 
 
 def _agrees(setting: object, value: str) -> bool:
-    """Return whether the `value` of a variable means the same as the JAX `setting` in force."""
+    """Return whether a variable's text `value` means the same as the current JAX `setting`."""
     words = {"1": "true", "t": "true", "yes": "true", "y": "true", "on": "true"}
     words |= {"0": "false", "f": "false", "no": "false", "n": "false", "off": "false", "": "false"}
     said, force = value.strip().lower(), str(getattr(setting, "value", setting)).lower()
@@ -222,7 +228,7 @@ def _agrees(setting: object, value: str) -> bool:
 def _require(config) -> list[tuple[str, object]]:
     """Apply the required settings of JAX.
 
-    Return (name, former value) of each setting that differed, except double precision."""
+    Return (name, former value) of each setting that was changed, except double precision."""
     changed = []
     for name, needed in _REQUIRED.items():
         if name not in config.values:  # gone in this version of JAX
@@ -236,7 +242,9 @@ def _require(config) -> list[tuple[str, object]]:
 
 
 def _start_device(jax) -> None:
-    """Start the platform named in JAX_PLATFORMS, or the CPU. Raises `InputError` on failure."""
+    """Start the platform named in JAX_PLATFORMS, by default the CPU.
+
+    Raises `InputError` if it does not start."""
     chosen = os.environ.get("JAX_PLATFORMS")
     before = jax.config.values.get("jax_platforms")
     jax.config.update("jax_platforms", "cpu" if chosen is None else chosen)
@@ -258,14 +266,16 @@ def _start_device(jax) -> None:
 
 
 def _reason(error: BaseException) -> str:
-    """Return the message of another library's error in one line, without its advice in brackets."""
+    """Return a library's error message as one line, without the library's advice in brackets."""
     text = re.sub(r"\s*\((?:set|you may need)\b[^)]*\)", "", str(error))
     text = " ".join(text.split()).rstrip(".")
     return text if len(text) <= 300 else f"{text[:297]}..."
 
 
 def _check_flags(flags: str) -> None:
-    """Test the XLA_FLAGS `flags` in a separate process. Raises `InputError` if they cannot work."""
+    """Test `flags`, the value of XLA_FLAGS, in a separate process.
+
+    Raises `InputError` if XLA does not start with them, or if they make results unsafe."""
     if os.environ.get(_CHECKED) == flags:
         return
     advice = "correct the flag or unset XLA_FLAGS"
@@ -298,7 +308,7 @@ def _check_flags(flags: str) -> None:
 
 
 def _complaint(log: str) -> str:
-    """Return XLA's complaint about its flags, from the `log` of a process that XLA has ended."""
+    """Return XLA's message about its flags from `log`, the stderr of a process that XLA ended."""
     lines = [line for line in log.splitlines() if line.strip()]
     marked = [line for line in lines if re.match(r"^[EF]\d{4} ", line)]
     options = [line for line in lines if line.startswith("xla: ")]

@@ -4,7 +4,7 @@ import jax
 
 
 def check_precision(precision: str) -> None:
-    """Raise RuntimeError unless JAX is set to this `precision` (float64 or float32)."""
+    """Raise RuntimeError if `precision` is float64 but JAX is set to single precision."""
     if precision == "float64" and not jax.config.read("jax_enable_x64"):
         raise RuntimeError(
             "JAX computes in single precision here: call "

@@ -1,8 +1,8 @@
-"""Compiled programs: made ahead, in parallel, and cached between processes.
+"""Compiled programs: compiled ahead of use, in parallel, and cached between processes.
 
 Tracing and compiling take longer than the computations themselves. JAX's own cache stores compiled
-code, but every process must trace and lower a function before it can look up the code. A `Program`
-looks up the code by name, source and kinds of arguments alone.
+code, but every process must trace and lower a function before it can look up the code. For the
+lookup, a `Program` needs only the function's name, its source and the kinds of its arguments.
 """
 
 import contextlib
@@ -49,8 +49,8 @@ _SETTINGS = (
 """Settings of JAX that change what is traced or compiled."""
 _VARIABLES = ("XLA_FLAGS", "EQX_ON_ERROR")
 OPTIONS: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
-"""Compiler options on CPUs. They select the older code generator for fused operations, which
-compiles in two thirds of the time; its code is as fast."""
+"""Compiler options on CPUs. They select the older code generator for fused operations, which needs
+two thirds of the time to compile and makes equally fast code."""
 _PACKAGE = Path(__file__).parents[1]
 _store: Store | None = None
 # Tracing runs in Python, so it is done one function at a time, in the order of requests. The
@@ -61,8 +61,8 @@ _tracing = threading.RLock()
 def keep_in(folder: Path | None) -> str | None:
     """Cache programs in `folder` from now on; `None` turns the cache off.
 
-    If the folder cannot be used, the cache is off and the result is None. If other users could
-    replace the programs in the folder, the cache is off and the result is the reason.
+    If the folder cannot be used, turn the cache off and return `None`. If other users could replace
+    the programs in the folder, turn the cache off and return the reason. Otherwise return `None`.
     """
     global _store
     _store = None
@@ -78,10 +78,10 @@ def keep_in(folder: Path | None) -> str | None:
 
 
 class _Kind(NamedTuple):
-    """Kind of arguments that a program is compiled for.
+    """Kind of arguments for which a program is compiled.
 
-    `tree`: structure of the arguments; `shapes`: (shape, dtype) of each array, None for other
-    leaves; `others`: type and value of each other leaf.
+    `tree`: structure of the arguments; `shapes`: one entry per leaf, (shape, dtype) for an array
+    and `None` for any other leaf; `others`: (type, value) of each leaf that is not an array.
     """
 
     tree: Any
@@ -90,16 +90,20 @@ class _Kind(NamedTuple):
 
 
 class _Made(NamedTuple):
-    """A compiled program, which takes only the arrays, and its result with structs for arrays."""
+    """A compiled program.
+
+    `call`: function that takes the arrays of the arguments and returns those of the result;
+    `result_shape`: the result with `jax.ShapeDtypeStruct` in place of arrays."""
 
     call: Callable[..., Any]
     result_shape: Any
 
 
 class Program:
-    """A function whose arguments are JAX trees, compiled once for each kind of arguments.
+    """A function whose arguments are JAX pytrees, compiled once for each kind of arguments.
 
-    As with `equinox.filter_jit`, arrays are traced. Everything else is static and must be hashable.
+    As with `equinox.filter_jit`, arrays are traced. All other leaves are static and must be
+    hashable.
     """
 
     def __init__(self, function: Callable[..., Any]):
@@ -109,7 +113,7 @@ class Program:
         self._lock = threading.Lock()
 
     def __call__(self, *args: Any) -> Any:
-        """Return the function's result; compile it first if needed."""
+        """Return the function's result for `args`; compile the function first if necessary."""
         leaves, kind = _split(args)
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return self.function(*args)
@@ -121,17 +125,19 @@ class Program:
         return jax.tree.map(lambda x: next(results) if _is_array(x) else x, made.result_shape)
 
     def prepare(self, *args: Any) -> None:
-        """Compile in the background for arguments of the same kind as `args`.
+        """Compile the function in the background for arguments of the same kind as `args`.
 
-        Arrays may be `jax.ShapeDtypeStruct`. If compilation fails, the call that needs the program
-        raises the error."""
+        In `args`, `jax.ShapeDtypeStruct` may replace an array. If compilation fails, the call that
+        needs the program raises the error."""
         _, kind = _split(args)
         future, new = self._future(kind)
         if new:
             threading.Thread(target=self._make, args=(future, kind)).start()
 
     def result_shape(self, *args: Any) -> Any:
-        """Return the result with `jax.ShapeDtypeStruct` in place of arrays, without compiling."""
+        """Return the result for `args` with `jax.ShapeDtypeStruct` in place of arrays.
+
+        The function is not compiled for this."""
         _, kind = _split(args)
         place = self._place(kind)
         kept = place is not None and place.kept
@@ -143,9 +149,7 @@ class Program:
         return jax.tree.map(_outline, eqx.filter_eval_shape(self.function, *args))
 
     def _future(self, kind: _Kind) -> tuple[Future[_Made], bool]:
-        """Return the future program for a `kind` of arguments.
-
-        Return also whether the caller must compile it."""
+        """Return (future of the program for this `kind`, whether the caller must compile it)."""
         with self._lock:
             new = kind not in self._made
             return self._made.setdefault(kind, Future()), new
@@ -197,7 +201,7 @@ class Program:
 
 
 class _Place(NamedTuple):
-    """An entry of a store: its name, and a digest of everything the program depends on."""
+    """An entry of `store`. `purpose`: digest of everything on which the program depends."""
 
     store: Store
     name: str
@@ -217,7 +221,7 @@ def _outline(leaf: Any) -> Any:
 
 
 def _split(args: tuple) -> tuple[list, _Kind]:
-    """Return the arrays among the leaves of `args`, and the kind of the arguments."""
+    """Return (arrays among the leaves of `args`, kind of the arguments)."""
     leaves, tree = jax.tree.flatten(args)
     shapes = tuple(
         (x.shape, str(jax.dtypes.canonicalize_dtype(x.dtype))) if _is_array(x) else None
@@ -228,9 +232,9 @@ def _split(args: tuple) -> tuple[list, _Kind]:
 
 
 def _finished(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-    """Compile a lowered program, with the `OPTIONS` that XLA_FLAGS does not set.
+    """Compile a lowered program with those of the `OPTIONS` that XLA_FLAGS does not set.
 
-    If the compiler does not know these options, compile without options."""
+    If this fails, as when the compiler does not know an option, compile without options."""
     said = os.environ.get("XLA_FLAGS", "")
     options = {name: value for name, value in OPTIONS.items() if name not in said}
     if options and jax.default_backend() == "cpu":
@@ -240,7 +244,7 @@ def _finished(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
 
 
 def _joined(kind: _Kind, arrays: Iterator) -> tuple:
-    """Return the arguments from their `kind` and `arrays`: the inverse of `_split`."""
+    """Return the arguments made up of their `kind` and `arrays`: the inverse of `_split`."""
     others = iter(kind.others)
     leaves = [next(arrays) if shape else next(others)[1] for shape in kind.shapes]
     return jax.tree.unflatten(kind.tree, leaves)
@@ -256,7 +260,7 @@ def _save(place: _Place, made: _Made, number: int) -> None:
 
 
 def _loaded(place: _Place | None) -> _Made | None:
-    """Return the cached program at `place`, or `None` if there is no working program."""
+    """Return the cached program at `place`, or `None` if there is none that can be loaded."""
     if place is None:
         return None
     try:
@@ -287,10 +291,10 @@ def _modules(kind: _Kind) -> set[str]:
 
 
 def _sources(modules: set[str]) -> list[str] | None:
-    """Return digests of the source files that a program depends on.
+    """Return digests of the source files on which a program depends.
 
-    These are all sources of this package, and the files of those `modules` that belong to no
-    package with a known version. The result is `None` if such a module has no file."""
+    These are all sources of this package, and the files of those `modules` that belong neither to
+    Python nor to a package with a known version. Return `None` if a file is missing."""
     digests = [_package_digest()]
     for name in sorted(modules):
         top = name.partition(".")[0]
@@ -306,7 +310,7 @@ def _sources(modules: set[str]) -> list[str] | None:
 
 @functools.cache
 def _package_digest() -> str:
-    """Return a digest of every source file of this package; empty if none can be read."""
+    """Return one digest of all source files of this package, or "" if there are no files."""
     digest, files = hashlib.sha256(), sorted(_PACKAGE.rglob("*.py"))
     for file in files:
         data = file.read_bytes()

@@ -2,8 +2,8 @@
 
 Programs read here are executed, so other users must not be able to change them. This holds for the
 folder, every file in it and every folder above. Each entry is signed together with its name and
-purpose, with a key in the user's own state folder. An entry that is damaged, exchanged or not
-signed is ignored.
+purpose, with a key in the user's own state folder. An entry that is damaged, unsigned or stored
+under another name is ignored.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ except ImportError:  # Windows
 MOST_BYTES = 200 * 2**20
 """Total size (bytes) of all entries above which the least recently used are removed."""
 SUFFIX = ".program"
-"""Suffix of entry names; other files in the folder are left alone."""
+"""Suffix of the names of entries. It distinguishes them from other files in the folder."""
 
 _KEY_NAME = "programs.key"
 _KEY_BYTES = 32
@@ -43,15 +43,15 @@ _IN_FOLDER = {os.open, os.unlink, os.stat, os.rename} <= os.supports_dir_fd
 
 
 class UnsafeFolderError(Exception):
-    """A folder can be changed by other users. The message names the folder and the remedy."""
+    """Raised if other users can change a folder. The message names the folder and the remedy."""
 
 
 class Folder:
-    """A folder of the user's own, created if it does not exist, and held open.
+    """A folder that belongs to the user. It is created if it does not exist, and kept open.
 
     Files are opened through the folder's descriptor, because its path may point elsewhere later.
-    Raises `UnsafeFolderError` if other users could write to the folder or exchange it, `OSError` if
-    the folder cannot be created or opened.
+    Raises `UnsafeFolderError` if other users own the folder or could write to it or replace it, and
+    `OSError` if the folder cannot be created or opened.
     """
 
     def __init__(self, path: Path):
@@ -83,11 +83,13 @@ class Folder:
         return name if self._open is not None else os.fspath(self.path / name)
 
     def open(self, name: str, flags: int) -> int:
-        """Open a file in the folder and return its descriptor. A new file is for the user alone."""
+        """Open a file in the folder with the `flags` of `os.open`, and return its descriptor.
+
+        Only the user has access to a new file."""
         return os.open(self._at(name), flags | _SAFELY, 0o600, dir_fd=self._open)
 
     def stat(self, name: str) -> os.stat_result:
-        """Return the `os.stat` result of the file itself, not of the target of a link."""
+        """Return the `os.stat` result of the file `name`; of a link itself, not of its target."""
         return os.stat(self._at(name), dir_fd=self._open, follow_symlinks=False)
 
     def exists(self, name: str) -> bool:
@@ -103,7 +105,9 @@ class Folder:
             os.unlink(self._at(name), dir_fd=self._open)
 
     def link(self, name: str, other: str) -> None:
-        """Give the file `name` a second name, `other`. Raises `FileExistsError` if it exists."""
+        """Give the file `name` a second name, `other`.
+
+        Raises `FileExistsError` if a file `other` exists."""
         os.link(self._at(name), self._at(other), src_dir_fd=self._open, dst_dir_fd=self._open)
 
     def replace(self, name: str, other: str) -> None:
@@ -115,10 +119,10 @@ class Folder:
         return os.listdir(self.path if self._open is None else self._open)
 
     def read(self, name: str, most: int, forbidden: int = _OTHERS_WRITE) -> bytes | None:
-        """Return the content of a regular file that belongs to the user.
+        """Return the content of the regular file `name`, which must belong to the user.
 
-        Return `None` for any other file, for a file larger than `most` bytes, and for a file with
-        one of the `forbidden` permission bits.
+        Return `None` if there is no such file, if it is larger than `most` bytes, or if it has one
+        of the `forbidden` permission bits.
         """
         try:
             file = self.open(name, os.O_RDONLY)
@@ -142,10 +146,10 @@ class Folder:
 
     @contextlib.contextmanager
     def unfinished(self, name: str, data: bytes) -> Iterator[str]:
-        """Create a file with `data` and yield its temporary name. On exit, remove the file if it
-        has not been renamed.
+        """Create a file with `data` and yield its temporary name, which contains `name`.
 
-        The file is locked meanwhile, so that `sweep` can tell it from the file of a dead process.
+        On exit, remove the file unless it has been renamed. Until then it is locked, so that
+        `sweep` can distinguish it from a file that an ended process has left.
         """
         own = f".{name}.{secrets.token_hex(8)}"
         file = self.open(own, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
@@ -162,7 +166,7 @@ class Folder:
                 os.close(file)
 
     def sweep(self, middle: str) -> None:
-        """Remove unfinished files of dead processes whose names contain `middle`."""
+        """Remove unfinished files left by ended processes, if the file names contain `middle`."""
         for name in self.names():
             if not (name.startswith(".") and middle in name):
                 continue
@@ -182,8 +186,8 @@ class Folder:
 class Store:
     """Signed entries in a folder.
 
-    Raises `UnsafeFolderError` if other users could change the entries or read the key, `OSError` if
-    the folder cannot be used.
+    Raises `UnsafeFolderError` if other users could change the entries or read the key, and
+    `OSError` if the folder cannot be used.
     """
 
     def __init__(self, path: Path):
@@ -195,7 +199,7 @@ class Store:
         return self._folder.exists(name + SUFFIX)
 
     def read(self, name: str, purpose: str) -> bytes | None:
-        """Return the data written as `name` for this `purpose`, or `None` without a valid entry."""
+        """Return the data of the entry `name`, or `None` if no valid entry has this `purpose`."""
         found = self._folder.read(name + SUFFIX, MOST_BYTES)
         if found is None:
             return None
@@ -206,7 +210,9 @@ class Store:
         return data
 
     def write(self, name: str, purpose: str, data: bytes) -> None:
-        """Write the entry `name` completely or not at all. Raises `OSError` if writing fails."""
+        """Write `data` as the entry `name`, completely or not at all, signed with its `purpose`.
+
+        Raises `OSError` if writing fails."""
         signed = _HEADER + self._mac(name, purpose, data) + data
         target = name + SUFFIX
         with self._folder.unfinished(target, signed) as made:
@@ -221,7 +227,7 @@ class Store:
         return mac.digest()
 
     def _prune(self) -> None:
-        """Remove the least recently used entries until the others are below `MOST_BYTES` in all."""
+        """Remove the least recently used entries until the rest take at most `MOST_BYTES`."""
         kept = []
         for name in self._folder.names():
             # Only our own files: the folder may hold others.
@@ -246,9 +252,9 @@ def key_folder() -> Path:
 
 
 def _key() -> bytes:
-    """Return the user's signing key, created if there is no valid key.
+    """Return the user's signing key; create one if there is no valid key.
 
-    Raises `UnsafeFolderError` if the key cannot be kept from other users."""
+    Raises `UnsafeFolderError` if the key cannot be stored where only the user has access."""
     path = key_folder()
     try:
         if not path.is_absolute():
@@ -293,7 +299,7 @@ def _there(folder: Folder) -> bool:
 
 
 def _make(path: Path) -> None:
-    """Create a folder and missing folders above it, with access for the user alone."""
+    """Create a folder and the missing folders above it, with access for the user only."""
     missing = []
     while not os.path.lexists(path):
         missing.append(path)
@@ -304,7 +310,9 @@ def _make(path: Path) -> None:
 
 
 def _check(path: Path, found: os.stat_result) -> None:
-    """Raise `UnsafeFolderError` if others own the folder `path`, or can change or replace it."""
+    """Raise `UnsafeFolderError` if other users own the folder, or can change or replace it.
+
+    `found`: `os.stat` result of the folder `path`."""
     if not _HAS_OWNERS:
         return  # On such systems, folders below the user's home are the user's by default.
     me = os.geteuid()

@@ -1,4 +1,4 @@
-"""Work divided among the cores of a machine."""
+"""Divides work among the cores of the machine."""
 
 import os
 from collections.abc import Callable
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def on_all_cores(work: Callable[..., Any], *arrays: Any) -> Any:
-    """Return `work(*arrays)`, with the leading axis (n,) divided among one thread per core.
+    """Return `work(*arrays)`, computed in parts along the leading axis (n,), one thread per core.
 
     All arrays, and all arrays of the result, must have this leading axis. The parts have equal
     size, so that they share a compiled program.

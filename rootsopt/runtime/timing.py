@@ -1,4 +1,4 @@
-"""Measure how much of a run is spent on tracing and compiling."""
+"""Measures how much of a run is spent on tracing and compiling."""
 
 import time
 from types import TracebackType
@@ -15,9 +15,8 @@ _COMPILE_EVENTS = (
 class CompileClock:
     """Context manager that measures the time spent on tracing, lowering and compiling.
 
-    JAX reports the single times. Programs compile in parallel and traces are nested. `seconds`
-    counts the time during which at least one of them was running, so it never exceeds the elapsed
-    time.
+    JAX reports the duration of each step. Since steps overlap (programs compile in parallel, traces
+    are nested), `seconds` is the time during which at least one step was running.
     """
 
     def __init__(self) -> None:
