@@ -197,7 +197,8 @@ class Part(eqx.Module):
 
     @property
     def edges(self) -> tuple[Float[Array, ""], ...]:
-        """Values of ε (rad) at which the part begins to couple the rotors, where solver steps end.
+        """Values of ε (rad) at which the part begins to couple the rotors. Solver steps end at
+        these.
         """
         return ()
 
