@@ -26,7 +26,7 @@ of the previous one, with the same solver steps (`Look.memory`)."""
 _FARTHEST = 0.05
 """Greatest entry of a Newton step above which the step is shortened to this size."""
 _PATIENCE = 4
-"""Number of evaluations for one point of the curve from which on evaluations are more careful (see
+"""Number of evaluations for one point of the curve after which evaluations become more careful (see
 `SolutionCurve`)."""
 _MOST = 14
 """Maximum number of evaluations of the equations for one point of the curve."""

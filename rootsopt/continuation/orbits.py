@@ -192,7 +192,7 @@ class Orbits:
     parameter as a fraction of its range. `config` of the first orbit; `parameter`: name of the
     parameter; `period`: k; `limits`: range of the parameter (config's unit) and step sizes.
 
-    Raises `InputError` for an unknown parameter or single precision.
+    Raises `InputError` for single precision.
     """
 
     def __init__(self, config: Config, parameter: str, period: int, limits: StepSizes):

@@ -33,11 +33,11 @@ sample falls on the end of each mesh period."""
 _NEWTON_STEPS = 24
 """Default maximum number of integrations to close one orbit."""
 _CLOSED = 4000, 1e-3, 1e-10
-"""Settings for the residual at which Newton's method stops: its lower limit (rounding errors; about
-1e-12 in float64), its value between the limits (tolerances), and its upper limit (scaled)."""
+"""Residual at which Newton's method stops: its lower limit (rounding errors; about 1e-12 in
+float64), its value (tolerances), and its upper limit (scaled)."""
 _KEPT = 4
 """Number of integrations after which the solver steps are kept, however large the Newton step. If a
-third of `Shots.count` is less, it applies instead."""
+third of `Shots.count` is less, that number is used instead."""
 _LOOKS = 6
 """Maximum number of searches for kinks in the course of closing one orbit."""
 _DRIFT = 30.0, 1e-9, 1e-6
@@ -54,8 +54,8 @@ _AGREE = 10.0, 1e-3, 3e-2
 derivatives are not reported: its value (square roots of the tolerance), and the lower and upper
 limits of this value."""
 _SMALL = 1e-9, 1e-3
-"""Lower and upper limits (scaled) of the threshold below which a Newton step is small, so that the
-solver steps are kept. Between these limits, the threshold is a thousand tolerances."""
+"""Limits (scaled) of the Newton step below which the solver steps are kept. This threshold is a
+thousand tolerances, but at least the first number and at most the second."""
 
 
 class Orbit(NamedTuple):
@@ -137,7 +137,7 @@ class _Closing(NamedTuple):
 
 
 class _Closer(eqx.Module):
-    """The loop of `orbit_or_window`. Its fields hold the arguments of that function.
+    """The loop of `orbit_or_window`. Its fields follow from the arguments of that function.
 
     `start` returns the initial state of the loop, `go_on` its condition, `step` the result of its
     body."""

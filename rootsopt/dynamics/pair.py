@@ -1,11 +1,11 @@
 """The rotor pair as an ordinary differential equation.
 
-The smallest scene has two states: ε = φ2 - φ1 and its rate. A part that sets rotor 1 free adds the
+The simplest scene has two states: ε = φ2 - φ1 and its rate. A part that sets rotor 1 free adds the
 speed of rotor 1 as a third state. Every part appends its own states, in the order of the parts.
 
 The independent variable τ is the rotation of rotor 1 in mesh periods (lobe pitches), so the
-equation is periodic even if the speed varies. ε is measured in `angle_scale`, so that the solver
-works with numbers of order one.
+equation is periodic even if the speed varies. ε is measured in units of `angle_scale`, so that the
+solver works with numbers of order one.
 """
 
 from collections.abc import Iterable
@@ -62,7 +62,7 @@ class FlankForce(NamedTuple):
 
     @property
     def total(self) -> Float[Array, "*n"]:
-        """Sum of the normal force magnitudes (N)."""
+        """Sum of the magnitudes of the normal forces (N)."""
         return self.drive + self.coast
 
 
@@ -190,7 +190,7 @@ class RotorPair(eqx.Module):
         return self.contact.jumps
 
     def rounding(self, depth: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the relative error of the force that rounding of the gap causes at a `depth` (m).
+        """Return the relative error of the force, due to rounding of the gap, at a `depth` (m).
 
         It is 0 if the contact has no `length_scale`."""
         length = self.contact.length_scale
@@ -260,13 +260,13 @@ class RotorPair(eqx.Module):
         return motion, acting
 
     def in_si(self, state: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return a scaled state in the units of `state_names`."""
+        """Convert a scaled `state` (n,) to the units of `state_names`."""
         angle, period = self.angle_scale, self.mesh_period
         first = [angle * state[:1], angle / period * state[1 : 2 + self.free]]
         return jnp.concatenate([*first, *self.own_states(state)])
 
     def scaled(self, state: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return the scaled form of a state given in the units of `state_names`."""
+        """Convert a `state` (n,) in the units of `state_names` to scaled form."""
         nothing = jnp.zeros(self.states, self.angle_scale.dtype)
         start = self.in_si(nothing)
         return ((state - start) / (self.in_si(nothing + 1) - start)).astype(start.dtype)

@@ -44,11 +44,12 @@ def motion(
     place: Float[Array, ""],
     width: Float[Array, ""],
 ) -> Float[Array, " n"]:
-    """Return the scaled state at `place`, a position counted in samples, between uniform samples.
+    """Interpolate the scaled state between uniform samples.
 
-    `states` (samples, n): scaled samples; `width`: their spacing (mesh periods). ε is a quintic
-    through the three nearest samples and their rates; dε/dt is the derivative of the quintic. The
-    other states are quartics through the five nearest samples.
+    `states` (samples, n): scaled samples; `place`: position at which to interpolate, counted in
+    samples; `width`: spacing of the samples (mesh periods). ε is a quintic through the three
+    nearest samples and their rates; dε/dt is the derivative of the quintic. The other states are
+    quartics through the five nearest samples.
     """
     middle = jnp.clip(jnp.round(place).astype(int), 2, states.shape[0] - 3)
     near = lax.dynamic_slice_in_dim(states, middle - 2, 5)
@@ -81,7 +82,7 @@ def _state(
     slope: Float[Array, ""],
     others: Float[Array, " m"],
 ) -> Float[Array, " n"]:
-    """Return the scaled state with ε = `swing`, dε/dτ = `slope` and the `others`."""
+    """Return the scaled state with ε = `swing`, dε/dτ = `slope` and the other states `others`."""
     state = jnp.concatenate([jnp.stack([swing, slope]), others])
     return state.at[1].divide(pair.lapse(state)) if pair.free else state
 

@@ -8,7 +8,7 @@ P. C. Müller, Chaos, Solitons & Fractals 5 (1995) 1671-1681):
     dy = (f₋ - f₊) dt*,        dt* = -d(δ₋ - δ₊) / (dδ₋/dτ - dδ₊/dτ).
 
 f is the right-hand side of the equation of motion and δ the penetration, before (₋) and after (₊)
-the jump. Integrals over the motion are entries of y like the states.
+the jump. Besides the states, y also contains the integrals over the motion.
 """
 
 import jax.numpy as jnp

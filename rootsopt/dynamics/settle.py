@@ -17,7 +17,7 @@ from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 
 BLOCK = 4
-"""Number of mesh periods integrated between two checks whether the motion repeats."""
+"""Number of mesh periods integrated between two checks of whether the motion repeats."""
 _MEMORY = 20
 """Number of stroboscopic states stored: more than twice the longest cycle searched for."""
 _PATIENCE = 32, 1e-5

@@ -34,7 +34,7 @@ _DRIFT = 1e3, 1e-5
 uncertain, because some kinks may lie inside long steps: its value (tolerances), and the lower limit
 of this value (scaled)."""
 _STRAINED = 100.0
-"""Error of a repeated step (tolerances) above which an orbit is rejected."""
+"""Estimated error of a repeated step (tolerances) above which an orbit is rejected."""
 
 
 class Verdict(NamedTuple):

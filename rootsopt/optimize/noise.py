@@ -30,7 +30,8 @@ class Verification(NamedTuple):
     `baseline`: evaluation of the baseline with the last ensemble; `problem`: the design problem
     relative to this evaluation; `optimized`: evaluation of the best candidate, None if it was not
     accepted; `record`: entries for the result file. Without a usable candidate, `problem` and
-    `baseline` are those of the search.
+    `baseline` are those of the search. If `baseline` is not usable, `problem` is that of the
+    search.
     """
 
     problem: Problem
@@ -144,7 +145,7 @@ def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[
 
 
 def most_promising(problem: Problem, trials: Sequence) -> Any:
-    """Return the trial at the best of the `candidates`, or None."""
+    """Return the trial at the best of the `candidates`, or None if there are no candidates."""
     found = candidates(problem, trials)
     if not found:
         return None
@@ -153,7 +154,7 @@ def most_promising(problem: Problem, trials: Sequence) -> Any:
 
 
 def message(record: dict[str, Any]) -> str:
-    """Return the message that no design has been confirmed by a verification over an ensemble.
+    """Return a message for the user: that no design was confirmed over an ensemble, and why.
 
     `record`: `Verification.record`. The message is empty if there was no such verification."""
     if "required_standard_errors" not in record:

@@ -170,8 +170,7 @@ class Problem:
         return bool(np.min(self.look(point)[2]) >= -_ACTIVE)
 
     def project(self, point) -> NDArray[np.float64]:
-        """Move `point` to a nearby feasible point, by Gauss-Newton steps on the violated
-        constraints.
+        """Project `point` onto the feasible set, by Gauss-Newton steps on the violated constraints.
 
         The result can still be infeasible, such as when the constraints contradict the bounds.
         """
@@ -193,9 +192,9 @@ class Problem:
     def toward(self, point, inside) -> NDArray[np.float64]:
         """Return a feasible point near `point`, as `project` does, with a fallback to `inside`.
 
-        `inside`: a feasible point. If `project` finds no feasible point, the point is first moved
-        half way towards `inside`, up to `_DRAWN` times. This helps where no profile exists at
-        `point`.
+        `inside`: a feasible point. If `project` finds no feasible point, the point is moved half
+        way towards `inside` and projected again, up to `_DRAWN` times. This helps where no profile
+        exists at `point`.
         """
         found = self.project(point)
         if self.space.family.by_limits:

@@ -47,7 +47,7 @@ _STATIONARY = 1e-3
 _HOLDS_UP = 0.01
 """Relative change of the objective in the verification above which a design is rejected."""
 _POLL = 0.05
-"""Interval (s) at which a waiting thread checks whether to stop."""
+"""Interval (s) at which a waiting thread checks whether it should stop."""
 
 Progress = Callable[[int, int, float], None]
 """Type of a progress callback, with arguments (evaluations done, evaluations expected, best
@@ -343,7 +343,8 @@ class Search:
     def _verify(self, trials: list[Trial]) -> tuple[Evaluation | None, dict[str, Any]]:
         """Simulate the best designs again, from rest at a tight tolerance, until one is confirmed.
 
-        Return the evaluation of the confirmed design, or None, and a record for the result file."""
+        At most five designs are simulated. Return the evaluation of the confirmed design, or None,
+        and a record for the result file."""
         ranked = sorted(filter(_candidate, trials), key=_objective)
         tried: list[np.ndarray] = []
         failures = []

@@ -339,7 +339,7 @@ def _cycle(pair: RotorPair, state, integrator: Integrator):
 
 @dataclasses.dataclass(frozen=True)
 class AttractorEvaluator(Wrapper):
-    """Evaluates a design by all its coexisting motions.
+    """Evaluates a design on the basis of all its coexisting motions.
 
     With `objective.motion: worst`, the result describes the motion with the greatest weighted sum
     of the objective's measures. Each measure is relative to the `reference` of `single`: a
@@ -398,7 +398,8 @@ class AttractorEvaluator(Wrapper):
 
 
 def _averaged(one: Evaluation, attractors: list[Attractor]) -> Evaluation:
-    """Return `one` with response and gradient averaged over the attractors by share."""
+    """Return `one` with response and gradient averaged over the attractors, weighted by their
+    shares."""
     shares = np.array([a.share for a in attractors])
     # On a coarse grid, the `known` states may be the only ones that lead to an orbit.
     shares = shares / shares.sum() if shares.sum() > 0 else np.ones(len(shares)) / len(shares)

@@ -32,7 +32,7 @@ class Choice:
     """Chosen settings and their measured error.
 
     `config`: the config with the settings in place of `auto`; `requested`: requested relative
-    error; `error`: largest relative error of mean and peak force, None if the scene has no periodic
+    error; `error`: greatest relative error of mean or peak force, None if the scene has no periodic
     steady state to compare; `tried`: all tried settings, each with its difference from the
     reference.
     """

@@ -72,7 +72,7 @@ ERRORS = {name: name.replace("_N", "_standard_error_N") for name in RESPONSES}
 
 @dataclasses.dataclass(frozen=True)
 class EnsembleEvaluator(Wrapper):
-    """Evaluates designs by an ensemble of motions in the scene of `single`.
+    """Evaluates designs with an ensemble of motions in the scene of `single`.
 
     A call has the argument `start` (members, n): scaled initial states, such as the `state` of a
     neighbouring design's evaluation. By default, the initial states are those of

@@ -55,8 +55,8 @@ class Members(NamedTuple):
     def status(self) -> Status:
         """AVERAGED if no member has failed, else the status of the failure.
 
-        Failures are checked in this order: of the solver, forces that are not finite, a stalled
-        motor, lobes that have passed through each other."""
+        Failures are checked in this order: the solver failed; the forces are not finite; the motor
+        stalled; the lobes passed through each other."""
         if not np.all(self.solved):
             return Status.SOLVER_FAILED
         if not np.all(np.isfinite(self.means)):
@@ -92,7 +92,7 @@ def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float
 
     |ε| ranges up to the pair's `angle_scale` (half the backlash plus the static penetration).
     |dε/dt| ranges up to the speed that the load causes across the whole range of ε, or 1 (scaled)
-    if that is greater. `seed` of the sequence.
+    if that is greater. `seed`: seed of the sequence.
     """
     from scipy.stats import qmc
 

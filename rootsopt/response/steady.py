@@ -2,7 +2,7 @@
 
 The derivative of an orbit comes from the implicit function theorem: JAX never differentiates
 through the search for the orbit. All requested derivatives are columns of one matrix, computed with
-the orbit. JAX transformations only multiply with this matrix. Therefore forward and reverse mode
+the orbit. JAX transformations only multiply by this matrix. Therefore forward and reverse mode
 agree to rounding. Derivatives that are not requested are not computed.
 """
 
@@ -152,8 +152,8 @@ def _split(values, response: Response):
 def _solved(scene: Scene, design, start, along: tuple[int, ...]) -> tuple[Response, Array]:
     """Return the response, and the derivatives (rows, m) of its differentiated fields.
 
-    `along`: numbers of the leaves of scene and design to differentiate with respect to, m entries
-    in all."""
+    `along`: numbers of the leaves of scene and design with respect to which to differentiate. The
+    leaves have m entries in total."""
     arguments = scene, design, start, along
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
         return _inline(*arguments)

@@ -40,7 +40,7 @@ class Term(eqx.Module):
     def value(
         self, scene: Scene, profile: Profile, shape: Geometry, forces: Forces
     ) -> Float[Array, ""]:
-        """Return the value of the term for one design, by operations that JAX can differentiate.
+        """Return the value of the term for one design, using operations that JAX can differentiate.
 
         `profile` and `shape`: profile and geometry of the design (SI units); `forces` (N): mean,
         peak and RMS of the steady contact force in the `scene`."""

@@ -84,7 +84,7 @@ class Part(eqx.Module):
 
     @property
     def free(self) -> bool:
-        """Whether the speed of rotor 1 is a state instead of prescribed."""
+        """Whether the part makes the speed of rotor 1 a state, instead of a prescribed quantity."""
         return False
 
     @property
