@@ -5,8 +5,8 @@ point on a curve, the next point is predicted along the tangent. Newton's method
 to the tangent then corrects the prediction (Keller 1977). A fold, where the parameter turns back,
 therefore needs no special treatment. The equations are an argument, and can be any equations.
 
-One evaluation of the equations and their Jacobian is called a *look*. The vector (n + 1,) of all
-unknowns is called a *place*; a *spot* is a place on the curve, with its tangent.
+In the code, one evaluation of the equations and their Jacobian is called a *look*. The vector (n +
+1,) of all unknowns is called a *place*; a *spot* is a place on the curve, with its tangent.
 """
 
 import dataclasses
@@ -19,37 +19,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 _TOLERANCE = 2e-11
-"""Residual above which a place does not lie on the curve."""
+"""Residual (greatest entry) above which Newton's method continues."""
 _NEAR = 1e-6
-"""Newton step below which every look repeats the computation of the previous look, with the same
-solver steps (`Look.memory`)."""
+"""Newton step (greatest entry) below which each evaluation of the equations repeats the computation
+of the previous one, with the same solver steps (`Look.memory`)."""
 _FARTHEST = 0.05
-"""Length above which a Newton step is shortened."""
+"""Greatest entry of a Newton step above which the step is shortened to this size."""
 _PATIENCE = 4
-"""Number of looks for one spot above which looks are more careful (see `SolutionCurve`)."""
+"""Number of evaluations for one point of the curve after which evaluations become more careful (see
+`SolutionCurve`)."""
 _MOST = 14
-"""Maximum number of looks for one spot."""
+"""Maximum number of evaluations of the equations for one point of the curve."""
 _TURN, _STRAIGHT = 0.9, 0.99
-"""Cosine of the angle between the tangents of successive spots below which a step is rejected, and
-cosine above which the next step grows."""
+"""Cosine of the angle between the tangents at successive points of the curve below which a step is
+rejected, and cosine above which the next step is longer."""
 _ASTRAY = 0.5
-"""Distance (steps) from the predicted to the corrected spot above which the spot is taken to lie on
-another curve."""
+"""Distance (steps) from the predicted to the corrected point above which the corrected point is
+assumed to lie on another curve."""
 _CORNER = 3e-5, 1e-4, 3e-4, 1e-3
-"""Distances from a corner at which the continuation of the curve is searched for, shortest
-first."""
+"""Distances from a corner of the curve (unit of `StepSizes`) at which the curve's continuation is
+searched for, shortest first."""
 _SAME = 1e-6
-"""Distance below which two spots count as the same."""
+"""Distance (unit of `StepSizes`) below which two points of a curve count as the same."""
 _CLOSING = 8
-"""Number of spots above which a curve is checked for closing at its first spot."""
+"""Number of points above which it is checked whether the curve has come back to its first point."""
 
 
 CORNER = "CORNER"
-"""Name of a corner of the curve among the crossings of a `Path`."""
+"""Name that stands for a corner of the curve in `Path.crossings`."""
 
 
 class End(enum.Enum):
-    """Why a curve ends where it does. The value is the explanation for the user."""
+    """The reasons why a curve can end. Each value explains the reason to the user."""
 
     START = "The branch was started here and followed in one direction."
     RANGE_END = "The parameter reached the end of its range."
@@ -69,7 +70,7 @@ class End(enum.Enum):
 
 
 class StoppedError(Exception):
-    """The next spot of the curve cannot be computed; `end` is the reason."""
+    """Raised if the next point of the curve cannot be computed; `end` is the reason."""
 
     def __init__(self, end: End):
         super().__init__(end.value)
@@ -77,11 +78,12 @@ class StoppedError(Exception):
 
 
 class Look(NamedTuple):
-    """The equations evaluated at a place.
+    """One evaluation of the equations and their Jacobian.
 
-    `residual` (n,) and `jacobian` (n, n + 1) of the equations; `memory`: pass this to the curve to
-    repeat the same computation, such as the same solver steps; `data`: further results of the
-    curve. A repeated computation makes the residual smooth. `memory` is None if it always is.
+    `residual` (n,) and `jacobian` (n, n + 1) of the equations; `memory`: pass this to the
+    `SolutionCurve` to repeat the same computation, such as the same solver steps; `data`: further
+    results. With a repeated computation, the residual is a smooth function. `memory` is None if the
+    residual is always smooth.
     """
 
     residual: NDArray[np.float64]
@@ -91,16 +93,16 @@ class Look(NamedTuple):
 
 
 SolutionCurve = Callable[[NDArray[np.float64], Any, bool], Look]
-"""Type of the function that evaluates the equations. Arguments: a place (n + 1,), a memory or None,
-and whether to compute more carefully than usual. It returns a `Look`, or raises `StoppedError` if
-there is no result."""
+"""Type of the function that evaluates the equations. Arguments: the unknowns (n + 1,);
+`Look.memory` of the computation to repeat, or None; and whether to compute more carefully than
+usual. It returns a `Look`, or raises `StoppedError` if there is no result."""
 
 
 class Spot(NamedTuple):
-    """A place on the curve, with its tangent.
+    """A point on the curve, with its tangent.
 
-    `place` (n + 1,): unknowns; `tangent` (n + 1,): unit vector; `look`: the last evaluation there;
-    `looks`: number of evaluations that Newton's method took.
+    `place` (n + 1,): unknowns; `tangent` (n + 1,): unit vector; `look`: the last evaluation of the
+    equations there; `looks`: number of evaluations that Newton's method took.
     """
 
     place: NDArray[np.float64]
@@ -111,13 +113,13 @@ class Spot(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class StepSizes:
-    """Range and step sizes of a curve.
+    """Range and step sizes for following a curve.
 
     `low`, `high`: range of the parameter; `first`, `least`, `greatest`: first, least and greatest
-    step, as Euclidean distances of the unknowns; `points`: maximum number of spots.
+    step, as Euclidean distances between the unknowns; `points`: maximum number of points.
 
-    Raises ValueError if `low` is not less than `high`, if the steps are not positive and ascending,
-    or if `points` is less than 1.
+    Raises ValueError if `low` is not less than `high`, if the steps are not 0 < `least` ≤ `first` ≤
+    `greatest`, or if `points` is less than 1.
     """
 
     low: float
@@ -143,11 +145,11 @@ class StepSizes:
 
 
 class Path(NamedTuple):
-    """A followed curve.
+    """The result of following a curve.
 
-    `spots` in order; `crossings`: spots at which a test is zero or the curve has a corner, each as
-    (index of the last spot before it, name of the test or `CORNER`, spot); `end`: why the curve
-    ends.
+    `spots`: points of the curve, in order; `crossings`: points at which a test is zero or the curve
+    has a corner; `end`: why the curve ends. Each crossing is a tuple (index of the last of `spots`
+    before it, name of the test or `CORNER`, point).
     """
 
     spots: list[Spot]
@@ -161,10 +163,11 @@ def corrected(
     across: NDArray[np.float64],
     along: NDArray[np.float64],
 ) -> Spot:
-    """Return the spot in the plane through the place `guess` (n + 1,) normal to `across` (n + 1,).
+    """Return the point at which the curve meets the plane through `guess` normal to `across`.
 
-    The tangent of the spot points in the direction of `along` (n + 1,). Raises `StoppedError` if
-    Newton's method does not converge, or if the curve has no result.
+    `guess` and `across` have the shape (n + 1,). The tangent at the point has the orientation of
+    `along` (n + 1,). Raises `StoppedError` if Newton's method does not converge, or if the curve
+    has no result.
     """
     place, memory, careful = guess, None, False
     last, grown = math.inf, 0
@@ -195,7 +198,8 @@ def corrected(
 
 
 def tangent(jacobian: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit null vector (n + 1,) of `jacobian` (n, n + 1) in the direction of `along`."""
+    """Return the unit null vector (n + 1,) of `jacobian` (n, n + 1) with the orientation of
+    `along`."""
     found = np.linalg.svd(jacobian)[2][-1]
     return found if found @ along >= 0 else -found
 
@@ -208,8 +212,9 @@ def follow_curve(
 ) -> Path:
     """Follow the curve from `start` in the direction of its tangent, and return the path.
 
-    A step is halved until Newton's method converges and the tangent turns little. `tests`:
-    functions of a spot, by name; the spots at which they are zero become `Path.crossings`.
+    A step is halved until Newton's method converges and the tangent turns only a little. `tests`:
+    functions of a `Spot`, keyed by name; the points at which they are zero are added to
+    `Path.crossings`.
     """
     tests = tests or {}
     spots, crossings = [start], []
@@ -243,15 +248,17 @@ def follow_curve(
 
 
 def _leaves(spot: Spot, steps: StepSizes) -> bool:
-    """Return whether `spot` is at an end of the range and its tangent points out of the range."""
+    """Return whether `spot` is at an end of the parameter's range, with a tangent pointing
+    outwards.
+    """
     value, way = float(spot.place[-1]), float(spot.tangent[-1])
     return (value <= steps.low and way < 0) or (value >= steps.high and way > 0)
 
 
 def _next(curve: SolutionCurve, old: Spot, step: float, steps: StepSizes) -> Spot:
-    """Return the spot one `step` after `old`, or at the end of the range if that is closer.
+    """Return the point one `step` after `old`, or at the end of the range if that is closer.
 
-    Raises `StoppedError` if no spot is found, or if the spot may lie on another curve.
+    Raises `StoppedError` if no point is found, or if the point may lie on another curve.
     """
     new = None
     guess = old.place + step * old.tangent
@@ -274,10 +281,10 @@ def _next(curve: SolutionCurve, old: Spot, step: float, steps: StepSizes) -> Spo
 
 
 def _around_corner(curve: SolutionCurve, old: Spot, steps: StepSizes) -> Spot | None:
-    """Return a spot close to `old` beyond a corner too sharp for a step to follow, or None.
+    """Return a point close to `old`, beyond a corner too sharp for a step to follow, or None.
 
-    The spot must lie ahead of `old`. That is so if its tangent, with the orientation of `old`,
-    points away from `old`.
+    The point must lie ahead of `old`: its tangent, with the orientation of the tangent at `old`,
+    must point away from `old`.
     """
     for size in _CORNER:
         for across in np.vstack([np.eye(len(old.place)), -np.eye(len(old.place))]):
@@ -300,7 +307,7 @@ def _orientation(spot: Spot) -> float:
 
 
 def _back_at_first(curve: SolutionCurve, spots: list[Spot]) -> bool:
-    """Return whether the last step has passed the first spot, so that the curve is closed."""
+    """Return whether the last step has passed the first of `spots`, so that the curve is closed."""
     first, old, new = spots[0], spots[-2], spots[-1]
     chord = new.place - old.place
     share = (first.place - old.place) @ chord / (chord @ chord)
@@ -316,7 +323,7 @@ def _back_at_first(curve: SolutionCurve, spots: list[Spot]) -> bool:
 
 
 def _located(curve: SolutionCurve, old: Spot, new: Spot, test: Callable[[Spot], float]) -> Spot:
-    """Return the spot between `old` and `new` at which `test` is zero.
+    """Return the point between `old` and `new` at which `test` is zero.
 
     The method is regula falsi, Illinois variant."""
     chord = new.place - old.place

@@ -2,8 +2,8 @@
 
 A branch begins at a known orbit (`Evaluation.state` and its period). It is a solution curve of the
 equations in `orbits`, followed by pseudo-arclength continuation (`arclength`). Unstable orbits,
-which a simulation does not show, are followed like stable orbits; `BranchPoint.stable` tells them
-apart.
+which a simulation does not show, are followed like stable orbits; `BranchPoint.stable`
+distinguishes them.
 """
 
 import dataclasses
@@ -37,15 +37,16 @@ from rootsopt.dynamics.verdict import RESIDUAL
 from rootsopt.errors import InputError
 
 _HALVED = 0.004
-"""Distance (unit of `StepSizes`) between the states at the start and middle of an orbit below which
-the end of a branch without other reason is `End.HALVED`."""
+"""Distance (unit of `StepSizes`) between the states at the start and the middle of an orbit below
+which a branch whose steps have become too small is reported to end at an orbit of half the period
+(`End.HALVED`)."""
 _SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
 """Distances (unit of `StepSizes`) from a period doubling at which the orbit of twice the period is
 searched for, in this order."""
 
 
 class Kind(enum.Enum):
-    """Kinds of bifurcations. The value says what happens to the orbit."""
+    """Kinds of bifurcation. Each value says what happens to the orbit."""
 
     FOLD = "Two orbits meet and vanish; a multiplier passes through +1."
     PERIOD_DOUBLING = "An orbit of twice the period is born; a multiplier passes through -1."
@@ -73,12 +74,12 @@ class Bifurcation:
 
 @dataclasses.dataclass(frozen=True)
 class Branch:
-    """Orbits of one period along a parameter.
+    """A family of orbits of the same period, followed along a parameter.
 
     `config` of the orbit from which the branch was followed; `parameter`: name of the parameter;
     `period` of all orbits (mesh periods); `points`: the orbits, in order; `bifurcations` on the
-    branch; `ends`: why the branch begins and ends where it does; `limits`: range (config's unit)
-    and step sizes.
+    branch; `ends`: why the branch begins and ends where it does; `limits`: range of the parameter
+    (config's unit) and step sizes.
     """
 
     config: Config
@@ -92,8 +93,8 @@ class Branch:
     def at(self, value: float) -> list[BranchPoint]:
         """Return all orbits of the branch at one `value` of the parameter (config's unit).
 
-        Each orbit is closed again at exactly this value. The list is empty if the branch does not
-        pass the value."""
+        Each orbit is closed again at exactly this value, and left out if that fails. The list is
+        empty if the branch does not pass the value."""
         orbits = Orbits(self.config, self.parameter, self.period, self.limits)
         found = []
         for old, new in zip(self.points[:-1], self.points[1:], strict=True):
@@ -126,8 +127,9 @@ def follow(
     step sizes. A step of length 1 spans the range, or changes the scaled state by `SPAN`. `ways`:
     directions to follow, -1 for falling and 1 for rising values of the parameter.
 
-    Raises `InputError` for an unknown parameter, a value outside the limits, single precision, or a
-    wrong `period` or `ways`; also if there is no orbit to start from.
+    Raises `InputError` for an unknown parameter, a config's value outside the limits, limits that
+    the config cannot have, single precision, or an invalid `period` or `ways`; also if there is no
+    orbit to start from.
     """
     value = value_of(config, parameter)
     if not limits.low <= value <= limits.high:
@@ -169,9 +171,9 @@ def follow_doubled(
 
     The first orbit is searched for a little away from the bifurcation, displaced along the
     eigenvector of the multiplier -1. `limits`: by default the limits of `branch`. The result is
-    None if only the orbit of single period is found, or if twice the period exceeds 8 mesh periods.
+    None if no orbit of twice the period is found, or if twice the period exceeds 8 mesh periods.
 
-    Raises `ValueError` for another kind of bifurcation.
+    Raises `ValueError` if `bifurcation` is not a period doubling.
     """
     if bifurcation.kind is not Kind.PERIOD_DOUBLING:
         raise ValueError(
@@ -206,7 +208,7 @@ def follow_doubled(
 
 
 def _branch(orbits: Orbits, path: Path) -> Branch:
-    """Return the branch that consists of the spots of `path`, with its bifurcations."""
+    """Return the branch that consists of the points of `path`, with its bifurcations."""
     end = path.end
     if end is End.STEP_TOO_SMALL and orbits.period % 2 == 0:
         half_way = path.spots[-1].look.data.half_way

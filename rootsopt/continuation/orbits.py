@@ -1,9 +1,9 @@
 """Periodic orbits as the solutions of equations in a state and a parameter.
 
-The unknowns are the parameter and the state at φ1 = 0, in the units of the first config at every
-value of the parameter. The equations require that the state returns after k mesh periods. Their
-derivatives come from the linearised steps of the motion. `rootsopt.continuation.branch` follows
-the curves of solutions.
+The unknowns are the state at φ1 = 0 and the parameter. At every value of the parameter, ε is
+measured in the unit of the first config. The equations require that the state returns after k mesh
+periods. Their derivatives come from the linearised steps of the motion.
+`rootsopt.continuation.branch` follows the curves of solutions.
 """
 
 import dataclasses
@@ -48,30 +48,32 @@ PLACES = {
 can also be followed along design parameters, whose keys are in the section `profile`."""
 _GEAR = ("backlash_mm", "damping_ratio")
 SPAN = 20.0
-"""Change of the scaled state that counts as much as the whole range of the parameter."""
+"""Change of the scaled state that counts as much as the whole range of the parameter when step
+lengths are measured."""
 _LOOKS = 504
-"""Number of uniform times of an orbit at which contact is checked."""
+"""Number of uniform times on an orbit at which it is checked whether flanks or gear touch."""
 LONGEST = 8
 """Longest orbit that can be followed (mesh periods)."""
 _STEP = 1 / 256
-"""Length (mesh periods) above which solver steps are divided. Steps may stay slightly longer."""
+"""Length (mesh periods) above which solver steps are divided. Slightly longer steps may remain."""
 _SAME = 1e-5
-"""Distance (unit of `StepSizes`) between the states at the start and the middle of an orbit, below
-which the orbit has half the period. States between steps are interpolated, so the limit is not 0.
+"""Distance (unit of `StepSizes`) between the states at the start and the middle of an orbit below
+which the orbit counts as one of half the period. States between steps are interpolated, so the
+limit is not 0.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class BranchPoint:
-    """One periodic orbit.
+    """One periodic orbit of a branch.
 
     `value` of the parameter (config's unit); `state` (n,) at φ1 = 0, scaled for the config with
     that value, so that an `Evaluator` can start there; `period` (mesh periods); `mean`, `peak`,
     `rms` of the contact force (N); `multipliers` (n,): Floquet multipliers; `residual`: greatest
-    entry of |Φ(z) - z|, divided by the greatest entry of |z| if above 1; `slope`: derivative of the
-    parameter, as a fraction of its range, with respect to arclength; `gap_time`: longest time (mesh
-    periods) in which neither flanks nor gear touch; `depth`: greatest penetration (m); `reach`:
-    greatest |ε| (rad); `looks`: number of integrations.
+    entry of |Φ(z) - z|, divided by the greatest entry of |z| if that exceeds 1; `slope`: derivative
+    of the parameter, as a fraction of its range, with respect to arclength; `gap_time`: longest
+    time (mesh periods) in which neither flanks nor gear touch; `depth`: greatest penetration (m);
+    `reach`: greatest |ε| (rad); `looks`: number of integrations.
     """
 
     value: float
@@ -154,9 +156,9 @@ class _Shot(NamedTuple):
     """Result of integrating k mesh periods from a state.
 
     `out`: the flow; `grid`: solver steps of the flow, with step ends added where the equation is
-    not smooth; `lost`: whether the pair was lost (`RotorPair.lost`); `touching`: whether there is
-    contact, at uniform times; `scale` (rad): unit of ε in the config at this value of the
-    parameter.
+    not smooth; `lost`: whether the rotors no longer run as a pair (see `RotorPair.lost`);
+    `touching`: whether there is contact, at uniform times; `scale` (rad): unit of ε in the config
+    at this value of the parameter.
     """
 
     out: Flow
@@ -187,7 +189,8 @@ class Orbits:
     """Equations for orbits of k mesh periods, as a `SolutionCurve`.
 
     The unknowns (n + 1,), called a *place*, are the scaled state divided by `SPAN`, then the
-    parameter as a fraction of its range.
+    parameter as a fraction of its range. `config` of the first orbit; `parameter`: name of the
+    parameter; `period`: k; `limits`: range of the parameter (config's unit) and step sizes.
 
     Raises `InputError` for single precision.
     """
@@ -210,12 +213,13 @@ class Orbits:
         self.unit = float(_unit(self.scene, self.names, self.values))
 
     def value(self, place: NDArray[np.float64]) -> float:
-        """Return the parameter at a place (config's unit), exact at both ends of the range."""
+        """Return the value of the parameter in `place` (config's unit), exact at both ends of the
+        range."""
         share = place[-1]
         return float(self.limits.high if share == 1 else self.limits.low + share * self.width)
 
     def place(self, state: ArrayLike, value: float) -> NDArray[np.float64]:
-        """Return the place of an orbit at a `value` of the parameter (config's unit).
+        """Return the unknowns (n + 1,) of an orbit at a `value` of the parameter (config's unit).
 
         `state` (n,): scaled for the config with this value."""
         scale = float(_unit(self.scene, self.names, self._values(value)))
@@ -228,7 +232,7 @@ class Orbits:
         return values
 
     def closed(self, guess: NDArray[np.float64]) -> BranchPoint:
-        """Return the orbit near the place `guess` (n + 1,), at the same value of the parameter.
+        """Return the orbit near the unknowns `guess` (n + 1,), at the same value of the parameter.
 
         Raises `StoppedError` if no orbit is found."""
         fixed = np.eye(len(guess))[-1]
@@ -406,7 +410,7 @@ def _shoot(  # Eleven parameters, since a compiled program takes its arrays one 
 
 
 def _without_long(grid: Float[Array, " steps"], period: Float[Array, ""]) -> Float[Array, " steps"]:
-    """Return `grid` with step ends added in steps much longer than `_STEP`.
+    """Return `grid` with step ends added, so that no step is much longer than `_STEP`.
 
     In free flight, the error control takes steps so long that a short contact may be missed. The
     flow would then jump between neighbouring states.

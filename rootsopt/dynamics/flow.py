@@ -18,13 +18,15 @@ from rootsopt.dynamics.saltation import MARKS, marks, saltation
 from rootsopt.dynamics.tangent import Linear, linearized, one_step, propagated
 
 _SHORTEST = 1e-9
-"""Minimum time (mesh periods) between the start of a step and a peak inside it."""
+"""Minimum time (mesh periods) from the start of a step to a peak inside it. An earlier peak is
+moved to this time."""
 
 
 class Strobe(NamedTuple):
-    """Scaled states at the end of successive mesh periods.
+    """Scaled states at the ends of successive mesh periods.
 
-    `states` (periods, n); `steps`: number of solver steps; `solved`: whether the solver succeeded.
+    `states` (periods, n); `steps`: total number of solver steps; `solved`: whether the solver
+    succeeded in every mesh period.
     """
 
     states: Float[Array, "periods n"]
@@ -33,17 +35,19 @@ class Strobe(NamedTuple):
 
 
 class Flow(NamedTuple):
-    """Result of integrating a motion over whole mesh periods. States are scaled.
+    """Result of integrating a motion over whole mesh periods. All states are scaled.
 
-    `end`: final state; `mean` (N), `mean_square` (N²), `peak` (N) of the contact force;
-    `peak_time` (mesh periods); `depth`: greatest penetration at the sampled times (m; negative:
-    least gap); `states` at uniform times, without the end; `grid`: ends of the steps (mesh
-    periods), inf beyond the last; `corners`: states at these ends; `steps`: number of accepted and
-    rejected solver steps; `solved`: whether the solver succeeded; `strain`: greatest error estimate
-    of a repeated step, in tolerances (0 if the pair is not `smooth`); `others`: values of
-    `Measures` after mean and mean square; `slope`: derivatives of (`end`, `mean`, `mean_square`,
-    `peak`, `others`), with n + d columns: the n entries of the initial state, then d parameter
-    directions. `slope` has no columns if no derivatives were requested.
+    `end`: final state; `mean` (N), `mean_square` (N²) and `peak` (N) of the contact force;
+    `peak_time`: time of the peak (mesh periods); `depth`: greatest penetration found (m; if
+    negative, the least gap); `states`: states at uniform times, excluding the end; `grid`: ends of
+    the accepted steps (mesh periods), padded with inf; `corners`: states at these ends; `steps`:
+    number of accepted and rejected solver steps; `solved`: whether the solver succeeded; `strain`:
+    greatest error estimate of a repeated step, in tolerances (0 if no steps were repeated or the
+    pair is not `smooth`); `others`: the further measures (see `Measures.values`).
+
+    `slope`: derivatives of the rows (`end`, `mean`, `mean_square`, `peak`, `others`). Its n + d
+    columns are the n entries of the initial state, then d parameter directions. It has no columns
+    if no derivatives were requested.
     """
 
     end: Float[Array, " n"]
@@ -65,10 +69,11 @@ class Flow(NamedTuple):
     def empty(
         cls, count: int, directions: int, samples: int, steps: int, measures: Measures, dtype: Any
     ) -> "Flow":
-        """Return a flow that has not been integrated yet.
+        """Return a placeholder for a flow that has not been integrated yet.
 
         `count`: number n of states; `directions`: number d of parameter directions; `samples`:
-        number of uniform samples; `steps`: maximum number of solver steps."""
+        number of uniform samples; `steps`: maximum number of solver steps; `measures`: averages of
+        the force; `dtype`: type of the arrays."""
         nothing = jnp.zeros((), dtype)
         return cls(
             end=jnp.zeros(count, dtype),
@@ -89,7 +94,7 @@ class Flow(NamedTuple):
 
     @property
     def response(self) -> Float[Array, " r"]:
-        """Mean (N), mean square (N²), peak (N) and other measures of the contact force."""
+        """Mean (N), mean square (N²), peak (N) and the further measures of the contact force."""
         return jnp.append(jnp.stack([self.mean, self.mean_square, self.peak]), self.others)
 
 
@@ -98,7 +103,7 @@ def strobe(
 ) -> Strobe:
     """Integrate the scaled `state` (n,) over `periods` mesh periods from φ1 = 0.
 
-    The contact force is not evaluated for statistics, unlike in `flow`.
+    Unlike `flow`, this function computes no statistics of the contact force.
 
     A step ends exactly at the end of each mesh period. Interpolated states would have an error far
     above the tolerance, which could hide that the motion repeats.
@@ -167,7 +172,8 @@ class _Equation(eqx.Module):
         return jnp.concatenate([slope, rates, *([marks(contact)] if marked else [])])
 
     def advanced(self, begin, end, y, dynamic) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Return y and its slope after one step, with derivatives that include moving jumps."""
+        """Return y and its slope after one step. Derivatives of y account for the moving instants
+        of jumps."""
         pair = eqx.combine(dynamic, self.static)
         term = diffrax.ODETerm(functools.partial(self.derivative, marked=pair.jumps))
         if not pair.jumps:
@@ -190,8 +196,8 @@ class _Equation(eqx.Module):
 class _Recorded(NamedTuple):
     """The steps that a solver has taken.
 
-    `before`, `after`: y before and after each step; `end`: y at the end; `last`: index of the last
-    step; `grid`, `states`, `strain`, `steps`, `solved`: as in `Flow`.
+    `before`, `after`: y at the start and end of each step; `end`: y at the end of the motion;
+    `last`: index of the last step; `grid`, `states`, `strain`, `steps`, `solved`: as in `Flow`.
     """
 
     grid: Float[Array, " steps"]
@@ -211,11 +217,11 @@ class _Recorded(NamedTuple):
 
 
 class _Peak(NamedTuple):
-    """The instant of the peak force.
+    """The instant of the peak force, and the times around it at which the force is evaluated.
 
     `holds`: index of the step that contains the peak; `time` of the peak (mesh periods); `beside`:
-    times relative to `time` (mesh periods) at which the force is evaluated; `noise`: relative
-    rounding error of the force.
+    evaluation times relative to `time` (mesh periods); `noise`: relative rounding error of the
+    force.
     """
 
     holds: Int[Array, ""]
@@ -237,18 +243,22 @@ def flow(  # Eleven parameters: adaptive steps, repeated steps and reverse mode 
     measures: Measures | None = None,
     top: Float[Array, ""] | None = None,
 ) -> Flow:
-    """Integrate over `periods` mesh periods (may be traced), with statistics of the force.
+    """Integrate over `periods` mesh periods (may be traced), and compute statistics of the force.
 
-    `state` (n,): scaled state at φ1 = 0; `measures`: further averages of the force, integrated
+    `state` (n,): scaled state at φ1 = 0; `measures`: averages of the force to compute, integrated
     under the same error control as the motion; `top` (N): roughly the greatest force, for the
-    p-norm; `samples`: number of uniform samples, between which the peak is located.
+    p-norm; `samples`: number of uniform samples of the state. The peak is also located between the
+    samples.
 
     `tangents`: d directions of the pair's parameters, stacked along a leading axis; d may be 0. If
-    given, every step is linearised, and the result has `slope`. The derivatives include the moving
-    instants of contact jumps. `adjoint`: makes the flow differentiable in reverse mode. If the
-    contact may jump, the steps themselves are differentiated instead of using `adjoint`.
+    given, every step is linearised, and the result has `slope`. The derivatives account for the
+    moving instants of contact jumps.
 
-    `grid`: ends of steps to repeat if `repeat` is true; otherwise steps are chosen adaptively.
+    `adjoint`: diffrax adjoint that makes the flow differentiable in reverse mode. If the contact
+    may jump, reverse mode differentiates the recorded steps instead of using `adjoint`.
+
+    `grid`: ends of steps (mesh periods) to repeat if `repeat` is true. Otherwise, or without a
+    `grid`, the steps are chosen adaptively.
     """
     count, dtype = state.shape[0], state.dtype
     measures = Measures() if measures is None else measures
@@ -417,9 +427,11 @@ def _peak_force(
 def _linearized(
     equation: _Equation, taken: _Recorded, peak: _Peak, dynamic: Any, moved: Any
 ) -> tuple[Float[Array, "m columns"], Float[Array, ""], Float[Array, " columns"]]:
-    """Return the derivatives of y at the end, the peak force (in `force_unit`) and its derivatives.
+    """Return the derivatives of y at the end, the peak force (in `force_unit`), and its
+    derivatives.
 
-    Columns are the n entries of the initial state, then the directions `moved` of the parameters.
+    The columns are the n entries of the initial state, then the directions `moved` of the
+    parameters.
     """
     count, size, sides = equation.states, taken.end.shape[0], peak.beside.shape[0]
 

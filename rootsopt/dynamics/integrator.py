@@ -25,17 +25,18 @@ IMPLICIT = ("kvaerno3", "kvaerno5")
 
 _STAGES = 1e5
 """Minimum tolerance (rounding errors) of Newton's method for the stages of an implicit step. The
-gap is a difference of lengths ten thousand times a penetration, and the force is a power of the
-gap. With a finer tolerance, the iterations would never end, and a repeated step cannot be made
-shorter. The result is better than this tolerance, because every iteration is a full Newton step."""
+gap is a difference between lengths that are ten thousand times a penetration, so rounding errors
+are large. With a finer tolerance, the iterations would not end, and a repeated step cannot be
+shortened. The actual error is smaller, because every iteration is a full Newton step."""
 _FIRST_STEP = 1e-3, 0.05
-"""Length of the first step: the smaller of an absolute limit (mesh periods) and a limit in units of
-`Timescales.swing`. The error control rejects a first step that is too long."""
+"""Limits of the first step: an absolute length (mesh periods), and a multiple of
+`Timescales.swing`. The smaller limit is the length of the first step. The error control rejects a
+first step that is too long."""
 _LONGEST = 1 / 32, 1 / 8, 4.0
-"""Longest step: the smaller of an absolute limit (mesh periods) and a limit in units of
-`Timescales.fall`. In free flight, the error control alone would let a step skip a short contact of
-the gear. The third number, divided by `max_steps`, is a lower bound (mesh periods) on the second
-limit: steps of this length use at most a quarter of `max_steps` per mesh period."""
+"""Limits of all steps: an absolute length (mesh periods), and a multiple of `Timescales.fall`. The
+smaller limit applies. In free flight, the error control alone would let a step skip a short contact
+of the gear. The third number, divided by `max_steps`, is the least value (mesh periods) of the
+second limit. Steps of this length use at most a quarter of `max_steps` per mesh period."""
 
 
 class Integrator(eqx.Module):
@@ -43,7 +44,8 @@ class Integrator(eqx.Module):
 
     `method`: a key of `METHODS` (explicit: tsit5, dopri5, dopri8; implicit: kvaerno3, kvaerno5);
     `rtol`: relative tolerance, also used as absolute tolerance, since states are scaled;
-    `max_steps`: maximum number of steps for one integration. The precision is that of the state.
+    `max_steps`: maximum number of steps in one integration. The precision is that of the initial
+    state.
     """
 
     method: str = eqx.field(static=True)
@@ -51,12 +53,12 @@ class Integrator(eqx.Module):
     max_steps: int = eqx.field(static=True)
 
     def tolerance(self, dtype: Any) -> Float[Array, ""]:
-        """Return `rtol` for states of type `dtype`, but at least 20 rounding errors of it."""
+        """Return `rtol` or, if greater, 20 rounding errors of `dtype`, the type of the states."""
         floor = 20 * float(jnp.finfo(dtype).eps)
         return jnp.maximum(self.rtol, floor).astype(dtype)
 
     def solver(self, dtype: Any, loops: str = "lax") -> diffrax.AbstractSolver:
-        """Return the method for states of type `dtype`.
+        """Return the diffrax solver for states of type `dtype`.
 
         `loops`: kind of loop over the stages of a step, "lax" (forward mode only) or "bounded"
         (forward and reverse mode)."""
@@ -78,8 +80,8 @@ class Integrator(eqx.Module):
         """Return the step size control for states of type `dtype`.
 
         `periods`: mesh periods per unit of the independent variable; `pair`: rotor pair whose
-        `timescales`, if known, limit the steps. The result is a `LandingControl` if they are known,
-        else a plain `diffrax.PIDController`."""
+        `timescales` limit the steps. The result is a `LandingControl` if the `timescales` are
+        known. Otherwise it is a plain `diffrax.PIDController`."""
         rtol = self.tolerance(dtype)
         longest = _LONGEST[0]
         if pair is not None and pair.timescales is not None:

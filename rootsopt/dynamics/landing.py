@@ -17,21 +17,23 @@ from jaxtyping import Array, Float
 from rootsopt.dynamics.pair import RotorPair
 
 _BEYOND = 1e-4
-"""Time (mesh periods) past an edge at which a step should end. A shorter contact may be missed."""
+"""Time (mesh periods) after reaching an edge at which a step should end. A contact shorter than
+this may be missed."""
 _LATE = 10.0
-"""Time past an edge, in units of `_BEYOND`, above which a step is repeated."""
+"""Time since passing an edge, in units of `_BEYOND`, above which a step is repeated with a shorter
+length."""
 _AFTER = 5.0
-"""Longest first step after an edge, in units of `_BEYOND`."""
+"""Maximum length of the first step after an edge, in units of `_BEYOND`."""
 _CLOSE = 0.05
-"""Distance (scaled ε) from an edge to the vertex of the parabola below which a step ends at the
-vertex."""
+"""Distance (scaled ε) between the vertex of the parabola and an edge below which the next step ends
+no later than at the vertex."""
 _INSIDE = 1 / 128
-"""Longest step (mesh periods) where ε alone does not determine whether flanks touch: beyond the
+"""Maximum step (mesh periods) where ε alone does not determine whether the flanks touch: beyond the
 clearance, or with displaced axes."""
 
 
 class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
-    """The step size control `base`, with steps that end where free flight may end.
+    """The step size control `base`, extended so that steps end where free flight may end.
 
     `edges`: scaled ε at which a flank or the gear may begin to touch; `inside`: scaled |ε| above
     which a flank may touch at any time; `unit`: mesh periods per unit of the independent variable.
@@ -46,7 +48,7 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
     def of(
         cls, base: diffrax.PIDController, pair: RotorPair, unit: Float[Array, ""] | float
     ) -> "LandingControl":
-        """Return the control for a `pair` whose `timescales` are known.
+        """Return the control based on `base` for a `pair` whose `timescales` are known.
 
         `unit`: mesh periods per unit of the independent variable."""
         assert pair.timescales is not None
@@ -100,14 +102,16 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         return keep, start, start + following, jump, new, result
 
     def _passed(self, before, after, step):
-        """Return whether a step has passed an edge, and the time (mesh periods) since then."""
+        """Return whether a step has passed an edge, and how long ago (mesh periods; 0 if it has
+        not)."""
         passed = (before[0] - self.edges) * (after[0] - self.edges) < 0
         rate = jnp.maximum(jnp.abs(after[1]), jnp.abs(after[0] - before[0]) / step)
         ago = jnp.abs(after[0] - self.edges) / rate
         return jnp.any(passed), jnp.max(jnp.where(passed, ago, 0.0))
 
     def _ahead(self, before, after, step):
-        """Return the longest step (mesh periods) from `after` that ends at the next edge."""
+        """Return the maximum length (mesh periods) of the step after `after`, so that it ends at an
+        edge."""
         place, rate = after
         bend = (rate - before[1]) / step
         away = place - self.edges

@@ -9,9 +9,10 @@ from jax import lax
 from jaxtyping import Array, Complex, Float
 
 _SQUARINGS = 40
-"""Number of squarings after which a matrix's growth rate no longer depends on the norm used."""
+"""Number of squarings of a matrix from which its growth rate is computed. After so many, the result
+no longer depends on the norm used."""
 _SWEEPS = 40
-"""Maximum number of QR iterations per eigenvalue."""
+"""Maximum number of QR iterations, per eigenvalue on average."""
 
 
 def solved(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:

@@ -1,7 +1,7 @@
 """Averages of the contact force over a motion, integrated along with the motion.
 
-Mean and mean square are always computed. On request, so are the Fourier coefficients of spectral
-lines, and the average power of the force that gives its p-norm.
+Mean and mean square are always computed. Two kinds of average are computed on request: the Fourier
+coefficients of spectral lines, and the average of a power of the force, which gives its p-norm.
 """
 
 from typing import Any
@@ -17,10 +17,10 @@ def _no_orders() -> Float[np.ndarray, "0"]:
 
 
 class Measures(eqx.Module):
-    """The averages to compute in addition to mean and mean square.
+    """The averages of the force to compute in addition to mean and mean square.
 
     `orders` (lines,): spectral lines, in multiples of the mesh frequency. A motion of k mesh
-    periods contains a line if k times its order is a whole number. `norm`: p of the p-norm
+    periods contains a line if k times its order is a whole number. `norm`: exponent p of the p-norm
     (mean of F^p)^(1/p) ≤ max F, a smooth substitute for the peak; None: no p-norm.
     """
 
@@ -56,9 +56,10 @@ class Measures(eqx.Module):
     ) -> tuple[Float[Array, " q"], Float[Array, " q"]]:
         """Return the measures from the averages of `rates`, and factors for their derivatives.
 
-        The measures are mean (N), mean square (N²), cosine and sine coefficients (N) and p-norm
-        (N). Derivatives of the averages times these factors are derivatives of the measures.
-        `unit` (N) and `top`: unit of the force in `rates`, and its greatest value there."""
+        The measures are the mean (N), the mean square (N²), the means of force times cosine and
+        force times sine (N), and the p-norm (N). Derivatives of the averages times these factors
+        are derivatives of the measures. `unit` (N): unit of the force in `rates`; `top`: as in
+        `rates`."""
         factors = jnp.full_like(averages, unit).at[1].set(unit**2)
         values = factors * averages
         if self.norm is not None:
@@ -71,11 +72,11 @@ class Measures(eqx.Module):
     def amplitudes(
         self, others: Any, slopes: Any, period: Any
     ) -> tuple[Float[Array, " lines"], list[Float[Array, " d"]]]:
-        """Return the amplitudes (N) of the lines of a closed orbit, and their derivatives.
+        """Return the amplitudes (N) of the spectral lines of a closed orbit, and their derivatives.
 
         `others` and `slopes`: values and derivatives of the measures that follow mean, mean square
-        and peak; `period`: mesh periods of the orbit. The amplitude is 0 for an order that is not a
-        line of the motion."""
+        and peak; `period`: mesh periods of the orbit. The amplitude is 0 if the motion does not
+        contain the line."""
         sizes, rows = [], []
         for k, order in enumerate(self.orders):
             cos, sin = others[k], others[k + self.orders.shape[0]]
@@ -91,8 +92,8 @@ class Measures(eqx.Module):
 
         `response` (r, 1 + d): rows mean, mean square, peak, then the other `values`. The first
         column holds the value, the other d columns its derivatives. `period` of the orbit (mesh
-        periods). Each name maps to a pair: the value (N) and its derivatives (d,). The amplitude is
-        0 for an order that is not a line of the motion.
+        periods). Each name maps to a pair: the value (N) and its derivatives (d,). The amplitude of
+        a line is 0 if the motion does not contain the line.
         """
         rows = np.asarray(response, np.float64)
         mean, square, peak, *others = rows

@@ -28,45 +28,48 @@ from rootsopt.dynamics.switches import halved, has_room, with_switches
 from rootsopt.dynamics.window import Window
 
 SAMPLES = 2520
-"""Uniform samples of an orbit. All periods up to ten divide it, so that a sample falls on the end
-of each mesh period."""
+"""Number of uniform samples of an orbit. It is a multiple of all periods up to ten, so that a
+sample falls on the end of each mesh period."""
 _NEWTON_STEPS = 24
-"""Default limit of integrations per orbit."""
+"""Default maximum number of integrations to close one orbit."""
 _CLOSED = 4000, 1e-3, 1e-10
-"""Limits (rounding errors, tolerances, scaled) that give the residual at which Newton's method
-stops. It is the second limit, but at most the third and at least the first (1e-12 in float64)."""
+"""Residual at which Newton's method stops: its lower limit (rounding errors; about 1e-12 in
+float64), its value (tolerances), and its upper limit (scaled)."""
 _KEPT = 4
-"""Number of integrations after which the solver steps are kept, however large the Newton step."""
+"""Number of integrations after which the solver steps are kept, however large the Newton step. If a
+third of `Shots.count` is less, that number is used instead."""
 _LOOKS = 6
-"""Maximum number of searches for kinks while an orbit is closed."""
+"""Maximum number of searches for kinks in the course of closing one orbit."""
 _DRIFT = 30.0, 1e-9, 1e-6
-"""Change (tolerances) of the orbit's start since the last search for kinks above which the search
-is repeated, with lower and upper limit (scaled). Kinks may lie this far outside their steps, which
-causes an error of first order."""
+"""Change of the orbit's start since the last search for kinks above which the search is repeated:
+its value (tolerances), and the lower and upper limits of this value (scaled). With a smaller
+change, kinks may lie slightly outside their short steps, which causes a first-order error."""
 _STRAIN = 10.0
-"""Error of a repeated step, in tolerances, above which the solver steps are chosen anew."""
+"""Estimated error of a repeated step (tolerances) above which the solver steps are chosen anew."""
 _AFTER = 3
 """Number of remaining integrations below which an orbit that is already closed keeps its steps. A
-new search for kinks, or a new choice of steps, would then risk losing the orbit."""
+new search for kinks, or a new choice of steps, could then leave the orbit open."""
 _AGREE = 10.0, 1e-3, 3e-2
-"""Relative difference (square roots of the tolerance) between derivatives on a grid and on halved
-steps above which the derivatives are not reported, with lower and upper limit."""
+"""Relative difference between the derivatives on a grid and on halved steps above which the
+derivatives are not reported: its value (square roots of the tolerance), and the lower and upper
+limits of this value."""
 _SMALL = 1e-9, 1e-3
-"""Lower and upper limit (scaled) of the Newton step below which the solver steps are kept. Between
-these limits, the threshold is a thousand tolerances."""
+"""Limits (scaled) of the Newton step below which the solver steps are kept. This threshold is a
+thousand tolerances, but at least the first number and at most the second."""
 
 
 class Orbit(NamedTuple):
-    """A closed orbit of k mesh periods with first derivatives.
+    """A closed orbit of k mesh periods, with its first derivatives.
 
-    `state`: scaled state at φ1 = 0; `flow` over the orbit; `residual`: |Φ(z) - z|, scaled;
-    `monodromy`: dΦ/dz; `multiplier`: greatest modulus of the Floquet multipliers, its eigenvalues;
-    `response`: mean (N), mean square (N²), peak (N) and the other measures; `sensitivity` (r, d):
-    derivatives of `response` with respect to the design, along the family of orbits; `moved`
-    (n, d): derivatives of `state`; `newton_steps`: integrations for Newton's method; `drift`:
-    change of `state` since the last search for kinks (scaled); `defect`: residual (scaled) on a
-    grid with halved steps; `disagreement`: relative difference of the derivatives on both grids.
-    `defect` and `disagreement` are 0 if there was no check.
+    `state`: scaled state z at φ1 = 0; `flow` over the orbit; `residual`: |Φ(z) - z|, scaled;
+    `monodromy`: dΦ/dz, whose eigenvalues are the Floquet multipliers; `multiplier`: greatest
+    modulus of the Floquet multipliers; `response`: mean (N), mean square (N²), peak (N) and the
+    further measures; `sensitivity` (r, d): derivatives of `response` with respect to the design,
+    along the family of orbits; `moved` (n, d): likewise, derivatives of `state`; `newton_steps`:
+    number of integrations for Newton's method; `drift`: change of `state` since the last search for
+    kinks (scaled); `defect`: residual (scaled) on a grid with halved steps; `disagreement`:
+    relative difference between the derivatives on both grids. `defect` and `disagreement` are 0 if
+    there was no check.
     """
 
     state: Float[Array, " n"]
@@ -108,13 +111,14 @@ class Orbit(NamedTuple):
 class _Closing(NamedTuple):
     """State of the loop that closes an orbit or integrates a window.
 
-    `orbit`, `window`: results so far; `state` and `grid` of the next integration; `repeat`: whether
-    the next integration repeats the steps of `grid`; `held`: whether the last integration repeated
-    its steps; `improving`: whether the last integration at least halved the residual, or the grid
-    is new; `base`: the grid without the step ends added for kinks; `best`: least residual on this
-    grid; `looks`: number of searches for kinks so far; `looked`: initial state at the last search;
-    `refined`: how often the steps were halved because derivatives disagreed; `checked`: whether
-    the derivatives were compared.
+    `orbit`, `window`: results so far; `state`, `grid`: initial state and step ends for the next
+    integration; `repeat`: whether the next integration repeats the steps of `grid`; `held`: whether
+    the last integration repeated steps that remain in use; `improving`: whether the last
+    integration at least halved the residual, or the grid is new; `base`: the grid without the step
+    ends added for kinks; `best`: least residual on this grid; `looks`: number of searches for kinks
+    so far; `looked`: initial state at the last search; `refined`: number of times that the steps
+    were halved because derivatives disagreed; `checked`: whether the derivatives have been compared
+    with those on halved steps.
     """
 
     orbit: Orbit
@@ -133,9 +137,10 @@ class _Closing(NamedTuple):
 
 
 class _Closer(eqx.Module):
-    """The loop of `orbit_or_window`, as methods of its arguments.
+    """The loop of `orbit_or_window`. Its fields follow from the arguments of that function.
 
-    `start` gives the loop's first state, `go_on` its condition, `step` its body."""
+    `start` returns the initial state of the loop, `go_on` its condition, `step` the result of its
+    body."""
 
     pair: RotorPair
     tangents: RotorPair
@@ -151,7 +156,8 @@ class _Closer(eqx.Module):
     periods: int = eqx.field(static=True)
 
     def start(self, state: Float[Array, " n"]) -> _Closing:
-        """Return the loop's state before the first integration, from the scaled `state`."""
+        """Return the initial state of the loop, for a motion that begins at the scaled `state`
+        (n,)."""
         count, dtype = state.shape[0], state.dtype
         directions = jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
         steps = self.integrator.max_steps
@@ -191,8 +197,8 @@ class _Closer(eqx.Module):
     def step(self, now: _Closing) -> _Closing:
         """Integrate once and return the new state of the loop.
 
-        The integration is a Newton shot, the check of the orbit on halved steps, or the next mesh
-        period of the window."""
+        The integration serves a Newton step, the check of the orbit on halved steps, or the next
+        mesh period of the window."""
         checking = ~self.is_open(now) & ~self.windowed
         start = jnp.where(checking, now.orbit.state, now.state)
         start = jnp.where(self.windowed, now.window.end, start)
@@ -221,10 +227,10 @@ class _Closer(eqx.Module):
         )
 
     def _newton(self, now: _Closing, start, checking, out: Flow) -> _Closing:
-        """Return the loop's state after the flow `out` from `start`.
+        """Return the loop's state after the flow `out` from the scaled state `start`.
 
-        This takes the Newton step, or evaluates the check of the orbit if `checking`. It also
-        chooses the grid of the next integration."""
+        If `checking`, compare the orbit with `out`, which has halved steps. Otherwise, take the
+        Newton step. In both cases, choose the grid of the next integration."""
         count, dtype = start.shape[0], start.dtype
         monodromy = out.slope[:count, :count]
         miss = out.end - start
@@ -294,7 +300,9 @@ class _Closer(eqx.Module):
         return following, look, strayed | strained
 
     def _steps(self, now: _Closing, out: Flow, renewed, finer):
-        """Return the grid without step ends for kinks, and the grid of the next integration."""
+        """Return the grid without step ends for kinks, and the grid of the next integration.
+
+        `renewed`: whether to search for kinks along `out`; `finer`: whether to halve the steps."""
         base = jnp.where(now.repeat, now.base, out.grid)
         base = lax.cond(finer, lambda: halved(base), lambda: base)
         length = self.period.astype(out.end.dtype)
@@ -312,9 +320,9 @@ class Shots(eqx.Module):
 
     `integrator` of the motion; `measures`: averages of the force; `count`: maximum number of
     integrations; `closed`: residual (scaled) at which Newton's method may stop; `samples`: number
-    of uniform samples of an orbit, a multiple of its period; `check`: whether to compare orbit and
-    derivatives with those on a grid with halved steps. If the derivatives disagree, the orbit is
-    closed once more, on the finer grid.
+    of uniform samples of an orbit, a multiple of its period; `check`: whether to compare the orbit
+    and its derivatives with those on a grid with halved steps, if the pair is `smooth`. If the
+    derivatives disagree, the orbit is closed once more, on the finer grid.
     """
 
     integrator: Integrator
@@ -334,7 +342,8 @@ def close_orbit(
 ) -> Orbit:
     """Close the orbit of `period` mesh periods near the scaled `state` (n,), and differentiate it.
 
-    `tangents`: d pair / d design, stacked along a leading axis. See `orbit_or_window`.
+    `tangents`: d pair / d design, stacked along a leading axis; `shots`: settings. See
+    `orbit_or_window`.
     """
     return orbit_or_window(pair, tangents, state, period, shots)[0]
 
@@ -355,10 +364,11 @@ def orbit_or_window(
     `period` mesh periods. Newton shooting finds it, and the implicit function theorem gives its
     derivatives. `tangents` holds d pair / d design, stacked along a leading axis.
 
-    Newton's method stops after `shots.count` integrations (half as many more if the steps were
-    halved), or at the residual `shots.closed`, limited below by `_CLOSED`. Once the Newton step is
-    small, the solver steps are kept, with step ends added at kinks. Φ is then smooth and closes to
-    rounding, and its derivative is as accurate as the motion.
+    Newton's method stops if the residual is at most `shots.closed` or, if greater, the limit from
+    `_CLOSED`. It also stops if the residual no longer halves, or after `shots.count` integrations
+    (half as many more if the steps were halved). Once the Newton step is small, the solver steps
+    are kept, with step ends added at kinks. Φ is then smooth and closes to rounding, and its
+    derivative is as accurate as the motion.
     """
     count, dtype = state.shape[0], state.dtype
     tolerance = shots.integrator.tolerance(dtype)
@@ -397,7 +407,7 @@ def orbit_or_window(
 
 
 def choose(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
-    """Return `new` where the `condition` holds, else `old`, for each leaf of a tree."""
+    """Return the tree `new` if the `condition` holds, else the tree `old`."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
 
 
@@ -412,12 +422,12 @@ def agreement(tolerance: Float[Array, ""]) -> Float[Array, ""]:
 def disagreement(
     first: Float[Array, "rows columns"], second: Float[Array, "rows columns"], count: int
 ) -> Float[Array, ""]:
-    """Return the largest relative difference of two estimates of an orbit's derivatives.
+    """Return the largest relative difference between two estimates of an orbit's derivatives.
 
-    The estimates are compared in (I - M)⁻¹, where M is the monodromy matrix, and in derivatives
-    with respect to the design: of state, mean force and mean square force. Differences are relative
-    to the greatest entry of the same quantity in `first`. `first` and `second`: `Flow.slope` on two
-    grids; `count`: number of states.
+    `first` and `second`: `Flow.slope` on two grids; `count`: number of states. Two kinds of
+    derivative are compared: (I - M)⁻¹, where M is the monodromy matrix; and the derivatives of
+    state, mean force and mean square force with respect to the design. Differences are relative to
+    the greatest entry of the same quantity in `first`.
     """
 
     def derivatives(slope):
@@ -446,15 +456,15 @@ def reverse_sensitivity(
     measures: Measures | None = None,
     top: Float[Array, ""] | None = None,
 ) -> Float[Array, "r d"]:
-    """Return `Orbit.sensitivity` (r, d) computed by reverse mode.
+    """Return `Orbit.sensitivity` (r, d), computed in reverse mode.
 
-    `build`: function from the `design` (d,) to a pair; `state` (n,), `period` and `grid`: scaled
-    start, mesh periods and steps of the closed orbit; `measures`: averages of the force; `top`:
-    peak force of the orbit (N).
+    `build`: function that returns the pair of a `design` (d,); `state` (n,), `period` and `grid`:
+    scaled start, mesh periods and steps of the closed orbit; `measures`: averages of the force;
+    `top`: peak force of the orbit (N).
 
-    The derivatives use diffrax's checkpointed adjoint or, where the contact may jump, the steps
-    themselves. Let R be the response, Φ the flow, M = dΦ/dz, v the cotangent of R and w the
-    cotangent of the end state. By the implicit function theorem, (I - M)ᵀ w = R_zᵀ v, and
+    The derivatives use diffrax's checkpointed adjoint. If the contact may jump, the recorded steps
+    are differentiated instead. Let R be the response, Φ the flow, M = dΦ/dz, v the cotangent of R
+    and w the cotangent of the end state. By the implicit function theorem, (I - M)ᵀ w = R_zᵀ v, and
     dR/dp = R_pᵀ v + Φ_pᵀ w.
     """
     count = state.shape[0]

@@ -1,11 +1,11 @@
 """The rotor pair as an ordinary differential equation.
 
-The smallest scene has two states: ε = φ2 - φ1 and its rate. A part that sets rotor 1 free adds the
+The simplest scene has two states: ε = φ2 - φ1 and its rate. A part that sets rotor 1 free adds the
 speed of rotor 1 as a third state. Every part appends its own states, in the order of the parts.
 
 The independent variable τ is the rotation of rotor 1 in mesh periods (lobe pitches), so the
-equation is periodic even if the speed varies. ε is measured in `angle_scale`, so that the solver
-works with numbers of order one.
+equation is periodic even if the speed varies. ε is measured in units of `angle_scale`, so that the
+solver works with numbers of order one.
 """
 
 from collections.abc import Iterable
@@ -47,7 +47,7 @@ class FlankForce(NamedTuple):
     gap); `closing`: rate of `depth` (m/s); `lever1`, `lever2`: levers (m) of the deeper flank;
     `torque1`, `torque2`: contact torques (N·m) on the rotors, each positive in its rotor's sense of
     rotation; `push`: contact force (N) on rotor 2 in x and y, None if no part lets the axes move.
-    The force on rotor 1 is opposite.
+    The force on rotor 1 is equal and opposite.
     """
 
     drive: Float[Array, "*n"]
@@ -62,7 +62,7 @@ class FlankForce(NamedTuple):
 
     @property
     def total(self) -> Float[Array, "*n"]:
-        """Sum of the normal force magnitudes (N)."""
+        """Sum of the magnitudes of the normal forces (N)."""
         return self.drive + self.coast
 
 
@@ -96,12 +96,13 @@ class _Touch(NamedTuple):
 class RotorPair(eqx.Module):
     """Two identical rotors in mesh, rotor 1 driven, rotor 2 loaded.
 
-    `contact`: gap and levers at a pose; `law`: contact force; `clearance` (m) added to
-    every flank gap; `inertia` of one rotor (kg·m²); `drive`, `load`, `gear`, `friction`,
-    `supports`: parts that the scene names; `angle_scale` (rad) and `force_scale` (N): units the
-    solver works in; `timescales` of oscillation and free flight, None if unknown; `two_sided`:
-    whether drive and coast flanks can touch at once. They cannot at the nominal centre distance
-    without negative clearance. `parts`: all other parts. An absent part is None and costs nothing.
+    `lobes`: number per rotor; `contact`: gap and levers at a pose; `law`: contact force law;
+    `clearance` (m) added to every flank gap; `inertia` of one rotor (kg·m²); `drive`, `load`,
+    `gear`, `friction`, `supports`: parts that the scene names; `angle_scale` (rad) and
+    `force_scale` (N): the solver's units; `timescales` of oscillation and free flight, None if
+    unknown; `two_sided`: whether drive and coast flanks can touch at once (at the nominal centre
+    distance, only with negative clearance); `parts`: all other parts. An absent part is None and
+    costs nothing.
 
     Raises InputError if two parts let the axes move; if one part does but `two_sided` is False; if
     the pair is two-sided but the contact is not (see `Contact.two_sided`).
@@ -189,7 +190,7 @@ class RotorPair(eqx.Module):
         return self.contact.jumps
 
     def rounding(self, depth: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the relative error of the force at a `depth` (m) that rounding of the gap causes.
+        """Return the relative error of the force, due to rounding of the gap, at a `depth` (m).
 
         It is 0 if the contact has no `length_scale`."""
         length = self.contact.length_scale
@@ -200,21 +201,22 @@ class RotorPair(eqx.Module):
     def at_start(self, first: Float[np.ndarray, "*k 2"]) -> Float[np.ndarray, "*k n"]:
         """Return scaled states (…, n) for the start of a motion, from ε and dε/dt.
 
-        `first` (…, 2): ε and dε/dt, scaled. All other states get their starting value (scaled: 0).
+        `first` (…, 2): ε and dε/dt, scaled. All other states have their starting values, which are
+        0 in scaled form.
         """
         return np.pad(first, [(0, 0)] * (first.ndim - 1) + [(0, self.states - 2)])
 
     def speed(self, state: Float[Array, "*k n"]) -> Float[Array, "*#k"]:
-        """Return the angular speed of rotor 1 (rad/s) in a scaled state."""
+        """Return the angular speed of rotor 1 (rad/s) in a scaled `state`."""
         if not self.free:
             return self.drive.speed
         return self.drive.speed + self.angle_scale / self.mesh_period * state[..., 2]
 
     def lapse(self, state: Float[Array, "*k n"]) -> Float[Array, "*#k"]:
-        """Return the time that a mesh period of rotation takes at a scaled state, relative to
-        `mesh_period`.
+        """Return the duration of a mesh period at the present speed, relative to `mesh_period`.
 
-        The speed of rotor 1 is limited below to half of `STALLED`, so that the time stays finite.
+        The speed follows from the scaled `state`. It is taken as at least half of `STALLED` times
+        the drive's speed, so that the duration stays finite.
         """
         creep = STALLED / 2 * self.drive.speed
         return self.drive.speed / jnp.maximum(self.speed(state), creep)
@@ -224,7 +226,8 @@ class RotorPair(eqx.Module):
         return Units(self.angle_scale, self.mesh_period)
 
     def own_states(self, state: Float[Array, "*k n"]) -> list[Float[Array | np.ndarray, "*k _"]]:
-        """Return the own states (SI units) of each of `all_parts` in a scaled state."""
+        """Return a list of the parts' own states (SI units), in the order of `all_parts`, from the
+        scaled `state` of the pair."""
         found, place = [], 2 + self.free
         for part in self.all_parts:
             count = len(part.states)
@@ -257,13 +260,13 @@ class RotorPair(eqx.Module):
         return motion, acting
 
     def in_si(self, state: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return a scaled state in the units of `state_names`."""
+        """Convert a scaled `state` (n,) to the units of `state_names`."""
         angle, period = self.angle_scale, self.mesh_period
         first = [angle * state[:1], angle / period * state[1 : 2 + self.free]]
         return jnp.concatenate([*first, *self.own_states(state)])
 
     def scaled(self, state: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return the scaled form of a state given in the units of `state_names`."""
+        """Convert a `state` (n,) in the units of `state_names` to scaled form."""
         nothing = jnp.zeros(self.states, self.angle_scale.dtype)
         start = self.in_si(nothing)
         return ((state - start) / (self.in_si(nothing + 1) - start)).astype(start.dtype)
@@ -293,7 +296,7 @@ class RotorPair(eqx.Module):
         return self._force(self.motion(tau, state))
 
     def _force(self, motion: Motion) -> FlankForce:
-        """Return the contact of the flanks at a motion.
+        """Return the contact of the flanks at the position and velocity `motion`.
 
         A pair that is not two-sided has the nominal centre distance and no negative clearance. Then
         only the drive flank can touch when ε < 0, and only the coast flank when ε > 0. One search
@@ -320,9 +323,9 @@ class RotorPair(eqx.Module):
         )
 
     def _flank_force(self, side: Float[Array, ""], motion: Motion) -> FlankForce:
-        """Return the contact on one side (1 drive, -1 coast).
+        """Return the contact on one side (1 drive, -1 coast) at the position and velocity `motion`.
 
-        The normal force of either side is in the field `drive`; `coast` is zero."""
+        The field `drive` holds the normal force on either side; `coast` is zero."""
         touch = self._touch(side, motion)
         force = self.law(touch.depth, touch.closing)
         _, lever1, lever2, _ = touch.approach
@@ -352,12 +355,13 @@ class RotorPair(eqx.Module):
         )
 
     def _touch(self, side: Float[Array, ""], motion: Motion) -> _Touch:
-        """Return the geometry of the flanks of one side (1 drive, -1 coast) at a motion.
+        """Return the geometry of the flanks of one side (1 drive, -1 coast) at a `motion`.
 
-        Let n be the drive side's normal from rotor 1 to rotor 2, and t the tangent, n turned by
+        Let n be the drive side's normal from rotor 1 to rotor 2, and t the tangent: n turned by
         +90°. Rotor 1 slides along rotor 2 at the speed ω1 h1 - ω2 h2 + (v1 - v2)·t. The coast side
         is the mirror image. Let θ be the angle of the displaced line of centres. A pair with
-        displaced axes equals a pair at another centre distance with the angles φ1 - θ and φ2 + θ.
+        displaced axes is equivalent to a pair at another centre distance with the angles φ1 - θ and
+        φ2 + θ.
         """
         contact, line, relative = self.contact, None, motion.relative
         if motion.shift is not None:
@@ -465,14 +469,14 @@ class RotorPair(eqx.Module):
         return Loads(torque1, torque2, axes)
 
     def lost(self, state: Float[Array, " n"]) -> Bool[Array, ""]:
-        """Return whether a pair in this scaled state no longer runs as a pair.
+        """Return whether the rotors no longer run as a pair in the scaled `state`.
 
-        Either the lobes have passed through each other, the motor has stalled, or a part reports a
-        loss, such as an axis displaced too far."""
+        This is so if the lobes have passed through each other, if the motor has stalled, or if a
+        part reports a loss, such as an axis displaced too far."""
         return self._lost(state, zip(self.all_parts, self.own_states(state), strict=True))
 
     def _lost(self, state, acting) -> Bool[Array, ""]:
-        """Return `lost` for a scaled state; `acting`: (part, its own states in SI units)."""
+        """Return `lost` for a scaled `state`; `acting`: pairs (part, its own states in SI)."""
         lost = ~(jnp.abs(self.angle_scale * state[0]) < self.angle_limit)
         for part, own in acting:
             gone = part.lost(own)

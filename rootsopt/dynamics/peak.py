@@ -1,4 +1,4 @@
-"""The greatest contact force of a motion: its instant, and its derivatives."""
+"""The greatest contact force of a motion: when it occurs, and its derivatives."""
 
 from typing import NamedTuple
 
@@ -10,30 +10,32 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.pair import RotorPair
 
 _RIVALS, _CLOSER, _ROUNDS = 4, 16, 10
-"""Settings for refining the peak: number of maxima refined (among samples, and again among ends of
-steps), number of times tried around each maximum, and number of rounds."""
+"""Settings for refining the peak: number of maxima refined (this many among the samples, and as
+many among the ends of steps), number of times evaluated around each maximum in a round, and number
+of rounds."""
 _INNER = 2 * _RIVALS * _CLOSER - 2
-"""Number of samples or ends of steps that one turn of the loop scans. A turn also evaluates one
-neighbour on either side."""
+"""Number of samples or ends of steps scanned in one iteration of the search. The iteration also
+evaluates one neighbour at either end."""
 _WIDE = 64
 """Distance of the outermost times in `BESIDE` from the peak, in units of `BESIDE_UNIT`."""
 BESIDE = (0.0, -1.0, -2.0, 1.0, 2.0, -_WIDE, _WIDE)
-"""Times at and around a located peak at which the force is evaluated, in units of `BESIDE_UNIT`."""
+"""Times relative to a located peak at which the force is evaluated, in units of `BESIDE_UNIT`."""
 BESIDE_UNIT = {8: 2e-8, 4: 1e-3}
 """Unit of `BESIDE` (mesh periods), by bytes per number."""
 _FARTHEST = {8: 32.0, 4: 1 / 16}
-"""Distance (units of `_WIDE`) from the located peak to the vertex of the parabola above which the
-vertex is rejected, by bytes per number. Peaks are located only to about 1e-5 mesh periods where the
-states bend between samples."""
+"""Distance (units of `_WIDE`) from the located peak to the vertex of the parabola through the
+forces above which the vertex is rejected, by bytes per number. Where the states bend between
+samples, peaks are located only to about 1e-5 mesh periods."""
 _ROUNDINGS = 1e5
 """Second difference of the force over `_WIDE` (rounding errors of the force) above which it counts
-as curvature, not rounding."""
+as curvature, not as rounding."""
 _NOISES = 10.0
 """Second difference of the force over `_WIDE` (multiples of the force's noise) above which it
-counts as curvature. Forces beside a smooth peak may also scatter by this much."""
+counts as curvature, not as noise. The forces next to a smooth peak may also scatter by this much.
+"""
 _LEAST = 1e-9
-"""Relative fall of the force on both sides of a peak below which the peak is not a corner: the fall
-may be rounding."""
+"""Fall of the force, summed over both sides of a peak and relative to the peak, below which the
+peak does not count as a corner: the fall may be rounding."""
 
 
 def motion(
@@ -42,10 +44,12 @@ def motion(
     place: Float[Array, ""],
     width: Float[Array, ""],
 ) -> Float[Array, " n"]:
-    """Return the scaled state between uniform samples a `width` (mesh periods) apart.
+    """Interpolate the scaled state between uniform samples.
 
-    `place`: position, counted in samples. ε is a quintic through the three nearest samples and
-    their rates, dε/dt its derivative. Other states are a quartic through the five nearest samples.
+    `states` (samples, n): scaled samples; `place`: position at which to interpolate, counted in
+    samples; `width`: spacing of the samples (mesh periods). ε is a quintic through the three
+    nearest samples and their rates; dε/dt is the derivative of the quintic. The other states are
+    quartics through the five nearest samples.
     """
     middle = jnp.clip(jnp.round(place).astype(int), 2, states.shape[0] - 3)
     near = lax.dynamic_slice_in_dim(states, middle - 2, 5)
@@ -78,7 +82,7 @@ def _state(
     slope: Float[Array, ""],
     others: Float[Array, " m"],
 ) -> Float[Array, " n"]:
-    """Return the scaled state with ε = `swing`, dε/dτ = `slope` and the `others`."""
+    """Return the scaled state with ε = `swing`, dε/dτ = `slope` and the other states `others`."""
     state = jnp.concatenate([jnp.stack([swing, slope]), others])
     return state.at[1].divide(pair.lapse(state)) if pair.free else state
 
@@ -100,7 +104,7 @@ class Steps(NamedTuple):
         """Return the scaled state at time `tau` (mesh periods), interpolated within its step.
 
         ε and dε/dτ come from the cubic through their values at both ends of the step. The other
-        states are linear."""
+        states are interpolated linearly."""
         k, step, x = self._place(tau)
         before, after = self.before[k], self.after[k]
         rate, last = step * _slope(pair, jnp.stack([before, after]))
@@ -113,8 +117,8 @@ class Steps(NamedTuple):
     def reaches(self, tau: Float[Array, ""], width: Float[Array, ""]) -> Bool[Array, ""]:
         """Return whether `motion` at `tau` (mesh periods) is as accurate as interpolated samples.
 
-        That is so if `tau` is close enough to an end of its step; `width` (mesh periods): distance
-        of the samples."""
+        That is so if `tau` is close enough to an end of its step; `width`: spacing of the samples
+        (mesh periods)."""
         _, step, x = self._place(tau)
         return x * (1 - x) * step**2 < width**2
 
@@ -133,11 +137,11 @@ def blended(
     tau: Float[Array, ""],
     width: Float[Array, ""],
 ) -> Float[Array, " n"]:
-    """Return the scaled state at `tau` (mesh periods) from samples and solver steps.
+    """Return the scaled state at `tau` (mesh periods), from samples or from solver steps.
 
-    `states`: samples a `width` (mesh periods) apart. A polynomial through samples on both sides of
-    a corner would smooth the corner away. Solver steps are short there, so the cubic of a step is
-    used wherever it is as accurate as the samples."""
+    `states`: samples with the spacing `width` (mesh periods). A polynomial through samples on both
+    sides of a corner would smooth the corner away. Solver steps are short there. Therefore the
+    cubic within a step is used wherever it is as accurate as the samples."""
     sampled = motion(pair, states, tau / width, width)
     return jnp.where(steps.reaches(tau, width), steps.motion(pair, tau), sampled)
 
@@ -145,16 +149,16 @@ def blended(
 def locate_peak(
     pair: RotorPair, states: Float[Array, "samples n"], length: Float[Array, ""], steps: Steps
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the time (mesh periods) of the greatest force, and the greatest penetration (m) seen.
+    """Return the time (mesh periods) of the greatest force, and the greatest penetration (m) found.
 
     `states`: samples at uniform times over `length` mesh periods; `steps`: solver steps.
 
     An impact's peak can be narrower than the sampling, and has a corner where the damping
-    saturates. The greatest sample need not be next to the greatest peak, so several maxima of the
-    samples are refined, by ever closer scans around each. An impact can also fall between two
-    samples, so the maxima at the ends of steps are refined as well. The state inside a long step is
-    less accurate. Such times count only if steps are about as dense as samples, or if the motion
-    can oscillate between samples.
+    saturates. The greatest sample need not be next to the greatest peak. Therefore several maxima
+    of the samples are refined, by ever closer scans around each. An impact can also fall between
+    two samples, so the maxima at the ends of steps are refined as well. The state inside a long
+    step is less accurate. Forces there count only if steps are about as dense as samples, or if the
+    motion can oscillate between samples.
     """
     last = jnp.stack([jnp.asarray(states.shape[0]), steps.count]) - 1  # of samples, of steps
     width = length / states.shape[0]
@@ -218,14 +222,14 @@ def one_sided(
     the derivatives of `forces`.
 
     `forces`: contact force at the times `BESIDE` around the located peak, in any unit; `noise`:
-    relative error of `forces` beyond rounding. There are three cases:
+    relative error of `forces` in addition to rounding. There are three cases:
 
     Smooth peak: the derivative of the peak is the derivative of the force at a fixed instant
     (envelope theorem). This instant is the vertex of the parabola through the forces, because
     rounding hides the exact maximum.
 
     Corner: the peak moves with the corner. Its derivative is a weighted mean of the derivatives on
-    both sides. With the same weights, the derivative of the force with respect to time is zero.
+    both sides. The weights are such that the same mean of the time derivatives is zero.
 
     Jump (such as with the `linear` contact): rounding decides on which side of the jump the located
     instant lies. The side with the greater force is used.

@@ -8,7 +8,7 @@ P. C. Müller, Chaos, Solitons & Fractals 5 (1995) 1671-1681):
     dy = (f₋ - f₊) dt*,        dt* = -d(δ₋ - δ₊) / (dδ₋/dτ - dδ₊/dτ).
 
 f is the right-hand side of the equation of motion and δ the penetration, before (₋) and after (₊)
-the jump. Integrals over the motion are entries of y like the states.
+the jump. Besides the states, y also contains the integrals over the motion.
 """
 
 import jax.numpy as jnp
@@ -18,22 +18,23 @@ from jaxtyping import Array, Float
 from rootsopt.dynamics.pair import FlankForce
 
 LONGEST = 4e-6
-"""Length of a step (mesh periods) above which the step is not checked for a jump. All steps made
-around a switch are shorter."""
+"""Length of a step (mesh periods) above which the step is not checked for a jump. The short steps
+around changes (`rootsopt.dynamics.switches`) are all shorter."""
 _FASTER = 20.0
-"""Rate of change of a lever (pitch radii per mesh period) above which the lever jumps. Along a
-flank of the EE family the rate is at most 2π, for any number of lobes."""
+"""Rate of change of a lever (pitch radii per mesh period) above which the change counts as a jump.
+Along a flank of the EE family the rate is at most 2π, for any number of lobes."""
 _ROUNDINGS = 300
-"""Lever changes below this many rounding errors are not jumps."""
+"""Change of a lever (rounding errors) below which the change does not count as a jump."""
 _ALIKE = 0.05
-"""Distance (fraction of the jump) of any stage's levers from both end values of a step, above which
-the change is not a jump. If a lever changes fast but continuously, some stages lie in between."""
+"""Distance (fraction of the jump) from the levers at a stage to the nearer of the levers at the two
+ends of the step, above which the change does not count as a jump. If a lever changes fast but
+continuously, some stages lie in between."""
 MARKS = 4
-"""Number of `marks`: values appended to the slope of a motion, by which a jump is recognised."""
+"""Number of `marks`: values appended to the slope of a motion, from which a jump is recognised."""
 
 
 def marks(contact: FlankForce) -> Float[Array, "4"]:
-    """Return penetration (m), its rate (m/s) and both levers (m), by which a jump is recognised."""
+    """Return penetration (m), its rate (m/s) and both levers (m), which together reveal a jump."""
     return jnp.stack([contact.depth, contact.closing, contact.lever1, contact.lever2])
 
 
@@ -43,11 +44,12 @@ def saltation(
     period: Float[Array, ""],
     length: Float[Array, ""] | None,
 ) -> Float[Array, " rows-4"]:
-    """Return zero, with the derivative that a jump inside a step adds to y after the step.
+    """Return zeros whose derivatives are those that a jump inside a step adds to y after the step.
 
     `step`: length of the step (mesh periods); `slopes`: slope of y followed by the `marks`, at the
     stages of the step, from its start to its end; `period` (s): duration of a mesh period at this
-    state; `length` (m): typical size of the levers. The error is of the order of the step length.
+    state; `length` (m): typical size of the levers. The derivatives have an error of the order of
+    the step length.
 
     Raises ValueError if `length` is None: a contact that jumps must state the size of its levers.
     """

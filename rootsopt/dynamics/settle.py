@@ -17,24 +17,25 @@ from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 
 BLOCK = 4
-"""Mesh periods integrated between two checks of the transient."""
+"""Number of mesh periods integrated between two checks of whether the motion repeats."""
 _MEMORY = 20
 """Number of stroboscopic states stored: more than twice the longest cycle searched for."""
 _PATIENCE = 32, 1e-5
-"""Length (mesh periods) of a transient above which its steps are finer, and the largest tolerance
-of the finer steps. The noise of coarser steps can hide that the motion repeats."""
+"""Length (mesh periods) of a transient above which its tolerance is lowered, and the maximum of the
+lowered tolerance. The noise of coarser steps can hide that the motion repeats."""
 NOISE = 100.0
-"""Noise of the stroboscopic states from adaptive steps, in tolerances, relative to the states."""
+"""Noise of the stroboscopic states that adaptive steps cause: a multiple of the tolerance, relative
+to the states."""
 
 
 class Transient(NamedTuple):
     """End of a transient.
 
     `state`: last stroboscopic state (scaled); `period`: length k of the cycle (mesh periods), 0 if
-    not settled; `nearest`: the k with which the last states repeat best; `spread`: scaled
-    difference of states that are `nearest` periods apart; `periods`: mesh periods simulated;
-    `lost`: see `RotorPair.lost`; `solved`: whether the solver succeeded; `steps`: number of solver
-    steps.
+    not settled; `nearest`: the period with which the last states repeat most closely; `spread`:
+    greatest scaled difference between states that are `nearest` periods apart; `periods`: mesh
+    periods simulated; `lost`: see `RotorPair.lost`; `solved`: whether the solver succeeded;
+    `steps`: number of solver steps.
     """
 
     state: Float[Array, " n"]
@@ -65,8 +66,8 @@ def settle(
     """Integrate from the scaled `state` (n,) until the stroboscopic states repeat with a period k.
 
     The motion has settled if the last k + 1 states differ from the states k periods earlier by less
-    than `tolerance` (scaled). For large states, the noise of the steps is the limit if it is
-    greater. k is the smallest such period, at most `max_orbit` ≤ 8. Steps become finer after
+    than `tolerance` (scaled). For large states, the noise of the steps replaces `tolerance` if it
+    is greater. k is the smallest such period, at most `max_orbit` ≤ 8. Steps become finer after
     `_PATIENCE`. The transient ends unsettled after `max_periods` mesh periods.
     """
     orders = jnp.arange(1, max_orbit + 1)

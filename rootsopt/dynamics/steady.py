@@ -2,8 +2,8 @@
 
 The transient is simulated until the motion repeats (`settle`). The orbit near its end is closed and
 differentiated (`orbit_or_window`), then checked (`verdict`). If a check fails, the next attempt
-uses finer tolerances. Where there is no orbit, a window of the motion tells chaos from a long
-transient. All attempts are turns of one loop, so that each part is compiled only once.
+uses finer tolerances. Where there is no orbit, a window of the motion distinguishes chaos from a
+long transient. All attempts are iterations of one loop, so that each part is compiled only once.
 """
 
 import dataclasses
@@ -27,11 +27,12 @@ from rootsopt.status import Status
 
 _NEARLY = 0.05
 """Scaled difference below which states nearly repeat. Newton's method then decides whether there is
-an orbit, or an orbit of a shorter period."""
+an orbit, possibly of a shorter period."""
 _CLOSEST = 1e-12
-"""Scaled difference below which no finer attempt is made: the states repeat to rounding."""
+"""Scaled difference between repeating states below which no finer attempt is made: the states
+repeat to rounding."""
 _TRUSTED = 1e-8
-"""Tolerance below which an orbit is not refined, unless the config requests a finer tolerance. An
+"""Finest tolerance to which an orbit is refined, unless the config requests a finer tolerance. An
 orbit is refined if it does not close or its derivatives are uncertain."""
 
 
@@ -44,11 +45,11 @@ class Solver(eqx.Module):
     period searched for (mesh periods), at most 8; `precision`: float64 or float32. `max_periods`
     and `examine` are floats, as are all leaves.
 
-    The other settings have defaults, which coarse surveys of many designs replace. `shots`: maximum
-    number of integrations to close an orbit; `closed`: residual (tolerances) at which an orbit may
-    count as closed; `samples`: number of uniform samples of an orbit; `check`: whether to compare
-    the derivatives with those on halved steps; `attempts`: maximum number of attempts; `windows`:
-    length of a window (mesh periods), a multiple of 16; 0: no window.
+    The other settings have defaults. Coarse surveys of many designs use other values. `shots`:
+    maximum number of integrations to close an orbit; `closed`: residual (tolerances) at which an
+    orbit may count as closed; `samples`: number of uniform samples of an orbit; `check`: whether to
+    compare the derivatives with those on halved steps; `attempts`: maximum number of attempts;
+    `windows`: length of a window (mesh periods), a multiple of 16; 0: no window.
     """
 
     transient: Integrator
@@ -69,10 +70,10 @@ class Solver(eqx.Module):
 class Steady(NamedTuple):
     """The steady motion that a state leads to.
 
-    `status`: code of a `Status`; `orbit`: the last orbit accepted; `period` (mesh periods), `rtol`
-    and `verdict`: length, tolerance and checks of this orbit; `window` of a motion that did not
-    settle; `settled`: end of the transient; `used`: mesh periods of all transients; `steps`: solver
-    steps of transients and orbits.
+    `status`: code of a `Status`; `orbit`: the orbit found, or the last one tried; `period` (mesh
+    periods), `rtol` and `verdict`: length and tolerance of this orbit, and the results of its
+    checks; `window` of a motion that did not settle; `settled`: end of the transient; `used`: mesh
+    periods of all transients; `steps`: solver steps of transients and orbits.
     """
 
     status: Int[Array, ""]
@@ -87,10 +88,11 @@ class Steady(NamedTuple):
 
     @property
     def forces(self) -> Float[Array, " r"]:
-        """Mean (N), mean square (N²), peak (N) and the other measures of the contact force.
+        """Mean (N), mean square (N²), peak (N) and the further measures of the contact force.
 
-        The values are those of a closed orbit or a whole window (other measures: NaN). They are 0
-        without contact, and NaN in all other cases."""
+        For a closed orbit, all of them are known. For a complete window of a motion that does not
+        settle, the further measures are NaN. Without contact, all of them are 0. Otherwise, they
+        are NaN."""
         closed = self.orbit.response
         unknown = jnp.full_like(closed, jnp.nan)
         found = jnp.where(among(self.status, CLOSED), closed, unknown)
@@ -116,12 +118,13 @@ def among(code: Int[Array, "*n"], statuses: tuple[Status, ...]) -> Bool[Array, "
 
 
 class _Search(NamedTuple):
-    """State of the loop over attempts: the result so far, and the next turn.
+    """State of the loop over attempts: the result so far, and what to do in the next iteration.
 
-    `found`: result so far; `shorter`: period (mesh periods) of an orbit to try next, 0 for none;
-    `windowed`: whether a window is next. In all other turns, a transient and its orbit are next.
-    They start from `state`, at the tolerances `coarse` (transient) and `fine` (orbit), until states
-    repeat `within` a scaled distance. `tries`: refinements made; `over`: whether the loop ends.
+    `found`: result so far; `shorter`: period (mesh periods) of a shorter orbit to try next, 0 for
+    none; `windowed`: whether to integrate a window next. Otherwise, the next iteration simulates a
+    transient and closes its orbit. It starts from `state`, at the tolerances `coarse` (transient)
+    and `fine` (orbit), and the states must repeat to the scaled distance `within`. `tries`: number
+    of refinements so far; `over`: whether the loop ends.
     """
 
     found: Steady
@@ -136,9 +139,10 @@ class _Search(NamedTuple):
 
 
 class _Attempts(eqx.Module):
-    """The loop of `steady_motion`, as methods of its arguments.
+    """The loop of `steady_motion`. Its fields hold the arguments of that function.
 
-    `start` gives the loop's first state, `step` its body, `final` the result."""
+    `start` returns the initial state of the loop, `step` the result of its body, `final` the result
+    of the search."""
 
     pair: RotorPair
     tangents: RotorPair
@@ -146,7 +150,8 @@ class _Attempts(eqx.Module):
     radius: Float[Array, ""]
 
     def start(self, state: Float[Array, " n"]) -> _Search:
-        """Return the loop's state before the first attempt, from the scaled `state`."""
+        """Return the initial state of the loop, for a motion that begins at the scaled `state`
+        (n,)."""
         solver, dtype, count = self.solver, state.dtype, state.shape[0]
         directions = jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
         steps = solver.orbit.max_steps
@@ -169,9 +174,10 @@ class _Attempts(eqx.Module):
         return _Search(found, state, coarse, fine, within, zero, no, zero, no)
 
     def step(self, now: _Search) -> _Search:
-        """Make one turn and return the new state of the loop.
+        """Make one iteration and return the new state of the loop.
 
-        A turn is a transient and its orbit, an orbit of a shorter period, or a window."""
+        An iteration computes a transient and its orbit, an orbit of a shorter period, or a window.
+        """
         solver, found = self.solver, now.found
         shorter = now.shorter > 0
         fresh = ~shorter & ~now.windowed
@@ -226,7 +232,10 @@ class _Attempts(eqx.Module):
         return self._next(now, new, within, lost, taken & shorter)
 
     def _next(self, now: _Search, new: Steady, within, lost, shortened) -> _Search:
-        """Return the loop's state after an attempt with the result `new`."""
+        """Return the loop's state after an iteration with the result `new`.
+
+        `within`: scaled distance to which the states repeated; `lost`: whether the transient
+        failed; `shortened`: whether an orbit of a shorter period was accepted."""
         solver = self.solver
         candidate = self._shorter(new, now.shorter)
         looks = (new.status == Status.PERIODIC.code) & ~shortened & ~now.windowed & ~lost
@@ -258,7 +267,7 @@ class _Attempts(eqx.Module):
     def _judged(self, orbit: Orbit, start, fine, within) -> tuple[Verdict, Int[Array, ""]]:
         """Return the `Verdict` on an orbit integrated at the tolerance `fine`, and a status code.
 
-        `final` checks the accuracy of the forces later."""
+        The accuracy of the forces is checked later, by `final`."""
         pair, solver, dtype = self.pair, self.solver, start.dtype
         closing = dataclasses.replace(solver.orbit, rtol=fine)
         rtols = solver.transient.tolerance(dtype), closing.tolerance(dtype)
@@ -281,8 +290,8 @@ class _Attempts(eqx.Module):
     def _shorter(self, found: Steady, beyond) -> Int[Array, ""]:
         """Return a shorter period after which the orbit nearly repeats, or 0.
 
-        The result is the least such period above `beyond` that divides the orbit's period. Noise of
-        the transient can hide this repetition."""
+        The result is the least such period above `beyond` that divides the orbit's period. In the
+        transient, noise can hide this repetition."""
         periods = jnp.arange(1, max(self.solver.max_orbit // 2, 1) + 1)
         place = periods * self.solver.samples // found.period
         states = found.orbit.flow.states[jnp.minimum(place, self.solver.samples - 1)]
@@ -292,15 +301,16 @@ class _Attempts(eqx.Module):
         return jnp.where(jnp.any(fits), periods[jnp.argmax(fits)], 0)
 
     def _unsettled(self, window: Window) -> Int[Array, ""]:
-        """Return the status code of a motion that has not settled, from a window of it."""
+        """Return the status code of a motion that has not settled, judged by a `window` of it."""
         if not self.solver.windows:
             return jnp.asarray(Status.NOT_SETTLED.code)
         return window_status(self.pair, window)
 
     def final(self, found: Steady) -> Steady:
-        """Return `found`, with another status if the forces of its orbit are not valid.
+        """Return `found`, with a different status if the forces of its orbit are not valid.
 
-        Then the status is TOO_DEEP (flanks penetrate too deep) or UNRESOLVED (errors too large)."""
+        The status is then TOO_DEEP (the flanks penetrate too deep) or UNRESOLVED (the numerical
+        errors of the forces are too large)."""
         orbit, judged = found.orbit, found.verdict
         closed = among(found.status, (Status.PERIODIC, Status.INACCURATE))
         deep = orbit.flow.depth > TOO_DEEP * self.radius
@@ -322,7 +332,7 @@ def transient_status(pair: RotorPair, settled: Transient) -> Int[Array, ""]:
 
 
 def window_status(pair: RotorPair, window: Window) -> Int[Array, ""]:
-    """Return the status code of a motion that has not settled, from a `window` of it."""
+    """Return the status code of a motion that has not settled, judged by a `window` of it."""
     finite = jnp.all(jnp.isfinite(window.response)) & jnp.isfinite(window.exponent)
     lost = pair.lost(window.end)
     least = float(jnp.finfo(window.end.dtype).eps) * pair.force_scale

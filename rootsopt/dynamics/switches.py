@@ -18,7 +18,7 @@ from rootsopt.dynamics.peak import Steps, blended
 
 _LOOKS, _LONGEST = 252, 8
 """Number of times per mesh period, in addition to the ends of steps, at which flags are compared to
-find changes; and the maximum number of mesh periods."""
+find changes; and the maximum length of the motion (mesh periods)."""
 _CHANGES = 1024
 """Maximum number of changes found in one motion. A mesh period has about 20 to 100."""
 _LANES = 16
@@ -26,26 +26,27 @@ _LANES = 16
 _HALVINGS = 26
 """Number of bisections that locate a change."""
 _BRIEF, _PARTS = 0.05, 8
-"""Distance (mesh periods) of two changes below which the interval between them is divided, and the
-number of steps into which it is divided."""
+"""Distance (mesh periods) between two changes below which the interval between them is divided, and
+the number of steps into which it is divided."""
 _ASIDE = 1e-9, 1e-6
-"""Lower and upper limit (mesh periods) of half the length of the short step around a change. The
+"""Lower and upper limits (mesh periods) of half the length of the short step around a change. The
 error of the gradients is proportional to this length."""
 _LOOSE = 1e3
-"""Half the length of the short step around a change, in tolerances, between the limits `_ASIDE`."""
+"""Half the length (mesh periods) of the short step around a change, as a multiple of the tolerance.
+It is limited by `_ASIDE`."""
 _ROUNDINGS = 16.0
-"""Half length (rounding errors of the time) below which the short step around a change is not made.
-This limit applies in single precision."""
+"""Minimum half length (rounding errors of the time) of the short step around a change. It exceeds
+the limits `_ASIDE` only in single precision."""
 _SHARE = 1e-4
-"""Half length of the short step around a change (fraction of the time to the nearest other change)
-above which the step is shortened. Where the curvature changes inside a rounded corner, the error of
-the gradients is proportional to the square of this fraction."""
+"""Maximum half length of the short step around a change, as a fraction of the time to the nearest
+other change. If the curvature changes inside a rounded corner, the error of the gradients is
+proportional to the square of this fraction."""
 _GRADES = 8.0, 64.0
 """Distances of further step ends from a change, in half lengths of the short step around the
 change. They keep the steps short around a change that lies slightly outside its short step."""
 _HOLDS = 2.5
-"""Length of a step (greatest half lengths of a short step around a change) up to which the step is
-never halved."""
+"""Length of a step, in maximum half lengths of a short step around a change, up to which the step
+is never halved, since it may be such a short step."""
 _APART = 1e-10
 """Distance (mesh periods) below which two step ends are merged."""
 
@@ -136,7 +137,7 @@ def with_switches(
 def halved(grid: Float[Array, " steps"]) -> Float[Array, " steps"]:
     """Return `grid` with its steps halved, or only the longest steps if there is no room for all.
 
-    The short steps around changes stay whole. A change lies in the middle of such a step, and
+    The short steps around changes are not halved. A change lies in the middle of such a step, and
     rounding would decide on which side of the change the derivatives are taken.
     """
     lengths, whole = _lengths(grid)
@@ -155,7 +156,8 @@ def has_room(grid: Float[Array, " steps"]) -> Bool[Array, ""]:
 
 
 def _lengths(grid):
-    """Return the lengths of all steps, and the greatest length of a short step around a change."""
+    """Return the lengths of all steps, and the length up to which a step may be a short one around
+    a change."""
     taken = grid < jnp.inf
     begins = jnp.concatenate([jnp.zeros_like(grid[:1]), grid[:-1]])
     lengths = jnp.where(taken, grid - jnp.where(taken, begins, 0.0), 0.0)

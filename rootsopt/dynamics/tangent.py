@@ -17,8 +17,8 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 _CHUNK = 32
-"""Number of steps linearised together. A larger number is faster per step, but wastes more where
-the motion ends inside a chunk."""
+"""Number of steps linearised together. A larger number is faster per step, but wastes more work in
+the chunk in which the motion ends."""
 
 
 def one_step(
@@ -31,8 +31,8 @@ def one_step(
 ) -> tuple[Float[Array, " m"], Float[Array, "stages m"]]:
     """Take one step of `solver` from `begin` to `end`. Return y at `end`, and dy/dτ at the stages.
 
-    `y` (m,): at `begin`. The first stage is at `begin`, the last at `end`. For an implicit solver,
-    only these two slopes are returned."""
+    `y` (m,): value at `begin`. The first stage is at `begin`, the last at `end`. For an implicit
+    solver, only these two slopes are returned."""
     if not isinstance(solver, diffrax.AbstractERK):
         memory = solver.init(term, begin, end, y, args)
         after = solver.step(term, begin, end, y, args, memory, made_jump=False)[0]
@@ -120,12 +120,13 @@ def propagated(
     them.
 
     `linear_step(k, there)` linearises step k. Its rows are y, then any further values. y holds the
-    n entries of the state, then integrals, on which no row depends. `start` (m, n + d): derivatives
-    of y before the first step, along n directions of the initial state and d parameters.
+    n entries of the state, then integrals. No row depends on the integrals. `start` (m, n + d):
+    derivatives of y before the first step, along n directions of the initial state and d
+    parameters.
 
     Side steps do not belong to the motion. Side step -1 starts where the step `branch` starts.
-    `aside` further side steps, numbered -2, -3 …, start at the end of side step -1. They receive
-    the rows there as `there`, which is zero for all earlier calls.
+    `aside` further side steps, numbered -2, -3 …, start at the end of side step -1. For these, the
+    argument `there` holds the rows at the end of side step -1; for all other steps it is zero.
 
     The result has three members: the derivatives of y (m, n + d) after the step `last`; the
     derivatives of the state (n, n + d) after side step -1; and the linearised side steps -2, -3 …

@@ -14,10 +14,11 @@ from rootsopt.dynamics.parts import Part
 class Timescales(eqx.Module):
     """Timescales of the fastest oscillation and of free flight.
 
-    `swing`: 1/ω (s) of the fastest oscillation: of rotor 2 on flank and timing gear, or of another
-    part; `fall`: time (s) from one end of the gear's play to the other under the load; `free`: |ε|
-    (rad) below which the clearance keeps the flanks apart at the nominal centre distance. `fall` is
-    infinite if the play is at most the rotation at static penetration: no free flight then.
+    `swing`: 1/ω (s), where ω is the angular frequency of the fastest oscillation: of rotor 2 on
+    flank and timing gear, or of another part; `fall`: time (s) in which the load closes the whole
+    backlash of the timing gear; `free`: |ε| (rad) below which the clearance keeps the flanks apart
+    at the nominal centre distance. If the backlash is at most the rotation at static penetration,
+    there is no free flight, and `fall` is infinite.
     """
 
     swing: Float[Array, ""]
@@ -38,8 +39,8 @@ class Timescales(eqx.Module):
 
         `inertia` (kg·m²) of one rotor; `force` (N): static flank force at the pitch `radius` (m);
         `clearance` (m) of the flanks. The contact stiffness is taken at the greater of two depths:
-        the static penetration, and the penetration of an impact after a fall through the play. The
-        energy of this impact is the work of the load.
+        the static penetration, and the penetration of an impact after free flight through the whole
+        backlash. The energy of this impact is the work of the load.
         """
         parts = tuple(parts)
         play = jnp.zeros_like(force)

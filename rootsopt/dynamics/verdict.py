@@ -14,7 +14,7 @@ from rootsopt.dynamics.orbit import Orbit, agreement
 from rootsopt.dynamics.settle import NOISE
 
 RESIDUAL = {"float64": 1e-9, "float32": 1e-3}
-"""Residual (scaled) above which an orbit does not count as closed, by precision."""
+"""Residual (scaled) above which an orbit does not count as closed, for each precision."""
 TOO_DEEP = 0.02
 """Penetration (pitch radii) above which the forces of an orbit are not valid."""
 UNRESOLVED = 1e-2
@@ -23,15 +23,18 @@ count as unresolved."""
 _UNKNOWN = 0.1
 """Estimated error of an orbit (scaled) above which the orbit is rejected."""
 _FREE = 1e-6
-"""Distance of a Floquet multiplier from 1 below which it counts as 1."""
+"""Distance from 1 below which a Floquet multiplier counts as 1. A greater multiplier also counts as
+1."""
 _DEFECT = 1e3
-"""Residual on halved steps (tolerances, times the greatest entry of the monodromy matrix if above
-1) above which an orbit's derivatives are uncertain."""
+"""Residual on halved steps (tolerances) above which an orbit's derivatives are uncertain. This
+limit is multiplied by the greatest entries of the state and of the monodromy matrix, where they
+exceed 1."""
 _DRIFT = 1e3, 1e-5
-"""Change of an orbit's start since the last search for kinks above which derivatives are uncertain,
-because some kinks may lie inside long steps. First in tolerances, then its minimum (scaled)."""
+"""Change of an orbit's start since the last search for kinks above which the derivatives are
+uncertain, because some kinks may lie inside long steps: its value (tolerances), and the lower limit
+of this value (scaled)."""
 _STRAINED = 100.0
-"""Error of a repeated step (tolerances) above which an orbit is rejected."""
+"""Estimated error of a repeated step (tolerances) above which an orbit is rejected."""
 
 
 class Verdict(NamedTuple):
@@ -77,11 +80,12 @@ def verdict(
 def is_idle(
     orbit: Orbit, least: Float[Array, ""] | float = 0.0, steady: Bool[Array, ""] | bool = False
 ) -> Bool[Array, ""]:
-    """Return whether no flank ever touches. Forces up to `least` (N) count as rounding.
+    """Return whether an `orbit` shows that no flank touches in the steady motion.
 
-    An orbit without contact is idle in two cases. Either it is `steady`, because the timing gear
-    holds the pair. Or no torque brings a displaced pair back (Floquet multiplier 1 or unknown), and
-    the pair can rest anywhere. In any other case, such an orbit says nothing about the motion.
+    Forces up to `least` (N) count as rounding. An orbit without contact is idle in two cases.
+    Either it is `steady`, because the timing gear holds the pair. Or no torque brings a displaced
+    pair back (Floquet multiplier 1 or unknown), and the pair can rest anywhere. In any other case,
+    an orbit without contact says nothing about the motion.
     """
     free = jnp.isnan(orbit.multiplier) | (orbit.multiplier > 1 - _FREE)
     return (orbit.flow.mean <= least) & (orbit.flow.peak <= least) & (free | steady)
@@ -96,9 +100,10 @@ def judged(
 ) -> Bool[Array, ""]:
     """Return whether an orbit is the stable motion that a transient led to.
 
-    `rtols`: tolerances of transient and orbit; `state` (n,): end of the transient, whose states
-    repeated to the distance `within`; `residual`: limit for a closed orbit. All values are scaled;
-    limits grow in proportion to states greater than 1. There are four conditions:
+    `rtols`: tolerances of transient and orbit; `state` (n,): end of the transient (scaled);
+    `within`: scaled distance to which the transient's states repeated; `residual`: greatest
+    residual (scaled) of a closed orbit. The limits grow with the state if it exceeds 1. There are
+    four conditions:
 
     - The orbit closes to `residual`, on steps that the solver would accept.
     - Its Floquet multipliers lie inside the unit circle.
@@ -117,7 +122,7 @@ def judged(
 
 
 def is_consistent(orbit: Orbit, least: Float[Array, ""]) -> Bool[Array, ""]:
-    """Return whether mean ≤ RMS ≤ peak force, up to about 1 % and forces of the size `least` (N).
+    """Return whether mean ≤ RMS ≤ peak force, to within about 1 % and within `least` (N).
 
     A violation shows that the steps were too coarse for short impacts. The computed mean square can
     then even be negative.
@@ -130,8 +135,9 @@ def is_consistent(orbit: Orbit, least: Float[Array, ""]) -> Bool[Array, ""]:
 def is_certain(orbit: Orbit, rtol: Float[Array, ""]) -> Bool[Array, ""]:
     """Return whether the derivatives of an orbit integrated at `rtol` are reliable.
 
-    The orbit must close to a multiple of the tolerance on halved steps, and the derivatives must
-    agree there. Since the last search for kinks, the orbit may only have moved a little."""
+    There are three conditions. On halved steps, the orbit must close to a multiple of the
+    tolerance. The derivatives on these steps must agree with the original ones. And the orbit must
+    have moved only a little since the last search for kinks."""
     size = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.state)))
     gain = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.monodromy)))
     closes = orbit.defect <= _DEFECT * rtol * size * gain

@@ -1,7 +1,7 @@
 """A window of a motion that has not settled: its forces, and its largest Lyapunov exponent.
 
-The exponent tells chaos from a long transient. It is the mean logarithmic growth rate of a tangent
-vector that is renormalised every mesh period (Benettin et al., Meccanica 15 (1980) 9-20).
+The exponent distinguishes chaos from a long transient. It is the mean logarithmic growth rate of a
+tangent vector that is renormalised every mesh period (Benettin et al., Meccanica 15 (1980) 9-20).
 """
 
 from typing import Any, NamedTuple
@@ -32,7 +32,7 @@ _Arrays = Array | np.ndarray
 
 
 class Window(NamedTuple):
-    """A motion over p mesh periods, of which the first `done` are known.
+    """A motion over p mesh periods, of which the first `done` have been integrated.
 
     `growth` (p,): logarithm of the tangent vector's growth factor in each mesh period; `response`
     (p, 3): mean (N), mean square (N²) and peak (N) of the contact force in each mesh period;
@@ -115,7 +115,8 @@ def _numpy_of(array: Any) -> Any:
 def lyapunov(
     pair: RotorPair, state: Float[Array, " n"], periods: int, integrator: Integrator
 ) -> Window:
-    """Integrate a window of `periods` mesh periods (a multiple of 16) from the scaled `state`."""
+    """Return a window of `periods` mesh periods (a multiple of 16), integrated from the scaled
+    `state`."""
     one, still = jnp.ones_like(state[0]), no_tangents(pair)
 
     def step(_: Any, window: Window) -> Window:

@@ -1,4 +1,4 @@
-"""The main job as a function: optimise a design and compare it with the baseline."""
+"""The main task in one function: optimise a design and compare it with the baseline."""
 
 from collections.abc import Callable
 

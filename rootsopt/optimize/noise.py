@@ -19,7 +19,7 @@ from rootsopt.response.ensemble import ERRORS, SIGNIFICANT, EnsembleEvaluator
 from rootsopt.response.evaluation import Evaluation
 
 _NEAR = 0.1
-"""Distance in the unit box below which trials count as one candidate."""
+"""Distance in the unit box below which trials count as the same candidate."""
 _CANDIDATES = 3
 """Maximum number of candidates that are averaged again."""
 
@@ -27,10 +27,11 @@ _CANDIDATES = 3
 class Verification(NamedTuple):
     """Outcome of a verification.
 
-    `baseline`: evaluation of the baseline by the last ensemble; `problem`: the design problem
+    `baseline`: evaluation of the baseline with the last ensemble; `problem`: the design problem
     relative to this evaluation; `optimized`: evaluation of the best candidate, None if it was not
     accepted; `record`: entries for the result file. Without a usable candidate, `problem` and
-    `baseline` are those of the search.
+    `baseline` are those of the search. If `baseline` is not usable, `problem` is that of the
+    search.
     """
 
     problem: Problem
@@ -59,10 +60,11 @@ def add_errors(rows: list[dict[str, Any]], trials: Sequence, problem: Problem) -
 
 
 def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> Verification:
-    """Choose the best candidate by a larger ensemble; compare it with the baseline by a third one.
+    """Choose the best candidate with a second ensemble, and compare it with the baseline in a
+    third.
 
-    `problem`, `evaluator` and `trials` of the search. Gradients come from ensembles of the search's
-    size.
+    `problem`, `evaluator` and `trials` of the search. The second and third ensembles are larger
+    than that of the search. Gradients come from ensembles of the search's size.
     """
     chooser, judge = (evaluator.independent(k).without_gradient() for k in (1, 2))
     settings = judge.settings
@@ -119,8 +121,8 @@ def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[
     """Return the most promising points of the unit box, each with an averaged objective.
 
     The points are at least `_NEAR` apart. The objective is the average over the trials near a
-    point. Points are ranked by this average plus its standard error, so a lucky trial among worse
-    trials does not rank high.
+    point. Points are ranked by this average plus its standard error. A lucky trial among worse
+    trials therefore ranks low.
     """
     # The first trial of a descent repeats a screening trial, with the same noise: count it once.
     usable = {tuple(trial.point): trial for trial in trials if trial.candidate}
@@ -143,7 +145,7 @@ def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[
 
 
 def most_promising(problem: Problem, trials: Sequence) -> Any:
-    """Return the trial at the best of the `candidates`, or None."""
+    """Return the trial at the best of the `candidates`, or None if there are no candidates."""
     found = candidates(problem, trials)
     if not found:
         return None
@@ -152,7 +154,7 @@ def most_promising(problem: Problem, trials: Sequence) -> Any:
 
 
 def message(record: dict[str, Any]) -> str:
-    """Return the message that no design has passed a verification over an ensemble.
+    """Return a message for the user: that no design was confirmed over an ensemble, and why.
 
     `record`: `Verification.record`. The message is empty if there was no such verification."""
     if "required_standard_errors" not in record:

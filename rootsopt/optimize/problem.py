@@ -1,4 +1,4 @@
-"""The design problem: objective and constraints of a config against its baseline."""
+"""The design problem of a config: objective and constraints, relative to its baseline."""
 
 import dataclasses
 import functools
@@ -23,12 +23,13 @@ from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 
 _NO_LINE = 1e-9
-"""Amplitude of a spectral line, relative to the mean force, below which there is no line."""
+"""Amplitude of a spectral line, relative to the mean force, below which the line counts as absent.
+"""
 _DRAWN = 5
 """Maximum number of times that an infeasible point is moved half way towards a feasible point."""
 _ACTIVE = 1e-6
-"""Scaled violation of a constraint below which a point counts as feasible, and distance from a
-bound of the unit box below which the bound counts as active."""
+"""Violation (scaled) of a constraint below which a point still counts as feasible. Also, distance
+from a bound of the unit box below which the bound counts as active."""
 
 
 @Program
@@ -63,9 +64,10 @@ class Problem:
 
     @classmethod
     def of(cls, config: Config, scene: Scene, baseline: Evaluation) -> "Problem":
-        """Return the problem; limits that the config leaves open come from the `baseline`.
+        """Return the problem of a `config`, with the `scene` and the evaluated `baseline`.
 
-        Raises `InputError` if a measure in the objective is 0 for the baseline, since the objective
+        Limits of constraints that the config leaves open come from the `baseline`. Raises
+        `InputError` if a measure in the objective is 0 for the baseline, since the objective
         divides each measure by its value for the baseline."""
         orders = {line_name(order): order for order in config.objective.line_weights}
         counting = [part for part in at_speeds(baseline) if part.share > 0]
@@ -90,19 +92,20 @@ class Problem:
         return cls(config, baseline, Space.of(config, scene, baseline.geometry["area_efficiency"]))
 
     def objective(self, evaluation: Evaluation) -> float:
-        """Return the objective: weighted measures over all speeds, each divided by its value for
-        the baseline.
+        """Return the objective: a weighted sum of measures, each divided by its value for the
+        baseline.
 
-        The objective is 1 at the baseline, and NaN for a design without a usable steady state."""
+        It combines all speeds. The objective is 1 at the baseline, and NaN for a design without a
+        usable steady state."""
         if not evaluation.usable:
             return float("nan")
         return sum(share * self._value(*pair) for share, *pair in self._counted(evaluation))
 
     def by_speed(self, evaluation: Evaluation) -> list[dict[str, float]]:
-        """Return the objective at each single speed; empty unless there are several speeds.
+        """Return the objective at each speed, one row each; empty without `objective.speeds_rpm`.
 
         The objective is NaN if a measure of the baseline is 0, which is possible only at a speed
-        without share.
+        with share 0.
         """
         parts = zip(at_speeds(evaluation), at_speeds(self.baseline), strict=True)
         return [
@@ -143,7 +146,7 @@ class Problem:
         return counted(self.config, evaluation, self.baseline, self._value)
 
     def _value(self, evaluation: Evaluation, baseline: Evaluation) -> float:
-        """Return the weighted sum of the measures at one speed, each divided by the baseline's."""
+        """Return the weighted sum of the measures at one speed, each relative to the `baseline`."""
         return sum(w * evaluation.response[k] for k, w in self._weights(baseline).items())
 
     def _weights(self, baseline: Evaluation) -> dict[str, float]:
@@ -167,9 +170,9 @@ class Problem:
         return bool(np.min(self.look(point)[2]) >= -_ACTIVE)
 
     def project(self, point) -> NDArray[np.float64]:
-        """Return a feasible point near `point`, by Gauss-Newton steps on the violated constraints.
+        """Project `point` onto the feasible set, by Gauss-Newton steps on the violated constraints.
 
-        The result can still be infeasible if the constraints contradict the bounds.
+        The result can still be infeasible, such as when the constraints contradict the bounds.
         """
         point = np.clip(np.asarray(point, dtype=np.float64), 0.0, 1.0)
         for _ in range(30):
@@ -190,7 +193,8 @@ class Problem:
         """Return a feasible point near `point`, as `project` does, with a fallback to `inside`.
 
         `inside`: a feasible point. If `project` finds no feasible point, the point is moved half
-        way towards `inside`, up to `_DRAWN` times. A profile may not even exist at `point`.
+        way towards `inside` and projected again, up to `_DRAWN` times. This helps where no profile
+        exists at `point`.
         """
         found = self.project(point)
         if self.space.family.by_limits:
@@ -202,11 +206,11 @@ class Problem:
         return found
 
     def descent(self, point, slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the part of `slope` (d,) that active constraints and bounds allow.
+        """Return `slope` (d,) without the components that active constraints and bounds forbid.
 
-        The negative slope is projected onto the cone of feasible directions: the closest direction
-        that violates no active constraint (a non-negative least-squares problem). The result is
-        zero exactly at a Karush-Kuhn-Tucker point.
+        The negative of the result is the projection of -`slope` onto the cone of feasible
+        directions: the closest direction that violates no active constraint (a non-negative
+        least-squares problem). The result is zero exactly at a Karush-Kuhn-Tucker point.
         """
         _, _, slack, jacobian = self.look(point)
         point = np.asarray(point)

@@ -2,10 +2,10 @@
 
 Screening chooses the starts from a Sobol sample of feasible designs. From each start, an optax
 update rule descends in the unit box. The gradient is first projected onto the directions that
-active constraints allow; each step is projected back onto the feasible set. Each orbit is the
-first guess for the next orbit. The best design is simulated again from rest at a tighter tolerance
-before it is reported. A search can be stopped at any time (`stop`), and then verifies the best
-design found so far.
+active constraints allow; each step is projected back onto the feasible set. Each orbit is the first
+guess for the next orbit. The best design is simulated again from rest at a tighter tolerance before
+it is reported. A search can be stopped at any time (`stop`). It then verifies the best design found
+so far, unless the objective is an average over an ensemble.
 """
 
 import dataclasses
@@ -41,13 +41,13 @@ RULES: dict[str, Callable[..., optax.GradientTransformation]] = {
 _PATIENCE = 4
 """Number of successive steps without a gain above which a descent ends."""
 _GAIN = 1e-4
-"""Relative decrease of the best objective below which a step is not a gain."""
+"""Relative decrease of the best objective below which a step does not count as a gain."""
 _STATIONARY = 1e-3
 """Norm of the projected gradient in the unit box below which a descent ends."""
 _HOLDS_UP = 0.01
 """Relative change of the objective in the verification above which a design is rejected."""
 _POLL = 0.05
-"""Interval (s) at which a waiting thread checks whether to stop."""
+"""Interval (s) at which a waiting thread checks whether it should stop."""
 
 Progress = Callable[[int, int, float], None]
 """Type of a progress callback, with arguments (evaluations done, evaluations expected, best
@@ -58,9 +58,9 @@ objective)."""
 class Trial:
     """One evaluated design of a search.
 
-    `point` (d,) of the unit box; `start`: number of the descent (-1: screening); `iteration`: steps
-    since the start of the descent; `evaluation` of the design; `objective`: NaN without a usable
-    steady state; `feasible`: whether all constraints are satisfied.
+    `point` (d,) of the unit box; `start`: number of the descent (-1: screening); `iteration`:
+    number of steps since the start of the descent; `evaluation` of the design; `objective`: NaN
+    without a usable steady state; `feasible`: whether all constraints are satisfied.
     """
 
     point: NDArray[np.float64]
@@ -124,7 +124,8 @@ class Optimization:
 
     @property
     def objective_by_speed(self) -> list[dict[str, float]]:
-        """Objective at the optimum at each of several speeds, one row each."""
+        """Objective at the optimum at each speed, one row each; empty unless there are several
+        speeds."""
         if self.problem is None or self.optimized is None:
             return []
         return self.problem.by_speed(self.optimized)
@@ -249,8 +250,8 @@ class Search:
     def _side_by_side(self, work: Callable[..., list[Trial]], tasks: Sequence) -> list[Trial]:
         """Return the trials of `work(*task)` for all tasks, in the order of the tasks.
 
-        If `stop` is set before all tasks end, the result is empty, and running evaluations are not
-        waited for."""
+        If `stop` is set before all tasks end, return an empty list, without waiting for evaluations
+        that are still running."""
         pool = ThreadPoolExecutor(os.cpu_count())
         tasks = tasks if not self.stop.is_set() else []
         done = [pool.submit(work, *task) for task in tasks]
@@ -342,7 +343,8 @@ class Search:
     def _verify(self, trials: list[Trial]) -> tuple[Evaluation | None, dict[str, Any]]:
         """Simulate the best designs again, from rest at a tight tolerance, until one is confirmed.
 
-        Return the evaluation of the confirmed design, or None, and a record for the result file."""
+        At most five designs are simulated. Return the evaluation of the confirmed design, or None,
+        and a record for the result file."""
         ranked = sorted(filter(_candidate, trials), key=_objective)
         tried: list[np.ndarray] = []
         failures = []
@@ -369,11 +371,11 @@ class Search:
 
 
 def until_stopped(work: Callable[[], T], stop: threading.Event, patience: float) -> T | None:
-    """Run `work()` in its own thread and return its result; return None if it does not end in time.
+    """Run `work()` in its own thread and return its result, or None if it does not end in time.
 
-    The thread makes the wait interruptible even during compiled code. `stop`: an event that asks
-    `work` to end. After that, the wait lasts at most `patience` (s). The first `KeyboardInterrupt`
-    sets `stop`; a second one is raised."""
+    `stop`: an event that asks `work` to end. After that, this function waits at most `patience`
+    (s). Because of the thread, the wait can be interrupted even during compiled code. The first
+    `KeyboardInterrupt` sets `stop`; a second one is raised."""
     future: Future[T] = Future()
 
     def do() -> None:
@@ -416,7 +418,7 @@ def _update(method, learning_rate, iterations, slope, state):
 
 
 def _near(point: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> bool:
-    """Return whether `point` (d,) practically coincides with one of the points `others`."""
+    """Return whether `point` (d,) is closer than 0.02 to one of the points `others`."""
     return any(np.linalg.norm(point - other) < 0.02 for other in others)
 
 

@@ -32,13 +32,14 @@ from rootsopt.status import Status
 _LONGEST = 8
 """Longest cycle searched for, in mesh periods."""
 _APART = 0.3
-"""Scaled distance above which two motions are never the same."""
+"""Scaled distance above which two motions always count as different."""
 _TRIES = 24
-"""Maximum number of motions that are evaluated."""
+"""Maximum number of motions that are evaluated, in addition to the motion from rest."""
 _DEPTHS = 3.0
-"""Depth of the grid into the flanks, in static penetrations."""
+"""Penetration of the flanks (static penetrations) up to which the grid extends."""
 _LOST = (Status.PASSED_THROUGH, Status.STALLED, Status.SOLVER_FAILED, Status.NON_FINITE)
-"""Statuses of motions that do not count as attractors: the mesh or the simulation was lost."""
+"""Statuses of motions that do not count as attractors: the mesh was lost, or the simulation failed.
+"""
 _GONE = tuple(status.code for status in _LOST)
 
 
@@ -63,10 +64,10 @@ class Basins:
 
     `relative` (rad) and `rate` (rad/s): axes of the grid; `leads_to` (rates, relatives): index of
     the attractor for each initial state, or -1 if it leads to none; `attractors`: closed orbits
-    first, then chaotic or unsettled motions (see their status), each kind by falling share; `rest`:
-    evaluation from rest; `lost`: shares of initial states that lead to no attractor, by status
-    label; `angle_scale` (rad), `mesh_period` (s): units of scaled states. In `lost`, the label
-    `not_settled` is for motions that could not be assigned to an attractor.
+    first, then chaotic or unsettled motions (see their status), each kind in order of decreasing
+    share; `rest`: evaluation from rest; `lost`: shares of initial states that lead to no attractor,
+    keyed by status label; `angle_scale` (rad), `mesh_period` (s): units of scaled states. In
+    `lost`, the label `not_settled` is for motions that could not be assigned to an attractor.
     """
 
     relative: NDArray[np.float64]
@@ -93,7 +94,7 @@ class Basins:
         return Status.NOT_SETTLED if any(self.lost.values()) else Status.PERIODIC
 
     def records(self) -> list[dict[str, Any]]:
-        """Return the attractors for the result file."""
+        """Return one record per attractor for the result file."""
         return [
             {"share": one.share, "reached": one.reached} | one.evaluation.record()
             for one in self.attractors
@@ -139,7 +140,9 @@ def find_fitted(
     known: Iterable[NDArray[np.float64]] = (),
     series: bool = False,
 ) -> tuple[Evaluator, Basins]:
-    """Return an evaluator fitted to the motion from rest, and the result of `find`."""
+    """Return an evaluator fitted to the motion from rest, and the result of `find`.
+
+    Arguments: see `find`."""
     config = evaluator.config
     design = design_vector(config) if design is None else jnp.asarray(design)
     evaluator, rest = evaluator.fit(design, None, series)
@@ -185,7 +188,7 @@ def closed(evaluation: Evaluation) -> bool:
 
 
 class _Sorter:
-    """Assigns each transient to the motion it has led to.
+    """Assigns each transient to the motion that it has led to.
 
     `evaluations` and `cycles`: the known motions and their stroboscopic states; `numbers`: for each
     transient the number of its motion, or -1 after a failure; `lost`: for each transient the label
@@ -268,9 +271,9 @@ class _Sorter:
 def _axes(config: Config, pair: RotorPair) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the axes of the grid: the initial ε (rad) and dε/dt (rad/s).
 
-    By default ε covers the play and `_DEPTHS` static penetrations. |dε/dt| goes up to twice the
-    greater of two speeds: the speed at which the load closes the play, and the speed that crosses
-    the play within a mesh period.
+    By default, ε covers the clearance and the backlash, and `_DEPTHS` static penetrations beyond.
+    |dε/dt| ranges up to twice the greater of two speeds: the speed that the load causes across the
+    range of ε, and the speed that crosses this range within a mesh period.
     """
     wanted = config.attractors
     radius = config.profile.pitch_radius_mm * MM
@@ -288,7 +291,9 @@ def _axes(config: Config, pair: RotorPair) -> tuple[NDArray[np.float64], NDArray
 
 
 def _spread(low: float, high: float, count: int) -> NDArray[np.float64]:
-    """Return `count` equidistant numbers from `low` to `high`; a single number is in the middle."""
+    """Return `count` equidistant numbers from `low` to `high`.
+
+    If `count` is 1, the number is in the middle."""
     return np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
 
 
@@ -327,13 +332,14 @@ def _together(pair, states, *settings):
 
 @Program
 def _cycle(pair: RotorPair, state, integrator: Integrator):
-    """Return the scaled states (`_LONGEST`, n) at the start of successive mesh periods."""
+    """Return the scaled states (`_LONGEST`, n) at the starts of successive mesh periods, from
+    `state` on."""
     return jnp.concatenate([state[None], strobe(pair, state, _LONGEST - 1, integrator).states])
 
 
 @dataclasses.dataclass(frozen=True)
 class AttractorEvaluator(Wrapper):
-    """Evaluates a design by all its coexisting motions.
+    """Evaluates a design on the basis of all its coexisting motions.
 
     With `objective.motion: worst`, the result describes the motion with the greatest weighted sum
     of the objective's measures. Each measure is relative to the `reference` of `single`: a
@@ -359,7 +365,7 @@ class AttractorEvaluator(Wrapper):
         return dataclasses.replace(self, single=single), self._of(basins)
 
     def _of(self, basins: Basins) -> Evaluation:
-        """Return the evaluation that combines all motions as `objective.motion` says."""
+        """Return the evaluation that combines all motions as `objective.motion` specifies."""
         usable = [a for a in basins.attractors if a.evaluation.usable]
         if not usable:
             return basins.rest
@@ -392,7 +398,8 @@ class AttractorEvaluator(Wrapper):
 
 
 def _averaged(one: Evaluation, attractors: list[Attractor]) -> Evaluation:
-    """Return `one` with response and gradient averaged over the attractors by share."""
+    """Return `one` with response and gradient averaged over the attractors, weighted by their
+    shares."""
     shares = np.array([a.share for a in attractors])
     # On a coarse grid, the `known` states may be the only ones that lead to an orbit.
     shares = shares / shares.sum() if shares.sum() > 0 else np.ones(len(shares)) / len(shares)

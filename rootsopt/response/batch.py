@@ -21,19 +21,20 @@ from rootsopt.scene import Scene
 from rootsopt.status import Status
 
 SAMPLES = 840
-"""Uniform samples of an orbit, from which the peak is located. All periods up to eight divide it.
+"""Number of uniform samples of an orbit, from which the peak is located. It is a multiple of all
+periods up to eight.
 """
 
 
 class Batch(NamedTuple):
     """Responses of n designs with d parameters.
 
-    `response` (n, 3): mean, peak and RMS force (N); `gradient` (n, 3, d): derivatives of
-    `response` (N per config unit);
-    `state` (n, s): scaled state of the orbit at φ1 = 0, a start for neighbouring designs;
-    `period` (mesh periods); `multiplier`: greatest modulus of the Floquet multipliers; `residual`
-    of the closed orbit; `deepest`: least ε (rad) on the orbit; `steps` of the solver; `status`:
-    codes of `Status`. `response` and `gradient` are NaN where there is no periodic orbit.
+    `response` (n, 3): mean, peak and RMS force (N); `gradient` (n, 3, d): derivatives of `response`
+    (N per config unit); `state` (n, s): scaled state of the orbit at φ1 = 0, a start for
+    neighbouring designs; `period` (mesh periods); `multiplier`: greatest modulus of the Floquet
+    multipliers; `residual` of the closed orbit; `deepest`: least ε (rad) on the orbit; `steps`:
+    number of solver steps; `status`: codes of `Status`. `response` and `gradient` are NaN where
+    there is no periodic orbit.
     """
 
     response: Float[Array, "*n 3"]

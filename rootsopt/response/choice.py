@@ -1,10 +1,10 @@
 """`solver.fidelity: auto`: choose the cheapest settings that meet a stated error.
 
-The config's design is first simulated from rest with the reference settings: contact by search, at
-a tolerance far below the requested error. Cheaper settings are then tried, cheapest first. The
-first settings whose mean and peak force agree with the reference are chosen. They must agree at
-every speed of the objective. The chosen settings are used for all further designs of the run, and
-in the resolved config. `rootsopt sweep` uses the chosen settings at all its speeds.
+The config's design is first simulated from rest with the reference settings: the contact is found
+by search, at a tolerance far below the requested error. Cheaper settings are then tried, cheapest
+first. The first settings whose mean and peak force agree with the reference are chosen. They must
+agree at every speed of the objective. The chosen settings are used for all further designs of the
+run, and in the resolved config. `rootsopt sweep` uses the chosen settings at all its speeds.
 
 Measuring the difference costs two or three simulations of one design. In return, the error does not
 depend on a rule of thumb about tolerances.
@@ -32,7 +32,7 @@ class Choice:
     """Chosen settings and their measured error.
 
     `config`: the config with the settings in place of `auto`; `requested`: requested relative
-    error; `error`: largest relative error of mean and peak force, None if the scene has no periodic
+    error; `error`: greatest relative error of mean or peak force, None if the scene has no periodic
     steady state to compare; `tried`: all tried settings, each with its difference from the
     reference.
     """
@@ -58,7 +58,7 @@ class Choice:
 
 
 def choose(config: Config) -> Choice:
-    """Choose settings for `config`, whose fidelity is `auto`, that meet `solver.accuracy`.
+    """Choose solver settings that meet `solver.accuracy`, for a `config` whose fidelity is `auto`.
 
     The reference's settings are chosen if no cheaper settings agree with the reference, or if the
     reference itself finds no periodic orbit. Cheaper settings can also disagree because the motion
@@ -96,9 +96,11 @@ def _evaluations(config: Config) -> list[Evaluation]:
 
 
 def resolve(config: Config) -> tuple[Config, dict[str, Any]]:
-    """Return `config` with chosen settings in place of `auto`, and a record for the result file.
+    """Return `config` with the chosen settings in place of `auto`, and a record for the result
+    file.
 
-    The record is empty if the config's fidelity is not `auto`."""
+    If the config's fidelity is not `auto`, the config is returned unchanged, and the record is
+    empty."""
     if config.solver.fidelity != "auto":
         return config, {}
     choice = choose(config)
@@ -134,8 +136,8 @@ def _with(config: Config, fidelity: str, rtol: float, map_error: float = 1e-4) -
 
 
 def difference(found: Evaluation, truth: Evaluation) -> float | None:
-    """Return the largest relative difference of mean and peak force; None unless both evaluations
-    are usable."""
+    """Return the larger of the relative differences in mean force and in peak force, or None unless
+    both evaluations are usable."""
     if not (found.usable and truth.usable):
         return None
     pairs = ((found.response[key], truth.response[key]) for key in _JUDGED)

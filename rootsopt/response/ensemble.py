@@ -1,13 +1,13 @@
 """One design in one scene, averaged over an ensemble of motions: for chaotic scenes.
 
-In a chaotic scene, a single motion is no basis for optimisation. Its average over a finite window
+In a chaotic scene, a single motion cannot guide an optimisation. Its average over a finite window
 jumps between designs that hardly differ, and its derivative grows with the window. The average over
-many motions is meaningful; it is known to a standard error.
+many motions is meaningful, and its standard error is known.
 
 An `EnsembleEvaluator` starts `ensemble.members` motions from different initial states, lets each
-settle and averages the contact force over all of them. The gradient is that of the average over a
+settle, and averages the contact force over all of them. The gradient is that of the average over a
 Gaussian neighbourhood of the design. It is the least-squares slope through pairs of opposite
-neighbours, with a standard error of its own.
+neighbours, and has its own standard error.
 """
 
 import dataclasses
@@ -54,41 +54,42 @@ from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 
 _RTOL = 1e-6
-"""Tolerance below which the motions of an ensemble are not integrated. The standard errors of an
+"""Finest tolerance at which the motions of an ensemble are integrated. The standard errors of an
 ensemble are far larger than the error of such steps (docs/chaos.md)."""
 _AGAIN = 4
-"""Divisor of `ensemble.settle_periods` for motions that start from the last states of a
-neighbouring design's motions."""
+"""Number by which `ensemble.settle_periods` is divided for motions that start from the last states
+of a neighbouring design's motions."""
 _MAPS = 5
 """Maximum number of contact maps tried for one ensemble."""
 VERIFYING = 4
-"""Factor by which the number of members is larger when the best design of a search is verified."""
+"""Factor by which the number of members is increased to verify the best design of a search."""
 SIGNIFICANT = 3.0
-"""Difference of two averages (combined standard errors) above which the difference is
-significant."""
+"""Difference between two averages (combined standard errors) above which it counts as significant.
+"""
 ERRORS = {name: name.replace("_N", "_standard_error_N") for name in RESPONSES}
-"""Keys of the standard errors in `steady_state`, by response."""
+"""Keys of the standard errors in `steady_state`, keyed by the name of the response."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EnsembleEvaluator(Wrapper):
-    """Evaluates designs by an ensemble of motions in the scene of `single`.
+    """Evaluates designs with an ensemble of motions in the scene of `single`.
 
-    Argument `start` (members, n) of a call: scaled initial states, such as the `state` of a
-    neighbouring design's evaluation. By default the initial states are spread over the play.
-    `differentiate`: whether to compute the gradient, which takes most of the time.
+    A call has the argument `start` (members, n): scaled initial states, such as the `state` of a
+    neighbouring design's evaluation. By default, the initial states are those of
+    `members.initial_states`. `differentiate`: whether to compute the gradient, which takes most of
+    the time.
 
     An evaluation with the status AVERAGED holds:
 
     - `response`: averages over members and mesh periods. `peak_force_N` is the **mean of the peaks
-      of all mesh periods**. The greatest force of all grows with the window and has no limit; it is
+      of all mesh periods**. The greatest force grows without limit as the window gets longer; it is
       `steady_state["greatest_force_N"]`.
     - `steady_state`: standard errors of the response (keys in `ERRORS`); `kind`: periodic if all
       members repeat, chaotic if a member has a positive Lyapunov exponent, else transient;
       `gradient_standard_error` (as `gradient`, per config unit); the size of the ensemble;
       `mean_force_drift_N` within the window, with its standard error. If this drift is far from
-      zero, `ensemble.settle_periods` is too short, or members still pass between coexisting motions
-      of several kinds.
+      zero, `ensemble.settle_periods` is too short, or members still move from one kind of
+      coexisting motion to another.
     - `state` (members, n): last scaled states, a `start` for a neighbouring design.
     - `series` of one member.
 
@@ -101,13 +102,13 @@ class EnsembleEvaluator(Wrapper):
 
     @property
     def integrator(self) -> Integrator:
-        """Integrator of the motions: the transient's integrator, but no finer than `_RTOL`."""
+        """Integrator of the motions: that of the transient, at a tolerance of at least `_RTOL`."""
         transient = self.scene.solver.transient
         return dataclasses.replace(transient, rtol=jnp.maximum(transient.rtol, _RTOL))
 
     @property
     def settings(self) -> EnsembleConfig:
-        """Size and seed of the ensemble."""
+        """The config's `ensemble` section: size and seed of the ensemble, among others."""
         return self.config.ensemble
 
     def without_gradient(self) -> "EnsembleEvaluator":
@@ -115,7 +116,7 @@ class EnsembleEvaluator(Wrapper):
         return dataclasses.replace(self, differentiate=False)
 
     def independent(self, number: int) -> "EnsembleEvaluator":
-        """Return another evaluator, to judge designs that were chosen with this evaluator.
+        """Return another evaluator, for judging designs that were chosen with this evaluator.
 
         Its seed is larger by `number`, and it has `VERIFYING` times as many members. Scene and
         compiled programs are shared."""
@@ -145,7 +146,7 @@ class EnsembleEvaluator(Wrapper):
         `design` (d,): in config units, by default the config's own; `start` (members, n): scaled
         initial states; `series`: whether to compute the series of a member.
 
-        Raises ValueError for a `start` of another shape."""
+        Raises ValueError if `start` has the wrong shape."""
         began = time.perf_counter()
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now, outcome = self._fitted(design, lambda now: now._attempt(design, start))
@@ -154,7 +155,10 @@ class EnsembleEvaluator(Wrapper):
     def _fitted(
         self, design, attempt: Callable[["EnsembleEvaluator"], "_Outcome"]
     ) -> tuple["EnsembleEvaluator", "_Outcome"]:
-        """Repeat `attempt` until its contact map fits; return the last evaluator and outcome."""
+        """Repeat `attempt` until its contact map fits, at most `_MAPS` times.
+
+        `attempt` simulates with the evaluator that it is given. Return the last evaluator and
+        outcome."""
         now, single = self, self.single._sized(design)
         for _ in range(_MAPS):
             now = self._around(single)
@@ -243,7 +247,8 @@ class EnsembleEvaluator(Wrapper):
     def _kind(self, pair, members: Members, with_series):
         """Return the entries of `steady_state` for the kind of motion, and the series of a member.
 
-        The Lyapunov exponent is computed for a member that does not repeat, if there is one.
+        The Lyapunov exponent is computed for a member whose motion does not repeat, if there is
+        one.
         """
         every = np.all(members.repeats, axis=0)
         kind: dict[str, Any] = {"kind": "transient"}
@@ -314,7 +319,7 @@ class _Outcome:
 
     @property
     def reached(self) -> float:
-        """Largest |ε| (rad) of all motions."""
+        """Largest |ε| (rad) in all motions."""
         return max(float(np.max(run.reach)) for run in self.runs)
 
 
@@ -323,10 +328,10 @@ def neighbours(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return random points (2n, d) of the unit box around `point` (d,), and their steps (n, d).
 
-    The points are a middle plus the n steps, then the middle minus the steps. The steps are
-    normally distributed with standard deviation `settings.spread`, and shortened where a point
-    would leave the box. The middle is `point`, moved to at least one standard deviation inside the
-    box, since a point at a bound has no opposite neighbours.
+    The first n points are a centre plus the steps, the last n the centre minus the steps. The steps
+    are normally distributed with standard deviation `settings.spread`, and shortened where a point
+    would leave the box. The centre is `point`, moved inside the box if it is less than one standard
+    deviation from a bound, since a point at a bound has no opposite neighbours.
     """
     from scipy.stats import norm, qmc
 
@@ -346,11 +351,12 @@ def fitted_slope(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the slopes (r, d) of r responses and their covariances (r, d, d).
 
-    `values` (2n, r): responses at n opposite pairs at ± `steps` (n, d). The slopes are a
-    least-squares fit to the differences of the pairs, exact for responses up to quadratic. As pairs
-    are added, the slope tends to the gradient of the average over the neighbourhood (Stein's
-    identity: E[δδᵀ]⁻¹ E[δ f] = ∇E[f] for normal δ). The covariance comes from the residuals of the
-    pairs. So it contains the noise of the values and their nonlinearity.
+    `values` (2n, r): responses at n opposite pairs of points, the first n at plus `steps` (n, d),
+    the last n at minus `steps`. The slopes are a least-squares fit to the differences of the pairs,
+    exact for responses up to quadratic. As the number of pairs grows, the slope tends to the
+    gradient of the average over the neighbourhood (Stein's identity: E[δδᵀ]⁻¹ E[δ f] = ∇E[f] for
+    normal δ). The covariance comes from the residuals of the pairs. It therefore includes the noise
+    of the values and their nonlinearity.
     """
     count = len(steps)
     differences = (values[:count] - values[count:]) / 2
@@ -384,7 +390,8 @@ def _point(space: Space, design):
 
 @Program
 def _around(space: Space, design, points):
-    """Return the designs at `points` of the unit box, and the Jacobian of the design in the box."""
+    """Return the designs at `points` of the unit box, and the Jacobian of the design with respect
+    to the point."""
     return jax.vmap(space.design)(points), jax.jacfwd(space.design)(space.point(design))
 
 

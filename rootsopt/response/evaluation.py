@@ -64,11 +64,11 @@ class Evaluation:
     """Everything known about one design in one scene.
 
     `design`: parameters in config units; `geometry`, `response` (N), `gradient` (N per config
-    unit): by the result file's keys. `gradient` is empty unless it can be trusted. `steady_state`:
-    kind of motion and its properties; `status` and `message`: outcome and advice; `statistics`:
-    effort and accuracy; `series`: whole orbits over at least one revolution, or a window of a
-    motion that does not settle; `state`: use as `start` for a neighbouring design, None if not
-    known. For a single motion, `state` is the scaled state (n,) of the orbit at φ1 = 0.
+    unit): dicts with the keys of the result file. `gradient` is empty unless it can be trusted.
+    `steady_state`: kind of motion and its properties; `status` and `message`: outcome and advice;
+    `statistics`: effort and accuracy; `series`: whole orbits over at least one revolution, or a
+    window of a motion that does not settle; `state`: `start` for evaluating a neighbouring design,
+    None if not known. For a single motion, `state` is the scaled state (n,) of the orbit at φ1 = 0.
     """
 
     design: dict[str, float]
@@ -124,9 +124,9 @@ class Evaluator:
     on which they are called.
 
     `survey`: whether the evaluator is for a search over many designs (see `surveying`);
-    `reference`: response to which forces are relative where motions are compared; `fitted`: whether
-    the contact map has been fitted to a motion; `map_error`: error of the contact map, relative to
-    the static penetration, NaN if unknown.
+    `reference`: response by which forces are divided when coexisting motions are compared;
+    `fitted`: whether the contact map has been fitted to a motion; `map_error`: error of the contact
+    map, relative to the static penetration, NaN if unknown.
     """
 
     config: Config
@@ -139,6 +139,8 @@ class Evaluator:
     @classmethod
     def of(cls, config: Config, rtol: float | None = None, survey: bool = False) -> "Evaluator":
         """Return the evaluator of a `config`; `rtol` overrides its orbit tolerance.
+
+        `survey`: whether the evaluator is for a search over many designs (see `surveying`).
 
         Raises InputError for an unknown objective term or a scene that cannot be simulated."""
         terms_of([*config.objective.terms])
@@ -167,8 +169,8 @@ class Evaluator:
         return dataclasses.replace(self, scene=scene)
 
     def relative_to(self, baseline: Evaluation) -> "Evaluator":
-        """Return another evaluator that compares coexisting motions by force relative to the
-        `baseline`."""
+        """Return another evaluator, which compares coexisting motions by their forces relative to
+        those of the `baseline`."""
         return dataclasses.replace(self, reference=baseline.response)
 
     def at_speed(self, speed_rpm: float) -> "Evaluator":
@@ -176,7 +178,9 @@ class Evaluator:
         return dataclasses.replace(self, scene=at_speed(self.scene, speed_rpm))
 
     def without_gradient(self) -> "Evaluator":
-        """Return this evaluator unchanged: its gradient is cheap. (Ensembles skip the gradient.)"""
+        """Return this evaluator unchanged, since its gradient takes little time.
+
+        Other evaluators, such as those of ensembles, skip the gradient."""
         return self
 
     @property
@@ -270,8 +274,9 @@ class Evaluator:
         """Return another evaluator whose contact map fits the motion `found`, or None if the
         present map fits.
 
-        A map must cover the motion. A map of which the motion uses only a small part wastes
-        resolution, so it is replaced, but only once: neighbouring designs then share a map.
+        A map must cover the motion. If the motion uses only a small part of the map, resolution is
+        wasted, and the map is replaced. This is done only once, so that neighbouring designs share
+        a map.
         """
         status, reached = Status.of(found.status), _reached(pair, found)
         return self.reaching(reached, status is Status.PERIODIC, pair.angle_limit)
@@ -280,7 +285,7 @@ class Evaluator:
         """Return another evaluator with a contact map for motions that reach |ε| = `reached` (rad).
 
         The map covers at most `most` (rad). The result is None if the present map fits, or if there
-        is no map. The map shrinks only if `steady`: the motion is periodic."""
+        is no map. `steady`: whether the motion is periodic; only then may the map shrink."""
         covered = -float(self.scene.deepest)
         if self.scene.fidelity != "map" or not np.isfinite(reached):
             return None
@@ -294,8 +299,8 @@ class Evaluator:
     def _report(self, design, built, found: Steady, began: float, series: bool) -> Evaluation:
         """Return the evaluation of the motion `found`.
 
-        `built`: rotor pair and geometry; `began`: clock at the start of the evaluation (s);
-        `series`: whether to compute the series."""
+        `built`: rotor pair and geometry; `began`: time at the start of the evaluation (s,
+        `perf_counter`); `series`: whether to compute the series."""
         seconds = time.perf_counter() - began
         (pair, shape), status, orbit = built, Status.of(found.status), found.orbit
         period = int(found.period)
@@ -353,7 +358,8 @@ class Evaluator:
     def _terms(self, design, response, gradient):
         """Return the values of the objective's further terms, and their gradients.
 
-        A gradient is NaN if it needs a gradient of the forces that is not known."""
+        The gradient of a term is NaN if it depends on gradients of the forces that are not known.
+        """
         names = [name for name in self.config.objective.terms if name not in response]
         if not names:
             return {}, {}
@@ -377,7 +383,7 @@ class Evaluator:
         return found if np.isnan(self.map_error) else found | {"map_error": self.map_error}
 
     def _gradient(self, design, found: Steady) -> dict[str, dict[str, float]]:
-        """Return the gradient of a closed orbit, by the result file's keys."""
+        """Return the gradient of a closed orbit as a dict with the keys of the result file."""
         if not self.keys:
             return {}
         orbit, solver = found.orbit, self.scene.solver
@@ -402,7 +408,8 @@ def at_speed(scene: Scene, speed_rpm: float) -> Scene:
 def _reached(pair: RotorPair, found: Steady) -> float:
     """Return the largest |ε| (rad) of the motion `found`.
 
-    The motion is the orbit, else the window, else only the last state of the transient."""
+    It is taken from the orbit if there is one, else from the window. Without a window, it is taken
+    from the last state of the transient alone."""
     scale = float(pair.angle_scale)
     if Status.of(found.status) in (*CLOSED, Status.IDLE):
         return scale * float(np.max(np.abs(found.orbit.flow.states[:, 0])))
@@ -437,11 +444,11 @@ def _closed(orbit: Orbit, period: int) -> dict[str, Any]:
 
 
 def idle_hint(config: Config, depth: float) -> str:
-    """Return advice for flanks that never touch: which clearance or backlash lets them touch.
+    """Return advice for flanks that never touch: which clearance or backlash would let them touch.
 
     `depth` (m): greatest penetration, the negative of the least gap. The motion does not depend on
-    the clearance as long as nothing touches. So the flanks touch once the clearance falls by more
-    than the least gap. The advice is empty if the gap is not known or too large."""
+    the clearance as long as nothing touches. Therefore, the flanks touch if the clearance is
+    reduced by more than the least gap. The advice is empty if the gap is not known or too large."""
     gap, clearance = -depth / MM, config.contact.clearance_mm
     if not (np.isfinite(gap) and 0 < gap < 0.9 * config.profile.pitch_radius_mm):
         return ""
@@ -458,7 +465,7 @@ def idle_hint(config: Config, depth: float) -> str:
 
 
 def geometry_record(scene: Scene, shape: Geometry) -> dict[str, float]:
-    """Return the geometry, by the result file's keys and in its units."""
+    """Return the geometry as a dict with the keys and units of the result file."""
     return {
         "outer_radius_mm": float(shape.outer_radius) / MM,
         "root_radius_mm": float(shape.root_radius) / MM,
@@ -477,7 +484,7 @@ unsettled_status = Program(window_status)
 
 
 def objective_weights(config: Config) -> dict[str, float]:
-    """Return the weights of the responses in the objective, by name; their sum is 1."""
+    """Return the weights of the responses in the objective, keyed by name; their sum is 1."""
     wanted = config.objective
     peak = PEAK_NORM if wanted.peak_norm is not None else "peak_force_N"
     shares = {
@@ -493,7 +500,7 @@ def objective_weights(config: Config) -> dict[str, float]:
 
 
 def floquet(monodromy) -> list[list[float]]:
-    """Return the Floquet multipliers as [real, imaginary], greatest modulus first.
+    """Return the Floquet multipliers as a list of [real, imaginary], greatest modulus first.
 
     `monodromy` (n, n): its eigenvalues are the Floquet multipliers."""
     values = np.linalg.eigvals(np.asarray(monodromy, np.float64))
@@ -557,9 +564,11 @@ def _orbit_series(pair: RotorPair, orbit: Orbit, period: int) -> Series:
 def unsettled(
     pair: RotorPair, status: Status, window: Window, series: bool
 ) -> tuple[dict[str, Any], dict[str, float], Series | None]:
-    """Return `steady_state`, `response` and `series` of an `Evaluation` that has not settled.
+    """Return `steady_state`, `response` and `series` for the `Evaluation` of a motion without an
+    orbit.
 
-    `window` and `status` of the motion; `series`: whether to compute the series (else None)."""
+    `status` of the motion; `window`: a window of the motion; `series`: whether to compute the
+    series. Otherwise, the series is None."""
     steady = {"kind": _KINDS.get(status, "transient")} | _of_window(window)
     if status not in (Status.CHAOTIC, Status.NOT_SETTLED, Status.IDLE):
         return steady, {}, None

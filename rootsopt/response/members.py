@@ -26,13 +26,13 @@ _MEMBERS = 4
 _MEMORY = 17
 """Number of stroboscopic states stored, to recognise a motion that repeats."""
 _REPEATS = 1e-2
-"""Scaled difference below which a motion repeats."""
+"""Scaled difference between states below which a motion counts as repeating."""
 
 
 class Members(NamedTuple):
     """Results of m motions of one design.
 
-    `means` (m, 3): mean force (N), mean square (N²) and mean over the peaks of mesh periods (N);
+    `means` (m, 3): mean force (N), mean square (N²) and mean of the peaks of all mesh periods (N);
     `drift`: mean force in the second half of the window minus that in the first (N); `greatest`:
     greatest force (N); `reach`: greatest |ε| (rad); `depth`: greatest penetration (m; negative:
     least gap); `states` (m, n): last scaled states; `repeats` (m, 8): whether the last states
@@ -53,9 +53,10 @@ class Members(NamedTuple):
 
     @property
     def status(self) -> Status:
-        """AVERAGED, or the failure of some member: solver, finite forces, stall, passing lobes.
+        """AVERAGED if no member has failed, else the status of the failure.
 
-        The kinds of failure are checked in this order."""
+        Failures are checked in this order: the solver failed; the forces are not finite; the motor
+        stalled; the lobes passed through each other."""
         if not np.all(self.solved):
             return Status.SOLVER_FAILED
         if not np.all(np.isfinite(self.means)):
@@ -66,7 +67,8 @@ class Members(NamedTuple):
 
     @property
     def responses(self) -> NDArray[np.float64]:
-        """Mean, peak and RMS force (N) in rows, with their standard errors, (3, 2).
+        """Array (3, 2) with rows for mean, peak and RMS force (N): the value, then its standard
+        error.
 
         The standard errors are those of means over independent members. The standard error of the
         RMS is correct to first order.
@@ -86,10 +88,11 @@ def mean_and_error(values: NDArray[np.float64]):
 
 
 def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float64]:
-    """Return scaled states (members, n): a scrambled Sobol sequence of ε and dε/dt.
+    """Return scaled states (members, n), in which ε and dε/dt are a scrambled Sobol sequence.
 
-    |ε| goes up to `angle_scale` (play and static penetration). |dε/dt| goes up to the speed after a
-    fall under the load through the whole range of ε.
+    |ε| ranges up to the pair's `angle_scale` (half the backlash plus the static penetration).
+    |dε/dt| ranges up to the speed that the load causes across the whole range of ε, or 1 (scaled)
+    if that is greater. `seed`: seed of the sequence.
     """
     from scipy.stats import qmc
 
@@ -102,7 +105,7 @@ def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float
 
 
 def prepare_members(pair: RotorPair, integrator: Integrator) -> None:
-    """Compile in the background the program that `run_members` needs on CPUs for `pair`."""
+    """Compile the program that `run_members` needs for `pair` on CPUs, in the background."""
     states = jax.ShapeDtypeStruct((_MEMBERS, pair.states), pair.angle_scale.dtype)
     count = jax.ShapeDtypeStruct((), int)
     _in_turn.prepare(pair, states, count, count, integrator)
@@ -147,10 +150,10 @@ def run_members(
 def member(
     pair: RotorPair, state: Float[Array, " n"], settle: Any, periods: Any, integrator: Integrator
 ) -> Members:
-    """Return the result of one motion from the scaled `state` (n,), as a pure function.
+    """Simulate one motion from the scaled `state` (n,) and return its result.
 
-    `settle`, `periods`: mesh periods before and in the window. The fields of the result lack the
-    leading axis of `Members`."""
+    `settle`: mesh periods before the window; `periods`: mesh periods of the window. The fields of
+    the result lack the leading axis of `Members`. This is a pure function."""
     dtype = state.dtype
     one, none, low = jnp.ones((), dtype), jnp.zeros((), dtype), jnp.full((), -jnp.inf, dtype)
 

@@ -30,21 +30,22 @@ def sweep_scenes(
     """Evaluate a `config` at every combination of the values of some of its keys.
 
     `axes`: dotted keys with their values, such as {"scene.speed_rpm": [1000, 2000]}. Each key is a
-    dimension of the result, in the order given. `progress` is called with (points done, all).
+    dimension of the result, in the order given. `progress` is called with (points done, number of
+    points).
 
     The result has these variables over the dimensions:
 
-    - `mean_force_N`, `peak_force_N`, `rms_force_N` (N) and whatever else the config reports (NaN if
-      not known);
+    - `mean_force_N`, `peak_force_N`, `rms_force_N` (N), and further responses that the config
+      requests (NaN if not known);
     - `status`: labels;
     - `period` (mesh periods; 0 if not periodic);
     - `floquet_multiplier`: greatest modulus (NaN if there is no closed orbit);
     - `gradient_…` of each response per config unit, with the further dimension `design_key` (NaN
       without a gradient).
 
-    Raises `InputError` for a key or value that a config cannot have, before anything is simulated;
-    ValueError without axes, for an axis without values, or if the design parameters differ between
-    points.
+    Raises `InputError` for a key or value that a config cannot have, before anything is simulated.
+    Raises ValueError if there are no axes, if an axis has no values, or if the design parameters
+    differ between points.
 
     >>> rootsopt.sweep_scenes(config, {"scene.speed_rpm": [1000.0, 2000.0, 3000.0]}).mean_force_N
     """
@@ -118,7 +119,7 @@ def _dataset(config: Config, axes, found: Sequence[Evaluation], keys) -> xarray.
 
 
 def _unit(name: str) -> str:
-    """Return the unit that a key ends with, or "1"."""
+    """Return the unit with which a key ends, or "1" if it ends with none."""
     endings = {"_rpm": "rpm", "_mm": "mm", "_deg": "deg", "_N": "N", "_N_m": "N m", "_mrad": "mrad"}
     fits = [ending for ending in endings if name.endswith(ending)]
     return endings[max(fits, key=len)] if fits else "1"

@@ -52,9 +52,9 @@ class AtSpeed(NamedTuple):
 class SpeedsEvaluation(Evaluation):
     """An `Evaluation` at the scene's own speed, together with the evaluations at all speeds.
 
-    `parts`: one for each speed; `status`: status of the first part that is not usable, if any, and
-    then there is no gradient; `state` (m, 1 + n): a row for each known motion, which holds the
-    number of its part, then the scaled state.
+    `parts`: one for each speed; `status`: that of the first part that is not usable. In this case,
+    there is no gradient. If all parts are usable, it is the status of the first part. `state` (m, 1
+    + n): a row for each known motion, which holds the number of its part, then the scaled state.
     """
 
     parts: tuple[AtSpeed, ...] = ()
@@ -69,8 +69,8 @@ class SpeedsEvaluation(Evaluation):
 class SpeedsEvaluator(Wrapper):
     """Evaluates designs at every speed of `objective.speeds_rpm` and at the scene's own speed.
 
-    `single`: the evaluator used at each speed; `baseline`: per-speed parts of the evaluation to
-    which the forces at each speed are relative.
+    `single`: the evaluator used at each speed; `baseline`: per-speed parts of the baseline's
+    evaluation, to which forces at the same speed are relative; empty: no baseline.
 
     The response is reported at the scene's own speed. If `objective.speeds_rpm` does not contain
     this speed, its share in the objective is 0, but its status counts.
@@ -79,8 +79,8 @@ class SpeedsEvaluator(Wrapper):
     baseline: tuple["AtSpeed", ...] = ()
 
     def relative_to(self, baseline: Evaluation) -> "SpeedsEvaluator":
-        """Return another evaluator that compares coexisting motions at each speed by force relative
-        to the `baseline` at the same speed."""
+        """Return another evaluator, which compares coexisting motions at each speed by their forces
+        relative to those of the `baseline` at the same speed."""
         return dataclasses.replace(self, baseline=at_speeds(baseline))
 
     def fit(self, design=None, start=None, series=True) -> tuple["SpeedsEvaluator", Evaluation]:
@@ -205,8 +205,8 @@ def sweep(
 ) -> tuple[AtSpeed, ...]:
     """Evaluate `design` (config units; default: the config's own) at each of the speeds, from rest.
 
-    `evaluator`: an evaluator for a single speed; `progress` is called with (speeds done, number of
-    speeds). All parts of the result have equal shares.
+    `evaluator`: an evaluator for a single speed; `progress` is called with (number of speeds done,
+    number of speeds). All parts of the result have equal shares.
     """
     parts: list[AtSpeed] = []
 
@@ -222,8 +222,8 @@ def sweep(
 
 
 def overall(parts: Sequence[AtSpeed]) -> tuple[Status, str]:
-    """Return status and message of the first part that is not usable, or of the first part if all
-    are usable."""
+    """Return status and message of the first part that is not usable. If all parts are usable,
+    return those of the first part."""
     for part in parts:
         if not part.evaluation.usable:
             return part.evaluation.status, f"At {part.speed_rpm:g} rpm: {part.evaluation.message}"

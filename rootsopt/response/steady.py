@@ -2,7 +2,7 @@
 
 The derivative of an orbit comes from the implicit function theorem: JAX never differentiates
 through the search for the orbit. All requested derivatives are columns of one matrix, computed with
-the orbit. JAX transformations only multiply with this matrix. Therefore forward and reverse mode
+the orbit. JAX transformations only multiply by this matrix. Therefore forward and reverse mode
 agree to rounding. Derivatives that are not requested are not computed.
 """
 
@@ -30,12 +30,12 @@ class Response(NamedTuple):
     """The steady response of one design in one scene; with leading axes if it was mapped.
 
     `mean`, `peak`, `rms`: contact force (N); `lines` (lines,): amplitudes (N) of the spectral lines
-    that the scene requests, in the same order (0 if the motion lacks the line); `peak_norm`: p-norm
-    (N), None unless the scene requests it; `period`: mesh periods of the orbit;
-    `multipliers` (n,): Floquet multipliers, greatest modulus first; `residual`: distance (scaled)
-    by which the orbit does not close; `status`: code of a `Status` (`Status.of(code)`); `state`
-    (n,) at φ1 = 0 in SI units: ε (rad), dε/dt (rad/s), then the states of parts, such as the excess
-    of a motor's speed over the scene's (rad/s).
+    that the scene requests, in the same order (0 if the motion does not contain the line);
+    `peak_norm`: p-norm (N), None unless the scene requests it; `period`: mesh periods of the orbit;
+    `multipliers` (n,): Floquet multipliers, greatest modulus first; `residual`: scaled distance
+    between the start and the end of the orbit; `status`: code of a `Status` (`Status.of(code)`);
+    `state` (n,) at φ1 = 0 in SI units: ε (rad), dε/dt (rad/s), then the states of parts, such as
+    the excess of a motor's speed over the scene's (rad/s).
 
     The forces are those of the orbit, or 0 without contact. If the motion does not settle, the
     forces are those of a window of 128 mesh periods. In all other cases, the forces are NaN. If the
@@ -68,8 +68,8 @@ def steady_response(
     the status is periodic. `multipliers` and `residual` are constants to JAX, with derivative 0.
     Only first derivatives are available.
 
-    Raises ValueError for a design of another size; RuntimeError if JAX is not set to the precision
-    of the scene.
+    Raises ValueError if the design has the wrong shape; RuntimeError if JAX is not set to the
+    precision of the scene.
 
     >>> config = rootsopt.load_config("configs/cic.yaml")
     >>> scene = rootsopt.Scene.from_config(config)
@@ -113,7 +113,7 @@ def _response_jvp(primals, tangents):
 
 
 def _moved(scene: Any, design: Any) -> tuple[list[tuple[int, Array]], list[Array]]:
-    """Return the tangents that are not None (zero), in two lists.
+    """Return the tangents that are not None, in two lists. A tangent of None stands for zero.
 
     The first list holds (number of the leaf in `_leaves`, tangent) for differentiable leaves. The
     second list holds the tangents of a measured outline, for which there are no derivatives."""
@@ -132,7 +132,8 @@ def _moved(scene: Any, design: Any) -> tuple[list[tuple[int, Array]], list[Array
 
 
 _SETTINGS = ("solver", "deepest")
-"""Fields of a scene that are numerical settings, not physical quantities; tangents are ignored."""
+"""Fields of a scene that are numerical settings, not physical quantities. Their tangents are
+ignored."""
 
 
 def _leaves(tree: Any) -> list[tuple[Any, Any]]:
@@ -151,8 +152,8 @@ def _split(values, response: Response):
 def _solved(scene: Scene, design, start, along: tuple[int, ...]) -> tuple[Response, Array]:
     """Return the response, and the derivatives (rows, m) of its differentiated fields.
 
-    `along`: numbers of the leaves of scene and design to differentiate with respect to, m entries
-    in all."""
+    `along`: numbers of the leaves of scene and design with respect to which to differentiate. The
+    leaves have m entries in total."""
     arguments = scene, design, start, along
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
         return _inline(*arguments)

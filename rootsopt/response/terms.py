@@ -40,14 +40,14 @@ class Term(eqx.Module):
     def value(
         self, scene: Scene, profile: Profile, shape: Geometry, forces: Forces
     ) -> Float[Array, ""]:
-        """Return the value of the term for one design, by operations that JAX can differentiate.
+        """Return the value of the term for one design, using operations that JAX can differentiate.
 
         `profile` and `shape`: profile and geometry of the design (SI units); `forces` (N): mean,
         peak and RMS of the steady contact force in the `scene`."""
 
 
 class GeometryTerm(Term):
-    """A term that is the field named `field` of `Geometry` (SI units), divided by `unit`."""
+    """A term whose value is the field of `Geometry` (SI units) named `field`, divided by `unit`."""
 
     field: str = eqx.field(static=True)
     unit: float = eqx.field(static=True)
@@ -58,7 +58,7 @@ class GeometryTerm(Term):
 
 
 class InertiaTerm(Term):
-    """A term that is the polar moment of inertia of one rotor (kg·m²)."""
+    """A term whose value is the polar moment of inertia of one rotor (kg·m²)."""
 
     def value(self, scene, profile, shape, forces):
         del profile, forces
@@ -66,7 +66,7 @@ class InertiaTerm(Term):
 
 
 class ForceTerm(Term):
-    """A term that is the field named `field` of `Forces` (N)."""
+    """A term whose value is the field of `Forces` (N) named `field`."""
 
     field: str = eqx.field(static=True)
 
@@ -79,9 +79,9 @@ _terms: dict[str, Term] = {}
 
 
 def register_term(name: str, term: Term) -> None:
-    """Register a `term` under a `name` for `objective.terms`.
+    """Register a `term` under a `name` for use in `objective.terms`.
 
-    Raises ValueError for a name that is not an identifier or is taken."""
+    Raises ValueError if the name is not an identifier or is already taken."""
     if not name.isidentifier():
         raise ValueError(
             f"Argument `name` must be a word of letters, digits and _, but is {name!r}"

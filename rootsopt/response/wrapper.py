@@ -41,13 +41,16 @@ class Evaluates(Protocol):
     def fit(
         self, design: Any = None, start: NDArray | None = None, series: bool = True
     ) -> tuple["Evaluates", Evaluation]:
-        """Evaluate a design. Return another evaluator, fitted to its motion, and the evaluation."""
+        """Evaluate a design. Return another evaluator, fitted to its motion, and the evaluation.
+
+        Arguments: see `__call__`."""
         ...
 
     def prepare(self, design: Any = None, series: bool = True) -> "Evaluates":
-        """Compile the programs for `design` in the background.
+        """Compile the programs for evaluating `design` (d,), in config units, in the background.
 
-        Return another evaluator, with a contact map sized for `design`."""
+        `series`: whether the evaluations will compute the series. Return another evaluator, with a
+        contact map sized for `design`."""
         ...
 
     def pair(self, design: ArrayLike) -> RotorPair:
@@ -67,20 +70,22 @@ class Evaluates(Protocol):
         ...
 
     def relative_to(self, baseline: Evaluation) -> "Evaluates":
-        """Return another evaluator that compares coexisting motions by force relative to a
-        `baseline`."""
+        """Return another evaluator, which compares coexisting motions by their forces relative to
+        those of the `baseline`."""
         ...
 
     def without_gradient(self) -> "Evaluates":
-        """Return an evaluator that skips the gradient if the gradient takes most of the time."""
+        """Return an evaluator that skips the gradient, if computing it takes most of the time."""
         ...
 
 
 @dataclasses.dataclass(frozen=True)
 class Wrapper:
-    """Base class of evaluators that combine several evaluations by another evaluator, `single`.
+    """Base class of evaluators that combine several evaluations, made by another evaluator,
+    `single`.
 
-    A subclass writes `fit`. A call is `fit` without the evaluator; other methods apply to `single`.
+    A subclass defines `fit`. A call returns the evaluation from `fit`; the other methods are
+    applied to `single`.
     """
 
     single: Evaluates
@@ -96,11 +101,15 @@ class Wrapper:
         return self.single.scene
 
     def __call__(self, design=None, start=None, series=True) -> Evaluation:
-        """Evaluate `design` (config units; default: the config's own)."""
+        """Evaluate `design` (config units; default: the config's own).
+
+        Arguments: see `Evaluates.__call__`."""
         return self.fit(design, start, series)[1]
 
     def fit(self: W, design=None, start=None, series=True) -> tuple[W, Evaluation]:
-        """Evaluate a design. Return another evaluator, fitted to its motion, and the evaluation."""
+        """Evaluate a design. Return another evaluator, fitted to its motion, and the evaluation.
+
+        Arguments: see `Evaluates.__call__`."""
         raise NotImplementedError
 
     def pair(self, design: ArrayLike) -> RotorPair:
@@ -108,7 +117,9 @@ class Wrapper:
         return self.single.pair(design)
 
     def prepare(self: W, design=None, series=True) -> W:
-        """Compile the programs for a design in the background; return an evaluator sized for it."""
+        """Compile the programs for evaluating a design in the background.
+
+        Return another evaluator, sized for the design. Arguments: see `Evaluates.prepare`."""
         return self._around(self.single.prepare(design, series))
 
     def at_speed(self: W, speed_rpm: float) -> W:
@@ -124,12 +135,12 @@ class Wrapper:
         return self._around(self.single.surveying())
 
     def relative_to(self: W, baseline: Evaluation) -> W:
-        """Return another evaluator that compares coexisting motions by force relative to a
-        `baseline`."""
+        """Return another evaluator, which compares coexisting motions by their forces relative to
+        those of the `baseline`."""
         return self._around(self.single.relative_to(baseline))
 
     def without_gradient(self: W) -> W:
-        """Return an evaluator that skips the gradient if it takes most of the time."""
+        """Return an evaluator that skips the gradient, if computing it takes most of the time."""
         return self._around(self.single.without_gradient())
 
     def _around(self: W, single: Evaluates) -> W:

@@ -51,7 +51,7 @@ class Units(NamedTuple):
 
 
 class Context(NamedTuple):
-    """The scene that a part is prepared for.
+    """Quantities of the scene for which a part is prepared.
 
     `inertia` (kg·m²) and `mass` (kg) of one rotor; `pitch_radius` (m); `angle` (rad): the solver's
     unit of ε; `load_torque` (N·m): mean load torque against rotor 2; `speed` (rad/s) of the drive.
@@ -66,8 +66,8 @@ class Context(NamedTuple):
 
 
 class Part(eqx.Module):
-    """A component that acts on a rotor pair by torques, forces on the axes, or drag at the flanks.
-    A part can have states of its own.
+    """A component that acts on a rotor pair through torques, forces on the axes, or drag at the
+    flanks. A part can have states of its own.
 
     Override the methods that apply to your part. A method you leave out costs nothing: no state, no
     computation. Store every number in a field that holds an array: a response is differentiable
@@ -84,7 +84,7 @@ class Part(eqx.Module):
 
     @property
     def free(self) -> bool:
-        """Whether the speed of rotor 1 is a state instead of prescribed."""
+        """Whether the part makes the speed of rotor 1 a state, instead of a prescribed quantity."""
         return False
 
     @property
@@ -94,7 +94,7 @@ class Part(eqx.Module):
 
     @property
     def rubs(self) -> bool:
-        """Whether the part acts against the sliding of the flanks (see `drag`)."""
+        """Whether the part opposes the sliding of the flanks (see `drag`)."""
         return False
 
     @property
@@ -139,26 +139,30 @@ class Part(eqx.Module):
         raise NotImplementedError(f"`{type(self).__name__}` displaces the axes, but has no `axes`")
 
     def lost(self, own: Own) -> Bool[Array, ""] | None:
-        """Return whether the part's own states stop the pair from running; None: they never do."""
+        """Return whether the part's own states show that the pair no longer runs; None: they never
+        do."""
         del own
         return None
 
     # Loads from the part. None: no load.
 
     def torque_on_1(self, motion: Motion, own: Own) -> Float[Array, ""] | None:
-        """Return the torque (N·m) on rotor 1. This method is called only where rotor 1 is free."""
+        """Return the torque (N·m) on rotor 1; None: zero.
+
+        This method is called only if rotor 1 is `free`.
+        """
         del motion, own
         return None
 
     def torque_on_2(self, motion: Motion, own: Own) -> Float[Array, ""] | None:
-        """Return the torque (N·m) on rotor 2."""
+        """Return the torque (N·m) on rotor 2; None: zero."""
         del motion, own
         return None
 
     def force_on_axes(self, motion: Motion, own: Own) -> Float[Array, "2 2"] | None:
-        """Return the forces (N) on the axes (rotor, x and y).
+        """Return the forces (N) on the axes (rotor, x and y); None: zero.
 
-        This method is called only where a part `displaces` the axes."""
+        This method is called only if a part `displaces` the axes."""
         del motion, own
         return None
 
@@ -187,23 +191,26 @@ class Part(eqx.Module):
 
     @property
     def play(self) -> Float[Array, ""] | None:
-        """Half the range of ε (rad) over which the part does not hold the rotors together; None for
-        a part that never holds them."""
+        """Half the backlash (rad): half the range of ε over which the part exerts no torque between
+        the rotors. None for a part that never couples the rotors."""
         return None
 
     @property
     def edges(self) -> tuple[Float[Array, ""], ...]:
-        """Values of ε (rad) at which the part begins to hold the rotors. Solver steps end there."""
+        """Values of ε (rad) at which the part begins to couple the rotors. Solver steps end at
+        these.
+        """
         return ()
 
     @property
     def holding_stiffness(self) -> Float[Array, ""] | None:
-        """Stiffness (N·m/rad) with which the part holds ε; None: no stiffness."""
+        """Torsional stiffness (N·m/rad) with which the part opposes ε; None: no stiffness."""
         return None
 
     def quickest(self, inertia: Float[Array, ""]) -> Float[Array, ""] | None:
-        """Return 1/ω (s) of the part's fastest oscillation; None: no oscillation of its own.
+        """Return 1/ω (s), where ω is the angular frequency of the part's fastest oscillation.
 
-        `inertia` (kg·m²) of one rotor."""
+        `inertia` (kg·m²) of one rotor. The result is None if the part has no oscillation of its
+        own."""
         del inertia
         return None

@@ -23,7 +23,7 @@ class PrescribedDrive(Drive):
 
 
 class MotorDrive(Drive):
-    """A motor on rotor 1 with a straight torque-speed line.
+    """A motor that turns rotor 1, with a linear torque-speed characteristic.
 
     `torque` (N·m) at `speed` (rad/s); `slope` (N·m·s/rad): loss of torque for each rad/s above
     `speed`; `inertia` (kg·m²) of the motor, which is added to the inertia of rotor 1.

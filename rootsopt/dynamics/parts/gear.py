@@ -10,12 +10,12 @@ from rootsopt.dynamics.parts.base import Motion, Part
 class TimingGear(Part):
     """Timing gear between the rotors: backlash, stiffness, damping.
 
-    The torque is zero for |ε| ≤ `half_backlash` (rad). Beyond that, it is `stiffness` (N·m/rad)
-    times the excess plus `damping` (N·m·s/rad) times dε/dt. Both ends of the backlash are rounded
-    over the first `rounding` (rad) of the excess. The rounding preserves integrals over ε: a motion
-    through the rounding loses the same energy to the spring, and the same momentum to the damper,
-    as at a sharp edge. `offset` (rad): ε at the middle of the backlash, for a gear mounted out of
-    phase; None: no offset.
+    The torque is zero while ε differs from `offset` by at most `half_backlash` (rad). Beyond that,
+    it is `stiffness` (N·m/rad) times the excess plus `damping` (N·m·s/rad) times dε/dt. The torque
+    sets in smoothly over the first `rounding` (rad) of the excess. The rounding preserves integrals
+    over ε: a motion through the rounding loses the same energy to the spring, and the same momentum
+    to the damper, as at a sharp edge. `offset` (rad): ε at the middle of the backlash, for a gear
+    mounted out of phase; None: 0.
     """
 
     stiffness: Float[Array, ""]
@@ -25,7 +25,9 @@ class TimingGear(Part):
     offset: Float[Array, ""] | None = None
 
     def __call__(self, relative: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the torque (N·m) against ε, at ε = `relative` (rad), dε/dt = `rate` (rad/s)."""
+        """Return the torque (N·m) on rotor 1, equal and opposite to the torque on rotor 2.
+
+        `relative`: ε (rad); `rate`: dε/dt (rad/s)."""
         relative = self._from_middle(relative)
         excess = jnp.abs(relative) - self.half_backlash
         engaged = jnp.where(

@@ -15,7 +15,7 @@ _BRIEF = 0.01
 
 
 class Load(Part):
-    """Torques against the rotors as functions of rotor 1's angle φ1.
+    """Torques that oppose the rotors, as functions of the angle φ1 of rotor 1.
 
     `torque` (N·m): mean torque against rotor 2.
     """
@@ -73,10 +73,11 @@ class GasLoad(Load):
         T = Δp L (r_a² - ρ²) / 2.
 
     ρ is computed for perfect rolling at φ1; the effect of ε on ρ, of order ε, is neglected.
-    Averaged over a turn, the torques on both rotors together equal the displaced volume times
-    Δp / 2π. This is exact unless a whole tip arc meshes at one instant (a canonical CIC profile).
-    There ρ jumps, and the jump is spread over `_BRIEF`. The pressure at a wide gap does not jump,
-    and the derivatives of a jump that moves with the design would need separate treatment.
+    Averaged over a turn, the torques on both rotors together equal the displaced volume times Δp /
+    2π. This is exact unless a whole tip arc meshes at one instant (a canonical CIC profile). There
+    ρ jumps, and the jump is spread over the roll angle `_BRIEF`, for two reasons. The real pressure
+    does not jump at a wide gap. And the derivatives of a jump that moves with the design would need
+    separate treatment.
 
     `pressure_length` (N/m): pressure difference Δp (Pa) times the rotor's length L (m); `profile`;
     `outer_radius` r_a (m); `torque`: mean torque against one rotor (N·m).

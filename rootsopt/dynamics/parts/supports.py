@@ -7,16 +7,17 @@ from jaxtyping import Array, Bool, Float
 from rootsopt.dynamics.parts.base import Context, Loads, Motion, Part, Units
 
 _DISPLACED = 0.1
-"""Displacement of an axis, relative to the centre distance, above which the mesh is lost."""
+"""Displacement of an axis, relative to the centre distance, above which the rotors no longer count
+as being in mesh."""
 
 
 class Supports(Part):
     """Elastic bearings that let the axes of both rotors move.
 
     `stiffness` (N/m) and `damping` (N·s/m) of a rotor's two bearings together, the same in every
-    direction across the axis; `mass` (kg) of one rotor; `radius` (m): the pitch radius. Mass and
-    radius come from the scene (`prepare`). The solver's unit of displacement is `radius` times the
-    unit of ε.
+    direction perpendicular to the axis; `mass` (kg) of one rotor; `radius` (m): the pitch radius.
+    Mass and radius come from the scene (`prepare`). The solver's unit of displacement is `radius`
+    times the unit of ε.
     """
 
     stiffness: Float[Array, ""]
