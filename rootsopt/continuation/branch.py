@@ -93,8 +93,8 @@ class Branch:
     def at(self, value: float) -> list[BranchPoint]:
         """Return all orbits of the branch at one `value` of the parameter (config's unit).
 
-        Each orbit is closed again at exactly this value, and left out if that fails. The list is
-        empty if the branch does not pass the value."""
+        Each orbit is closed again at exactly this value, and left out if that fails. The branch's
+        last point is returned as it is. The list is empty if the branch does not pass the value."""
         orbits = Orbits(self.config, self.parameter, self.period, self.limits)
         found = []
         for old, new in zip(self.points[:-1], self.points[1:], strict=True):

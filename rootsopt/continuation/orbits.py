@@ -192,7 +192,7 @@ class Orbits:
     parameter as a fraction of its range. `config` of the first orbit; `parameter`: name of the
     parameter; `period`: k; `limits`: range of the parameter (config's unit) and step sizes.
 
-    Raises `InputError` for single precision.
+    Raises `InputError` for an unknown parameter or single precision.
     """
 
     def __init__(self, config: Config, parameter: str, period: int, limits: StepSizes):
@@ -201,6 +201,7 @@ class Orbits:
                 "`solver.precision` must be float64 to follow a branch, but is "
                 f"{config.solver.precision}"
             )
+        _check(config, parameter)
         self.config, self.parameter, self.period, self.limits = config, parameter, period, limits
         self.names = parameters(config)
         self.values = np.array([value_of(config, name) for name in self.names])
