@@ -65,6 +65,10 @@ class Evaluates(Protocol):
         """Return another evaluator that compares motions by their forces relative to a baseline."""
         ...
 
+    def with_maxima(self) -> "Evaluates":
+        """Return another evaluator that adds all local maxima of the force to an evaluation."""
+        ...
+
     def without_gradient(self) -> "Evaluates":
         """Return an evaluator that skips the gradient if it takes most of the time."""
         ...
@@ -120,6 +124,10 @@ class Wrapper:
     def relative_to(self: W, baseline: Evaluation) -> W:
         """Return another evaluator that compares motions by forces relative to a `baseline`."""
         return self._around(self.single.relative_to(baseline))
+
+    def with_maxima(self: W) -> W:
+        """Return another evaluator that adds all local maxima of the force to an evaluation."""
+        return self._around(self.single.with_maxima())
 
     def without_gradient(self: W) -> W:
         """Return an evaluator that skips the gradient if it takes most of the time."""
