@@ -17,11 +17,14 @@ from rootsopt.config.units import unit_of
 from rootsopt.design.space import Space, slacks_and_slopes
 from rootsopt.dynamics.measures import line_name
 from rootsopt.errors import InputError
+from rootsopt.optimize.local import Group, Local
 from rootsopt.response.evaluation import Evaluation, objective_weights
 from rootsopt.response.speeds import at_speeds, counted
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 
+PEAK = "peak_force_N"
+"""Name of the measure that is the greatest of several local maxima."""
 _NO_LINE = 1e-9
 """Amplitude of a spectral line, relative to the mean force, below which there is no line."""
 _DRAWN = 5
@@ -130,6 +133,70 @@ class Problem:
             for key, weight in self._weights(baseline).items():
                 by_design += share * weight * np.array(list(one.gradient[key].values()))
         return np.asarray(by_design @ np.asarray(jacobian))
+
+    def local(self, evaluation: Evaluation, point) -> Local | None:
+        """Return the problem at a `point` to first order; None without a usable steady state.
+
+        With `Evaluation.maxima`, every local maximum of the force is a branch of the objective. So
+        is every speed, where the worst of several counts, and every coexisting motion."""
+        if not evaluation.usable:
+            return None
+        _, jacobian, slack, normals = self.look(point)
+        worst = self.config.objective.over_speeds == "worst"
+        # The same groups at every point, even if one of them has a single branch.
+        cornered = self.cornered or self.config.objective.motion == "worst"
+        parts = zip(at_speeds(evaluation), at_speeds(self.baseline), strict=True)
+        smooth, slope = 0.0, np.zeros(len(self.space.lower))
+        groups: list[Group] = []
+        for number, (part, base) in enumerate(parts):
+            if part.share <= 0:
+                continue
+            one = self._branches(part.evaluation, base.evaluation, number)
+            if not (cornered or worst):
+                smooth += part.share * float(one.values[0])
+                slope += part.share * one.slopes[0]
+            else:
+                share = 1.0 if worst else part.share
+                groups.append(Group(one.tags, share * one.values, share * one.slopes))
+        if worst:
+            together = [np.concatenate(arrays) for arrays in zip(*groups, strict=True)]
+            groups = [Group(*together)]
+        scaled = tuple(g._replace(slopes=g.slopes @ jacobian) for g in groups)
+        return Local(smooth, slope @ jacobian, scaled, slack, normals)
+
+    @property
+    def cornered(self) -> bool:
+        """Whether the objective contains the peak force of single motions."""
+        return PEAK in objective_weights(self.config) and self.config.objective.motion in (
+            "reached",
+            "worst",
+        )
+
+    def _branches(self, evaluation: Evaluation, baseline: Evaluation, number: int) -> Group:
+        """Return the objective at one speed as branches, with slopes per config unit.
+
+        `number`: that of the speed, the kind of the branches."""
+        weights = self._weights(baseline)
+        tags, values, slopes = [], [], []
+        for one in (evaluation, *evaluation.rivals):
+            maxima = one.maxima if PEAK in weights else None
+            smooth = {k: w for k, w in weights.items() if maxima is None or k != PEAK}
+            value = sum(w * one.response[k] for k, w in smooth.items())
+            slope = sum(
+                (w * np.array(list(one.gradient[k].values())) for k, w in smooth.items()),
+                np.zeros(len(self.space.lower)),
+            )
+            if maxima is None or not maxima.times.size:
+                tags.append((number, 0.0))
+                values.append(self._value(one, baseline))
+                slopes.append(slope)
+                continue
+            period = one.steady_state["period"]
+            for time, force, row in zip(*maxima, strict=True):
+                tags.append((number, time / period))
+                values.append(value + weights[PEAK] * force)
+                slopes.append(slope + weights[PEAK] * row)
+        return Group(np.array(tags), np.array(values), np.array(slopes))
 
     def _counted(self, evaluation: Evaluation):
         return counted(self.config, evaluation, self.baseline, self._value)

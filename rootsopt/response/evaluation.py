@@ -70,7 +70,8 @@ class Evaluation:
     effort and accuracy; `series`: whole orbits over at least one revolution, or a window of a
     motion that does not settle; `state`: `start` for a neighbouring design, None if not known. For
     one motion it is the scaled state of the orbit at φ1 = 0 (n,). `maxima`: local maxima of the
-    force over the orbit, slopes in N per config unit; None unless requested and periodic.
+    force over the orbit, slopes in N per config unit; None unless requested and periodic. `rivals`:
+    evaluations of the other motions, where the worst of several counts.
     """
 
     design: dict[str, float]
@@ -84,6 +85,7 @@ class Evaluation:
     series: Series | None
     state: NDArray[np.float64] | None = None
     maxima: Maxima | None = None
+    rivals: "tuple[Evaluation, ...]" = ()
 
     @property
     def usable(self) -> bool:
