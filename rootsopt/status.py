@@ -72,6 +72,11 @@ class Status(enum.Enum):
         "contact parameters."
     )
 
+    NOT_CONVERGED = (
+        "The design is better than the baseline, but the first-order conditions of an optimum do "
+        "not hold there: optimality.message of result.json says why, and what to do."
+    )
+
     @property
     def code(self) -> int:
         """Number of the status in arrays."""

@@ -64,6 +64,8 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
             if baseline:
                 optimized = result.optimized.record()["speeds"]
                 out.print(tables.speeds_table(baseline, optimized, result.objective_by_speed))
+            if result.optimality is not None:
+                out.print(tables.optimality_table(result.optimality.record(), numbers[0]))
             if alike:
                 out.print(tables.likeness_table(alike["resembles"]))
         if result.interrupted or result.optimized is None:
@@ -143,6 +145,8 @@ def _advice(result) -> str:
         return _interrupted(result)
     if not result.baseline.usable:
         return f"baseline: {result.baseline.message}"
+    if result.optimality is not None and not result.optimality.converged:
+        return result.optimality.message
     if result.optimized is not None:
         return result.optimized.message
     if message := noise.message(result.verification):
@@ -198,6 +202,8 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
     data["constraints"] = result.constraints
     if config.objective.speeds_rpm and result.optimized is not None:
         data["objective_by_speed"] = result.objective_by_speed
+    if result.optimality is not None:
+        data["optimality"] = result.optimality.record()
     data["verification"] = result.verification
     data["status"], data["message"] = result.status.label, _advice(result)
     data["statistics"] = {

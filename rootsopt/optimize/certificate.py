@@ -19,7 +19,7 @@ NEAR = 1e-4
 """Distance from a limit, or of a branch from the greatest one, up to which it can be active."""
 _WEIGHT = 1e4
 """Weight of the condition that shares add up to 1. It holds exactly where the residual is 0."""
-_NEGLIGIBLE = 1e-9
+_NEGLIGIBLE = 1e-6
 """Length of a constraint's gradient up to which the constraint cannot hold a design."""
 
 

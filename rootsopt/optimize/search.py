@@ -1,10 +1,11 @@
-"""The search: screening, optax descent with projection, verification.
+"""The search: screening, local searches, verification with a certificate.
 
-Screening chooses the starts from a Sobol sample of feasible designs. From each start, an optax
-update rule descends in the unit box. The gradient is first projected onto the directions that
-active constraints allow; each step is projected back onto the feasible set. The last orbit is the
-first guess for the next. The best design so far is kept, and simulated again from rest at a tighter
-tolerance before it is reported. A search can be stopped at any time (`stop`). It then verifies the
+Screening chooses the starts from a Sobol sample of feasible designs. From each start, a local
+search begins: sequential quadratic programming on exact gradients (`rootsopt.optimize.sqp`), or a
+descent by an optax update rule. The descent projects the gradient onto the directions that active
+constraints allow, and each step back onto the feasible set. The last orbit is the first guess for
+the next. The best design is simulated again from rest before it is reported, and its first-order
+conditions are checked there. A search can be stopped at any time (`stop`). It then verifies the
 best design found so far.
 """
 
@@ -24,7 +25,11 @@ from numpy.typing import NDArray
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
-from rootsopt.optimize.problem import Problem
+from rootsopt.optimize.certificate import certify
+from rootsopt.optimize.local import Local
+from rootsopt.optimize.optimality import RESIDUAL, Optimality, StartOutcome
+from rootsopt.optimize.problem import FEASIBLE, Problem
+from rootsopt.optimize.sqp import Found, Stops, descend
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.wrapper import Evaluates
@@ -57,9 +62,10 @@ Progress = Callable[[int, int, float], None]
 class Trial:
     """One evaluated design of a search.
 
-    `point` (d,) of the unit box; `start`: number of the descent (-1: screening); `iteration`: steps
-    from its start; `evaluation`; `objective`: NaN without a usable steady state; `feasible`:
-    whether all constraints are satisfied.
+    `point` (d,) of the unit box; `start`: number of the local search (-1: screening); `iteration`:
+    steps from its start; `evaluation`; `objective`: NaN without a usable steady state; `feasible`:
+    whether all constraints are satisfied; `residual`: of the first-order conditions, NaN if not
+    known.
     """
 
     point: NDArray[np.float64]
@@ -68,6 +74,7 @@ class Trial:
     evaluation: Evaluation
     objective: float
     feasible: bool
+    residual: float = float("nan")
 
     @property
     def candidate(self) -> bool:
@@ -83,7 +90,9 @@ class Optimization:
     `optimized`: evaluation of the best design, None if no design better than the baseline was
     confirmed; `history`: one row per trial; `verification`: objective in the search and in the
     verification; `interrupted`: whether the search was stopped. `verification["holds_up"]` is None
-    if the search was stopped before the best design could be verified.
+    if the search was stopped before the best design could be verified. `optimality`: first-order
+    conditions at the best design, and what the starts found; None for an average over an ensemble
+    or without a verified design.
     """
 
     problem: Problem | None
@@ -92,6 +101,7 @@ class Optimization:
     history: list[dict[str, Any]]
     verification: dict[str, Any]
     interrupted: bool = False
+    optimality: Optimality | None = None
 
     @property
     def status(self) -> Status:
@@ -100,7 +110,11 @@ class Optimization:
             return Status.INTERRUPTED
         if not self.baseline.usable:
             return self.baseline.status
-        return Status.NOT_IMPROVED if self.optimized is None else self.optimized.status
+        if self.optimized is None:
+            return Status.NOT_IMPROVED
+        if self.optimality is not None and not self.optimality.converged:
+            return Status.NOT_CONVERGED
+        return self.optimized.status
 
     @property
     def improvement(self) -> dict[str, float]:
@@ -118,7 +132,8 @@ class Optimization:
         """Constraints at the optimum, one row each."""
         if self.problem is None or self.optimized is None:
             return []
-        return self.problem.constraint_rows(self.optimized)
+        certificate = None if self.optimality is None else self.optimality.certificate
+        return self.problem.constraint_rows(self.optimized, certificate)
 
     @property
     def objective_by_speed(self) -> list[dict[str, float]]:
@@ -152,6 +167,7 @@ class Search:
         self.config = config
         self.settings = config.optimizer
         self.progress = progress or (lambda done, expected, best: None)
+        self.method = method_of(config)
         self.expected = self.settings.screening + self.settings.starts * (
             self.settings.iterations + 1
         )
@@ -163,6 +179,7 @@ class Search:
         self._lock, self._best = threading.Lock(), float("nan")
         self._trials: list[Trial] = []
         self._refuted: list[NDArray[np.float64]] = []
+        self._found: dict[int, Found] = {}
         self._baseline: Evaluation | None = None
 
     def run(self) -> Optimization:
@@ -183,6 +200,10 @@ class Search:
         # The search needs gradients and a ranking of designs, not the last digits.
         self.fast = exact.at_tolerance(max(1e-6, self.config.solver.rtol)).surveying()
         self.problem = Problem.of(self.config, exact.scene, baseline)
+        if self.problem.cornered:
+            self.exact = exact.with_maxima()
+        # Second-order convergence needs more digits than a descent.
+        self.sharp = self.exact.surveying()
         self._baseline = baseline
         start = self.problem.point(list(baseline.design.values()))
         points = self._feasible(start)
@@ -190,7 +211,8 @@ class Search:
         if self.settings.screening:
             trials = self._side_by_side(self._screen, [(point,) for point in points])
         starts = self._starts(trials) or points[:1]
-        trials += self._side_by_side(self._descend, list(enumerate(starts)))
+        work = self._solve if self.method == "slsqp" else self._descend
+        trials += self._side_by_side(work, list(enumerate(starts)))
         if self.stop.is_set():
             if self.noisy and (found := self.so_far()) is not None:
                 return found
@@ -207,7 +229,8 @@ class Search:
             return Optimization(*settled, self.stop.is_set())
         optimized, verification = self._verify(trials)
         settled = self.problem, baseline, optimized, rows, verification
-        return Optimization(*settled, self.stop.is_set())
+        optimality = None if optimized is None else self._optimality(optimized, trials)
+        return Optimization(*settled, self.stop.is_set(), optimality)
 
     def so_far(self) -> Optimization | None:
         """Return what the search has found so far, without verification.
@@ -293,6 +316,35 @@ class Search:
                 chosen.append(trial.point)
         return chosen
 
+    def _solve(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
+        """Search from `point` by sequential quadratic programming and return the trials.
+
+        `number`: that of the local search."""
+        trials: list[Trial] = []
+        last: list[Trial] = []
+
+        def look(point: NDArray[np.float64]) -> Local | None:
+            orbit = last[-1].evaluation.state if last else None
+            trial, local = self._looked(point, number, len(trials), orbit)
+            trials.append(trial)
+            if local is not None:
+                last.append(trial)
+            return local
+
+        stops = Stops(evaluations=self.settings.iterations + 1, asked=self.stop.is_set)
+        if not self.stop.is_set():
+            found = descend(look, point, stops)
+            with self._lock:
+                self._found[number] = found
+        return trials
+
+    def _looked(self, point, number, iteration, orbit) -> tuple[Trial, Local | None]:
+        """Evaluate a point with its first-order conditions."""
+        evaluation = self.sharp(self.problem.design(point), start=orbit, series=False)
+        local = self.problem.local(evaluation, point)
+        residual = float("nan") if local is None else certify(local, point).residual
+        return self._noted(point, number, iteration, evaluation, residual), local
+
     def _descend(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
         """Descend from `point` and return the trials; `number`: that of the descent."""
         settings = self.settings
@@ -327,9 +379,14 @@ class Search:
 
     def _evaluate(self, evaluator: Evaluates, point, start, iteration, orbit=None) -> Trial:
         evaluation = evaluator(self.problem.design(point), start=orbit, series=False)
+        return self._noted(point, start, iteration, evaluation)
+
+    def _noted(self, point, start, iteration, evaluation, residual=float("nan")) -> Trial:
+        """Return the trial of an evaluation, and record it."""
         objective = self.problem.objective(evaluation)
         feasible = self.problem.feasible(point)
-        trial = Trial(np.asarray(point), start, iteration, evaluation, objective, feasible)
+        point = np.array(point)
+        trial = Trial(point, start, iteration, evaluation, objective, feasible, residual)
         with self._lock:
             self._trials.append(trial)
             if trial.candidate:
@@ -341,7 +398,10 @@ class Search:
         """Simulate the best designs again, from rest at a tight tolerance, until one is confirmed.
 
         Return its evaluation, or None, and the record for the result file."""
+        ends = {found.point.tobytes() for found in self._found.values()}
         ranked = sorted(filter(_candidate, trials), key=_objective)
+        # The ends of local searches come first: points beside them are no better.
+        ranked.sort(key=lambda trial: trial.point.tobytes() not in ends)
         tried: list[np.ndarray] = []
         failures = []
         for candidate in ranked:
@@ -364,6 +424,73 @@ class Search:
             failures.append(record | {"design": evaluation.design})
             self._refuted.append(candidate.point)
         return None, {"holds_up": False, "rejected": failures}
+
+    def _optimality(self, optimized: Evaluation, trials: list[Trial]) -> Optimality | None:
+        """Return the first-order conditions at a verified design, and what the starts found."""
+        point = self.problem.point(list(optimized.design.values()))
+        local = self.problem.local(optimized, point)
+        if local is None:
+            return None
+        certificate = certify(local, point)
+        starts = [self._outcome(number, found) for number, found in sorted(self._found.items())]
+        reason = "converged"
+        ends = sorted(self._found.items())
+        if not certificate.holds(RESIDUAL, FEASIBLE):
+            reasons = [found.reason for _, found in ends if _near(found.point, [point])]
+            reason = reasons[0] if reasons else "descent"
+            reason = "verification" if reason == "converged" else reason
+        held = self.problem.held_by(optimized, certificate)
+        starts = [self._outcome(number, found) for number, found in ends]
+        return Optimality(self.method, certificate, reason, held, starts or self._ends(trials))
+
+    def _outcome(self, number: int, found: Found) -> StartOutcome:
+        """Return the outcome of a local search by sequential quadratic programming."""
+        certificate, local = found.certificate, found.local
+        reason = found.reason
+        if certificate is not None and certificate.holds(RESIDUAL, FEASIBLE):
+            reason = "converged"
+        return StartOutcome(
+            start=number,
+            objective=float("nan") if local is None else local.objective,
+            residual=float("nan") if certificate is None else certificate.residual,
+            reason=reason,
+            evaluations=found.evaluations,
+            design=self._named(found.point),
+            point=found.point,
+        )
+
+    def _ends(self, trials: list[Trial]) -> list[StartOutcome]:
+        """Return the outcomes of descents: the best trial of each."""
+        starts: dict[int, list[Trial]] = {}
+        for trial in trials:
+            if trial.start >= 0:
+                starts.setdefault(trial.start, []).append(trial)
+        found = []
+        for number, every in sorted(starts.items()):
+            best = min(filter(_candidate, every), key=_objective, default=every[0])
+            outcome = best.objective, best.residual, "descent", len(every)
+            found.append(StartOutcome(number, *outcome, self._named(best.point), best.point))
+        return found
+
+    def _named(self, point) -> dict[str, float]:
+        """Return the design at a point, by key."""
+        values = map(float, self.problem.design(point))
+        return dict(zip(self.problem.baseline.design, values, strict=True))
+
+
+def method_of(config: Config) -> str:
+    """Return the method of the local searches: that of the config, without `auto`.
+
+    Raises InputError for a method that needs exact gradients, if the config's are averages."""
+    method, noisy = config.optimizer.method, config.objective.motion == "ensemble"
+    if method == "auto":
+        return "adam" if noisy else "slsqp"
+    if method == "slsqp" and noisy:
+        raise InputError(
+            "`optimizer.method` must be adam, rmsprop or sgd for `objective.motion` ensemble, but "
+            "is slsqp: gradients of averages have noise; set it to auto"
+        )
+    return method
 
 
 def until_stopped(work: Callable[[], T], stop: threading.Event, patience: float) -> T | None:
@@ -441,6 +568,7 @@ def _history(trials: list[Trial]) -> list[dict[str, Any]]:
                 **evaluation.design,
                 "area_efficiency": evaluation.geometry["area_efficiency"],
                 "feasible": trial.feasible,
+                "residual": trial.residual,
                 "status": evaluation.status.label,
             }
         )

@@ -85,7 +85,7 @@ REASONS = {
 """Reasons why a local search ends, with advice."""
 
 
-class _End(Exception):
+class _EndError(Exception):
     """Ends SLSQP from inside a function it calls."""
 
 
@@ -107,7 +107,7 @@ class _Epigraph:
         key = point.tobytes()
         if key not in self.known:
             if self.stops.asked() or self.evaluations >= self.stops.evaluations:
-                raise _End
+                raise _EndError
             self.evaluations += 1
             self.known[key] = found = self.look(point)
             if found is not None:
@@ -128,7 +128,7 @@ class _Epigraph:
         if better or (done and found.objective <= best.objective + limit):
             self.best, self.certificate = (point, found), certificate
             if done:
-                raise _End
+                raise _EndError
 
     def point(self, z) -> NDArray[np.float64]:
         """Return the point of the unit box for the variables of SLSQP."""
@@ -210,7 +210,7 @@ def descend(look: Look, start: NDArray[np.float64], stops: Stops | None = None) 
         before = problem.best[1]
         try:
             _slsqp(problem)
-        except _End:
+        except _EndError:
             reason = "interrupted" if stops.asked() else "evaluations"
         if problem.certificate.holds(stops.residual, stops.feasibility):
             reason = "converged"

@@ -76,6 +76,62 @@ def comparison_table(
     return Group(table, *(Text(f"{name}: {message}") for name, message in notes))
 
 
+def optimality_table(
+    optimality: Mapping[str, Any], constraints: list[dict[str, Any]]
+) -> RenderableType:
+    """Show the first-order conditions at the optimum, what holds it, and what the starts found.
+
+    `optimality` is the entry of the result file; `constraints` are its rows."""
+    table = _table("Certificate of the optimum", "value", "objective")
+    word = optimality["reason"].replace("_", " ")
+    _group(
+        table,
+        "first-order conditions",
+        [
+            ("residual (of the unit box)", _number(optimality["residual"]), word),
+            ("violation (scaled)", _number(optimality["violation"]), ""),
+        ],
+    )
+    prices = [row for row in constraints if abs(row.get("multiplier", 0.0)) > 0]
+    _group(table, "price of a limit", map(_price, prices))
+    held = optimality["held_by"]
+    if len(held) > 1:
+        _group(table, "branches that hold the optimum (share)", map(_held, held))
+    _group(table, "starts", map(_start, optimality["starts"]))
+    _group(table, "distinct optima", _optima(optimality))
+    return Group(table, Text(optimality["message"]))
+
+
+def _price(row: Mapping[str, Any]) -> tuple[str, ...]:
+    step = f"{row['relaxed_by']:+g} {row['unit']}".strip()
+    name = f"{_words(row['name'])} {row['sense']} {_number(row['limit'])} {row['unit']}".strip()
+    return name, step, f"{row['relaxed_objective_percent']:+.3g} %"
+
+
+def _held(row: Mapping[str, Any]) -> tuple[str, ...]:
+    at = "" if row["speed_rpm"] is None else f"{_number(row['speed_rpm'])} rpm"
+    if row["rotation_deg"] is not None:
+        at += f" peak of {_number(row['force_N'])} N at {row['rotation_deg']:.2f} deg"
+    return at.strip() or "motion", f"{row['share']:.3f}", _number(row["objective"])
+
+
+def _start(row: Mapping[str, Any]) -> tuple[str, ...]:
+    word = row["reason"].replace("_", " ")
+    count = f"{row['evaluations']} designs"
+    return f"start {row['start']}: {word}", count, _number(row["objective"])
+
+
+def _optima(optimality: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    rows = []
+    for number, one in enumerate(optimality["optima"]):
+        times = f"{one['found']} of {len(optimality['starts'])} starts"
+        rows.append((f"optimum {number}", times, _number(one["objective"])))
+    share = optimality["unseen"]["share_of_starts"]
+    if rows and share is not None:
+        rows.append(("further starts that would find a new one", f"{100 * share:.3g} %", ""))
+    return rows
+
+
 def evaluation_table(evaluation: Evaluation) -> RenderableType:
     """Show one design in one scene."""
     record = evaluation.record()
@@ -227,7 +283,8 @@ def _constraint(row: Mapping[str, Any]) -> tuple[str | Text, ...]:
     if not row["satisfied"]:
         verdict = Text("violated", style="bold red")
     else:
-        verdict = Text("active" if row.get("active") else "satisfied", style="green")
+        word = "active" if row.get("active") else "satisfied"
+        verdict = Text("met by all" if row.get("always") else word, style="green")
     return label, _number(row["baseline"]), _number(row["optimized"]), verdict
 
 
