@@ -4,6 +4,9 @@ The peak is the greatest of several local maxima. Where two of them are equal, t
 as a function of the design, while each maximum by itself is smooth. A search that knows all of them
 can converge to such a corner.
 
+A maximum can grow out of a *shoulder*: a place near the top where the force rises or falls slowly,
+without a maximum. Shoulders near the greatest force are listed as well, as maxima to come.
+
 The maxima are computed after the orbit and only on request, so the orbit's own program does not
 grow.
 """
@@ -29,6 +32,8 @@ from rootsopt.runtime.programs import Program
 
 MOST = 12
 """Maximum number of local maxima that are reported: the greatest ones."""
+_BESIDES = 4
+"""Maximum number of shoulders that are reported besides."""
 _LANES = 64
 """Number of instants at which the force is evaluated together."""
 _CLOSER, _ROUNDS = 16, 10
@@ -39,12 +44,14 @@ _DIP = 1e-6
 """Relative fall of the force between two maxima below which they count as one."""
 _LEAST = 1e-3
 """Fraction of the greatest force below which a maximum is left out."""
+_SHOULDER = 0.02
+"""Relative distance from the greatest force within which shoulders are listed."""
 _SHORTEST = 1e-9
 """Minimum time (mesh periods) between the start of a step and a maximum inside it."""
 
 
 class Maxima(NamedTuple):
-    """Local maxima of the contact force over one orbit, greatest first.
+    """Local maxima and shoulders of the contact force over one orbit, greatest first.
 
     `times` (k,) in mesh periods from φ1 = 0; `forces` (k,) in N; `slopes` (k, d): derivatives of
     the forces along the orbit's d directions (N per unit of each direction).
@@ -72,7 +79,7 @@ def local_maxima(
     times, forces = _located(pair, orbit, steps, float(period))
     if not times.size:
         return Maxima(times, forces, np.zeros((0, orbit.moved.shape[1])))
-    padded = np.resize(times, MOST)
+    padded = np.resize(times, MOST + _BESIDES)
     rounding = pair.rounding(jnp.asarray(orbit.flow.depth))
     values, slopes = _differentiated(pair, tangents, orbit, padded, rounding, integrator)
     values, slopes = (np.asarray(x, np.float64)[: times.size] for x in (values, slopes))
@@ -119,7 +126,9 @@ def _located(
         best = np.where(better, around[row, column], best)
         top = np.where(better, tried[row, column], top)
         reach *= 2.0 / (_CLOSER - 1)
-    return best, top
+    even = force(width * np.arange(states.shape[0]))
+    beside = shoulders(even)[:_BESIDES]
+    return np.append(best, width * beside), np.append(top, even[beside])
 
 
 def candidates(
@@ -146,6 +155,19 @@ def candidates(
     found = np.sort(np.asarray(kept, dtype=np.int64))
     low, high = places[np.maximum(found - 1, 0)], places[np.minimum(found + 1, last)]
     return found, np.stack([low, high])
+
+
+def shoulders(forces: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the indices (k,) of shoulders among uniform samples (m,) of one cycle, highest first.
+
+    A shoulder is where the slope of the force comes nearest to 0 without changing its sign."""
+    slope = np.roll(forces, -1) - np.roll(forces, 1)
+    before, after, steep = np.roll(slope, 1), np.roll(slope, -1), np.abs(slope)
+    same = (np.sign(before) == np.sign(slope)) & (np.sign(after) == np.sign(slope))
+    least = (steep <= np.abs(before)) & (steep < np.abs(after))
+    high = forces > (1 - _SHOULDER) * np.max(forces)
+    found = np.flatnonzero(same & least & high)
+    return found[np.argsort(-forces[found], kind="stable")]
 
 
 def _dip(forces: NDArray[np.float64], one: int, other: int) -> float:
@@ -284,4 +306,4 @@ def _along(kept: _Pieces, start: Float[Array, "n d"], taken: Int[Array, ""]) -> 
     return lax.fori_loop(0, taken, advance, (start, found))[1]
 
 
-__all__ = ["MOST", "Maxima", "candidates", "local_maxima"]
+__all__ = ["MOST", "Maxima", "candidates", "local_maxima", "shoulders"]
