@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment, minimize
 from rootsopt.optimize.certificate import Certificate, certify
 from rootsopt.optimize.local import Group, Local, Look
 
-_SCALE = 0.3
+_SCALE = 0.1
 """Side of the unit box in the variables of SLSQP, which begins with a unit Hessian."""
 _SLOTS = 4
 """Number of branches of one group that may appear during a search, besides twice those at its
