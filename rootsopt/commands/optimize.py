@@ -66,6 +66,8 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
                 out.print(tables.speeds_table(baseline, optimized, result.objective_by_speed))
             if result.optimality is not None:
                 out.print(tables.optimality_table(result.optimality.record(), numbers[0]))
+                if result.optimality.sensitivities:
+                    out.print(tables.sensitivity_table([*result.optimality.sensitivities]))
             if alike:
                 out.print(tables.likeness_table(alike["resembles"]))
         if result.interrupted or result.optimized is None:

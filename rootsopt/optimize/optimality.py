@@ -80,7 +80,8 @@ class Optimality:
     """What is known about the optimum of a search.
 
     `method` of the local searches; `certificate` at the verified design; `reason`: a word for why
-    the search stopped; `holders`: branches that are active; `starts`: outcome of each local search.
+    the search stopped; `holders`: branches that are active; `starts`: outcome of each local search;
+    `sensitivities`: rows of the table of scene quantities.
     """
 
     method: str
@@ -88,6 +89,7 @@ class Optimality:
     reason: str
     holders: Sequence[Holder]
     starts: Sequence[StartOutcome]
+    sensitivities: Sequence[dict[str, Any]] = ()
 
     @property
     def converged(self) -> bool:
@@ -129,6 +131,7 @@ class Optimality:
             ],
             "optima": [one._asdict() for one in optima],
             "unseen": unseen(sum(one.found for one in optima), len(optima)),
+            "sensitivities": [*self.sensitivities],
         }
 
 

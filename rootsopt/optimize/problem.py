@@ -172,6 +172,20 @@ class Problem:
         scaled = tuple(g._replace(slopes=g.slopes @ jacobian) for g in groups)
         return Local(smooth, slope @ jacobian, scaled, slack, normals)
 
+    def along_scene(self, moved: Evaluation, certificate: Certificate) -> dict[str, float]:
+        """Return the derivatives of the optimal objective with respect to scene quantities.
+
+        `moved`: evaluation of the optimum at a single speed, with gradients by scene quantity
+        (`by_scene`). The design follows the optimum, which has no effect to first order (envelope
+        theorem). The result is empty if a term of the objective is not a force."""
+        weights = self._weights(self.baseline)
+        if not weights.keys() <= moved.gradient.keys():
+            return {}
+        group = self._branches(moved, self.baseline, 0)
+        shares = certificate.shares[0] if certificate.shares else np.ones(1)
+        keys = next(iter(moved.gradient.values()))
+        return dict(zip(keys, map(float, shares @ group.slopes), strict=True))
+
     @property
     def cornered(self) -> bool:
         """Whether the objective contains the peak force of single motions."""
@@ -192,7 +206,7 @@ class Problem:
             value = sum(w * one.response[k] for k, w in smooth.items())
             slope = sum(
                 (w * np.array(list(one.gradient[k].values())) for k, w in smooth.items()),
-                np.zeros(len(self.space.lower)),
+                start=0.0,
             )
             if maxima is None or not maxima.times.size:
                 tags.append((number, 0.0))

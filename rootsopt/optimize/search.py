@@ -25,13 +25,14 @@ from numpy.typing import NDArray
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
-from rootsopt.optimize.certificate import certify
+from rootsopt.optimize.certificate import Certificate, certify
 from rootsopt.optimize.local import Local
 from rootsopt.optimize.optimality import RESIDUAL, Optimality, StartOutcome
 from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.optimize.sqp import Found, Stops, descend
-from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.evaluators import evaluator_for
+from rootsopt.response.sensitivity import by_scene, quantities
 from rootsopt.response.wrapper import Evaluates
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import design_vector
@@ -180,6 +181,7 @@ class Search:
         self._trials: list[Trial] = []
         self._refuted: list[NDArray[np.float64]] = []
         self._found: dict[int, Found] = {}
+        self._fitted: Evaluates | None = None
         self._baseline: Evaluation | None = None
 
     def run(self) -> Optimization:
@@ -410,7 +412,7 @@ class Search:
             if _near(candidate.point, tried):
                 continue
             tried.append(candidate.point)
-            evaluation = self.exact(self.problem.design(candidate.point))
+            self._fitted, evaluation = self.exact.fit(self.problem.design(candidate.point))
             objective = self.problem.objective(evaluation)
             change = abs(objective / candidate.objective - 1)
             record = {
@@ -441,7 +443,28 @@ class Search:
             reason = "verification" if reason == "converged" else reason
         held = self.problem.held_by(optimized, certificate)
         starts = [self._outcome(number, found) for number, found in ends]
-        return Optimality(self.method, certificate, reason, held, starts or self._ends(trials))
+        starts = starts or self._ends(trials)
+        rows = self._sensitivities(optimized, certificate)
+        return Optimality(self.method, certificate, reason, held, starts, rows)
+
+    def _sensitivities(self, optimized: Evaluation, certificate: Certificate) -> list[dict]:
+        """Return the rows of the table of scene quantities; none for several speeds or motions."""
+        if not isinstance(self._fitted, Evaluator) or self.stop.is_set():
+            return []
+        moved = by_scene(self._fitted, optimized)
+        if moved is None:
+            return []
+        objective = self.problem.along_scene(moved, certificate)
+        level = self.problem.objective(optimized)
+        rows = []
+        for one in quantities(self.config):
+            forces = {name: one.step * row[one.key] for name, row in moved.gradient.items()}
+            row = {"quantity": one.name, "key": one.key, "unit": one.unit, "value": one.value}
+            row |= {"step": one.step} | forces
+            if objective:
+                row["objective_percent"] = 100 * one.step * objective[one.key] / level
+            rows.append(row)
+        return rows
 
     def _outcome(self, number: int, found: Found) -> StartOutcome:
         """Return the outcome of a local search by sequential quadratic programming."""

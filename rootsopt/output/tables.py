@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.sensitivity import MICROMETRE
 from rootsopt.status import Status
 
 DASH = "-"
@@ -100,6 +101,21 @@ def optimality_table(
     _group(table, "starts", map(_start, optimality["starts"]))
     _group(table, "distinct optima", _optima(optimality))
     return Group(table, Text(optimality["message"]))
+
+
+def sensitivity_table(rows: list[dict[str, Any]]) -> RenderableType:
+    """Show how forces and objective at the optimum change with the quantities of the scene.
+
+    `rows` are `sensitivities` of `optimality` in the result file."""
+    table = _table("Sensitivity of the optimum", "mean, N", "peak, N", "objective")
+    for row in rows:
+        length = row["unit"] == "mm" and row["step"] == MICROMETRE
+        step = "+1 um" if length else "+1 %"
+        forces = (f"{row[key]:+.3g}" for key in ("mean_force_N", "peak_force_N"))
+        share = row.get("objective_percent")
+        change = DASH if share is None else f"{share:+.3g} %"
+        table.add_row(f"{row['quantity']} {step}", *forces, change)
+    return table
 
 
 def _price(row: Mapping[str, Any]) -> tuple[str, ...]:

@@ -225,7 +225,7 @@ class Evaluator:
             pair, tangents, shape = _build(now.scene, design)
             dtype = pair.angle_scale.dtype
             state = np.zeros(pair.states, dtype) if start is None else np.asarray(start, dtype)
-            found = jax.device_get(now._motion(pair, tangents, state))
+            found = jax.device_get(now.motion(pair, tangents, state))
             other = now._refitted(pair, found)
             if other is None:
                 break
@@ -238,7 +238,9 @@ class Evaluator:
             report = dataclasses.replace(report, maxima=maxima)
         return now, report
 
-    def _motion(self, pair: RotorPair, tangents: RotorPair, state) -> Steady:
+    def motion(self, pair: RotorPair, tangents: RotorPair, state) -> Steady:
+        """Return the steady motion of `pair` that the scaled `state` (n,) leads to, with its
+        derivatives along `tangents`."""
         return _motion(pair, tangents, state, self.scene.pitch_radius, self.scene.solver)
 
     def pair(self, design: ArrayLike) -> RotorPair:

@@ -258,7 +258,11 @@ def test_free_form_is_improved_by_a_search():
     assert result.improvement["objective"] > 0.005
     assert all(row["satisfied"] for row in result.constraints)
     names = {row["name"] for row in result.constraints}
-    assert {"addendum radius of curvature", "tangents clear of the axis", "undercut margin"} <= names
+    assert {
+        "addendum radius of curvature",
+        "tangents clear of the axis",
+        "undercut margin",
+    } <= names
     check(with_design(settings.profile, list(result.optimized.design.values())))
 
 
