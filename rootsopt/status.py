@@ -76,6 +76,10 @@ class Status(enum.Enum):
         "The design is better than the baseline, but the first-order conditions of an optimum do "
         "not hold there: optimality.message of result.json says why, and what to do."
     )
+    INFEASIBLE = (
+        "No design satisfies all constraints. `infeasible` of result.json lists those that are in "
+        "conflict, and the nearest limits that can be met. Relax one of them."
+    )
 
     @property
     def code(self) -> int:

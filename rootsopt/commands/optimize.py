@@ -45,6 +45,8 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
         config, choice, result = _searched(config, progress, stop)
     if result is None:
         return _nothing_known(config, folder)
+    if result.infeasible is not None:
+        return _contradiction(config, folder, result)
     ran = time.perf_counter() - began
     alike = {} if result.interrupted else _alike(config, result)
     _write(folder, config, options, result, choice | alike, clock.seconds, ran)
@@ -117,6 +119,26 @@ def _nothing_known(config: "Config", folder: "RunFolder") -> "Outcome":
     folder.overwrite = False  # An earlier result is more valuable than this one.
     text = f"{status.label}: {message}"
     return cli.Outcome(cli.NO_RESULT, lambda out: out.print(text, soft_wrap=True))
+
+
+def _contradiction(config: "Config", folder: "RunFolder", result) -> "Outcome":
+    """Write the files of a run whose constraints contradict each other: why, and nothing else."""
+    from rootsopt.commands import cli
+    from rootsopt.output import files, tables
+
+    found = result.infeasible
+    files.write_config(folder, config)
+    data = {"baseline": result.baseline.record(), "optimized": None}
+    data |= {"status": result.status.label, "message": found.message}
+    data |= {"infeasible": found.record(), "versions": files.versions()}
+    folder.write_json("result.json", data)
+    rows = found.record()["conflicts"]
+
+    def show(out):
+        out.print(tables.conflict_table(rows))
+        out.print(f"{result.status.label}: {found.message}", soft_wrap=True)
+
+    return cli.Outcome(cli.NO_RESULT, show)
 
 
 def _alike(config: "Config", result) -> dict:

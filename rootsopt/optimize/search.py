@@ -26,6 +26,7 @@ from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
 from rootsopt.optimize.certificate import Certificate, certify
+from rootsopt.optimize.infeasible import Infeasible, explain
 from rootsopt.optimize.local import Local
 from rootsopt.optimize.optimality import RESIDUAL, Optimality, StartOutcome
 from rootsopt.optimize.problem import FEASIBLE, Problem
@@ -52,6 +53,8 @@ _STATIONARY = 1e-3
 """Norm of the projected gradient in the unit box below which a descent ends."""
 _HOLDS_UP = 0.01
 """Relative change of the objective in the verification above which a design is rejected."""
+_EXPLAINED = 8
+"""Maximum number of starts of the search for the least violation of the constraints."""
 _POLL = 0.05
 """Interval (s) at which a waiting thread checks whether to stop."""
 
@@ -65,8 +68,7 @@ class Trial:
 
     `point` (d,) of the unit box; `start`: number of the local search (-1: screening); `iteration`:
     steps from its start; `evaluation`; `objective`: NaN without a usable steady state; `feasible`:
-    whether all constraints are satisfied; `residual`: of the first-order conditions, NaN if not
-    known.
+    whether all constraints are satisfied; `local`: the problem to first order, None if not known.
     """
 
     point: NDArray[np.float64]
@@ -75,7 +77,12 @@ class Trial:
     evaluation: Evaluation
     objective: float
     feasible: bool
-    residual: float = float("nan")
+    local: Local | None = None
+
+    @property
+    def residual(self) -> float:
+        """Residual of the first-order conditions; NaN if not known."""
+        return float("nan") if self.local is None else certify(self.local, self.point).residual
 
     @property
     def candidate(self) -> bool:
@@ -93,7 +100,7 @@ class Optimization:
     verification; `interrupted`: whether the search was stopped. `verification["holds_up"]` is None
     if the search was stopped before the best design could be verified. `optimality`: first-order
     conditions at the best design, and what the starts found; None for an average over an ensemble
-    or without a verified design.
+    or without a verified design. `infeasible`: why no design satisfies all constraints, if so.
     """
 
     problem: Problem | None
@@ -103,6 +110,7 @@ class Optimization:
     verification: dict[str, Any]
     interrupted: bool = False
     optimality: Optimality | None = None
+    infeasible: Infeasible | None = None
 
     @property
     def status(self) -> Status:
@@ -111,6 +119,8 @@ class Optimization:
             return Status.INTERRUPTED
         if not self.baseline.usable:
             return self.baseline.status
+        if self.infeasible is not None:
+            return Status.INFEASIBLE
         if self.optimized is None:
             return Status.NOT_IMPROVED
         if self.optimality is not None and not self.optimality.converged:
@@ -181,7 +191,6 @@ class Search:
         self._trials: list[Trial] = []
         self._refuted: list[NDArray[np.float64]] = []
         self._found: dict[int, Found] = {}
-        self._fitted: Evaluates | None = None
         self._baseline: Evaluation | None = None
 
     def run(self) -> Optimization:
@@ -190,8 +199,7 @@ class Search:
         After `stop`, the outcome is the best design found before. It is verified, unless the
         objective is an average over an ensemble.
 
-        Raises InputError if no design is feasible, or if the objective is not defined for the
-        baseline."""
+        Raises InputError if the objective is not defined for the baseline."""
         exact = self.exact.prepare(design_vector(self.config))
         Space.of(self.config, exact.scene, 0.0).prepare()
         exact, baseline = exact.fit()
@@ -209,6 +217,10 @@ class Search:
         self._baseline = baseline
         start = self.problem.point(list(baseline.design.values()))
         points = self._feasible(start)
+        if not points:
+            reason = explain(self.problem, self._sample[:_EXPLAINED])
+            nothing = None, [], {}, self.stop.is_set(), None, reason
+            return Optimization(self.problem, baseline, *nothing)
         trials: list[Trial] = []
         if self.settings.screening:
             trials = self._side_by_side(self._screen, [(point,) for point in points])
@@ -288,21 +300,13 @@ class Search:
             pool.shutdown(wait=not self.stop.is_set(), cancel_futures=True)
 
     def _feasible(self, baseline_point) -> list[NDArray[np.float64]]:
-        """Return the baseline's point and a Sobol sample, made feasible; drop the infeasible ones.
-
-        Raises InputError if no point is feasible."""
+        """Return the baseline's point and a Sobol sample, made feasible, without infeasible ones."""
         start = self.problem.project(baseline_point)
         count, seed = self.settings.screening, self.settings.seed
         sample = sobol(count, seed, len(baseline_point))
         points = [start, *(self.problem.toward(point, start) for point in sample)]
-        points = [point for point in points if self.problem.feasible(point)]
-        if not points:
-            raise InputError(
-                "`constraints` and `optimizer.bounds` leave no feasible design; lower "
-                "`constraints.area_efficiency_min`, or widen `optimizer.bounds` or the range of "
-                "`constraints.outer_radius_*_mm`"
-            )
-        return points
+        self._sample = points
+        return [point for point in points if self.problem.feasible(point)]
 
     def _screen(self, point) -> list[Trial]:
         if self.stop.is_set():
@@ -327,11 +331,11 @@ class Search:
 
         def look(point: NDArray[np.float64]) -> Local | None:
             orbit = last[-1].evaluation.state if last else None
-            trial, local = self._looked(point, number, len(trials), orbit)
+            trial = self._evaluate(self.sharp, point, number, len(trials), orbit)
             trials.append(trial)
-            if local is not None:
+            if trial.local is not None:
                 last.append(trial)
-            return local
+            return trial.local
 
         stops = Stops(evaluations=self.settings.iterations + 1, asked=self.stop.is_set)
         if not self.stop.is_set():
@@ -339,13 +343,6 @@ class Search:
             with self._lock:
                 self._found[number] = found
         return trials
-
-    def _looked(self, point, number, iteration, orbit) -> tuple[Trial, Local | None]:
-        """Evaluate a point with its first-order conditions."""
-        evaluation = self.sharp(self.problem.design(point), start=orbit, series=False)
-        local = self.problem.local(evaluation, point)
-        residual = float("nan") if local is None else certify(local, point).residual
-        return self._noted(point, number, iteration, evaluation, residual), local
 
     def _descend(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
         """Descend from `point` and return the trials; `number`: that of the descent."""
@@ -381,14 +378,13 @@ class Search:
 
     def _evaluate(self, evaluator: Evaluates, point, start, iteration, orbit=None) -> Trial:
         evaluation = evaluator(self.problem.design(point), start=orbit, series=False)
-        return self._noted(point, start, iteration, evaluation)
-
-    def _noted(self, point, start, iteration, evaluation, residual=float("nan")) -> Trial:
-        """Return the trial of an evaluation, and record it."""
         objective = self.problem.objective(evaluation)
         feasible = self.problem.feasible(point)
         point = np.array(point)
-        trial = Trial(point, start, iteration, evaluation, objective, feasible, residual)
+        local = None
+        if start >= 0 and not self.noisy:
+            local = self.problem.local(evaluation, point)
+        trial = Trial(point, start, iteration, evaluation, objective, feasible, local)
         with self._lock:
             self._trials.append(trial)
             if trial.candidate:
@@ -412,7 +408,7 @@ class Search:
             if _near(candidate.point, tried):
                 continue
             tried.append(candidate.point)
-            self._fitted, evaluation = self.exact.fit(self.problem.design(candidate.point))
+            evaluation = self.exact(self.problem.design(candidate.point))
             objective = self.problem.objective(evaluation)
             change = abs(objective / candidate.objective - 1)
             record = {
@@ -449,9 +445,11 @@ class Search:
 
     def _sensitivities(self, optimized: Evaluation, certificate: Certificate) -> list[dict]:
         """Return the rows of the table of scene quantities; none for several speeds or motions."""
-        if not isinstance(self._fitted, Evaluator) or self.stop.is_set():
+        if not isinstance(self.exact, Evaluator) or self.stop.is_set():
             return []
-        moved = by_scene(self._fitted, optimized)
+        design = np.array(list(optimized.design.values()))
+        fitted = self.exact.fit(design, optimized.state, series=False)[0]
+        moved = by_scene(fitted, optimized)
         if moved is None:
             return []
         objective = self.problem.along_scene(moved, certificate)

@@ -118,6 +118,18 @@ def sensitivity_table(rows: list[dict[str, Any]]) -> RenderableType:
     return table
 
 
+def conflict_table(rows: list[dict[str, Any]]) -> RenderableType:
+    """Show constraints that contradict each other, with the nearest limits that can be met.
+
+    `rows` are `conflicts` of `infeasible` in the result file."""
+    table = _table("Constraints in conflict", "least violation", "with all others")
+    for row in rows:
+        unit = f" {row['unit']}" if row["unit"] else ""
+        name = f"{row['name']} {row['sense']} {_number(row['limit'])}{unit}"
+        table.add_row(name, _number(row["together"]), _number(row["alone"]))
+    return table
+
+
 def _price(row: Mapping[str, Any]) -> tuple[str, ...]:
     step = f"{row['relaxed_by']:+g} {row['unit']}".strip()
     name = f"{_words(row['name'])} {row['sense']} {_number(row['limit'])} {row['unit']}".strip()
