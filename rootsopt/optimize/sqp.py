@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment, minimize
 from rootsopt.optimize.certificate import Certificate, certify
 from rootsopt.optimize.local import Group, Local, Look
 
-_SCALE = 0.1
+SCALE = 0.1
 """Side of the unit box in the variables of SLSQP, which begins with a unit Hessian."""
 _SLOTS = 4
 """Number of branches of one group that may appear during a search, besides twice those at its
@@ -85,12 +85,12 @@ REASONS = {
 """Reasons why a local search ends, with advice."""
 
 
-class _EndError(Exception):
-    """Ends SLSQP from inside a function it calls."""
+class EndError(Exception):
+    """Ends a search from inside a function it calls."""
 
 
-class _Epigraph:
-    """The smooth problem in the variables z = (x / `_SCALE`, t), with what SLSQP has seen of it."""
+class Epigraph:
+    """The smooth problem in the variables z = (x / `SCALE`, t), with what a search has seen of it."""
 
     def __init__(self, look: Look, start: NDArray[np.float64], first: Local, stops: Stops):
         self.look, self.stops, self.size = look, stops, len(start)
@@ -107,7 +107,7 @@ class _Epigraph:
         key = point.tobytes()
         if key not in self.known:
             if self.stops.asked() or self.evaluations >= self.stops.evaluations:
-                raise _EndError
+                raise EndError
             self.evaluations += 1
             self.known[key] = found = self.look(point)
             if found is not None:
@@ -128,28 +128,28 @@ class _Epigraph:
         if better or (done and found.objective <= best.objective + limit):
             self.best, self.certificate = (point, found), certificate
             if done:
-                raise _EndError
+                raise EndError
 
     def point(self, z) -> NDArray[np.float64]:
         """Return the point of the unit box for the variables of SLSQP."""
-        return np.clip(np.asarray(z[: self.size]) * _SCALE, 0.0, 1.0)
+        return np.clip(np.asarray(z[: self.size]) * SCALE, 0.0, 1.0)
 
     def start(self) -> NDArray[np.float64]:
         """Return the variables at the best point."""
         point, local = self.best
         self.good = local
-        return np.concatenate([point / _SCALE, [group.top for group in local.groups]])
+        return np.concatenate([point / SCALE, [group.top for group in local.groups]])
 
     def value(self, z) -> tuple[float, NDArray[np.float64]]:
         """Return the smooth objective and its gradient."""
         found = self.at(self.point(z))
         steps = np.ones(len(z) - self.size)
         if found is None:
-            gradient = np.concatenate([_SCALE * self.good.slope, steps])
+            gradient = np.concatenate([SCALE * self.good.slope, steps])
             return self.best[1].objective + _UNUSABLE, gradient
         self.good = found
         total = found.smooth + float(np.sum(z[self.size :]))
-        return total, np.concatenate([_SCALE * found.slope, steps])
+        return total, np.concatenate([SCALE * found.slope, steps])
 
     def constraints(self, z) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return all constraints ≥ 0 and their gradients: t - b_i, then those of the problem."""
@@ -162,12 +162,12 @@ class _Epigraph:
             for place, b, slope in zip(places, group.values, group.slopes, strict=True):
                 if place >= 0:
                     value[place] = z[self.size + k] - b
-                    row[place, : self.size] = -_SCALE * slope
+                    row[place, : self.size] = -SCALE * slope
                     row[place, self.size + k] = 1.0
             values.append(value)
             rows.append(row)
         wide = np.zeros((len(found.slack), len(z)))
-        wide[:, : self.size] = _SCALE * found.normals
+        wide[:, : self.size] = SCALE * found.normals
         return np.concatenate([*values, found.slack]), np.concatenate([*rows, wide])
 
     def _places(self, k: int, group: Group) -> list[int]:
@@ -202,7 +202,7 @@ def descend(look: Look, start: NDArray[np.float64], stops: Stops | None = None) 
     first = look(start)
     if first is None:
         return Found(start, None, None, "unusable", 1)
-    problem = _Epigraph(look, start, first, stops)
+    problem = Epigraph(look, start, first, stops)
     reason = "no_progress"
     if problem.certificate.holds(stops.residual, stops.feasibility):
         reason = "converged"
@@ -210,7 +210,7 @@ def descend(look: Look, start: NDArray[np.float64], stops: Stops | None = None) 
         before = problem.best[1]
         try:
             _slsqp(problem)
-        except _EndError:
+        except EndError:
             reason = "interrupted" if stops.asked() else "evaluations"
         if problem.certificate.holds(stops.residual, stops.feasibility):
             reason = "converged"
@@ -224,7 +224,7 @@ def descend(look: Look, start: NDArray[np.float64], stops: Stops | None = None) 
     return Found(point, local, problem.certificate, reason, problem.evaluations)
 
 
-def _slsqp(problem: _Epigraph) -> None:
+def _slsqp(problem: Epigraph) -> None:
     start, size = problem.start(), problem.size
     free = [(None, None)] * (len(start) - size)
     minimize(
@@ -232,7 +232,7 @@ def _slsqp(problem: _Epigraph) -> None:
         start,
         jac=True,
         method="SLSQP",
-        bounds=[(0.0, 1.0 / _SCALE)] * size + free,
+        bounds=[(0.0, 1.0 / SCALE)] * size + free,
         constraints={
             "type": "ineq",
             "fun": lambda z: problem.constraints(z)[0],
@@ -242,4 +242,4 @@ def _slsqp(problem: _Epigraph) -> None:
     )
 
 
-__all__ = ["REASONS", "Found", "Stops", "descend"]
+__all__ = ["REASONS", "EndError", "Epigraph", "Found", "Stops", "descend"]

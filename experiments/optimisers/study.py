@@ -1,0 +1,161 @@
+"""Compares optimisation methods on the same problems, by evaluations and time to the optimum.
+
+Every problem is a config with overrides. All methods start at the baseline, see the same values and
+gradients, and end when their evaluations run out. The best feasible value that any of them reaches
+counts as the optimum.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments.optimisers.methods import METHODS, Method
+from rootsopt.config import load
+from rootsopt.optimize.certificate import certify
+from rootsopt.optimize.local import Local
+from rootsopt.optimize.problem import FEASIBLE, Problem
+from rootsopt.optimize.sqp import Stops
+from rootsopt.response.evaluators import evaluator_for
+
+REACHED = 1e-6
+"""Distance of the objective from the optimum at which a method has reached it."""
+EVALUATIONS, QUICK = 150, 15
+"""Designs that each method may simulate, in a full and in a reduced run."""
+_PEAK = "objective.mean_weight=0"
+
+
+class Task(NamedTuple):
+    """A problem: `name`, `config` and overrides."""
+
+    name: str
+    config: str
+    overrides: tuple[str, ...] = ()
+
+
+TASKS = (
+    Task("cic", "configs/cic.yaml"),
+    Task("cic, peak alone", "configs/cic.yaml", (_PEAK,)),
+    Task("cic, mean alone", "configs/cic.yaml", ("objective.peak_weight=0",)),
+    Task("cic, RMS alone", "configs/cic.yaml", (
+        _PEAK, "objective.peak_weight=0", "objective.rms_weight=1")),
+    Task("cic, 2000 rpm", "configs/cic.yaml", ("scene.speed_rpm=2000",)),
+    Task("cic, 5000 rpm", "configs/cic.yaml", ("scene.speed_rpm=5000",)),
+    Task("cic, half the load", "configs/cic.yaml", ("scene.load.torque_N_m=2.4",)),
+    Task("cic, wide backlash", "configs/cic.yaml", ("scene.timing_gear.backlash_mm=0.2",)),
+    Task("cic, narrow bore of the housing", "configs/cic.yaml", (
+        "constraints.outer_radius_max_mm=44.8", "constraints.area_efficiency_min=0.43")),
+    Task("cic, wide seal", "configs/cic.yaml", ("constraints.seal_width_min_mm=5",)),
+    Task("cic, two speeds", "configs/cic.yaml", ("objective.speeds_rpm=[2500, 3500]",)),
+    Task("cic, worst of two speeds", "configs/cic.yaml", (
+        "objective.speeds_rpm=[2500, 3500]", "objective.over_speeds=worst")),
+    Task("free form", "configs/free.yaml"),
+)  # fmt: skip
+QUICK_TASKS = 2
+"""Number of problems in a reduced run."""
+
+
+class Look:
+    """A problem as methods see it, with a record of every evaluation."""
+
+    def __init__(self, task: Task):
+        self.config = load(task.config, list(task.overrides))
+        evaluator = evaluator_for(self.config)
+        evaluator, baseline = evaluator.fit(series=False)
+        self.problem = Problem.of(self.config, evaluator.scene, baseline)
+        self.baseline = baseline
+        self.evaluator = evaluator.relative_to(baseline).surveying().with_maxima()
+        point = self.problem.point(list(baseline.design.values()))
+        self.start = self.problem.project(point)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all evaluations."""
+        self.rows: list[dict[str, float]] = []
+        self.state, self.began = self.baseline.state, time.perf_counter()
+
+    def __call__(self, point: np.ndarray) -> Local | None:
+        """Evaluate the problem at a point and record it."""
+        design = self.problem.design(point)
+        evaluation = self.evaluator(design, start=self.state, series=False)
+        found = self.problem.local(evaluation, point)
+        if found is not None:
+            self.state = evaluation.state
+        self.rows.append(
+            {
+                "evaluation": len(self.rows) + 1,
+                "seconds": time.perf_counter() - self.began,
+                "objective": np.nan if found is None else found.objective,
+                "violation": np.nan if found is None else found.violation,
+                "residual": np.nan if found is None else certify(found, point).residual,
+            }
+        )
+        return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Results:
+    """Every evaluation of every method on every problem, and a summary row for each pair."""
+
+    rows: list[dict[str, Any]]
+    missing: tuple[str, ...]
+
+    def summary(self) -> list[dict[str, Any]]:
+        """Return evaluations and time to the optimum, by problem and method."""
+        found = []
+        for task in dict.fromkeys(row["problem"] for row in self.rows):
+            rows = [row for row in self.rows if row["problem"] == task]
+            best = min((row["objective"] for row in rows if _met(row)), default=np.nan)
+            for method in dict.fromkeys(row["method"] for row in rows):
+                own = [row for row in rows if row["method"] == method]
+                met = [row for row in own if _met(row)]
+                hits = [row for row in met if row["objective"] <= best + REACHED]
+                found.append(
+                    {
+                        "problem": task,
+                        "method": method,
+                        "evaluations": hits[0]["evaluation"] if hits else None,
+                        "seconds": hits[0]["seconds"] if hits else None,
+                        "above_best": min((r["objective"] for r in met), default=np.nan) - best,
+                        "residual": min((r["residual"] for r in met), default=np.nan),
+                        "designs": len(own),
+                    }
+                )
+        return found
+
+    def reached(self) -> dict[str, int]:
+        """Return on how many problems each method has reached the optimum."""
+        counts: dict[str, int] = {}
+        for row in self.summary():
+            counts[row["method"]] = counts.get(row["method"], 0) + (row["evaluations"] is not None)
+        return counts
+
+
+def _met(row: dict[str, Any]) -> bool:
+    return bool(np.isfinite(row["objective"]) and row["violation"] <= FEASIBLE)
+
+
+def run(
+    quick: bool,
+    tasks: Sequence[Task] = TASKS,
+    say: Callable[[str], None] = lambda text: None,
+) -> Results:
+    """Run every method on every problem; a method whose package is missing is left out."""
+    methods: dict[str, Method] = dict(METHODS)
+    try:
+        import nlopt  # type: ignore[import-not-found] # noqa: F401
+    except ImportError:
+        del methods["mma"]
+    tasks = tasks[:QUICK_TASKS] if quick else tasks
+    rows: list[dict[str, Any]] = []
+    for task in tasks:
+        look = Look(task)
+        look(look.start)  # Compiles.
+        for name, method in methods.items():
+            look.reset()
+            method(look, look.start, Stops(1e-9, 1e-9, QUICK if quick else EVALUATIONS))
+            rows += [{"problem": task.name, "method": name, **row} for row in look.rows]
+            say(f"{task.name}: {name}, {len(look.rows)} designs")
+    return Results(rows, tuple(METHODS.keys() - methods.keys()))
