@@ -42,7 +42,14 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
         door.patience(promise) as stop,
         _progress(Console(stderr=True)) as progress,
     ):
-        config, choice, result = _searched(config, progress, stop)
+        checkpoint = _checkpoint(config, options, folder)
+        try:
+            config, choice, result = _searched(config, progress, stop, checkpoint)
+        except BaseException:
+            checkpoint.close(remove=checkpoint.empty)
+            raise
+    # A stopped search can go on later. One that has ended needs its checkpoint no more.
+    checkpoint.close(remove=checkpoint.empty or not stop.is_set())
     if result is None:
         return _nothing_known(config, folder)
     if result.infeasible is not None:
@@ -84,7 +91,16 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
 
 
-def _searched(config: "Config", progress, stop: threading.Event):
+def _checkpoint(config: "Config", options: "argparse.Namespace", folder: "RunFolder"):
+    """Return the checkpoint beside the result folder, begun anew or resumed."""
+    from rootsopt.optimize.checkpoint import Checkpoint
+    from rootsopt.output import files
+
+    header = {"config": config.model_dump(mode="json"), "versions": files.versions()}
+    return Checkpoint(folder.checkpoint, header, options.resume)
+
+
+def _searched(config: "Config", progress, stop: threading.Event, checkpoint):
     """Run the search; return the config without `auto`, the chosen settings and the result.
 
     The result is `None` if the search was stopped before the baseline was simulated.
@@ -96,7 +112,7 @@ def _searched(config: "Config", progress, stop: threading.Event):
 
     def work():
         state["config"], state["choice"] = resolve(config)
-        state["search"] = Search(state["config"], progress, stop)
+        state["search"] = Search(state["config"], progress, stop, checkpoint)
         return state["search"].run()
 
     result = until_stopped(work, stop, _PATIENCE)
@@ -287,4 +303,13 @@ def _run(argv: Sequence[str] | None) -> int:
     from rootsopt import export
     from rootsopt.commands import cli
 
-    return cli.run("optimize", PURPOSE, body, argv, lambda p: export.add_option(p, "none"))
+    def add(parser: "argparse.ArgumentParser") -> None:
+        export.add_option(parser, "none")
+        parser.add_argument(
+            "--resume",
+            action="store_true",
+            help="go on with a run into the same folder that was stopped or killed, from its "
+            "checkpoint; the result is that of an uninterrupted run",
+        )
+
+    return cli.run("optimize", PURPOSE, body, argv, add)

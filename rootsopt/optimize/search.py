@@ -26,6 +26,7 @@ from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
 from rootsopt.optimize.certificate import Certificate, certify
+from rootsopt.optimize.checkpoint import Checkpoint
 from rootsopt.optimize.infeasible import Infeasible, explain
 from rootsopt.optimize.local import Local
 from rootsopt.optimize.optimality import RESIDUAL, Optimality, StartOutcome
@@ -158,7 +159,8 @@ class Search:
     """One optimisation run of a config.
 
     `progress` is called with (evaluations done, evaluations expected, best objective). `stop`: an
-    event that another thread can set to end the search early.
+    event that another thread can set to end the search early. `checkpoint`: keeps every evaluation,
+    and gives back those of an interrupted search.
 
     Raises InputError for a profile family without design parameters.
     """
@@ -168,6 +170,7 @@ class Search:
         config: Config,
         progress: Progress | None = None,
         stop: threading.Event | None = None,
+        checkpoint: Checkpoint | None = None,
     ):
         if not FAMILY_KEYS[config.profile.family]:
             valid = ", ".join(family for family, keys in FAMILY_KEYS.items() if keys)
@@ -186,6 +189,7 @@ class Search:
         # If every objective is noisy, steps without a gain are no reason to end a descent.
         self.noisy = config.objective.motion == "ensemble"
         self.patience = np.inf if self.noisy else _PATIENCE
+        self.checkpoint = checkpoint
         self.stop = threading.Event() if stop is None else stop
         self._lock, self._best = threading.Lock(), float("nan")
         self._trials: list[Trial] = []
@@ -223,7 +227,7 @@ class Search:
             return Optimization(self.problem, baseline, *nothing)
         trials: list[Trial] = []
         if self.settings.screening:
-            trials = self._side_by_side(self._screen, [(point,) for point in points])
+            trials = self._side_by_side(self._screen, list(enumerate(points)))
         starts = self._starts(trials) or points[:1]
         work = self._solve if self.method == "slsqp" else self._descend
         trials += self._side_by_side(work, list(enumerate(starts)))
@@ -300,7 +304,7 @@ class Search:
             pool.shutdown(wait=not self.stop.is_set(), cancel_futures=True)
 
     def _feasible(self, baseline_point) -> list[NDArray[np.float64]]:
-        """Return the baseline's point and a Sobol sample, made feasible, without infeasible ones."""
+        """Return the baseline's point and a Sobol sample, made feasible as far as possible."""
         start = self.problem.project(baseline_point)
         count, seed = self.settings.screening, self.settings.seed
         sample = sobol(count, seed, len(baseline_point))
@@ -308,10 +312,10 @@ class Search:
         self._sample = points
         return [point for point in points if self.problem.feasible(point)]
 
-    def _screen(self, point) -> list[Trial]:
+    def _screen(self, number: int, point) -> list[Trial]:
         if self.stop.is_set():
             return []
-        return [self._evaluate(self.fast.without_gradient(), point, start=-1, iteration=0)]
+        return [self._evaluate(self.fast.without_gradient(), point, -1, 0, key=(-1, number))]
 
     def _starts(self, trials: list[Trial]) -> list[NDArray[np.float64]]:
         """Return the points of the best screened designs, at least 0.15 apart in the unit box."""
@@ -376,11 +380,21 @@ class Search:
             point = self.problem.toward(point + np.asarray(update), point)
         return trials
 
-    def _evaluate(self, evaluator: Evaluates, point, start, iteration, orbit=None) -> Trial:
-        evaluation = evaluator(self.problem.design(point), start=orbit, series=False)
+    def _evaluate(
+        self, evaluator: Evaluates, point, start, iteration, orbit=None, key=None
+    ) -> Trial:
+        """Evaluate a point, or take what the checkpoint has under `key`, and record the trial."""
+        point = np.array(point, dtype=np.float64)
+        key = (start, iteration) if key is None else key
+        kept = None if self.checkpoint is None else self.checkpoint.known(key, point)
+        if kept is None:
+            evaluation = evaluator(self.problem.design(point), start=orbit, series=False)
+            if self.checkpoint is not None:
+                self.checkpoint.add(key, point, evaluation)
+        else:
+            evaluation = kept
         objective = self.problem.objective(evaluation)
         feasible = self.problem.feasible(point)
-        point = np.array(point)
         local = None
         if start >= 0 and not self.noisy:
             local = self.problem.local(evaluation, point)

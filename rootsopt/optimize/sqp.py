@@ -90,7 +90,7 @@ class EndError(Exception):
 
 
 class Epigraph:
-    """The smooth problem in the variables z = (x / `SCALE`, t), with what a search has seen of it."""
+    """The smooth problem in variables z = (x / `SCALE`, t), with what a search has seen of it."""
 
     def __init__(self, look: Look, start: NDArray[np.float64], first: Local, stops: Stops):
         self.look, self.stops, self.size = look, stops, len(start)
