@@ -48,7 +48,7 @@ class Checkpoint:
         self.reused, self._added = 0, False
         plain = json.loads(json.dumps(header))
         kept = self._read(plain) if resume else 0
-        self._file = open(path, "r+b" if kept else "wb")  # noqa: SIM115: closed by `close`.
+        self._file = open(path, "r+b" if kept else "wb")  # noqa: SIM115
         self._file.truncate(kept)
         self._file.seek(kept)
         if not kept:
