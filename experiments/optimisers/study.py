@@ -1,23 +1,25 @@
 """Compares optimisation methods on the same problems, by evaluations and time to the optimum.
 
-Every problem is a config with overrides. All methods start at the baseline, see the same values and
-gradients, and end when their evaluations run out. The best feasible value that any of them reaches
-counts as the optimum.
+Every problem is a config with overrides. All methods work on the epigraph of the same problem, with
+exact gradients, start at the baseline and end when their evaluations run out. The best feasible
+value that any of them reaches counts as the optimum.
 """
 
 import dataclasses
+import importlib.util
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import BFGS, NonlinearConstraint, minimize
 
-from experiments.optimisers.methods import METHODS, Method
 from rootsopt.config import load
 from rootsopt.optimize.certificate import certify
-from rootsopt.optimize.local import Local
+from rootsopt.optimize.local import Local, Look
 from rootsopt.optimize.problem import FEASIBLE, Problem
-from rootsopt.optimize.sqp import Stops
+from rootsopt.optimize.sqp import SCALE, EndError, Epigraph, Stops, descend
 from rootsopt.response.evaluators import evaluator_for
 
 REACHED = 1e-6
@@ -25,6 +27,11 @@ REACHED = 1e-6
 EVALUATIONS, QUICK = 150, 15
 """Designs that each method may simulate, in a full and in a reduced run."""
 _PEAK = "objective.mean_weight=0"
+Method = Callable[[Look, NDArray[np.float64], Stops], None]
+_OUTER, _INNER = 30, 25
+"""Rounds of the augmented Lagrangian, and iterations of L-BFGS in each."""
+_PENALTY, _GROWTH, _MOST = 10.0, 4.0, 1e6
+"""First weight of the penalty, its growth where the violation does not fall by half, its limit."""
 
 
 class Task(NamedTuple):
@@ -57,7 +64,126 @@ QUICK_TASKS = 2
 """Number of problems in a reduced run."""
 
 
-class Look:
+def slsqp(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
+    """Run the package's own local search: sequential quadratic programming."""
+    descend(look, start, stops)
+
+
+def _problem(look: Look, start: NDArray[np.float64], stops: Stops) -> Epigraph | None:
+    first = look(start)
+    return None if first is None else Epigraph(look, start, first, stops)
+
+
+def _bounds(problem: Epigraph, count: int) -> list[tuple[float | None, float | None]]:
+    free: list[tuple[float | None, float | None]] = [(None, None)]
+    return [(0.0, 1.0 / SCALE)] * problem.size + free * (count - problem.size)
+
+
+def augmented_lagrangian(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
+    """Run an augmented Lagrangian with SciPy's L-BFGS-B (Nocedal and Wright, algorithm 17.4)."""
+    problem = _problem(look, start, stops)
+    if problem is None:
+        return
+    z = problem.start()
+    weights = np.zeros(len(problem.constraints(z)[0]))
+    penalty, before = _PENALTY, np.inf
+
+    def merit(z):
+        value, slope = problem.value(z)
+        slack, normals = problem.constraints(z)
+        short = np.maximum(weights / penalty - slack, 0.0)
+        return value + penalty / 2 * short @ short, slope - penalty * short @ normals
+
+    try:
+        for _ in range(_OUTER):
+            options = {"maxiter": _INNER}
+            bounds = _bounds(problem, len(z))
+            z = minimize(merit, z, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
+            slack = problem.constraints(z)[0]
+            violation = np.max(np.maximum(-slack, 0.0))
+            weights = np.maximum(weights - penalty * slack, 0.0)
+            if violation > before / 2:
+                penalty = min(_GROWTH * penalty, _MOST)
+            before = violation
+    except EndError:
+        return
+
+
+def interior_point(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
+    """Run SciPy's trust-constr: an interior point method within a trust region."""
+    problem = _problem(look, start, stops)
+    if problem is None:
+        return
+    z = problem.start()
+    limits = NonlinearConstraint(
+        lambda z: problem.constraints(z)[0],
+        0.0,
+        np.inf,
+        jac=lambda z: problem.constraints(z)[1],
+        hess=BFGS(),
+    )
+    options = {"maxiter": 10_000, "gtol": 1e-12, "xtol": 1e-12, "barrier_tol": 1e-10}
+    try:
+        minimize(
+            problem.value,
+            z,
+            jac=True,
+            hess=BFGS(),
+            method="trust-constr",
+            bounds=_bounds(problem, len(z)),
+            constraints=limits,
+            options=options,
+        )
+    except EndError:
+        return
+
+
+def moving_asymptotes(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
+    """Run NLopt's method of moving asymptotes (Svanberg 2002, globally convergent).
+
+    Raises ImportError without the package `nlopt`."""
+    import nlopt  # type: ignore[import-not-found]
+
+    problem = _problem(look, start, stops)
+    if problem is None:
+        return
+    z = problem.start()
+    count = len(problem.constraints(z)[0])
+    search = nlopt.opt(nlopt.LD_MMA, len(z))
+    low, high = zip(*_bounds(problem, len(z)), strict=True)
+    search.set_lower_bounds([-1e3 if b is None else b for b in low])
+    search.set_upper_bounds([1e3 if b is None else b for b in high])
+
+    def value(z, slope):
+        found, gradient = problem.value(z)
+        if slope.size:
+            slope[:] = gradient
+        return found
+
+    def limits(result, z, slope):
+        slack, normals = problem.constraints(z)
+        result[:] = -slack
+        if slope.size:
+            slope[:] = -normals
+
+    search.set_min_objective(value)
+    search.add_inequality_mconstraint(limits, np.full(count, 1e-9))
+    search.set_maxeval(stops.evaluations)
+    try:
+        search.optimize(z)
+    except (EndError, nlopt.RoundoffLimited, RuntimeError):
+        return
+
+
+METHODS: dict[str, Method] = {
+    "slsqp": slsqp,
+    "augmented_lagrangian": augmented_lagrangian,
+    "interior_point": interior_point,
+    "mma": moving_asymptotes,
+}
+
+
+class Recorder:
     """A problem as methods see it, with a record of every evaluation."""
 
     def __init__(self, task: Task):
@@ -144,14 +270,12 @@ def run(
 ) -> Results:
     """Run every method on every problem; a method whose package is missing is left out."""
     methods: dict[str, Method] = dict(METHODS)
-    try:
-        import nlopt  # type: ignore[import-not-found] # noqa: F401
-    except ImportError:
+    if importlib.util.find_spec("nlopt") is None:
         del methods["mma"]
     tasks = tasks[:QUICK_TASKS] if quick else tasks
     rows: list[dict[str, Any]] = []
     for task in tasks:
-        look = Look(task)
+        look = Recorder(task)
         look(look.start)  # Compiles.
         for name, method in methods.items():
             look.reset()

@@ -258,6 +258,9 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
 
         if result.optimized is not None:
             runs.optimization_figures(folder, result.baseline, result.optimized, rows, config)
+            if result.optimality is not None:
+                required = data["optimality"]["required_residual"]
+                runs.certificate_figure(folder, rows, data["constraints"], required)
         else:
             runs.simulation_figures(folder, result.baseline, config)
         if config.objective.speeds_rpm:

@@ -149,7 +149,7 @@ def candidates(
     # The highest come first; a lower one counts if the force falls between it and all of them.
     kept: list[int] = []
     for k in at[np.argsort(-forces[at], kind="stable")]:
-        apart = all(_dip(forces, k, other) < (1 - _DIP) * forces[k] for other in kept)
+        apart = all(_dip(forces, int(k), other) < (1 - _DIP) * forces[k] for other in kept)
         if apart and len(kept) < MOST:
             kept.append(int(k))
     found = np.sort(np.asarray(kept, dtype=np.int64))

@@ -219,6 +219,10 @@ class Search:
         # Second-order convergence needs more digits than a descent.
         self.sharp = self.exact.surveying()
         self._baseline = baseline
+        if self.problem.cornered and self.method == "slsqp":
+            # Compile what the maxima need during the screening.
+            again = list(baseline.design.values()), baseline.state, False
+            threading.Thread(target=self.sharp, args=again, daemon=True).start()
         start = self.problem.point(list(baseline.design.values()))
         points = self._feasible(start)
         if not points:
