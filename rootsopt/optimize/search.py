@@ -28,7 +28,7 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.certificate import Certificate, certify
 from rootsopt.optimize.checkpoint import Checkpoint
 from rootsopt.optimize.infeasible import Infeasible, explain
-from rootsopt.optimize.local import Local
+from rootsopt.optimize.local import Local, Look
 from rootsopt.optimize.optimality import RESIDUAL, Optimality, StartOutcome
 from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.optimize.sqp import Found, Stops, descend
@@ -347,10 +347,26 @@ class Search:
 
         stops = Stops(evaluations=self.settings.iterations + 1, asked=self.stop.is_set)
         if not self.stop.is_set():
-            found = descend(look, point, stops)
+            found = self._repaired(descend(look, point, stops), trials, look)
             with self._lock:
                 self._found[number] = found
         return trials
+
+    def _repaired(self, found: Found, trials: list[Trial], look: Look) -> Found:
+        """Return the outcome of a local search that ended early, with a better design if the best
+        infeasible trial can be made feasible."""
+        usable = [trial for trial in trials if trial.local is not None]
+        best = min(usable, key=_objective, default=trials[0])
+        if found.converged or best.feasible or found.local is None or self.stop.is_set():
+            return found
+        point = self.problem.toward(best.point, found.point)
+        local = look(point)
+        if local is None or not self.problem.feasible(point):
+            return found
+        if found.local.violation <= FEASIBLE and local.objective >= found.local.objective:
+            return found
+        outcome = point, local, certify(local, point), found.reason, found.evaluations + 1
+        return Found(*outcome)
 
     def _descend(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
         """Descend from `point` and return the trials; `number`: that of the descent."""

@@ -251,6 +251,7 @@ def test_free_form_is_improved_by_a_search():
         "optimizer.screening=0",
         "optimizer.starts=1",
         "optimizer.iterations=4",
+        "optimizer.method=adam",
         "optimizer.learning_rate=0.01",
     )
     result = Search(settings).run()
@@ -276,6 +277,7 @@ def test_single_arc_is_improved_by_a_search():
         "optimizer.screening=4",
         "optimizer.starts=1",
         "optimizer.iterations=3",
+        "optimizer.method=adam",
     )
     result = Search(settings).run()
     assert result.optimized is not None
