@@ -72,6 +72,15 @@ class Status(enum.Enum):
         "contact parameters."
     )
 
+    NOT_CONVERGED = (
+        "The design is better than the baseline, but the first-order conditions of an optimum do "
+        "not hold there: optimality.message of result.json says why, and what to do."
+    )
+    INFEASIBLE = (
+        "No design satisfies all constraints. `infeasible` of result.json lists those that are in "
+        "conflict, and the nearest limits that can be met. Relax one of them."
+    )
+
     @property
     def code(self) -> int:
         """Number that represents the status in arrays."""

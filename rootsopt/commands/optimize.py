@@ -45,9 +45,18 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
         door.patience(promise) as stop,
         _progress(Console(stderr=True)) as progress,
     ):
-        config, choice, result = _searched(config, progress, stop)
+        checkpoint = _checkpoint(config, options, folder)
+        try:
+            config, choice, result = _searched(config, progress, stop, checkpoint)
+        except BaseException:
+            checkpoint.close(remove=checkpoint.empty)
+            raise
+    # A stopped search can go on later. One that has ended needs its checkpoint no more.
+    checkpoint.close(remove=checkpoint.empty or not stop.is_set())
     if result is None:
         return _nothing_known(config, folder)
+    if result.infeasible is not None:
+        return _contradiction(config, folder, result)
     ran = time.perf_counter() - began
     alike = {} if result.interrupted else _alike(config, result)
     _write(folder, config, options, result, choice | alike, clock.seconds, ran)
@@ -67,6 +76,10 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
             if baseline:
                 optimized = result.optimized.record()["speeds"]
                 out.print(tables.speeds_table(baseline, optimized, result.objective_by_speed))
+            if result.optimality is not None:
+                out.print(tables.optimality_table(result.optimality.record(), numbers[0]))
+                if result.optimality.sensitivities:
+                    out.print(tables.sensitivity_table([*result.optimality.sensitivities]))
             if alike:
                 out.print(tables.likeness_table(alike["resembles"]))
         if result.interrupted or result.optimized is None:
@@ -81,8 +94,17 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
 
 
-def _searched(config: "Config", progress, stop: threading.Event):
-    """Run the search; return (config, record of the settings chosen for `auto`, result).
+def _checkpoint(config: "Config", options: "argparse.Namespace", folder: "RunFolder"):
+    """Return the checkpoint beside the result folder, begun anew or resumed."""
+    from rootsopt.optimize.checkpoint import Checkpoint
+    from rootsopt.output import files
+
+    header = {"config": config.model_dump(mode="json"), "versions": files.versions()}
+    return Checkpoint(folder.checkpoint, header, options.resume)
+
+
+def _searched(config: "Config", progress, stop: threading.Event, checkpoint):
+    """Run the search; return the config without `auto`, the chosen settings and the result.
 
     In the returned config, chosen settings replace `auto`. The result is `None` if the search was
     stopped before the baseline was simulated. `progress`: function as from `_progress`, or `None`;
@@ -95,7 +117,7 @@ def _searched(config: "Config", progress, stop: threading.Event):
 
     def work():
         state["config"], state["choice"] = resolve(config)
-        state["search"] = Search(state["config"], progress, stop)
+        state["search"] = Search(state["config"], progress, stop, checkpoint)
         return state["search"].run()
 
     result = until_stopped(work, stop, _PATIENCE)
@@ -120,6 +142,26 @@ def _nothing_known(config: "Config", folder: "RunFolder") -> "Outcome":
     folder.overwrite = False  # An earlier result is more valuable than this one.
     text = f"{status.label}: {message}"
     return cli.Outcome(cli.NO_RESULT, lambda out: out.print(text, soft_wrap=True))
+
+
+def _contradiction(config: "Config", folder: "RunFolder", result) -> "Outcome":
+    """Write the files of a run whose constraints contradict each other: why, and nothing else."""
+    from rootsopt.commands import cli
+    from rootsopt.output import files, tables
+
+    found = result.infeasible
+    files.write_config(folder, config)
+    data = {"baseline": result.baseline.record(), "optimized": None}
+    data |= {"status": result.status.label, "message": found.message}
+    data |= {"infeasible": found.record(), "versions": files.versions()}
+    folder.write_json("result.json", data)
+    rows = found.record()["conflicts"]
+
+    def show(out):
+        out.print(tables.conflict_table(rows))
+        out.print(f"{result.status.label}: {found.message}", soft_wrap=True)
+
+    return cli.Outcome(cli.NO_RESULT, show)
 
 
 def _alike(config: "Config", result) -> dict:
@@ -152,6 +194,8 @@ def _advice(result) -> str:
         return _interrupted(result)
     if not result.baseline.usable:
         return f"baseline: {result.baseline.message}"
+    if result.optimality is not None and not result.optimality.converged:
+        return result.optimality.message
     if result.optimized is not None:
         return result.optimized.message
     if message := noise.message(result.verification):
@@ -207,6 +251,8 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
     data["constraints"] = result.constraints
     if config.objective.speeds_rpm and result.optimized is not None:
         data["objective_by_speed"] = result.objective_by_speed
+    if result.optimality is not None:
+        data["optimality"] = result.optimality.record()
     data["verification"] = result.verification
     data["status"], data["message"] = result.status.label, _advice(result)
     data["statistics"] = {
@@ -221,6 +267,9 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
 
         if result.optimized is not None:
             runs.optimization_figures(folder, result.baseline, result.optimized, rows, config)
+            if result.optimality is not None:
+                required = data["optimality"]["required_residual"]
+                runs.certificate_figure(folder, rows, data["constraints"], required)
         else:
             runs.simulation_figures(folder, result.baseline, config)
         if config.objective.speeds_rpm:
@@ -270,4 +319,13 @@ def _run(argv: Sequence[str] | None) -> int:
     from rootsopt import export
     from rootsopt.commands import cli
 
-    return cli.run("optimize", PURPOSE, body, argv, lambda p: export.add_option(p, "none"))
+    def add(parser: "argparse.ArgumentParser") -> None:
+        export.add_option(parser, "none")
+        parser.add_argument(
+            "--resume",
+            action="store_true",
+            help="go on with a run into the same folder that was stopped or killed, from its "
+            "checkpoint; the result is that of an uninterrupted run",
+        )
+
+    return cli.run("optimize", PURPOSE, body, argv, add)

@@ -346,16 +346,18 @@ follow(_derive)
 
 
 class OptimizerConfig(Section):
-    """Update rule, starts and bounds of the search for a design."""
+    """Method, starts and bounds of the search for a design."""
 
-    method: Literal["adam", "rmsprop", "sgd"] = Field(
-        "adam", description="optax update rule: adam, rmsprop, sgd"
+    method: Literal["auto", "slsqp", "adam", "rmsprop", "sgd"] = Field(
+        "auto",
+        description="slsqp: sequential quadratic programming, converges to a certified optimum; "
+        "adam, rmsprop, sgd: optax update rules; auto: slsqp, or adam for an ensemble",
     )
     learning_rate: Annotated[float, between(1e-6, 10)] = Field(
-        0.05, description="step, in bounds scaled to the unit box"
+        0.05, description="step of an optax update rule, in bounds scaled to the unit box"
     )
     iterations: Annotated[int, Field(ge=1, le=10000)] = Field(
-        40, description="iterations per start"
+        40, description="iterations per start; for slsqp, designs simulated per start"
     )
     starts: Annotated[int, Field(ge=1, le=64)] = Field(2, description="number of local searches")
     screening: Annotated[int, Field(ge=0, le=4096)] = Field(

@@ -27,14 +27,14 @@ from rootsopt.scene import Scene
 
 _SOUND = (
     # name, margin, unit, limit, scale, factor
-    ("order of the joints", "turning", "deg", 0.0, 0.1, DEG),
-    ("convex addendum", "convexity", "mm", 0.0, MM, MM),
-    ("reach of the normals", "reach", "mm", 0.0, MM, MM),
-    ("levers from the tip on", "fall", "mm", 0.0, MM, MM),
-    ("roll angle per normal", "rolling", "", 0.0, 0.1, 1.0),
-    ("roll angle from the tip on", "order", "deg", 0.0, 0.1, DEG),
-    ("star shape", "star", "mm", 0.0, MM, MM),
-    ("root above the axis", "root", "mm", 0.0, MM, MM),
+    ("least turn of a flank segment", "turning", "deg", 0.0, 0.1, DEG),
+    ("addendum radius of curvature", "convexity", "mm", 0.0, MM, MM),
+    ("normals within the pitch circle", "reach", "mm", 0.0, MM, MM),
+    ("outline falls from the tip", "fall", "mm", 0.0, MM, MM),
+    ("one contact per flank (roll per turn of the normal)", "rolling", "", 0.0, 0.1, 1.0),
+    ("contact begins at the tip (roll angle)", "order", "deg", 0.0, 0.1, DEG),
+    ("tangents clear of the axis", "star", "mm", 0.0, MM, MM),
+    ("root radius", "root", "mm", 0.0, MM, MM),
 )
 """Constraints that keep a profile sound, in addition to that on the undercut margin."""
 

@@ -138,7 +138,7 @@ def strobe(
     return Strobe(states, jnp.sum(steps), jnp.all(solved))
 
 
-class _Equation(eqx.Module):
+class Equation(eqx.Module):
     """The equation of motion together with the integrals of the measures, in the solver's units.
 
     The unknown y holds the state (n,), then the integrals, then the time if rotor 1 is free.
@@ -266,7 +266,7 @@ def flow(  # Eleven parameters: adaptive steps, repeated steps and reverse mode 
     top = jnp.ones_like(force_unit) if top is None else lax.stop_gradient(top) / force_unit
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
     solver = integrator.solver(dtype, "lax" if adjoint is None else "bounded")
-    equation = _Equation(static, measures, force_unit, top, count, solver)
+    equation = Equation(static, measures, force_unit, top, count, solver)
     start = equation.start(state, pair.free)
     ends = jnp.full(integrator.max_steps, jnp.inf, dtype) if grid is None else grid / periods
     control = StepGrid(  # pyright: ignore[reportCallIssue]
@@ -334,7 +334,7 @@ def flow(  # Eleven parameters: adaptive steps, repeated steps and reverse mode 
 
 
 def _solved(
-    equation: _Equation,
+    equation: Equation,
     dynamic: Any,
     start: Float[Array, " m"],
     periods: Float[Array, ""],
@@ -392,7 +392,7 @@ def _solved(
 
 
 def _retraced(
-    equation: _Equation, taken: _Recorded, start: Float[Array, " m"], dynamic: Any
+    equation: Equation, taken: _Recorded, start: Float[Array, " m"], dynamic: Any
 ) -> _Recorded:
     """Repeat the steps in `taken`, so that reverse mode includes the moving instants of jumps."""
 
@@ -409,7 +409,7 @@ def _retraced(
 
 
 def _peak_force(
-    equation: _Equation, taken: _Recorded, peak: _Peak, dynamic: Any
+    equation: Equation, taken: _Recorded, peak: _Peak, dynamic: Any
 ) -> Float[Array, ""]:
     """Return the peak force (in `force_unit`), differentiable in reverse mode."""
     begin, y = taken.begins[peak.holds], taken.before[peak.holds]
@@ -425,7 +425,7 @@ def _peak_force(
 
 
 def _linearized(
-    equation: _Equation, taken: _Recorded, peak: _Peak, dynamic: Any, moved: Any
+    equation: Equation, taken: _Recorded, peak: _Peak, dynamic: Any, moved: Any
 ) -> tuple[Float[Array, "m columns"], Float[Array, ""], Float[Array, " columns"]]:
     """Return the derivatives of y at the end, the peak force (in `force_unit`), and its
     derivatives.

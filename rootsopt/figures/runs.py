@@ -10,6 +10,7 @@ from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.config.families import is_list
 from rootsopt.figures.force import plot_force, plot_spectrum
 from rootsopt.figures.history import plot_history
+from rootsopt.figures.optimum import plot_prices, plot_residual
 from rootsopt.figures.profiles import plot_conjugacy, plot_flank, plot_meshing, plot_profiles
 from rootsopt.figures.style import (
     figure,
@@ -68,6 +69,22 @@ def optimization_figures(
         keys = FAMILY_KEYS[config.profile.family]
         names.append(_write(folder, "history", _history(history, keys)))
     return names
+
+
+def certificate_figure(
+    folder: ResultFolder,
+    history: Sequence[Mapping[str, Any]],
+    constraints: Sequence[Mapping[str, Any]],
+    required: float,
+) -> str:
+    """Write optimum.png: convergence and price of each limit; return its name.
+
+    `required`: first-order residual of an optimum."""
+    made, axes = figure(11, 4.2, 1, 2)
+    plot_residual(axes[0, 0], history, required)
+    plot_prices(axes[0, 1], constraints)
+    made.suptitle("Certificate of the optimum")
+    return _write(folder, "optimum", made)
 
 
 def _outline(config, design):

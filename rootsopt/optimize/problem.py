@@ -17,18 +17,28 @@ from rootsopt.config.units import unit_of
 from rootsopt.design.space import Space, slacks_and_slopes
 from rootsopt.dynamics.measures import line_name
 from rootsopt.errors import InputError
+from rootsopt.optimize.certificate import NEAR, Certificate
+from rootsopt.optimize.local import Group, Local
+from rootsopt.optimize.optimality import Holder
 from rootsopt.response.evaluation import Evaluation, objective_weights
 from rootsopt.response.speeds import at_speeds, counted
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 
+PEAK = "peak_force_N"
+"""Name of the measure that is the greatest of several local maxima."""
 _NO_LINE = 1e-9
-"""Amplitude of a spectral line, relative to the mean force, below which the line counts as absent.
-"""
+"""Amplitude of a spectral line, relative to the mean force, below which there is no line."""
+_SAME = 1e-6
+"""Slack and slope of a constraint (scaled) up to which every design meets it with equality."""
+_HELD = 1e-6
+"""Multiplier of a bound, or share of a branch, up to which it does not hold the design."""
+_STEPS = {"mm": 0.1, "deg": 1.0, "": 0.01}
+"""Steps by unit for which the report states the price of a limit."""
 _DRAWN = 5
-"""Maximum number of times that an infeasible point is moved half way towards a feasible point."""
-_ACTIVE = 1e-6
-"""Violation (scaled) of a constraint below which a point still counts as feasible. Also, distance
+"""Maximum number of times that an infeasible point is moved half way towards a feasible one."""
+FEASIBLE = 1e-6
+"""Scaled violation of a constraint below which a point counts as feasible. It is also the distance
 from a bound of the unit box below which the bound counts as active."""
 
 
@@ -142,6 +152,84 @@ class Problem:
                 by_design += share * weight * np.array(list(one.gradient[key].values()))
         return np.asarray(by_design @ np.asarray(jacobian))
 
+    def local(self, evaluation: Evaluation, point) -> Local | None:
+        """Return the problem at a `point` to first order; None without a usable steady state.
+
+        With `Evaluation.maxima`, every local maximum of the force is a branch of the objective. So
+        is every speed, where the worst of several counts, and every coexisting motion."""
+        if not evaluation.usable:
+            return None
+        _, jacobian, slack, normals = self.look(point)
+        worst = self.config.objective.over_speeds == "worst"
+        # The same groups at every point, even if one of them has a single branch.
+        cornered = self.cornered or self.config.objective.motion == "worst"
+        parts = zip(at_speeds(evaluation), at_speeds(self.baseline), strict=True)
+        smooth, slope = 0.0, np.zeros(len(self.space.lower))
+        groups: list[Group] = []
+        for number, (part, base) in enumerate(parts):
+            if part.share <= 0:
+                continue
+            one = self._branches(part.evaluation, base.evaluation, number)
+            if not (cornered or worst):
+                smooth += part.share * float(one.values[0])
+                slope += part.share * one.slopes[0]
+            else:
+                share = 1.0 if worst else part.share
+                groups.append(Group(one.tags, share * one.values, share * one.slopes))
+        if worst:
+            together = [np.concatenate(arrays) for arrays in zip(*groups, strict=True)]
+            groups = [Group(*together)]
+        scaled = tuple(g._replace(slopes=g.slopes @ jacobian) for g in groups)
+        return Local(smooth, slope @ jacobian, scaled, slack, normals)
+
+    def along_scene(self, moved: Evaluation, certificate: Certificate) -> dict[str, float]:
+        """Return the derivatives of the optimal objective with respect to scene quantities.
+
+        `moved`: evaluation of the optimum at a single speed, with gradients by scene quantity
+        (`by_scene`). The design follows the optimum, which has no effect to first order (envelope
+        theorem). The result is empty if a term of the objective is not a force."""
+        weights = self._weights(self.baseline)
+        if not weights.keys() <= moved.gradient.keys():
+            return {}
+        group = self._branches(moved, self.baseline, 0)
+        shares = certificate.shares[0] if certificate.shares else np.ones(1)
+        keys = next(iter(moved.gradient.values()))
+        return dict(zip(keys, map(float, shares @ group.slopes), strict=True))
+
+    @property
+    def cornered(self) -> bool:
+        """Whether the objective contains the peak force of single motions."""
+        return PEAK in objective_weights(self.config) and self.config.objective.motion in (
+            "reached",
+            "worst",
+        )
+
+    def _branches(self, evaluation: Evaluation, baseline: Evaluation, number: int) -> Group:
+        """Return the objective at one speed as branches, with slopes per config unit.
+
+        `number`: that of the speed, the kind of the branches."""
+        weights = self._weights(baseline)
+        tags, values, slopes = [], [], []
+        for one in (evaluation, *evaluation.rivals):
+            maxima = one.maxima if PEAK in weights else None
+            smooth = {k: w for k, w in weights.items() if maxima is None or k != PEAK}
+            value = sum(w * one.response[k] for k, w in smooth.items())
+            slope = sum(
+                (w * np.array(list(one.gradient[k].values())) for k, w in smooth.items()),
+                start=0.0,
+            )
+            if maxima is None or not maxima.times.size:
+                tags.append((number, 0.0))
+                values.append(self._value(one, baseline))
+                slopes.append(slope)
+                continue
+            period = one.steady_state["period"]
+            for time, force, row in zip(*maxima, strict=True):
+                tags.append((number, time / period))
+                values.append(value + weights[PEAK] * force)
+                slopes.append(slope + weights[PEAK] * row)
+        return Group(np.array(tags), np.array(values), np.array(slopes))
+
     def _counted(self, evaluation: Evaluation):
         return counted(self.config, evaluation, self.baseline, self._value)
 
@@ -167,7 +255,7 @@ class Problem:
 
     def feasible(self, point) -> bool:
         """Return whether a point satisfies every constraint."""
-        return bool(np.min(self.look(point)[2]) >= -_ACTIVE)
+        return bool(np.min(self.look(point)[2]) >= -FEASIBLE)
 
     def project(self, point) -> NDArray[np.float64]:
         """Project `point` onto the feasible set, by Gauss-Newton steps on the violated constraints.
@@ -216,16 +304,21 @@ class Problem:
         point = np.asarray(point)
         walls = [row for row, s in zip(jacobian, slack, strict=True) if s < 1e-4]
         sides = np.eye(len(point))
-        walls += [side for side, x in zip(sides, point, strict=True) if x <= _ACTIVE]
-        walls += [-side for side, x in zip(sides, point, strict=True) if x >= 1 - _ACTIVE]
+        walls += [side for side, x in zip(sides, point, strict=True) if x <= FEASIBLE]
+        walls += [-side for side, x in zip(sides, point, strict=True) if x >= 1 - FEASIBLE]
         if not walls:
             return np.asarray(slope, dtype=np.float64)
         normals = np.stack(walls)
         multipliers, _ = nnls(normals.T, slope)
         return np.asarray(slope - multipliers @ normals, dtype=np.float64)
 
-    def constraint_rows(self, optimized: Evaluation) -> list[dict]:
-        """Return one row per constraint, with its values, for the report and the result file."""
+    def constraint_rows(
+        self, optimized: Evaluation, certificate: Certificate | None = None
+    ) -> list[dict]:
+        """Return one row per constraint, with its values, for the report and the result file.
+
+        With a `certificate`, each row has a `multiplier`: the change of the objective per unit of
+        the limit. Bounds of the search that hold the design have rows, too."""
         rows = []
         keys = {
             "area_efficiency": "area_efficiency",
@@ -234,6 +327,7 @@ class Problem:
             "root_radius": "root_radius_mm",
             "outer_radius": "outer_radius_mm",
         }
+        always = self._always(optimized)
         for k, c in enumerate(self.space.constraints):
             limit = float(c.limit) / c.factor
             if c.margin:
@@ -244,25 +338,119 @@ class Problem:
                 after = optimized.geometry[keys[c.quantity]]
             slack = c.sign * (after - limit) * c.factor / c.scale
             sense = "<=" if c.ceiling else ">="
-            rows.append(_row(c.name, before, after, limit, c.unit, slack, sense))
-        return rows + self._range_rows(optimized)
+            row = _row(c.name, before, after, limit, c.unit, slack, sense)
+            if always[k]:
+                row |= {"active": False, "always": True}
+            if certificate is not None:
+                per_unit = certificate.multipliers[k] * c.factor / c.scale
+                row |= self._multiplier(row, per_unit, optimized)
+            rows.append(row)
+        return rows + self._range_rows(optimized, certificate)
+
+    def _always(self, optimized: Evaluation) -> NDArray[np.bool_]:
+        """Return which constraints (m,) every design meets with equality: at the baseline and at
+        the optimum their slack is 0 and does not depend on the design."""
+        found = np.ones(len(self.space.constraints), bool)
+        for one in (self.baseline, optimized):
+            _, _, slack, normals = self.look(self.point(list(one.design.values())))
+            found &= (np.abs(slack) < _SAME) & (np.linalg.norm(normals, axis=1) < _SAME)
+        return found
+
+    def _multiplier(self, row: dict, per_unit: float, optimized: Evaluation) -> dict:
+        """Return the entries of a row that tell what its limit costs.
+
+        `per_unit`: decrease of the objective per unit by which the limit is relaxed."""
+        step = _STEPS.get(row["unit"], 1.0)
+        relax = step if row["sense"] == "<=" else -step
+        toward = -1.0 if row["sense"] == "<=" else 1.0
+        gain = -100 * per_unit * step / self.objective(optimized)
+        return {
+            "multiplier": toward * float(per_unit),
+            "relaxed_by": relax,
+            "relaxed_objective_percent": float(gain),
+        }
 
     def _slacks(self, evaluation: Evaluation) -> NDArray[np.float64]:
         """Return the scaled slack of every constraint for an evaluated design."""
         design = np.asarray(list(evaluation.design.values()), dtype=np.float64)
         return np.asarray(_slacks_of(self.space, design))
 
-    def _range_rows(self, optimized: Evaluation) -> list[dict]:
-        """Return rows for the upper limits of parameters whose range depends on other
-        parameters."""
+    def _range_rows(
+        self, optimized: Evaluation, certificate: Certificate | None = None
+    ) -> list[dict]:
+        """Return rows for the upper limits of parameters whose range depends on the others, and,
+        with a `certificate`, for the bounds of the search that hold the design."""
         design = np.asarray(list(optimized.design.values()), dtype=np.float64)
+        ranges, names = _ranges(self.space, design), list(optimized.design)
+        low, high = (np.array(x) for x in (self.space.lower, self.space.upper))
+        limited = dict.fromkeys(names, False)
         rows = []
-        for key, (_, most) in _ranges(self.space, design).items():
+        for key, (least, most) in ranges.items():
+            place = names.index(key)
             before, after, limit = self.baseline.design[key], optimized.design[key], float(most)
-            name, unit = key.removesuffix("_mm").removesuffix("_deg"), unit_of(key)
-            row = name.replace("_", " "), before, after, limit, unit, limit - after, "<="
-            rows.append(_row(*row))
+            row = _row(words(key), before, after, limit, unit_of(key), limit - after, "<=")
+            limited[key] = limit <= high[place]
+            low[place], high[place] = max(low[place], float(least)), min(high[place], limit)
+            if certificate is not None:
+                width = max(high[place] - low[place], 1e-300)
+                per_unit = certificate.upper[place] / width if limited[key] else 0.0
+                row |= self._multiplier(row, per_unit, optimized)
+            rows.append(row)
+        if certificate is None:
+            return rows
+        for place, key in enumerate(names):
+            width = max(high[place] - low[place], 1e-300)
+            sides = (
+                (">=", low[place], certificate.lower[place], "lower"),
+                ("<=", high[place], certificate.upper[place], "upper"),
+            )
+            for sense, limit, multiplier, side in sides:
+                if multiplier <= _HELD or (side == "upper" and limited[key]):
+                    continue
+                slack = (design[place] - limit) / width * (1 if sense == ">=" else -1)
+                values = self.baseline.design[key], design[place], limit, unit_of(key)
+                row = _row(f"{side} bound of {words(key)}", *map(_plain, values), slack, sense)
+                rows.append(row | self._multiplier(row, multiplier / width, optimized))
         return rows
+
+    def held_by(self, evaluation: Evaluation, certificate: Certificate) -> list[Holder]:
+        """Return the branches of the objective that are active at an evaluated optimum."""
+        labels: list[list[Holder]] = []
+        worst = self.config.objective.over_speeds == "worst"
+        parts = zip(at_speeds(evaluation), at_speeds(self.baseline), strict=True)
+        for part, base in parts:
+            if part.share <= 0:
+                continue
+            found: list[Holder] = []
+            for one in (part.evaluation, *part.evaluation.rivals):
+                value = self._value(one, base.evaluation)
+                if one.maxima is None or not one.maxima.times.size:
+                    found.append(Holder(part.speed_rpm, math.nan, math.nan, value, 0.0))
+                    continue
+                weight = self._weights(base.evaluation).get(PEAK, 0.0)
+                turn = 360.0 / self.config.profile.lobes
+                for time, force, _ in zip(*one.maxima, strict=True):
+                    height = value + weight * (force - one.response[PEAK])
+                    found.append(Holder(part.speed_rpm, turn * time, float(force), height, 0.0))
+            if worst and labels:
+                labels[0] += found
+            else:
+                labels.append(found)
+        return [
+            label._replace(share=float(share))
+            for shares, group in zip(certificate.shares, labels, strict=False)
+            for share, label in zip(shares, group, strict=True)
+            if share > _HELD
+        ]
+
+
+def words(key: str) -> str:
+    """Return the name of a design parameter in words, without its unit."""
+    return key.removesuffix("_mm").removesuffix("_deg").replace("_", " ")
+
+
+def _plain(value):
+    return float(value) if isinstance(value, np.floating) else value
 
 
 def _row(name, before, after, limit, unit, slack, sense) -> dict:
@@ -274,8 +462,8 @@ def _row(name, before, after, limit, unit, slack, sense) -> dict:
         "unit": unit,
         "sense": sense,
         "satisfied": bool(slack >= -1e-6),
-        "active": bool(abs(slack) < 1e-4),
+        "active": bool(abs(slack) < NEAR),
     }
 
 
-__all__: Sequence[str] = ["Problem"]
+__all__: Sequence[str] = ["FEASIBLE", "Problem", "words"]

@@ -1,11 +1,12 @@
-"""The search: screening, optax descent with projection, verification.
+"""The search: screening, local searches, verification with a certificate.
 
-Screening chooses the starts from a Sobol sample of feasible designs. From each start, an optax
-update rule descends in the unit box. The gradient is first projected onto the directions that
-active constraints allow; each step is projected back onto the feasible set. Each orbit is the first
-guess for the next orbit. The best design is simulated again from rest at a tighter tolerance before
-it is reported. A search can be stopped at any time (`stop`). It then verifies the best design found
-so far, unless the objective is an average over an ensemble.
+Screening chooses the starts from a Sobol sample of feasible designs. From each start, a local
+search begins: sequential quadratic programming on exact gradients (`rootsopt.optimize.sqp`), or a
+descent by an optax update rule. The descent projects the gradient onto the directions that active
+constraints allow, and each step back onto the feasible set. The last orbit is the first guess for
+the next. The best design is simulated again from rest before it is reported, and its first-order
+conditions are checked there. A search can be stopped at any time (`stop`). It then verifies the
+best design found so far.
 """
 
 import dataclasses
@@ -24,9 +25,16 @@ from numpy.typing import NDArray
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
-from rootsopt.optimize.problem import Problem
-from rootsopt.response.evaluation import Evaluation
+from rootsopt.optimize.certificate import Certificate, certify
+from rootsopt.optimize.checkpoint import Checkpoint
+from rootsopt.optimize.infeasible import Infeasible, explain
+from rootsopt.optimize.local import Local, Look
+from rootsopt.optimize.optimality import RESIDUAL, Optimality, StartOutcome
+from rootsopt.optimize.problem import FEASIBLE, Problem
+from rootsopt.optimize.sqp import Found, Stops, descend
+from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.evaluators import evaluator_for
+from rootsopt.response.sensitivity import by_scene, quantities
 from rootsopt.response.wrapper import Evaluates
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import design_vector
@@ -46,6 +54,8 @@ _STATIONARY = 1e-3
 """Norm of the projected gradient in the unit box below which a descent ends."""
 _HOLDS_UP = 0.01
 """Relative change of the objective in the verification above which a design is rejected."""
+_EXPLAINED = 8
+"""Maximum number of starts of the search for the least violation of the constraints."""
 _POLL = 0.05
 """Interval (s) at which a waiting thread checks whether it should stop."""
 
@@ -58,9 +68,9 @@ objective)."""
 class Trial:
     """One evaluated design of a search.
 
-    `point` (d,) of the unit box; `start`: number of the descent (-1: screening); `iteration`:
-    number of steps since the start of the descent; `evaluation` of the design; `objective`: NaN
-    without a usable steady state; `feasible`: whether all constraints are satisfied.
+    `point` (d,) of the unit box; `start`: number of the local search (-1: screening); `iteration`:
+    steps from its start; `evaluation`; `objective`: NaN without a usable steady state; `feasible`:
+    whether all constraints are satisfied; `local`: the problem to first order, None if not known.
     """
 
     point: NDArray[np.float64]
@@ -69,6 +79,12 @@ class Trial:
     evaluation: Evaluation
     objective: float
     feasible: bool
+    local: Local | None = None
+
+    @property
+    def residual(self) -> float:
+        """Residual of the first-order conditions; NaN if not known."""
+        return float("nan") if self.local is None else certify(self.local, self.point).residual
 
     @property
     def candidate(self) -> bool:
@@ -80,12 +96,13 @@ class Trial:
 class Optimization:
     """Outcome of a search.
 
-    `problem`: the design problem, None if the baseline has no usable steady state; `baseline`:
-    evaluation of the baseline; `optimized`: evaluation of the best design, None if no design better
-    than the baseline was confirmed; `history`: one row per trial; `verification`: objective in the
-    search and in the verification; `interrupted`: whether the search was stopped.
-    `verification["holds_up"]` is None if the search was stopped before the best design could be
-    verified.
+    `problem`: None if the baseline has no usable steady state; `baseline`: its evaluation;
+    `optimized`: evaluation of the best design, None if no design better than the baseline was
+    confirmed; `history`: one row per trial; `verification`: objective in the search and in the
+    verification; `interrupted`: whether the search was stopped. `verification["holds_up"]` is None
+    if the search was stopped before the best design could be verified. `optimality`: first-order
+    conditions at the best design, and what the starts found; None for an average over an ensemble
+    or without a verified design. `infeasible`: why no design satisfies all constraints, if so.
     """
 
     problem: Problem | None
@@ -94,6 +111,8 @@ class Optimization:
     history: list[dict[str, Any]]
     verification: dict[str, Any]
     interrupted: bool = False
+    optimality: Optimality | None = None
+    infeasible: Infeasible | None = None
 
     @property
     def status(self) -> Status:
@@ -102,7 +121,13 @@ class Optimization:
             return Status.INTERRUPTED
         if not self.baseline.usable:
             return self.baseline.status
-        return Status.NOT_IMPROVED if self.optimized is None else self.optimized.status
+        if self.infeasible is not None:
+            return Status.INFEASIBLE
+        if self.optimized is None:
+            return Status.NOT_IMPROVED
+        if self.optimality is not None and not self.optimality.converged:
+            return Status.NOT_CONVERGED
+        return self.optimized.status
 
     @property
     def improvement(self) -> dict[str, float]:
@@ -120,7 +145,8 @@ class Optimization:
         """Constraints at the optimum, one row each."""
         if self.problem is None or self.optimized is None:
             return []
-        return self.problem.constraint_rows(self.optimized)
+        certificate = None if self.optimality is None else self.optimality.certificate
+        return self.problem.constraint_rows(self.optimized, certificate)
 
     @property
     def objective_by_speed(self) -> list[dict[str, float]]:
@@ -135,7 +161,8 @@ class Search:
     """One optimisation run of a config.
 
     `progress` is called with (evaluations done, evaluations expected, best objective). `stop`: an
-    event that another thread can set to end the search early.
+    event that another thread can set to end the search early. `checkpoint`: keeps every evaluation,
+    and gives back those of an interrupted search.
 
     Raises InputError for a profile family without design parameters.
     """
@@ -145,6 +172,7 @@ class Search:
         config: Config,
         progress: Progress | None = None,
         stop: threading.Event | None = None,
+        checkpoint: Checkpoint | None = None,
     ):
         if not FAMILY_KEYS[config.profile.family]:
             valid = ", ".join(family for family, keys in FAMILY_KEYS.items() if keys)
@@ -155,6 +183,7 @@ class Search:
         self.config = config
         self.settings = config.optimizer
         self.progress = progress or (lambda done, expected, best: None)
+        self.method = method_of(config)
         self.expected = self.settings.screening + self.settings.starts * (
             self.settings.iterations + 1
         )
@@ -162,10 +191,12 @@ class Search:
         # If objectives are noisy, steps without a gain do not show that a descent has converged.
         self.noisy = config.objective.motion == "ensemble"
         self.patience = np.inf if self.noisy else _PATIENCE
+        self.checkpoint = checkpoint
         self.stop = threading.Event() if stop is None else stop
         self._lock, self._best = threading.Lock(), float("nan")
         self._trials: list[Trial] = []
         self._refuted: list[NDArray[np.float64]] = []
+        self._found: dict[int, Found] = {}
         self._baseline: Evaluation | None = None
 
     def run(self) -> Optimization:
@@ -174,8 +205,7 @@ class Search:
         After `stop`, the outcome is the best design found before. It is verified, unless the
         objective is an average over an ensemble.
 
-        Raises InputError if no design is feasible, or if the objective is not defined for the
-        baseline."""
+        Raises InputError if the objective is not defined for the baseline."""
         exact = self.exact.prepare(design_vector(self.config))
         Space.of(self.config, exact.scene, 0.0).prepare()
         exact, baseline = exact.fit()
@@ -186,14 +216,27 @@ class Search:
         # The search needs gradients and a ranking of designs, not the last digits.
         self.fast = exact.at_tolerance(max(1e-6, self.config.solver.rtol)).surveying()
         self.problem = Problem.of(self.config, exact.scene, baseline)
+        if self.problem.cornered:
+            self.exact = exact.with_maxima()
+        # Second-order convergence needs more digits than a descent.
+        self.sharp = self.exact.surveying()
         self._baseline = baseline
+        if self.problem.cornered and self.method == "slsqp":
+            # Compile what the maxima need during the screening.
+            again = list(baseline.design.values()), baseline.state, False
+            threading.Thread(target=self.sharp, args=again, daemon=True).start()
         start = self.problem.point(list(baseline.design.values()))
         points = self._feasible(start)
+        if not points:
+            reason = explain(self.problem, self._sample[:_EXPLAINED])
+            nothing = None, [], {}, self.stop.is_set(), None, reason
+            return Optimization(self.problem, baseline, *nothing)
         trials: list[Trial] = []
         if self.settings.screening:
-            trials = self._side_by_side(self._screen, [(point,) for point in points])
+            trials = self._side_by_side(self._screen, list(enumerate(points)))
         starts = self._starts(trials) or points[:1]
-        trials += self._side_by_side(self._descend, list(enumerate(starts)))
+        work = self._solve if self.method == "slsqp" else self._descend
+        trials += self._side_by_side(work, list(enumerate(starts)))
         if self.stop.is_set():
             if self.noisy and (found := self.so_far()) is not None:
                 return found
@@ -210,7 +253,8 @@ class Search:
             return Optimization(*settled, self.stop.is_set())
         optimized, verification = self._verify(trials)
         settled = self.problem, baseline, optimized, rows, verification
-        return Optimization(*settled, self.stop.is_set())
+        optimality = None if optimized is None else self._optimality(optimized, trials)
+        return Optimization(*settled, self.stop.is_set(), optimality)
 
     def so_far(self) -> Optimization | None:
         """Return what the search has found so far, without verification.
@@ -266,26 +310,18 @@ class Search:
             pool.shutdown(wait=not self.stop.is_set(), cancel_futures=True)
 
     def _feasible(self, baseline_point) -> list[NDArray[np.float64]]:
-        """Return feasible points: the baseline's and a Sobol sample, each projected if necessary.
-
-        Points that stay infeasible are dropped. Raises InputError if no point is feasible."""
+        """Return the baseline's point and a Sobol sample, made feasible as far as possible."""
         start = self.problem.project(baseline_point)
         count, seed = self.settings.screening, self.settings.seed
         sample = sobol(count, seed, len(baseline_point))
         points = [start, *(self.problem.toward(point, start) for point in sample)]
-        points = [point for point in points if self.problem.feasible(point)]
-        if not points:
-            raise InputError(
-                "`constraints` and `optimizer.bounds` leave no feasible design; lower "
-                "`constraints.area_efficiency_min`, or widen `optimizer.bounds` or the range of "
-                "`constraints.outer_radius_*_mm`"
-            )
-        return points
+        self._sample = points
+        return [point for point in points if self.problem.feasible(point)]
 
-    def _screen(self, point) -> list[Trial]:
+    def _screen(self, number: int, point) -> list[Trial]:
         if self.stop.is_set():
             return []
-        return [self._evaluate(self.fast.without_gradient(), point, start=-1, iteration=0)]
+        return [self._evaluate(self.fast.without_gradient(), point, -1, 0, key=(-1, number))]
 
     def _starts(self, trials: list[Trial]) -> list[NDArray[np.float64]]:
         """Return the points of the best screened designs, at least 0.15 apart in the unit box."""
@@ -295,6 +331,44 @@ class Search:
             if apart and len(chosen) < self.settings.starts:
                 chosen.append(trial.point)
         return chosen
+
+    def _solve(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
+        """Search from `point` by sequential quadratic programming and return the trials.
+
+        `number`: that of the local search."""
+        trials: list[Trial] = []
+        last: list[Trial] = []
+
+        def look(point: NDArray[np.float64]) -> Local | None:
+            orbit = last[-1].evaluation.state if last else None
+            trial = self._evaluate(self.sharp, point, number, len(trials), orbit)
+            trials.append(trial)
+            if trial.local is not None:
+                last.append(trial)
+            return trial.local
+
+        stops = Stops(evaluations=self.settings.iterations + 1, asked=self.stop.is_set)
+        if not self.stop.is_set():
+            found = self._repaired(descend(look, point, stops), trials, look)
+            with self._lock:
+                self._found[number] = found
+        return trials
+
+    def _repaired(self, found: Found, trials: list[Trial], look: Look) -> Found:
+        """Return the outcome of a local search that ended early, with a better design if the best
+        infeasible trial can be made feasible."""
+        usable = [trial for trial in trials if trial.local is not None]
+        best = min(usable, key=_objective, default=trials[0])
+        if found.converged or best.feasible or found.local is None or self.stop.is_set():
+            return found
+        point = self.problem.toward(best.point, found.point)
+        local = look(point)
+        if local is None or not self.problem.feasible(point):
+            return found
+        if found.local.violation <= FEASIBLE and local.objective >= found.local.objective:
+            return found
+        outcome = point, local, certify(local, point), found.reason, found.evaluations + 1
+        return Found(*outcome)
 
     def _descend(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
         """Descend from `point` (d,) and return the trials; `number`: index of the descent."""
@@ -328,11 +402,25 @@ class Search:
             point = self.problem.toward(point + np.asarray(update), point)
         return trials
 
-    def _evaluate(self, evaluator: Evaluates, point, start, iteration, orbit=None) -> Trial:
-        evaluation = evaluator(self.problem.design(point), start=orbit, series=False)
+    def _evaluate(
+        self, evaluator: Evaluates, point, start, iteration, orbit=None, key=None
+    ) -> Trial:
+        """Evaluate a point, or take what the checkpoint has under `key`, and record the trial."""
+        point = np.array(point, dtype=np.float64)
+        key = (start, iteration) if key is None else key
+        kept = None if self.checkpoint is None else self.checkpoint.known(key, point)
+        if kept is None:
+            evaluation = evaluator(self.problem.design(point), start=orbit, series=False)
+            if self.checkpoint is not None:
+                self.checkpoint.add(key, point, evaluation)
+        else:
+            evaluation = kept
         objective = self.problem.objective(evaluation)
         feasible = self.problem.feasible(point)
-        trial = Trial(np.asarray(point), start, iteration, evaluation, objective, feasible)
+        local = None
+        if start >= 0 and not self.noisy:
+            local = self.problem.local(evaluation, point)
+        trial = Trial(point, start, iteration, evaluation, objective, feasible, local)
         with self._lock:
             self._trials.append(trial)
             if trial.candidate:
@@ -343,9 +431,11 @@ class Search:
     def _verify(self, trials: list[Trial]) -> tuple[Evaluation | None, dict[str, Any]]:
         """Simulate the best designs again, from rest at a tight tolerance, until one is confirmed.
 
-        At most five designs are simulated. Return the evaluation of the confirmed design, or None,
-        and a record for the result file."""
+        Return its evaluation, or None, and the record for the result file."""
+        ends = {found.point.tobytes() for found in self._found.values()}
         ranked = sorted(filter(_candidate, trials), key=_objective)
+        # The ends of local searches come first: points beside them are no better.
+        ranked.sort(key=lambda trial: trial.point.tobytes() not in ends)
         tried: list[np.ndarray] = []
         failures = []
         for candidate in ranked:
@@ -368,6 +458,96 @@ class Search:
             failures.append(record | {"design": evaluation.design})
             self._refuted.append(candidate.point)
         return None, {"holds_up": False, "rejected": failures}
+
+    def _optimality(self, optimized: Evaluation, trials: list[Trial]) -> Optimality | None:
+        """Return the first-order conditions at a verified design, and what the starts found."""
+        point = self.problem.point(list(optimized.design.values()))
+        local = self.problem.local(optimized, point)
+        if local is None:
+            return None
+        certificate = certify(local, point)
+        starts = [self._outcome(number, found) for number, found in sorted(self._found.items())]
+        reason = "converged"
+        ends = sorted(self._found.items())
+        if not certificate.holds(RESIDUAL, FEASIBLE):
+            reasons = [found.reason for _, found in ends if _near(found.point, [point])]
+            reason = reasons[0] if reasons else "descent"
+            reason = "verification" if reason == "converged" else reason
+        held = self.problem.held_by(optimized, certificate)
+        starts = [self._outcome(number, found) for number, found in ends]
+        starts = starts or self._ends(trials)
+        rows = self._sensitivities(optimized, certificate)
+        return Optimality(self.method, certificate, reason, held, starts, rows)
+
+    def _sensitivities(self, optimized: Evaluation, certificate: Certificate) -> list[dict]:
+        """Return the rows of the table of scene quantities; none for several speeds or motions."""
+        if not isinstance(self.exact, Evaluator) or self.stop.is_set():
+            return []
+        design = np.array(list(optimized.design.values()))
+        fitted = self.exact.fit(design, optimized.state, series=False)[0]
+        moved = by_scene(fitted, optimized)
+        if moved is None:
+            return []
+        objective = self.problem.along_scene(moved, certificate)
+        level = self.problem.objective(optimized)
+        rows = []
+        for one in quantities(self.config):
+            forces = {name: one.step * row[one.key] for name, row in moved.gradient.items()}
+            row = {"quantity": one.name, "key": one.key, "unit": one.unit, "value": one.value}
+            row |= {"step": one.step} | forces
+            if objective:
+                row["objective_percent"] = 100 * one.step * objective[one.key] / level
+            rows.append(row)
+        return rows
+
+    def _outcome(self, number: int, found: Found) -> StartOutcome:
+        """Return the outcome of a local search by sequential quadratic programming."""
+        certificate, local = found.certificate, found.local
+        reason = found.reason
+        if certificate is not None and certificate.holds(RESIDUAL, FEASIBLE):
+            reason = "converged"
+        return StartOutcome(
+            start=number,
+            objective=float("nan") if local is None else local.objective,
+            residual=float("nan") if certificate is None else certificate.residual,
+            reason=reason,
+            evaluations=found.evaluations,
+            design=self._named(found.point),
+            point=found.point,
+        )
+
+    def _ends(self, trials: list[Trial]) -> list[StartOutcome]:
+        """Return the outcomes of descents: the best trial of each."""
+        starts: dict[int, list[Trial]] = {}
+        for trial in trials:
+            if trial.start >= 0:
+                starts.setdefault(trial.start, []).append(trial)
+        found = []
+        for number, every in sorted(starts.items()):
+            best = min(filter(_candidate, every), key=_objective, default=every[0])
+            outcome = best.objective, best.residual, "descent", len(every)
+            found.append(StartOutcome(number, *outcome, self._named(best.point), best.point))
+        return found
+
+    def _named(self, point) -> dict[str, float]:
+        """Return the design at a point, by key."""
+        values = map(float, self.problem.design(point))
+        return dict(zip(self.problem.baseline.design, values, strict=True))
+
+
+def method_of(config: Config) -> str:
+    """Return the method of the local searches: that of the config, without `auto`.
+
+    Raises InputError for a method that needs exact gradients, if the config's are averages."""
+    method, noisy = config.optimizer.method, config.objective.motion == "ensemble"
+    if method == "auto":
+        return "adam" if noisy else "slsqp"
+    if method == "slsqp" and noisy:
+        raise InputError(
+            "`optimizer.method` must be adam, rmsprop or sgd for `objective.motion` ensemble, but "
+            "is slsqp: gradients of averages have noise; set it to auto"
+        )
+    return method
 
 
 def until_stopped(work: Callable[[], T], stop: threading.Event, patience: float) -> T | None:
@@ -445,6 +625,7 @@ def _history(trials: list[Trial]) -> list[dict[str, Any]]:
                 **evaluation.design,
                 "area_efficiency": evaluation.geometry["area_efficiency"],
                 "feasible": trial.feasible,
+                "residual": trial.residual,
                 "status": evaluation.status.label,
             }
         )

@@ -183,6 +183,11 @@ class RunFolder(ResultFolder):
         return self._base.with_name(self._base.name + unique)
 
     @property
+    def checkpoint(self) -> Path:
+        """File beside the folder for what a killed run needs to go on; not part of the run."""
+        return self._base.with_name(self._base.name + ".checkpoint")
+
+    @property
     def place(self) -> Path:
         """Temporary folder into which files are written."""
         return self.stage

@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.sensitivity import MICROMETRE
 from rootsopt.status import Status
 
 DASH = "-"
@@ -75,6 +76,89 @@ def comparison_table(
     if baseline.message == optimized.message:
         notes = [("both", baseline.message)]
     return Group(table, *(Text(f"{name}: {message}") for name, message in notes))
+
+
+def optimality_table(
+    optimality: Mapping[str, Any], constraints: list[dict[str, Any]]
+) -> RenderableType:
+    """Show the first-order conditions at the optimum, what holds it, and what the starts found.
+
+    `optimality` is the entry of the result file; `constraints` are its rows."""
+    table = _table("Certificate of the optimum", "value", "objective")
+    word = optimality["reason"].replace("_", " ")
+    _group(
+        table,
+        "first-order conditions",
+        [
+            ("residual (of the unit box)", _number(optimality["residual"]), word),
+            ("violation (scaled)", _number(optimality["violation"]), ""),
+        ],
+    )
+    prices = [row for row in constraints if abs(row.get("multiplier", 0.0)) > 0]
+    _group(table, "price of a limit", map(_price, prices))
+    held = optimality["held_by"]
+    if len(held) > 1:
+        _group(table, "branches that hold the optimum (share)", map(_held, held))
+    _group(table, "starts", map(_start, optimality["starts"]))
+    _group(table, "distinct optima", _optima(optimality))
+    return Group(table, Text(optimality["message"]))
+
+
+def sensitivity_table(rows: list[dict[str, Any]]) -> RenderableType:
+    """Show how forces and objective at the optimum change with the quantities of the scene.
+
+    `rows` are `sensitivities` of `optimality` in the result file."""
+    table = _table("Sensitivity of the optimum", "mean, N", "peak, N", "objective")
+    for row in rows:
+        length = row["unit"] == "mm" and row["step"] == MICROMETRE
+        step = "+1 um" if length else "+1 %"
+        forces = (f"{row[key]:+.3g}" for key in ("mean_force_N", "peak_force_N"))
+        share = row.get("objective_percent")
+        change = DASH if share is None else f"{share:+.3g} %"
+        table.add_row(f"{row['quantity']} {step}", *forces, change)
+    return table
+
+
+def conflict_table(rows: list[dict[str, Any]]) -> RenderableType:
+    """Show constraints that contradict each other, with the nearest limits that can be met.
+
+    `rows` are `conflicts` of `infeasible` in the result file."""
+    table = _table("Constraints in conflict", "least violation", "with all others")
+    for row in rows:
+        unit = f" {row['unit']}" if row["unit"] else ""
+        name = f"{row['name']} {row['sense']} {_number(row['limit'])}{unit}"
+        table.add_row(name, _number(row["together"]), _number(row["alone"]))
+    return table
+
+
+def _price(row: Mapping[str, Any]) -> tuple[str, ...]:
+    step = f"{row['relaxed_by']:+g} {row['unit']}".strip()
+    name = f"{_words(row['name'])} {row['sense']} {_number(row['limit'])} {row['unit']}".strip()
+    return name, step, f"{row['relaxed_objective_percent']:+.3g} %"
+
+
+def _held(row: Mapping[str, Any]) -> tuple[str, ...]:
+    at = "" if row["speed_rpm"] is None else f"{_number(row['speed_rpm'])} rpm"
+    if row["rotation_deg"] is not None:
+        at += f" peak of {_number(row['force_N'])} N at {row['rotation_deg']:.2f} deg"
+    return at.strip() or "motion", f"{row['share']:.3f}", _number(row["objective"])
+
+
+def _start(row: Mapping[str, Any]) -> tuple[str, ...]:
+    word = row["reason"].replace("_", " ")
+    count = f"{row['evaluations']} designs"
+    return f"start {row['start']}: {word}", count, _number(row["objective"])
+
+
+def _optima(optimality: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    rows = []
+    for number, one in enumerate(optimality["optima"]):
+        times = f"{one['found']} of {len(optimality['starts'])} starts"
+        rows.append((f"optimum {number}", times, _number(one["objective"])))
+    share = optimality["unseen"]["share_of_starts"]
+    if rows and share is not None:
+        rows.append(("further starts that would find a new one", f"{100 * share:.3g} %", ""))
+    return rows
 
 
 def evaluation_table(evaluation: Evaluation) -> RenderableType:
@@ -232,7 +316,8 @@ def _constraint(row: Mapping[str, Any]) -> tuple[str | Text, ...]:
     if not row["satisfied"]:
         verdict = Text("violated", style="bold red")
     else:
-        verdict = Text("active" if row.get("active") else "satisfied", style="green")
+        word = "active" if row.get("active") else "satisfied"
+        verdict = Text("met by all" if row.get("always") else word, style="green")
     return label, _number(row["baseline"]), _number(row["optimized"]), verdict
 
 

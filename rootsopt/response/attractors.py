@@ -371,11 +371,13 @@ class AttractorEvaluator(Wrapper):
             return basins.rest
         orbits = [a for a in basins.attractors if closed(a.evaluation)]
         chosen = max(usable, key=self._badness(usable)).evaluation
+        rivals = tuple(a.evaluation for a in usable if a.evaluation is not chosen)
         if self.config.objective.motion == "weighted":
-            chosen = _averaged(chosen, orbits)
+            chosen, rivals = _averaged(chosen, orbits), ()
         status = basins.status
         return dataclasses.replace(
             chosen,
+            rivals=rivals,
             gradient=chosen.gradient if status.usable else {},
             steady_state=chosen.steady_state | {"attractors": basins.summary()},
             status=status,
@@ -414,6 +416,7 @@ def _averaged(one: Evaluation, attractors: list[Attractor]) -> Evaluation:
 
     return dataclasses.replace(
         one,
+        maxima=None,
         response={k: average([e.response[k] for e in found]) for k in one.response},
         gradient={
             name: {k: average([slope(e, name, k) for e in found]) for k in row}

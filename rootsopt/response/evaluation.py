@@ -16,6 +16,7 @@ from rootsopt.config import Config
 from rootsopt.config.units import MM, RPM
 from rootsopt.contact.size import size_map
 from rootsopt.dynamics.integrator import Integrator
+from rootsopt.dynamics.maxima import Maxima, local_maxima
 from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
 from rootsopt.dynamics.orbit import Orbit, reverse_sensitivity
 from rootsopt.dynamics.pair import RotorPair
@@ -64,11 +65,13 @@ class Evaluation:
     """Everything known about one design in one scene.
 
     `design`: parameters in config units; `geometry`, `response` (N), `gradient` (N per config
-    unit): dicts with the keys of the result file. `gradient` is empty unless it can be trusted.
-    `steady_state`: kind of motion and its properties; `status` and `message`: outcome and advice;
-    `statistics`: effort and accuracy; `series`: whole orbits over at least one revolution, or a
-    window of a motion that does not settle; `state`: `start` for evaluating a neighbouring design,
-    None if not known. For a single motion, `state` is the scaled state (n,) of the orbit at φ1 = 0.
+    unit): by the result file's keys. `gradient` is empty unless it can be trusted. `steady_state`:
+    kind of motion and its properties; `status` and `message`: outcome and advice; `statistics`:
+    effort and accuracy; `series`: whole orbits over at least one revolution, or a window of a
+    motion that does not settle; `state`: `start` for a neighbouring design, None if not known. For
+    one motion it is the scaled state of the orbit at φ1 = 0 (n,). `maxima`: local maxima of the
+    force over the orbit, slopes in N per config unit; None unless requested and periodic. `rivals`:
+    evaluations of the other motions, where the worst of several counts.
     """
 
     design: dict[str, float]
@@ -81,6 +84,8 @@ class Evaluation:
     statistics: dict[str, int | float]
     series: Series | None
     state: NDArray[np.float64] | None = None
+    maxima: Maxima | None = None
+    rivals: "tuple[Evaluation, ...]" = ()
 
     @property
     def usable(self) -> bool:
@@ -126,7 +131,8 @@ class Evaluator:
     `survey`: whether the evaluator is for a search over many designs (see `surveying`);
     `reference`: response by which forces are divided when coexisting motions are compared;
     `fitted`: whether the contact map has been fitted to a motion; `map_error`: error of the contact
-    map, relative to the static penetration, NaN if unknown.
+    map, relative to the static penetration, NaN if unknown; `maxima`: whether to compute all local
+    maxima of the force, with their gradients.
     """
 
     config: Config
@@ -135,6 +141,7 @@ class Evaluator:
     reference: dict[str, float] | None = None
     fitted: bool = False
     map_error: float = float("nan")
+    maxima: bool = False
 
     @classmethod
     def of(cls, config: Config, rtol: float | None = None, survey: bool = False) -> "Evaluator":
@@ -176,6 +183,10 @@ class Evaluator:
     def at_speed(self, speed_rpm: float) -> "Evaluator":
         """Return another evaluator at the speed `speed_rpm`."""
         return dataclasses.replace(self, scene=at_speed(self.scene, speed_rpm))
+
+    def with_maxima(self) -> "Evaluator":
+        """Return another evaluator that adds all local maxima of the force to an evaluation."""
+        return dataclasses.replace(self, maxima=True)
 
     def without_gradient(self) -> "Evaluator":
         """Return this evaluator unchanged, since its gradient takes little time.
@@ -219,15 +230,22 @@ class Evaluator:
             pair, tangents, shape = _build(now.scene, design)
             dtype = pair.angle_scale.dtype
             state = np.zeros(pair.states, dtype) if start is None else np.asarray(start, dtype)
-            found = jax.device_get(now._motion(pair, tangents, state))
+            found = jax.device_get(now.motion(pair, tangents, state))
             other = now._refitted(pair, found)
             if other is None:
                 break
             if float(other.scene.deepest) < float(now.scene.deepest):
                 other = other._sized(design)
-        return now, now._report(design, (pair, shape), found, began, series)
+        report = now._report(design, (pair, shape), found, began, series)
+        if self.maxima and report.usable:
+            integrator = now.scene.solver.orbit
+            maxima = local_maxima(pair, tangents, found.orbit, int(found.period), integrator)
+            report = dataclasses.replace(report, maxima=maxima)
+        return now, report
 
-    def _motion(self, pair: RotorPair, tangents: RotorPair, state) -> Steady:
+    def motion(self, pair: RotorPair, tangents: RotorPair, state) -> Steady:
+        """Return the steady motion of `pair` that the scaled `state` (n,) leads to, with its
+        derivatives along `tangents`."""
         return _motion(pair, tangents, state, self.scene.pitch_radius, self.scene.solver)
 
     def pair(self, design: ArrayLike) -> RotorPair:

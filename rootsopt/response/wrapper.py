@@ -74,6 +74,10 @@ class Evaluates(Protocol):
         those of the `baseline`."""
         ...
 
+    def with_maxima(self) -> "Evaluates":
+        """Return another evaluator that adds all local maxima of the force to an evaluation."""
+        ...
+
     def without_gradient(self) -> "Evaluates":
         """Return an evaluator that skips the gradient, if computing it takes most of the time."""
         ...
@@ -138,6 +142,10 @@ class Wrapper:
         """Return another evaluator, which compares coexisting motions by their forces relative to
         those of the `baseline`."""
         return self._around(self.single.relative_to(baseline))
+
+    def with_maxima(self: W) -> W:
+        """Return another evaluator that adds all local maxima of the force to an evaluation."""
+        return self._around(self.single.with_maxima())
 
     def without_gradient(self: W) -> W:
         """Return an evaluator that skips the gradient, if computing it takes most of the time."""

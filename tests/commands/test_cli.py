@@ -88,10 +88,14 @@ def test_optimize_writes_the_contract(tmp_path):
         assert force.mean() == pytest.approx(result[name]["response"]["mean_force_N"], rel=1e-3)
         assert force.max() <= result[name]["response"]["peak_force_N"] * (1 + 1e-6)
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["optimizer"]["screening"] == 2
-    assert result["status"] == "periodic"
+    # Two iterations are too few for the first-order conditions.
+    assert result["status"] in ("periodic", "not_converged")
+    assert result["optimality"]["converged"] == (result["status"] == "periodic")
+    assert len(result["optimality"]["starts"]) == 1
+    assert all("multiplier" in row for row in result["constraints"])
     assert result["run"]["command"] == "optimize"
     figures = {path.name for path in (tmp_path / "figures").iterdir()}
-    names = ("profiles", "meshing", "force", "spectrum", "history")
+    names = ("profiles", "meshing", "force", "spectrum", "history", "optimum")
     assert figures == {f"{name}.png" for name in names}
     assert (tmp_path / "history.csv").read_text().count("\n") >= 4
     # The optimised design, as a config and as a drawing, both read back.

@@ -95,7 +95,7 @@ def test_family_is_known_to_a_command_by_its_file(blunt_cycloid, tmp_path):
 @pytest.mark.long
 def test_family_is_optimised(blunt_cycloid, tmp_path):
     """Better than the baseline, within the bounds of its parameters."""
-    budget = ("screening=2", "starts=1", "iterations=3")
+    budget = ("screening=2", "starts=1", "iterations=3", "method=adam")
     given = [word for setting in budget for word in ("--set", f"optimizer.{setting}")]
     given += ["--set", "solver.fidelity=linear", "--no-figures", "-o", str(tmp_path / "out")]
     assert optimize.main(["configs/ee.yaml", *DESIGN, *given]) == 0

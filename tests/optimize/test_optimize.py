@@ -19,6 +19,7 @@ import pytest
 from rootsopt.config import parse
 from rootsopt.design.space import sobol
 from rootsopt.errors import InputError
+from rootsopt.optimize.infeasible import explain
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, until_stopped
 from rootsopt.profiles import geometry
@@ -152,13 +153,27 @@ def test_descent_respects_active_constraints(problem):
         np.testing.assert_allclose(problem.descent(point, outward), 0, atol=1e-9)
 
 
-def test_contradicting_constraints_are_bad_input():
-    """No feasible design: one message, before anything is searched."""
-    settings = config("constraints.area_efficiency_min=0.9", "optimizer.screening=4")
+def test_contradicting_constraints_are_explained():
+    """A rotor with more area than its housing allows: both limits are named, and each can be met
+    at the value that the other one leaves, found on a grid by projection."""
+    limits = "constraints.outer_radius_max_mm=42.0", "constraints.area_efficiency_min=0.44"
+    settings = config(*limits, "optimizer.screening=4", "constraints.seal_width_min_mm=0.1")
     search = Search(settings)
     search.problem = Problem.of(settings, Scene.from_config(settings), baseline(settings))
-    with pytest.raises(InputError, match=r"constraints\.area_efficiency_min"):
-        search._feasible(np.full(3, 0.5))
+    assert search._feasible(np.full(3, 0.5)) == []
+    found = explain(search.problem, search._sample)
+    by_name = {one.name: one for one in found.conflicts}
+    assert {"area efficiency", "outer radius"} <= by_name.keys()
+    assert found.violation > 0.1
+    assert "constraints" in found.message
+    radius = by_name["outer radius"].alone
+    # With this radius there is a design, and with 0.1 mm less there is none.
+    for shift, possible in ((1e-3, True), (-0.1, False)):
+        moved = config(*limits[1:], f"constraints.outer_radius_max_mm={radius + shift}",
+                       "constraints.seal_width_min_mm=0.1")  # fmt: skip
+        again = Problem.of(moved, Scene.from_config(moved), baseline(moved))
+        points = [again.project(p) for p in sobol(16, 3)]
+        assert any(again.feasible(p) for p in points) == possible
 
 
 def test_ee_has_nothing_to_optimise():
@@ -365,7 +380,9 @@ def test_signals_to_the_command(tmp_path, after, number):
         assert result["improvement"]["objective"] > 0
         names = {"history.csv", "optimized.yaml", "profile_optimized.csv", "response_optimized.csv"}
         assert names <= written
-    assert sorted(os.listdir(tmp_path)) == ["run", "scene.yaml"]
+    # With designs to go on with, the checkpoint stays.
+    kept = [".run.checkpoint"] if after else []
+    assert sorted(os.listdir(tmp_path)) == [*kept, "run", "scene.yaml"]
 
 
 def test_objective_slope_agrees_with_finite_differences():

@@ -230,6 +230,7 @@ def test_optimiser_over_all_motions(tmp_path):
     small = (
         "objective.motion=worst",
         "optimizer.iterations=3",
+        "optimizer.method=adam",
         "optimizer.screening=2",
         "optimizer.starts=1",
         "attractors.relatives=8",

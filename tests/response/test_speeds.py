@@ -285,7 +285,8 @@ def test_sweep_command(tmp_path, capsys, singles):
 
 def test_optimize_over_speeds(tmp_path, capsys):
     """A short run end to end: better over the speeds, each speed in table, records, picture."""
-    short = "optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=2"
+    short = ["optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=2"]
+    short.append("optimizer.method=adam")
     assert run("optimize", tmp_path, SPEEDS, WEIGHTS, *short) == 0
     assert "Contact force over speed" in capsys.readouterr().out
     result = json.loads((tmp_path / "result.json").read_text())

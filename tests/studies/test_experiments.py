@@ -348,3 +348,16 @@ def test_families(tmp_path, programs):
     assert "| 1 | `" in out
     assert is_picture(tmp_path / "families.png")
     assert is_picture(tmp_path / "families_profiles.png")
+
+
+@pytest.mark.long
+def test_optimisers(tmp_path, programs):
+    """Every method improves on the start of every problem, and each evaluation is recorded."""
+    run("optimisers", tmp_path, programs)
+    rows = rows_of(tmp_path / "optimisers.csv")
+    for method in ("slsqp", "augmented_lagrangian", "interior_point"):
+        own = [row for row in rows if row["method"] == method]
+        assert 2 < len(own) <= 30
+    record = json.loads((tmp_path / "optimisers.json").read_text())
+    assert all(row["designs"] > 1 for row in record["summary"])
+    assert is_picture(tmp_path / "optimisers.png")

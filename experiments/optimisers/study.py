@@ -1,0 +1,285 @@
+"""Compares optimisation methods on the same problems, by evaluations and time to the optimum.
+
+Every problem is a config with overrides. All methods work on the epigraph of the same problem, with
+exact gradients, start at the baseline and end when their evaluations run out. The best feasible
+value that any of them reaches counts as the optimum.
+"""
+
+import dataclasses
+import importlib.util
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import BFGS, NonlinearConstraint, minimize
+
+from rootsopt.config import load
+from rootsopt.optimize.certificate import certify
+from rootsopt.optimize.local import Local, Look
+from rootsopt.optimize.problem import FEASIBLE, Problem
+from rootsopt.optimize.sqp import SCALE, EndError, Epigraph, Stops, descend
+from rootsopt.response.evaluators import evaluator_for
+
+REACHED = 1e-6
+"""Distance of the objective from the optimum at which a method has reached it."""
+EVALUATIONS, QUICK = 150, 15
+"""Designs that each method may simulate, in a full and in a reduced run."""
+_PEAK = "objective.mean_weight=0"
+Method = Callable[[Look, NDArray[np.float64], Stops], None]
+_OUTER, _INNER = 30, 25
+"""Rounds of the augmented Lagrangian, and iterations of L-BFGS in each."""
+_PENALTY, _GROWTH, _MOST = 10.0, 4.0, 1e6
+"""First weight of the penalty, its growth where the violation does not fall by half, its limit."""
+
+
+class Task(NamedTuple):
+    """A problem: `name`, `config` and overrides."""
+
+    name: str
+    config: str
+    overrides: tuple[str, ...] = ()
+
+
+TASKS = (
+    Task("cic", "configs/cic.yaml"),
+    Task("cic, peak alone", "configs/cic.yaml", (_PEAK,)),
+    Task("cic, mean alone", "configs/cic.yaml", ("objective.peak_weight=0",)),
+    Task("cic, RMS alone", "configs/cic.yaml", (
+        _PEAK, "objective.peak_weight=0", "objective.rms_weight=1")),
+    Task("cic, 2000 rpm", "configs/cic.yaml", ("scene.speed_rpm=2000",)),
+    Task("cic, 5000 rpm", "configs/cic.yaml", ("scene.speed_rpm=5000",)),
+    Task("cic, half the load", "configs/cic.yaml", ("scene.load.torque_N_m=2.4",)),
+    Task("cic, wide backlash", "configs/cic.yaml", ("scene.timing_gear.backlash_mm=0.2",)),
+    Task("cic, narrow bore of the housing", "configs/cic.yaml", (
+        "constraints.outer_radius_max_mm=44.8", "constraints.area_efficiency_min=0.43")),
+    Task("cic, wide seal", "configs/cic.yaml", ("constraints.seal_width_min_mm=5",)),
+    Task("cic, two speeds", "configs/cic.yaml", ("objective.speeds_rpm=[2500, 3500]",)),
+    Task("cic, worst of two speeds", "configs/cic.yaml", (
+        "objective.speeds_rpm=[2500, 3500]", "objective.over_speeds=worst")),
+    Task("free form", "configs/free.yaml"),
+)  # fmt: skip
+QUICK_TASKS = 2
+"""Number of problems in a reduced run."""
+
+
+def slsqp(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
+    """Run the package's own local search: sequential quadratic programming."""
+    descend(look, start, stops)
+
+
+def _problem(look: Look, start: NDArray[np.float64], stops: Stops) -> Epigraph | None:
+    first = look(start)
+    return None if first is None else Epigraph(look, start, first, stops)
+
+
+def _bounds(problem: Epigraph, count: int) -> list[tuple[float | None, float | None]]:
+    free: list[tuple[float | None, float | None]] = [(None, None)]
+    return [(0.0, 1.0 / SCALE)] * problem.size + free * (count - problem.size)
+
+
+def augmented_lagrangian(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
+    """Run an augmented Lagrangian with SciPy's L-BFGS-B (Nocedal and Wright, algorithm 17.4)."""
+    problem = _problem(look, start, stops)
+    if problem is None:
+        return
+    z = problem.start()
+    weights = np.zeros(len(problem.constraints(z)[0]))
+    penalty, before = _PENALTY, np.inf
+
+    def merit(z):
+        value, slope = problem.value(z)
+        slack, normals = problem.constraints(z)
+        short = np.maximum(weights / penalty - slack, 0.0)
+        return value + penalty / 2 * short @ short, slope - penalty * short @ normals
+
+    try:
+        for _ in range(_OUTER):
+            options = {"maxiter": _INNER}
+            bounds = _bounds(problem, len(z))
+            z = minimize(merit, z, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
+            slack = problem.constraints(z)[0]
+            violation = np.max(np.maximum(-slack, 0.0))
+            weights = np.maximum(weights - penalty * slack, 0.0)
+            if violation > before / 2:
+                penalty = min(_GROWTH * penalty, _MOST)
+            before = violation
+    except EndError:
+        return
+
+
+def interior_point(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
+    """Run SciPy's trust-constr: an interior point method within a trust region."""
+    problem = _problem(look, start, stops)
+    if problem is None:
+        return
+    z = problem.start()
+    limits = NonlinearConstraint(
+        lambda z: problem.constraints(z)[0],
+        0.0,
+        np.inf,
+        jac=lambda z: problem.constraints(z)[1],
+        hess=BFGS(),
+    )
+    options = {"maxiter": 10_000, "gtol": 1e-12, "xtol": 1e-12, "barrier_tol": 1e-10}
+    try:
+        minimize(
+            problem.value,
+            z,
+            jac=True,
+            hess=BFGS(),
+            method="trust-constr",
+            bounds=_bounds(problem, len(z)),
+            constraints=limits,
+            options=options,
+        )
+    except EndError:
+        return
+
+
+def moving_asymptotes(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
+    """Run NLopt's method of moving asymptotes (Svanberg 2002, globally convergent).
+
+    Raises ImportError without the package `nlopt`."""
+    import nlopt  # type: ignore[import-not-found]
+
+    problem = _problem(look, start, stops)
+    if problem is None:
+        return
+    z = problem.start()
+    count = len(problem.constraints(z)[0])
+    search = nlopt.opt(nlopt.LD_MMA, len(z))
+    low, high = zip(*_bounds(problem, len(z)), strict=True)
+    search.set_lower_bounds([-1e3 if b is None else b for b in low])
+    search.set_upper_bounds([1e3 if b is None else b for b in high])
+
+    def value(z, slope):
+        found, gradient = problem.value(z)
+        if slope.size:
+            slope[:] = gradient
+        return found
+
+    def limits(result, z, slope):
+        slack, normals = problem.constraints(z)
+        result[:] = -slack
+        if slope.size:
+            slope[:] = -normals
+
+    search.set_min_objective(value)
+    search.add_inequality_mconstraint(limits, np.full(count, 1e-9))
+    search.set_maxeval(stops.evaluations)
+    try:
+        search.optimize(z)
+    except (EndError, nlopt.RoundoffLimited, RuntimeError):
+        return
+
+
+METHODS: dict[str, Method] = {
+    "slsqp": slsqp,
+    "augmented_lagrangian": augmented_lagrangian,
+    "interior_point": interior_point,
+    "mma": moving_asymptotes,
+}
+
+
+class Recorder:
+    """A problem as methods see it, with a record of every evaluation."""
+
+    def __init__(self, task: Task):
+        self.config = load(task.config, list(task.overrides))
+        evaluator = evaluator_for(self.config)
+        evaluator, baseline = evaluator.fit(series=False)
+        self.problem = Problem.of(self.config, evaluator.scene, baseline)
+        self.baseline = baseline
+        self.evaluator = evaluator.relative_to(baseline).surveying().with_maxima()
+        point = self.problem.point(list(baseline.design.values()))
+        self.start = self.problem.project(point)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all evaluations."""
+        self.rows: list[dict[str, float]] = []
+        self.state, self.began = self.baseline.state, time.perf_counter()
+
+    def __call__(self, point: np.ndarray) -> Local | None:
+        """Evaluate the problem at a point and record it."""
+        design = self.problem.design(point)
+        evaluation = self.evaluator(design, start=self.state, series=False)
+        found = self.problem.local(evaluation, point)
+        if found is not None:
+            self.state = evaluation.state
+        self.rows.append(
+            {
+                "evaluation": len(self.rows) + 1,
+                "seconds": time.perf_counter() - self.began,
+                "objective": np.nan if found is None else found.objective,
+                "violation": np.nan if found is None else found.violation,
+                "residual": np.nan if found is None else certify(found, point).residual,
+            }
+        )
+        return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Results:
+    """Every evaluation of every method on every problem, and a summary row for each pair."""
+
+    rows: list[dict[str, Any]]
+    missing: tuple[str, ...]
+
+    def summary(self) -> list[dict[str, Any]]:
+        """Return evaluations and time to the optimum, by problem and method."""
+        found = []
+        for task in dict.fromkeys(row["problem"] for row in self.rows):
+            rows = [row for row in self.rows if row["problem"] == task]
+            best = min((row["objective"] for row in rows if _met(row)), default=np.nan)
+            for method in dict.fromkeys(row["method"] for row in rows):
+                own = [row for row in rows if row["method"] == method]
+                met = [row for row in own if _met(row)]
+                hits = [row for row in met if row["objective"] <= best + REACHED]
+                found.append(
+                    {
+                        "problem": task,
+                        "method": method,
+                        "evaluations": hits[0]["evaluation"] if hits else None,
+                        "seconds": hits[0]["seconds"] if hits else None,
+                        "above_best": min((r["objective"] for r in met), default=np.nan) - best,
+                        "residual": min((r["residual"] for r in met), default=np.nan),
+                        "designs": len(own),
+                    }
+                )
+        return found
+
+    def reached(self) -> dict[str, int]:
+        """Return on how many problems each method has reached the optimum."""
+        counts: dict[str, int] = {}
+        for row in self.summary():
+            counts[row["method"]] = counts.get(row["method"], 0) + (row["evaluations"] is not None)
+        return counts
+
+
+def _met(row: dict[str, Any]) -> bool:
+    return bool(np.isfinite(row["objective"]) and row["violation"] <= FEASIBLE)
+
+
+def run(
+    quick: bool,
+    tasks: Sequence[Task] = TASKS,
+    say: Callable[[str], None] = lambda text: None,
+) -> Results:
+    """Run every method on every problem; a method whose package is missing is left out."""
+    methods: dict[str, Method] = dict(METHODS)
+    if importlib.util.find_spec("nlopt") is None:
+        del methods["mma"]
+    tasks = tasks[:QUICK_TASKS] if quick else tasks
+    rows: list[dict[str, Any]] = []
+    for task in tasks:
+        look = Recorder(task)
+        look(look.start)  # Compiles.
+        for name, method in methods.items():
+            look.reset()
+            method(look, look.start, Stops(1e-9, 1e-9, QUICK if quick else EVALUATIONS))
+            rows += [{"problem": task.name, "method": name, **row} for row in look.rows]
+            say(f"{task.name}: {name}, {len(look.rows)} designs")
+    return Results(rows, tuple(METHODS.keys() - methods.keys()))

@@ -1,0 +1,53 @@
+"""Certificate of an optimum: convergence of the local searches, and the price of each limit."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from rootsopt.figures.style import BLUE, COLORS, GREY
+
+_WIDEST = 40
+"""Number of characters above which the name of a limit is shortened."""
+
+
+def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: float) -> Axes:
+    """Draw the first-order residual over the iterations of each local search.
+
+    `history`: rows with `start`, `iteration` and `residual`; `required`: residual of an optimum.
+    Trials of the screening, and trials without a residual, are left out."""
+    starts = sorted({int(row["start"]) for row in history if int(row["start"]) >= 0})
+    for start in starts:
+        rows = [row for row in history if int(row["start"]) == start]
+        x = np.array([row["iteration"] for row in rows], dtype=float)
+        y = np.array([row["residual"] for row in rows], dtype=float)
+        known = np.isfinite(y)
+        color = COLORS[start % len(COLORS)]
+        ax.semilogy(
+            x[known], np.maximum(y[known], 1e-16), "o-", color=color, label=f"start {start}"
+        )
+    ax.axhline(required, color=GREY, linestyle=":", label="required")
+    ax.set_xlabel("iteration")
+    ax.set_ylabel("first-order residual")
+    ax.legend(frameon=False)
+    return ax
+
+
+def plot_prices(ax: Axes, constraints: Sequence[Mapping[str, Any]]) -> Axes:
+    """Draw the gain in the objective (%) from relaxing each limit by its step, as bars.
+
+    `constraints`: rows of the result file; those without a multiplier are left out."""
+    rows = [row for row in constraints if abs(row.get("multiplier") or 0.0) > 0]
+    rows.sort(key=lambda row: row["relaxed_objective_percent"], reverse=True)
+    names = []
+    for row in rows:
+        name, step = row["name"], f"{row['relaxed_by']:+g} {row['unit']}".strip()
+        short = name if len(name) <= _WIDEST else f"{name[:_WIDEST]}…"
+        names.append(f"{short}, {step}")
+    ax.barh(names, [-row["relaxed_objective_percent"] for row in rows], color=BLUE)
+    if not rows:
+        ax.text(0.5, 0.5, "no limit holds the optimum", ha="center", transform=ax.transAxes)
+        ax.set_yticks([])
+    ax.set_xlabel("decrease of the objective (%)")
+    return ax

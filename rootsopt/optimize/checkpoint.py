@@ -1,0 +1,185 @@
+"""Evaluations of a search, kept in a file as they are made, so that a killed search can go on.
+
+A search is deterministic: the same evaluations lead to the same points. So a resumed search begins
+again and takes what is in the file instead of simulating it. From there on it continues with the
+same numbers, to the last bit, as if it had not been interrupted.
+
+The file has one JSON object per line. JSON keeps every float exactly. The first line tells which
+config and which versions the evaluations belong to. A last line that is cut off is ignored.
+"""
+
+import contextlib
+import dataclasses
+import json
+import os
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.dynamics.maxima import Maxima
+from rootsopt.errors import InputError
+from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation
+from rootsopt.status import Status
+
+_SHOWN = 5
+"""Number of differences that a refusal lists."""
+Key = tuple[int, int]
+"""Number of the local search, and of its evaluation."""
+
+
+class Checkpoint:
+    """The evaluations of one search in a file.
+
+    `header`: what they depend on, as nested mappings of plain values. With `resume`, evaluations in
+    the file are used again; without, the file is begun anew.
+
+    Raises `InputError` with `resume` if there is no file, or if it belongs to another header.
+    """
+
+    def __init__(self, path: Path, header: Mapping[str, Any], resume: bool = False):
+        self.path = path
+        self._lock = threading.Lock()
+        self._known: dict[Key, tuple[list[float], Evaluation]] = {}
+        self.reused, self._added = 0, False
+        plain = json.loads(json.dumps(header))
+        kept = self._read(plain) if resume else 0
+        self._file = open(path, "r+b" if kept else "wb")  # noqa: SIM115
+        self._file.truncate(kept)
+        self._file.seek(kept)
+        if not kept:
+            self._write(plain)
+
+    def _read(self, header: Mapping[str, Any]) -> int:
+        """Read the file; return the number of bytes of its whole lines."""
+        try:
+            data = self.path.read_bytes()
+        except OSError:
+            raise InputError(
+                f"`--resume` needs the checkpoint of an interrupted run, but there is no "
+                f"{str(self.path)!r}; leave out `--resume`, or name that run's folder with --output"
+            ) from None
+        kept, first = 0, True
+        for line in data.splitlines(keepends=True):
+            try:
+                found = json.loads(line) if line.endswith(b"\n") else None
+            except ValueError:
+                found = None
+            if found is None:
+                break
+            if first:
+                self._compare(found, header)
+            else:
+                key = int(found["key"][0]), int(found["key"][1])
+                self._known[key] = found["point"], _evaluation(found["evaluation"])
+            first = False
+            kept += len(line)
+        return kept
+
+    def _compare(self, found: Any, header: Mapping[str, Any]) -> None:
+        """Raise `InputError` if the file belongs to another header."""
+        old, new = _flat(found), _flat(header)
+        keys = [key for key in sorted({*old, *new}) if old.get(key) != new.get(key)]
+        if keys:
+            changes = [f"{k} (then {old.get(k)}, now {new.get(k)})" for k in keys[:_SHOWN]]
+            more = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
+            raise InputError(
+                f"`--resume` needs the config and versions of the interrupted run, but these "
+                f"differ: {', '.join(changes)}{more}; restore them, or leave out `--resume`"
+            )
+
+    def known(self, key: Key, point: NDArray[np.float64]) -> Evaluation | None:
+        """Return the evaluation of this number at this `point` (d,), if the file has it."""
+        with self._lock:
+            found = self._known.get(key)
+            if found is None or found[0] != point.tolist():
+                return None
+            self.reused += 1
+            return found[1]
+
+    def add(self, key: Key, point: NDArray[np.float64], evaluation: Evaluation) -> None:
+        """Write an evaluation to the file at once."""
+        self._added = True
+        row = {"key": [*key], "point": point.tolist(), "evaluation": _plain(evaluation)}
+        self._write(row)
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is no evaluation to go on with."""
+        return not self._known and not self._added
+
+    def _write(self, row: Mapping[str, Any]) -> None:
+        line = json.dumps(row, default=_item).encode() + b"\n"
+        with self._lock:
+            # A search that was stopped may still finish an evaluation.
+            if self._file.closed:
+                return
+            # A full disk costs the checkpoint, not the run.
+            with contextlib.suppress(OSError):
+                self._file.write(line)
+                self._file.flush()
+                os.fsync(self._file.fileno())
+
+    def close(self, remove: bool = True) -> None:
+        """Close the file, and remove it: a run that has ended needs it no more."""
+        with self._lock:
+            self._file.close()
+        if remove:
+            self.path.unlink(missing_ok=True)
+
+
+def _item(value: Any) -> Any:
+    """Return a NumPy number or array as plain values."""
+    return np.asarray(value).tolist()
+
+
+def _flat(tree: Any, name: str = "") -> dict[str, Any]:
+    """Return the leaves of nested mappings by dotted key."""
+    if not isinstance(tree, dict):
+        return {name: tree}
+    found: dict[str, Any] = {}
+    for key, value in tree.items():
+        found |= _flat(value, f"{name}.{key}" if name else key)
+    return found
+
+
+def _plain(evaluation: Evaluation) -> dict[str, Any]:
+    """Return an evaluation without series as plain values."""
+    names = (field.name for field in dataclasses.fields(Evaluation))
+    found = {name: getattr(evaluation, name) for name in names}
+    maxima, state = evaluation.maxima, evaluation.state
+    found |= {
+        "series": None,
+        "status": evaluation.status.name,
+        "state": None if state is None else np.asarray(state).tolist(),
+        "maxima": None if maxima is None else [part.tolist() for part in maxima],
+        "rivals": [_plain(one) for one in evaluation.rivals],
+    }
+    if isinstance(evaluation, SpeedsEvaluation):
+        parts = evaluation.parts
+        found["parts"] = [[p.speed_rpm, p.share, _plain(p.evaluation)] for p in parts]
+    return found
+
+
+def _evaluation(found: Mapping[str, Any]) -> Evaluation:
+    """Return the evaluation that `_plain` has written."""
+    values = dict(found)
+    parts = values.pop("parts", None)
+    if values["state"] is not None:
+        values["state"] = np.asarray(values["state"], np.float64)
+    if values["maxima"] is not None:
+        times, forces, slopes = (np.asarray(part, np.float64) for part in values["maxima"])
+        values["maxima"] = Maxima(times, forces, slopes)
+    values["status"] = Status[values["status"]]
+    values["rivals"] = tuple(_evaluation(one) for one in values["rivals"])
+    if parts is None:
+        return Evaluation(**values)
+    every = tuple(AtSpeed(speed, share, _evaluation(one)) for speed, share, one in parts)
+    return SpeedsEvaluation(**values, parts=every)
+
+
+__all__ = ["Checkpoint"]

@@ -1,0 +1,245 @@
+"""Local search by sequential quadratic programming on the epigraph of an objective with corners.
+
+Every maximum over branches becomes a variable t with one constraint b_i(x) ≤ t per branch, so all
+functions are smooth. SciPy's SLSQP (Kraft, A software package for sequential quadratic programming,
+DFVLR-FB 88-28, 1988) solves the smooth problem with exact gradients.
+
+A point without an objective has a merit above all others there, so the line search shortens its
+step until it finds a usable point. Such a point is never the result.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment, minimize
+
+from rootsopt.optimize.certificate import Certificate, certify
+from rootsopt.optimize.local import Group, Local, Look
+
+SCALE = 0.1
+"""Side of the unit box in the variables of SLSQP, which begins with a unit Hessian."""
+_SLOTS = 4
+"""Number of branches of one group that may appear during a search, besides twice those at its
+start."""
+_SAME = 0.1
+"""Difference of phases above which branches of neighbouring points are never the same."""
+_UNUSABLE = 1e3
+"""Objective of a point that has none, above the best."""
+_RESTARTS = 6
+"""Maximum number of times that SLSQP begins again, with a new Hessian, at its best point."""
+_GAIN = 1e-9
+"""Decrease of the objective below which a restart counts as no progress."""
+
+
+class Stops(NamedTuple):
+    """When a local search ends.
+
+    `residual`: first-order residual at which it has converged; `feasibility`: violation up to which
+    a point is feasible; `evaluations`: maximum number of points; `asked`: function that tells
+    whether to end at once.
+    """
+
+    residual: float = 1e-6
+    feasibility: float = 1e-6
+    evaluations: int = 200
+    asked: Callable[[], bool] = lambda: False
+
+
+class Found(NamedTuple):
+    """Outcome of a local search.
+
+    `point` (d,): the best feasible point, or the least infeasible one; `local`: the problem there,
+    None if no point was usable; `certificate` of the point; `reason`: word of `REASONS` for the
+    end; `evaluations`: number of points evaluated.
+    """
+
+    point: NDArray[np.float64]
+    local: Local | None
+    certificate: Certificate | None
+    reason: str
+    evaluations: int
+
+    @property
+    def converged(self) -> bool:
+        """Whether the point satisfies the first-order conditions."""
+        return self.reason == "converged"
+
+
+REASONS = {
+    "converged": "The first-order conditions hold.",
+    "evaluations": (
+        "The evaluations ran out before the first-order conditions held. Raise "
+        "optimizer.iterations."
+    ),
+    "no_progress": (
+        "No step along the gradients lowers the objective further, but the first-order conditions "
+        "do not hold: the gradients are less accurate than they require, or the motion changes its "
+        "kind beside the design. Tighten solver.rtol, or raise optimizer.starts."
+    ),
+    "infeasible": "No point near the start satisfies all constraints. Relax a constraint.",
+    "unusable": "The start has no usable steady state. Choose another one.",
+    "interrupted": "The search was stopped before its end.",
+}
+"""Reasons why a local search ends, with advice."""
+
+
+class EndError(Exception):
+    """Ends a search from inside a function it calls."""
+
+
+class Epigraph:
+    """The smooth problem in variables z = (x / `SCALE`, t), with what a search has seen of it."""
+
+    def __init__(self, look: Look, start: NDArray[np.float64], first: Local, stops: Stops):
+        self.look, self.stops, self.size = look, stops, len(start)
+        self.evaluations = 1
+        self.known: dict[bytes, Local | None] = {start.tobytes(): first}
+        self.good, self.best = first, (start, first)
+        self.certificate = certify(first, start)
+        slots = [2 * len(group.values) + _SLOTS for group in first.groups]
+        self.slots = [np.full((count, 2), np.nan) for count in slots]
+        self.used = [np.zeros(count) for count in slots]
+
+    def at(self, point: NDArray[np.float64]) -> Local | None:
+        """Return the problem at a point, evaluated once."""
+        key = point.tobytes()
+        if key not in self.known:
+            if self.stops.asked() or self.evaluations >= self.stops.evaluations:
+                raise EndError
+            self.evaluations += 1
+            self.known[key] = found = self.look(point)
+            if found is not None:
+                self._judge(point, found)
+        return self.known[key]
+
+    def _judge(self, point, found: Local) -> None:
+        """Keep the best point, and end the search where it satisfies the first-order conditions."""
+        best = self.best[1]
+        limit = self.stops.feasibility
+        if max(found.violation, limit) < max(best.violation, limit):
+            better = True
+        else:
+            feasible = found.violation <= max(best.violation, limit)
+            better = feasible and found.objective < best.objective
+        certificate = certify(found, point)
+        done = certificate.holds(self.stops.residual, limit)
+        if better or (done and found.objective <= best.objective + limit):
+            self.best, self.certificate = (point, found), certificate
+            if done:
+                raise EndError
+
+    def point(self, z) -> NDArray[np.float64]:
+        """Return the point of the unit box for the variables of SLSQP."""
+        return np.clip(np.asarray(z[: self.size]) * SCALE, 0.0, 1.0)
+
+    def start(self) -> NDArray[np.float64]:
+        """Return the variables at the best point."""
+        point, local = self.best
+        self.good = local
+        return np.concatenate([point / SCALE, [group.top for group in local.groups]])
+
+    def value(self, z) -> tuple[float, NDArray[np.float64]]:
+        """Return the smooth objective and its gradient."""
+        found = self.at(self.point(z))
+        steps = np.ones(len(z) - self.size)
+        if found is None:
+            gradient = np.concatenate([SCALE * self.good.slope, steps])
+            return self.best[1].objective + _UNUSABLE, gradient
+        self.good = found
+        total = found.smooth + float(np.sum(z[self.size :]))
+        return total, np.concatenate([SCALE * found.slope, steps])
+
+    def constraints(self, z) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return all constraints ≥ 0 and their gradients: t - b_i, then those of the problem."""
+        found = self.at(self.point(z))
+        found = self.good if found is None else found
+        values, rows = [], []
+        for k, group in enumerate(found.groups):
+            places = self._places(k, group)
+            value, row = np.ones(len(self.slots[k])), np.zeros((len(self.slots[k]), len(z)))
+            for place, b, slope in zip(places, group.values, group.slopes, strict=True):
+                if place >= 0:
+                    value[place] = z[self.size + k] - b
+                    row[place, : self.size] = -SCALE * slope
+                    row[place, self.size + k] = 1.0
+            values.append(value)
+            rows.append(row)
+        wide = np.zeros((len(found.slack), len(z)))
+        wide[:, : self.size] = SCALE * found.normals
+        return np.concatenate([*values, found.slack]), np.concatenate([*rows, wide])
+
+    def _places(self, k: int, group: Group) -> list[int]:
+        """Return the slot of each branch of group `k`; -1 if there is none left.
+
+        A branch keeps its slot from point to point, so that SLSQP sees smooth constraints."""
+        slots = self.slots[k]
+        apart = np.abs(group.tags[:, None, 1] - slots[None, :, 1])
+        apart = np.minimum(apart % 1.0, -apart % 1.0)
+        other = group.tags[:, None, 0] != slots[None, :, 0]
+        cost = np.where(other | ~(apart <= _SAME), 10.0, apart)
+        places = [-1] * len(group.values)
+        for branch, slot in zip(*linear_sum_assignment(cost), strict=True):
+            if cost[branch, slot] < 10.0:
+                places[branch] = int(slot)
+        free = [s for s in np.argsort(self.used[k], kind="stable") if s not in places]
+        for branch in np.argsort(-group.values, kind="stable"):
+            if places[branch] < 0 and free:
+                places[branch] = int(free.pop(0))
+        for branch, place in enumerate(places):
+            if place >= 0:
+                slots[place], self.used[k][place] = group.tags[branch], self.evaluations
+        return places
+
+
+def descend(look: Look, start: NDArray[np.float64], stops: Stops | None = None) -> Found:
+    """Search for a local minimum from `start` (d,) in the unit box.
+
+    `look` evaluates the problem at a point; `stops`: when to end."""
+    stops = Stops() if stops is None else stops
+    start = np.clip(np.asarray(start, dtype=np.float64), 0.0, 1.0)
+    first = look(start)
+    if first is None:
+        return Found(start, None, None, "unusable", 1)
+    problem = Epigraph(look, start, first, stops)
+    reason = "no_progress"
+    if problem.certificate.holds(stops.residual, stops.feasibility):
+        reason = "converged"
+    for _ in range(_RESTARTS if reason != "converged" else 0):
+        before = problem.best[1]
+        try:
+            _slsqp(problem)
+        except EndError:
+            reason = "interrupted" if stops.asked() else "evaluations"
+        if problem.certificate.holds(stops.residual, stops.feasibility):
+            reason = "converged"
+        after = problem.best[1]
+        gained = before.objective - after.objective > _GAIN or before.violation > after.violation
+        if reason != "no_progress" or not gained:
+            break
+    point, local = problem.best
+    if local.violation > stops.feasibility and reason == "no_progress":
+        reason = "infeasible"
+    return Found(point, local, problem.certificate, reason, problem.evaluations)
+
+
+def _slsqp(problem: Epigraph) -> None:
+    start, size = problem.start(), problem.size
+    free = [(None, None)] * (len(start) - size)
+    minimize(
+        problem.value,
+        start,
+        jac=True,
+        method="SLSQP",
+        bounds=[(0.0, 1.0 / SCALE)] * size + free,
+        constraints={
+            "type": "ineq",
+            "fun": lambda z: problem.constraints(z)[0],
+            "jac": lambda z: problem.constraints(z)[1],
+        },
+        options={"maxiter": 1000, "ftol": 1e-14},
+    )
+
+
+__all__ = ["REASONS", "EndError", "Epigraph", "Found", "Stops", "descend"]

@@ -1,0 +1,163 @@
+"""First-order sensitivities of a steady motion to the quantities of its scene.
+
+Every number of the config that the scene depends on is a direction in which the rotor pair changes.
+The derivatives along these directions come from the orbit, as those with respect to the design do,
+by the program that is compiled already.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rootsopt.config import Config
+from rootsopt.dynamics.maxima import local_maxima
+from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene, along
+from rootsopt.status import Status
+
+_STEP = 1e-6
+"""Relative step of the differences that turn a config key into a direction of the scene. The map
+from config to scene is close to linear."""
+_SETTINGS = ("solver", "deepest")
+"""Fields of a scene on which the response does not depend."""
+MICROMETRE = 1e-3
+"""One micrometre in mm, the step of lengths in the table."""
+_PERCENT = 0.01
+
+
+class Quantity(NamedTuple):
+    """A number of the config on which forces depend.
+
+    `key`: dotted; `name` in words; `unit`; `value`; `step`: change for which the table states the
+    effect.
+    """
+
+    key: str
+    name: str
+    unit: str
+    value: float
+    step: float
+
+
+_LENGTHS = (
+    ("contact.clearance_mm", "clearance of the flanks"),
+    ("scene.timing_gear.backlash_mm", "backlash of the timing gear"),
+    ("scene.center_distance_error_mm", "centre distance error"),
+)
+_OTHERS = (
+    ("scene.speed_rpm", "speed", "rpm"),
+    ("scene.load.torque_N_m", "load", "N m"),
+    ("scene.load.pressure_difference_Pa", "pressure difference", "Pa"),
+    ("scene.timing_gear.stiffness_N_m_per_rad", "stiffness of the timing gear", "N m/rad"),
+    ("scene.timing_gear.damping_ratio", "damping ratio of the timing gear", ""),
+    ("contact.stiffness_N_per_mm_e", "contact stiffness", "N/mm^e"),
+    ("contact.max_damping_N_s_per_mm", "contact damping", "N s/mm"),
+    ("rotor.density_kg_m3", "density", "kg/m^3"),
+    ("rotor.length_mm", "rotor length", "mm"),
+)
+
+
+def quantities(config: Config) -> list[Quantity]:
+    """Return the quantities of a config's scene for the sensitivity table.
+
+    Lengths change by 1 µm, other quantities by 1 %. Parts that the scene does not have, and
+    quantities that are 0, are left out; a clearance or an error of 0 is kept."""
+    found = []
+    for key, name in _LENGTHS:
+        value = _value(config, key)
+        if value is not None:
+            found.append(Quantity(key, name, "mm", value, MICROMETRE))
+    for key, name, unit in _OTHERS:
+        value = _value(config, key)
+        if value:
+            found.append(Quantity(key, name, unit, value, _PERCENT * value))
+    return found
+
+
+def _value(config: Config, key: str) -> float | None:
+    """Return the number at a dotted key; None where there is none."""
+    found: Any = config
+    for name in key.split("."):
+        found = getattr(found, name, None)
+    return float(found) if isinstance(found, int | float) else None
+
+
+def _with(config: Any, key: str, value: float) -> Any:
+    """Return a copy of a section with the number at a dotted key replaced."""
+    name, _, rest = key.partition(".")
+    inner = _with(getattr(config, name), rest, value) if rest else value
+    return config.model_copy(update={name: inner})
+
+
+def _direction(config: Config, scene: Scene, quantity: Quantity) -> Scene:
+    """Return the derivative of the scene's arrays with respect to a quantity."""
+    size = _STEP * (abs(quantity.value) or 1.0)
+    moved = Scene.from_config(_with(config, quantity.key, quantity.value + size))
+    here = Scene.from_config(config)
+
+    def change(before, after):
+        return (np.asarray(after, np.float64) - np.asarray(before, np.float64)) / size
+
+    arrays = [eqx.filter(one, eqx.is_inexact_array) for one in (here, moved)]
+    found = jax.tree.map(change, *arrays)
+    nothing = jax.tree.map(np.zeros_like, found)
+    return dataclasses.replace(found, **{name: getattr(nothing, name) for name in _SETTINGS})
+
+
+@Program
+def _along(scene: Scene, design, directions: Scene):
+    """Return the pair and its derivatives along directions of the scene (leading axis)."""
+    arrays, rest = eqx.partition(scene, eqx.is_inexact_array)
+
+    def build(arrays):
+        return eqx.combine(arrays, rest).pair_and_shape(design)
+
+    return along(build, arrays, directions)[:2]
+
+
+def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
+    """Return `evaluation` with gradients with respect to the scene's quantities.
+
+    They replace those with respect to the design, in `gradient` (by config key, N per config unit)
+    and in `maxima`. The result is None if the orbit is not found again from the evaluation's
+    state."""
+    config, solver = evaluator.config, evaluator.scene.solver
+    design = jnp.asarray(list(evaluation.design.values()))
+    wanted = quantities(config)
+    size = max(1, len(evaluation.design))
+    directions = [_direction(config, evaluator.scene, one) for one in wanted]
+    blank = jax.tree.map(np.zeros_like, directions[0])
+    gradient: dict[str, dict[str, float]] = {name: {} for name in evaluation.gradient}
+    slopes, maxima = [], evaluation.maxima
+    for begin in range(0, len(wanted), size):
+        # As many directions as design parameters, so that the compiled program fits.
+        some = directions[begin : begin + size]
+        stacked = jax.tree.map(lambda *x: np.stack(x), *some, *[blank] * (size - len(some)))
+        pair, tangents = _along(evaluator.scene, design, stacked)
+        found = jax.device_get(evaluator.motion(pair, tangents, np.asarray(evaluation.state)))
+        if Status.of(found.status) is not Status.PERIODIC:
+            return None
+        rows = np.column_stack([found.orbit.response, found.orbit.sensitivity])
+        named = solver.measures.named(rows, int(found.period))
+        for name in gradient.keys() & named.keys():
+            values = named[name][1][: len(some)]
+            keys = [one.key for one in wanted[begin : begin + size]]
+            gradient[name] |= dict(zip(keys, map(float, values), strict=True))
+        if maxima is not None:
+            period = int(found.period)
+            again = local_maxima(pair, tangents, found.orbit, period, solver.orbit)
+            if again.times.shape != maxima.times.shape:
+                return None
+            slopes.append(again.slopes[:, : len(some)])
+    gradient = {name: row for name, row in gradient.items() if row}
+    if maxima is not None:
+        maxima = maxima._replace(slopes=np.concatenate(slopes, axis=1))
+    return dataclasses.replace(evaluation, gradient=gradient, maxima=maxima)
+
+
+__all__ = ["Quantity", "by_scene", "quantities"]

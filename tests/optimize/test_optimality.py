@@ -1,0 +1,43 @@
+"""Distinct optima of several starts, and the estimates of optima that were not seen."""
+
+import numpy as np
+import pytest
+
+from rootsopt.optimize.optimality import StartOutcome, distinct, unseen
+
+
+def outcome(number, objective, point):
+    return StartOutcome(number, objective, 1e-9, "converged", 10, {"a": point}, np.array([point]))
+
+
+def test_optima_are_told_apart_by_objective_and_point():
+    starts = [outcome(0, 0.9, 0.5), outcome(1, 0.8, 0.2), outcome(2, 0.8 + 1e-6, 0.2001)]
+    starts.append(outcome(3, 0.8, 0.9))
+    found = distinct(starts)
+    assert [(one.objective, one.found) for one in found] == [(0.8, 2), (0.8, 1), (0.9, 1)]
+
+
+def test_unseen_optima_by_simulation():
+    """The share of unseen basins against draws from the posterior that the formulas are for:
+    Dirichlet sizes with a uniform prior, for a known number of basins averaged over many."""
+    found = unseen(10, 1)
+    assert found["share_of_starts"] == pytest.approx(2 / 90)
+    assert found["expected_optima"] == pytest.approx(9 / 7)
+    rng = np.random.default_rng(0)
+    searches, hidden, hits = 10, 0.0, 0
+    # Prior: any number of basins is equally likely (improper; cut at 60), sizes uniform.
+    for _ in range(40_000):
+        count = rng.integers(1, 61)
+        sizes = rng.dirichlet(np.ones(count))
+        seen = np.unique(rng.choice(count, searches, p=sizes))
+        if len(seen) == 2:
+            hits += 1
+            hidden += 1 - sizes[seen].sum()
+    assert hits > 100
+    assert hidden / hits == pytest.approx(unseen(10, 2)["share_of_starts"], rel=0.2)
+
+
+def test_too_few_searches_tell_nothing():
+    assert unseen(1, 1)["share_of_starts"] is None
+    assert unseen(3, 1)["expected_optima"] is None
+    assert unseen(2, 2)["share_of_starts"] == 1.0

@@ -1,0 +1,157 @@
+"""Local search and certificate on problems whose optimum and multipliers are known."""
+
+import numpy as np
+import pytest
+
+from rootsopt.optimize.certificate import certify
+from rootsopt.optimize.local import Group, Local
+from rootsopt.optimize.sqp import Stops, descend
+
+
+def group(values, slopes):
+    """A group of branches of one kind, told apart by evenly spread phases."""
+    count = len(values)
+    tags = np.stack([np.zeros(count), np.arange(count) / count], axis=1)
+    return Group(tags, np.asarray(values, float), np.asarray(slopes, float))
+
+
+def smooth(x, limit=0.5):
+    """(x - 0.9)² + 2 (y - 0.8)² under x + y ≤ 2 `limit`."""
+    value = (x[0] - 0.9) ** 2 + 2 * (x[1] - 0.8) ** 2
+    slope = np.array([2 * (x[0] - 0.9), 4 * (x[1] - 0.8)])
+    normals = np.array([[-1.0, -1.0]])
+    return Local(value, slope, (), np.array([2 * limit - x.sum()]), normals)
+
+
+def corner(x, lift=0.0):
+    """The greater of two paraboloids, the first lifted: its minimum has a corner."""
+    values = [
+        lift + (x[0] - 0.2) ** 2 + (x[1] - 0.3) ** 2,
+        (x[0] - 0.8) ** 2 + 2 * (x[1] - 0.5) ** 2,
+    ]
+    slopes = [
+        [2 * (x[0] - 0.2), 2 * (x[1] - 0.3)],
+        [2 * (x[0] - 0.8), 4 * (x[1] - 0.5)],
+    ]
+    return Local(0.0, np.zeros(2), (group(values, slopes),), np.zeros(0), np.zeros((0, 2)))
+
+
+def bounded(x):
+    """2 x - 3 y: the minimum is a corner of the box."""
+    return Local(2 * x[0] - 3 * x[1], np.array([2.0, -3.0]), (), np.zeros(0), np.zeros((0, 2)))
+
+
+def ended(x):
+    """-x + (y - 0.4)², without an objective beyond x = 0.7, where x ≤ 0.69 is the limit."""
+    if x[0] > 0.7:
+        return None
+    slope = np.array([-1.0, 2 * (x[1] - 0.4)])
+    return Local(
+        -x[0] + (x[1] - 0.4) ** 2, slope, (), np.array([0.69 - x[0]]), np.array([[-1.0, 0.0]])
+    )
+
+
+def lowest_corner(count=801):
+    """Least value of `corner` on a fine grid, by its formulas."""
+    x, y = np.meshgrid(*[np.linspace(0, 1, count)] * 2)
+    first = (x - 0.2) ** 2 + (y - 0.3) ** 2
+    return np.min(np.maximum(first, (x - 0.8) ** 2 + 2 * (y - 0.5) ** 2))
+
+
+def test_multiplier_of_a_constraint_is_the_price_of_its_limit():
+    """By hand: x - 0.9 = -μ/2, y - 0.8 = -μ/4 and x + y = 1, so μ = 14/15."""
+    found = descend(smooth, np.array([0.1, 0.1]))
+    assert found.converged
+    assert found.certificate.multipliers == pytest.approx([14 / 15], abs=1e-6)
+    np.testing.assert_allclose(found.point, [0.9 - 7 / 15, 0.8 - 7 / 30], atol=1e-6)
+    # The same by solving again with the limit moved.
+    up, down = (
+        descend(lambda x, s=s: smooth(x, 0.5 + s / 2), np.array([0.1, 0.1])).local.objective
+        for s in (1e-3, -1e-3)
+    )
+    assert (down - up) / 2e-3 == pytest.approx(14 / 15, rel=1e-5)
+
+
+@pytest.mark.parametrize("start", [[0.1, 0.9], [0.9, 0.1], [0.5, 0.5], [0.0, 0.0]])
+def test_converges_to_a_corner_of_the_objective(start):
+    """Both branches are equal there, and their shares make the slope zero."""
+    found = descend(corner, np.array(start))
+    assert found.converged
+    assert found.evaluations < 20
+    (values,) = (g.values for g in found.local.groups)
+    assert values[0] == pytest.approx(values[1], abs=1e-9)
+    (shares,) = found.certificate.shares
+    assert min(shares) > 0.1
+    assert found.local.objective <= lowest_corner() + 1e-9
+    # A share is the slope of the optimum when its branch is lifted.
+    up, down = (
+        descend(lambda x, s=s: corner(x, s), np.array(start)).local.objective for s in (1e-4, -1e-4)
+    )
+    assert (up - down) / 2e-4 == pytest.approx(shares[0], abs=1e-3)
+
+
+def test_bounds_have_multipliers():
+    found = descend(bounded, np.array([0.5, 0.5]))
+    np.testing.assert_allclose(found.point, [0, 1], atol=1e-12)
+    assert found.converged
+    np.testing.assert_allclose(found.certificate.lower, [2, 0], atol=1e-9)
+    np.testing.assert_allclose(found.certificate.upper, [0, 3], atol=1e-9)
+
+
+def test_steps_into_unusable_designs_are_shortened():
+    """The result is next to them, and never one of them."""
+    found = descend(ended, np.array([0.1, 0.9]))
+    assert found.converged
+    np.testing.assert_allclose(found.point, [0.69, 0.4], atol=1e-6)
+    assert descend(lambda x: None, np.array([0.1, 0.9])).reason == "unusable"
+
+
+def test_reasons_of_an_early_end():
+    """Too few evaluations, a request to stop, and a slope that contradicts the values."""
+    start = np.array([0.1, 0.9])
+    few = descend(corner, start, Stops(evaluations=2))
+    assert (few.reason, few.evaluations) == ("evaluations", 2)
+    assert descend(corner, start, Stops(asked=lambda: True)).reason == "interrupted"
+    wrong = descend(lambda x: smooth(x)._replace(slope=-smooth(x).slope), np.array([0.1, 0.1]))
+    assert not wrong.converged
+
+
+def test_contradicting_constraints_are_infeasible():
+    """x ≥ 0.8 and x ≤ 0.2: the least violation, 0.3, is found."""
+
+    def look(x):
+        slack, normals = np.array([x[0] - 0.8, 0.2 - x[0]]), np.array([[1.0, 0], [-1.0, 0]])
+        return Local(x[1], np.array([0.0, 1.0]), (), slack, normals)
+
+    found = descend(look, np.array([0.1, 0.9]))
+    assert found.reason == "infeasible"
+
+
+def test_certificate_is_zero_only_at_an_optimum():
+    """It does not depend on the search: at other points it is the slope that is left."""
+    assert certify(corner(np.array([0.2, 0.3])), np.array([0.2, 0.3])).residual > 0.5
+    point = np.array([0.9 - 7 / 15, 0.8 - 7 / 30])
+    assert certify(smooth(point), point).residual < 1e-12
+    beside = point + np.array([0.1, -0.1])
+    assert certify(smooth(beside), beside).residual == pytest.approx(
+        np.linalg.norm([0.2 + 0.4, -0.2 - 0.4]) / 2, rel=1e-9
+    )
+
+
+def test_constraint_that_cannot_move_has_no_multiplier():
+    """Every design meets it with equality: its gradient is zero."""
+
+    def look(x):
+        found = smooth(x)
+        return found._replace(
+            slack=np.append(found.slack, 0.0), normals=np.vstack([found.normals, [[1e-12, 0]]])
+        )
+
+    found = descend(look, np.array([0.1, 0.1]))
+    assert found.converged
+    assert found.certificate.multipliers[1] == 0
+
+
+def test_search_is_reproducible():
+    first, second = (descend(corner, np.array([0.1, 0.9])) for _ in range(2))
+    assert first.point.tobytes() == second.point.tobytes()
