@@ -54,6 +54,8 @@ _OPTIMISED = (
     "response",
 )
 """Files that compute longer than they compile."""
+_PRECISE = ("steady",)
+"""Files whose own functions are optimised too, as they tell the rounding of optimised code."""
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -63,7 +65,7 @@ def compiled(request):
     name = request.path.stem.removeprefix("test_")
     options = programs.OPTIONS | {"xla_backend_optimization_level": 3 if name in _OPTIMISED else 0}
     # The package's programs take the options; functions that a test compiles itself take the flag.
-    jax.config.update("jax_disable_most_optimizations", name not in _OPTIMISED)
+    jax.config.update("jax_disable_most_optimizations", name not in _OPTIMISED + _PRECISE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(programs, "OPTIONS", options)
         yield

@@ -156,20 +156,19 @@ class Parameter:
 class Family:
     """A profile family: its config keys and how its profiles are made.
 
-    `name`: the word in `profile.family`; `help`: one line on the curves of its addendum.
-    `maker`: function that returns a `Profile` from `lobes`, `pitch_radius` (m) and the parameters
-    in SI units. Each parameter is passed under its key without the unit, as in
-    `maker(lobes, pitch_radius, arc_center=0.03)`. `None`: the profile is read from a file.
-    `parameters`: design parameters, in the order of their values in a design; a list comes last.
+    `name`: the word in `profile.family`; `help`: one line on the curves of its addendum. `maker`:
+    function that returns a `Profile` from `lobes`, `pitch_radius` (m) and the parameters in SI
+    units. Each parameter is passed under its key without the unit, as in `maker(lobes,
+    pitch_radius, arc_center=0.03)`. `None`: the profile is read from a file. `parameters`: design
+    parameters, in the order of their values in a design; a list-valued parameter comes last.
     `example`: values, by key, of a sound design with three lobes and a pitch radius of 33 mm.
     `remedy`: what to change if a profile is not sound; completes a message, without a full stop.
-    `inherent`: names from `MARGINS` of the margins that may be negative in this family.
-    `limits`: called with the `ProfileConfig`; raises `InputError` if a closed-form limit is
-    violated.
+    `inherent`: names from `MARGINS` of the margins that may be negative in this family. `limits`:
+    called with the `ProfileConfig`; raises `InputError` if a closed-form limit is violated.
     `by_limits`: whether these limits ensure a sound profile, so that the margins are not checked.
     `ranges`: called with `lobes`, `pitch_radius_mm` and the values by key; returns (low, high) by
-    key for parameters whose range depends on the others. The optimiser searches such a parameter
-    as a fraction of this range, within its bounds.
+    key for parameters whose range depends on the others. The optimiser searches such a parameter as
+    a fraction of this range, within its bounds.
 
     A subclass may override `make`, `check` and `dependent` instead of giving functions.
     """

@@ -37,8 +37,8 @@ from rootsopt.dynamics.verdict import RESIDUAL
 from rootsopt.errors import InputError
 
 _HALVED = 0.004
-"""Distance (unit of `StepSizes`) between the states at the start and the middle of an orbit below
-which a branch whose steps have become too small is reported to end at an orbit of half the period
+"""Distance (unit of `StepSizes`) below which the states at the start and the middle of an orbit
+count as equal. A branch whose steps have become too small there ends at an orbit of half the period
 (`End.HALVED`)."""
 _SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
 """Distances (unit of `StepSizes`) from a period doubling at which the orbit of twice the period is

@@ -110,8 +110,9 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         return jnp.any(passed), jnp.max(jnp.where(passed, ago, 0.0))
 
     def _ahead(self, before, after, step):
-        """Return the maximum length (mesh periods) of the step after `after`, so that it ends at an
-        edge."""
+        """Return the maximum length (mesh periods) of the step that follows `after`.
+
+        A step of this length ends where ε next reaches an edge."""
         place, rate = after
         bend = (rate - before[1]) / step
         away = place - self.edges

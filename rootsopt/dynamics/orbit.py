@@ -28,34 +28,35 @@ from rootsopt.dynamics.switches import halved, has_room, with_switches
 from rootsopt.dynamics.window import Window
 
 SAMPLES = 2520
-"""Number of uniform samples of an orbit. It is a multiple of all periods up to ten, so that a
+"""Number of uniform samples of an orbit. It is divisible by every period up to ten, so that a
 sample falls on the end of each mesh period."""
 _NEWTON_STEPS = 24
 """Default maximum number of integrations to close one orbit."""
 _CLOSED = 4000, 1e-3, 1e-10
-"""Residual at which Newton's method stops: its lower limit (rounding errors; about 1e-12 in
-float64), its value (tolerances), and its upper limit (scaled)."""
+"""Threshold of the residual at which Newton's method stops, and its bounds. The second number is
+the threshold (tolerances). It is at least the first number (rounding errors; about 1e-12 in
+float64) and at most the third (scaled)."""
 _KEPT = 4
 """Number of integrations after which the solver steps are kept, however large the Newton step. If a
 third of `Shots.count` is less, that number is used instead."""
 _LOOKS = 6
 """Maximum number of searches for kinks in the course of closing one orbit."""
 _DRIFT = 30.0, 1e-9, 1e-6
-"""Change of the orbit's start since the last search for kinks above which the search is repeated:
-its value (tolerances), and the lower and upper limits of this value (scaled). With a smaller
-change, kinks may lie slightly outside their short steps, which causes a first-order error."""
+"""Change of the orbit's start above which the search for kinks is repeated (tolerances), and the
+lower and upper bounds of this threshold (scaled). After a smaller change, kinks may lie slightly
+outside their short steps, which causes a first-order error."""
 _STRAIN = 10.0
 """Estimated error of a repeated step (tolerances) above which the solver steps are chosen anew."""
 _AFTER = 3
 """Number of remaining integrations below which an orbit that is already closed keeps its steps. A
 new search for kinks, or a new choice of steps, could then leave the orbit open."""
 _AGREE = 10.0, 1e-3, 3e-2
-"""Relative difference between the derivatives on a grid and on halved steps above which the
-derivatives are not reported: its value (square roots of the tolerance), and the lower and upper
-limits of this value."""
+"""Relative difference between the derivatives on a grid and on halved steps above which no
+derivatives are reported (square roots of the tolerance), and the lower and upper bounds of this
+threshold."""
 _SMALL = 1e-9, 1e-3
-"""Limits (scaled) of the Newton step below which the solver steps are kept. This threshold is a
-thousand tolerances, but at least the first number and at most the second."""
+"""Bounds (scaled) of the threshold below which a Newton step keeps the solver steps. The threshold
+is a thousand tolerances, within these bounds."""
 
 
 class Orbit(NamedTuple):

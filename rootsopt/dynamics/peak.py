@@ -10,9 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.pair import RotorPair
 
 _RIVALS, _CLOSER, _ROUNDS = 4, 16, 10
-"""Settings for refining the peak: number of maxima refined (this many among the samples, and as
-many among the ends of steps), number of times evaluated around each maximum in a round, and number
-of rounds."""
+"""Settings for refining the peak: number of refined maxima among the samples (and as many among the
+ends of steps), number of evaluations around each maximum in a round, and number of rounds."""
 _INNER = 2 * _RIVALS * _CLOSER - 2
 """Number of samples or ends of steps scanned in one iteration of the search. The iteration also
 evaluates one neighbour at either end."""
@@ -21,11 +20,11 @@ _WIDE = 64
 BESIDE = (0.0, -1.0, -2.0, 1.0, 2.0, -_WIDE, _WIDE)
 """Times relative to a located peak at which the force is evaluated, in units of `BESIDE_UNIT`."""
 BESIDE_UNIT = {8: 2e-8, 4: 1e-3}
-"""Unit of `BESIDE` (mesh periods), by bytes per number."""
+"""Unit of `BESIDE` (mesh periods), keyed by bytes per number."""
 _FARTHEST = {8: 32.0, 4: 1 / 16}
-"""Distance (units of `_WIDE`) from the located peak to the vertex of the parabola through the
-forces above which the vertex is rejected, by bytes per number. Where the states bend between
-samples, peaks are located only to about 1e-5 mesh periods."""
+"""Distance (units of `_WIDE`) between a located peak and the vertex of the parabola through the
+forces around it. A vertex farther away is rejected. Keyed by bytes per number. Where the states
+bend between samples, peaks are located only to about 1e-5 mesh periods."""
 _ROUNDINGS = 1e5
 """Second difference of the force over `_WIDE` (rounding errors of the force) above which it counts
 as curvature, not as rounding."""

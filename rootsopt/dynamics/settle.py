@@ -21,8 +21,8 @@ BLOCK = 4
 _MEMORY = 20
 """Number of stroboscopic states stored: more than twice the longest cycle searched for."""
 _PATIENCE = 32, 1e-5
-"""Length (mesh periods) of a transient above which its tolerance is lowered, and the maximum of the
-lowered tolerance. The noise of coarser steps can hide that the motion repeats."""
+"""Length (mesh periods) above which a transient continues with a lower tolerance, and the greatest
+value of that tolerance. The noise of coarser steps can hide that the motion repeats."""
 NOISE = 100.0
 """Noise of the stroboscopic states that adaptive steps cause: a multiple of the tolerance, relative
 to the states."""

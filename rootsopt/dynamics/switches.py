@@ -20,7 +20,7 @@ _LOOKS, _LONGEST = 252, 8
 """Number of times per mesh period, in addition to the ends of steps, at which flags are compared to
 find changes; and the maximum length of the motion (mesh periods)."""
 _CHANGES = 1024
-"""Maximum number of changes found in one motion. A mesh period has about 20 to 100."""
+"""Maximum number of changes of flags found in one motion. A mesh period has about 20 to 100."""
 _LANES = 16
 """Number of times at which flags are evaluated together, as arrays."""
 _HALVINGS = 26
@@ -42,11 +42,12 @@ _SHARE = 1e-4
 other change. If the curvature changes inside a rounded corner, the error of the gradients is
 proportional to the square of this fraction."""
 _GRADES = 8.0, 64.0
-"""Distances of further step ends from a change, in half lengths of the short step around the
-change. They keep the steps short around a change that lies slightly outside its short step."""
+"""Distances of further step ends from a change of a flag, as multiples of half the length of the
+short step around it. They keep the neighbouring steps short, in case the change occurs slightly
+outside its short step."""
 _HOLDS = 2.5
-"""Length of a step, in maximum half lengths of a short step around a change, up to which the step
-is never halved, since it may be such a short step."""
+"""Length of a step (multiples of the greatest half length of a short step around a change) up to
+which the step is never halved: it may be such a short step."""
 _APART = 1e-10
 """Distance (mesh periods) below which two step ends are merged."""
 

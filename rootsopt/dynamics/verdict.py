@@ -31,8 +31,8 @@ limit is multiplied by the greatest entries of the state and of the monodromy ma
 exceed 1."""
 _DRIFT = 1e3, 1e-5
 """Change of an orbit's start since the last search for kinks above which the derivatives are
-uncertain, because some kinks may lie inside long steps: its value (tolerances), and the lower limit
-of this value (scaled)."""
+uncertain (tolerances), and the lower bound of this threshold (scaled). After a greater change, some
+kinks may lie inside long steps."""
 _STRAINED = 100.0
 """Estimated error of a repeated step (tolerances) above which an orbit is rejected."""
 

@@ -21,7 +21,8 @@ from rootsopt.dynamics.pair import RotorPair
 PERIODS = 128
 """Length of a window (mesh periods)."""
 _BATCHES = 16
-"""Number of batches into which a window is divided to estimate the exponent's standard error."""
+"""Number of batches into which a window is divided to estimate the standard error of the Lyapunov
+exponent."""
 _KEPT = 105
 """Number of states stored per mesh period."""
 _SAMPLES = 630

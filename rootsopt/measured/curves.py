@@ -44,7 +44,7 @@ sampled either."""
 
 @dataclasses.dataclass(frozen=True)
 class MeasuredCurve:
-    """A curve z(t) (mm) of successive spline pieces.
+    """A plane curve z(t) = x(t) + i y(t) (mm), made of successive spline pieces.
 
     `ends` (k,): values of t at the ends of the pieces; `pieces`: the k - 1 splines between them."""
 

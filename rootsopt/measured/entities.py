@@ -159,9 +159,9 @@ class Entity:
 
     @classmethod
     def of(cls, entity: Any, name: str) -> "Entity":
-        """Build the entity from the library's object; `name` names the drawing in messages.
+        """Build the entity from an ezdxf entity; `name` names the drawing in messages.
 
-        Raises `InputError` if the object cannot be read."""
+        Raises `InputError` if the entity cannot be read."""
         kind = entity.dxftype()
         with guarded(name, f"{kind} cannot be read", "repair or remove it in the drawing"):
             handle = short(entity.dxf.handle or "unknown", 20)

@@ -27,8 +27,8 @@ _SHARES = 400
 """Number of points at which two flanks are compared."""
 _FOLD = 1e-3
 """Polar angle (rad) of a backward run of the outline above which the outline is rejected. Smaller
-angles are noise and rounding. Also the distance (pitch radii) between the axis and a tangent that
-passes it on the wrong side, above which the outline is rejected."""
+runs are noise and rounding. Also the distance (pitch radii) by which a tangent may pass the axis on
+the wrong side."""
 _OFF = 0.02
 """Deviation between flanks (pitch radii) above which an outline is rejected. A larger smoothing is
 rejected, too."""

@@ -27,11 +27,12 @@ _CANDIDATES = 3
 class Verification(NamedTuple):
     """Outcome of a verification.
 
-    `baseline`: evaluation of the baseline with the last ensemble; `problem`: the design problem
-    relative to this evaluation; `optimized`: evaluation of the best candidate, None if it was not
-    accepted; `record`: entries for the result file. Without a usable candidate, `problem` and
-    `baseline` are those of the search. If `baseline` is not usable, `problem` is that of the
-    search.
+    `baseline`: evaluation of the baseline over the ensemble of the decision; `problem`: the design
+    problem relative to `baseline`; `optimized`: evaluation of the best candidate over the same
+    ensemble, None if it was not accepted; `record`: entries for the result file.
+
+    If there is no usable candidate, `problem` and `baseline` are those of the search. If only the
+    new baseline is not usable, `baseline` is the new one, but `problem` is that of the search.
     """
 
     problem: Problem

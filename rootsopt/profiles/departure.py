@@ -1,4 +1,4 @@
-"""Measures the greatest distance between the flanks of two profiles."""
+"""The greatest distance between the flanks of two profiles."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -36,7 +36,7 @@ _APART = 0.3
 _TRIES = 24
 """Maximum number of motions that are evaluated, in addition to the motion from rest."""
 _DEPTHS = 3.0
-"""Penetration of the flanks (static penetrations) up to which the grid extends."""
+"""Penetration of the flanks (multiples of the static penetration) up to which the grid extends."""
 _LOST = (Status.PASSED_THROUGH, Status.STALLED, Status.SOLVER_FAILED, Status.NON_FINITE)
 """Statuses of motions that do not count as attractors: the mesh was lost, or the simulation failed.
 """

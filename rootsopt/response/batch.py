@@ -21,9 +21,8 @@ from rootsopt.scene import Scene
 from rootsopt.status import Status
 
 SAMPLES = 840
-"""Number of uniform samples of an orbit, from which the peak is located. It is a multiple of all
-periods up to eight.
-"""
+"""Number of uniform samples of an orbit, from which the peak is located. It is divisible by every
+period (mesh periods) up to eight."""
 
 
 class Batch(NamedTuple):
@@ -32,9 +31,9 @@ class Batch(NamedTuple):
     `response` (n, 3): mean, peak and RMS force (N); `gradient` (n, 3, d): derivatives of `response`
     (N per config unit); `state` (n, s): scaled state of the orbit at φ1 = 0, a start for
     neighbouring designs; `period` (mesh periods); `multiplier`: greatest modulus of the Floquet
-    multipliers; `residual` of the closed orbit; `deepest`: least ε (rad) on the orbit; `steps`:
-    number of solver steps; `status`: codes of `Status`. `response` and `gradient` are NaN where
-    there is no periodic orbit.
+    multipliers; `residual` of the closed orbit; `deepest`: most negative ε (rad) on the orbit;
+    `steps`: number of solver steps; `status`: codes of `Status`. `response` and `gradient` are NaN
+    where there is no periodic orbit.
     """
 
     response: Float[Array, "*n 3"]
@@ -90,9 +89,9 @@ def respond(
 ) -> Batch:
     """Return the steady response of one design, started from a scaled state.
 
-    `design` (d,): in config units; `state` (s,): scaled state at φ1 = 0; `solver`: see `coarse`;
-    `gradient`: whether to compute derivatives. This is a pure function: JAX can map it over
-    `design`, `state` or the leaves of `scene`.
+    `design` (d,): in config units; `state` (s,): scaled state at φ1 = 0; `solver`: settings, such
+    as those of `coarse`; `gradient`: whether to compute derivatives. This is a pure function: JAX
+    can map it over `design`, `state` or the leaves of `scene`.
     """
     if gradient:
         pair, tangents, _ = scene.pair_and_tangents(design)

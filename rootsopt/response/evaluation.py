@@ -163,7 +163,8 @@ class Evaluator:
     def surveying(self) -> "Evaluator":
         """Return another evaluator for a search over many designs.
 
-        It gives up sooner on a design that does not settle."""
+        Its motions from rest may settle for a quarter of the allowed transient only, and a design
+        that does not settle is not examined further."""
         least = max(self.config.solver.max_mesh_periods // 4, 8 * BLOCK)
         hasty = self._solving(
             lambda solver: (solver.max_periods, solver.examine),

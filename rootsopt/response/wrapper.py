@@ -66,7 +66,9 @@ class Evaluates(Protocol):
         ...
 
     def surveying(self) -> "Evaluates":
-        """Return another evaluator for a search over many designs."""
+        """Return another evaluator for a search over many designs.
+
+        It gives up sooner on a design that does not settle (see `Evaluator.surveying`)."""
         ...
 
     def relative_to(self, baseline: Evaluation) -> "Evaluates":
@@ -135,7 +137,9 @@ class Wrapper:
         return self._around(self.single.at_tolerance(rtol))
 
     def surveying(self: W) -> W:
-        """Return another evaluator for a search over many designs."""
+        """Return another evaluator for a search over many designs.
+
+        It gives up sooner on a design that does not settle (see `Evaluator.surveying`)."""
         return self._around(self.single.surveying())
 
     def relative_to(self: W, baseline: Evaluation) -> W:
