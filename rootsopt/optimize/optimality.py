@@ -20,7 +20,7 @@ have found the same optimum."""
 _REASONS = REASONS | {
     "descent": (
         "The descent has a step size and no test for an optimum: the design may be short of it. "
-        "Set optimizer.method to slsqp."
+        "Set optimizer.method to auto."
     ),
     "verification": (
         "The first-order conditions held in the search, but not when the design was simulated "

@@ -373,7 +373,7 @@ class Search:
     def _descend(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
         """Descend from `point` (d,) and return the trials; `number`: index of the descent."""
         settings = self.settings
-        rule = settings.method, settings.learning_rate, settings.iterations
+        rule = self.method, settings.learning_rate, settings.iterations
         state = _init(*rule, point)
         best, since = np.inf, 0
         trials: list[Trial] = []
@@ -466,7 +466,6 @@ class Search:
         if local is None:
             return None
         certificate = certify(local, point)
-        starts = [self._outcome(number, found) for number, found in sorted(self._found.items())]
         reason = "converged"
         ends = sorted(self._found.items())
         if not certificate.holds(RESIDUAL, FEASIBLE):

@@ -100,13 +100,13 @@ def _direction(config: Config, scene: Scene, quantity: Quantity) -> Scene:
     moved = Scene.from_config(_with(config, quantity.key, quantity.value + size))
     here = Scene.from_config(config)
 
-    def change(before, after):
+    def change(path, before, after):
+        if path[0].name in _SETTINGS:
+            return np.zeros(np.shape(before))
         return (np.asarray(after, np.float64) - np.asarray(before, np.float64)) / size
 
     arrays = [eqx.filter(one, eqx.is_inexact_array) for one in (here, moved)]
-    found = jax.tree.map(change, *arrays)
-    nothing = jax.tree.map(np.zeros_like, found)
-    return dataclasses.replace(found, **{name: getattr(nothing, name) for name in _SETTINGS})
+    return jax.tree_util.tree_map_with_path(change, *arrays)
 
 
 @Program

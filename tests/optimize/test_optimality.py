@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
+from rootsopt import load_config
+from rootsopt.errors import InputError
 from rootsopt.optimize.optimality import StartOutcome, distinct, unseen
+from rootsopt.optimize.search import method_of
 
 
 def outcome(number, objective, point):
@@ -41,3 +44,12 @@ def test_too_few_searches_tell_nothing():
     assert unseen(1, 1)["share_of_starts"] is None
     assert unseen(3, 1)["expected_optima"] is None
     assert unseen(2, 2)["share_of_starts"] == 1.0
+
+
+def test_method_follows_the_objective():
+    """`auto` is slsqp, except for averages, whose gradients have noise."""
+    assert method_of(load_config("configs/cic.yaml", ["optimizer.method=auto"])) == "slsqp"
+    noisy = ["objective.motion=ensemble", "optimizer.method=auto"]
+    assert method_of(load_config("configs/cic.yaml", noisy)) == "adam"
+    with pytest.raises(InputError, match=r"optimizer\.method"):
+        method_of(load_config("configs/cic.yaml", [noisy[0], "optimizer.method=slsqp"]))
