@@ -9,7 +9,7 @@ works with numbers of order one.
 """
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -90,6 +90,21 @@ class _Touch(NamedTuple):
     roll: Float[Array, ""]
     approach: Approach
     sliding: _Sliding | None
+
+
+class Margins(NamedTuple):
+    """Distances of a motion from the instants at which the equation is not smooth.
+
+    `values` (s,): positive where the flags of `RotorPair.switches` are set. With a `NearContact`,
+    each is smooth across the instant at which its flag changes, and zero there. `counts` (s,):
+    whether they matter; those of a flank do where it transmits a force. `places`: what the contact
+    has found (`Approach.place`) for the flanks that can touch or, if both sides can, for drive and
+    coast flanks.
+    """
+
+    values: Float[Array, " s"]
+    counts: Bool[Array, " s"]
+    places: list[Any]
 
 
 class RotorPair(eqx.Module):
@@ -354,7 +369,7 @@ class RotorPair(eqx.Module):
         coast side is the mirror image. With displaced axes, the pair is one at another centre
         distance, turned by the angle θ of its line of centres: φ1 - θ and φ2 + θ.
         """
-        contact, line, relative = self.contact, None, motion.relative
+        contact, line, relative = self.contact.on_side(side), None, motion.relative
         if motion.shift is not None:
             x, y = motion.shift[1] - motion.shift[0]
             line = jnp.stack([contact.center_distance + x, y])
@@ -415,6 +430,39 @@ class RotorPair(eqx.Module):
             flags, counts = jnp.append(flags, drives), jnp.append(counts, True)
         flags = jnp.concatenate([flags, *(part.switches(motion, own) for part, own in acting)])
         return flags, jnp.pad(counts, (0, flags.size - counts.size), constant_values=True)
+
+    def margins(
+        self, tau: Float[Array, ""], state: Float[Array, " n"]
+    ) -> Margins:
+        """Return the `Margins` at rotation `tau` (mesh periods) and scaled `state`."""
+        motion, acting = self._moving(tau, state)
+
+        def of_flank(side):
+            touch = self._touch(side, motion)
+            found = [
+                self.law.margins(touch.depth, touch.closing),
+                self.contact.on_side(side).margins(touch.roll, touch.approach),
+            ]
+            if touch.sliding is not None:
+                speed = touch.sliding.speed
+                found += [part.drag_margins(speed) for part in self.all_parts if part.rubs]
+            pushes = self.law(touch.depth, touch.closing) > 0
+            values = jnp.concatenate(found)
+            return values, jnp.full(values.shape, pushes), touch.approach.place
+
+        one = jnp.ones((), self.angle_scale.dtype)
+        if self.two_sided:
+            flanks = [of_flank(one), of_flank(-one)]
+        else:
+            flanks = [of_flank(jnp.where(motion.relative < 0, one, -one))]
+        values, counts, places = (list(each) for each in zip(*flanks, strict=True))
+        if not self.two_sided:
+            values.append(-motion.relative[None])
+            counts.append(counts[0][:1])
+        values += [part.margins(motion, own) for part, own in acting]
+        found, counted = jnp.concatenate(values), jnp.concatenate(counts)
+        counted = jnp.pad(counted, (0, found.size - counted.size), constant_values=True)
+        return Margins(found, counted, places)
 
     def derivative(
         self, tau: Float[Array, ""], state: Float[Array, " n"]

@@ -38,3 +38,7 @@ class Friction(Part):
         """Return flags of the smooth piece that the coefficient is on."""
         speeds = jnp.stack([self.stiction_speed, self.friction_speed])
         return sliding > jnp.concatenate([speeds, -speeds])
+
+    def drag_margins(self, sliding: Float[Array, ""]) -> Float[Array, "4"]:
+        speeds = jnp.stack([self.stiction_speed, self.friction_speed])
+        return sliding - jnp.concatenate([speeds, -speeds])

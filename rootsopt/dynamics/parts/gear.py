@@ -63,5 +63,10 @@ class TimingGear(Part):
         excess = jnp.abs(self._from_middle(motion.relative)) - self.half_backlash
         return excess > jnp.stack([jnp.zeros_like(self.rounding), self.rounding])
 
+    def margins(self, motion: Motion, own) -> Float[Array, "2"]:
+        del own
+        excess = jnp.abs(self._from_middle(motion.relative)) - self.half_backlash
+        return excess - jnp.stack([jnp.zeros_like(self.rounding), self.rounding])
+
     def _from_middle(self, relative):
         return relative if self.offset is None else relative - self.offset
