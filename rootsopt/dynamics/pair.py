@@ -99,12 +99,13 @@ class Margins(NamedTuple):
     each is smooth across the instant at which its flag changes, and zero there. `counts` (s,):
     whether they matter; those of a flank do where it transmits a force. `places`: what the contact
     has found (`Approach.place`) for the flanks that can touch or, if both sides can, for drive and
-    coast flanks.
+    coast flanks; `pushes` (sides,): whether these flanks transmit a force.
     """
 
     values: Float[Array, " s"]
     counts: Bool[Array, " s"]
     places: list[Any]
+    pushes: Bool[Array, " sides"]
 
 
 class RotorPair(eqx.Module):
@@ -448,21 +449,21 @@ class RotorPair(eqx.Module):
                 found += [part.drag_margins(speed) for part in self.all_parts if part.rubs]
             pushes = self.law(touch.depth, touch.closing) > 0
             values = jnp.concatenate(found)
-            return values, jnp.full(values.shape, pushes), touch.approach.place
+            return values, jnp.full(values.shape, pushes), touch.approach.place, pushes
 
         one = jnp.ones((), self.angle_scale.dtype)
         if self.two_sided:
             flanks = [of_flank(one), of_flank(-one)]
         else:
             flanks = [of_flank(jnp.where(motion.relative < 0, one, -one))]
-        values, counts, places = (list(each) for each in zip(*flanks, strict=True))
+        values, counts, places, pushes = (list(each) for each in zip(*flanks, strict=True))
         if not self.two_sided:
             values.append(-motion.relative[None])
             counts.append(counts[0][:1])
         values += [part.margins(motion, own) for part, own in acting]
         found, counted = jnp.concatenate(values), jnp.concatenate(counts)
         counted = jnp.pad(counted, (0, found.size - counted.size), constant_values=True)
-        return Margins(found, counted, places)
+        return Margins(found, counted, places, jnp.stack(pushes))
 
     def derivative(
         self, tau: Float[Array, ""], state: Float[Array, " n"]

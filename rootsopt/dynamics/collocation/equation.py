@@ -66,12 +66,16 @@ class Equation(eqx.Module):
         if near.free:
             rates = near.lapse(state) * jnp.append(rates, jnp.ones_like(unit))
         found = near.margins(tau, state)
-        moved = [
-            jnp.stack([own.normal2, own.normal2 if rival is None else rival.normal2])
-            for own, rival in found.places
-        ]
         values = jnp.concatenate([slope, rates, found.values[which][None]])
-        return values, (jnp.stack(moved), contact.total, contact.depth)
+        return values, (_roots(found.places), contact.total, contact.depth)
+
+    def force(
+        self, tau: Float[Array, ""], state: Float[Array, " n"], roots: Float[Array, "sides 2"]
+    ) -> tuple[Float[Array, ""], Float[Array, "sides 2"]]:
+        """Return the contact force (N) and the roots there."""
+        near = self.near(*eqx.partition(self.pair, eqx.is_inexact_array), roots)
+        places = near.margins(tau, state).places
+        return near.contact_at(tau, state).total, _roots(places)
 
     def point(
         self,
@@ -108,3 +112,12 @@ class Equation(eqx.Module):
 
         _, linear = jax.linearize(value, dynamic)
         return jax.vmap(linear, out_axes=-1)(eqx.filter(tangents, eqx.is_inexact_array))
+
+
+def _roots(places: list[Any]) -> Float[Array, "sides 2"]:
+    """Return the roots that a `NearContact` has found."""
+    moved = [
+        jnp.stack([own.normal2, own.normal2 if rival is None else rival.normal2])
+        for own, rival in places
+    ]
+    return jnp.stack(moved)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.contact.search import SearchContact
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.gauss import GAUSS
-from rootsopt.dynamics.collocation.newton import in_blocks
+from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.pair import RotorPair
 
 _ASIDE = 2e-7, 0.02
@@ -33,13 +33,15 @@ class Look(NamedTuple):
     """Flags along a motion, in the order of time.
 
     `tau` (p,): places (mesh periods); `flags` (p, f); `counts` (p, f): whether they matter;
-    `roots` (e, s + 2, sides): normal angles of the closest approach; `total`: number of places.
+    `roots` (e, s + 2, sides): normal angles of the closest approach; `pushes` (e, s + 2, sides):
+    whether the flanks transmit a force; `total`: number of places.
     """
 
     tau: Float[Array, " p"]
     flags: Bool[Array, "p f"]
     counts: Bool[Array, "p f"]
     roots: Float[Array, "e q sides"]
+    pushes: Bool[Array, "e q sides"]
     total: Int[Array, ""]
 
 
@@ -60,10 +62,10 @@ class Events(NamedTuple):
 
 
 def flags_at(pair: RotorPair, tau, state):
-    """Return flags, whether they matter, and the roots (sides,) of the contact."""
+    """Return flags, whether they matter, the roots (sides,) of the contact, and whether it pushes."""
     found = pair.margins(tau, state)
     roots = jnp.stack([place.normal2 for place in found.places])
-    return found.values > 0, found.counts, roots
+    return found.values > 0, found.counts, roots, found.pushes
 
 
 def ranks(pair: RotorPair) -> list[int]:
@@ -106,10 +108,11 @@ def look(pair: RotorPair, elements: Elements) -> Look:
     tau = jnp.concatenate([tau[:, :-1], end], axis=1)
     state = jnp.concatenate([state[:, :-1], ends], axis=1)
     each = jax.vmap(jax.vmap(lambda t, z: flags_at(pair, t, z)))
-    flags, counts, roots = in_blocks(each, mesh.used, tau, state)
+    flags, counts, roots, pushes = in_blocks(each, mesh.used, tau, state)
     width = flags.shape[-1]
     total = mesh.used * tau.shape[1]
-    return Look(tau.ravel(), flags.reshape(-1, width), counts.reshape(-1, width), roots, total)
+    flags, counts = flags.reshape(-1, width), counts.reshape(-1, width)
+    return Look(tau.ravel(), flags, counts, roots, pushes, total)
 
 
 def rooted(elements: Elements, seen: Look) -> Elements:
@@ -118,10 +121,8 @@ def rooted(elements: Elements, seen: Look) -> Elements:
     At the end of an element, the root is that of the side on which the flanks push; the rival next
     to a cusp is the root after the end."""
     inside = len(GAUSS.nodes)
-    shape = seen.roots.shape[0], inside + 2, -1
-    flanks = seen.counts.reshape(shape)
-    before = flanks[:, inside, 0] | ~flanks[:, inside + 1, 0]
-    own = jnp.where(before[:, None], seen.roots[:, inside], seen.roots[:, inside + 1])
+    before = seen.pushes[:, inside] | ~seen.pushes[:, inside + 1]
+    own = jnp.where(before, seen.roots[:, inside], seen.roots[:, inside + 1])
     ends = jnp.stack([own, seen.roots[:, inside + 1]], axis=-1)
     points = jnp.repeat(seen.roots[:, :inside, :, None], 2, axis=-1)
     return elements._replace(roots=jnp.concatenate([points, ends[:, None]], axis=1))

@@ -149,3 +149,11 @@ def aligned(
     wanted = jnp.where(inside, wanted, jnp.where(place <= begin, low, high))
     mesh = shared(times, which, count, (place, wanted), used, old.left.shape[0])
     return moved(elements, mesh)
+
+
+def counted(elements: Elements) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+    """Return places and the number of elements up to them."""
+    mesh = elements.mesh
+    begin, end = mesh.ends
+    real = jnp.arange(begin.shape[0]) < mesh.used
+    return jnp.append(begin[:1], end), jnp.append(0.0, jnp.cumsum(jnp.where(real, 1.0, 0.0)))

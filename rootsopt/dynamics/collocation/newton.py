@@ -1,12 +1,13 @@
 """Newton's method for the orbit and its events on a mesh of known topology."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.equation import Equation, Point
 from rootsopt.dynamics.collocation.gauss import GAUSS
@@ -19,8 +20,6 @@ from rootsopt.dynamics.collocation.system import (
     own_column,
 )
 
-BLOCK = 16
-"""Number of elements evaluated together. The number of elements of a mesh is a multiple of it."""
 _TURNS = 16
 """Maximum number of Newton steps."""
 _ROOM = 0.7
@@ -33,30 +32,13 @@ class Converged(NamedTuple):
     """Result of Newton's method.
 
     `elements`; `size`: last step (scaled) of the states and, in mesh periods, of the events;
-    `turns`: number of steps; `points` (e, s + 1): the equation at the places of the last step.
+    `turns`: number of steps; `force` (e, s): contact force (N) at the Gauss points.
     """
 
     elements: Elements
     size: Float[Array, ""]
     turns: Int[Array, ""]
-
-
-def in_blocks(function: Any, used: Int[Array, ""], *arrays: Any) -> Any:
-    """Return `function` of arrays (e, …), evaluated in blocks of elements; 0 beyond `used`."""
-    shapes = jax.eval_shape(function, *arrays)
-    count = jax.tree.leaves(arrays)[0].shape[0]
-    size = min(BLOCK, count)
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-
-    def block(number, found):
-        begin = number * size
-        part = jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, begin, size), arrays)
-        new = function(*part)
-        return jax.tree.map(
-            lambda old, x: lax.dynamic_update_slice_in_dim(old, x, begin, 0), found, new
-        )
-
-    return lax.fori_loop(0, (used + size - 1) // size, block, nothing)
+    force: Float[Array, "e s"]
 
 
 def evaluated(equation: Equation, elements: Elements) -> Point:
@@ -89,7 +71,7 @@ def newton(equation: Equation, elements: Elements, tolerance: Float[Array, ""]) 
     """Solve for the orbit near `elements`, until a step is below `tolerance` (scaled)."""
 
     def go_on(now):
-        return (now.turns < _TURNS) & (now.size > tolerance)
+        return (now.turns < _TURNS) & (now.size > tolerance)  # Ends at NaN.
 
     def turn(now):
         at = now.elements
@@ -97,9 +79,11 @@ def newton(equation: Equation, elements: Elements, tolerance: Float[Array, ""]) 
         found = lines(at, points)
         step = solved_step(at, found, own_column(at, found))
         moved, size = advanced(at, step, points.roots)
-        return Converged(moved, size, now.turns + 1)
+        return Converged(moved, size, now.turns + 1, points.force[:, : len(GAUSS.nodes)])
 
-    start = Converged(elements, jnp.full_like(elements.state[0, 0], jnp.inf), jnp.zeros((), int))
+    force = jnp.zeros(elements.slopes.shape[:2], elements.state.dtype)
+    infinite = jnp.full_like(elements.state[0, 0], jnp.inf)
+    start = Converged(elements, infinite, jnp.zeros((), int), force)
     return lax.while_loop(go_on, turn, start)
 
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.linear import solved
 
 
@@ -61,7 +62,7 @@ class Step(NamedTuple):
     monodromy: Float[Array, "n n"]
 
 
-class _Condensed(NamedTuple):
+class Condensed(NamedTuple):
     """What is left of the elements.
 
     `slopes` (e, s, n, n + 2 + k): the slopes' dependence on start, shifts of left and right end of
@@ -80,13 +81,22 @@ def own_column(elements: Elements, lines: Lines) -> Columns:
     return Columns(lines.miss[..., None], gap[..., None], lines.margin[:, None])
 
 
-def condensed(elements: Elements, lines: Lines, columns: Columns) -> _Condensed:
+def condensed(elements: Elements, lines: Lines, columns: Columns) -> Condensed:
     """Eliminate the slopes of each element."""
     mesh = elements.mesh
-    count, points, states = elements.slopes.shape
-    length = mesh.lengths[:, None, None, None]
-    share = mesh.right - mesh.left
-    rise = jnp.sum(GAUSS.integral[:, :, None] * elements.slopes[:, None], axis=2)
+    shares = jnp.stack([mesh.left, mesh.right, mesh.lengths], axis=1)
+    return in_blocks(_condensed, mesh.used, shares, elements.slopes, lines, columns)
+
+
+def _condensed(
+    shares: Float[Array, "e 3"], own: Float[Array, "e s n"], lines: Lines, columns: Columns
+) -> Condensed:
+    """Eliminate the slopes of some elements; `shares`: start and end in the interval, length."""
+    count, points, states = own.shape
+    left, right_end, lengths = shares.T
+    length = lengths[:, None, None, None]
+    share = right_end - left
+    rise = jnp.sum(GAUSS.integral[:, :, None] * own[:, None], axis=2)
     by_time, by_state = lines.slopes[..., :1], lines.slopes[..., 1:]
     matrix = jnp.eye(points * states).reshape(points, states, points, states) - (
         length[..., None] * by_state[:, :, :, None] * GAUSS.integral[:, None, :, None]
@@ -95,7 +105,7 @@ def condensed(elements: Elements, lines: Lines, columns: Columns) -> _Condensed:
     stretch = share[:, None, None, None] * jnp.sum(
         by_state * rise[:, :, None], axis=-1, keepdims=True
     )
-    place = (mesh.left[:, None] + share[:, None] * GAUSS.nodes)[..., None, None]
+    place = (left[:, None] + share[:, None] * GAUSS.nodes)[..., None, None]
     right = [by_state, by_time * (1 - place) - stretch, by_time * place + stretch, columns.slope]
     right = jnp.concatenate(right, axis=-1)
     system = jnp.concatenate(
@@ -107,10 +117,10 @@ def condensed(elements: Elements, lines: Lines, columns: Columns) -> _Condensed:
     )
     slopes = _eliminated(system).reshape(count, points, states, -1)
     end = jnp.sum(GAUSS.weights[:, None, None] * slopes, axis=1) * length[:, 0]
-    longer = share[:, None] * jnp.sum(GAUSS.weights[:, None] * elements.slopes, axis=1)
+    longer = share[:, None] * jnp.sum(GAUSS.weights[:, None] * own, axis=1)
     still = jnp.broadcast_to(jnp.eye(states), (count, states, states))
     added = [still, -longer[..., None], longer[..., None], columns.gap]
-    return _Condensed(slopes, end + jnp.concatenate(added, axis=-1))
+    return Condensed(slopes, end + jnp.concatenate(added, axis=-1))
 
 
 def _eliminated(system: Float[Array, "e m c"]) -> Float[Array, "e m k"]:
@@ -131,7 +141,7 @@ def _eliminated(system: Float[Array, "e m c"]) -> Float[Array, "e m k"]:
     return lax.fori_loop(0, size, eliminate, system)[..., size:]
 
 
-def chained(elements: Elements, lines: Lines, columns: Columns, parts: _Condensed) -> Step:
+def chained(elements: Elements, lines: Lines, columns: Columns, parts: Condensed) -> Step:
     """Solve for the states at the elements' starts and the times of the events."""
     mesh = elements.mesh
     states, width = elements.state.shape[1], columns.gap.shape[-1]
