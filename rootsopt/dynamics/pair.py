@@ -432,9 +432,7 @@ class RotorPair(eqx.Module):
         flags = jnp.concatenate([flags, *(part.switches(motion, own) for part, own in acting)])
         return flags, jnp.pad(counts, (0, flags.size - counts.size), constant_values=True)
 
-    def margins(
-        self, tau: Float[Array, ""], state: Float[Array, " n"]
-    ) -> Margins:
+    def margins(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> Margins:
         """Return the `Margins` at rotation `tau` (mesh periods) and scaled `state`."""
         motion, acting = self._moving(tau, state)
 

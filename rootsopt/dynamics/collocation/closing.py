@@ -141,15 +141,15 @@ def close(
         used = jnp.clip(now.elements.mesh.used + extra, events.count + 2, capacity - 1)
         times = events.times, events.which
         new = aligned(now.elements, times, density, used)
-        return now._replace(
-            elements=new, fits=jnp.ones((), bool), solved=jnp.zeros((), bool)
-        )
+        return now._replace(elements=new, fits=jnp.ones((), bool), solved=jnp.zeros((), bool))
 
     def solve(now: _Loop, seen) -> _Loop:
         got = newton(equation, rooted(now.elements, seen), jnp.asarray(_SMALL))
         good = got.size <= 10 * _SMALL
         closed = now.closed._replace(steps=now.closed.steps + got.turns)
-        return now._replace(closed=closed, elements=got.elements, force=got.force, solved=good, over=~good)
+        return now._replace(
+            closed=closed, elements=got.elements, force=got.force, solved=good, over=~good
+        )
 
     def finer(now: _Loop, events: Events) -> _Loop:
         """Keep the forces of an orbit whose flags agree, and go to a finer mesh."""
@@ -165,7 +165,10 @@ def close(
             found=found, error=error, drift=drift, sound=jnp.ones((), bool), events=events.count
         )
         new = aligned(
-            found.elements, (events.times, events.which), needed(at), jnp.minimum(used, capacity - 1)
+            found.elements,
+            (events.times, events.which),
+            needed(at),
+            jnp.minimum(used, capacity - 1),
         )
         return now._replace(
             closed=closed,
@@ -198,9 +201,7 @@ def _differences(before: Found, after: Found):
 
 def _nothing(equation: Equation, tangents: Any, elements: Elements) -> Closed:
     """Return the result before the first turn."""
-    shape = jax.eval_shape(
-        lambda: response(equation, elements, elements.slopes[..., 0], tangents)
-    )
+    shape = jax.eval_shape(lambda: response(equation, elements, elements.slopes[..., 0], tangents))
     empty: Found = jax.tree.map(lambda x: jnp.full(x.shape, 0, x.dtype), shape)
     infinite, zero = jnp.asarray(jnp.inf), jnp.zeros((), int)
     no = jnp.zeros((), bool)

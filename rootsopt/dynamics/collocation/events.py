@@ -13,9 +13,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.search import SearchContact
+from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.gauss import GAUSS
-from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.pair import RotorPair
 
 _ASIDE = 2e-7, 0.02

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.equation import Equation, Point
 from rootsopt.dynamics.collocation.gauss import GAUSS
-from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.newton import lines
 from rootsopt.dynamics.collocation.system import (
     Columns,
@@ -66,8 +66,7 @@ class Found(NamedTuple):
 
 
 def _inside(elements: Elements, k: Any, share: Any) -> tuple[Array, Array, Array]:
-    """Return time, state and roots (as the Gauss points' own polynomial) at a place of an element.
-    """
+    """Return time, state and roots (as the Gauss points' own polynomial) at a place of an element."""
     begin, length = elements.mesh.ends[0][k], elements.mesh.lengths[k]
     rise = jnp.sum(GAUSS.integrated(share)[:, None] * elements.slopes[k], axis=0)
     weights = GAUSS.lagrange(share)
@@ -97,7 +96,7 @@ def located_peak(equation: Equation, elements: Elements, force: Float[Array, "e 
 
     def round_(number, carry):
         share, roots, best = carry
-        reach = 0.5 * _CLOSER**number.astype(force.dtype)
+        reach = 0.5 * _CLOSER ** number.astype(force.dtype)
         tried = jnp.clip(share[:, None] + reach * spread, 0.0, 1.0)
         first = jax.vmap(lambda k, places: jax.vmap(lambda x: _inside(elements, k, x)[2])(places))
         begun = jnp.where(number < 2, first(rivals, tried), roots[:, None])

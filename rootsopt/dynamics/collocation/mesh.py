@@ -70,7 +70,9 @@ def needed(elements: Elements) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
     mesh = elements.mesh
     highest = jnp.sum(jnp.asarray(GAUSS.powers[-1])[:, None] * elements.slopes, axis=1)
     size = jnp.max(jnp.abs(highest), axis=1) * mesh.lengths
-    share = jnp.where(jnp.arange(size.shape[0]) < mesh.used, size ** (1 / (len(GAUSS.nodes) + 1)), 0)
+    share = jnp.where(
+        jnp.arange(size.shape[0]) < mesh.used, size ** (1 / (len(GAUSS.nodes) + 1)), 0
+    )
     begin, end = mesh.ends
     return jnp.append(begin[:1], end), jnp.append(0.0, jnp.cumsum(share))
 
