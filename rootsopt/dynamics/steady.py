@@ -15,6 +15,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.dynamics.collocation.closing import supported
+from rootsopt.dynamics.collocation.motion import collocated
 from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
@@ -48,6 +50,10 @@ class Solver(eqx.Module):
     close an orbit; `closed`: residual, in tolerances, at which it may count as closed; `samples`:
     number of its samples; `check`: compare the derivatives with those on halved steps; `attempts`:
     maximum number of attempts; `windows`: mesh periods of a window, a multiple of 16; 0: no window.
+
+    `closing`: how orbits are closed: shooting, collocation, or auto, which is collocation and,
+    where it fails, shooting. Shooting alone closes orbits of pairs that collocation does not
+    support.
     """
 
     transient: Integrator
@@ -63,6 +69,7 @@ class Solver(eqx.Module):
     check: bool = eqx.field(static=True, default=True)
     attempts: int = eqx.field(static=True, default=16)
     windows: int = eqx.field(static=True, default=PERIODS)
+    closing: str = eqx.field(static=True, default="shooting")
 
 
 class Steady(NamedTuple):
@@ -294,6 +301,43 @@ class _Attempts(eqx.Module):
             return jnp.asarray(Status.NOT_SETTLED.code)
         return window_status(self.pair, window)
 
+    def collocated(self, state: Float[Array, " n"]) -> Steady:
+        """Return the motion that the scaled `state` leads to, its orbit closed by collocation.
+
+        The status is `NOT_SETTLED` where there is no orbit that is sound, stable and near the end
+        of the transient, and that an integration confirms."""
+        solver, empty = self.solver, self.start(state).found
+        within = settled_within(solver.transient.rtol).astype(state.dtype)
+        periods = solver.max_periods.astype(int)
+        settled = settle(self.pair, state, solver.transient, within, periods, solver.max_orbit)
+        failure = transient_status(self.pair, settled)
+        period = jnp.maximum(settled.period, 1)
+        lost = empty._replace(
+            status=failure, settled=settled, used=settled.periods, steps=settled.steps
+        )
+
+        def close() -> Steady:
+            made = collocated(
+                self.pair,
+                self.tangents,
+                (settled.state, period),
+                (solver.transient, solver.orbit),
+                solver.measures,
+                (solver.samples, solver.max_orbit),
+            )
+            judged, status = self._judged(made.orbit, settled.state, solver.orbit.rtol, within)
+            unknown = among(status, (Status.PERIODIC, Status.INACCURATE)) & ~made.verified
+            status = jnp.where(unknown, Status.NOT_SETTLED.code, status)
+            return lost._replace(
+                status=status,
+                orbit=made.orbit,
+                period=period,
+                verdict=judged,
+                steps=settled.steps + made.orbit.flow.steps,
+            )
+
+        return self.final(lax.cond(failure < 0, close, lambda: lost))
+
     def final(self, found: Steady) -> Steady:
         """Return `found`, with its status changed if the forces of its orbit are not valid: the
         flanks penetrate too deep, or errors are too large."""
@@ -353,7 +397,16 @@ def steady_motion(
     """
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     attempts = _Attempts(pair, tangents, solver, radius)
-    search = lax.while_loop(
-        lambda now: ~now.over, lambda now: attempts.step(now), attempts.start(state)
-    )
-    return attempts.final(search.found)
+
+    def shooting() -> Steady:
+        search = lax.while_loop(
+            lambda now: ~now.over, lambda now: attempts.step(now), attempts.start(state)
+        )
+        return attempts.final(search.found)
+
+    if solver.closing == "shooting" or solver.precision != "float64" or not supported(pair):
+        return shooting()
+    found = attempts.collocated(state)
+    if solver.closing == "collocation":
+        return found
+    return lax.cond(found.status == Status.PERIODIC.code, lambda: found, shooting)

@@ -37,8 +37,8 @@ _TURNS = 24
 _SMALL = 3e-9
 """Newton step (scaled) at which an orbit is closed. The next one would be of its square."""
 _GAIN = 10.0
-"""Factor by which the error of the finer of two meshes is below their difference. With superconvergent
-elements it is larger (1.4⁸)."""
+"""Factor by which the error of the finer of two meshes is below their difference. With
+superconvergent elements it is larger (1.4⁸)."""
 
 
 class Closed(NamedTuple):
@@ -62,8 +62,9 @@ class Closed(NamedTuple):
 class _Loop(NamedTuple):
     """State of the loop: the result so far, and the elements of the next turn.
 
-    `force` (e, s): contact force (N) at the Gauss points; `fits`: whether the elements end at events; `solved`: whether Newton's method has converged on
-    them; `meshes`: number of meshes on which the orbit was solved; `over`: whether the loop ends.
+    `force` (e, s): contact force (N) at the Gauss points; `fits`: whether the elements end at
+    events; `solved`: whether Newton's method has converged on them; `meshes`: number of meshes on
+    which the orbit was solved; `over`: whether the loop ends.
     """
 
     closed: Closed
@@ -111,11 +112,17 @@ def first_elements(period: Int[Array, ""]) -> Int[Array, ""]:
 
 
 def close(
-    equation: Equation, tangents: Any, elements: Elements, tolerance: Float[Array, ""]
+    equation: Equation,
+    tangents: Any,
+    elements: Elements,
+    tolerance: Float[Array, ""],
+    known: Bool[Array, ""] | bool = False,
 ) -> Closed:
     """Close the orbit near the motion `elements`, to a relative error `tolerance` of its forces.
 
-    `tangents`: directions (d, …) of the pair's parameters for the derivatives."""
+    `tangents`: directions (d, …) of the pair's parameters for the derivatives; `known`: whether the
+    elements end at events, such as those of the orbit of a similar pair. With a `tolerance` of inf,
+    the orbit is solved on one mesh only, without an error estimate."""
     pair = jax.lax.stop_gradient(equation.pair)
     capacity, room = elements.state.shape[0], elements.mesh.times.shape[0]
 
@@ -180,7 +187,9 @@ def close(
 
     nothing = _nothing(equation, tangents, elements)
     no = jnp.zeros((), bool)
-    start = _Loop(nothing, elements, elements.slopes[..., 0], no, no, jnp.zeros((), int), no)
+    start = _Loop(
+        nothing, elements, elements.slopes[..., 0], jnp.asarray(known), no, jnp.zeros((), int), no
+    )
     return lax.while_loop(go_on, turn, start).closed
 
 

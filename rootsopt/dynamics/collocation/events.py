@@ -62,7 +62,7 @@ class Events(NamedTuple):
 
 
 def flags_at(pair: RotorPair, tau, state):
-    """Return flags, whether they matter, the roots (sides,) of the contact, and whether it pushes."""
+    """Return flags, whether they matter, roots (sides,) of the contact, and whether it pushes."""
     found = pair.margins(tau, state)
     roots = jnp.stack([place.normal2 for place in found.places])
     return found.values > 0, found.counts, roots, found.pushes
@@ -129,7 +129,7 @@ def rooted(elements: Elements, seen: Look) -> Elements:
 
 
 def found_events(pair: RotorPair, elements: Elements, seen: Look, room: int) -> Events:
-    """Return the events of the motion that was `seen`; `room`: number of times that a mesh holds."""
+    """Return the events of the motion that was `seen`; `room`: of the arrays for times."""
     mesh = elements.mesh
     places = seen.tau.shape[0]
     per = len(GAUSS.nodes) + 2

@@ -66,7 +66,7 @@ class Found(NamedTuple):
 
 
 def _inside(elements: Elements, k: Any, share: Any) -> tuple[Array, Array, Array]:
-    """Return time, state and roots (as the Gauss points' own polynomial) at a place of an element."""
+    """Return time, state and roots (by the polynomial of the Gauss points) inside an element."""
     begin, length = elements.mesh.ends[0][k], elements.mesh.lengths[k]
     rise = jnp.sum(GAUSS.integrated(share)[:, None] * elements.slopes[k], axis=0)
     weights = GAUSS.lagrange(share)
@@ -95,7 +95,7 @@ def located_peak(equation: Equation, elements: Elements, force: Float[Array, "e 
     each = jax.vmap(jax.vmap(at, (None, 0, 0)))
 
     def round_(number, carry):
-        share, roots, best = carry
+        share, roots, _ = carry
         reach = 0.5 * _CLOSER ** number.astype(force.dtype)
         tried = jnp.clip(share[:, None] + reach * spread, 0.0, 1.0)
         first = jax.vmap(lambda k, places: jax.vmap(lambda x: _inside(elements, k, x)[2])(places))

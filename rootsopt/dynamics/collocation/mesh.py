@@ -79,7 +79,7 @@ def needed(elements: Elements) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
 
 def moved(elements: Elements, mesh: Mesh) -> Elements:
     """Return the same motion on another mesh; its roots are those of the nearest places."""
-    old_begin, old_end = elements.mesh.ends
+    old_begin = elements.mesh.ends[0]
     begin, _ = mesh.ends
     length, old_length = mesh.lengths, elements.mesh.lengths
     last = elements.mesh.used - 1
