@@ -449,19 +449,20 @@ class RotorPair(eqx.Module):
             values = jnp.concatenate(found)
             return values, jnp.full(values.shape, pushes), touch.approach.place, pushes
 
-        one = jnp.ones((), self.angle_scale.dtype)
         if self.two_sided:
-            flanks = [of_flank(one), of_flank(-one)]
+            sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)
+            values, counts, both, pushes = jax.vmap(of_flank)(sides)
+            places = [jax.tree.map(lambda x, k=k: x[k], both) for k in range(2)]
+            values, counts = [values.ravel()], [counts.ravel()]
         else:
-            flanks = [of_flank(jnp.where(motion.relative < 0, one, -one))]
-        values, counts, places, pushes = (list(each) for each in zip(*flanks, strict=True))
-        if not self.two_sided:
-            values.append(-motion.relative[None])
-            counts.append(counts[0][:1])
+            one = jnp.ones((), self.angle_scale.dtype)
+            values, counts, place, push = of_flank(jnp.where(motion.relative < 0, one, -one))
+            values, counts = [values, -motion.relative[None]], [counts, counts[:1]]
+            places, pushes = [place], push[None]
         values += [part.margins(motion, own) for part, own in acting]
         found, counted = jnp.concatenate(values), jnp.concatenate(counts)
         counted = jnp.pad(counted, (0, found.size - counted.size), constant_values=True)
-        return Margins(found, counted, places, jnp.stack(pushes))
+        return Margins(found, counted, places, pushes)
 
     def derivative(
         self, tau: Float[Array, ""], state: Float[Array, " n"]

@@ -78,7 +78,7 @@ class Steady(NamedTuple):
     `status`: code of a `Status`; `orbit`: the last one kept; `period`: its mesh periods; `rtol`:
     its tolerance; `verdict` on it; `window` of a motion that did not settle; `settled`: end of the
     transient; `used`: mesh periods of all transients; `steps`: solver steps of transients and
-    orbits.
+    orbits; `collocated`: whether the orbit was closed by collocation.
     """
 
     status: Int[Array, ""]
@@ -90,6 +90,7 @@ class Steady(NamedTuple):
     settled: Transient
     used: Int[Array, ""]
     steps: Int[Array, ""]
+    collocated: Bool[Array, ""]
 
     @property
     def forces(self) -> Float[Array, " r"]:
@@ -167,6 +168,7 @@ class _Attempts(eqx.Module):
             settled=Transient(state, zero, one, infinite, zero, no, ~no, zero),
             used=zero,
             steps=zero,
+            collocated=no,
         )
         coarse, fine = solver.transient.rtol, solver.orbit.rtol
         within = settled_within(coarse).astype(dtype)
@@ -226,6 +228,7 @@ class _Attempts(eqx.Module):
             settled=settled,
             used=used,
             steps=steps + jnp.where(now.windowed, 0, orbit.flow.steps),
+            collocated=found.collocated,
         )
         return self._next(now, new, within, lost, taken & shorter)
 
@@ -334,6 +337,7 @@ class _Attempts(eqx.Module):
                 period=period,
                 verdict=judged,
                 steps=settled.steps + made.orbit.flow.steps,
+                collocated=jnp.ones((), bool),
             )
 
         return self.final(lax.cond(failure < 0, close, lambda: lost))

@@ -417,6 +417,8 @@ def _orbit_statistics(found: Steady) -> dict[str, int | float]:
         "orbit_defect": float(orbit.defect),
         "force_rounding": float(found.verdict.rounding),
     }
+    if bool(found.collocated):
+        statistics["collocated"] = 1
     if np.isfinite(orbit.disagreement):  # Infinite: there was no room for a comparison.
         statistics["gradient_disagreement"] = float(orbit.disagreement)
     return statistics

@@ -34,7 +34,7 @@ class Gauss(NamedTuple):
         """Return the rule with `count` points."""
         node, weight = np.polynomial.legendre.leggauss(count)
         node, weight = (node + 1) / 2, weight / 2
-        powers = np.linalg.inv(np.vander(node, count, increasing=True))
+        powers = np.asarray(np.linalg.inv(np.vander(node, count, increasing=True)), np.float64)
         order = np.arange(1, count + 1)
         integral = (node[:, None] ** order / order) @ powers
         return cls(node, weight, integral, powers)

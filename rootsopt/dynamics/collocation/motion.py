@@ -22,6 +22,10 @@ _STEPS = 1024
 """Maximum number of steps per mesh period of the motion from which an orbit is started."""
 _ACCURACY = 10.0
 """Error of the forces that is accepted, in tolerances of the orbit's integration."""
+_UNREFINED = 10.0
+"""Factor by which the error estimate may exceed that where no finer mesh can be had."""
+_REPEATS = 1e-5
+"""Scaled difference of states below which an orbit repeats sooner than after its period."""
 _MISS = 1e3
 """Distance (scaled) by which an integration from the orbit's own state may miss its start, in
 tolerances times the greatest entry of the monodromy matrix."""
@@ -82,6 +86,12 @@ def collocated(
     apart = jnp.max(jnp.abs(out.response[:3] - found.response[:3]) / scale)
     verified = closed.sound & (miss <= _MISS * tolerance * size * gain)
     verified &= apart <= jnp.maximum(factor * tolerance, least)
+    verified &= closed.error <= _UNREFINED * _ACCURACY * tolerance
+    # The transient may have taken a whole number of periods for one.
+    shorter = jnp.arange(1, max(longest // 2, 1) + 1)
+    states = out.states[jnp.minimum(shorter * samples // period, samples - 1)]
+    repeats = jnp.max(jnp.abs(states - found.state), axis=1) < _REPEATS
+    verified &= ~jnp.any(repeats & (shorter < period) & (period % shorter == 0))
     orbit = Orbit(
         state=found.state,
         flow=_as_flow(out, found),
