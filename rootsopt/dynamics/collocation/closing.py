@@ -133,21 +133,28 @@ def close(
         seen = look(pair, now.elements)
         events = found_events(pair, now.elements, seen, room)
         agree = now.fits & (events.new == 0) & (events.gone == 0)
+        done = agree & now.solved
         new = lax.cond(
             agree,
-            lambda: lax.cond(now.solved, lambda: finer(now, events), lambda: solve(now, seen)),
-            lambda: align(now, events),
+            lambda: lax.cond(now.solved, lambda: keep(now, events), lambda: solve(now, seen)),
+            lambda: now,
         )
         over = new.over | ~events.fits
+        new = lax.cond((done | ~agree) & ~over, lambda: align(new, events, done), lambda: new)
         closed = new.closed._replace(turns=now.closed.turns + 1)
         return new._replace(closed=closed, over=over)
 
-    def align(now: _Loop, events: Events) -> _Loop:
-        density = lax.cond(now.fits, lambda: needed(now.elements), lambda: counted(now.elements))
-        extra = jnp.where(now.fits, 0, _EVENT * events.count - now.elements.mesh.used // 2)
-        used = jnp.clip(now.elements.mesh.used + extra, events.count + 2, capacity - 1)
-        times = events.times, events.which
-        new = aligned(now.elements, times, density, used)
+    def align(now: _Loop, events: Events, finer) -> _Loop:
+        """Move the motion to a mesh that ends at its events, and is finer if asked for."""
+        taken = now.elements.mesh.used
+        first = taken // 2 + _EVENT * events.count
+        used = jnp.where(now.fits, jnp.where(finer, (_FINER * taken).astype(int), taken), first)
+        used = jnp.clip(used, events.count + 2, capacity - 1)
+        density = tuple(
+            jnp.where(now.fits, *both)
+            for both in zip(needed(now.elements), counted(now.elements), strict=True)
+        )
+        new = aligned(now.elements, (events.times, events.which), density, used)
         return now._replace(elements=new, fits=jnp.ones((), bool), solved=jnp.zeros((), bool))
 
     def solve(now: _Loop, seen) -> _Loop:
@@ -158,31 +165,21 @@ def close(
             closed=closed, elements=got.elements, force=got.force, solved=good, over=~good
         )
 
-    def finer(now: _Loop, events: Events) -> _Loop:
-        """Keep the forces of an orbit whose flags agree, and go to a finer mesh."""
-        at, before = now.elements, now.closed.found
-        found = response(equation, at, now.force, tangents)
-        error, drift = _differences(before, found)
+    def keep(now: _Loop, events: Events) -> _Loop:
+        """Keep the forces of an orbit whose flags agree."""
+        found = response(equation, now.elements, now.force, tangents)
+        error, drift = _differences(now.closed.found, found)
         first = now.meshes == 0
         error, drift = (jnp.where(first, jnp.inf, x / _GAIN) for x in (error, drift))
-        used = (_FINER * at.mesh.used).astype(int)
-        full = used >= capacity
-        close_by = error <= tolerance
+        full = now.elements.mesh.used >= capacity - 1
         closed = now.closed._replace(
             found=found, error=error, drift=drift, sound=jnp.ones((), bool), events=events.count
         )
-        new = aligned(
-            found.elements,
-            (events.times, events.which),
-            needed(at),
-            jnp.minimum(used, capacity - 1),
-        )
         return now._replace(
             closed=closed,
-            elements=new,
-            solved=jnp.zeros((), bool),
+            elements=found.elements,
             meshes=now.meshes + 1,
-            over=close_by | full | ~(found.correction < 1e-3),
+            over=(error <= tolerance) | full | ~(found.correction < 1e-3),
         )
 
     nothing = _nothing(equation, tangents, elements)

@@ -103,15 +103,22 @@ class Equation(eqx.Module):
         roots: Float[Array, "sides 2"],
         which: Int[Array, ""],
         tangents: Any,
-    ) -> Float[Array, "r d"]:
-        """Return the derivatives of `Point.values` along `tangents` (d, …) of the pair."""
+    ) -> tuple[Point, Float[Array, "r d"]]:
+        """Return `point`, and the derivatives of its values along `tangents` (d, …) of the pair."""
         dynamic, static = eqx.partition(self.pair, eqx.is_inexact_array)
+        moved = eqx.filter(tangents, eqx.is_inexact_array)
 
-        def value(dynamic):
-            return self.evaluated(dynamic, static, tau, state, roots, which)[0]
+        def value(dynamic, place):
+            return self.evaluated(dynamic, static, place[0], place[1:], roots, which)
 
-        _, linear = jax.linearize(value, dynamic)
-        return jax.vmap(linear, out_axes=-1)(eqx.filter(tangents, eqx.is_inexact_array))
+        place = jnp.append(tau, state)
+        size, count = place.shape[0], jax.tree.leaves(moved)[0].shape[0]
+        values, linear, rest = jax.linearize(value, dynamic, place, has_aux=True)
+        # All directions at once: first those of time and state, then those of the pair.
+        moved = jax.tree.map(lambda x: jnp.pad(x, [(size, 0)] + [(0, 0)] * (x.ndim - 1)), moved)
+        unit = jnp.eye(size + count, size, dtype=place.dtype)
+        slopes = jax.vmap(linear)(moved, unit).T
+        return Point(values, slopes[:, :size], *rest), slopes[:, size:]
 
 
 def _roots(places: list[Any]) -> Float[Array, "sides 2"]:

@@ -129,8 +129,7 @@ def response(equation: Equation, elements: Elements, force: Any, tangents: Any) 
     which = jnp.maximum(mesh.which[mesh.interval + 1], 0)
 
     def both(tau, state, roots, which):
-        point = equation.point(tau, state, roots, which)
-        return point, equation.along(tau, state, roots, which, tangents)
+        return equation.along(tau, state, roots, which, tangents)
 
     each = jax.vmap(jax.vmap(both, (0, 0, 0, None)))
     points, along = in_blocks(each, extra + 1, tau, state, roots, which)
