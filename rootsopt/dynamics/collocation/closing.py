@@ -63,8 +63,8 @@ class _Loop(NamedTuple):
     """State of the loop: the result so far, and the elements of the next turn.
 
     `force` (e, s): contact force (N) at the Gauss points; `fits`: whether the elements end at
-    events; `solved`: whether Newton's method has converged on them; `meshes`: number of meshes on
-    which the orbit was solved; `over`: whether the loop ends.
+    events; `solved`: whether Newton's method has converged on them; `failures`: how often it did
+    not; `meshes`: number of meshes on which the orbit was solved; `over`: whether the loop ends.
     """
 
     closed: Closed
@@ -72,6 +72,7 @@ class _Loop(NamedTuple):
     force: Float[Array, "e s"]
     fits: Bool[Array, ""]
     solved: Bool[Array, ""]
+    failures: Int[Array, ""]
     meshes: Int[Array, ""]
     over: Bool[Array, ""]
 
@@ -161,8 +162,15 @@ def close(
         got = newton(equation, rooted(now.elements, seen), jnp.asarray(_SMALL))
         good = got.size <= 10 * _SMALL
         closed = now.closed._replace(steps=now.closed.steps + got.turns)
+        # A step that leads out of the mesh's events is tried again with those found on its way.
+        failures = now.failures + ~good
         return now._replace(
-            closed=closed, elements=got.elements, force=got.force, solved=good, over=~good
+            closed=closed,
+            elements=got.elements,
+            force=got.force,
+            solved=good,
+            failures=failures,
+            over=~jnp.isfinite(got.size) | (failures > _FAILURES),
         )
 
     def keep(now: _Loop, events: Events) -> _Loop:
@@ -183,9 +191,9 @@ def close(
         )
 
     nothing = _nothing(equation, tangents, elements)
-    no = jnp.zeros((), bool)
+    no, zero = jnp.zeros((), bool), jnp.zeros((), int)
     start = _Loop(
-        nothing, elements, elements.slopes[..., 0], jnp.asarray(known), no, jnp.zeros((), int), no
+        nothing, elements, elements.slopes[..., 0], jnp.asarray(known), no, zero, zero, no
     )
     return lax.while_loop(go_on, turn, start).closed
 

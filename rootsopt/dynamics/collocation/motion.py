@@ -24,7 +24,7 @@ _ACCURACY = 10.0
 """Error of the forces that is accepted, in tolerances of the orbit's integration."""
 _UNREFINED = 10.0
 """Factor by which the error estimate may exceed that where no finer mesh can be had."""
-_REPEATS = 1e-5
+_REPEATS = 1e-6
 """Scaled difference of states below which an orbit repeats sooner than after its period."""
 _MISS = 1e3
 """Distance (scaled) by which an integration from the orbit's own state may miss its start, in
@@ -89,7 +89,7 @@ def collocated(
     verified &= closed.error <= _UNREFINED * _ACCURACY * tolerance
     # The transient may have taken a whole number of periods for one.
     shorter = jnp.arange(1, max(longest // 2, 1) + 1)
-    states = out.states[jnp.minimum(shorter * samples // period, samples - 1)]
+    states = jax.vmap(found.elements.motion)(shorter.astype(state.dtype))
     repeats = jnp.max(jnp.abs(states - found.state), axis=1) < _REPEATS
     verified &= ~jnp.any(repeats & (shorter < period) & (period % shorter == 0))
     orbit = Orbit(
