@@ -34,6 +34,8 @@ _TIMES = 48
 """Greatest number of events per mesh period."""
 _TURNS = 24
 """Maximum number of turns of the loop."""
+_FAILURES = 4
+"""Maximum number of times that Newton's method may not converge."""
 _SMALL = 3e-9
 """Newton step (scaled) at which an orbit is closed. The next one would be of its square."""
 _GAIN = 10.0
