@@ -380,7 +380,8 @@ class Evaluator:
             return {}
         orbit, solver = found.orbit, self.scene.solver
         sensitivity = orbit.sensitivity
-        if self.config.solver.gradient == "reverse":
+        # Collocation has them already, and no steps to go back through.
+        if self.config.solver.gradient == "reverse" and not bool(found.collocated):
             settings = np.asarray(found.period), solver.orbit, solver.measures
             sensitivity = _reverse(self.scene, design, orbit, *settings)
         rows = np.column_stack([orbit.response, sensitivity])
