@@ -22,6 +22,7 @@ from rootsopt.dynamics.collocation.events import Events, found_events, look, roo
 from rootsopt.dynamics.collocation.forces import Found, response
 from rootsopt.dynamics.collocation.mesh import aligned, counted, needed
 from rootsopt.dynamics.collocation.newton import newton
+from rootsopt.dynamics.orbit import choose
 from rootsopt.dynamics.pair import RotorPair
 
 _FIRST, _EVENT = 20, 1
@@ -34,6 +35,8 @@ _TIMES = 48
 """Greatest number of events per mesh period."""
 _TURNS = 24
 """Maximum number of turns of the loop."""
+_CORRECTED = 1e-6
+"""Last correction (scaled) above which an orbit is rejected."""
 _FAILURES = 4
 """Maximum number of times that Newton's method may not converge."""
 _SMALL = 3e-9
@@ -182,14 +185,22 @@ def close(
         first = now.meshes == 0
         error, drift = (jnp.where(first, jnp.inf, x / _GAIN) for x in (error, drift))
         full = now.elements.mesh.used >= capacity - 1
-        closed = now.closed._replace(
-            found=found, error=error, drift=drift, sound=jnp.ones((), bool), events=events.count
+        # Newton's method has converged: a large correction, or none, comes from a margin that is
+        # not regular at its event.
+        good = found.correction < _CORRECTED
+        kept = now.closed
+        closed = kept._replace(
+            found=choose(good, found, kept.found),
+            error=jnp.where(good, error, kept.error),
+            drift=jnp.where(good, drift, kept.drift),
+            sound=kept.sound | good,
+            events=jnp.where(good, events.count, kept.events),
         )
         return now._replace(
             closed=closed,
             elements=found.elements,
             meshes=now.meshes + 1,
-            over=(error <= tolerance) | full | ~(found.correction < 1e-3),
+            over=(error <= tolerance) | full | ~good,
         )
 
     nothing = _nothing(equation, tangents, elements)

@@ -32,6 +32,10 @@ _ROUNDS, _CLOSER = 14, 0.25
 """Number of rounds of the search, and the factor by which each shortens its range."""
 
 
+_MENDED = 3
+"""Evaluations at each place; the contact's roots converge with them."""
+
+
 class Peak(NamedTuple):
     """The greatest force of an orbit.
 
@@ -100,7 +104,13 @@ def located_peak(equation: Equation, elements: Elements, force: Float[Array, "e 
         tried = jnp.clip(share[:, None] + reach * spread, 0.0, 1.0)
         first = jax.vmap(lambda k, places: jax.vmap(lambda x: _inside(elements, k, x)[2])(places))
         begun = jnp.where(number < 2, first(rivals, tried), roots[:, None])
-        forces, new = each(rivals, tried, begun)
+        # Polynomials through the roots are poor near the ends: the first step only mends them.
+        forces, new = lax.fori_loop(
+            0,
+            _MENDED,
+            lambda _, found: each(rivals, tried, found[1]),
+            (jnp.zeros_like(tried), begun),
+        )
         top = jnp.argmax(forces, axis=1)
         pick = jax.vmap(lambda x, i: x[i])
         return pick(tried, top), pick(new, top), pick(forces, top)
