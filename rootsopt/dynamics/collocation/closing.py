@@ -156,10 +156,8 @@ def close(
         first = taken // 2 + _EVENT * events.count
         used = jnp.where(now.fits, jnp.where(finer, (_FINER * taken).astype(int), taken), first)
         used = jnp.clip(used, events.count + 2, capacity - 1)
-        density = tuple(
-            jnp.where(now.fits, *both)
-            for both in zip(needed(now.elements), counted(now.elements), strict=True)
-        )
+        (place, wanted), (spot, number) = needed(now.elements), counted(now.elements)
+        density = jnp.where(now.fits, place, spot), jnp.where(now.fits, wanted, number)
         new = aligned(now.elements, (events.times, events.which), density, used)
         return now._replace(elements=new, fits=jnp.ones((), bool), solved=jnp.zeros((), bool))
 

@@ -70,8 +70,8 @@ def test_collocation_agrees_with_shooting(name, overrides, period):
         np.testing.assert_allclose(getattr(one, force), getattr(other, force), rtol=5e-7)
     size = np.max(np.abs(by_other), axis=1, keepdims=True)
     np.testing.assert_allclose(by_one / size, by_other / size, rtol=0, atol=1e-4)
-    sizes = [np.sort(np.abs(response.multipliers)) for response in (one, other)]
-    np.testing.assert_allclose(*sizes, atol=1e-5)
+    first, second = (np.sort(np.abs(response.multipliers)) for response in (one, other))
+    np.testing.assert_allclose(first, second, atol=1e-5)
     np.testing.assert_allclose(one.state, other.state, rtol=1e-5, atol=1e-9)
 
 
