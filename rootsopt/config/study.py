@@ -61,6 +61,11 @@ class SolverConfig(Section):
     max_orbit_periods: Annotated[int, Field(ge=1, le=8)] = Field(
         8, description="longest periodic orbit to find, in mesh periods"
     )
+    orbit: Literal["collocation", "shooting", "auto"] = Field(
+        "shooting",
+        description="how periodic orbits are closed: by shooting, by collocation aligned with "
+        "contact events, or auto: collocation and, where it fails, shooting",
+    )
     gradient: Literal["forward", "reverse"] = Field(
         "forward", description="differentiation mode; both give the same gradient"
     )

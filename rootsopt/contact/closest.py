@@ -214,6 +214,22 @@ class FlankPair(eqx.Module):
             pieces.append(found.normal2 > self.frozen.pitch_normal - _NEAR_CUSP)
         return jnp.concatenate([jnp.stack(pieces), beyond])
 
+    def margins(
+        self, roll: Float[Array, ""], found: ClosestApproach, rival: Float[Array, ""]
+    ) -> Float[Array, " s"]:
+        """Return numbers (s,) that are positive where the flags of `switches` are set.
+
+        `rival`: gap (m) of the other minimum next to a cusp. Whether there is a common normal has
+        no margin: it changes only where the flanks are apart."""
+        ends = jnp.stack([segment.stop for segment in self.profile.segments()[:-1]] or [0.0])
+        normals = jnp.stack([found.normal1, found.normal2])
+        beyond = (normals[:, None] - ends).ravel()
+        half = self.profile.half_pitch
+        pieces = [jnp.where(found.found, 1.0, -1.0), jnp.sin(jnp.pi / 2 * (roll - half) / half)]
+        if self.profile.cusp:
+            pieces.append(rival - found.gap)
+        return jnp.concatenate([jnp.stack(pieces), beyond])
+
     def _closest(self, roll, relative) -> ClosestApproach:
         """Return the closest approach for a folded `roll`, with its derivatives.
 

@@ -106,6 +106,18 @@ class Contact(eqx.Module):
         del roll, approach
         return jnp.zeros(0, bool)
 
+    def margins(self, roll: Float[Array, ""], approach: Approach) -> Float[Array, " s"]:
+        """Return numbers (s,) that are positive where the flags of `switches` are set.
+
+        By default they are 1 and -1. Those of `NearContact` are smooth across the instant at which
+        their flag changes, and zero there."""
+        return jnp.where(self.switches(roll, approach), 1.0, -1.0)
+
+    def on_side(self, side: Float[Array, ""]) -> "Contact":
+        """Return the contact for one side of the flanks (1 drive, -1 coast); by default itself."""
+        del side
+        return self
+
     def _lacks(self, what: str, why: str) -> InputError:
         return InputError(
             f"the contact `{type(self).__name__}` does not give {what}, which {why}; use "

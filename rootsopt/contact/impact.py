@@ -105,6 +105,15 @@ class ImpactLaw(ContactLaw):
         limits = jnp.stack([jnp.zeros_like(elastic), width * elastic])
         return jnp.concatenate([depth > depths, positive & (total > limits)])
 
+    def margins(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, "5"]:
+        positive, elastic, total, width = self._parts(depth, rate)
+        depths = jnp.stack([jnp.zeros_like(depth), self.smoothing, self.full_damping_depth])
+        # Relative to the elastic force, which vanishes with the depth.
+        large = elastic > float(jnp.finfo(elastic.dtype).tiny) ** 0.5
+        share = total / jnp.where(large, elastic, 1.0)
+        released = jnp.where(positive, jnp.stack([share, share - width]), -1.0)
+        return jnp.concatenate([depth - depths, released])
+
     def _parts(self, depth, rate):
         """Return (whether in contact, elastic force (N), total force (N) before release, width).
 

@@ -36,6 +36,14 @@ class ContactLaw(eqx.Module):
         del rate
         return jnp.stack([depth > 0])
 
+    def margins(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, " s"]:
+        """Return numbers (s,) that are positive where the flags of `switches` are set.
+
+        Each is smooth across the instant at which its flag changes, and zero there. A law that
+        overrides `switches` but not `margins` cannot be used by collocation."""
+        del rate
+        return jnp.stack([depth])
+
     def stiffness_at(self, depth: Float[Array, ""]) -> Float[Array, ""]:
         """Return the static stiffness (N/m) at a penetration `depth` (m) > 0."""
         still = jnp.zeros_like(depth)

@@ -9,7 +9,7 @@ solver works with numbers of order one.
 """
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -91,6 +91,22 @@ class _Touch(NamedTuple):
     roll: Float[Array, ""]
     approach: Approach
     sliding: _Sliding | None
+
+
+class Margins(NamedTuple):
+    """Distances of a motion from the instants at which the equation is not smooth.
+
+    `values` (s,): positive where the flags of `RotorPair.switches` are set. With a `NearContact`,
+    each is smooth across the instant at which its flag changes, and zero there. `counts` (s,):
+    whether they matter; those of a flank do where it transmits a force. `places`: what the contact
+    has found (`Approach.place`) for the flanks that can touch or, if both sides can, for drive and
+    coast flanks; `pushes` (sides,): whether these flanks transmit a force.
+    """
+
+    values: Float[Array, " s"]
+    counts: Bool[Array, " s"]
+    places: list[Any]
+    pushes: Bool[Array, " sides"]
 
 
 class RotorPair(eqx.Module):
@@ -363,7 +379,7 @@ class RotorPair(eqx.Module):
         displaced axes is equivalent to a pair at another centre distance with the angles φ1 - θ and
         φ2 + θ.
         """
-        contact, line, relative = self.contact, None, motion.relative
+        contact, line, relative = self.contact.on_side(side), None, motion.relative
         if motion.shift is not None:
             x, y = motion.shift[1] - motion.shift[0]
             line = jnp.stack([contact.center_distance + x, y])
@@ -424,6 +440,38 @@ class RotorPair(eqx.Module):
             flags, counts = jnp.append(flags, drives), jnp.append(counts, True)
         flags = jnp.concatenate([flags, *(part.switches(motion, own) for part, own in acting)])
         return flags, jnp.pad(counts, (0, flags.size - counts.size), constant_values=True)
+
+    def margins(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> Margins:
+        """Return the `Margins` at rotation `tau` (mesh periods) and scaled `state`."""
+        motion, acting = self._moving(tau, state)
+
+        def of_flank(side):
+            touch = self._touch(side, motion)
+            found = [
+                self.law.margins(touch.depth, touch.closing),
+                self.contact.on_side(side).margins(touch.roll, touch.approach),
+            ]
+            if touch.sliding is not None:
+                speed = touch.sliding.speed
+                found += [part.drag_margins(speed) for part in self.all_parts if part.rubs]
+            pushes = self.law(touch.depth, touch.closing) > 0
+            values = jnp.concatenate(found)
+            return values, jnp.full(values.shape, pushes), touch.approach.place, pushes
+
+        if self.two_sided:
+            sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)
+            values, counts, both, pushes = jax.vmap(of_flank)(sides)
+            places = [jax.tree.map(lambda x, k=k: x[k], both) for k in range(2)]
+            values, counts = [values.ravel()], [counts.ravel()]
+        else:
+            one = jnp.ones((), self.angle_scale.dtype)
+            values, counts, place, push = of_flank(jnp.where(motion.relative < 0, one, -one))
+            values, counts = [values, -motion.relative[None]], [counts, counts[:1]]
+            places, pushes = [place], push[None]
+        values += [part.margins(motion, own) for part, own in acting]
+        found, counted = jnp.concatenate(values), jnp.concatenate(counts)
+        counted = jnp.pad(counted, (0, found.size - counted.size), constant_values=True)
+        return Margins(found, counted, places, pushes)
 
     def derivative(
         self, tau: Float[Array, ""], state: Float[Array, " n"]

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.dynamics.collocation.closing import supported
+from rootsopt.dynamics.collocation.motion import collocated
 from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
@@ -50,6 +52,9 @@ class Solver(eqx.Module):
     orbit may count as closed; `samples`: number of uniform samples of an orbit; `check`: whether to
     compare the derivatives with those on halved steps; `attempts`: maximum number of attempts;
     `windows`: length of a window (mesh periods), a multiple of 16; 0: no window.
+
+    `closing`: how orbits are closed: `shooting`, `collocation`, or `auto` (collocation, and
+    shooting if it fails). Only shooting closes orbits of pairs that collocation does not support.
     """
 
     transient: Integrator
@@ -65,6 +70,7 @@ class Solver(eqx.Module):
     check: bool = eqx.field(static=True, default=True)
     attempts: int = eqx.field(static=True, default=16)
     windows: int = eqx.field(static=True, default=PERIODS)
+    closing: str = eqx.field(static=True, default="shooting")
 
 
 class Steady(NamedTuple):
@@ -73,7 +79,8 @@ class Steady(NamedTuple):
     `status`: code of a `Status`; `orbit`: the orbit found, or the last one tried; `period` (mesh
     periods), `rtol` and `verdict`: length and tolerance of this orbit, and the results of its
     checks; `window` of a motion that did not settle; `settled`: end of the transient; `used`: mesh
-    periods of all transients; `steps`: solver steps of transients and orbits.
+    periods of all transients; `steps`: solver steps of transients and orbits;
+    `collocated`: whether the orbit was closed by collocation.
     """
 
     status: Int[Array, ""]
@@ -85,6 +92,7 @@ class Steady(NamedTuple):
     settled: Transient
     used: Int[Array, ""]
     steps: Int[Array, ""]
+    collocated: Bool[Array, ""]
 
     @property
     def forces(self) -> Float[Array, " r"]:
@@ -168,6 +176,7 @@ class _Attempts(eqx.Module):
             settled=Transient(state, zero, one, infinite, zero, no, ~no, zero),
             used=zero,
             steps=zero,
+            collocated=no,
         )
         coarse, fine = solver.transient.rtol, solver.orbit.rtol
         within = settled_within(coarse).astype(dtype)
@@ -228,6 +237,7 @@ class _Attempts(eqx.Module):
             settled=settled,
             used=used,
             steps=steps + jnp.where(now.windowed, 0, orbit.flow.steps),
+            collocated=found.collocated,
         )
         return self._next(now, new, within, lost, taken & shorter)
 
@@ -306,6 +316,44 @@ class _Attempts(eqx.Module):
             return jnp.asarray(Status.NOT_SETTLED.code)
         return window_status(self.pair, window)
 
+    def collocated(self, state: Float[Array, " n"]) -> Steady:
+        """Return the motion that the scaled `state` leads to, its orbit closed by collocation.
+
+        The status is `NOT_SETTLED` where there is no orbit that is sound, stable and near the end
+        of the transient, and that an integration confirms."""
+        solver, empty = self.solver, self.start(state).found
+        within = settled_within(solver.transient.rtol).astype(state.dtype)
+        periods = solver.max_periods.astype(int)
+        settled = settle(self.pair, state, solver.transient, within, periods, solver.max_orbit)
+        failure = transient_status(self.pair, settled)
+        period = jnp.maximum(settled.period, 1)
+        lost = empty._replace(
+            status=failure, settled=settled, used=settled.periods, steps=settled.steps
+        )
+
+        def close() -> Steady:
+            made = collocated(
+                self.pair,
+                self.tangents,
+                (settled.state, period),
+                (solver.transient, solver.orbit),
+                solver.measures,
+                (solver.samples, solver.max_orbit),
+            )
+            judged, status = self._judged(made.orbit, settled.state, solver.orbit.rtol, within)
+            unknown = among(status, (Status.PERIODIC, Status.INACCURATE)) & ~made.verified
+            status = jnp.where(unknown, Status.NOT_SETTLED.code, status)
+            return lost._replace(
+                status=status,
+                orbit=made.orbit,
+                period=period,
+                verdict=judged,
+                steps=settled.steps + made.orbit.flow.steps,
+                collocated=jnp.ones((), bool),
+            )
+
+        return self.final(lax.cond(failure < 0, close, lambda: lost))
+
     def final(self, found: Steady) -> Steady:
         """Return `found`, with a different status if the forces of its orbit are not valid.
 
@@ -367,7 +415,16 @@ def steady_motion(
     """
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     attempts = _Attempts(pair, tangents, solver, radius)
-    search = lax.while_loop(
-        lambda now: ~now.over, lambda now: attempts.step(now), attempts.start(state)
-    )
-    return attempts.final(search.found)
+
+    def shooting() -> Steady:
+        search = lax.while_loop(
+            lambda now: ~now.over, lambda now: attempts.step(now), attempts.start(state)
+        )
+        return attempts.final(search.found)
+
+    if solver.closing == "shooting" or solver.precision != "float64" or not supported(pair):
+        return shooting()
+    found = attempts.collocated(state)
+    if solver.closing == "collocation":
+        return found
+    return lax.cond(found.status == Status.PERIODIC.code, lambda: found, shooting)

@@ -407,7 +407,8 @@ class Evaluator:
             return {}
         orbit, solver = found.orbit, self.scene.solver
         sensitivity = orbit.sensitivity
-        if self.config.solver.gradient == "reverse":
+        # Collocation has them already, and no steps to go back through.
+        if self.config.solver.gradient == "reverse" and not bool(found.collocated):
             settings = np.asarray(found.period), solver.orbit, solver.measures
             sensitivity = _reverse(self.scene, design, orbit, *settings)
         rows = np.column_stack([orbit.response, sensitivity])
@@ -447,6 +448,8 @@ def _orbit_statistics(found: Steady) -> dict[str, int | float]:
         "orbit_defect": float(orbit.defect),
         "force_rounding": float(found.verdict.rounding),
     }
+    if bool(found.collocated):
+        statistics["collocated"] = 1
     if np.isfinite(orbit.disagreement):  # Infinite: there was no room for a comparison.
         statistics["gradient_disagreement"] = float(orbit.disagreement)
     return statistics

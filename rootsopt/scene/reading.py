@@ -157,6 +157,7 @@ def solver_of(config: Config) -> Solver:
         examine=jnp.asarray(1.0),
         max_orbit=settings.max_orbit_periods,
         precision=settings.precision,
+        closing=settings.orbit,
     )
 
 

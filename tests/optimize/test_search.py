@@ -29,6 +29,7 @@ def searching(truth=lambda point: 1.0, **settings) -> Search:
     search = object.__new__(Search)
     search.stop, search._refuted, search._trials = threading.Event(), [], []
     search._found, search.checkpoint, search.noisy = {}, None, True
+    search.method = settings.get("method")
     search.settings = types.SimpleNamespace(screening=0, seed=0, starts=2)
     vars(search.settings).update(settings)
     search.problem = types.SimpleNamespace(

@@ -187,6 +187,20 @@ class Part(eqx.Module):
         del sliding
         return jnp.zeros(0, bool)
 
+    # Numbers that are positive where these flags are set. Each is smooth across the instant at
+    # which its flag changes, and zero there. Collocation needs them; a part that has flags but no
+    # margins is left to shooting.
+
+    def margins(self, motion: Motion, own: Own) -> Float[Array, " s"]:
+        """Return numbers that are positive where the flags of `switches` are set."""
+        del motion, own
+        return jnp.zeros(0)
+
+    def drag_margins(self, sliding: Float[Array, ""]) -> Float[Array, " s"]:
+        """Return numbers that are positive where the flags of `drag_switches` are set."""
+        del sliding
+        return jnp.zeros(0)
+
     # Data from which the solver chooses its steps.
 
     @property

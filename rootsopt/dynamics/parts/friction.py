@@ -39,3 +39,7 @@ class Friction(Part):
         and ±`friction_speed`."""
         speeds = jnp.stack([self.stiction_speed, self.friction_speed])
         return sliding > jnp.concatenate([speeds, -speeds])
+
+    def drag_margins(self, sliding: Float[Array, ""]) -> Float[Array, "4"]:
+        speeds = jnp.stack([self.stiction_speed, self.friction_speed])
+        return sliding - jnp.concatenate([speeds, -speeds])

@@ -65,6 +65,11 @@ class TimingGear(Part):
         excess = jnp.abs(self._from_middle(motion.relative)) - self.half_backlash
         return excess > jnp.stack([jnp.zeros_like(self.rounding), self.rounding])
 
+    def margins(self, motion: Motion, own) -> Float[Array, "2"]:
+        del own
+        excess = jnp.abs(self._from_middle(motion.relative)) - self.half_backlash
+        return excess - jnp.stack([jnp.zeros_like(self.rounding), self.rounding])
+
     def _from_middle(self, relative):
         """Return ε (rad) relative to the middle of the backlash."""
         return relative if self.offset is None else relative - self.offset

@@ -138,3 +138,12 @@ class GasLoad(Load):
         ends = [segment.stop for segment in self.profile.segments()[:-1]]
         passed = [self.profile.normal_at(addendum) > end for end in ends]
         return jnp.stack([jnp.sin(phi * self.profile.lobes) > 0, roll > half, *passed])
+
+    def margins(self, motion, own) -> Float[Array, " s"]:
+        del own
+        phi, half = motion.phi, self.profile.half_pitch
+        roll = self._roll(phi)
+        addendum = half - jnp.abs(roll - half)
+        ends = [segment.stop for segment in self.profile.segments()[:-1]]
+        passed = [self.profile.normal_at(addendum) - end for end in ends]
+        return jnp.stack([jnp.sin(phi * self.profile.lobes), roll - half, *passed])

@@ -1,0 +1,108 @@
+"""Contact near a known closest approach, without a search."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from rootsopt.contact.closest import ClosestApproach, FlankPair, contact_begins
+from rootsopt.contact.gap import Approach, Contact
+from rootsopt.contact.point import ContactPoint, contact_point
+
+_FARTHEST = 0.06
+"""Newton step (rad) above which a pose counts as one without a common normal."""
+_BEYOND = 0.05
+"""Normal angle (rad) beyond the search's nodes up to which a root is accepted."""
+
+
+class NearContact(Contact):
+    """Gap and levers from one Newton step, next to a closest approach that is already known.
+
+    `pair`: the flanks; `roots` (sides, 2): normal angles ν2 (rad) near the closest approach and,
+    for flanks with a cusp, near the other minimum of the gap. There is one row for the flanks that
+    can touch or, if both sides can, one for the drive and one for the coast flanks.
+
+    T is linearised at the root, which gives ν2 to second order in the distance from it. Repeated
+    evaluations, each from the roots that the last one returned in `Approach.place`, converge like
+    Newton's method. Derivatives follow the root (implicit function theorem).
+    """
+
+    pair: FlankPair
+    roots: Float[Array, "sides 2"]
+
+    @property
+    def jumps(self) -> bool:
+        """Whether the levers may jump from one minimum of the gap to another of equal depth."""
+        return self.pair.profile.cusp or not self.pair.rolling
+
+    @property
+    def two_sided(self) -> bool:
+        return True
+
+    @property
+    def length_scale(self) -> Float[Array, ""]:
+        return self.pair.center_distance / 2
+
+    @property
+    def center_distance(self) -> Float[Array, ""]:
+        return jnp.asarray(self.pair.center_distance)
+
+    def __call__(self, roll, relative):
+        return self.approach(roll, relative)[:3]
+
+    def at_distance(self, distance: Float[Array, ""]) -> "NearContact":
+        return eqx.tree_at(lambda contact: contact.pair.center_distance, self, distance)
+
+    def on_side(self, side: Float[Array, ""]) -> "NearContact":
+        if self.roots.shape[0] == 1:
+            return self
+        own = jnp.where(side > 0, self.roots[:1], self.roots[1:])
+        return eqx.tree_at(lambda contact: contact.roots, self, own)
+
+    def approach(self, roll, relative) -> Approach:
+        found, rival = self._moved(0, roll, relative), None
+        if self.pair.profile.cusp:
+            rival = self._moved(1, roll, relative)
+        return Approach(found.gap, found.lever1, found.lever2, (found, rival))
+
+    def point(self, roll, relative, approach: Approach) -> ContactPoint:
+        return contact_point(self.pair, roll, relative, approach.place[0])
+
+    def margins(self, roll, approach: Approach) -> Float[Array, " s"]:
+        found, rival = approach.place
+        other = found.gap if rival is None else rival.gap
+        return self.pair.margins(roll, found, other)
+
+    def _moved(self, which: int, roll, relative) -> ClosestApproach:
+        """Return the closest approach one Newton step from the root of this number."""
+        pair = self.pair
+        root = lax.stop_gradient(self.roots[0, which])
+        folded, mirrored = pair.folded(roll)
+        here, turned = jax.jvp(
+            lambda normal: pair._mesh(normal, folded, relative), (root,), (jnp.ones_like(root),)
+        )
+        turned = lax.stop_gradient(turned)
+        offset, gap, normal1, lever1, lever2 = here
+        falls = turned[0] < 0
+        step = jnp.where(falls, -offset / jnp.where(falls, turned[0], -1.0), 0.0)
+        low, high = pair.nodes.normal[0] - _BEYOND, pair.nodes.normal[-1] + _BEYOND
+        present = falls & (jnp.abs(step) < _FARTHEST) & (root > low) & (root < high)
+        present &= folded >= contact_begins(relative)
+        step = jnp.clip(step, -_FARTHEST, _FARTHEST)
+        # The gap is stationary at the root: half a step's slope is its mean over the step.
+        gap = gap + turned[1] * step / 2
+        lever1, lever2 = lever1 + turned[3] * step, lever2 + turned[4] * step
+        first, second = (
+            jnp.where(mirrored, lever2, lever1),
+            jnp.where(mirrored, lever1, lever2),
+        )
+        away = lax.stop_gradient(pair.profile.pitch_radius)
+        return ClosestApproach(
+            gap=jnp.where(present, gap, away),
+            lever1=jnp.where(present, first, 0.0),
+            lever2=jnp.where(present, second, 0.0),
+            normal1=normal1 + turned[2] * step,
+            normal2=root + step,
+            found=present,
+        )

@@ -1,0 +1,236 @@
+"""Close a periodic orbit by collocation: events, mesh and orbit until all three agree.
+
+One loop does everything, so that each program is compiled once. A turn looks at the flags of the
+equation along the orbit. If they change where the mesh does not expect it, the elements are aligned
+with the events found. If they agree, Newton's method solves for orbit and events, and the flags are
+looked at again. An orbit whose flags agree is solved once more on a finer mesh, shared out by the
+error of the coarser one; the difference of the two is the error estimate.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from rootsopt.contact.search import SearchContact
+from rootsopt.dynamics.collocation.blocks import BLOCK
+from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.equation import Equation
+from rootsopt.dynamics.collocation.events import Events, found_events, look, rooted
+from rootsopt.dynamics.collocation.forces import Found, response
+from rootsopt.dynamics.collocation.mesh import aligned, counted, needed
+from rootsopt.dynamics.collocation.newton import newton
+from rootsopt.dynamics.orbit import choose
+from rootsopt.dynamics.pair import RotorPair
+
+_FIRST, _EVENT = 20, 1
+"""Elements of the first mesh: per mesh period, and in addition for each event."""
+_FINER = 1.4
+"""Factor by which a finer mesh has more elements."""
+_MOST = 96
+"""Greatest number of elements per mesh period."""
+_TIMES = 48
+"""Greatest number of events per mesh period."""
+_TURNS = 24
+"""Maximum number of turns of the loop."""
+_CORRECTED = 1e-6
+"""Last correction (scaled) above which an orbit is rejected."""
+_FAILURES = 4
+"""Maximum number of times that Newton's method may not converge."""
+_SMALL = 3e-9
+"""Newton step (scaled) at which an orbit is closed. The next one would be of its square."""
+_GAIN = 10.0
+"""Factor by which the error of the finer of two meshes is below their difference. With
+superconvergent elements it is larger (1.4⁸)."""
+
+
+class Closed(NamedTuple):
+    """A closed orbit.
+
+    `found`: its forces and derivatives; `error`: estimated relative error of mean, RMS and peak
+    force; `drift`: the same of the derivatives, relative to the largest of each force; `sound`:
+    whether Newton's method converged and the flags agree with the events of the mesh; `events`:
+    their number; `turns`: turns of the loop; `steps`: Newton steps.
+    """
+
+    found: Found
+    error: Float[Array, ""]
+    drift: Float[Array, ""]
+    sound: Bool[Array, ""]
+    events: Int[Array, ""]
+    turns: Int[Array, ""]
+    steps: Int[Array, ""]
+
+
+class _Loop(NamedTuple):
+    """State of the loop: the result so far, and the elements of the next turn.
+
+    `force` (e, s): contact force (N) at the Gauss points; `fits`: whether the elements end at
+    events; `solved`: whether Newton's method has converged on them; `failures`: how often it did
+    not; `meshes`: number of meshes on which the orbit was solved; `over`: whether the loop ends.
+    """
+
+    closed: Closed
+    elements: Elements
+    force: Float[Array, "e s"]
+    fits: Bool[Array, ""]
+    solved: Bool[Array, ""]
+    failures: Int[Array, ""]
+    meshes: Int[Array, ""]
+    over: Bool[Array, ""]
+
+
+def supported(pair: RotorPair) -> bool:
+    """Return whether collocation can solve for the orbits of `pair`.
+
+    It needs a contact by search, and margins for all flags."""
+    owners = [pair.law, *pair.all_parts]
+    names = [("margins", "switches"), ("drag_margins", "drag_switches")]
+    known = all(
+        _newer(type(owner), margin, flag)
+        for owner in owners
+        for margin, flag in names
+        if hasattr(owner, flag)
+    )
+    return known and isinstance(pair.contact, SearchContact)
+
+
+def _newer(kind: type, margin: str, flag: str) -> bool:
+    """Return whether a class defines `margin` where, or after, it defines `flag`."""
+    order = list(kind.__mro__)
+    places = [
+        next(k for k, base in enumerate(order) if name in vars(base)) for name in (margin, flag)
+    ]
+    return places[0] <= places[1]
+
+
+def sizes(periods: int) -> tuple[int, int]:
+    """Return the room for elements and for times of orbits of up to `periods` mesh periods."""
+    elements = -(-(periods * _MOST) // BLOCK) * BLOCK
+    return elements, periods * _TIMES + 3
+
+
+def first_elements(period: Int[Array, ""]) -> Int[Array, ""]:
+    """Return the number of elements of a first mesh without events."""
+    return jnp.asarray(2 * _FIRST * period)
+
+
+def close(
+    equation: Equation,
+    tangents: Any,
+    elements: Elements,
+    tolerance: Float[Array, ""],
+    known: Bool[Array, ""] | bool = False,
+) -> Closed:
+    """Close the orbit near the motion `elements`, to a relative error `tolerance` of its forces.
+
+    `tangents`: directions (d, …) of the pair's parameters for the derivatives; `known`: whether the
+    elements end at events, such as those of the orbit of a similar pair. With a `tolerance` of inf,
+    the orbit is solved on one mesh only, without an error estimate."""
+    pair = jax.lax.stop_gradient(equation.pair)
+    capacity, room = elements.state.shape[0], elements.mesh.times.shape[0]
+
+    def go_on(now: _Loop):
+        return ~now.over & (now.closed.turns < _TURNS)
+
+    def turn(now: _Loop) -> _Loop:
+        seen = look(pair, now.elements)
+        events = found_events(pair, now.elements, seen, room)
+        agree = now.fits & (events.new == 0) & (events.gone == 0)
+        done = agree & now.solved
+        new = lax.cond(
+            agree,
+            lambda: lax.cond(now.solved, lambda: keep(now, events), lambda: solve(now, seen)),
+            lambda: now,
+        )
+        over = new.over | ~events.fits
+        new = lax.cond((done | ~agree) & ~over, lambda: align(new, events, done), lambda: new)
+        closed = new.closed._replace(turns=now.closed.turns + 1)
+        return new._replace(closed=closed, over=over)
+
+    def align(now: _Loop, events: Events, finer) -> _Loop:
+        """Move the motion to a mesh that ends at its events, and is finer if asked for."""
+        taken = now.elements.mesh.used
+        first = taken // 2 + _EVENT * events.count
+        used = jnp.where(now.fits, jnp.where(finer, (_FINER * taken).astype(int), taken), first)
+        used = jnp.clip(used, events.count + 2, capacity - 1)
+        (place, wanted), (spot, number) = needed(now.elements), counted(now.elements)
+        density = jnp.where(now.fits, place, spot), jnp.where(now.fits, wanted, number)
+        new = aligned(now.elements, (events.times, events.which), density, used)
+        return now._replace(elements=new, fits=jnp.ones((), bool), solved=jnp.zeros((), bool))
+
+    def solve(now: _Loop, seen) -> _Loop:
+        got = newton(equation, rooted(now.elements, seen), jnp.asarray(_SMALL))
+        good = got.size <= 10 * _SMALL
+        closed = now.closed._replace(steps=now.closed.steps + got.turns)
+        # A step that leads out of the mesh's events is tried again with those found on its way.
+        failures = now.failures + ~good
+        return now._replace(
+            closed=closed,
+            elements=got.elements,
+            force=got.force,
+            solved=good,
+            failures=failures,
+            over=~jnp.isfinite(got.size) | (failures > _FAILURES),
+        )
+
+    def keep(now: _Loop, events: Events) -> _Loop:
+        """Keep the forces of an orbit whose flags agree."""
+        found = response(equation, now.elements, now.force, tangents)
+        error, drift = _differences(now.closed.found, found)
+        first = now.meshes == 0
+        error, drift = (jnp.where(first, jnp.inf, x / _GAIN) for x in (error, drift))
+        full = now.elements.mesh.used >= capacity - 1
+        # Newton's method has converged: a large correction, or none, comes from a margin that is
+        # not regular at its event.
+        good = found.correction < _CORRECTED
+        kept = now.closed
+        closed = kept._replace(
+            found=choose(good, found, kept.found),
+            error=jnp.where(good, error, kept.error),
+            drift=jnp.where(good, drift, kept.drift),
+            sound=kept.sound | good,
+            events=jnp.where(good, events.count, kept.events),
+        )
+        return now._replace(
+            closed=closed,
+            elements=found.elements,
+            meshes=now.meshes + 1,
+            over=(error <= tolerance) | full | ~good,
+        )
+
+    nothing = _nothing(equation, tangents, elements)
+    no, zero = jnp.zeros((), bool), jnp.zeros((), int)
+    start = _Loop(
+        nothing, elements, elements.slopes[..., 0], jnp.asarray(known), no, zero, zero, no
+    )
+    return lax.while_loop(go_on, turn, start).closed
+
+
+def _differences(before: Found, after: Found):
+    """Return the relative differences of forces, and of their derivatives."""
+
+    def rms(values):
+        return values.at[1].set(jnp.sqrt(jnp.maximum(values[1], 0.0)))[:3]
+
+    one, other = rms(before.response), rms(after.response)
+    size = jnp.maximum(jnp.abs(other), 1e-30)
+    error = jnp.max(jnp.abs(one - other) / size)
+    slopes = jnp.max(jnp.abs(before.sensitivity - after.sensitivity), axis=1, initial=0.0)
+    largest = jnp.max(jnp.abs(after.sensitivity), axis=1, initial=0.0)
+    drift = jnp.max((slopes / jnp.where(largest > 0, largest, 1.0))[:3])
+    return error, drift
+
+
+def _nothing(equation: Equation, tangents: Any, elements: Elements) -> Closed:
+    """Return the result before the first turn."""
+    shape = jax.eval_shape(lambda: response(equation, elements, elements.slopes[..., 0], tangents))
+    empty: Found = jax.tree.map(lambda x: jnp.full(x.shape, 0, x.dtype), shape)
+    infinite, zero = jnp.asarray(jnp.inf), jnp.zeros((), int)
+    no = jnp.zeros((), bool)
+    return Closed(empty, infinite, infinite, no, zero, zero, zero)
+
+
+__all__ = ["Closed", "close", "first_elements", "sizes", "supported"]

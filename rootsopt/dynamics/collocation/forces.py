@@ -1,0 +1,239 @@
+"""Forces of a closed orbit, its multipliers, and the derivatives of both.
+
+The derivatives with respect to parameters solve the same linear equations as Newton's step, with
+the derivatives of the equation and of the margins as right-hand sides. Events move with the
+parameters and the elements with the events, so that no kink or jump crosses a Gauss point.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from rootsopt.dynamics.collocation.blocks import in_blocks
+from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.equation import Equation, Point
+from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.collocation.newton import lines
+from rootsopt.dynamics.collocation.system import (
+    Columns,
+    Step,
+    chained,
+    condensed,
+    moved_places,
+    own_column,
+)
+
+_RIVALS, _PLACES = 4, 9
+"""Number of elements in which the peak is searched for, and of places tried in each at once."""
+_ROUNDS, _CLOSER = 14, 0.25
+"""Number of rounds of the search, and the factor by which each shortens its range."""
+
+
+_MENDED = 3
+"""Evaluations at each place; the contact's roots converge with them."""
+
+
+class Peak(NamedTuple):
+    """The greatest force of an orbit.
+
+    `element`: its number; `share`: place inside it, 0 … 1; `roots` (sides, 2) of the contact there;
+    `force` (N).
+    """
+
+    element: Int[Array, ""]
+    share: Float[Array, ""]
+    roots: Float[Array, "sides 2"]
+    force: Float[Array, ""]
+
+
+class Found(NamedTuple):
+    """Results of a closed orbit, with derivatives along d directions of the parameters.
+
+    `elements` after a last correction; `response` (r,): mean (N), mean square (N²), peak (N) and
+    the other measures; `sensitivity` (r, d); `state` (n,) at φ1 = 0 and `moved` (n, d); `monodromy`
+    (n, n) of the start of the mesh; `depth`: greatest penetration at the places of the mesh (m);
+    `peak`; `correction`: size of the last correction (scaled).
+    """
+
+    elements: Elements
+    response: Float[Array, " r"]
+    sensitivity: Float[Array, "r d"]
+    state: Float[Array, " n"]
+    moved: Float[Array, "n d"]
+    monodromy: Float[Array, "n n"]
+    depth: Float[Array, ""]
+    peak: Peak
+    correction: Float[Array, ""]
+
+
+def _inside(elements: Elements, k: Any, share: Any) -> tuple[Array, Array, Array]:
+    """Return time, state and roots (by the polynomial of the Gauss points) inside an element."""
+    begin, length = elements.mesh.ends[0][k], elements.mesh.lengths[k]
+    rise = jnp.sum(GAUSS.integrated(share)[:, None] * elements.slopes[k], axis=0)
+    weights = GAUSS.lagrange(share)
+    roots = jnp.sum(weights[:, None, None] * elements.roots[k, : len(GAUSS.nodes)], axis=0)
+    return begin + length * share, elements.state[k] + length * rise, roots
+
+
+def located_peak(equation: Equation, elements: Elements, force: Float[Array, "e s"]) -> Peak:
+    """Return the greatest force; `force` (N): that at the Gauss points.
+
+    Inside an element the force is smooth, so that the polynomial through the Gauss points tells in
+    which elements the peak may lie. In these it is searched for by ever closer scans. The ends of
+    an element are its own: a peak on a corner is found at the event, and moves with it."""
+    shares = jnp.linspace(0.0, 1.0, _PLACES)
+    used = jnp.arange(force.shape[0]) < elements.mesh.used
+    smooth = force @ GAUSS.lagrange(shares).T
+    highest = jnp.where(used, jnp.max(smooth, axis=1), -jnp.inf)
+    rivals = lax.top_k(highest, _RIVALS)[1]
+    spread = jnp.linspace(-1.0, 1.0, _PLACES)
+
+    def at(k, share, roots):
+        tau, state, _ = _inside(elements, k, share)
+        found = equation.force(tau, state, roots)
+        return found
+
+    each = jax.vmap(jax.vmap(at, (None, 0, 0)))
+
+    def round_(number, carry):
+        share, roots, _ = carry
+        reach = 0.5 * _CLOSER ** number.astype(force.dtype)
+        tried = jnp.clip(share[:, None] + reach * spread, 0.0, 1.0)
+        first = jax.vmap(lambda k, places: jax.vmap(lambda x: _inside(elements, k, x)[2])(places))
+        begun = jnp.where(number < 2, first(rivals, tried), roots[:, None])
+        # Polynomials through the roots are poor near the ends: the first step only mends them.
+        forces, new = lax.fori_loop(
+            0,
+            _MENDED,
+            lambda _, found: each(rivals, tried, found[1]),
+            (jnp.zeros_like(tried), begun),
+        )
+        top = jnp.argmax(forces, axis=1)
+        pick = jax.vmap(lambda x, i: x[i])
+        return pick(tried, top), pick(new, top), pick(forces, top)
+
+    half = jnp.full(_RIVALS, 0.5, force.dtype)
+    begun = jnp.zeros((_RIVALS, *elements.roots.shape[2:]), force.dtype)
+    share, roots, best = lax.fori_loop(0, _ROUNDS, round_, (half, begun, half))
+    top = jnp.argmax(best)
+    return Peak(rivals[top], share[top], roots[top], best[top])
+
+
+def response(equation: Equation, elements: Elements, force: Any, tangents: Any) -> Found:
+    """Return forces and derivatives of the closed orbit `elements`.
+
+    `force` (e, s): contact force (N) at the Gauss points; `tangents`: directions (d, …) of the
+    pair's parameters. The mesh needs room for one more element."""
+    mesh = elements.mesh
+    count, inside = elements.state.shape[1], len(GAUSS.nodes)
+    peak = located_peak(equation, elements, force)
+    # The peak is one more place, evaluated with the others.
+    tau, state = elements.places
+    at_peak = _inside(elements, peak.element, peak.share)
+    extra = mesh.used
+    tau, state = tau.at[extra].set(at_peak[0]), state.at[extra].set(at_peak[1])
+    roots = elements.roots.at[extra].set(peak.roots)
+    which = jnp.maximum(mesh.which[mesh.interval + 1], 0)
+
+    def both(tau, state, roots, which):
+        return equation.along(tau, state, roots, which, tangents)
+
+    each = jax.vmap(jax.vmap(both, (0, 0, 0, None)))
+    points, along = in_blocks(each, extra + 1, tau, state, roots, which)
+    found = lines(elements, points)
+    own = own_column(elements, found)
+    width = along.shape[-1]
+    columns = Columns(
+        slope=jnp.concatenate([own.slope, along[:, :inside, :count]], axis=-1),
+        gap=jnp.pad(own.gap, ((0, 0), (0, 0), (0, width))),
+        margin=jnp.concatenate([own.margin, along[:, inside, -1]], axis=-1),
+    )
+    step = chained(elements, found, columns, condensed(elements, found, columns))
+    raw, changes = _averages(equation, elements, points, along, step)
+    unit = lax.stop_gradient(equation.pair.force_scale)
+    top = lax.stop_gradient(equation.top) / unit
+    averages, factors = equation.measures.values(raw, unit, top)
+    by_averages = changes * factors[:, None]
+    height, by_height = _height(equation, elements, step, peak, (points, along))
+    values = jnp.concatenate([averages[:2], height[None], averages[2:]])
+    slopes = jnp.concatenate([by_averages[:2], by_height[None], by_averages[2:]])
+    values = values + slopes[:, 0]
+    origin = _origin(elements)
+    corrected = Elements(
+        mesh._replace(times=mesh.times + step.times[:, 0]),
+        elements.state + step.state[..., 0],
+        elements.slopes + step.slopes[..., 0],
+        points.roots.at[extra].set(elements.roots[extra]),
+    )
+    used = (jnp.arange(tau.shape[0]) < mesh.used)[:, None]
+    return Found(
+        elements=corrected,
+        response=values,
+        sensitivity=slopes[:, 1:],
+        state=corrected.state[origin],
+        moved=step.state[origin, :, 1:],
+        monodromy=step.monodromy,
+        depth=jnp.max(jnp.where(used, points.depth, -jnp.inf)),
+        peak=peak,
+        correction=jnp.max(jnp.abs(step.state[..., 0])),
+    )
+
+
+def _averages(equation: Equation, elements: Elements, points: Point, along, step: Step):
+    """Return the averages of the integrands, and their changes for all columns."""
+    mesh = elements.mesh
+    count, inside = elements.state.shape[1], len(GAUSS.nodes)
+    rates = slice(count, count + equation.rates)
+    times, states = moved_places(elements, step)
+    value, bend = points.values[:, :inside, rates], points.slopes[:, :inside, rates]
+    change = bend[..., :1] * times[:, :, None]
+    change += jnp.sum(bend[..., 1:, None] * states[:, :, None], axis=-2)
+    change = change.at[..., 1:].add(along[:, :inside, rates])
+    left, right = step.times[mesh.interval], step.times[mesh.interval + 1]
+    longer = (mesh.right - mesh.left)[:, None] * (right - left)
+    weights = GAUSS.weights[:, None]
+    part = jnp.sum(weights * value, axis=1)
+    by_part = jnp.sum(weights[..., None] * change, axis=1)
+    used = (jnp.arange(part.shape[0]) < mesh.used)[:, None]
+    total = jnp.sum(jnp.where(used, mesh.lengths[:, None] * part, 0.0), axis=0)
+    moved = mesh.lengths[:, None, None] * by_part + part[..., None] * longer[:, None]
+    moved = jnp.sum(jnp.where(used[..., None], moved, 0.0), axis=0)
+    if not equation.pair.free:
+        return total / mesh.period, moved / mesh.period
+    duration, kept = total[-1], total[:-1] / total[-1]
+    return kept, (moved[:-1] - kept[:, None] * moved[-1]) / duration
+
+
+def _height(equation: Equation, elements: Elements, step: Step, peak: Peak, evaluated: Any):
+    """Return the peak (N) and its changes for all columns."""
+    points, along = evaluated
+    mesh, extra = elements.mesh, elements.mesh.used
+    count, k = elements.state.shape[1], peak.element
+    rates = slice(count, count + equation.rates)
+    value, bend = points.values[extra, 0, rates], points.slopes[extra, 0, rates]
+    begin, end = mesh.interval[k], mesh.interval[k] + 1
+    share = mesh.right[k] - mesh.left[k]
+    place = mesh.left[k] + share * peak.share
+    time = step.times[begin] * (1 - place) + step.times[end] * place
+    weights = GAUSS.integrated(peak.share)[:, None]
+    longer = share * (step.times[end] - step.times[begin])
+    state = step.state[k] + mesh.lengths[k] * jnp.sum(weights[..., None] * step.slopes[k], axis=0)
+    state += jnp.sum(weights * elements.slopes[k], axis=0)[:, None] * longer
+    change = bend[:, :1] * time + bend[:, 1:] @ state
+    change = change.at[:, 1:].add(along[extra, 0, rates])
+    unit = lax.stop_gradient(equation.pair.force_scale)
+    if not equation.pair.free:
+        return unit * value[0], unit * change[0]
+    force = value[0] / value[-1]
+    return unit * force, unit * (change[0] - force * change[-1]) / value[-1]
+
+
+def _origin(elements: Elements) -> Int[Array, ""]:
+    """Return the number of the element that begins at φ1 = 0."""
+    mesh = elements.mesh
+    begin = mesh.ends[0]
+    away = jnp.abs(begin - mesh.period * jnp.round(begin / mesh.period))
+    return jnp.argmin(jnp.where(jnp.arange(begin.shape[0]) < mesh.used, away, jnp.inf))

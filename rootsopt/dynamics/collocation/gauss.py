@@ -1,0 +1,53 @@
+"""Gauss points of an element, and the polynomial through the slopes at these points.
+
+On an element of length h, the state is z(σ) = z(0) + h Σ a_j(σ) k_j for 0 ≤ σ ≤ 1. The k_j are the
+slopes at the Gauss points c_j, and a_j is the integral of the j-th Lagrange polynomial. At the
+element's end the error is of order 2s, inside it of order s + 1 (de Boor and Swartz, SIAM J. Numer.
+Anal. 10 (1973) 582-606).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+POINTS = 4
+"""Gauss points of an element."""
+
+
+class Gauss(NamedTuple):
+    """Rule with s points on 0 … 1.
+
+    `nodes` (s,): c; `weights` (s,): b; `integral` (s, s): a_j(c_i), the Runge-Kutta matrix;
+    `powers` (s, s): from values at the points to coefficients of powers of σ.
+    """
+
+    nodes: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    integral: NDArray[np.float64]
+    powers: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, count: int) -> "Gauss":
+        """Return the rule with `count` points."""
+        node, weight = np.polynomial.legendre.leggauss(count)
+        node, weight = (node + 1) / 2, weight / 2
+        powers = np.asarray(np.linalg.inv(np.vander(node, count, increasing=True)), np.float64)
+        order = np.arange(1, count + 1)
+        integral = (node[:, None] ** order / order) @ powers
+        return cls(node, weight, integral, powers)
+
+    def lagrange(self, share: Float[Array, "*m"]) -> Float[Array, "*m s"]:
+        """Return the Lagrange polynomials at σ = `share`."""
+        order = np.arange(len(self.nodes))
+        return share[..., None] ** order @ jnp.asarray(self.powers)
+
+    def integrated(self, share: Float[Array, "*m"]) -> Float[Array, "*m s"]:
+        """Return the integrals a_j of the Lagrange polynomials from 0 to σ = `share`."""
+        order = np.arange(1, len(self.nodes) + 1)
+        return (share[..., None] ** order / order) @ jnp.asarray(self.powers)
+
+
+GAUSS = Gauss.of(POINTS)

@@ -1,0 +1,161 @@
+"""Meshes: elements shared out among the intervals between events."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from rootsopt.dynamics.collocation.elements import Elements, Mesh
+from rootsopt.dynamics.collocation.events import _SAME
+from rootsopt.dynamics.collocation.gauss import GAUSS
+
+_FLOOR = 0.15
+"""Least density of elements, relative to the mean."""
+
+
+def shared(
+    times: Float[Array, " m"],
+    which: Int[Array, " m"],
+    events: Int[Array, ""],
+    density: tuple[Float[Array, " p"], Float[Array, " p"]],
+    used: Int[Array, ""],
+    capacity: int,
+) -> Mesh:
+    """Return a mesh of `used` elements that end at events.
+
+    `times`, `which`: as in `Mesh`, with `events` events after the first time; `density`: places
+    (mesh periods) and the number of elements wanted up to them, in any unit. Each interval has at
+    least one element."""
+    place, wanted = density
+    # A floor, so that no part of the period is left to one long element.
+    even = (place - place[0]) / (place[-1] - place[0])
+    total = wanted[-1] - wanted[0]
+    wanted = (wanted - wanted[0]) / jnp.where(total > 0, total, 1.0) + _FLOOR * even
+    at = jnp.interp(times, place, wanted)
+    weight = jnp.diff(at)
+    number = jnp.arange(weight.shape[0])
+    real = number <= events
+    spare = used - events - 1
+    fair = jnp.where(real, spare * weight / jnp.sum(jnp.where(real, weight, 0.0)), 0.0)
+    whole = jnp.floor(fair).astype(int)
+    rest = spare - jnp.sum(whole)
+    rank = jnp.argsort(jnp.argsort(-jnp.where(real, fair - whole, -1.0)))
+    counts = jnp.where(real, 1 + whole + (rank < rest), 0)
+    begins = jnp.cumsum(counts) - counts
+    element = jnp.arange(capacity)
+    filled = element < used
+    interval = jnp.clip(jnp.searchsorted(begins + counts, element, side="right"), 0, events)
+    inside, size = element - begins[interval], jnp.maximum(counts[interval], 1)
+
+    def share(step):
+        goal = at[interval] + weight[interval] * step / size
+        room = times[interval + 1] - times[interval]
+        found = (jnp.interp(goal, wanted, place) - times[interval]) / jnp.where(room > 0, room, 1)
+        found = jnp.where(step == 0, 0.0, jnp.where(step == size, 1.0, found))
+        return jnp.where(filled, found, 1.0)
+
+    return Mesh(
+        times=times,
+        which=which,
+        interval=jnp.where(filled, interval, times.shape[0] - 2),
+        left=share(inside),
+        right=share(inside + 1),
+        used=used,
+    )
+
+
+def needed(elements: Elements) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+    """Return places and the number of elements needed up to them, in some unit.
+
+    An element's error goes with the highest coefficient of its slopes. With as many elements as
+    its root says, all have the same error."""
+    mesh = elements.mesh
+    highest = jnp.sum(jnp.asarray(GAUSS.powers[-1])[:, None] * elements.slopes, axis=1)
+    size = jnp.max(jnp.abs(highest), axis=1) * mesh.lengths
+    share = jnp.where(
+        jnp.arange(size.shape[0]) < mesh.used, size ** (1 / (len(GAUSS.nodes) + 1)), 0
+    )
+    begin, end = mesh.ends
+    return jnp.append(begin[:1], end), jnp.append(0.0, jnp.cumsum(share))
+
+
+def moved(elements: Elements, mesh: Mesh) -> Elements:
+    """Return the same motion on another mesh; its roots are those of the nearest places."""
+    old_begin = elements.mesh.ends[0]
+    begin, _ = mesh.ends
+    length, old_length = mesh.lengths, elements.mesh.lengths
+    last = elements.mesh.used - 1
+
+    def at(tau, integrated: bool):
+        start = elements.mesh.times[0]
+        tau = start + jnp.mod(tau - start, elements.mesh.period)
+        k = jnp.clip(jnp.searchsorted(old_begin, tau, side="right") - 1, 0, last)
+        size = jnp.where(old_length[k] > 0, old_length[k], 1.0)
+        share = (tau - old_begin[k]) / size
+        if integrated:
+            rise = jnp.sum(GAUSS.integrated(share)[..., None] * elements.slopes[k], axis=-2)
+            return elements.state[k] + old_length[k][..., None] * rise
+        return jnp.sum(GAUSS.lagrange(share)[..., None] * elements.slopes[k], axis=-2)
+
+    tau = begin[:, None] + length[:, None] * GAUSS.nodes
+    return Elements(mesh, at(begin, True), at(tau, False), elements.roots)
+
+
+def aligned(
+    elements: Elements,
+    events: tuple[Float[Array, " m"], Int[Array, " m"]],
+    density: tuple[Float[Array, " p"], Float[Array, " p"]],
+    used: Int[Array, ""],
+) -> Elements:
+    """Return the motion on `used` elements that end at its `events` (times, inf beyond the last,
+    and margins).
+
+    The mesh starts away from events, in the middle of the longest interval, and has an end at
+    φ1 = 0."""
+    old = elements.mesh
+    length, room = old.period, old.times.shape[0]
+    times, which = events
+    real = times < jnp.inf
+    fresh = old.times[0] == 0
+    # The longest interval between events, on the circle.
+    place = jnp.where(real, jnp.mod(times, length), jnp.inf)
+    order = jnp.argsort(place)
+    place = place[order]
+    count = jnp.sum(real)
+    after = jnp.append(place[1:], jnp.inf)
+    number = jnp.arange(place.shape[0])
+    after = jnp.where(number == count - 1, place[0] + length, after)
+    gap = jnp.where(number < count, after - jnp.where(number < count, place, 0.0), 0.0)
+    widest = jnp.argmax(gap)
+    middle = jnp.mod(place[widest] + gap[widest] / 2, length)
+    middle = jnp.where(count > 0, middle, 0.37 * length)
+    # Away from φ1 = 0 as well, which is an end of its own.
+    near = jnp.minimum(middle, length - middle) < 1e-3
+    middle = jnp.where(near, jnp.mod(middle + gap[widest] / 4 + 2e-3, length), middle)
+    begin = jnp.where(fresh, middle, old.times[0])
+    times = jnp.where(real, begin + jnp.mod(times - begin, length), jnp.inf)
+    origin = begin + jnp.mod(-begin, length)
+    apart = jnp.min(jnp.where(real, jnp.abs(times - origin), jnp.inf)) > _SAME
+    spot = jnp.argmax(jnp.where(apart, ~real, jnp.abs(times - origin) <= _SAME))
+    times, which = times.at[spot].set(origin), which.at[spot].set(-1)
+    order = jnp.argsort(times)
+    times, which = times[order][: room - 1], which[order][: room - 1]
+    count = jnp.sum(times < jnp.inf)
+    end = begin + length
+    times = jnp.concatenate([begin[None], jnp.minimum(times, end)])
+    which = jnp.concatenate([jnp.full(1, -1), jnp.where(times[1:] < end, which, -1)])
+    place, wanted = density
+    place = jnp.concatenate([place, place[1:] + length])
+    wanted = jnp.concatenate([wanted, wanted[1:] + wanted[-1]])
+    inside = (place >= begin) & (place <= end)
+    low, high = jnp.interp(jnp.stack([begin, end]), place, wanted)
+    place = jnp.where(inside, place, jnp.where(place < begin, begin, end))
+    wanted = jnp.where(inside, wanted, jnp.where(place <= begin, low, high))
+    mesh = shared(times, which, count, (place, wanted), used, old.left.shape[0])
+    return moved(elements, mesh)
+
+
+def counted(elements: Elements) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+    """Return places and the number of elements up to them."""
+    mesh = elements.mesh
+    begin, end = mesh.ends
+    real = jnp.arange(begin.shape[0]) < mesh.used
+    return jnp.append(begin[:1], end), jnp.append(0.0, jnp.cumsum(jnp.where(real, 1.0, 0.0)))

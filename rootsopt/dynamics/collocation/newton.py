@@ -1,0 +1,111 @@
+"""Newton's method for the orbit and its events on a mesh of known topology."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from rootsopt.dynamics.collocation.blocks import in_blocks
+from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.equation import Equation, Point
+from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.collocation.system import (
+    Columns,
+    Lines,
+    Step,
+    chained,
+    condensed,
+    own_column,
+)
+
+_TURNS = 16
+"""Maximum number of Newton steps."""
+_ROOM = 0.7
+"""Fraction of an interval by which one step may shorten it."""
+_LONGEST = 1.0
+"""Longest step (scaled)."""
+
+
+class Converged(NamedTuple):
+    """Result of Newton's method.
+
+    `elements`; `size`: last step (scaled) of the states and, in mesh periods, of the events;
+    `turns`: number of steps; `force` (e, s): contact force (N) at the Gauss points.
+    """
+
+    elements: Elements
+    size: Float[Array, ""]
+    turns: Int[Array, ""]
+    force: Float[Array, "e s"]
+
+
+def evaluated(equation: Equation, elements: Elements) -> Point:
+    """Return the equation at the Gauss points and the end of each element, (e, s + 1, …)."""
+    mesh = elements.mesh
+    tau, state = elements.places
+    which = jnp.maximum(mesh.which[mesh.interval + 1], 0)
+    each = jax.vmap(jax.vmap(equation.point, (0, 0, 0, None)))
+    return in_blocks(each, mesh.used, tau, state, elements.roots, which)
+
+
+def lines(elements: Elements, points: Point) -> Lines:
+    """Return the linearised equation from its `points`."""
+    count = elements.state.shape[1]
+    inside = len(GAUSS.nodes)
+    return Lines(
+        miss=points.values[:, :inside, :count] - elements.slopes,
+        slopes=points.slopes[:, :inside, :count],
+        margin=points.values[:, inside, -1],
+        bend=points.slopes[:, inside, -1],
+    )
+
+
+def solved_step(elements: Elements, found: Lines, columns: Columns) -> Step:
+    """Solve the linear equations for some right-hand sides."""
+    return chained(elements, found, columns, condensed(elements, found, columns))
+
+
+def newton(equation: Equation, elements: Elements, tolerance: Float[Array, ""]) -> Converged:
+    """Solve for the orbit near `elements`, until a step is below `tolerance` (scaled)."""
+
+    def go_on(now):
+        return (now.turns < _TURNS) & (now.size > tolerance)  # Ends at NaN.
+
+    def turn(now):
+        at = now.elements
+        points = evaluated(equation, at)
+        found = lines(at, points)
+        step = solved_step(at, found, own_column(at, found))
+        moved, size = advanced(at, step, points.roots)
+        return Converged(moved, size, now.turns + 1, points.force[:, : len(GAUSS.nodes)])
+
+    force = jnp.zeros(elements.slopes.shape[:2], elements.state.dtype)
+    infinite = jnp.full_like(elements.state[0, 0], jnp.inf)
+    start = Converged(elements, infinite, jnp.zeros((), int), force)
+    return lax.while_loop(go_on, turn, start)
+
+
+def advanced(
+    elements: Elements, step: Step, roots: Float[Array, "e p sides 2"]
+) -> tuple[Elements, Float[Array, ""]]:
+    """Return the elements after a Newton step, and the size of the whole step.
+
+    The step is shortened where an interval would turn around or a state would leave the region in
+    which the equation is nearly linear."""
+    mesh = elements.mesh
+    times, states, slopes = step.times[:, 0], step.state[..., 0], step.slopes[..., 0]
+    room, change = jnp.diff(mesh.times), jnp.diff(times)
+    shrinks = (change < 0) & (room > 0)
+    share = jnp.where(shrinks, _ROOM * room / jnp.where(shrinks, -change, 1.0), 1.0)
+    largest = jnp.max(jnp.abs(states))
+    share = jnp.minimum(jnp.min(share), 1.0)
+    share = jnp.minimum(share, _LONGEST / jnp.maximum(largest, _LONGEST))
+    moved = Elements(
+        mesh._replace(times=mesh.times + share * times),
+        elements.state + share * states,
+        elements.slopes + share * slopes,
+        roots,
+    )
+    return moved, jnp.maximum(largest, jnp.max(jnp.abs(times)))

@@ -1,0 +1,211 @@
+"""The linear equations of one Newton step: condensed element by element, then chained.
+
+On an element with Runge-Kutta matrix A and weights b, slopes K and length h, collocation demands
+
+    k_i = f(τ_i, z + h Σ A_ij k_j),      z⁺ = z + h Σ b_i k_i,
+
+with z⁺ the state at the start of the next element, and at an event m(τ, z⁺) = 0. The slopes of an
+element depend on its own start and on the shifts of both ends of its interval alone, so they are
+eliminated first (condensation; Ascher, Mattheij and Russell, Numerical Solution of Boundary Value
+Problems, section 7.2). What is left is carried along the chain of elements, where every event gives
+the shift of its own time. The end of the chain is its start.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from rootsopt.dynamics.collocation.blocks import in_blocks
+from rootsopt.dynamics.collocation.elements import Elements, Mesh
+from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.linear import solved
+
+
+class Lines(NamedTuple):
+    """The equation linearised at the places of all elements.
+
+    `miss` (e, s, n): slope of the equation minus that of the element at the Gauss points; `slopes`
+    (e, s, n, 1 + n): derivatives of the equation there; `margin` (e,) at the element's end, and
+    `bend` (e, 1 + n): its derivatives.
+    """
+
+    miss: Float[Array, "e s n"]
+    slopes: Float[Array, "e s n c"]
+    margin: Float[Array, " e"]
+    bend: Float[Array, "e c"]
+
+
+class Columns(NamedTuple):
+    """Right-hand sides: changes of the equation that the step answers.
+
+    `slope` (e, s, n, k) at the Gauss points; `gap` (e, n, k): by which elements miss the start of
+    the next; `margin` (e, k) at the elements' ends.
+    """
+
+    slope: Float[Array, "e s n k"]
+    gap: Float[Array, "e n k"]
+    margin: Float[Array, "e k"]
+
+
+class Step(NamedTuple):
+    """Solution of the linear equations, k columns.
+
+    `state` (e, n, k); `slopes` (e, s, n, k); `times` (m, k) of the mesh; `monodromy` (n, n).
+    """
+
+    state: Float[Array, "e n k"]
+    slopes: Float[Array, "e s n k"]
+    times: Float[Array, "m k"]
+    monodromy: Float[Array, "n n"]
+
+
+class Condensed(NamedTuple):
+    """What is left of the elements.
+
+    `slopes` (e, s, n, n + 2 + k): the slopes' dependence on start, shifts of left and right end of
+    the interval, and right-hand sides; `rise` (e, n, n + 2 + k): the same of the element's end.
+    """
+
+    slopes: Float[Array, "e s n c"]
+    rise: Float[Array, "e n c"]
+
+
+def own_column(elements: Elements, lines: Lines) -> Columns:
+    """Return the right-hand side of Newton's step."""
+    rise = jnp.sum(GAUSS.weights[:, None] * elements.slopes, axis=1)
+    reached = elements.state + elements.mesh.lengths[:, None] * rise
+    gap = reached - elements.following
+    return Columns(lines.miss[..., None], gap[..., None], lines.margin[:, None])
+
+
+def condensed(elements: Elements, lines: Lines, columns: Columns) -> Condensed:
+    """Eliminate the slopes of each element."""
+    mesh = elements.mesh
+    shares = jnp.stack([mesh.left, mesh.right, mesh.lengths], axis=1)
+    return in_blocks(_condensed, mesh.used, shares, elements.slopes, lines, columns)
+
+
+def _condensed(
+    shares: Float[Array, "e 3"], own: Float[Array, "e s n"], lines: Lines, columns: Columns
+) -> Condensed:
+    """Eliminate the slopes of some elements; `shares`: start and end in the interval, length."""
+    count, points, states = own.shape
+    left, right_end, lengths = shares.T
+    length = lengths[:, None, None, None]
+    share = right_end - left
+    rise = jnp.sum(GAUSS.integral[:, :, None] * own[:, None], axis=2)
+    by_time, by_state = lines.slopes[..., :1], lines.slopes[..., 1:]
+    matrix = jnp.eye(points * states).reshape(points, states, points, states) - (
+        length[..., None] * by_state[:, :, :, None] * GAUSS.integral[:, None, :, None]
+    )
+    # A longer interval is a longer element: its states move, at the same relative place.
+    stretch = share[:, None, None, None] * jnp.sum(
+        by_state * rise[:, :, None], axis=-1, keepdims=True
+    )
+    place = (left[:, None] + share[:, None] * GAUSS.nodes)[..., None, None]
+    right = [by_state, by_time * (1 - place) - stretch, by_time * place + stretch, columns.slope]
+    right = jnp.concatenate(right, axis=-1)
+    system = jnp.concatenate(
+        [
+            matrix.reshape(count, points * states, points * states),
+            right.reshape(count, points * states, -1),
+        ],
+        axis=-1,
+    )
+    slopes = _eliminated(system).reshape(count, points, states, -1)
+    end = jnp.sum(GAUSS.weights[:, None, None] * slopes, axis=1) * length[:, 0]
+    longer = share[:, None] * jnp.sum(GAUSS.weights[:, None] * own, axis=1)
+    still = jnp.broadcast_to(jnp.eye(states), (count, states, states))
+    added = [still, -longer[..., None], longer[..., None], columns.gap]
+    return Condensed(slopes, end + jnp.concatenate(added, axis=-1))
+
+
+def _eliminated(system: Float[Array, "e m c"]) -> Float[Array, "e m k"]:
+    """Return the solutions of small systems (matrix and right-hand sides side by side).
+
+    The matrices differ from the unit matrix by less than the elements are short, so that no pivot
+    is looked for."""
+    size = system.shape[1]
+    place = jnp.arange(size)
+
+    def eliminate(k, system):
+        row = lax.dynamic_index_in_dim(system, k, 1, keepdims=False)
+        row = row / lax.dynamic_index_in_dim(row, k, 1)
+        factor = lax.dynamic_index_in_dim(system, k, 2)
+        changed = system - factor * row[:, None]
+        return jnp.where((place == k)[:, None], row[:, None], changed)
+
+    return lax.fori_loop(0, size, eliminate, system)[..., size:]
+
+
+def chained(elements: Elements, lines: Lines, columns: Columns, parts: Condensed) -> Step:
+    """Solve for the states at the elements' starts and the times of the events."""
+    mesh = elements.mesh
+    states, width = elements.state.shape[1], columns.gap.shape[-1]
+    last, fixed = mesh.last, mesh.which[mesh.interval + 1] < 0
+    rise, bend = parts.rise, lines.bend
+    wide = states + width
+    pushed = jnp.pad(columns.margin, ((0, 0), (states, 0)))
+
+    def along(carry, k):
+        """Advance over element k; columns depend on the first state and the right-hand sides."""
+        now, by_end, begun = carry
+        part = rise[k]
+        after = jnp.sum(part[:, :states, None] * now, axis=1)
+        after += part[:, states, None] * begun
+        after = after.at[:, states:].add(part[:, states + 2 :])
+        moved = jnp.sum(part[:, :states] * by_end, axis=1) + part[:, states + 1]
+        by_state, by_time = bend[k, 1:], bend[k, 0]
+        shift = -(pushed[k] + by_state @ after) / (by_time + by_state @ moved)
+        shift = jnp.where(fixed[k], 0.0, shift)
+        over = jnp.where(last[k], after + moved[:, None] * shift, after)
+        following = over, jnp.where(last[k], 0.0, moved), jnp.where(last[k], shift, begun)
+        return following, (now, by_end, jnp.where(last[k], shift, 0.0))
+
+    def step(k, loop):
+        carry, kept = loop
+        carry, new = along(carry, k)
+        return carry, jax.tree.map(lambda all_, one: all_.at[k].set(one), kept, new)
+
+    count, dtype = elements.state.shape[0], elements.state.dtype
+    start = jnp.eye(states, wide, dtype=dtype), jnp.zeros(states, dtype), jnp.zeros(wide, dtype)
+    kept = (
+        jnp.zeros((count, states, wide), dtype),
+        jnp.zeros((count, states), dtype),
+        jnp.zeros((count, wide), dtype),
+    )
+    (end, *_), (now, by_end, shift) = lax.fori_loop(0, mesh.used, step, (start, kept))
+    monodromy = end[:, :states]
+    first = solved(jnp.eye(states, dtype=dtype) - monodromy, end[:, states:])
+
+    def closed(rows):
+        return jnp.sum(rows[..., :states, None] * first, axis=-2) + rows[..., states:]
+
+    used = jnp.arange(count) < mesh.used
+    place = jnp.where(last & used, mesh.interval + 1, mesh.times.shape[0])
+    times = jnp.zeros((mesh.times.shape[0], width), dtype).at[place].set(closed(shift), mode="drop")
+    left, right = times[mesh.interval], times[mesh.interval + 1]
+    state = closed(now) + by_end[..., None] * right[:, None]
+    answer = parts.slopes[..., states + 2 :] + (
+        parts.slopes[..., states, None] * left[:, None, None]
+        + parts.slopes[..., states + 1, None] * right[:, None, None]
+        + jnp.sum(parts.slopes[..., :states, None] * state[:, None, None], axis=-2)
+    )
+    return Step(state, answer, times, monodromy)
+
+
+def moved_places(elements: Elements, step: Step) -> tuple[Array, Array]:
+    """Return the changes of times (e, s, k) and states (e, s, n, k) at the Gauss points."""
+    mesh: Mesh = elements.mesh
+    left, right = step.times[mesh.interval], step.times[mesh.interval + 1]
+    share = mesh.right - mesh.left
+    place = (mesh.left[:, None] + share[:, None] * GAUSS.nodes)[..., None]
+    times = left[:, None] * (1 - place) + right[:, None] * place
+    rise = jnp.sum(GAUSS.integral[:, :, None] * elements.slopes[:, None], axis=2)
+    longer = share[:, None] * (right - left)
+    within = jnp.sum(GAUSS.integral[:, :, None, None] * step.slopes[:, None], axis=2)
+    states = step.state[:, None] + mesh.lengths[:, None, None, None] * within
+    return times, states + rise[..., None] * longer[:, None, None]

@@ -1,0 +1,96 @@
+"""Contact from a known root agrees with the search, and its margins with the flags."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rootsopt
+from rootsopt.contact.near import NearContact
+from rootsopt.contact.search import SearchContact
+from rootsopt.scene import Scene
+
+GAS = [
+    "scene.load={pressure_difference_Pa: 2.0e4}",
+    "contact.friction={static: 0.2, kinetic: 0.1, stiction_speed_mm_s: 100, "
+    "friction_speed_mm_s: 1000}",
+]
+SCENES = {
+    "cic": ("cic", []),
+    "ee": ("ee", []),
+    "gas and friction": ("cic", GAS),
+    "pump": ("pump", []),
+}
+
+
+def _pair(name):
+    config = rootsopt.load_config(f"configs/{SCENES[name][0]}.yaml", SCENES[name][1])
+    scene = Scene.from_config(config)
+    return eqx.filter_jit(lambda s, d: s.pair(d))(scene, jnp.asarray(config.design, float))
+
+
+def _states(pair, count):
+    draw = np.random.default_rng(3)
+    tau = draw.uniform(0, 1, count)
+    states = 0.3 * draw.normal(size=(count, pair.states))
+    states[:, 0] = draw.uniform(-1.5, 0.5, count)
+    states[:, 1] *= 20
+    return jnp.asarray(tau), jnp.asarray(states)
+
+
+def _near(pair, places):
+    roots = jnp.stack([jnp.stack([place.normal2, place.normal2]) for place in places])
+    return eqx.tree_at(lambda p: p.contact, pair, NearContact(pair.contact.pair, roots))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_margins_have_the_sign_of_the_flags(name):
+    pair = _pair(name)
+    assert isinstance(pair.contact, SearchContact)
+
+    @eqx.filter_jit
+    def both(pair, tau, state):
+        searched = pair.margins(tau, state)
+        near = _near(pair, searched.places).margins(tau, state)
+        return *pair.switches(tau, state), searched, near
+
+    cusp = pair.contact.pair.profile.cusp
+    rival = jax.eval_shape(
+        lambda: pair.law.margins(jnp.zeros(()), jnp.zeros(()))
+    ).shape[0] + 2  # fmt: skip
+    seen = 0
+    for tau, state in zip(*_states(pair, 60), strict=True):
+        flags, counts, searched, near = both(pair, tau, state)
+        np.testing.assert_array_equal(flags, searched.values > 0)
+        counted = np.array(counts & searched.counts)
+        if cusp:
+            # Its margin needs the other root, which is known at the event alone.
+            counted[rival] = False
+        seen += counted.sum()
+        np.testing.assert_array_equal(flags[counted], np.asarray(near.values > 0)[counted])
+    assert seen > 100
+
+
+@pytest.mark.parametrize("name", ["cic", "ee", "pump"])
+def test_equation_near_a_root_is_that_of_the_search(name):
+    """From a root 1e-3 away, two evaluations reach the search's forces and derivatives."""
+    pair = _pair(name)
+
+    def searched(pair, tau, state):
+        return pair.derivative(tau, state)[0]
+
+    def near(pair, tau, state, away):
+        places = pair.margins(tau, state).places
+        moved = _near(pair, [place._replace(normal2=place.normal2 + away) for place in places])
+        again = [own for own, _ in moved.margins(tau, state).places]
+        return _near(pair, again).derivative(tau, state)[0]
+
+    slopes = eqx.filter_jit(lambda p, t, z: (searched(p, t, z), jax.jacfwd(searched, 2)(p, t, z)))
+    nearly = eqx.filter_jit(
+        lambda p, t, z: (near(p, t, z, 1e-3), jax.jacfwd(near, 2)(p, t, z, 1e-3))
+    )
+    for tau, state in zip(*_states(pair, 25), strict=True):
+        for one, other in zip(slopes(pair, tau, state), nearly(pair, tau, state), strict=True):
+            size = np.max(np.abs(one))
+            np.testing.assert_allclose(other, one, rtol=0, atol=2e-6 * size)

@@ -1,0 +1,94 @@
+"""Gauss rule, elements and meshes."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from rootsopt.dynamics.collocation.elements import Elements, Mesh
+from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
+from rootsopt.dynamics.collocation.mesh import aligned, counted, moved, needed, shared
+
+ROOM = 32
+
+
+def _elements(function, slope, edges, start=0.0):
+    """Elements on fixed edges whose motion is a known function."""
+    edges = np.asarray(edges)
+    count = len(edges) - 1
+    length = edges[-1] - edges[0]
+    pad = ROOM - count
+    share = (edges - edges[0]) / length
+    mesh = Mesh(
+        times=jnp.full(8, edges[-1]).at[0].set(start),
+        which=jnp.full(8, -1),
+        interval=jnp.asarray([0] * count + [6] * pad),
+        left=jnp.asarray([*share[:-1], *np.ones(pad)]),
+        right=jnp.asarray([*share[1:], *np.ones(pad)]),
+        used=jnp.asarray(count),
+    )
+    begin, _ = mesh.ends
+    inside = begin[:, None] + mesh.lengths[:, None] * GAUSS.nodes
+    roots = jnp.zeros((ROOM, POINTS + 1, 1, 2))
+    return Elements(mesh, function(begin)[:, None], slope(inside)[..., None], roots)
+
+
+def _wave(edges):
+    turn = 2 * jnp.pi
+    return _elements(lambda t: jnp.sin(turn * t), lambda t: turn * jnp.cos(turn * t), edges)
+
+
+def test_rule_integrates_polynomials():
+    """Slopes of degree 3 give the quartic exactly; weights are exact up to degree 7."""
+    for degree in range(POINTS):
+        slopes = GAUSS.nodes**degree
+        shares = jnp.linspace(0, 1, 7)
+        found = GAUSS.integrated(shares) @ slopes
+        np.testing.assert_allclose(found, shares ** (degree + 1) / (degree + 1), atol=1e-14)
+        np.testing.assert_allclose(GAUSS.lagrange(shares) @ slopes, shares**degree, atol=1e-13)
+    for degree in range(2 * POINTS):
+        np.testing.assert_allclose(GAUSS.weights @ GAUSS.nodes**degree, 1 / (degree + 1))
+
+
+def test_motion_is_that_of_the_polynomials():
+    elements = _wave(np.linspace(0, 1, 13))
+    for tau in (0.0, 0.111, 0.5, 0.99, 1.3):
+        expected = np.sin(2 * np.pi * tau)
+        np.testing.assert_allclose(elements.motion(jnp.asarray(tau)), expected, atol=1e-6)
+
+
+def test_motion_moves_to_another_mesh():
+    """Elements aligned with events begin at them, start away from them, and keep the motion."""
+    elements = _wave(np.linspace(0, 1, 17))
+    events = jnp.full(8, jnp.inf).at[:3].set(jnp.asarray([0.1, 0.1004, 0.62]))
+    which = jnp.full(8, -1).at[:3].set(jnp.asarray([4, 5, 6]))
+    new = aligned(elements, (events, which), counted(elements), jnp.asarray(20))
+    begin, end = (np.asarray(x)[:20] for x in new.mesh.ends)
+    assert int(new.mesh.used) == 20
+    np.testing.assert_allclose(begin[1:], end[:-1], atol=1e-15)
+    np.testing.assert_allclose(end[-1] - begin[0], 1)
+    places = np.mod(begin, 1)
+    for event in (0.1, 0.1004, 0.62, 0.0):
+        assert np.min(np.abs(places - event)) < 1e-12
+    assert np.min(np.abs(np.mod(begin[0] - np.array([0.1, 0.62, 1.0]), 1.0))) > 0.1
+    assert set(np.asarray(new.mesh.which).tolist()) == {-1, 4, 5, 6}
+    for tau in np.random.default_rng(0).uniform(0, 1, 20):
+        expected = np.sin(2 * np.pi * tau)
+        np.testing.assert_allclose(new.motion(jnp.asarray(tau)), expected, atol=2e-6)
+    back = moved(new, elements.mesh)
+    np.testing.assert_allclose(back.state[:16], elements.state[:16], atol=2e-6)
+
+
+def test_elements_crowd_where_they_are_needed():
+    """A motion that is nearly still except in one tenth has most of its elements there."""
+
+    def function(t):
+        return jnp.tanh(60 * (t - 0.45))
+
+    def slope(t):
+        return 60 / jnp.cosh(60 * (t - 0.45)) ** 2
+
+    elements = _elements(function, slope, np.linspace(0, 1, 25))
+    times = jnp.full(8, 1.0).at[0].set(0.0)
+    mesh = shared(times, jnp.full(8, -1), jnp.asarray(0), needed(elements), jnp.asarray(24), ROOM)
+    begin = np.asarray(mesh.ends[0])[:24]
+    assert np.sum((begin > 0.4) & (begin < 0.5)) >= 10
+    assert np.max(np.diff(begin)) < 0.4
