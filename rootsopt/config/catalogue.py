@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 _LONGEST = 5e4
 """Length (mm) above which a config is rejected, whatever its pitch radius."""
 _SHARES = 0.002, 10.0
-"""Least and greatest length (pitch radii) of a profile; a config outside this range is rejected."""
+"""Range (pitch radii) of the parameters of a profile that are lengths; a config outside this range
+is rejected."""
 _NO_FLOOR = 0.0, 10.0
 """Range (pitch radii) that replaces `_SHARES` for a length whose lower limit is set by its key (in
 mm) or by its family."""

@@ -29,9 +29,9 @@ def following_mm(
     """Return the default smoothing length (mm) of a scene, with two significant digits.
 
     `load_torque` (N·m): torque on rotor 2. `gear_stiffness` (N·m/rad): stiffness of the timing
-    gear, `None` without a gear. `contact`: stiffness (N/mm^e), exponent and depth of full damping
-    (mm) of the flanks. `precision`: `float64` or `float32`. Rounding over this length changes every
-    force by less than 1e-4 of its value (`python -m experiments.smoothing`).
+    gear, `None` without a gear. `contact`: stiffness (N/mm^e), exponent e and depth of full damping
+    (mm) of the flanks. `precision`: `float64` or `float32`. Smoothing over this length changes the
+    forces by less than 1e-4 of their values (measured by `python -m experiments.smoothing`).
     """
     torque = max(load_torque, _LEAST_LOAD)
     stiffness, exponent, full = contact

@@ -1,18 +1,21 @@
-"""Contact of nodes with straight segments: the paper's own method, Eq. 9.
+"""Contact gap between two flanks as polylines: nodes against straight segments (paper, Eq. 9).
 
 Each flank is a polyline from tip to root. The gap is the least (p - q) · n over the nodes p of one
 flank and the segments (q, n) of the other that face them. The paper tests the nodes of rotor 2
 only. Here, the nodes of each flank are tested against the segments of the other, so that the result
 does not change when the rotors are exchanged.
 
-A segment faces the nodes between the bisectors at its two ends. On a bisector the distances to both
-segments agree. The gap is therefore continuous over the pose, its derivatives are the levers, and
-forces come from a potential. The levers jump from segment to segment: their error is of first order
-in the node spacing, that of the gap of second order.
+A segment faces the nodes between the bisectors at its two ends. On a bisector, the distances to
+both segments agree, so the gap is continuous over the pose. Its derivatives with respect to the
+rotations are the levers of the contact force, so elastic forces come from a potential. The levers
+jump from segment to segment: their error is of first order in the node spacing, that of the gap of
+second order.
 
-Let a = x + ε/2 for rotor 1, a = π/N - x + ε/2 for rotor 2, and E the centre distance. A point z of
-one flank, in its own rotor's frame with a tip on +x, lies at R(a) (E - R(-a′) z) in the frame of
-the other. Exchanging the rotors only exchanges a and a′.
+Let N be the number of lobes, x the roll coordinate and ε the relative rotation (see `Contact`), E
+the vector between the axes, and R(a) the rotation by a. With a = x + ε/2 for rotor 1 and
+a = π/N - x + ε/2 for rotor 2, a point z of the flank of one rotor, in its own frame with a tip on
++x, lies at R(a) (E - R(-a′) z) in the frame of the other rotor; a belongs to that other rotor and
+a′ to the point's rotor. Exchanging the rotors only exchanges a and a′.
 """
 
 import equinox as eqx

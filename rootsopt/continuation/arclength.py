@@ -93,9 +93,10 @@ class Look(NamedTuple):
 
 
 SolutionCurve = Callable[[NDArray[np.float64], Any, bool], Look]
-"""Type of the function that evaluates the equations. Arguments: the unknowns (n + 1,);
-`Look.memory` of the computation to repeat, or None; and whether to compute more carefully than
-usual. It returns a `Look`, or raises `StoppedError` if there is no result."""
+"""Type of the function that evaluates the equations of a curve. Arguments: the unknowns (n + 1,);
+`Look.memory` of an earlier evaluation whose solver steps are repeated, or None for new steps; and
+whether the steps are to be refined, because Newton's method converges slowly. It returns a `Look`,
+or raises `StoppedError` if there is no result."""
 
 
 class Spot(NamedTuple):

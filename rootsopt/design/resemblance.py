@@ -129,7 +129,7 @@ class _Seen(NamedTuple):
 
     @property
     def away(self) -> float:
-        """Greatest distance (pitch radii) between the flanks; infinite for an unsound member."""
+        """Greatest distance (pitch radii) between member and profile; infinite if it is unsound."""
         return float(np.max(np.abs(self.distance))) if self.sound else math.inf
 
 

@@ -30,7 +30,8 @@ _ALIKE = 0.05
 ends of the step, above which the change does not count as a jump. If a lever changes fast but
 continuously, some stages lie in between."""
 MARKS = 4
-"""Number of `marks`: values appended to the slope of a motion, from which a jump is recognised."""
+"""Number of `marks`: further numbers stored with the time derivative of a motion (penetration, its
+rate, both levers). A jump of the levers shows in them."""
 
 
 def marks(contact: FlankForce) -> Float[Array, "4"]:

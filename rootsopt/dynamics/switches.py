@@ -38,9 +38,9 @@ _ROUNDINGS = 16.0
 """Minimum half length (rounding errors of the time) of the short step around a change. It exceeds
 the limits `_ASIDE` only in single precision."""
 _SHARE = 1e-4
-"""Maximum half length of the short step around a change, as a fraction of the time to the nearest
-other change. If the curvature changes inside a rounded corner, the error of the gradients is
-proportional to the square of this fraction."""
+"""Maximum half length of the short step around a change of a flag, as a fraction of the time to the
+nearest other change. Where flags change at the ends of a rounded corner, the error of the gradients
+is proportional to the square of this fraction."""
 _GRADES = 8.0, 64.0
 """Distances of further step ends from a change of a flag, as multiples of half the length of the
 short step around it. They keep the neighbouring steps short, in case the change occurs slightly

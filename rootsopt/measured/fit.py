@@ -30,8 +30,8 @@ _FOLD = 1e-3
 runs are noise and rounding. Also the distance (pitch radii) by which a tangent may pass the axis on
 the wrong side."""
 _OFF = 0.02
-"""Deviation between flanks (pitch radii) above which an outline is rejected. A larger smoothing is
-rejected, too."""
+"""Deviation between flanks (pitch radii) above which an outline is rejected. It is also the
+greatest allowed `profile.outline_smoothing_mm`, in pitch radii."""
 _LAND = 1e-3, 0.5 * np.pi / 180
 """Two limits for the tip land, which is an arc about the rotor's axis. The first is the moment arm
 of the normal about the axis (pitch radii) above which the land ends. The second is the range of

@@ -112,10 +112,11 @@ class Problem:
         return sum(share * self._value(*pair) for share, *pair in self._counted(evaluation))
 
     def by_speed(self, evaluation: Evaluation) -> list[dict[str, float]]:
-        """Return the objective at each speed, one row each; empty without `objective.speeds_rpm`.
+        """Return a row for each speed of `objective.speeds_rpm`, with the keys `speed_rpm`, `share`
+        (weight of the speed) and `objective` (value at this speed alone).
 
         The objective is NaN if a measure of the baseline is 0, which is possible only at a speed
-        with share 0.
+        with share 0. Without `objective.speeds_rpm`, the list is empty.
         """
         parts = zip(at_speeds(evaluation), at_speeds(self.baseline), strict=True)
         return [

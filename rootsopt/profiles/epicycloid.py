@@ -116,11 +116,11 @@ def circle_epicycloid(
     rolling_radius: Float[ArrayLike, ""],
     tip_arc_turn: Float[ArrayLike, ""],
 ) -> TippedEpicycloid:
-    """Return a tip arc centred on the lobe's axis with an epicycloid of `rolling_radius` r_e (m).
+    """Return the profile of a tip arc, centred on the lobe's axis, followed by an epicycloid.
 
-    `lobes`: N; `pitch_radius`: r (m). The arc ends at the normal angle `tip_arc_turn` ν (rad). For
-    ν = π/2 - π r / 4N r_e (β = 0 at the joint) the arc is centred on the pitch circle. All of it
-    then meshes at one instant."""
+    `lobes`: N; `pitch_radius`: r (m); `rolling_radius`: r_e of the epicycloid (m); `tip_arc_turn`:
+    normal angle ν (rad) at which the arc ends. For ν = π/2 - π r / (4 N r_e), the arc is centred on
+    the pitch circle (roll angle β = 0 at its end), and the whole arc meshes at one instant."""
     return TippedEpicycloid(lobes, pitch_radius, rolling_radius, tip_arc_turn)
 
 
