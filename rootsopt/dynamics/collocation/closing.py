@@ -9,6 +9,7 @@ error of the coarser one; the difference of the two is the error estimate.
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -117,52 +118,54 @@ def first_elements(period: Int[Array, ""]) -> Int[Array, ""]:
     return jnp.asarray(2 * _FIRST * period)
 
 
-def close(
-    equation: Equation,
-    tangents: Any,
-    elements: Elements,
-    tolerance: Float[Array, ""],
-    known: Bool[Array, ""] | bool = False,
-) -> Closed:
-    """Close the orbit near the motion `elements`, to a relative error `tolerance` of its forces.
+class _Closer(eqx.Module):
+    """Arguments of `close`. Its loop is `start` and `turn`.
 
-    `tangents`: directions (d, …) of the pair's parameters for the derivatives; `known`: whether the
-    elements end at events, such as those of the orbit of a similar pair. With a `tolerance` of inf,
-    the orbit is solved on one mesh only, without an error estimate."""
-    pair = jax.lax.stop_gradient(equation.pair)
-    capacity, room = elements.state.shape[0], elements.mesh.times.shape[0]
+    `frozen`: the pair without derivatives."""
 
-    def go_on(now: _Loop):
-        return ~now.over & (now.closed.turns < _TURNS)
+    equation: Equation
+    frozen: RotorPair
+    tangents: Any
+    tolerance: Float[Array, ""]
 
-    def turn(now: _Loop) -> _Loop:
-        seen = look(pair, now.elements)
-        events = found_events(pair, now.elements, seen, room)
+    def start(self, elements: Elements, known: Bool[Array, ""]) -> _Loop:
+        """Return the loop's state before the first turn."""
+        nothing = _nothing(self.equation, self.tangents, elements)
+        no, zero = jnp.zeros((), bool), jnp.zeros((), int)
+        return _Loop(nothing, elements, elements.slopes[..., 0], known, no, zero, zero, no)
+
+    def turn(self, now: _Loop) -> _Loop:
+        """Look at the flags, then solve, keep the forces or change the mesh, as they say."""
+        seen = look(self.frozen, now.elements)
+        events = found_events(self.frozen, now.elements, seen, now.elements.mesh.times.shape[0])
         agree = now.fits & (events.new == 0) & (events.gone == 0)
         done = agree & now.solved
         new = lax.cond(
             agree,
-            lambda: lax.cond(now.solved, lambda: keep(now, events), lambda: solve(now, seen)),
+            lambda: lax.cond(
+                now.solved, lambda: self.keep(now, events), lambda: self.solve(now, seen)
+            ),
             lambda: now,
         )
         over = new.over | ~events.fits
-        new = lax.cond((done | ~agree) & ~over, lambda: align(new, events, done), lambda: new)
+        new = lax.cond((done | ~agree) & ~over, lambda: self.align(new, events, done), lambda: new)
         closed = new.closed._replace(turns=now.closed.turns + 1)
         return new._replace(closed=closed, over=over)
 
-    def align(now: _Loop, events: Events, finer) -> _Loop:
+    def align(self, now: _Loop, events: Events, finer) -> _Loop:
         """Move the motion to a mesh that ends at its events, and is finer if asked for."""
         taken = now.elements.mesh.used
         first = taken // 2 + _EVENT * events.count
         used = jnp.where(now.fits, jnp.where(finer, (_FINER * taken).astype(int), taken), first)
-        used = jnp.clip(used, events.count + 2, capacity - 1)
+        used = jnp.clip(used, events.count + 2, now.elements.state.shape[0] - 1)
         (place, wanted), (spot, number) = needed(now.elements), counted(now.elements)
         density = jnp.where(now.fits, place, spot), jnp.where(now.fits, wanted, number)
         new = aligned(now.elements, (events.times, events.which), density, used)
         return now._replace(elements=new, fits=jnp.ones((), bool), solved=jnp.zeros((), bool))
 
-    def solve(now: _Loop, seen) -> _Loop:
-        got = newton(equation, rooted(now.elements, seen), jnp.asarray(_SMALL))
+    def solve(self, now: _Loop, seen) -> _Loop:
+        """Run Newton's method on the mesh as it is."""
+        got = newton(self.equation, rooted(now.elements, seen), jnp.asarray(_SMALL))
         good = got.size <= 10 * _SMALL
         closed = now.closed._replace(steps=now.closed.steps + got.turns)
         # A step that leads out of the mesh's events is tried again with those found on its way.
@@ -176,13 +179,13 @@ def close(
             over=~jnp.isfinite(got.size) | (failures > _FAILURES),
         )
 
-    def keep(now: _Loop, events: Events) -> _Loop:
+    def keep(self, now: _Loop, events: Events) -> _Loop:
         """Keep the forces of an orbit whose flags agree."""
-        found = response(equation, now.elements, now.force, tangents)
+        found = response(self.equation, now.elements, now.force, self.tangents)
         error, drift = _differences(now.closed.found, found)
         first = now.meshes == 0
         error, drift = (jnp.where(first, jnp.inf, x / _GAIN) for x in (error, drift))
-        full = now.elements.mesh.used >= capacity - 1
+        full = now.elements.mesh.used >= now.elements.state.shape[0] - 1
         # Newton's method has converged: a large correction, or none, comes from a margin that is
         # not regular at its event.
         good = found.correction < _CORRECTED
@@ -198,15 +201,29 @@ def close(
             closed=closed,
             elements=found.elements,
             meshes=now.meshes + 1,
-            over=(error <= tolerance) | full | ~good,
+            over=(error <= self.tolerance) | full | ~good,
         )
 
-    nothing = _nothing(equation, tangents, elements)
-    no, zero = jnp.zeros((), bool), jnp.zeros((), int)
-    start = _Loop(
-        nothing, elements, elements.slopes[..., 0], jnp.asarray(known), no, zero, zero, no
-    )
-    return lax.while_loop(go_on, turn, start).closed
+
+def close(
+    equation: Equation,
+    tangents: Any,
+    elements: Elements,
+    tolerance: Float[Array, ""],
+    known: Bool[Array, ""] | bool = False,
+) -> Closed:
+    """Close the orbit near the motion `elements`, to a relative error `tolerance` of its forces.
+
+    `tangents`: directions (d, …) of the pair's parameters for the derivatives; `known`: whether the
+    elements end at events, such as those of the orbit of a similar pair. With a `tolerance` of inf,
+    the orbit is solved on one mesh only, without an error estimate."""
+    closer = _Closer(equation, lax.stop_gradient(equation.pair), tangents, tolerance)
+
+    def go_on(now: _Loop) -> Bool[Array, ""]:
+        return ~now.over & (now.closed.turns < _TURNS)
+
+    start = closer.start(elements, jnp.asarray(known))
+    return lax.while_loop(go_on, lambda now: closer.turn(now), start).closed
 
 
 def _differences(before: Found, after: Found):

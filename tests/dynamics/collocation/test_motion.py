@@ -75,6 +75,15 @@ def test_collocation_agrees_with_shooting(name, overrides, period):
     np.testing.assert_allclose(one.state, other.state, rtol=1e-5, atol=1e-9)
 
 
+def test_program_has_the_shapes_of_shooting():
+    """`auto` holds both in one program; their results must have one structure."""
+    config = rootsopt.load_config("configs/cic.yaml", ["solver.orbit=auto"])
+    scene = Scene.from_config(config)
+    design = jnp.asarray(config.design, float)
+    found = eqx.filter_eval_shape(rootsopt.steady_response, scene, design)
+    assert found.multipliers.shape == (2,)
+
+
 class _Flagged(Part):
     """A part with a flag and no margin."""
 
