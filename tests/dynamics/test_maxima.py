@@ -25,7 +25,7 @@ def found(evaluator):
 
 
 def test_maxima_are_those_of_the_series(found):
-    """Against the uniform samples of the force: every maximum there is listed, and none is lower."""
+    """Against the uniform samples of the force: every maximum is listed, none lower."""
     cycle, maxima, samples = found.series.force[:SAMPLES], found.maxima, SAMPLES
     period = found.steady_state["period"]
     higher = (cycle > np.roll(cycle, 1)) & (cycle >= np.roll(cycle, -1))
