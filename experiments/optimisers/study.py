@@ -119,7 +119,7 @@ def interior_point(look: Look, start: NDArray[np.float64], stops: Stops) -> None
         lambda z: problem.constraints(z)[0],
         0.0,
         np.inf,
-        jac=lambda z: problem.constraints(z)[1],
+        jac=lambda z: problem.constraints(z)[1],  # pyright: ignore[reportArgumentType]
         hess=BFGS(),
     )
     options = {"maxiter": 10_000, "gtol": 1e-12, "xtol": 1e-12, "barrier_tol": 1e-10}

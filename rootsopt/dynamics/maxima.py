@@ -92,7 +92,8 @@ def _steps(orbit: Orbit) -> Steps:
     grid, after = np.asarray(orbit.flow.grid), np.asarray(orbit.flow.corners)
     begins = np.concatenate([np.zeros_like(grid[:1]), grid[:-1]])
     before = np.concatenate([np.asarray(orbit.state)[None], after[:-1]])
-    return Steps(begins, grid, before, after, np.sum(grid < np.inf))
+    arrays: Any = begins, grid, before, after, np.sum(grid < np.inf)
+    return Steps(*arrays)
 
 
 def _located(

@@ -409,8 +409,9 @@ class Problem:
                 if multiplier <= _HELD or (side == "upper" and limited[key]):
                     continue
                 slack = (design[place] - limit) / width * (1 if sense == ">=" else -1)
-                values = self.baseline.design[key], design[place], limit, unit_of(key)
-                row = _row(f"{side} bound of {words(key)}", *map(_plain, values), slack, sense)
+                before, after = self.baseline.design[key], float(design[place])
+                name, unit = f"{side} bound of {words(key)}", unit_of(key)
+                row = _row(name, before, after, float(limit), unit, slack, sense)
                 rows.append(row | self._multiplier(row, multiplier / width, optimized))
         return rows
 
@@ -448,10 +449,6 @@ class Problem:
 def words(key: str) -> str:
     """Return the name of a design parameter in words, without its unit."""
     return key.removesuffix("_mm").removesuffix("_deg").replace("_", " ")
-
-
-def _plain(value):
-    return float(value) if isinstance(value, np.floating) else value
 
 
 def _row(name, before, after, limit, unit, slack, sense) -> dict:
