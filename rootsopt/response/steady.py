@@ -55,7 +55,7 @@ class Response(NamedTuple):
 
 
 def steady_response(
-    scene: Scene, design: ArrayLike, start: Float[Array, " n"] | None = None
+    scene: Scene, design: ArrayLike, start: ArrayLike | None = None
 ) -> Response:
     """Return the steady response of a `design` (d,) in config units, in a `scene`.
 
@@ -88,6 +88,7 @@ def steady_response(
             f"Argument `design` must have {expected} entries for this scene, but has "
             f"{design.shape[0]}; see `config.design_keys`"
         )
+    start = None if start is None else jnp.asarray(start, float)
     return _response(scene, design, start)
 
 
