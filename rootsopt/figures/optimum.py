@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from rootsopt.figures.style import BLUE, COLORS, GREY
 
@@ -29,7 +30,9 @@ def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: floa
         )
     ax.axhline(required, color=GREY, linestyle=":", label="required")
     ax.set_xlabel("iteration")
-    ax.set_ylabel("first-order residual")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_ylabel("first-order residual (of the unit box)")
+    ax.grid(visible=True, alpha=0.3)
     ax.legend(frameon=False)
     return ax
 
