@@ -54,9 +54,7 @@ class Response(NamedTuple):
     state: Float[Array, " n"]
 
 
-def steady_response(
-    scene: Scene, design: ArrayLike, start: ArrayLike | None = None
-) -> Response:
+def steady_response(scene: Scene, design: ArrayLike, start: ArrayLike | None = None) -> Response:
     """Return the steady response of a `design` (d,) in config units, in a `scene`.
 
     `start` (n,): state at φ1 = 0 from which the motion begins (SI units, as `Response.state`); by
