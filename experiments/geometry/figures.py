@@ -23,7 +23,7 @@ def errors(rows: list[Row]) -> Figure:
     ax = axes[0, 0]
     for key, (label, mark, color) in SERIES.items():
         worst = [[row[key] for row in rows if row["family"] == family] for family in families]
-        # Without a valid design there is no error to draw.
+        # A family without a valid design has no error to draw.
         known = [max((x for x in one if np.isfinite(x)), default=np.nan) for one in worst]
         ax.plot(np.maximum(known, FLOOR), range(len(families)), mark, color=color, label=label)
     ax.set_xscale("log")

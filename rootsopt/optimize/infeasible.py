@@ -118,8 +118,8 @@ def _alone(problem: Problem, k: int, starts: Sequence[NDArray[np.float64]]) -> f
 
 
 def _best(found: Sequence[Found]) -> Found | None:
-    usable = [one for one in found if one.local is not None]
-    return min(usable, key=lambda one: one.local.objective, default=None)  # type: ignore[union-attr]
+    usable = [(one.local.objective, one) for one in found if one.local is not None]
+    return min(usable, key=lambda pair: pair[0], default=(0.0, None))[1]
 
 
 def _in_units(constraint: Constraint, slack: float) -> float:

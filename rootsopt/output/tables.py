@@ -152,7 +152,7 @@ def _start(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _optima(optimality: Mapping[str, Any]) -> list[tuple[str, ...]]:
     rows = []
-    for number, one in enumerate(optimality["optima"]):
+    for number, one in enumerate(optimality["optima"], start=1):
         times = f"{one['found']} of {len(optimality['starts'])} starts"
         rows.append((f"optimum {number}", times, _number(one["objective"])))
     share = optimality["unseen"]["share_of_starts"]
