@@ -16,15 +16,6 @@ from jaxtyping import install_import_hook
 install_import_hook("rootsopt", "typechecking.typechecked")
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-# Each process of a session has a core of its own: a program is compiled in one piece, which takes a
-# fifth less work than many pieces side by side, and as the package's own are (`programs.OPTIONS`).
-os.environ["XLA_FLAGS"] = " ".join(
-    (
-        os.environ.get("XLA_FLAGS", ""),
-        "--xla_cpu_parallel_codegen_split_count=1",
-        "--xla_cpu_use_fusion_emitters=false",
-    )
-).strip()
 # Tracing makes many objects that live on: looking for garbage among them finds little.
 gc.set_threshold(100_000, 50, 100)
 # One folder of compiled programs for all processes of a session, new for every session.
@@ -37,6 +28,16 @@ from rootsopt.commands.cli import use_cache  # noqa: E402
 from rootsopt.runtime import programs  # noqa: E402
 from rootsopt.runtime.environment import use_float64  # noqa: E402
 
+# Each process of a session has a core of its own: a program is compiled in one piece, which takes a
+# fifth less work than many pieces side by side. The tests' own functions are compiled with the
+# options of the package's programs.
+_FLAGS = {"xla_cpu_parallel_codegen_split_count": 1, **programs.OPTIONS}
+os.environ["XLA_FLAGS"] = " ".join(
+    [
+        os.environ.get("XLA_FLAGS", ""),
+        *(f"--{name}={str(value).lower()}" for name, value in _FLAGS.items()),
+    ]
+).strip()
 use_float64()
 use_cache()
 settings.register_profile("rootsopt", deadline=None, derandomize=True, max_examples=25)

@@ -230,6 +230,7 @@ class FlankPair(eqx.Module):
             pieces.append(rival - found.gap)
         return jnp.concatenate([jnp.stack(pieces), beyond])
 
+    @eqx.filter_jit  # so that all its calls in one program are traced once
     def _closest(self, roll, relative) -> ClosestApproach:
         """Return the closest approach for a folded `roll`, with its derivatives.
 

@@ -307,6 +307,7 @@ class RotorPair(eqx.Module):
             motion = motion._replace(shift=rest, drift=rest)
         return self._force(motion)
 
+    @eqx.filter_jit
     def contact_at(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> FlankForce:
         """Return the flank contact at rotation `tau` (mesh periods) and scaled `state`."""
         return self._force(self.motion(tau, state))
@@ -473,6 +474,7 @@ class RotorPair(eqx.Module):
         counted = jnp.pad(counted, (0, found.size - counted.size), constant_values=True)
         return Margins(found, counted, places, pushes)
 
+    @eqx.filter_jit
     def derivative(
         self, tau: Float[Array, ""], state: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], FlankForce]:

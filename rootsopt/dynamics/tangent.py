@@ -132,6 +132,7 @@ def propagated(
     derivatives of the state (n, n + d) after side step -1; and the linearised side steps -2, -3 …
     (stacked).
     """
+    linear_step = jax.jit(linear_step)  # traced once
     shape = jax.eval_shape(linear_step, last, start[:, 0])
     count = shape.by_state.shape[1]
 

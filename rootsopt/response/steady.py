@@ -209,7 +209,7 @@ def _basis(leaves: list[Array]) -> list[Array]:
     sizes = [leaf.size for leaf in leaves]
     unit, begin, rows = np.eye(sum(sizes)), 0, []
     for leaf, size in zip(leaves, sizes, strict=True):
-        part = unit[:, begin : begin + size].reshape(-1, *leaf.shape)
+        part = unit[:, begin : begin + size].reshape(len(unit), *leaf.shape)
         rows.append(jnp.asarray(part, leaf.dtype))
         begin += size
     return rows
