@@ -243,6 +243,31 @@ def test_composes_with_jit_and_vmap(scene, known):
     assert np.isnan(values[1])
 
 
+def test_batch_is_computed_one_by_one(scene):
+    """On a CPU. As arrays, every motion would take as long as all of them."""
+    designs = jnp.stack([jnp.asarray(DESIGN)] * 7)
+    batch = jax.make_jaxpr(jax.vmap(lambda design: steady_response(scene, design).mean))(designs)
+    assert " length=7" in str(batch)
+
+
+def test_design_without_parameters():
+    """Its derivative is empty, and the one by the scene is not."""
+    config = rootsopt.load_config("configs/ee.yaml")
+    scene = Scene.from_config(config)
+    mean = jax.eval_shape(
+        jax.grad(lambda design, scene: steady_response(scene, design).mean, (0, 1)),
+        config.design,
+        scene,
+    )
+    assert mean[0].shape == (0,)
+    assert mean[1].speed.shape == ()
+
+
+def test_function_compiled_with_the_options_of_programs(scene):
+    response = jax.jit(lambda x: jnp.sin(x), compiler_options=rootsopt.COMPILER_OPTIONS)(1.0)
+    assert float(response) == pytest.approx(np.sin(1.0), rel=1e-15)
+
+
 @pytest.mark.long
 def test_within_an_optimiser(scene):
     """A function that calls it twice, in an optax loop."""
