@@ -28,14 +28,14 @@ if TYPE_CHECKING:
     from rootsopt.response.steady import steady_response as steady_response
     from rootsopt.response.terms import Term as Term
     from rootsopt.response.terms import register_term as register_term
-    from rootsopt.runtime.programs import OPTIONS as COMPILER_OPTIONS
+    from rootsopt.runtime.programs import COMPILER_OPTIONS as COMPILER_OPTIONS
     from rootsopt.scene import Scene as Scene
     from rootsopt.status import Status as Status
 
 __version__ = "0.1.0"
 
 _PUBLIC = {
-    "COMPILER_OPTIONS": "rootsopt.runtime.programs:OPTIONS",
+    "COMPILER_OPTIONS": "rootsopt.runtime.programs:COMPILER_OPTIONS",
     "Config": "rootsopt.config:Config",
     "Contact": "rootsopt.contact.gap:Contact",
     "ContactLaw": "rootsopt.contact.law:ContactLaw",

@@ -31,7 +31,7 @@ from rootsopt.runtime.environment import use_float64  # noqa: E402
 # Each process of a session has a core of its own: a program is compiled in one piece, which takes a
 # fifth less work than many pieces side by side. The tests' own functions are compiled with the
 # options of the package's programs.
-_FLAGS = {"xla_cpu_parallel_codegen_split_count": 1, **programs.OPTIONS}
+_FLAGS = {"xla_cpu_parallel_codegen_split_count": 1, **programs.COMPILER_OPTIONS}
 os.environ["XLA_FLAGS"] = " ".join(
     [
         os.environ.get("XLA_FLAGS", ""),
@@ -64,11 +64,13 @@ def compiled(request):
     """Optimise programs, as a user has them, only where that pays: elsewhere the arithmetic is the
     same except for rounding, and compiling takes half the time."""
     name = request.path.stem.removeprefix("test_")
-    options = programs.OPTIONS | {"xla_backend_optimization_level": 3 if name in _OPTIMISED else 0}
+    options = programs.COMPILER_OPTIONS | {
+        "xla_backend_optimization_level": 3 if name in _OPTIMISED else 0
+    }
     # The package's programs take the options; functions that a test compiles itself take the flag.
     jax.config.update("jax_disable_most_optimizations", name not in _OPTIMISED + _PRECISE)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(programs, "OPTIONS", options)
+        patch.setattr(programs, "COMPILER_OPTIONS", options)
         yield
     jax.config.update("jax_disable_most_optimizations", False)
 

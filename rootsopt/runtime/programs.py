@@ -48,7 +48,7 @@ _SETTINGS = (
 )
 """Settings of JAX that change what is traced or compiled."""
 _VARIABLES = ("XLA_FLAGS", "EQX_ON_ERROR")
-OPTIONS: dict[str, str | bool] = {
+COMPILER_OPTIONS: dict[str, str | bool] = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_disable_hlo_passes": (
         "while-loop-invariant-code-motion,while-loop-constant-sinking,simplify-while-loops"
@@ -239,11 +239,11 @@ def _split(args: tuple) -> tuple[list, _Kind]:
 
 
 def _finished(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-    """Compile a lowered program with those of the `OPTIONS` that XLA_FLAGS does not set.
+    """Compile a lowered program with those of the `COMPILER_OPTIONS` that XLA_FLAGS does not set.
 
     If this fails, as when the compiler does not know an option, compile without options."""
     said = os.environ.get("XLA_FLAGS", "")
-    options = {name: value for name, value in OPTIONS.items() if name not in said}
+    options = {name: value for name, value in COMPILER_OPTIONS.items() if name not in said}
     if options and jax.default_backend() == "cpu":
         with contextlib.suppress(jax.errors.JaxRuntimeError):
             return lowered.compile(compiler_options=options)
@@ -347,5 +347,5 @@ def _versions() -> list[str]:
 def _settings() -> list[str]:
     """Return the current values of the settings that change what is traced or compiled."""
     variables = [f"{name}={os.environ.get(name, '')}" for name in _VARIABLES]
-    variables.append(f"{sorted(OPTIONS.items())}")
+    variables.append(f"{sorted(COMPILER_OPTIONS.items())}")
     return variables + [f"{name}={getattr(jax.config, name, None)}" for name in _SETTINGS]

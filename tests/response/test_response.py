@@ -245,9 +245,19 @@ def test_composes_with_jit_and_vmap(scene, known):
 
 def test_batch_is_computed_one_by_one(scene):
     """On a CPU. As arrays, every motion would take as long as all of them."""
-    designs = jnp.stack([jnp.asarray(DESIGN)] * 7)
-    batch = jax.make_jaxpr(jax.vmap(lambda design: steady_response(scene, design).mean))(designs)
-    assert " length=7" in str(batch)
+
+    def mean(design):
+        return steady_response(scene, design).mean
+
+    one, batch = (
+        len(str(jax.make_jaxpr(function)(design)).splitlines())
+        for function, design in [
+            (mean, jnp.asarray(DESIGN)),
+            (jax.vmap(mean), jnp.stack([DESIGN] * 7)),
+        ]
+    )
+    # A program for arrays of motions has more operations: selections instead of conditions.
+    assert batch < 1.05 * one
 
 
 def test_design_without_parameters():
