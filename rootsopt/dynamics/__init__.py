@@ -1,1 +1,2 @@
-"""Motion of a rotor pair: equation, integration, orbits and their derivatives."""
+"""The motion of a rotor pair: equation of motion, integration, periodic orbits and their
+derivatives."""

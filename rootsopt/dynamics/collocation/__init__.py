@@ -1,1 +1,2 @@
-"""Periodic orbits at all their instants at once, by collocation aligned with events."""
+"""Periodic orbits by collocation: all instants are solved for at once, on elements that end at
+events."""

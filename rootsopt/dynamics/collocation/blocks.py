@@ -1,4 +1,7 @@
-"""Evaluation of as many elements as a mesh has, in arrays with room for more."""
+"""Evaluation of the elements of a mesh in blocks.
+
+The arrays of a mesh have room for more elements than the mesh uses. Blocks of unused elements are
+not evaluated."""
 
 from typing import Any
 
@@ -8,11 +11,15 @@ from jax import lax
 from jaxtyping import Array, Int
 
 BLOCK = 16
-"""Number of elements evaluated together. The room of a mesh is a multiple of it."""
+"""Number of elements evaluated together. The arrays of a mesh have room for a multiple of this
+number."""
 
 
 def in_blocks(function: Any, used: Int[Array, ""], *arrays: Any) -> Any:
-    """Return `function` of arrays (e, …), evaluated in blocks of elements; 0 beyond `used`."""
+    """Return `function(*arrays)`, evaluated block by block along the leading axis of elements.
+
+    `function` maps arrays (e, …) of e elements to arrays (e, …); `used`: number of elements in use.
+    Blocks without such elements are not evaluated; their results are 0."""
     shapes = jax.eval_shape(function, *arrays)
     count = jax.tree.leaves(arrays)[0].shape[0]
     size = min(BLOCK, count)

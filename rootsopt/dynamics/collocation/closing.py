@@ -1,10 +1,15 @@
-"""Close a periodic orbit by collocation: events, mesh and orbit until all three agree.
+"""Close a periodic orbit by collocation: find its events, its mesh and the orbit itself.
 
-One loop does everything, so that each program is compiled once. A turn looks at the flags of the
-equation along the orbit. If they change where the mesh does not expect it, the elements are aligned
-with the events found. If they agree, Newton's method solves for orbit and events, and the flags are
-looked at again. An orbit whose flags agree is solved once more on a finer mesh, shared out by the
-error of the coarser one; the difference of the two is the error estimate.
+An *event* is an instant at which a flag of the equation (`RotorPair.switches`) changes. The *mesh*
+divides the orbit into elements that end at its events.
+
+One loop does everything, so that each program is compiled once. Each iteration evaluates the flags
+along the orbit. If the flags do not change exactly at the events of the mesh, the elements are
+aligned with the changes found. Otherwise, Newton's method solves for the orbit and the times of its
+events, and the flags are evaluated again.
+
+An orbit whose flags agree is solved again on a finer mesh, graded according to the error on the
+coarser mesh. The difference between the two solutions is the error estimate.
 """
 
 from typing import Any, NamedTuple
@@ -27,33 +32,39 @@ from rootsopt.dynamics.orbit import choose
 from rootsopt.dynamics.pair import RotorPair
 
 _FIRST, _EVENT = 20, 1
-"""Elements of the first mesh: per mesh period, and in addition for each event."""
+"""Number of elements of the first mesh that is aligned with events: per mesh period, and in
+addition per event."""
 _FINER = 1.4
-"""Factor by which a finer mesh has more elements."""
+"""Factor by which the number of elements grows when the mesh is refined."""
 _MOST = 96
-"""Greatest number of elements per mesh period."""
+"""Maximum number of elements per mesh period."""
 _TIMES = 48
-"""Greatest number of events per mesh period."""
+"""Number of events per mesh period, on average over the orbit, above which the search for the orbit
+fails."""
 _TURNS = 24
-"""Maximum number of turns of the loop."""
+"""Maximum number of iterations of the loop."""
 _CORRECTED = 1e-6
-"""Last correction (scaled) above which an orbit is rejected."""
+"""Last correction of the states (scaled) above which an orbit is rejected."""
 _FAILURES = 4
-"""Maximum number of times that Newton's method may not converge."""
+"""Number of times that Newton's method does not converge, above which the search for the orbit
+fails."""
 _SMALL = 3e-9
-"""Newton step (scaled) at which an orbit is closed. The next one would be of its square."""
+"""Newton step (scaled) below which Newton's method stops. The step after it would be smaller by
+orders of magnitude, since convergence is quadratic."""
 _GAIN = 10.0
-"""Factor by which the error of the finer of two meshes is below their difference. With
-superconvergent elements it is larger (1.4⁸)."""
+"""Factor by which the difference between the results on two meshes is divided to estimate the error
+on the finer mesh. In theory the error falls by the larger factor 1.4⁸."""
 
 
 class Closed(NamedTuple):
     """A closed orbit.
 
-    `found`: its forces and derivatives; `error`: estimated relative error of mean, RMS and peak
-    force; `drift`: the same of the derivatives, relative to the largest of each force; `sound`:
-    whether Newton's method converged and the flags agree with the events of the mesh; `events`:
-    their number; `turns`: turns of the loop; `steps`: Newton steps.
+    `found`: its forces and derivatives; `error`: estimated relative error of the forces, the
+    largest of mean, RMS and peak; `drift`: estimated error of their derivatives, relative to the
+    largest derivative of the same force; `sound`: whether Newton's method has converged and the
+    flags agree with the events of the mesh; `events`: number of events; `turns`: number of
+    iterations of the loop; `steps`: number of Newton steps. `error` and `drift` are inf if only one
+    mesh was solved.
     """
 
     found: Found
@@ -66,11 +77,13 @@ class Closed(NamedTuple):
 
 
 class _Loop(NamedTuple):
-    """State of the loop: the result so far, and the elements of the next turn.
+    """State of the loop.
 
-    `force` (e, s): contact force (N) at the Gauss points; `fits`: whether the elements end at
-    events; `solved`: whether Newton's method has converged on them; `failures`: how often it did
-    not; `meshes`: number of meshes on which the orbit was solved; `over`: whether the loop ends.
+    `closed`: result so far; `elements`: motion for the next iteration; `force` (e, s): contact
+    force (N) at the Gauss points; `fits`: whether the elements end at events; `solved`: whether
+    Newton's method has converged on these elements; `failures`: number of times that it has not
+    converged; `meshes`: number of meshes on which the orbit has been solved; `over`: whether the
+    loop ends.
     """
 
     closed: Closed
@@ -84,9 +97,10 @@ class _Loop(NamedTuple):
 
 
 def supported(pair: RotorPair) -> bool:
-    """Return whether collocation can solve for the orbits of `pair`.
+    """Return whether collocation can close orbits of `pair`.
 
-    It needs a contact by search, and margins for all flags."""
+    The contact must be a `SearchContact`, and every flag of contact law and parts needs a margin
+    (see `Margins`)."""
     owners = [pair.law, *pair.all_parts]
     names = [("margins", "switches"), ("drag_margins", "drag_switches")]
     known = all(
@@ -99,7 +113,10 @@ def supported(pair: RotorPair) -> bool:
 
 
 def _newer(kind: type, margin: str, flag: str) -> bool:
-    """Return whether a class defines `margin` where, or after, it defines `flag`."""
+    """Return whether the method `margin` of the class `kind` belongs to the same version as its
+    method `flag`.
+
+    That is so if `margin` is defined in the same class as `flag` or in a subclass of that class."""
     order = list(kind.__mro__)
     places = [
         next(k for k, base in enumerate(order) if name in vars(base)) for name in (margin, flag)
@@ -108,20 +125,24 @@ def _newer(kind: type, margin: str, flag: str) -> bool:
 
 
 def sizes(periods: int) -> tuple[int, int]:
-    """Return the room for elements and for times of orbits of up to `periods` mesh periods."""
+    """Return the sizes of the arrays of a mesh: for its elements, and for its times.
+
+    They suffice for orbits of at most `periods` mesh periods."""
     elements = -(-(periods * _MOST) // BLOCK) * BLOCK
     return elements, periods * _TIMES + 3
 
 
 def first_elements(period: Int[Array, ""]) -> Int[Array, ""]:
-    """Return the number of elements of a first mesh without events."""
+    """Return the number of elements for an orbit of `period` mesh periods before its events are
+    known."""
     return jnp.asarray(2 * _FIRST * period)
 
 
 class _Closer(eqx.Module):
-    """Arguments of `close`. Its loop is `start` and `turn`.
+    """The loop of `close`: `start` returns its initial state, `turn` makes one iteration.
 
-    `frozen`: the pair without derivatives."""
+    `frozen`: the pair of `equation`, treated as constant by JAX. The other fields are arguments of
+    `close`."""
 
     equation: Equation
     frozen: RotorPair
@@ -129,13 +150,18 @@ class _Closer(eqx.Module):
     tolerance: Float[Array, ""]
 
     def start(self, elements: Elements, known: Bool[Array, ""]) -> _Loop:
-        """Return the loop's state before the first turn."""
+        """Return the initial state of the loop for the motion `elements`.
+
+        `known`: whether the elements end at events."""
         nothing = _nothing(self.equation, self.tangents, elements)
         no, zero = jnp.zeros((), bool), jnp.zeros((), int)
         return _Loop(nothing, elements, elements.slopes[..., 0], known, no, zero, zero, no)
 
     def turn(self, now: _Loop) -> _Loop:
-        """Look at the flags, then solve, keep the forces or change the mesh, as they say."""
+        """Evaluate the flags along the motion, and return the loop's state after one iteration.
+
+        Depending on the flags, the iteration solves for the orbit, stores its forces or changes the
+        mesh."""
         seen = look(self.frozen, now.elements)
         events = found_events(self.frozen, now.elements, seen, now.elements.mesh.times.shape[0])
         agree = now.fits & (events.new == 0) & (events.gone == 0)
@@ -153,7 +179,9 @@ class _Closer(eqx.Module):
         return new._replace(closed=closed, over=over)
 
     def align(self, now: _Loop, events: Events, finer) -> _Loop:
-        """Move the motion to a mesh that ends at its events, and is finer if asked for."""
+        """Return the loop's state with the motion on a mesh that ends at `events`.
+
+        `finer`: whether the new mesh has more elements than the old one."""
         taken = now.elements.mesh.used
         first = taken // 2 + _EVENT * events.count
         used = jnp.where(now.fits, jnp.where(finer, (_FINER * taken).astype(int), taken), first)
@@ -164,7 +192,8 @@ class _Closer(eqx.Module):
         return now._replace(elements=new, fits=jnp.ones((), bool), solved=jnp.zeros((), bool))
 
     def solve(self, now: _Loop, seen) -> _Loop:
-        """Run Newton's method on the mesh as it is."""
+        """Return the loop's state after Newton's method on the present mesh; `seen`: flags along
+        the motion."""
         got = newton(self.equation, rooted(now.elements, seen), jnp.asarray(_SMALL))
         good = got.size <= 10 * _SMALL
         closed = now.closed._replace(steps=now.closed.steps + got.turns)
@@ -180,7 +209,8 @@ class _Closer(eqx.Module):
         )
 
     def keep(self, now: _Loop, events: Events) -> _Loop:
-        """Keep the forces of an orbit whose flags agree."""
+        """Return the loop's state with the forces, derivatives and errors of an orbit whose flags
+        agree."""
         found = response(self.equation, now.elements, now.force, self.tangents)
         error, drift = _differences(now.closed.found, found)
         first = now.meshes == 0
@@ -212,11 +242,12 @@ def close(
     tolerance: Float[Array, ""],
     known: Bool[Array, ""] | bool = False,
 ) -> Closed:
-    """Close the orbit near the motion `elements`, to a relative error `tolerance` of its forces.
+    """Close the orbit near the motion `elements`, and compute its forces and their derivatives.
 
-    `tangents`: directions (d, …) of the pair's parameters for the derivatives; `known`: whether the
-    elements end at events, such as those of the orbit of a similar pair. With a `tolerance` of inf,
-    the orbit is solved on one mesh only, without an error estimate."""
+    `tangents`: d directions of the pair's parameters along which to differentiate, stacked along a
+    leading axis; `tolerance`: relative error of the forces to reach. If it is inf, the orbit is
+    solved on one mesh only, without an error estimate. `known`: whether the elements end at events,
+    as those of an orbit of a similar pair do."""
     closer = _Closer(equation, lax.stop_gradient(equation.pair), tangents, tolerance)
 
     def go_on(now: _Loop) -> Bool[Array, ""]:
@@ -227,7 +258,8 @@ def close(
 
 
 def _differences(before: Found, after: Found):
-    """Return the relative differences of forces, and of their derivatives."""
+    """Return the largest relative difference between two results in mean, RMS and peak force, and
+    that in their derivatives."""
 
     def rms(values):
         return values.at[1].set(jnp.sqrt(jnp.maximum(values[1], 0.0)))[:3]
@@ -242,7 +274,7 @@ def _differences(before: Found, after: Found):
 
 
 def _nothing(equation: Equation, tangents: Any, elements: Elements) -> Closed:
-    """Return the result before the first turn."""
+    """Return the result before the first iteration: zeros, with infinite errors."""
     shape = jax.eval_shape(lambda: response(equation, elements, elements.slopes[..., 0], tangents))
     empty: Found = jax.tree.map(lambda x: jnp.full(x.shape, 0, x.dtype), shape)
     infinite, zero = jnp.asarray(jnp.inf), jnp.zeros((), int)

@@ -1,8 +1,8 @@
-"""An orbit as polynomials on elements, some of which end at events.
+"""A motion as polynomials on elements, some of which end at events.
 
-The period is cut into *intervals* by events, instants at which the equation of motion is not
-smooth. An interval has one or more elements, at fixed shares of its length, so that all elements
-move when the events at its ends do.
+Events are instants at which the equation of motion is not smooth. They divide the period into
+*intervals*. Each interval consists of one or more elements, at fixed fractions of its length. All
+elements therefore move when the events at the ends of their interval move.
 """
 
 from typing import NamedTuple
@@ -14,13 +14,14 @@ from rootsopt.dynamics.collocation.gauss import GAUSS
 
 
 class Mesh(NamedTuple):
-    """Elements of one period of an orbit.
+    """Elements of one period of an orbit: m times, room for e elements.
 
-    `times` (m,): start of the period, its events, and from the last event on the end of the period
-    (mesh periods); `which` (m,): number of the margin that is zero at each of these times, -1 where
-    the time is fixed; `interval` (e,): index of the time at which an element's interval begins;
-    `left`, `right` (e,): shares of the interval at which the element begins and ends; `used`:
-    number of elements; all others have no length and lie at the end.
+    `times` (m,) in mesh periods: start of the period, events in ascending order, then the end of
+    the period, repeated; `which` (m,): index of the margin (`Margins.values`) that is zero at each
+    time, -1 where the time is fixed; `interval` (e,): index in `times` of the start of the interval
+    that contains the element; `left`, `right` (e,): start and end of the element, as fractions of
+    its interval; `used`: number of elements in use. The unused elements come last and have length
+    0.
     """
 
     times: Float[Array, " m"]
@@ -44,23 +45,23 @@ class Mesh(NamedTuple):
 
     @property
     def last(self) -> Bool[Array, " e"]:
-        """Whether an element is the last one of its interval."""
+        """Whether each element is the last of its interval."""
         following = jnp.append(self.interval[1:], -1)
         number = jnp.arange(self.interval.shape[0])
         return (self.interval != following) | (number >= self.used - 1)
 
     @property
     def period(self) -> Float[Array, ""]:
-        """Length of the orbit (mesh periods)."""
+        """Length of the period (mesh periods)."""
         return self.times[-1] - self.times[0]
 
 
 class Elements(NamedTuple):
-    """A motion on a mesh.
+    """A motion on a `mesh` of e elements with s Gauss points each.
 
-    `state` (e, n): scaled state at the start of each element; `slopes` (e, s, n): its derivative at
-    the Gauss points; `roots` (e, s + 1, sides, 2): see `NearContact`, at the Gauss points and at
-    the element's end.
+    `state` (e, n): scaled state at the start of each element; `slopes` (e, s, n): derivative of the
+    state with respect to time (mesh periods) at the Gauss points; `roots` (e, s + 1, sides, 2):
+    `NearContact.roots` at the Gauss points and at the end of each element.
     """
 
     mesh: Mesh
@@ -70,9 +71,10 @@ class Elements(NamedTuple):
 
     @property
     def places(self) -> tuple[Float[Array, "e p"], Float[Array, "e p n"]]:
-        """Times (mesh periods) and scaled states at the Gauss points and the end of each element.
+        """Times (e, s + 1) in mesh periods and scaled states (e, s + 1, n) at the Gauss points and
+        the end of each element.
 
-        The state at the end is the one at which the next element starts."""
+        The state at the end is the state at which the next element starts."""
         begin, end = self.mesh.ends
         length = self.mesh.lengths
         tau = jnp.append(begin[:, None] + length[:, None] * GAUSS.nodes, end[:, None], axis=1)
@@ -82,12 +84,13 @@ class Elements(NamedTuple):
 
     @property
     def following(self) -> Float[Array, "e n"]:
-        """State at the start of the next element; of the first one, for the last."""
+        """Scaled state at the start of the next element; for the last element, at the start of the
+        first."""
         number = jnp.arange(self.state.shape[0])
         return self.state[jnp.where(number + 1 < self.mesh.used, number + 1, 0)]
 
     def motion(self, tau: Float[Array, ""]) -> Float[Array, " n"]:
-        """Return the scaled state at the time `tau` (mesh periods)."""
+        """Return the scaled state at the time `tau` (mesh periods), continued periodically."""
         mesh = self.mesh
         begin = mesh.ends[0]
         tau = mesh.times[0] + jnp.mod(tau - mesh.times[0], mesh.period)
@@ -95,7 +98,8 @@ class Elements(NamedTuple):
         return self.inside(k, tau)
 
     def inside(self, k: Int[Array, ""], tau: Float[Array, ""]) -> Float[Array, " n"]:
-        """Return the scaled state at `tau` (mesh periods) by the polynomial of element `k`."""
+        """Return the scaled state at the time `tau` (mesh periods), from the polynomial of element
+        `k`."""
         length = self.mesh.lengths[k]
         share = (tau - self.mesh.ends[0][k]) / jnp.where(length > 0, length, 1.0)
         rise = jnp.sum(GAUSS.integrated(share)[:, None] * self.slopes[k], axis=0)

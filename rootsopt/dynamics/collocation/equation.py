@@ -1,4 +1,4 @@
-"""The equation of motion at one instant, with its derivatives, next to a known contact."""
+"""The equation of motion at one instant, and its derivatives, for a contact known approximately."""
 
 from typing import Any, NamedTuple
 
@@ -14,11 +14,12 @@ from rootsopt.dynamics.pair import RotorPair
 
 
 class Point(NamedTuple):
-    """The equation at an instant.
+    """The equation of motion at one instant, as r = n + q + 1 values.
 
-    `values` (r,): slope of the state (n,), integrands of the measures (see `Equation`) and the
-    margin asked for; `slopes` (r, 1 + n): their derivatives with respect to time and state;
-    `roots` (sides, 2): see `NearContact`; `force`: contact force (N); `depth`: penetration (m).
+    `values` (r,): derivatives of the n scaled states with respect to time (mesh periods), q
+    integrands (see `Equation`), and one margin (see `Margins`); `slopes` (r, 1 + n): derivatives of
+    `values` with respect to time and state; `roots` (sides, 2): improved `NearContact.roots`;
+    `force`: contact force (N); `depth`: penetration (m).
     """
 
     values: Float[Array, " r"]
@@ -29,10 +30,10 @@ class Point(NamedTuple):
 
 
 class Equation(eqx.Module):
-    """The equation of motion of a pair with the integrands of the measures.
+    """The equation of motion of a `pair`, together with the integrands of `measures`.
 
-    The integrands are those of `measures`, in the solver's unit of force. Where rotor 1 is free
-    they are times the lapse of time, which is then the last integrand. `top` (N): roughly the
+    Forces in the integrands are in units of `pair.force_scale`. If rotor 1 is free, the integrands
+    are multiplied by `RotorPair.lapse`, which is also the last integrand. `top` (N): roughly the
     greatest force.
     """
 
@@ -47,17 +48,23 @@ class Equation(eqx.Module):
 
     @property
     def sides(self) -> int:
-        """Number of sides of the flanks that can touch at once."""
+        """Number of flank sides (drive, coast) that can touch at once."""
         return 1 + self.pair.two_sided
 
     def near(self, dynamic: Any, static: Any, roots: Float[Array, "sides 2"]) -> RotorPair:
-        """Return the pair with a contact that starts from known roots."""
+        """Return the pair with a contact evaluated near known `roots` (see `NearContact`).
+
+        `dynamic`, `static`: the pair's floating-point arrays, and the rest of the pair."""
         pair: RotorPair = eqx.combine(dynamic, static)
         assert isinstance(pair.contact, SearchContact)
         return eqx.tree_at(lambda p: p.contact, pair, NearContact(pair.contact.pair, roots))
 
     def evaluated(self, dynamic, static, tau, state, roots, which):
-        """Return `Point.values`, and its roots, force and depth."""
+        """Return `Point.values`, and the tuple (roots, force, depth) with the other fields of
+        `Point`.
+
+        `dynamic`, `static`: the pair's floating-point arrays, and the rest of the pair. For the
+        other arguments, see `point`."""
         near = self.near(dynamic, static, roots)
         slope, contact = near.derivative(tau, state)
         unit = jax.lax.stop_gradient(self.pair.force_scale)
@@ -72,7 +79,10 @@ class Equation(eqx.Module):
     def force(
         self, tau: Float[Array, ""], state: Float[Array, " n"], roots: Float[Array, "sides 2"]
     ) -> tuple[Float[Array, ""], Float[Array, "sides 2"]]:
-        """Return the contact force (N) and the roots there."""
+        """Return the contact force (N), and the improved `roots`.
+
+        `tau`: time (mesh periods); `state` (n,): scaled; `roots` (sides, 2):
+        `NearContact.roots`."""
         near = self.near(*eqx.partition(self.pair, eqx.is_inexact_array), roots)
         places = near.margins(tau, state).places
         return near.contact_at(tau, state).total, _roots(places)
@@ -84,8 +94,10 @@ class Equation(eqx.Module):
         roots: Float[Array, "sides 2"],
         which: Int[Array, ""],
     ) -> Point:
-        """Return the equation at `tau` (mesh periods) and the scaled `state`, with the margin of
-        number `which`."""
+        """Return the equation and its derivatives at the time `tau` (mesh periods) and the scaled
+        `state`.
+
+        `roots` (sides, 2): `NearContact.roots`; `which`: index of the margin to evaluate."""
         dynamic, static = eqx.partition(self.pair, eqx.is_inexact_array)
 
         def value(place):
@@ -104,7 +116,11 @@ class Equation(eqx.Module):
         which: Int[Array, ""],
         tangents: Any,
     ) -> tuple[Point, Float[Array, "r d"]]:
-        """Return `point`, and the derivatives of its values along `tangents` (d, …) of the pair."""
+        """Return `point`, and the derivatives of `Point.values` along d directions of the pair's
+        parameters.
+
+        `tangents`: directions, stacked along a leading axis. For the other arguments, see
+        `point`."""
         dynamic, static = eqx.partition(self.pair, eqx.is_inexact_array)
         moved = eqx.filter(tangents, eqx.is_inexact_array)
 
@@ -122,7 +138,9 @@ class Equation(eqx.Module):
 
 
 def _roots(places: list[Any]) -> Float[Array, "sides 2"]:
-    """Return the roots that a `NearContact` has found."""
+    """Return the `NearContact.roots` improved by an evaluation.
+
+    `places`: for each side, the closest approaches found (`Approach.place`)."""
     moved = [
         jnp.stack([own.normal2, own.normal2 if rival is None else rival.normal2])
         for own, rival in places

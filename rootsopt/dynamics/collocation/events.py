@@ -1,8 +1,8 @@
-"""Search for the events of a motion, and check of the events that a mesh assumes.
+"""Find the events of a motion, and check the events that a mesh assumes.
 
-The flags of the equation are looked at between all Gauss points and on both sides of all ends of
-elements, by the contact's own search. A change of a flag is an event. Those in the middle of
-elements are located by bisection.
+An event is an instant at which a flag of the equation (`RotorPair.switches`) changes. The flags are
+evaluated at all Gauss points and on both sides of the end of each element, with a search for the
+contact. Events inside elements are located by bisection.
 """
 
 from typing import NamedTuple
@@ -19,22 +19,24 @@ from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.pair import RotorPair
 
 _ASIDE = 2e-7, 0.02
-"""Distance from an element's end at which the flags are looked at: in mesh periods, and at most in
-lengths of the shorter of the two elements beside it."""
+"""Greatest distance from an element's end at which flags are evaluated: in mesh periods, and as a
+fraction of the shorter of the two adjacent elements. The smaller distance applies."""
 _HALVINGS = 30
 """Number of bisections that locate an event."""
 _SAME = 3e-9
-"""Distance (mesh periods) below which two events are one."""
+"""Time (mesh periods) between two events up to which they are merged into one."""
 _CHANGES = 384
-"""Maximum number of changes of flags between neighbouring places."""
+"""Number of new flag changes along a motion above which the search for its orbit fails."""
 
 
 class Look(NamedTuple):
-    """Flags along a motion, in the order of time.
+    """Flags along a motion, at p instants in order of time.
 
-    `tau` (p,): places (mesh periods); `flags` (p, f); `counts` (p, f): whether they matter;
-    `roots` (e, s + 2, sides): normal angles of the closest approach; `pushes` (e, s + 2, sides):
-    whether the flanks transmit a force; `total`: number of places.
+    `tau` (p,): times (mesh periods); `flags` (p, f): the f flags of the equation; `counts` (p, f):
+    whether each flag matters there; `roots` (e, s + 2, sides): normal angles ν2 (rad) of the
+    closest approach, for each of e elements at its s Gauss points and on both sides of its end;
+    `pushes` (e, s + 2, sides): whether the flanks transmit a force; `total`: number of instants in
+    use.
     """
 
     tau: Float[Array, " p"]
@@ -46,11 +48,12 @@ class Look(NamedTuple):
 
 
 class Events(NamedTuple):
-    """Events of a motion in the order of time, as in `Mesh`.
+    """Events of a motion, in order of time.
 
-    `times`, `which` (m,); `count`: number of them; `new`: number of changes that are not at events
-    of the mesh; `gone`: number of the mesh's events at which nothing changes; `fits`: whether there
-    is room for all.
+    `times` (m,) in mesh periods (inf beyond the last); `which` (m,): index of the margin that is
+    zero at each event, -1 where the time is fixed; `count`: number of events; `new`: number of flag
+    changes that are not at events of the mesh; `gone`: number of events of the mesh at which the
+    flag does not change; `fits`: whether the arrays have room for all events.
     """
 
     times: Float[Array, " m"]
@@ -62,17 +65,23 @@ class Events(NamedTuple):
 
 
 def flags_at(pair: RotorPair, tau, state):
-    """Return flags, whether they matter, roots (sides,) of the contact, and whether it pushes."""
+    """Return the flags (f,) of the equation at the time `tau` (mesh periods) and the scaled
+    `state`.
+
+    Also return whether each flag matters (f,), the normal angles ν2 (rad) of the closest approach
+    (sides,), and whether the flanks transmit a force (sides,)."""
     found = pair.margins(tau, state)
     roots = jnp.stack([place.normal2 for place in found.places])
     return found.values > 0, found.counts, roots, found.pushes
 
 
 def ranks(pair: RotorPair) -> list[int]:
-    """Return for each margin its rank among those that change at one instant: the least counts.
+    """Return the rank of each margin. If several flags change at one instant, the margin with the
+    least rank determines the event.
 
-    Margins that do not depend on the contact are best known, then the change to the other minimum
-    next to a cusp, with which other flags change. -1: not an event by itself."""
+    Margins that do not depend on the contact come first, since their zeros are known best. The
+    change to the other minimum of the gap next to a cusp comes second, because other flags change
+    with it. The rank -1 marks a flag whose change is not an event by itself."""
     assert isinstance(pair.contact, SearchContact)
     nothing = jnp.zeros(())
     law = jax.eval_shape(pair.law.margins, nothing, nothing).shape[0]
@@ -95,7 +104,7 @@ def ranks(pair: RotorPair) -> list[int]:
 
 
 def look(pair: RotorPair, elements: Elements) -> Look:
-    """Look at the flags at the Gauss points and on both sides of the end of each element."""
+    """Evaluate the flags at the Gauss points and on both sides of the end of each element."""
     mesh = elements.mesh
     tau, state = elements.places
     number = jnp.arange(mesh.left.shape[0])
@@ -116,10 +125,12 @@ def look(pair: RotorPair, elements: Elements) -> Look:
 
 
 def rooted(elements: Elements, seen: Look) -> Elements:
-    """Return the elements with the contact's roots from a look at them.
+    """Return `elements` with the contact's roots replaced by those from `seen`, the result of
+    `look`.
 
-    At the end of an element, the root is that of the side on which the flanks push; the rival next
-    to a cusp is the root after the end."""
+    At the end of an element, the first root belongs to the side of the end on which the flanks
+    push. The second root, for the other minimum next to a cusp, belongs to the instant after the
+    end."""
     inside = len(GAUSS.nodes)
     before = seen.pushes[:, inside] | ~seen.pushes[:, inside + 1]
     own = jnp.where(before, seen.roots[:, inside], seen.roots[:, inside + 1])
@@ -129,7 +140,9 @@ def rooted(elements: Elements, seen: Look) -> Elements:
 
 
 def found_events(pair: RotorPair, elements: Elements, seen: Look, room: int) -> Events:
-    """Return the events of the motion that was `seen`; `room`: of the arrays for times."""
+    """Return the events of the motion `elements`, whose flags are `seen`.
+
+    `room`: size m of the returned arrays."""
     mesh = elements.mesh
     places = seen.tau.shape[0]
     per = len(GAUSS.nodes) + 2
@@ -177,8 +190,10 @@ def found_events(pair: RotorPair, elements: Elements, seen: Look, room: int) -> 
 
 
 def _merged(times, which, rank):
-    """Sort events and merge those of one instant; return times (inf beyond the last), margins and
-    their number."""
+    """Sort events by time, and merge those at the same instant.
+
+    `times`: inf for missing events; `which`: index of each event's margin, or -1; `rank`: see
+    `ranks`. Return the merged times and margins, and the number of events."""
     importance = jnp.where(which < 0, -1, rank[which])
     order = jnp.lexsort((importance, times))
     times, which, importance = times[order], which[order], importance[order]

@@ -1,8 +1,8 @@
-"""Forces of a closed orbit, its multipliers, and the derivatives of both.
+"""Forces of a closed orbit, its monodromy matrix, and the derivatives of the forces.
 
-The derivatives with respect to parameters solve the same linear equations as Newton's step, with
-the derivatives of the equation and of the margins as right-hand sides. Events move with the
-parameters and the elements with the events, so that no kink or jump crosses a Gauss point.
+The derivatives with respect to parameters solve the same linear equations as Newton's step. The
+right-hand sides are the derivatives of the equation and of the margins. Events move with the
+parameters, and elements move with the events. Therefore no kink or jump crosses a Gauss point.
 """
 
 from typing import Any, NamedTuple
@@ -27,20 +27,24 @@ from rootsopt.dynamics.collocation.system import (
 )
 
 _RIVALS, _PLACES = 4, 9
-"""Number of elements in which the peak is searched for, and of places tried in each at once."""
+"""Number of elements in which the peak is searched for, and number of instants per element at which
+the force is evaluated in each round."""
 _ROUNDS, _CLOSER = 14, 0.25
-"""Number of rounds of the search, and the factor by which each shortens its range."""
+"""Number of rounds of the search for the peak, and factor by which the searched range shrinks from
+one round to the next."""
 
 
 _MENDED = 3
-"""Evaluations at each place; the contact's roots converge with them."""
+"""Number of evaluations at each instant in the search for the peak. Each starts from the contact's
+roots of the one before, so that the roots converge."""
 
 
 class Peak(NamedTuple):
-    """The greatest force of an orbit.
+    """The greatest contact force of an orbit.
 
-    `element`: its number; `share`: place inside it, 0 … 1; `roots` (sides, 2) of the contact there;
-    `force` (N).
+    `element`: index of the element that contains the peak; `share`: position in the element, from 0
+    (start) to 1 (end); `roots` (sides, 2): `NearContact.roots` at the peak; `force`: contact force
+    (N).
     """
 
     element: Int[Array, ""]
@@ -52,10 +56,12 @@ class Peak(NamedTuple):
 class Found(NamedTuple):
     """Results of a closed orbit, with derivatives along d directions of the parameters.
 
-    `elements` after a last correction; `response` (r,): mean (N), mean square (N²), peak (N) and
-    the other measures; `sensitivity` (r, d); `state` (n,) at φ1 = 0 and `moved` (n, d); `monodromy`
-    (n, n) of the start of the mesh; `depth`: greatest penetration at the places of the mesh (m);
-    `peak`; `correction`: size of the last correction (scaled).
+    `elements`: the orbit after a last correction; `response` (r,): mean (N), mean square (N²), peak
+    (N) and the further measures; `sensitivity` (r, d): derivatives of `response`; `state` (n,):
+    scaled state at φ1 = 0; `moved` (n, d): derivatives of `state`; `monodromy` (n, n): monodromy
+    matrix at the start of the mesh; `depth`: greatest penetration (m) at Gauss points and element
+    ends; `peak`: the greatest force before the last correction; `correction`: greatest entry of the
+    last correction of the states (scaled).
     """
 
     elements: Elements
@@ -70,7 +76,10 @@ class Found(NamedTuple):
 
 
 def _inside(elements: Elements, k: Any, share: Any) -> tuple[Array, Array, Array]:
-    """Return time, state and roots (by the polynomial of the Gauss points) inside an element."""
+    """Return time (mesh periods), scaled state and contact roots at the fraction `share` of element
+    `k`.
+
+    The roots come from the polynomial through those at the Gauss points."""
     begin, length = elements.mesh.ends[0][k], elements.mesh.lengths[k]
     rise = jnp.sum(GAUSS.integrated(share)[:, None] * elements.slopes[k], axis=0)
     weights = GAUSS.lagrange(share)
@@ -79,11 +88,12 @@ def _inside(elements: Elements, k: Any, share: Any) -> tuple[Array, Array, Array
 
 
 def located_peak(equation: Equation, elements: Elements, force: Float[Array, "e s"]) -> Peak:
-    """Return the greatest force; `force` (N): that at the Gauss points.
+    """Return the greatest contact force of the orbit `elements`.
 
-    Inside an element the force is smooth, so that the polynomial through the Gauss points tells in
-    which elements the peak may lie. In these it is searched for by ever closer scans. The ends of
-    an element are its own: a peak on a corner is found at the event, and moves with it."""
+    `force` (e, s): contact force (N) at the Gauss points. Inside an element the force is smooth.
+    The polynomial through these forces therefore shows which elements may contain the peak. In
+    these, ever closer scans search for it. A peak at a corner of the force lies at the end of an
+    element, which is an event, and moves with this event."""
     shares = jnp.linspace(0.0, 1.0, _PLACES)
     used = jnp.arange(force.shape[0]) < elements.mesh.used
     smooth = force @ GAUSS.lagrange(shares).T
@@ -123,10 +133,11 @@ def located_peak(equation: Equation, elements: Elements, force: Float[Array, "e 
 
 
 def response(equation: Equation, elements: Elements, force: Any, tangents: Any) -> Found:
-    """Return forces and derivatives of the closed orbit `elements`.
+    """Return the forces of the closed orbit `elements` and their derivatives.
 
-    `force` (e, s): contact force (N) at the Gauss points; `tangents`: directions (d, …) of the
-    pair's parameters. The mesh needs room for one more element."""
+    `force` (e, s): contact force (N) at the Gauss points; `tangents`: d directions of the pair's
+    parameters, stacked along a leading axis. The arrays of the mesh must have room for one more
+    element."""
     mesh = elements.mesh
     count, inside = elements.state.shape[1], len(GAUSS.nodes)
     peak = located_peak(equation, elements, force)
@@ -183,7 +194,10 @@ def response(equation: Equation, elements: Elements, force: Any, tangents: Any) 
 
 
 def _averages(equation: Equation, elements: Elements, points: Point, along, step: Step):
-    """Return the averages of the integrands, and their changes for all columns."""
+    """Return the averages of the integrands over the orbit, and their changes (averages, columns).
+
+    `points`, `along`: results of `Equation.along` at the Gauss points; `step`: solution of the
+    linear equations, one column per direction."""
     mesh = elements.mesh
     count, inside = elements.state.shape[1], len(GAUSS.nodes)
     rates = slice(count, count + equation.rates)
@@ -208,7 +222,9 @@ def _averages(equation: Equation, elements: Elements, points: Point, along, step
 
 
 def _height(equation: Equation, elements: Elements, step: Step, peak: Peak, evaluated: Any):
-    """Return the peak (N) and its changes for all columns."""
+    """Return the peak force (N), and its changes for all columns of `step`.
+
+    `evaluated`: results of `Equation.along`; those at the peak follow the elements in use."""
     points, along = evaluated
     mesh, extra = elements.mesh, elements.mesh.used
     count, k = elements.state.shape[1], peak.element
@@ -232,7 +248,7 @@ def _height(equation: Equation, elements: Elements, step: Step, peak: Peak, eval
 
 
 def _origin(elements: Elements) -> Int[Array, ""]:
-    """Return the number of the element that begins at φ1 = 0."""
+    """Return the index of the element that begins at φ1 = 0."""
     mesh = elements.mesh
     begin = mesh.ends[0]
     away = jnp.abs(begin - mesh.period * jnp.round(begin / mesh.period))

@@ -1,9 +1,9 @@
 """Gauss points of an element, and the polynomial through the slopes at these points.
 
 On an element of length h, the state is z(σ) = z(0) + h Σ a_j(σ) k_j for 0 ≤ σ ≤ 1. The k_j are the
-slopes at the Gauss points c_j, and a_j is the integral of the j-th Lagrange polynomial. At the
-element's end the error is of order 2s, inside it of order s + 1 (de Boor and Swartz, SIAM J. Numer.
-Anal. 10 (1973) 582-606).
+slopes at the s Gauss points c_j, and a_j is the integral of the j-th Lagrange polynomial. The error
+is of order 2s at the end of the element, and of order s + 1 inside it (de Boor and Swartz, SIAM J.
+Numer. Anal. 10 (1973) 582-606).
 """
 
 from typing import NamedTuple
@@ -14,14 +14,15 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 POINTS = 4
-"""Gauss points of an element."""
+"""Number s of Gauss points per element."""
 
 
 class Gauss(NamedTuple):
-    """Rule with s points on 0 … 1.
+    """Gauss-Legendre rule with s points on the interval from 0 to 1.
 
-    `nodes` (s,): c; `weights` (s,): b; `integral` (s, s): a_j(c_i), the Runge-Kutta matrix;
-    `powers` (s, s): from values at the points to coefficients of powers of σ.
+    `nodes` (s,): points c_i; `weights` (s,); `integral` (s, s): a_j(c_i), the matrix of the
+    Runge-Kutta method; `powers` (s, s): matrix that converts values at the points to coefficients
+    of powers of σ.
     """
 
     nodes: NDArray[np.float64]
@@ -40,12 +41,12 @@ class Gauss(NamedTuple):
         return cls(node, weight, integral, powers)
 
     def lagrange(self, share: Float[Array, "*m"]) -> Float[Array, "*m s"]:
-        """Return the Lagrange polynomials at σ = `share`."""
+        """Return the s Lagrange polynomials at σ = `share`."""
         order = np.arange(len(self.nodes))
         return share[..., None] ** order @ jnp.asarray(self.powers)
 
     def integrated(self, share: Float[Array, "*m"]) -> Float[Array, "*m s"]:
-        """Return the integrals a_j of the Lagrange polynomials from 0 to σ = `share`."""
+        """Return the integrals a_j of the s Lagrange polynomials from 0 to σ = `share`."""
         order = np.arange(1, len(self.nodes) + 1)
         return (share[..., None] ** order / order) @ jnp.asarray(self.powers)
 

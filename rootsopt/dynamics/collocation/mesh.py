@@ -1,4 +1,4 @@
-"""Meshes: elements shared out among the intervals between events."""
+"""Meshes: distribution of elements over the intervals between events."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -8,7 +8,8 @@ from rootsopt.dynamics.collocation.events import _SAME
 from rootsopt.dynamics.collocation.gauss import GAUSS
 
 _FLOOR = 0.15
-"""Least density of elements, relative to the mean."""
+"""Density of elements, as a fraction of the mean density wanted, that is added everywhere. It
+limits the length of elements."""
 
 
 def shared(
@@ -19,11 +20,12 @@ def shared(
     used: Int[Array, ""],
     capacity: int,
 ) -> Mesh:
-    """Return a mesh of `used` elements that end at events.
+    """Return a mesh of `used` elements, some of which end at events.
 
-    `times`, `which`: as in `Mesh`, with `events` events after the first time; `density`: places
-    (mesh periods) and the number of elements wanted up to them, in any unit. Each interval has at
-    least one element."""
+    `times`, `which` (m,): as in `Mesh`; `events`: number of events; `density`: times (p,) in mesh
+    periods, and number of elements wanted from the first of them to each (p,), in any unit;
+    `capacity`: size of the arrays for elements. Each interval between events has at least one
+    element."""
     place, wanted = density
     # A floor, so that no part of the period is left to one long element.
     even = (place - place[0]) / (place[-1] - place[0])
@@ -63,10 +65,11 @@ def shared(
 
 
 def needed(elements: Elements) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-    """Return places and the number of elements needed up to them, in some unit.
+    """Return a density of elements for which all elements have about the same error.
 
-    An element's error goes with the highest coefficient of its slopes. With as many elements as
-    its root says, all have the same error."""
+    The density is given by times (p,) in mesh periods, and the number of elements from the first of
+    them to each (p,), in an arbitrary unit. An element's error is estimated from the highest
+    coefficient of the polynomial through its slopes."""
     mesh = elements.mesh
     highest = jnp.sum(jnp.asarray(GAUSS.powers[-1])[:, None] * elements.slopes, axis=1)
     size = jnp.max(jnp.abs(highest), axis=1) * mesh.lengths
@@ -78,7 +81,10 @@ def needed(elements: Elements) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
 
 
 def moved(elements: Elements, mesh: Mesh) -> Elements:
-    """Return the same motion on another mesh; its roots are those of the nearest places."""
+    """Return the motion `elements` on another `mesh`.
+
+    The contact's roots are copied without change. They are not valid on the new mesh (see
+    `events.rooted`)."""
     old_begin = elements.mesh.ends[0]
     begin, _ = mesh.ends
     length, old_length = mesh.lengths, elements.mesh.lengths
@@ -105,11 +111,11 @@ def aligned(
     density: tuple[Float[Array, " p"], Float[Array, " p"]],
     used: Int[Array, ""],
 ) -> Elements:
-    """Return the motion on `used` elements that end at its `events` (times, inf beyond the last,
-    and margins).
+    """Return the motion `elements` on a mesh of `used` elements, some of which end at `events`.
 
-    The mesh starts away from events, in the middle of the longest interval, and has an end at
-    φ1 = 0."""
+    `events`: times (mesh periods; inf beyond the last), and indices of their margins; `density`: as
+    for `shared`. The mesh also has an element end at φ1 = 0. A motion whose mesh starts at φ1 = 0
+    gets a new start: the middle of the longest interval between events."""
     old = elements.mesh
     length, room = old.period, old.times.shape[0]
     times, which = events
@@ -154,7 +160,8 @@ def aligned(
 
 
 def counted(elements: Elements) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-    """Return places and the number of elements up to them."""
+    """Return the present density of elements: times (mesh periods), and the number of elements up
+    to each."""
     mesh = elements.mesh
     begin, end = mesh.ends
     real = jnp.arange(begin.shape[0]) < mesh.used

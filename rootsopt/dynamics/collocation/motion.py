@@ -1,4 +1,4 @@
-"""The steady motion that a state leads to, with its orbit closed by collocation."""
+"""The steady motion near the end of a transient, as an orbit closed by collocation."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -19,27 +19,32 @@ from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
 
 _STEPS = 1024
-"""Maximum number of steps per mesh period of the motion from which an orbit is started."""
+"""Maximum number of solver steps, per mesh period of the longest orbit, of the integration that
+provides the first elements."""
 _ACCURACY = 10.0
-"""Error of the forces that is accepted, in tolerances of the orbit's integration."""
+"""Requested relative error of the forces, in tolerances of the orbit's integrator."""
 _UNREFINED = 10.0
-"""Factor by which the error estimate may exceed that where no finer mesh can be had."""
+"""Estimated error of the forces above which an orbit is rejected, in multiples of the requested
+error. The estimate exceeds the request if the mesh has no room for refinement."""
 _REPEATS = 1e-6
-"""Scaled difference of states below which an orbit repeats sooner than after its period."""
+"""Scaled difference between the states at φ1 = 0 and after a fraction of the period, below which an
+orbit is rejected. Its true period is then shorter."""
 _MISS = 1e3
-"""Distance (scaled) by which an integration from the orbit's own state may miss its start, in
-tolerances times the greatest entry of the monodromy matrix."""
+"""Scaled difference between the start and the end of an integration from the orbit's state, above
+which the orbit is rejected. The unit is the tolerance times the greatest entries of the state and
+of the monodromy matrix, where they exceed 1."""
 _APART = 1e4, 1e-4
-"""Relative difference between the forces of the orbit and of that integration, in tolerances, and
-its least limit."""
+"""Relative difference between the forces of the orbit and of that integration above which the orbit
+is rejected (tolerances), and the lower bound of this threshold."""
 
 
 class Collocated(NamedTuple):
-    """An orbit closed by collocation, and what is known about it.
+    """An orbit closed by collocation, with the results of its checks.
 
-    `orbit`: its `flow` is an integration from its own state over its period, and its residual the
-    last correction; `closed`: result of collocation; `verified`: whether the integration closes and
-    has the same forces.
+    `orbit`: its `flow` is an integration over one period, with the forces from collocation; its
+    `residual` is the last correction, inf if the orbit is not sound. `closed`: result of
+    collocation; `verified`: whether the orbit is sound and accurate, and the integration confirms
+    it.
     """
 
     orbit: Orbit
@@ -55,11 +60,12 @@ def collocated(
     measures: Measures,
     sizes_of: tuple[int, int],
 ) -> Collocated:
-    """Close the orbit that the motion from a state repeats nearly, and integrate it once.
+    """Close the orbit near the motion from a given state, and confirm it by one integration.
 
-    `start`: scaled state at φ1 = 0 and period (mesh periods); `integrators`: those of the transient
-    and of the orbit, whose tolerance is the orbit's; `sizes_of`: number of samples of the
-    integration, and the longest period (mesh periods)."""
+    `tangents`: directions of the pair's parameters, stacked along a leading axis; `start`: scaled
+    state at φ1 = 0, and period (mesh periods); `integrators`: those of the transient and of the
+    orbit, whose tolerance sets the accuracy; `measures`: averages of the force; `sizes_of`: number
+    of samples of the integration, and longest period (mesh periods)."""
     state, period = start
     samples, longest = sizes_of
     transient, integrator = integrators
@@ -110,8 +116,8 @@ def collocated(
 
 
 def _as_flow(out: Flow, found: Found) -> Flow:
-    """Return the integration `out` with the forces of the orbit, and their derivatives with respect
-    to the first state unknown."""
+    """Return the flow `out` with the forces of the orbit `found`, and with zeros for the
+    derivatives."""
     response = found.response
     rows = found.state.shape[0] + response.shape[0]
     columns = found.state.shape[0] + found.moved.shape[1]

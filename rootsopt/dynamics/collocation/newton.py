@@ -1,4 +1,5 @@
-"""Newton's method for the orbit and its events on a mesh of known topology."""
+"""Newton's method for an orbit and the times of its events. The sequence of events stays the
+same."""
 
 from typing import NamedTuple
 
@@ -23,16 +24,17 @@ from rootsopt.dynamics.collocation.system import (
 _TURNS = 16
 """Maximum number of Newton steps."""
 _ROOM = 0.7
-"""Fraction of an interval by which one step may shorten it."""
+"""Greatest fraction of an interval's length by which one step may shorten the interval."""
 _LONGEST = 1.0
-"""Longest step (scaled)."""
+"""Change of a state (scaled) above which a Newton step is shortened."""
 
 
 class Converged(NamedTuple):
     """Result of Newton's method.
 
-    `elements`; `size`: last step (scaled) of the states and, in mesh periods, of the events;
-    `turns`: number of steps; `force` (e, s): contact force (N) at the Gauss points.
+    `elements`: the orbit; `size`: greatest change in the last step, of the states (scaled) and of
+    the event times (mesh periods); `turns`: number of steps; `force` (e, s): contact force (N) at
+    the Gauss points.
     """
 
     elements: Elements
@@ -42,7 +44,9 @@ class Converged(NamedTuple):
 
 
 def evaluated(equation: Equation, elements: Elements) -> Point:
-    """Return the equation at the Gauss points and the end of each element, (e, s + 1, …)."""
+    """Return the equation at the Gauss points and the end of each element.
+
+    All fields of the result have the leading axes (e, s + 1)."""
     mesh = elements.mesh
     tau, state = elements.places
     which = jnp.maximum(mesh.which[mesh.interval + 1], 0)
@@ -51,7 +55,7 @@ def evaluated(equation: Equation, elements: Elements) -> Point:
 
 
 def lines(elements: Elements, points: Point) -> Lines:
-    """Return the linearised equation from its `points`."""
+    """Return the linearised equation of `elements`; `points`: result of `evaluated`."""
     count = elements.state.shape[1]
     inside = len(GAUSS.nodes)
     return Lines(
@@ -63,12 +67,12 @@ def lines(elements: Elements, points: Point) -> Lines:
 
 
 def solved_step(elements: Elements, found: Lines, columns: Columns) -> Step:
-    """Solve the linear equations for some right-hand sides."""
+    """Solve the linearised equation `found` for several right-hand sides (`columns`)."""
     return chained(elements, found, columns, condensed(elements, found, columns))
 
 
 def newton(equation: Equation, elements: Elements, tolerance: Float[Array, ""]) -> Converged:
-    """Solve for the orbit near `elements`, until a step is below `tolerance` (scaled)."""
+    """Solve for the orbit near `elements`, until the last step is at most `tolerance` (scaled)."""
 
     def go_on(now):
         return (now.turns < _TURNS) & (now.size > tolerance)  # Ends at NaN.
@@ -90,10 +94,11 @@ def newton(equation: Equation, elements: Elements, tolerance: Float[Array, ""]) 
 def advanced(
     elements: Elements, step: Step, roots: Float[Array, "e p sides 2"]
 ) -> tuple[Elements, Float[Array, ""]]:
-    """Return the elements after a Newton step, and the size of the whole step.
+    """Return the elements after a Newton step, and the size of the step before any shortening.
 
-    The step is shortened where an interval would turn around or a state would leave the region in
-    which the equation is nearly linear."""
+    `roots`: contact roots at the Gauss points and element ends. The step is shortened if it would
+    shrink an interval too much, or if a state would leave the region in which the equation is
+    nearly linear."""
     mesh = elements.mesh
     times, states, slopes = step.times[:, 0], step.state[..., 0], step.slopes[..., 0]
     room, change = jnp.diff(mesh.times), jnp.diff(times)

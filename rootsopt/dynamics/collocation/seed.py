@@ -1,4 +1,4 @@
-"""A first orbit from an integration of the motion that the transient ends on."""
+"""First elements of an orbit, from an integration of the motion near the end of the transient."""
 
 import diffrax
 import jax.numpy as jnp
@@ -18,10 +18,11 @@ def seeded(
     used: Int[Array, ""],
     sizes: tuple[int, int],
 ) -> tuple[Elements, Bool[Array, ""]]:
-    """Return the motion from the scaled `state` at φ1 = 0 over `period` mesh periods.
+    """Return the motion from the scaled `state` at φ1 = 0 over `period` mesh periods, and whether
+    the solver succeeded.
 
-    `used`: number of elements; `sizes`: of the arrays for elements and times. Elements are short
-    where the integrator's steps are. The second result: whether the solver succeeded."""
+    `used`: number of elements; `sizes`: sizes of the arrays for elements and for times. Elements
+    are short where the integrator's steps are short."""
     dtype = state.dtype
     length = period.astype(dtype)
     capacity, room = sizes
@@ -67,7 +68,8 @@ def seeded(
     )
 
     def motion(tau):
-        """Return state and slope by the cubic through the ends of a step."""
+        """Return states and slopes at the times `tau`, from the cubic through both ends of a solver
+        step."""
         k = jnp.clip(jnp.searchsorted(times, tau, side="right") - 1, 0, steps - 1)
         step = (times[k + 1] - times[k])[..., None]
         x = (tau - times[k])[..., None] / step

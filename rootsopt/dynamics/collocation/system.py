@@ -1,14 +1,16 @@
-"""The linear equations of one Newton step: condensed element by element, then chained.
+"""The linear equations of one Newton step, solved element by element.
 
-On an element with Runge-Kutta matrix A and weights b, slopes K and length h, collocation demands
+On an element with Runge-Kutta matrix A and weights b, slopes k and length h, collocation requires
 
     k_i = f(τ_i, z + h Σ A_ij k_j),      z⁺ = z + h Σ b_i k_i,
 
-with z⁺ the state at the start of the next element, and at an event m(τ, z⁺) = 0. The slopes of an
-element depend on its own start and on the shifts of both ends of its interval alone, so they are
-eliminated first (condensation; Ascher, Mattheij and Russell, Numerical Solution of Boundary Value
-Problems, section 7.2). What is left is carried along the chain of elements, where every event gives
-the shift of its own time. The end of the chain is its start.
+where z⁺ is the state at the start of the next element. At an event, also the margin m(τ, z⁺) = 0.
+
+The slopes of an element depend only on the state at its start and on the times of both ends of its
+interval. They are therefore eliminated first (condensation; Ascher, Mattheij and Russell, Numerical
+Solution of Boundary Value Problems, section 7.2). The remaining equations are solved from one
+element to the next. Each event determines the change of its own time. The state at the end of the
+last element must equal that at the start of the first.
 """
 
 from typing import NamedTuple
@@ -25,11 +27,12 @@ from rootsopt.dynamics.linear import solved
 
 
 class Lines(NamedTuple):
-    """The equation linearised at the places of all elements.
+    """The equation linearised at the Gauss points and at the end of each element.
 
-    `miss` (e, s, n): slope of the equation minus that of the element at the Gauss points; `slopes`
-    (e, s, n, 1 + n): derivatives of the equation there; `margin` (e,) at the element's end, and
-    `bend` (e, 1 + n): its derivatives.
+    `miss` (e, s, n): slope from the equation minus the element's slope, at the Gauss points;
+    `slopes` (e, s, n, 1 + n): derivatives of the equation at the Gauss points with respect to time
+    and state; `margin` (e,): margin at the element's end; `bend` (e, 1 + n): derivatives of the
+    margin.
     """
 
     miss: Float[Array, "e s n"]
@@ -39,10 +42,11 @@ class Lines(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """Right-hand sides: changes of the equation that the step answers.
+    """Right-hand sides of the linear equations, one in each of k columns.
 
-    `slope` (e, s, n, k) at the Gauss points; `gap` (e, n, k): by which elements miss the start of
-    the next; `margin` (e, k) at the elements' ends.
+    `slope` (e, s, n, k): change of the equation at the Gauss points; `gap` (e, n, k): state at the
+    end of each element minus that at the start of the next; `margin` (e, k): change of the margin
+    at the element's end.
     """
 
     slope: Float[Array, "e s n k"]
@@ -51,9 +55,11 @@ class Columns(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Solution of the linear equations, k columns.
+    """Solution of the linear equations: changes of a motion, one in each of k columns.
 
-    `state` (e, n, k); `slopes` (e, s, n, k); `times` (m, k) of the mesh; `monodromy` (n, n).
+    `state` (e, n, k): scaled states at the starts of the elements; `slopes` (e, s, n, k): slopes at
+    the Gauss points; `times` (m, k): times of the mesh; `monodromy` (n, n): monodromy matrix at the
+    start of the mesh.
     """
 
     state: Float[Array, "e n k"]
@@ -63,10 +69,11 @@ class Step(NamedTuple):
 
 
 class Condensed(NamedTuple):
-    """What is left of the elements.
+    """The linear equations after elimination of the slopes.
 
-    `slopes` (e, s, n, n + 2 + k): the slopes' dependence on start, shifts of left and right end of
-    the interval, and right-hand sides; `rise` (e, n, n + 2 + k): the same of the element's end.
+    `slopes` (e, s, n, n + 2 + k): changes of the slopes, as a linear function of the change of the
+    element's first state (n), the shifts of both ends of its interval (2), and the right-hand sides
+    (k); `rise` (e, n, n + 2 + k): likewise, change of the state at the element's end.
     """
 
     slopes: Float[Array, "e s n c"]
@@ -74,7 +81,7 @@ class Condensed(NamedTuple):
 
 
 def own_column(elements: Elements, lines: Lines) -> Columns:
-    """Return the right-hand side of Newton's step."""
+    """Return the right-hand side of Newton's step for the motion `elements`, as a single column."""
     rise = jnp.sum(GAUSS.weights[:, None] * elements.slopes, axis=1)
     reached = elements.state + elements.mesh.lengths[:, None] * rise
     gap = reached - elements.following
@@ -82,7 +89,7 @@ def own_column(elements: Elements, lines: Lines) -> Columns:
 
 
 def condensed(elements: Elements, lines: Lines, columns: Columns) -> Condensed:
-    """Eliminate the slopes of each element."""
+    """Eliminate the slopes of all elements."""
     mesh = elements.mesh
     shares = jnp.stack([mesh.left, mesh.right, mesh.lengths], axis=1)
     return in_blocks(_condensed, mesh.used, shares, elements.slopes, lines, columns)
@@ -91,7 +98,10 @@ def condensed(elements: Elements, lines: Lines, columns: Columns) -> Condensed:
 def _condensed(
     shares: Float[Array, "e 3"], own: Float[Array, "e s n"], lines: Lines, columns: Columns
 ) -> Condensed:
-    """Eliminate the slopes of some elements; `shares`: start and end in the interval, length."""
+    """Eliminate the slopes of some elements.
+
+    `shares`: start and end of each element as fractions of its interval, and its length (mesh
+    periods); `own`: its slopes."""
     count, points, states = own.shape
     left, right_end, lengths = shares.T
     length = lengths[:, None, None, None]
@@ -124,10 +134,11 @@ def _condensed(
 
 
 def _eliminated(system: Float[Array, "e m c"]) -> Float[Array, "e m k"]:
-    """Return the solutions of small systems (matrix and right-hand sides side by side).
+    """Return the solutions of e small systems, each with its matrix and right-hand sides side by
+    side.
 
-    The matrices differ from the unit matrix by less than the elements are short, so that no pivot
-    is looked for."""
+    The method is Gauss-Jordan elimination without pivoting. On short elements the matrices are
+    close to the identity."""
     size = system.shape[1]
     place = jnp.arange(size)
 
@@ -142,7 +153,8 @@ def _eliminated(system: Float[Array, "e m c"]) -> Float[Array, "e m k"]:
 
 
 def chained(elements: Elements, lines: Lines, columns: Columns, parts: Condensed) -> Step:
-    """Solve for the states at the elements' starts and the times of the events."""
+    """Solve for the changes of the states, slopes and event times; `parts`: result of
+    `condensed`."""
     mesh = elements.mesh
     states, width = elements.state.shape[1], columns.gap.shape[-1]
     last, fixed = mesh.last, mesh.which[mesh.interval + 1] < 0
@@ -151,7 +163,8 @@ def chained(elements: Elements, lines: Lines, columns: Columns, parts: Condensed
     pushed = jnp.pad(columns.margin, ((0, 0), (states, 0)))
 
     def along(carry, k):
-        """Advance over element k; columns depend on the first state and the right-hand sides."""
+        """Advance over element k; `carry`: dependence on the first state and on the right-hand
+        sides."""
         now, by_end, begun = carry
         part = rise[k]
         after = jnp.sum(part[:, :states, None] * now, axis=1)
@@ -198,7 +211,7 @@ def chained(elements: Elements, lines: Lines, columns: Columns, parts: Condensed
 
 
 def moved_places(elements: Elements, step: Step) -> tuple[Array, Array]:
-    """Return the changes of times (e, s, k) and states (e, s, n, k) at the Gauss points."""
+    """Return the changes of times (e, s, k) and scaled states (e, s, n, k) at the Gauss points."""
     mesh: Mesh = elements.mesh
     left, right = step.times[mesh.interval], step.times[mesh.interval + 1]
     share = mesh.right - mesh.left
