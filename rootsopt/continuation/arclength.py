@@ -24,10 +24,10 @@ _NEAR = 1e-6
 """Newton step (greatest entry) below which each evaluation of the equations repeats the computation
 of the previous one, with the same solver steps (`Look.memory`)."""
 _FARTHEST = 0.05
-"""Greatest entry of a Newton step above which the step is shortened to this size."""
+"""Newton step (greatest entry) above which the step is shortened to this size."""
 _PATIENCE = 4
-"""Number of evaluations for one point of the curve after which evaluations become more careful (see
-`SolutionCurve`)."""
+"""Number of evaluations for one point of the curve after which further evaluations refine their
+solver steps (see `SolutionCurve`)."""
 _MOST = 14
 """Maximum number of evaluations of the equations for one point of the curve."""
 _TURN, _STRAIGHT = 0.9, 0.99
@@ -42,7 +42,7 @@ searched for, shortest first."""
 _SAME = 1e-6
 """Distance (unit of `StepSizes`) below which two points of a curve count as the same."""
 _CLOSING = 8
-"""Number of points above which it is checked whether the curve has come back to its first point."""
+"""Number of points above which the curve is checked for a return to its first point."""
 
 
 CORNER = "CORNER"

@@ -39,11 +39,12 @@ class Flow(NamedTuple):
 
     `end`: final state; `mean` (N), `mean_square` (N²) and `peak` (N) of the contact force;
     `peak_time`: time of the peak (mesh periods); `depth`: greatest penetration found (m; if
-    negative, the least gap); `states`: states at uniform times, excluding the end; `grid`: ends of
-    the accepted steps (mesh periods), padded with inf; `corners`: states at these ends; `steps`:
-    number of accepted and rejected solver steps; `solved`: whether the solver succeeded; `strain`:
-    greatest error estimate of a repeated step, in tolerances (0 if no steps were repeated or the
-    pair is not `smooth`); `others`: the further measures (see `Measures.values`).
+    negative, the least gap); `states` (samples, n): states at uniform times, excluding the end;
+    `grid` (steps,): ends of the accepted steps (mesh periods), padded with inf; `corners` (steps,
+    n): states at the ends of steps; `steps`: number of accepted and rejected solver steps;
+    `solved`: whether the solver succeeded; `strain`: greatest error estimate of a repeated step, in
+    tolerances (0 if no steps were repeated or the pair is not `smooth`); `others`: the further
+    measures (see `Measures.values`).
 
     `slope`: derivatives of the rows (`end`, `mean`, `mean_square`, `peak`, `others`). Its n + d
     columns are the n entries of the initial state, then d parameter directions. It has no columns
@@ -158,11 +159,13 @@ class Equation(eqx.Module):
     solver: diffrax.AbstractSolver
 
     def start(self, state: Float[Array, " n"], free: bool) -> Float[Array, " m"]:
-        """Return y at the start: the scaled `state`, then zeros for the integrals."""
+        """Return y at the start: the scaled `state`, then zeros for the integrals and, if `free`,
+        the time."""
         return jnp.pad(state, (0, self.measures.count + free))
 
     def derivative(self, tau, y, dynamic, marked: bool = False) -> Float[Array, " m"]:
-        """Return dy/dτ, followed by the `marks` of the contact if `marked`."""
+        """Return dy/dτ at the time `tau` (mesh periods), followed by the `marks` of the contact if
+        `marked`."""
         pair = eqx.combine(dynamic, self.static)
         slope, contact = pair.derivative(tau, y[: self.states])
         rates = self.measures.rates(tau, contact.total / self.force_unit, self.top)
@@ -172,8 +175,10 @@ class Equation(eqx.Module):
         return jnp.concatenate([slope, rates, *([marks(contact)] if marked else [])])
 
     def advanced(self, begin, end, y, dynamic) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Return y and its slope after one step. Derivatives of y account for the moving instants
-        of jumps."""
+        """Return y, and its derivative dy/dτ, after one step from `begin` to `end` (mesh periods).
+
+        The derivatives of y with respect to state and parameters account for the moving instants of
+        jumps."""
         pair = eqx.combine(dynamic, self.static)
         term = diffrax.ODETerm(functools.partial(self.derivative, marked=pair.jumps))
         if not pair.jumps:
@@ -186,7 +191,8 @@ class Equation(eqx.Module):
         return after[:-MARKS] + moved, slopes[-1, :-MARKS]
 
     def with_force(self, begin, end, y, dynamic) -> Float[Array, " rows"]:
-        """Return y at the end of one step, followed by the contact force (`force_unit`) there."""
+        """Return y after one step from `begin` to `end` (mesh periods), and the contact force
+        (`force_unit`) there."""
         after, slope = self.advanced(begin, end, y, dynamic)
         free = eqx.combine(dynamic, self.static).free
         force = slope[self.states]
@@ -243,12 +249,12 @@ def flow(  # Eleven parameters: adaptive steps, repeated steps and reverse mode 
     measures: Measures | None = None,
     top: Float[Array, ""] | None = None,
 ) -> Flow:
-    """Integrate over `periods` mesh periods (may be traced), and compute statistics of the force.
+    """Integrate over `periods` mesh periods, and compute statistics of the contact force.
 
-    `state` (n,): scaled state at φ1 = 0; `measures`: averages of the force to compute, integrated
-    under the same error control as the motion; `top` (N): roughly the greatest force, for the
-    p-norm; `samples`: number of uniform samples of the state. The peak is also located between the
-    samples.
+    `state` (n,): scaled state at φ1 = 0; `periods`: a whole number, which JAX may trace;
+    `measures`: averages of the force to compute, integrated under the same error control as the
+    motion; `top` (N): roughly the greatest force, for the p-norm; `samples`: number of uniform
+    samples of the state. The peak is also located between the samples.
 
     `tangents`: d directions of the pair's parameters, stacked along a leading axis; d may be 0. If
     given, every step is linearised, and the result has `slope`. The derivatives account for the
@@ -394,7 +400,9 @@ def _solved(
 def _retraced(
     equation: Equation, taken: _Recorded, start: Float[Array, " m"], dynamic: Any
 ) -> _Recorded:
-    """Repeat the steps in `taken`, so that reverse mode includes the moving instants of jumps."""
+    """Repeat the steps in `taken` from y = `start`, in a form that JAX can differentiate.
+
+    The derivatives account for the moving instants of jumps."""
 
     @jax.checkpoint
     def again(y, step):
@@ -427,11 +435,11 @@ def _peak_force(
 def _linearized(
     equation: Equation, taken: _Recorded, peak: _Peak, dynamic: Any, moved: Any
 ) -> tuple[Float[Array, "m columns"], Float[Array, ""], Float[Array, " columns"]]:
-    """Return the derivatives of y at the end, the peak force (in `force_unit`), and its
-    derivatives.
+    """Return three results: the derivatives of y at the end, the peak force, and the derivatives of
+    the peak force.
 
-    The columns are the n entries of the initial state, then the directions `moved` of the
-    parameters.
+    Forces are in `force_unit`. The columns of derivatives are the n entries of the initial state,
+    then the directions `moved` of the parameters.
     """
     count, size, sides = equation.states, taken.end.shape[0], peak.beside.shape[0]
 

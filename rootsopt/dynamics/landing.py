@@ -102,17 +102,21 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         return keep, start, start + following, jump, new, result
 
     def _passed(self, before, after, step):
-        """Return whether a step has passed an edge, and how long ago (mesh periods; 0 if it has
-        not)."""
+        """Return whether a step has passed an edge, and the time since then (mesh periods).
+
+        `before`, `after`: scaled ε and dε/dτ at both ends of the step; `step`: its length (mesh
+        periods). The time is 0 if no edge was passed."""
         passed = (before[0] - self.edges) * (after[0] - self.edges) < 0
         rate = jnp.maximum(jnp.abs(after[1]), jnp.abs(after[0] - before[0]) / step)
         ago = jnp.abs(after[0] - self.edges) / rate
         return jnp.any(passed), jnp.max(jnp.where(passed, ago, 0.0))
 
     def _ahead(self, before, after, step):
-        """Return the maximum length (mesh periods) of the step that follows `after`.
+        """Return the maximum length (mesh periods) of the next step. Such a step ends where ε next
+        reaches an edge.
 
-        A step of this length ends where ε next reaches an edge."""
+        `before`, `after`: scaled ε and dε/dτ at both ends of the last step; `step`: its length
+        (mesh periods)."""
         place, rate = after
         bend = (rate - before[1]) / step
         away = place - self.edges

@@ -4,8 +4,9 @@ The peak is the greatest of several local maxima. Where two of them are equal, t
 as a function of the design, while each maximum by itself is smooth. A search that knows all of them
 can converge to such a corner.
 
-A maximum can grow out of a *shoulder*: a place near the top where the force rises or falls slowly,
-without a maximum. Shoulders near the greatest force are listed as well, as maxima to come.
+A *shoulder* is an instant at which the force almost has a maximum: it rises or falls slowly, and
+faster before and after. A change of the design can turn a shoulder into a maximum. Shoulders near
+the greatest force are therefore listed as well.
 
 The maxima are computed after the orbit and only on request, so the orbit's own program does not
 grow.
@@ -33,21 +34,23 @@ from rootsopt.runtime.programs import Program
 MOST = 12
 """Maximum number of local maxima that are reported: the greatest ones."""
 _BESIDES = 4
-"""Maximum number of shoulders that are reported besides."""
+"""Maximum number of shoulders that are reported in addition to the maxima."""
 _LANES = 64
-"""Number of instants at which the force is evaluated together."""
+"""Number of instants at which the force is evaluated together, as arrays."""
 _CLOSER, _ROUNDS = 16, 10
-"""Places tried around each maximum in one round of refinement, and number of rounds."""
+"""Number of instants tried around each maximum in one round of refinement, and number of rounds."""
 _CHUNK = 32
-"""Number of steps linearised together."""
+"""Number of steps linearised together, as arrays."""
 _DIP = 1e-6
-"""Relative fall of the force between two maxima below which they count as one."""
+"""Fall of the force between two maxima, relative to the lower one, below which they count as
+one."""
 _LEAST = 1e-3
 """Fraction of the greatest force below which a maximum is left out."""
 _SHOULDER = 0.02
-"""Relative distance from the greatest force within which shoulders are listed."""
+"""Difference from the greatest force, relative to that force, below which shoulders are listed."""
 _SHORTEST = 1e-9
-"""Minimum time (mesh periods) between the start of a step and a maximum inside it."""
+"""Minimum time (mesh periods) from the start of a step to a maximum inside it. An earlier maximum
+is moved to this time."""
 
 
 class Maxima(NamedTuple):
@@ -67,13 +70,13 @@ def local_maxima(
 ) -> Maxima:
     """Return the local maxima of the contact force over a closed `orbit`, with derivatives.
 
-    `tangents`: directions of the pair's parameters, as for `close_orbit`; `period`: mesh periods of
-    the orbit; `integrator`: the one that closed it.
+    `tangents`: directions of the pair's parameters, as for `close_orbit`; `period` of the orbit
+    (mesh periods); `integrator`: the integrator with which the orbit was closed.
 
     The derivatives follow the family of orbits (implicit function theorem). At a smooth maximum
     they are those at a fixed instant (envelope theorem). Where the force has a corner, they follow
-    the corner, as those of the peak do. A maximum at most `_DIP` above the force between it and a
-    greater one belongs to that one.
+    the corner, as those of the peak do. A maximum is left out if the force hardly falls (`_DIP`)
+    between it and a greater maximum.
     """
     steps = _steps(orbit)
     times, forces = _located(pair, orbit, steps, float(period))
@@ -99,7 +102,10 @@ def _steps(orbit: Orbit) -> Steps:
 def _located(
     pair: RotorPair, orbit: Orbit, steps: Steps, length: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return times (mesh periods) and forces (N) of the local maxima, in order of time."""
+    """Return times (mesh periods) and forces (N) of the local maxima in order of time, then of the
+    shoulders.
+
+    `length` of the orbit (mesh periods)."""
     states = np.asarray(orbit.flow.states)
     width = length / states.shape[0]
     ends = np.asarray(steps.ends)[: int(steps.count)]
@@ -137,9 +143,9 @@ def candidates(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the indices (k,) of local maxima among samples, and the intervals (2, k) around them.
 
-    `places`, `forces` (m,): samples over one cycle, of which the last repeats the first. At most
-    `MOST` are returned, in order of time. At the seam of the cycle, the higher neighbour tells on
-    which side the maximum lies."""
+    `places`, `forces` (m,): times and forces over one cycle. The last sample repeats the first. At
+    most `MOST` maxima are returned, in order of time. If this repeated sample is a maximum, it
+    counts once, on the side of its higher neighbour."""
     last = len(places) - 1
     before, after = np.roll(forces, 1), np.roll(forces, -1)
     before[0], after[-1] = forces[-2], forces[1]
@@ -159,9 +165,11 @@ def candidates(
 
 
 def shoulders(forces: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the indices (k,) of shoulders among uniform samples (m,) of one cycle, highest first.
+    """Return the indices (k,) of shoulders among uniform samples (m,) of one cycle, greatest force
+    first.
 
-    A shoulder is where the slope of the force comes nearest to 0 without changing its sign."""
+    A shoulder is a sample at which the slope of the force is closest to 0, without a change of
+    sign."""
     slope = np.roll(forces, -1) - np.roll(forces, 1)
     before, after, steep = np.roll(slope, 1), np.roll(slope, -1), np.abs(slope)
     same = (np.sign(before) == np.sign(slope)) & (np.sign(after) == np.sign(slope))
@@ -172,7 +180,9 @@ def shoulders(forces: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _dip(forces: NDArray[np.float64], one: int, other: int) -> float:
-    """Return the least force that must be crossed between two samples, either way round."""
+    """Return the least force on the way between samples `one` and `other` of a cycle.
+
+    Of the two ways around the cycle, the one with the greater least force is taken."""
     low, high = sorted((one, other))
     inner, outer = forces[low : high + 1], np.concatenate([forces[high:], forces[: low + 1]])
     return float(max(inner.min(), outer.min()))
@@ -180,7 +190,10 @@ def _dip(forces: NDArray[np.float64], one: int, other: int) -> float:
 
 @Program
 def _forces(pair: RotorPair, states, steps: Steps, times, width, count):
-    """Return the contact force (N) at the first `count` of the `times` (mesh periods)."""
+    """Return the contact force (N) at the first `count` of the `times` (mesh periods).
+
+    `states`: samples with the spacing `width` (mesh periods). Results for the other times have no
+    meaning."""
     lanes = jnp.arange(_LANES)
 
     def look(carry):
@@ -197,9 +210,10 @@ def _forces(pair: RotorPair, states, steps: Steps, times, width, count):
 
 
 class _Pieces(NamedTuple):
-    """Linearised steps, stacked: force and state at the end, and their derivatives.
+    """Several linearised steps: state and force after each step, and their derivatives.
 
-    `value` (jobs, n + 1), `by_state` (jobs, n + 1, n), `by_parameters` (jobs, n + 1, d)."""
+    `value` (jobs, n + 1); `by_state` (jobs, n + 1, n): with respect to the state before the step;
+    `by_parameters` (jobs, n + 1, d): along d directions of the parameters."""
 
     value: Float[Array, "jobs rows"]
     by_state: Float[Array, "jobs rows n"]
@@ -215,9 +229,10 @@ def _differentiated(
     noise: Float[Array, ""],
     integrator: Integrator,
 ) -> tuple[Float[Array, " k"], Float[Array, "k d"]]:
-    """Return the force (N) at the located maxima, and its derivatives along the family of orbits.
+    """Return the force (N) at located maxima, and its derivatives along the family of orbits.
 
-    `times` (k,): instants of the maxima (mesh periods); `noise`: relative rounding of the force."""
+    `times` (k,): instants of the maxima (mesh periods); `noise`: relative rounding error of the
+    force."""
     dtype, count = orbit.state.dtype, orbit.state.shape[0]
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
     moved = eqx.filter(tangents, eqx.is_inexact_array)
@@ -287,7 +302,9 @@ def _differentiated(
 
 
 def _after(pieces: _Pieces, before: Float[Array, "jobs n d"]) -> Float[Array, "jobs rows d"]:
-    """Return the derivatives after linearised steps, given those of the state before them."""
+    """Return the derivatives of the values after the steps `pieces`.
+
+    `before`: derivatives of the state before each step."""
     moved = jnp.sum(pieces.by_state[..., None] * before[:, None], axis=2)
     return moved + pieces.by_parameters
 
@@ -295,7 +312,8 @@ def _after(pieces: _Pieces, before: Float[Array, "jobs n d"]) -> Float[Array, "j
 def _along(kept: _Pieces, start: Float[Array, "n d"], taken: Int[Array, ""]) -> Any:
     """Return the derivatives (steps, n, d) of the state at the start of each step of an orbit.
 
-    `start` (n, d): those at the start of the orbit; `taken`: number of steps."""
+    `kept`: the linearised steps; `start` (n, d): derivatives at the start of the orbit; `taken`:
+    number of steps."""
     count = start.shape[0]
 
     def advance(k, carry):

@@ -33,9 +33,9 @@ sample falls on the end of each mesh period."""
 _NEWTON_STEPS = 24
 """Default maximum number of integrations to close one orbit."""
 _CLOSED = 4000, 1e-3, 1e-10
-"""Threshold of the residual at which Newton's method stops, and its bounds. The second number is
-the threshold (tolerances). It is at least the first number (rounding errors; about 1e-12 in
-float64) and at most the third (scaled)."""
+"""Limits of the residual at which Newton's method stops. The limit is the second number
+(tolerances), but at least the first number (rounding errors; about 1e-12 in float64) and at most
+the third (scaled)."""
 _KEPT = 4
 """Number of integrations after which the solver steps are kept, however large the Newton step. If a
 third of `Shots.count` is less, that number is used instead."""
@@ -55,8 +55,8 @@ _AGREE = 10.0, 1e-3, 3e-2
 derivatives are reported (square roots of the tolerance), and the lower and upper bounds of this
 threshold."""
 _SMALL = 1e-9, 1e-3
-"""Bounds (scaled) of the threshold below which a Newton step keeps the solver steps. The threshold
-is a thousand tolerances, within these bounds."""
+"""Lower and upper bounds (scaled) of the Newton step below which the solver steps are kept. Between
+them, this limit is a thousand tolerances."""
 
 
 class Orbit(NamedTuple):
@@ -138,10 +138,10 @@ class _Closing(NamedTuple):
 
 
 class _Closer(eqx.Module):
-    """The loop of `orbit_or_window`. Its fields follow from the arguments of that function.
+    """The loop of `orbit_or_window`, with the settings of one call.
 
-    `start` returns the initial state of the loop, `go_on` its condition, `step` the result of its
-    body."""
+    `start` returns the initial state of the loop, `go_on` whether the loop continues, and `step`
+    its next state."""
 
     pair: RotorPair
     tangents: RotorPair
@@ -282,8 +282,8 @@ class _Closer(eqx.Module):
         )
 
     def _kept(self, now: _Closing, start, out: Flow, size, residual, improving):
-        """Return three flags: whether to keep the steps of `out` from now on, whether to search for
-        kinks along `out`, and whether to discard the steps kept so far."""
+        """Return whether to keep the steps of `out`, whether to search for kinks along `out`, and
+        whether to discard the steps kept so far."""
         done, smooth = now.orbit.newton_steps + 1, self.pair.smooth
         known = size < jnp.clip(1000 * self.tolerance, *_SMALL)
         following = now.repeat | known | (done >= jnp.minimum(self.shots // 3, _KEPT))

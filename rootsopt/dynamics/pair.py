@@ -80,10 +80,12 @@ class _Sliding(NamedTuple):
 
 
 class _Touch(NamedTuple):
-    """The flanks of one side at a pose (angles of both rotors and positions of their axes).
+    """The flanks of one side (drive or coast) at given angles of the rotors and positions of their
+    axes.
 
     `depth`: penetration (m); `closing`: rate of `depth` (m/s); `roll`: roll coordinate (rad);
-    `approach`: gap and levers that the contact found; `sliding`: None unless a part needs it.
+    `approach`: gap and levers from the contact; `sliding`: data of the contact point, None if no
+    part needs them.
     """
 
     depth: Float[Array, ""]
@@ -96,11 +98,12 @@ class _Touch(NamedTuple):
 class Margins(NamedTuple):
     """Distances of a motion from the instants at which the equation is not smooth.
 
-    `values` (s,): positive where the flags of `RotorPair.switches` are set. With a `NearContact`,
-    each is smooth across the instant at which its flag changes, and zero there. `counts` (s,):
-    whether they matter; those of a flank do where it transmits a force. `places`: what the contact
-    has found (`Approach.place`) for the flanks that can touch or, if both sides can, for drive and
-    coast flanks; `pushes` (sides,): whether these flanks transmit a force.
+    `values` (s,): one *margin* for each flag of `RotorPair.switches`, positive where the flag is
+    set. With a `NearContact`, each margin is zero at the instant at which its flag changes, and
+    smooth around this instant. `counts` (s,): whether each flag matters. The flags of a flank
+    matter where the flank transmits a force. `places`: `Approach.place` of the flanks that can
+    touch, or of drive and coast flanks if both can touch; `pushes` (sides,): whether these flanks
+    transmit a force.
     """
 
     values: Float[Array, " s"]
@@ -197,7 +200,7 @@ class RotorPair(eqx.Module):
 
     @property
     def smooth(self) -> bool:
-        """Whether the equation is smooth between its `switches`."""
+        """Whether the equation is smooth as long as no flag of `switches` changes."""
         return self.contact.smooth
 
     @property

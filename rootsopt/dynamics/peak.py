@@ -22,9 +22,9 @@ BESIDE = (0.0, -1.0, -2.0, 1.0, 2.0, -_WIDE, _WIDE)
 BESIDE_UNIT = {8: 2e-8, 4: 1e-3}
 """Unit of `BESIDE` (mesh periods), keyed by bytes per number."""
 _FARTHEST = {8: 32.0, 4: 1 / 16}
-"""Distance (units of `_WIDE`) between a located peak and the vertex of the parabola through the
-forces around it. A vertex farther away is rejected. Keyed by bytes per number. Where the states
-bend between samples, peaks are located only to about 1e-5 mesh periods."""
+"""Distance (units of `_WIDE`) from a located peak to the vertex of the parabola through the forces
+around it, above which the vertex is rejected. Keyed by bytes per number. It is large for 8 bytes,
+because peaks are located only to about 1e-5 mesh periods where the states bend between samples."""
 _ROUNDINGS = 1e5
 """Second difference of the force over `_WIDE` (rounding errors of the force) above which it counts
 as curvature, not as rounding."""

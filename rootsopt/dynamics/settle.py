@@ -24,8 +24,8 @@ _PATIENCE = 32, 1e-5
 """Length (mesh periods) above which a transient continues with a lower tolerance, and the greatest
 value of that tolerance. The noise of coarser steps can hide that the motion repeats."""
 NOISE = 100.0
-"""Noise of the stroboscopic states that adaptive steps cause: a multiple of the tolerance, relative
-to the states."""
+"""Noise of the stroboscopic states that adaptive steps cause (tolerances, relative to the
+states)."""
 
 
 class Transient(NamedTuple):

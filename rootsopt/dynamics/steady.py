@@ -79,7 +79,7 @@ class Steady(NamedTuple):
     `status`: code of a `Status`; `orbit`: the orbit found, or the last one tried; `period` (mesh
     periods), `rtol` and `verdict`: length and tolerance of this orbit, and the results of its
     checks; `window` of a motion that did not settle; `settled`: end of the transient; `used`: mesh
-    periods of all transients; `steps`: solver steps of transients and orbits;
+    periods of all transients; `steps`: number of solver steps of transients and orbits;
     `collocated`: whether the orbit was closed by collocation.
     """
 
@@ -317,10 +317,10 @@ class _Attempts(eqx.Module):
         return window_status(self.pair, window)
 
     def collocated(self, state: Float[Array, " n"]) -> Steady:
-        """Return the motion that the scaled `state` leads to, its orbit closed by collocation.
+        """Return the motion that the scaled `state` leads to, with an orbit closed by collocation.
 
-        The status is `NOT_SETTLED` where there is no orbit that is sound, stable and near the end
-        of the transient, and that an integration confirms."""
+        The status is NOT_SETTLED if the orbit is not stable, is not near the end of the transient,
+        or is not confirmed by an integration."""
         solver, empty = self.solver, self.start(state).found
         within = settled_within(solver.transient.rtol).astype(state.dtype)
         periods = solver.max_periods.astype(int)

@@ -23,8 +23,7 @@ count as unresolved."""
 _UNKNOWN = 0.1
 """Estimated error of an orbit (scaled) above which the orbit is rejected."""
 _FREE = 1e-6
-"""Distance from 1 below which a Floquet multiplier counts as 1. A greater multiplier also counts as
-1."""
+"""Distance from 1 below which a Floquet multiplier counts as 1. So does a multiplier above 1."""
 _DEFECT = 1e3
 """Residual on halved steps (tolerances) above which an orbit's derivatives are uncertain. This
 limit is multiplied by the greatest entries of the state and of the monodromy matrix, where they
@@ -82,10 +81,10 @@ def is_idle(
 ) -> Bool[Array, ""]:
     """Return whether an `orbit` shows that no flank touches in the steady motion.
 
-    Forces up to `least` (N) count as rounding. An orbit without contact is idle in two cases.
-    Either it is `steady`, because the timing gear holds the pair. Or no torque brings a displaced
-    pair back (Floquet multiplier 1 or unknown), and the pair can rest anywhere. In any other case,
-    an orbit without contact says nothing about the motion.
+    Forces up to `least` (N) count as rounding. An orbit without contact is idle in two cases. In
+    the first, it is `steady`, because the timing gear holds the pair. In the second, no torque
+    brings a displaced pair back (Floquet multiplier 1 or unknown), so that the pair can rest
+    anywhere. In any other case, an orbit without contact says nothing about the motion.
     """
     free = jnp.isnan(orbit.multiplier) | (orbit.multiplier > 1 - _FREE)
     return (orbit.flow.mean <= least) & (orbit.flow.peak <= least) & (free | steady)
@@ -136,8 +135,8 @@ def is_certain(orbit: Orbit, rtol: Float[Array, ""]) -> Bool[Array, ""]:
     """Return whether the derivatives of an orbit integrated at `rtol` are reliable.
 
     There are three conditions. On halved steps, the orbit must close to a multiple of the
-    tolerance. The derivatives on these steps must agree with the original ones. And the orbit must
-    have moved only a little since the last search for kinks."""
+    tolerance. The derivatives on these steps must agree with the original ones. The orbit must have
+    moved only a little since the last search for kinks."""
     size = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.state)))
     gain = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.monodromy)))
     closes = orbit.defect <= _DEFECT * rtol * size * gain

@@ -82,7 +82,7 @@ class Basins:
     @property
     def status(self) -> Status:
         """PERIODIC if every initial state leads to a stable periodic motion, and at least one such
-        motion has contact; else the status of a motion that violates this."""
+        motion has contact. Otherwise, the status of a motion for which this is not true."""
         for status in _LOST:
             if self.lost.get(status.label):
                 return status

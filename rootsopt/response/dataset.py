@@ -16,8 +16,8 @@ _COLUMNS = {
     "force": ("contact_force_N", "N", "contact force: sum of the normal forces", 1.0),
     "depth": ("penetration_m", "m", "greatest penetration; negative: least gap", 1.0),
 }
-"""Columns of the dataset, keyed by the field of a `Series`. Each has its name in the CSV file of
-the response, its unit, a long name, and the factor that converts SI units to its unit."""
+"""Columns of the dataset, keyed by the field of a `Series`. Each entry holds the name in CSV files,
+the unit, a long name, and the factor from SI units to this unit."""
 
 
 def dataset(evaluation: "Evaluation") -> xarray.Dataset:

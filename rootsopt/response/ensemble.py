@@ -57,8 +57,8 @@ _RTOL = 1e-6
 """Finest tolerance at which the motions of an ensemble are integrated. The standard errors of an
 ensemble are far larger than the error of such steps (docs/chaos.md)."""
 _AGAIN = 4
-"""Number by which `ensemble.settle_periods` is divided for motions that start from the last states
-of a neighbouring design's motions."""
+"""Divisor of `ensemble.settle_periods` for motions that start from the last states of a
+neighbouring design's motions."""
 _MAPS = 5
 """Maximum number of contact maps tried for one ensemble."""
 VERIFYING = 4

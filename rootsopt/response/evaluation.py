@@ -65,13 +65,13 @@ class Evaluation:
     """Everything known about one design in one scene.
 
     `design`: parameters in config units; `geometry`, `response` (N), `gradient` (N per config
-    unit): by the result file's keys. `gradient` is empty unless it can be trusted. `steady_state`:
-    kind of motion and its properties; `status` and `message`: outcome and advice; `statistics`:
-    effort and accuracy; `series`: whole orbits over at least one revolution, or a window of a
-    motion that does not settle; `state`: `start` for a neighbouring design, None if not known. For
-    one motion it is the scaled state of the orbit at φ1 = 0 (n,). `maxima`: local maxima of the
-    force over the orbit, slopes in N per config unit; None unless requested and periodic. `rivals`:
-    evaluations of the other motions, where the worst of several counts.
+    unit): dicts with the keys of the result file. `gradient` is empty unless it can be trusted.
+    `steady_state`: kind of motion and its properties; `status` and `message`: outcome and advice;
+    `statistics`: effort and accuracy; `series`: whole orbits over at least one revolution, or a
+    window of a motion that does not settle; `state`: argument `start` for a neighbouring design,
+    None if not known. For one motion it is the scaled state of the orbit at φ1 = 0 (n,). `maxima`:
+    local maxima of the force over the orbit, slopes in N per config unit; None unless requested and
+    periodic. `rivals`: evaluations of the other motions, if the worst of several motions counts.
     """
 
     design: dict[str, float]

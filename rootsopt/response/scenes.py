@@ -119,7 +119,7 @@ def _dataset(config: Config, axes, found: Sequence[Evaluation], keys) -> xarray.
 
 
 def _unit(name: str) -> str:
-    """Return the unit with which a key ends, or "1" if it ends with none."""
+    """Return the unit with which a key ends, or "1" if the key has no unit."""
     endings = {"_rpm": "rpm", "_mm": "mm", "_deg": "deg", "_N": "N", "_N_m": "N m", "_mrad": "mrad"}
     fits = [ending for ending in endings if name.endswith(ending)]
     return endings[max(fits, key=len)] if fits else "1"

@@ -1,8 +1,8 @@
 """First-order sensitivities of a steady motion to the quantities of its scene.
 
-Every number of the config that the scene depends on is a direction in which the rotor pair changes.
-The derivatives along these directions come from the orbit, as those with respect to the design do,
-by the program that is compiled already.
+A quantity is a number of the config, such as the load torque. The rotor pair depends on each
+quantity, and the forces depend on the pair. The derivatives of the forces come from the orbit, by
+the same compiled program as the derivatives with respect to the design.
 """
 
 import dataclasses
@@ -21,20 +21,22 @@ from rootsopt.scene import Scene, along
 from rootsopt.status import Status
 
 _STEP = 1e-6
-"""Relative step of the differences that turn a config key into a direction of the scene. The map
-from config to scene is close to linear."""
+"""Relative step of the difference quotients that approximate the derivatives of the scene with
+respect to a quantity. Their error is small, since the scene depends almost linearly on its
+quantities."""
 _SETTINGS = ("solver", "deepest")
-"""Fields of a scene on which the response does not depend."""
+"""Fields of a scene on which the response does not depend. Their derivatives are set to zero."""
 MICROMETRE = 1e-3
-"""One micrometre in mm, the step of lengths in the table."""
+"""One micrometre (mm): change of clearance, backlash and centre distance error for which the table
+states the effect."""
 _PERCENT = 0.01
 
 
 class Quantity(NamedTuple):
-    """A number of the config on which forces depend.
+    """A quantity of a scene on which the contact forces depend.
 
-    `key`: dotted; `name` in words; `unit`; `value`; `step`: change for which the table states the
-    effect.
+    `key`: dotted config key; `name`: description in words; `unit` of `value` and `step`; `value`:
+    number in the config; `step`: change for which the table states the effect.
     """
 
     key: str
@@ -63,10 +65,11 @@ _OTHERS = (
 
 
 def quantities(config: Config) -> list[Quantity]:
-    """Return the quantities of a config's scene for the sensitivity table.
+    """Return the quantities that the sensitivity table lists for the scene of `config`.
 
-    Lengths change by 1 µm, other quantities by 1 %. Parts that the scene does not have, and
-    quantities that are 0, are left out; a clearance or an error of 0 is kept."""
+    The table states the effect of a change by 1 µm for clearance, backlash and centre distance
+    error, and by 1 % for all other quantities. Quantities of parts that the scene does not have are
+    left out. So are quantities that are 0, except the first three."""
     found = []
     for key, name in _LENGTHS:
         value = _value(config, key)
@@ -80,7 +83,7 @@ def quantities(config: Config) -> list[Quantity]:
 
 
 def _value(config: Config, key: str) -> float | None:
-    """Return the number at a dotted key; None where there is none."""
+    """Return the number at a dotted config key, or None if there is no number."""
     found: Any = config
     for name in key.split("."):
         found = getattr(found, name, None)
@@ -88,14 +91,14 @@ def _value(config: Config, key: str) -> float | None:
 
 
 def _with(config: Any, key: str, value: float) -> Any:
-    """Return a copy of a section with the number at a dotted key replaced."""
+    """Return a copy of a config section in which the number at a dotted key is `value`."""
     name, _, rest = key.partition(".")
     inner = _with(getattr(config, name), rest, value) if rest else value
     return config.model_copy(update={name: inner})
 
 
 def _direction(config: Config, scene: Scene, quantity: Quantity) -> Scene:
-    """Return the derivative of the scene's arrays with respect to a quantity."""
+    """Return the derivatives of the scene's arrays with respect to a `quantity`, as a `Scene`."""
     size = _STEP * (abs(quantity.value) or 1.0)
     moved = Scene.from_config(_with(config, quantity.key, quantity.value + size))
     here = Scene.from_config(config)
@@ -111,7 +114,9 @@ def _direction(config: Config, scene: Scene, quantity: Quantity) -> Scene:
 
 @Program
 def _along(scene: Scene, design, directions: Scene):
-    """Return the pair and its derivatives along directions of the scene (leading axis)."""
+    """Return the rotor pair of a design, and its derivatives along several directions of the scene.
+
+    `directions`: stacked along a leading axis."""
     arrays, rest = eqx.partition(scene, eqx.is_inexact_array)
 
     def build(arrays):
@@ -121,11 +126,11 @@ def _along(scene: Scene, design, directions: Scene):
 
 
 def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
-    """Return `evaluation` with gradients with respect to the scene's quantities.
+    """Return `evaluation` with gradients with respect to the quantities of the scene.
 
-    They replace those with respect to the design, in `gradient` (by config key, N per config unit)
-    and in `maxima`. The result is None if the orbit is not found again from the evaluation's
-    state."""
+    They replace the gradients with respect to the design: in `gradient` (N per config unit, keyed
+    by config key), and in `maxima`. The result is None if the steady motion from the evaluation's
+    state is not periodic, or does not have the same number of maxima."""
     config, solver = evaluator.config, evaluator.scene.solver
     design = jnp.asarray(list(evaluation.design.values()))
     wanted = quantities(config)

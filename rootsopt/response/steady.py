@@ -28,7 +28,8 @@ from rootsopt.status import Status
 
 
 class Response(NamedTuple):
-    """The steady response of one design in one scene; with leading axes if it was mapped.
+    """The steady response of one design in one scene. If it was mapped (`vmap`), all fields have
+    leading axes.
 
     `mean`, `peak`, `rms`: contact force (N); `lines` (lines,): amplitudes (N) of the spectral lines
     that the scene requests, in the same order (0 if the motion does not contain the line);

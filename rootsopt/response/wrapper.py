@@ -87,7 +87,8 @@ class Evaluates(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Wrapper:
-    """Base class of evaluators that combine several evaluations by another evaluator, `single`.
+    """Base class of evaluators that combine several evaluations made by another evaluator,
+    `single`.
 
     A subclass defines `fit`, which combines evaluations of one design (see `Evaluates.fit`). A call
     returns the evaluation from `fit`. The other methods delegate to `single`.

@@ -27,12 +27,12 @@ from rootsopt.dynamics.linear import solved
 
 
 class Lines(NamedTuple):
-    """The equation linearised at the Gauss points and at the end of each element.
+    """The equation linearised on e elements with s Gauss points each, for n states.
 
     `miss` (e, s, n): slope from the equation minus the element's slope, at the Gauss points;
     `slopes` (e, s, n, 1 + n): derivatives of the equation at the Gauss points with respect to time
     and state; `margin` (e,): margin at the element's end; `bend` (e, 1 + n): derivatives of the
-    margin.
+    margin with respect to time and state.
     """
 
     miss: Float[Array, "e s n"]
@@ -42,7 +42,8 @@ class Lines(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """Right-hand sides of the linear equations, one in each of k columns.
+    """Right-hand sides of the linear equations, one in each of k columns (e, s and n as in
+    `Lines`).
 
     `slope` (e, s, n, k): change of the equation at the Gauss points; `gap` (e, n, k): state at the
     end of each element minus that at the start of the next; `margin` (e, k): change of the margin
@@ -57,9 +58,9 @@ class Columns(NamedTuple):
 class Step(NamedTuple):
     """Solution of the linear equations: changes of a motion, one in each of k columns.
 
-    `state` (e, n, k): scaled states at the starts of the elements; `slopes` (e, s, n, k): slopes at
-    the Gauss points; `times` (m, k): times of the mesh; `monodromy` (n, n): monodromy matrix at the
-    start of the mesh.
+    `state` (e, n, k): scaled states at the starts of e elements; `slopes` (e, s, n, k): slopes at
+    their s Gauss points; `times` (m, k): times of the mesh (mesh periods); `monodromy` (n, n):
+    monodromy matrix at the start of the mesh.
     """
 
     state: Float[Array, "e n k"]
@@ -69,11 +70,12 @@ class Step(NamedTuple):
 
 
 class Condensed(NamedTuple):
-    """The linear equations after elimination of the slopes.
+    """The linear equations after elimination of the slopes (e, s and n as in `Lines`).
 
-    `slopes` (e, s, n, n + 2 + k): changes of the slopes, as a linear function of the change of the
-    element's first state (n), the shifts of both ends of its interval (2), and the right-hand sides
-    (k); `rise` (e, n, n + 2 + k): likewise, change of the state at the element's end.
+    `slopes` (e, s, n, n + 2 + k): coefficients of the slopes' changes; `rise` (e, n, n + 2 + k):
+    likewise, of the change of the state at the element's end. They multiply the change of the state
+    at the element's start (n), and the shifts of both ends of its interval (2). The last k are
+    constants, one for each right-hand side.
     """
 
     slopes: Float[Array, "e s n c"]

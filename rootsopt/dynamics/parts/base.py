@@ -192,12 +192,14 @@ class Part(eqx.Module):
     # margins is left to shooting.
 
     def margins(self, motion: Motion, own: Own) -> Float[Array, " s"]:
-        """Return numbers that are positive where the flags of `switches` are set."""
+        """Return numbers (s,), each positive where the flag of `switches` with the same index is
+        set."""
         del motion, own
         return jnp.zeros(0)
 
     def drag_margins(self, sliding: Float[Array, ""]) -> Float[Array, " s"]:
-        """Return numbers that are positive where the flags of `drag_switches` are set."""
+        """Return numbers (s,), each positive where the flag of `drag_switches` with the same index
+        is set."""
         del sliding
         return jnp.zeros(0)
 

@@ -76,11 +76,11 @@ class GasLoad(Load):
     Averaged over a turn, the torques on both rotors together equal the displaced volume times Δp /
     2π. This is exact unless a whole tip arc meshes at one instant (a canonical CIC profile). There
     ρ jumps, and the jump is spread over the roll angle `_BRIEF`, for two reasons. The real pressure
-    does not jump at a wide gap. And the derivatives of a jump that moves with the design would need
-    separate treatment.
+    does not jump at a wide gap. Besides, the derivatives of a jump that moves with the design would
+    need separate treatment.
 
-    `pressure_length` (N/m): pressure difference Δp (Pa) times the rotor's length L (m); `profile`;
-    `outer_radius` r_a (m); `torque`: mean torque against one rotor (N·m).
+    `pressure_length` (N/m): pressure difference Δp (Pa) times the rotor's length L (m); `profile`
+    of the rotors; `outer_radius` r_a (m); `torque`: mean torque against one rotor (N·m).
     """
 
     pressure_length: Float[Array, ""]

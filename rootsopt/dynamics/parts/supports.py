@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 from rootsopt.dynamics.parts.base import Context, Loads, Motion, Part, Units
 
 _DISPLACED = 0.1
-"""Displacement of an axis, relative to the centre distance, above which the rotors no longer count
+"""Displacement of an axis (fraction of the centre distance) above which the rotors no longer count
 as being in mesh."""
 
 
