@@ -34,8 +34,8 @@ _NEWTON_STEPS = 24
 """Default maximum number of integrations to close one orbit."""
 _CLOSED = 4000, 1e-3, 1e-10
 """Limits of the residual at which Newton's method stops. The limit is the second number
-(tolerances), but at least the first number (rounding errors; about 1e-12 in float64) and at most
-the third (scaled)."""
+(tolerances), at most the third (scaled). In any case it is at least the first number (rounding
+errors; about 1e-12 in float64)."""
 _KEPT = 4
 """Number of integrations after which the solver steps are kept, however large the Newton step. If a
 third of `Shots.count` is less, that number is used instead."""

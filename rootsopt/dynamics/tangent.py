@@ -31,8 +31,9 @@ def one_step(
 ) -> tuple[Float[Array, " m"], Float[Array, "stages m"]]:
     """Take one step of `solver` from `begin` to `end`. Return y at `end`, and dy/dτ at the stages.
 
-    `y` (m,): value at `begin`. The first stage is at `begin`, the last at `end`. For an implicit
-    solver, only these two slopes are returned."""
+    `term`: diffrax term of the equation; `y` (m,): value at `begin`; `args`: arguments for `term`.
+    The first stage is at `begin`, the last at `end`. For an implicit solver, only these two slopes
+    are returned."""
     if not isinstance(solver, diffrax.AbstractERK):
         memory = solver.init(term, begin, end, y, args)
         after = solver.step(term, begin, end, y, args, memory, made_jump=False)[0]

@@ -136,8 +136,10 @@ def _with(config: Config, fidelity: str, rtol: float, map_error: float = 1e-4) -
 
 
 def difference(found: Evaluation, truth: Evaluation) -> float | None:
-    """Return the larger of the relative differences in mean force and in peak force, or None unless
-    both evaluations are usable."""
+    """Return the larger of the differences in mean and in peak force, relative to `truth`.
+
+    The result is None unless both evaluations are usable. If a force of `truth` is 0, its
+    difference is absolute (N)."""
     if not (found.usable and truth.usable):
         return None
     pairs = ((found.response[key], truth.response[key]) for key in _JUDGED)

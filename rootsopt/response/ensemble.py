@@ -129,7 +129,8 @@ class EnsembleEvaluator(Wrapper):
     def prepare(self, design=None, series: bool = True) -> "EnsembleEvaluator":
         """Compile the programs for evaluating `design` (config units) in the background.
 
-        Return another evaluator, with a contact map sized for the design."""
+        `series` has no effect. Return another evaluator, with a contact map sized for the
+        design."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now = self._around(self.single._sized(design))
         pair, _ = _pair.result_shape(now.scene, design)

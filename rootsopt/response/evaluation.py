@@ -256,7 +256,8 @@ class Evaluator:
     def prepare(self, design: ArrayLike | None = None, series: bool = True) -> "Evaluator":
         """Compile the programs for evaluating `design` (config units) in the background.
 
-        Return another evaluator, with a contact map sized for the design."""
+        `series`: whether the evaluations will compute the series. Return another evaluator, with a
+        contact map sized for the design."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now = self._sized(design)
         pair, tangents, _ = _build.result_shape(now.scene, design)

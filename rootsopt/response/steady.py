@@ -72,7 +72,7 @@ def steady_response(scene: Scene, design: ArrayLike, start: ArrayLike | None = N
     `compiler_options=rootsopt.COMPILER_OPTIONS`.
 
     Raises ValueError if the design has the wrong shape; RuntimeError if JAX is not set to the
-    precision of the scene.
+    precision of the scene; NotImplementedError if a second derivative is requested.
 
     >>> config = rootsopt.load_config("configs/cic.yaml")
     >>> scene = rootsopt.Scene.from_config(config)

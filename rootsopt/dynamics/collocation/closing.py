@@ -113,10 +113,10 @@ def supported(pair: RotorPair) -> bool:
 
 
 def _newer(kind: type, margin: str, flag: str) -> bool:
-    """Return whether the method `margin` of the class `kind` belongs to the same version as its
-    method `flag`.
+    """Return whether the method `margin` of the class `kind` takes its method `flag` into account.
 
-    That is so if `margin` is defined in the same class as `flag` or in a subclass of that class."""
+    That is so if `margin` is defined in the same class as `flag`, or in a subclass of that
+    class."""
     order = list(kind.__mro__)
     places = [
         next(k for k, base in enumerate(order) if name in vars(base)) for name in (margin, flag)
@@ -125,9 +125,9 @@ def _newer(kind: type, margin: str, flag: str) -> bool:
 
 
 def sizes(periods: int) -> tuple[int, int]:
-    """Return the sizes of the arrays of a mesh: for its elements, and for its times.
+    """Return the sizes of the arrays of a mesh, for its elements and for its times.
 
-    They suffice for orbits of at most `periods` mesh periods."""
+    They are large enough for orbits of up to `periods` mesh periods."""
     elements = -(-(periods * _MOST) // BLOCK) * BLOCK
     return elements, periods * _TIMES + 3
 
@@ -258,8 +258,10 @@ def close(
 
 
 def _differences(before: Found, after: Found):
-    """Return the largest relative difference between two results in mean, RMS and peak force, and
-    that in their derivatives."""
+    """Return two relative differences between the results on two meshes.
+
+    The first is the largest difference in mean, RMS and peak force, the second that in their
+    derivatives."""
 
     def rms(values):
         return values.at[1].set(jnp.sqrt(jnp.maximum(values[1], 0.0)))[:3]

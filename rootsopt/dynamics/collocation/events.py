@@ -125,8 +125,7 @@ def look(pair: RotorPair, elements: Elements) -> Look:
 
 
 def rooted(elements: Elements, seen: Look) -> Elements:
-    """Return `elements` with the contact's roots replaced by those from `seen`, the result of
-    `look`.
+    """Return `elements` with `roots` from `seen`, the result of `look`.
 
     At the end of an element, the first root belongs to the side of the end on which the flanks
     push. The second root, for the other minimum next to a cusp, belongs to the instant after the

@@ -35,8 +35,8 @@ one round to the next."""
 
 
 _MENDED = 3
-"""Number of evaluations at each instant in the search for the peak. Each starts from the contact's
-roots of the one before, so that the roots converge."""
+"""Number of evaluations at each instant in the search for the peak. Each evaluation improves the
+`NearContact.roots` from which the next one starts."""
 
 
 class Peak(NamedTuple):
@@ -76,8 +76,8 @@ class Found(NamedTuple):
 
 
 def _inside(elements: Elements, k: Any, share: Any) -> tuple[Array, Array, Array]:
-    """Return time (mesh periods), scaled state and contact roots at the fraction `share` of element
-    `k`.
+    """Return time (mesh periods), scaled state and `NearContact.roots` at the fraction `share` of
+    element `k`.
 
     The roots come from the polynomial through those at the Gauss points."""
     begin, length = elements.mesh.ends[0][k], elements.mesh.lengths[k]

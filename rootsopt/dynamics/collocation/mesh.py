@@ -83,8 +83,8 @@ def needed(elements: Elements) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
 def moved(elements: Elements, mesh: Mesh) -> Elements:
     """Return the motion `elements` on another `mesh`.
 
-    The contact's roots are copied without change. They are not valid on the new mesh (see
-    `events.rooted`)."""
+    `Elements.roots` are copied without change. They are not valid on the new mesh, and must be
+    renewed (see `events.rooted`)."""
     old_begin = elements.mesh.ends[0]
     begin, _ = mesh.ends
     length, old_length = mesh.lengths, elements.mesh.lengths

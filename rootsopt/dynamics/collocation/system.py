@@ -4,7 +4,8 @@ On an element with Runge-Kutta matrix A and weights b, slopes k and length h, co
 
     k_i = f(τ_i, z + h Σ A_ij k_j),      z⁺ = z + h Σ b_i k_i,
 
-where z⁺ is the state at the start of the next element. At an event, also the margin m(τ, z⁺) = 0.
+where z⁺ is the state at the start of the next element. At an event, the margin m(τ, z⁺) must be
+zero as well.
 
 The slopes of an element depend only on the state at its start and on the times of both ends of its
 interval. They are therefore eliminated first (condensation; Ascher, Mattheij and Russell, Numerical
@@ -165,8 +166,10 @@ def chained(elements: Elements, lines: Lines, columns: Columns, parts: Condensed
     pushed = jnp.pad(columns.margin, ((0, 0), (states, 0)))
 
     def along(carry, k):
-        """Advance over element k; `carry`: dependence on the first state and on the right-hand
-        sides."""
+        """Advance over element k.
+
+        `carry`: change of the state at its start, as a function of the first state and the
+        right-hand sides."""
         now, by_end, begun = carry
         part = rise[k]
         after = jnp.sum(part[:, :states, None] * now, axis=1)

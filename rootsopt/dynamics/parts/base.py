@@ -73,6 +73,9 @@ class Part(eqx.Module):
     computation. Store every number in a field that holds an array: a response is differentiable
     with respect to these fields. Quantities are in SI units; torques, speeds and angles are
     positive in the rotor's own sense of rotation.
+
+    Arguments of several methods: `motion`: position and velocity of the pair; `own` (m,): the
+    part's own states; `loads`: sums of all loads on the pair.
     """
 
     # Properties of the part.
@@ -127,6 +130,8 @@ class Part(eqx.Module):
     def rates(self, motion: Motion, own: Own, loads: Loads) -> Float[Array, " m"]:
         """Return the time derivatives (m,) of the part's own states `own` (SI units).
 
+        `motion`: position and velocity of the pair; `loads`: sums of all loads on it.
+
         Raises NotImplementedError for a part that has states but does not override this method."""
         raise NotImplementedError(f"`{type(self).__name__}` has states, but no `rates`")
 
@@ -134,6 +139,8 @@ class Part(eqx.Module):
         self, own: Float[Array, "*k m"] | Float[np.ndarray, "*k m"]
     ) -> tuple[Float[Array, "*k 2 2"], Float[Array, "*k 2 2"]]:
         """Return the displacements (m) and the velocities (m/s) of the axes (rotor, x and y).
+
+        `own`: the part's own states (SI units).
 
         Raises NotImplementedError for a part that `displaces` but does not override this method."""
         raise NotImplementedError(f"`{type(self).__name__}` displaces the axes, but has no `axes`")
@@ -149,19 +156,24 @@ class Part(eqx.Module):
     def torque_on_1(self, motion: Motion, own: Own) -> Float[Array, ""] | None:
         """Return the torque (N·m) on rotor 1; None: zero.
 
+        `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI units).
         This method is called only if rotor 1 is `free`.
         """
         del motion, own
         return None
 
     def torque_on_2(self, motion: Motion, own: Own) -> Float[Array, ""] | None:
-        """Return the torque (N·m) on rotor 2; None: zero."""
+        """Return the torque (N·m) on rotor 2; None: zero.
+
+        `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI
+        units)."""
         del motion, own
         return None
 
     def force_on_axes(self, motion: Motion, own: Own) -> Float[Array, "2 2"] | None:
         """Return the forces (N) on the axes (rotor, x and y); None: zero.
 
+        `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI units).
         This method is called only if a part `displaces` the axes."""
         del motion, own
         return None
@@ -178,7 +190,10 @@ class Part(eqx.Module):
     # integrals lose accuracy and derivatives are wrong.
 
     def switches(self, motion: Motion, own: Own) -> Bool[Array, " s"]:
-        """Return flags (s,) that change where the part's loads or rates are not smooth."""
+        """Return flags (s,) that change where the part's loads or rates are not smooth.
+
+        `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI
+        units)."""
         del motion, own
         return jnp.zeros(0, bool)
 

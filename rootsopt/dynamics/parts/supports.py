@@ -66,6 +66,7 @@ class Supports(Part):
     def force(
         self, displacement: Float[Array, "*n"], velocity: Float[Array, "*n"]
     ) -> Float[Array, "*n"]:
-        """Return the forces (N) on the rotors at displacements (m) and velocities (m/s) of their
-        axes."""
+        """Return the bearing forces (N) on the rotors.
+
+        `displacement` (m), `velocity` (m/s): those of the axes. All arrays have the same shape."""
         return -self.stiffness * displacement - self.damping * velocity
