@@ -31,8 +31,8 @@ solver steps (see `SolutionCurve`)."""
 _MOST = 14
 """Maximum number of evaluations of the equations for one point of the curve."""
 _TURN, _STRAIGHT = 0.9, 0.99
-"""Cosine of the angle between the tangents at successive points of the curve below which a step is
-rejected, and cosine above which the next step is longer."""
+"""Cosines of the angle between the tangents at successive points of the curve. Below the first
+cosine, a step is rejected. Above the second, the next step is longer."""
 _ASTRAY = 0.5
 """Distance (steps) from the predicted to the corrected point above which the corrected point is
 assumed to lie on another curve."""
@@ -119,8 +119,8 @@ class StepSizes:
     `low`, `high`: range of the parameter; `first`, `least`, `greatest`: first, least and greatest
     step, as Euclidean distances between the unknowns; `points`: maximum number of points.
 
-    Raises ValueError if `low` is not less than `high`, if the steps are not 0 < `least` ≤ `first` ≤
-    `greatest`, or if `points` is less than 1.
+    Raises ValueError if `low` is not less than `high`; if the steps are not 0 < `least` ≤ `first` ≤
+    `greatest`; if `points` is less than 1.
     """
 
     low: float

@@ -127,9 +127,9 @@ def follow(
     step sizes. A step of length 1 spans the range, or changes the scaled state by `SPAN`. `ways`:
     directions to follow, -1 for falling and 1 for rising values of the parameter.
 
-    Raises `InputError` for an unknown parameter, a config's value outside the limits, limits that
-    the config cannot have, single precision, or an invalid `period` or `ways`; also if there is no
-    orbit to start from.
+    Raises `InputError` for an unknown parameter, single precision, or an invalid `period` or
+    `ways`; for limits that exclude the config's value, or that the config cannot have; and if there
+    is no orbit to start from.
     """
     value = value_of(config, parameter)
     if not limits.low <= value <= limits.high:

@@ -58,8 +58,7 @@ _STEP = 1 / 256
 """Length (mesh periods) above which solver steps are divided. Slightly longer steps may remain."""
 _SAME = 1e-5
 """Distance (unit of `StepSizes`) between the states at the start and the middle of an orbit below
-which the orbit counts as one of half the period. States between steps are interpolated, so the
-limit is not 0.
+which the orbit has half the period. States between steps are interpolated, so the limit is not 0.
 """
 
 

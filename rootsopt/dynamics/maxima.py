@@ -182,7 +182,7 @@ def shoulders(forces: NDArray[np.float64]) -> NDArray[np.int64]:
 def _dip(forces: NDArray[np.float64], one: int, other: int) -> float:
     """Return the least force on the way between samples `one` and `other` of a cycle.
 
-    Of the two ways around the cycle, the one with the greater least force is taken."""
+    The direction around the cycle is that in which this least force is greater."""
     low, high = sorted((one, other))
     inner, outer = forces[low : high + 1], np.concatenate([forces[high:], forces[: low + 1]])
     return float(max(inner.min(), outer.min()))

@@ -40,7 +40,7 @@ class Measures(eqx.Module):
         """Return the integrands of the averages at time `tau` (mesh periods).
 
         `force`: the contact force, in any unit; `top`: roughly its greatest value, in the same
-        unit. It scales the powers of the force, so that none overflows."""
+        unit. Powers of the force are scaled by `top`, so that they do not overflow."""
         rates = [jnp.stack([force, force**2])]
         if self.orders.shape[0]:
             angle = 2 * jnp.pi * jnp.asarray(self.orders, force.dtype) * tau

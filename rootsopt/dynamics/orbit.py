@@ -1,12 +1,12 @@
 """Close a periodic orbit by shooting, and differentiate it.
 
 Newton's method on the k-fold stroboscopic map closes an orbit of k mesh periods. The monodromy
-matrix tells whether the orbit is stable, and the implicit function theorem gives its derivatives.
+matrix shows whether the orbit is stable, and the implicit function theorem gives its derivatives.
 Where there is no orbit, the same loop integrates a window of the motion
 (`rootsopt.dynamics.window`).
 
-The solver steps of an orbit are recorded as a *grid*, and repeated once Newton's method is close.
-A *kink* is an instant at which the equation of motion is not smooth; grid steps end there.
+The solver steps of an orbit are recorded as a *grid*, and repeated once Newton's method is close. A
+*kink* is an instant at which the equation of motion is not smooth; grid steps end there.
 """
 
 from collections.abc import Callable
@@ -42,9 +42,9 @@ third of `Shots.count` is less, that number is used instead."""
 _LOOKS = 6
 """Maximum number of searches for kinks in the course of closing one orbit."""
 _DRIFT = 30.0, 1e-9, 1e-6
-"""Change of the orbit's start above which the search for kinks is repeated (tolerances), and the
-lower and upper bounds of this threshold (scaled). After a smaller change, kinks may lie slightly
-outside their short steps, which causes a first-order error."""
+"""Change of the orbit's start (scaled) above which the search for kinks is repeated. The limit is
+the first number (tolerances), at least the second and at most the third (scaled). After a smaller
+change, kinks may lie slightly outside their short steps, which causes a first-order error."""
 _STRAIN = 10.0
 """Estimated error of a repeated step (tolerances) above which the solver steps are chosen anew."""
 _AFTER = 3
@@ -52,8 +52,8 @@ _AFTER = 3
 new search for kinks, or a new choice of steps, could then leave the orbit open."""
 _AGREE = 10.0, 1e-3, 3e-2
 """Relative difference between the derivatives on a grid and on halved steps above which no
-derivatives are reported (square roots of the tolerance), and the lower and upper bounds of this
-threshold."""
+derivatives are reported. The limit is the first number times the square root of the tolerance, at
+least the second number and at most the third."""
 _SMALL = 1e-9, 1e-3
 """Lower and upper bounds (scaled) of the Newton step below which the solver steps are kept. Between
 them, this limit is a thousand tolerances."""
@@ -359,7 +359,7 @@ def orbit_or_window(
     periods: int = 0,
 ) -> tuple[Orbit, Window]:
     """Close and differentiate an orbit or, if `windowed`, integrate a window of `periods` mesh
-    periods from `state`. Return both; whichever was not computed is a placeholder.
+    periods from `state`. Return both; the one that was not computed is a placeholder.
 
     The orbit is the solution of Φ(z) = z near the scaled `state` (n,), where Φ is the flow over
     `period` mesh periods. Newton shooting finds it, and the implicit function theorem gives its

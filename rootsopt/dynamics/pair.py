@@ -524,8 +524,8 @@ class RotorPair(eqx.Module):
     def lost(self, state: Float[Array, " n"]) -> Bool[Array, ""]:
         """Return whether the rotors no longer run as a pair in the scaled `state`.
 
-        This is so if the lobes have passed through each other, if the motor has stalled, or if a
-        part reports a loss, such as an axis displaced too far."""
+        There are three possible reasons: the lobes have passed through each other; the motor has
+        stalled; or a part reports a loss, such as an axis displaced too far."""
         return self._lost(state, zip(self.all_parts, self.own_states(state), strict=True))
 
     def _lost(self, state, acting) -> Bool[Array, ""]:

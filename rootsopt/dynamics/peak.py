@@ -10,8 +10,9 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.pair import RotorPair
 
 _RIVALS, _CLOSER, _ROUNDS = 4, 16, 10
-"""Settings for refining the peak: number of refined maxima among the samples (and as many among the
-ends of steps), number of evaluations around each maximum in a round, and number of rounds."""
+"""Settings for refining the peak. `_RIVALS`: number of refined maxima among the samples, and as
+many among the ends of steps; `_CLOSER`: number of evaluations around each maximum in a round;
+`_ROUNDS`: number of rounds."""
 _INNER = 2 * _RIVALS * _CLOSER - 2
 """Number of samples or ends of steps scanned in one iteration of the search. The iteration also
 evaluates one neighbour at either end."""
@@ -33,8 +34,8 @@ _NOISES = 10.0
 counts as curvature, not as noise. The forces next to a smooth peak may also scatter by this much.
 """
 _LEAST = 1e-9
-"""Fall of the force, summed over both sides of a peak and relative to the peak, below which the
-peak does not count as a corner: the fall may be rounding."""
+"""Fall of the force on both sides of a peak together, relative to the peak, below which the peak
+does not count as a corner. The fall may then be rounding."""
 
 
 def motion(

@@ -26,9 +26,9 @@ Along a flank of the EE family the rate is at most 2π, for any number of lobes.
 _ROUNDINGS = 300
 """Change of a lever (rounding errors) below which the change does not count as a jump."""
 _ALIKE = 0.05
-"""Distance (fraction of the jump) from the levers at a stage to the nearer of the levers at the two
-ends of the step, above which the change does not count as a jump. If a lever changes fast but
-continuously, some stages lie in between."""
+"""Distance from the levers at a stage to those at the nearer end of the step (fraction of the
+change over the step). Above this distance, the change does not count as a jump: if a lever changes
+fast but continuously, some stages lie in between."""
 MARKS = 4
 """Number of `marks`: further numbers stored with the time derivative of a motion (penetration, its
 rate, both levers). A jump of the levers shows in them."""

@@ -21,7 +21,7 @@ BLOCK = 4
 _MEMORY = 20
 """Number of stroboscopic states stored: more than twice the longest cycle searched for."""
 _PATIENCE = 32, 1e-5
-"""Length (mesh periods) above which a transient continues with a lower tolerance, and the greatest
+"""Number of mesh periods after which a transient continues with a finer tolerance, and the greatest
 value of that tolerance. The noise of coarser steps can hide that the motion repeats."""
 NOISE = 100.0
 """Noise of the stroboscopic states that adaptive steps cause (tolerances, relative to the

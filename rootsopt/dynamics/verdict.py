@@ -30,8 +30,8 @@ limit is multiplied by the greatest entries of the state and of the monodromy ma
 exceed 1."""
 _DRIFT = 1e3, 1e-5
 """Change of an orbit's start since the last search for kinks above which the derivatives are
-uncertain (tolerances), and the lower bound of this threshold (scaled). After a greater change, some
-kinks may lie inside long steps."""
+uncertain. The limit is the first number (tolerances), but at least the second (scaled). After a
+greater change, some kinks may lie inside long steps."""
 _STRAINED = 100.0
 """Estimated error of a repeated step (tolerances) above which an orbit is rejected."""
 

@@ -332,7 +332,7 @@ def neighbours(
     The first n points are a centre plus the steps, the last n the centre minus the steps. The steps
     are normally distributed with standard deviation `settings.spread`, and shortened where a point
     would leave the box. The centre is `point`, moved inside the box if it is less than one standard
-    deviation from a bound, since a point at a bound has no opposite neighbours.
+    deviation from a bound. (A point at a bound has no opposite neighbours.)
     """
     from scipy.stats import norm, qmc
 

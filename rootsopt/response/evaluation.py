@@ -163,8 +163,8 @@ class Evaluator:
     def surveying(self) -> "Evaluator":
         """Return another evaluator for a search over many designs.
 
-        Its motions from rest may settle for a quarter of the allowed transient only, and a design
-        that does not settle is not examined further."""
+        Motions have only a quarter of the allowed transient in which to settle, but at least 32
+        mesh periods. A design that does not settle is not examined further."""
         least = max(self.config.solver.max_mesh_periods // 4, 8 * BLOCK)
         hasty = self._solving(
             lambda solver: (solver.max_periods, solver.examine),
@@ -177,7 +177,7 @@ class Evaluator:
         return dataclasses.replace(self, scene=scene)
 
     def relative_to(self, baseline: Evaluation) -> "Evaluator":
-        """Return another evaluator, which compares coexisting motions by their forces relative to
+        """Return another evaluator that compares coexisting motions by their forces relative to
         those of the `baseline`."""
         return dataclasses.replace(self, reference=baseline.response)
 

@@ -68,8 +68,8 @@ def quantities(config: Config) -> list[Quantity]:
     """Return the quantities that the sensitivity table lists for the scene of `config`.
 
     The table states the effect of a change by 1 µm for clearance, backlash and centre distance
-    error, and by 1 % for all other quantities. Quantities of parts that the scene does not have are
-    left out. So are quantities that are 0, except the first three."""
+    error. For all other quantities, the change is 1 %. Quantities of parts that the scene does not
+    have are left out. So are quantities that are 0, except the first three."""
     found = []
     for key, name in _LENGTHS:
         value = _value(config, key)

@@ -79,7 +79,7 @@ class SpeedsEvaluator(Wrapper):
     baseline: tuple["AtSpeed", ...] = ()
 
     def relative_to(self, baseline: Evaluation) -> "SpeedsEvaluator":
-        """Return another evaluator, which compares coexisting motions at each speed by their forces
+        """Return another evaluator that compares coexisting motions at each speed by their forces
         relative to those of the `baseline` at the same speed."""
         return dataclasses.replace(self, baseline=at_speeds(baseline))
 

@@ -72,7 +72,7 @@ class Evaluates(Protocol):
         ...
 
     def relative_to(self, baseline: Evaluation) -> "Evaluates":
-        """Return another evaluator, which compares coexisting motions by their forces relative to
+        """Return another evaluator that compares coexisting motions by their forces relative to
         those of the `baseline`."""
         ...
 
@@ -143,7 +143,7 @@ class Wrapper:
         return self._around(self.single.surveying())
 
     def relative_to(self: W, baseline: Evaluation) -> W:
-        """Return another evaluator, which compares coexisting motions by their forces relative to
+        """Return another evaluator that compares coexisting motions by their forces relative to
         those of the `baseline`."""
         return self._around(self.single.relative_to(baseline))
 

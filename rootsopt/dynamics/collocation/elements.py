@@ -71,10 +71,11 @@ class Elements(NamedTuple):
 
     @property
     def places(self) -> tuple[Float[Array, "e p"], Float[Array, "e p n"]]:
-        """Times (e, s + 1) in mesh periods and scaled states (e, s + 1, n) at the Gauss points and
-        the end of each element.
+        """Times (e, s + 1) and scaled states (e, s + 1, n) at the Gauss points and the end of each
+        element.
 
-        The state at the end is the state at which the next element starts."""
+        Times are in mesh periods. The state at the end is the state at which the next element
+        starts."""
         begin, end = self.mesh.ends
         length = self.mesh.lengths
         tau = jnp.append(begin[:, None] + length[:, None] * GAUSS.nodes, end[:, None], axis=1)

@@ -1,9 +1,10 @@
 """Gauss points of an element, and the polynomial through the slopes at these points.
 
 On an element of length h, the state is z(σ) = z(0) + h Σ a_j(σ) k_j for 0 ≤ σ ≤ 1. The k_j are the
-slopes at the s Gauss points c_j, and a_j is the integral of the j-th Lagrange polynomial. The error
-is of order 2s at the end of the element, and of order s + 1 inside it (de Boor and Swartz, SIAM J.
-Numer. Anal. 10 (1973) 582-606).
+slopes at the s Gauss points c_j, and a_j is the integral of the j-th Lagrange polynomial.
+
+The error is of order 2s at the end of the element, and of order s + 1 inside the element. See de
+Boor and Swartz, SIAM J. Numer. Anal. 10 (1973) 582-606.
 """
 
 from typing import NamedTuple

@@ -8,8 +8,8 @@ from rootsopt.dynamics.collocation.events import _SAME
 from rootsopt.dynamics.collocation.gauss import GAUSS
 
 _FLOOR = 0.15
-"""Density of elements, as a fraction of the mean density wanted, that is added everywhere. It
-limits the length of elements."""
+"""Density of elements that is added everywhere, as a fraction of the mean density. It limits the
+length of elements."""
 
 
 def shared(
@@ -23,9 +23,8 @@ def shared(
     """Return a mesh of `used` elements, some of which end at events.
 
     `times`, `which` (m,): as in `Mesh`; `events`: number of events; `density`: times (p,) in mesh
-    periods, and number of elements wanted from the first of them to each (p,), in any unit;
-    `capacity`: size of the arrays for elements. Each interval between events has at least one
-    element."""
+    periods, and desired number of elements up to each time (p,), in any unit; `capacity`: size of
+    the arrays for elements. Each interval between events has at least one element."""
     place, wanted = density
     # A floor, so that no part of the period is left to one long element.
     even = (place - place[0]) / (place[-1] - place[0])
@@ -67,9 +66,9 @@ def shared(
 def needed(elements: Elements) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
     """Return a density of elements for which all elements have about the same error.
 
-    The density is given by times (p,) in mesh periods, and the number of elements from the first of
-    them to each (p,), in an arbitrary unit. An element's error is estimated from the highest
-    coefficient of the polynomial through its slopes."""
+    The density consists of times (p,) in mesh periods, and of the number of elements up to each
+    time (p,), in an arbitrary unit. An element's error is estimated from the highest coefficient of
+    the polynomial through its slopes."""
     mesh = elements.mesh
     highest = jnp.sum(jnp.asarray(GAUSS.powers[-1])[:, None] * elements.slopes, axis=1)
     size = jnp.max(jnp.abs(highest), axis=1) * mesh.lengths
@@ -160,8 +159,10 @@ def aligned(
 
 
 def counted(elements: Elements) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-    """Return the present density of elements: times (mesh periods), and the number of elements up
-    to each."""
+    """Return the present density of elements.
+
+    The density consists of times (p,) in mesh periods, and of the number of elements up to each
+    time (p,)."""
     mesh = elements.mesh
     begin, end = mesh.ends
     real = jnp.arange(begin.shape[0]) < mesh.used

@@ -31,11 +31,11 @@ _REPEATS = 1e-6
 orbit is rejected. Its true period is then shorter."""
 _MISS = 1e3
 """Scaled difference between the start and the end of an integration from the orbit's state, above
-which the orbit is rejected. The unit is the tolerance times the greatest entries of the state and
-of the monodromy matrix, where they exceed 1."""
+which the orbit is rejected. The limit is this number of tolerances, multiplied by the greatest
+entries of the state and of the monodromy matrix, where they exceed 1."""
 _APART = 1e4, 1e-4
-"""Relative difference between the forces of the orbit and of that integration above which the orbit
-is rejected (tolerances), and the lower bound of this threshold."""
+"""Relative difference between the forces of the orbit and of an integration from its state, above
+which the orbit is rejected. The limit is the first number (tolerances), but at least the second."""
 
 
 class Collocated(NamedTuple):

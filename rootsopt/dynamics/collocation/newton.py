@@ -96,8 +96,8 @@ def advanced(
 ) -> tuple[Elements, Float[Array, ""]]:
     """Return the elements after a Newton step, and the size of the step before any shortening.
 
-    `roots`: new `Elements.roots`. The step is shortened if it would shrink an interval too much, or
-    if a state would leave the region in which the equation is nearly linear."""
+    `roots`: new `Elements.roots`. The step is shortened if it would shrink an interval too much. It
+    is also shortened if it is too long for the linearised equation."""
     mesh = elements.mesh
     times, states, slopes = step.times[:, 0], step.state[..., 0], step.slopes[..., 0]
     room, change = jnp.diff(mesh.times), jnp.diff(times)
