@@ -215,8 +215,9 @@ def parse(
 
 
 def _find_family(data: dict) -> None:
-    """Load the installed package that offers the family in `data`, unless it is already registered.
-    """
+    """Load the installed package that offers the config's family.
+
+    `data`: the config as plain values. Do nothing if the family is already registered."""
     profile = data.get("profile")
     name = profile.get("family") if isinstance(profile, dict) else None
     if isinstance(name, str) and bare(name) not in map(bare, families()):

@@ -1,4 +1,4 @@
-"""Chooses the smoothing length of the contact force for a config that gives none."""
+"""Chooses the smoothing length of a scene if the config gives none."""
 
 import math
 
@@ -7,9 +7,10 @@ _LONGEST = 1e-4
 _SHARES = {"twist": 0.05, "depth": 0.02, "damping": 0.1}
 """Greatest default smoothing length, as a fraction of each of three lengths.
 
-`twist`: deflection of the timing gear under the full load, at the pitch radius. A longer smoothing
-length would reach the gear's working range, so its stiffness would change. `depth`: penetration of
-the flanks under the full load. `damping`: penetration at which damping is full."""
+`twist`: deflection of the timing gear under the full load, at the pitch radius. With a longer
+smoothing length, the gear would work in the rounded edge of its backlash, where its stiffness
+differs. `depth`: penetration of the flanks under the full load. `damping`: penetration at which the
+damping is full."""
 _LEAST = {"float64": 1e-6, "float32": 1e-5}
 """Least default smoothing length (mm) for each precision.
 

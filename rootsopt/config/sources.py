@@ -23,11 +23,10 @@ _KINDS = (
 
 
 def regular_file(path: str | os.PathLike, what: str) -> Path:
-    """Return `path`, unless it is something that is not a regular file.
+    """Return `path`; raise `InputError` if it is a folder, pipe, device or socket.
 
-    `what`: name of the expected file in the message, as in "a config". A missing file is accepted,
-    because reading it reports the problem. Raises `InputError` for a folder, pipe, device or
-    socket. Reading one of these might never end."""
+    Reading one of these might never end. A missing file is accepted, because reading it reports the
+    problem. `what`: name of the expected file in the message, as in "a config"."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
