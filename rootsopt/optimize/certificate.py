@@ -24,8 +24,7 @@ NEAR = 1e-4
 For a constraint, the distance is its scaled slack. For a bound, it is measured in the unit box. For
 a branch, it is the difference from the greatest branch."""
 _WEIGHT = 1e4
-"""Weight, in the least squares, of the condition that the shares of a maximum add up to
-1."""
+"""Weight, in the least-squares problem, of the condition that the shares of a maximum sum to 1."""
 _NEGLIGIBLE = 1e-6
 """Norm of a constraint's scaled gradient below which the constraint counts as inactive."""
 
@@ -34,12 +33,12 @@ class Certificate(NamedTuple):
     """First-order conditions at a point, for d design parameters and m constraints.
 
     `residual`: norm of all conditions that should be zero, in the objective's unit per side of the
-    unit box. They are the Lagrangian's gradient and the products of each multiplier or share and
-    its distance from being active.
+    unit box. One condition is the Lagrangian's gradient. The others are complementarity products:
+    each multiplier or share, times the distance of its limit or branch from being active.
 
     `violation`: greatest scaled violation of a constraint. `multipliers` (m,): those of the
     constraints. `lower`, `upper` (d,): multipliers of the bounds. `shares`: one array (k,) for each
-    maximum over k branches. Its entries add up to 1."""
+    maximum over k branches, whose entries add up to 1."""
 
     residual: float
     violation: float

@@ -40,7 +40,7 @@ class Checkpoint:
     mappings of plain values. `resume`: whether to reuse the evaluations in the file; otherwise,
     start a new file.
 
-    Raises `InputError` with `resume` if there is no file or if its header differs from `header`.
+    With `resume`, raises `InputError` if there is no file or if its header differs from `header`.
     Raises `OSError` if the file cannot be opened for writing."""
 
     def __init__(self, path: Path, header: Mapping[str, Any], resume: bool = False):
@@ -97,9 +97,9 @@ class Checkpoint:
             )
 
     def known(self, key: Key, point: NDArray[np.float64]) -> Evaluation | None:
-        """Return the evaluation that the resumed file has under `key` for this `point` (d,).
+        """Return the evaluation stored under `key`, or `None` unless it belongs to `point` (d,).
 
-        Return `None` if there is none. Only evaluations that were read at the start are found."""
+        Only evaluations that were read from a resumed file are found."""
         with self._lock:
             found = self._known.get(key)
             if found is None or found[0] != point.tolist():

@@ -17,8 +17,8 @@ from rootsopt.optimize.sqp import Found, Stops, descend
 
 _STOPS = Stops(residual=1e-7, feasibility=1e-9, evaluations=300)
 _PART = 1e-3
-"""Share above which a constraint counts as in conflict. At the least violation, the shares of all
-constraints add up to 1."""
+"""Share of a constraint in the least violation above which the constraint counts as in conflict.
+The shares of all constraints add up to 1."""
 
 
 class Conflict(NamedTuple):
@@ -102,7 +102,7 @@ def explain(problem: Problem, starts: Sequence[NDArray[np.float64]]) -> Infeasib
 
 
 def _alone(problem: Problem, k: int, starts: Sequence[NDArray[np.float64]]) -> float | None:
-    """Return the nearest limit that constraint `k` can meet while all others hold, in its unit.
+    """Return the nearest limit of constraint `k`, in its unit, that can be met if all others hold.
 
     `starts`: points (d,) of the unit box from which to search. Return `None` if the searches find
     no point that satisfies the other constraints."""

@@ -3,7 +3,8 @@
 The lowest of many noisy objectives is low partly by chance. The decision therefore does not use the
 objectives of the search. The best few designs are averaged again over a larger ensemble of other
 motions. The best of these and the baseline are then averaged over a third ensemble. The design is
-accepted if its objective is lower by more than `SIGNIFICANT` combined standard errors."""
+accepted if its objective is lower than the baseline's by more than `SIGNIFICANT` combined standard
+errors."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -26,12 +27,12 @@ _CANDIDATES = 3
 class Verification(NamedTuple):
     """Outcome of a verification.
 
-    `baseline`: evaluation of the baseline over the ensemble that decides. `problem`: the design
-    problem relative to this baseline. `optimized`: evaluation of the best candidate over the same
-    ensemble, or `None` if it was not accepted. `record`: entries for the result file.
+    `baseline`: evaluation of the baseline over the third ensemble, which decides. `problem`: the
+    design problem relative to this baseline. `optimized`: evaluation of the best candidate over the
+    same ensemble, or `None` if it was not accepted. `record`: entries for the result file.
 
     If no candidate is usable, `problem` and `baseline` are those of the search. If only the new
-    baseline is not usable, `problem` is that of the search."""
+    evaluation of the baseline is not usable, `problem` is that of the search."""
 
     problem: Problem
     baseline: Evaluation

@@ -1,5 +1,4 @@
-"""What is known about an optimum: certificate, active branches, and the optima that the starts
-found."""
+"""What is known about an optimum: certificate, active branches, outcomes of the local searches."""
 
 import dataclasses
 import math
@@ -53,8 +52,8 @@ class Holder(NamedTuple):
     `speed_rpm`: speed of the branch, NaN if there is only one speed. `objective`: value of the
     branch. `share`: its weight in the gradient of the objective.
 
-    `rotation_deg`, `force_N`: rotation of rotor 1 (from φ1 = 0) and contact force at the local
-    maximum that is the branch. Both are NaN for any other branch."""
+    `rotation_deg`, `force_N`: rotation of rotor 1 (degrees from φ1 = 0) and contact force (N), if
+    the branch is a local maximum of the force over time. Otherwise, both are NaN."""
 
     speed_rpm: float
     rotation_deg: float

@@ -26,13 +26,13 @@ from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 
 PEAK = "peak_force_N"
-"""Name of the peak force, the greatest of several local maxima of the contact force."""
+"""Key of the peak force in a response: the greatest of several local maxima of the force."""
 _NO_LINE = 1e-9
 """Amplitude of the baseline's spectral line (relative to its mean force) below which an objective
 that contains this line is rejected."""
 _SAME = 1e-6
-"""Slack and slope of a constraint (both scaled) below which the constraint holds with equality for
-every design."""
+"""Slack and slope of a constraint (both scaled) below which the constraint counts as met with
+equality by every design."""
 _HELD = 1e-6
 """Multiplier of a bound, or share of a branch, below which the bound or branch counts as inactive.
 """
@@ -40,7 +40,7 @@ _STEPS = {"mm": 0.1, "deg": 1.0, "": 0.01}
 """Change of a limit, by the unit of the limit, for which the report states the effect on the
 objective."""
 _DRAWN = 5
-"""Maximum number of times that an infeasible point is moved half way to a feasible point."""
+"""Maximum number of times that an infeasible point is moved halfway towards a feasible point."""
 FEASIBLE = 1e-6
 """Scaled violation of a constraint above which a point counts as infeasible. It is also the
 distance from a bound of the unit box above which the bound counts as inactive."""
@@ -205,8 +205,7 @@ class Problem:
 
     @property
     def cornered(self) -> bool:
-        """Whether the objective contains the peak force of single motions, so that it can have
-        corners."""
+        """Whether the objective contains the peak force of single motions, which has corners."""
         return PEAK in objective_weights(self.config) and self.config.objective.motion in (
             "reached",
             "worst",
@@ -268,7 +267,7 @@ class Problem:
         return bool(np.min(self.look(point)[2]) >= -FEASIBLE)
 
     def project(self, point) -> NDArray[np.float64]:
-        """Move `point` (d,) onto the feasible set by Gauss-Newton steps.
+        """Return `point` (d,) moved onto the feasible set by Gauss-Newton steps.
 
         Each step is computed from the violated constraints. The result can still be infeasible, for
         example if the constraints contradict the bounds."""
@@ -288,12 +287,13 @@ class Problem:
         return np.asarray(point, dtype=np.float64)
 
     def toward(self, point, inside) -> NDArray[np.float64]:
-        """Return a point near `point` (d,) that is feasible if possible, as `project` does.
+        """Return a point near `point` (d,) that is feasible if possible.
 
-        `inside`: a feasible point. If `project` fails, `point` is moved half way towards `inside`
-        and projected again, up to `_DRAWN` times. If this fails too, the result is the projection
-        of `inside`. This helps where no profile exists at `point`. Families whose closed-form
-        limits ensure a sound profile need only the first projection."""
+        `inside`: a feasible point. The result is that of `project` if this is feasible. Otherwise,
+        `point` is moved halfway towards `inside` and projected again, up to `_DRAWN` times. If this
+        fails too, the result is the projection of `inside`. This helps where no profile exists at
+        `point`. Families whose closed-form limits ensure a sound profile need only the first
+        projection."""
         found = self.project(point)
         if self.space.family.by_limits:
             return found
@@ -304,12 +304,11 @@ class Problem:
         return found
 
     def descent(self, point, slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradient `slope` (d,) without the parts that active limits block.
+        """Return the gradient `slope` (d,) projected so that its negative is a feasible direction.
 
-        The active limits are the constraints and bounds that are active at `point` (d,). The
-        negative of the result is the projection of -`slope` onto the cone of feasible directions (a
-        non-negative least-squares problem). It is the closest direction that violates no active
-        limit. The result is zero exactly at a Karush-Kuhn-Tucker point."""
+        The negative of the result is the direction closest to -`slope` that violates no constraint
+        or bound active at `point` (d,). It solves a non-negative least-squares problem. The result
+        is zero exactly at a Karush-Kuhn-Tucker point."""
         _, _, slack, jacobian = self.look(point)
         point = np.asarray(point)
         walls = [row for row, s in zip(jacobian, slack, strict=True) if s < 1e-4]
@@ -462,8 +461,7 @@ class Problem:
 
 
 def words(key: str) -> str:
-    """Return the name of a design parameter in words, without its unit: `edge_radius_mm` gives
-    "edge radius"."""
+    """Return a design parameter's name in words: `edge_radius_mm` gives "edge radius"."""
     return key.removesuffix("_mm").removesuffix("_deg").replace("_", " ")
 
 

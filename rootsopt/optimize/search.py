@@ -58,8 +58,7 @@ _HOLDS_UP = 0.01
 """Relative difference between a design's objectives in search and verification above which the
 design is rejected."""
 _EXPLAINED = 8
-"""Number of starts above which the search for the least violation of the constraints uses only the
-first ones."""
+"""Maximum number of points from which the least violation of the constraints is searched for."""
 _POLL = 0.05
 """Interval (s) at which a waiting thread checks whether it should stop."""
 
@@ -374,8 +373,8 @@ class Search:
         """Return the outcome of a local search, improved if its best trial was infeasible.
 
         If the search has not converged, its best trial is moved onto the feasible set. The moved
-        design replaces the outcome `found` if it is better. `look`: evaluates the problem at a
-        point."""
+        design replaces the outcome `found` if it is better. `trials`: trials of the search; `look`:
+        function that evaluates the problem at a point."""
         usable = [trial for trial in trials if trial.local is not None]
         best = min(usable, key=_objective, default=trials[0])
         if found.converged or best.feasible or found.local is None or self.stop.is_set():
@@ -584,8 +583,8 @@ def until_stopped(work: Callable[[], T], stop: threading.Event, patience: float)
     """Run `work()` in its own thread, and return its result, or `None` if it ends too late.
 
     `stop`: event that asks `work` to end. Once it is set, this function waits at most `patience`
-    (s). The first `KeyboardInterrupt` sets `stop`; a second one is raised. Thanks to the thread,
-    this works even while compiled code is running."""
+    (s). The first `KeyboardInterrupt` sets `stop`; a second one is raised. Because `work` has its
+    own thread, an interrupt takes effect even while compiled code is running."""
     future: Future[T] = Future()
 
     def do() -> None:

@@ -5,8 +5,8 @@ variable t with one constraint b_i(x) ≤ t per branch, so all functions are smo
 solves this problem with exact gradients. See Kraft, A software package for sequential quadratic
 programming, DFVLR-FB 88-28, 1988.
 
-A point without an objective gets a value far above all others. The line search then shortens its
-step until it finds a usable point. Such a point is never the result."""
+A point without an objective gets a value far above all others, and is never the result. The line
+search then shortens its step until it finds a usable point."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -19,15 +19,15 @@ from rootsopt.optimize.certificate import Certificate, certify
 from rootsopt.optimize.local import Group, Local, Look
 
 SCALE = 0.1
-"""Factor between SLSQP's variables z and the unit box: x = `SCALE` z. It shortens the first step,
-because SLSQP starts with a unit Hessian."""
+"""Factor from SLSQP's variables z to the point x of the unit box: x = `SCALE` · z. It shortens the
+first step, because SLSQP starts with a unit Hessian."""
 _SLOTS = 4
-"""Number of constraints that a maximum has in addition to twice its number of branches at the
-start. They are for branches that appear during the search."""
+"""Number of constraints reserved for new branches of a maximum that appear during a search. They
+add to twice the number of branches at the start."""
 _SAME = 0.1
 """Difference between phases above which branches at neighbouring points count as different."""
 _UNUSABLE = 1e3
-"""Value of a point without an objective, added to the best objective so far."""
+"""Amount by which the value of a point without an objective exceeds the best objective."""
 _RESTARTS = 6
 """Maximum number of runs of SLSQP. Each starts at the best point, with a unit Hessian."""
 _GAIN = 1e-9
@@ -37,8 +37,8 @@ _GAIN = 1e-9
 class Stops(NamedTuple):
     """When a local search ends.
 
-    `residual`: first-order residual up to which the search has converged; `feasibility`: scaled
-    violation up to which a point is feasible; `evaluations`: maximum number of evaluated points;
+    `residual`: first-order residual below which the search has converged; `feasibility`: scaled
+    violation below which a point is feasible; `evaluations`: maximum number of evaluated points;
     `asked`: function that returns whether to end at once."""
 
     residual: float = 1e-6
@@ -81,7 +81,7 @@ REASONS = {
     "unusable": "The start has no usable steady state. Choose another one.",
     "interrupted": "The search was stopped before its end.",
 }
-"""Why a local search has ended: word for the result file, and explanation with advice."""
+"""Reasons why a local search ends: each word with its explanation and advice."""
 
 
 class EndError(Exception):
@@ -91,8 +91,9 @@ class EndError(Exception):
 class Epigraph:
     """The smooth problem that SLSQP solves, with all points evaluated so far.
 
-    The variables z are x / `SCALE`, followed by one t per maximum. `look`: evaluates the problem at
-    a point; `start` (d,): first point; `first`: the problem there; `stops`: when to end."""
+    The variables z are x / `SCALE`, followed by one variable t per maximum, its upper bound.
+    `look`: function that evaluates the problem at a point; `start` (d,): first point; `first`: the
+    problem there; `stops`: when to end."""
 
     def __init__(self, look: Look, start: NDArray[np.float64], first: Local, stops: Stops):
         self.look, self.stops, self.size = look, stops, len(start)
@@ -105,7 +106,7 @@ class Epigraph:
         self.used = [np.zeros(count) for count in slots]
 
     def at(self, point: NDArray[np.float64]) -> Local | None:
-        """Return the problem at a `point` (d,); evaluate it only once.
+        """Return the problem at a `point` (d,), which is evaluated only on the first call.
 
         Raises `EndError` if a new evaluation would be needed but the search should end."""
         key = point.tobytes()
@@ -121,7 +122,7 @@ class Epigraph:
     def _judge(self, point, found: Local) -> None:
         """Keep a new `point` if it is the best one; `found` is the problem there.
 
-        Raises `EndError` if it satisfies the first-order conditions."""
+        Raises `EndError` if the best point satisfies the first-order conditions."""
         best = self.best[1]
         limit = self.stops.feasibility
         if max(found.violation, limit) < max(best.violation, limit):
@@ -160,7 +161,8 @@ class Epigraph:
         return total, np.concatenate([SCALE * found.slope, steps])
 
     def constraints(self, z) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return all constraints c ≥ 0 and their gradients at SLSQP's variables `z`.
+        """Return the values of all constraints c ≥ 0, and their gradients, at SLSQP's variables
+        `z`.
 
         First come t - b_i for the branches b_i of each maximum t, then the constraints of the
         problem."""
@@ -182,7 +184,7 @@ class Epigraph:
         return np.concatenate([*values, found.slack]), np.concatenate([*rows, wide])
 
     def _places(self, k: int, group: Group) -> list[int]:
-        """Return the constraint, by index within its group, that each branch of group `k` uses.
+        """Return the index, within its group, of the constraint that each branch of group `k` uses.
 
         A branch keeps its index from point to point, so that SLSQP sees smooth constraints. The
         index is -1 if all constraints of the group are taken."""
