@@ -17,8 +17,7 @@ from typing import Any
 OK, BAD_INPUT, NO_RESULT = 0, 2, 3
 _NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 _GONE = (errno.EPIPE, errno.EBADF, errno.ESHUTDOWN)
-"""Error numbers of a write to a stream that nobody reads. Such an error does not change the exit
-code."""
+"""Numbers of the errors that occur if nobody reads a stream. They do not change the exit code."""
 _WAITING = "rootsopt signals"
 _SHOW_CURSOR = "\x1b[?25h"
 
@@ -122,7 +121,7 @@ def patience(promise: str) -> Iterator[threading.Event]:
 
 @contextlib.contextmanager
 def leaving(abandon: Callable[[], str]) -> Iterator[None]:
-    """Have `abandon` called if a signal stops the process during the `with` block.
+    """Call `abandon` if a signal stops the process during the `with` block.
 
     `abandon`: function that cleans up and returns a message for the user. It is not called unless
     the command runs as its own process."""

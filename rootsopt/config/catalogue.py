@@ -15,9 +15,9 @@ _LONGEST = 5e4
 _SHARES = 0.002, 10.0
 """Range (pitch radii) outside which a length of a profile is rejected."""
 _NO_FLOOR = 0.0, 10.0
-"""Range (pitch radii) outside which a length is rejected if another check sets its lower limit.
+"""Range (pitch radii) outside which a length with a lower limit of its own is rejected.
 
-It replaces `_SHARES` for lengths whose family, or whose own least value in mm, sets that limit."""
+It replaces `_SHARES` where the key or the family sets the lower limit."""
 
 
 @dataclasses.dataclass(frozen=True)

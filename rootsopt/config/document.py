@@ -113,7 +113,7 @@ class _Loader(yaml.SafeLoader):
     def _count(self, nodes: int, height: int, mark) -> None:
         """Add a complete node to the counts of its parent.
 
-        `nodes`: number of nodes inside it, with itself; `height`: number of nested levels; `mark`:
+        `nodes`: number of nodes in it, including itself; `height`: number of nested levels; `mark`:
         position in the text. Raises an error if a limit is exceeded."""
         if len(self._open) + height > _DEEPEST:
             raise _wrong(f"there are more than {_DEEPEST} nested levels", mark)

@@ -13,7 +13,7 @@ from rootsopt.config.units import hint, unit_of
 from rootsopt.config.words import named, shown
 
 _MOST_NAMES = 12
-"""Number of valid keys above which a message lists only this many."""
+"""Maximum number of valid keys that a message lists."""
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
@@ -65,8 +65,9 @@ def _split(model: type[BaseModel], location: tuple) -> tuple[list[Any], list[Any
 def _branch(first, problems, place):
     """Return the problem to report for a key that accepts either a word or a number.
 
-    `first`: first of the `problems`; `place`: the key. For a number that is not allowed, pydantic
-    first reports that it is not one of the words. Return the problem with the number instead."""
+    `first`: first of the `problems`; `place`: list of keys that leads to this key. For a number
+    that is not allowed, pydantic first reports that it is not one of the words. Return the problem
+    with the number instead."""
     if first["type"] != "literal_error" or not _is_number(first.get("input")):
         return first
     size = len(place)
@@ -122,7 +123,7 @@ def _allowed(kind: str, value: Any, context: dict, message: str, field: FieldInf
 
 
 def _advice(place: list, kind: str, value: Any, field: FieldInfo | None) -> str:
-    """Return the end of a message that guesses what the user meant, or "" without a guess."""
+    """Return a guess at what the user meant, as the end of a message; "" if there is none."""
     if field is None:
         return ""
     if kind in ("greater_than_equal", "less_than_equal", "less_than") and _is_number(value):
@@ -191,7 +192,7 @@ def all_keys(model: type[BaseModel], prefix: str = ""):
 
 
 class Limits(NamedTuple):
-    """Limits of a number x, `None` for no limit: `ge` ≤ x, `gt` < x, x ≤ `le`, x < `lt`."""
+    """Limits of a number x: `ge` ≤ x, `gt` < x, x ≤ `le`, x < `lt`. `None`: no such limit."""
 
     ge: float | None = None
     gt: float | None = None
@@ -202,7 +203,7 @@ class Limits(NamedTuple):
     def ends(self) -> tuple[float, float]:
         """Ends (low, high) of the range, infinite if there is no limit.
 
-        They do not tell whether an end itself is allowed."""
+        An end is also returned if the range excludes it."""
         low = self.ge if self.ge is not None else self.gt
         high = self.le if self.le is not None else self.lt
         return (float("-inf") if low is None else low, float("inf") if high is None else high)

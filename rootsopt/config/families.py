@@ -285,9 +285,9 @@ def users_of(key: str) -> list[str]:
 
 
 def follow(update: Callable[[], None]) -> None:
-    """Have `update` called after each change to the table of families.
+    """Register a function `update` to be called after each change to the table of families.
 
-    Such functions are called in the order in which they were registered."""
+    Functions are called in the order in which they were registered."""
     _followers.append(update)
 
 

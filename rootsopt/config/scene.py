@@ -213,7 +213,7 @@ class ContactConfig(Section):
 
     @property
     def rounding_mm(self) -> float:
-        """Smoothing length (mm). Only a complete config always has one."""
+        """Smoothing length (mm). It is set in every complete config."""
         assert self.smoothing_mm is not None
         return self.smoothing_mm
 

@@ -25,7 +25,7 @@ Torque = Annotated[float, between(0, 1e7)]
 
 
 class Section(BaseModel):
-    """A section of the config: immutable, without unknown keys or conversions between types.
+    """An immutable section of the config that rejects unknown keys and values of the wrong type.
 
     A word from a list of choices may be in upper or lower case, with spaces, `-` or `_` between its
     parts. The section stores the word as listed."""

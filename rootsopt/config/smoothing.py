@@ -33,8 +33,8 @@ def following_mm(
     stiffness of the timing gear (N·m/rad), `None` without a gear. `contact`: stiffness (N/mm^e),
     exponent e and depth of full damping (mm) of the flanks. `precision`: `float64` or `float32`.
 
-    This smoothing changes the forces by less than 1e-4 of their values, as measured by `python -m
-    experiments.smoothing`."""
+    This smoothing changes the forces by less than 1e-4 of their values. The command `python -m
+    experiments.smoothing` measures this."""
     torque = max(load_torque, _LEAST_LOAD)
     stiffness, exponent, full = contact
     force = torque / (pitch_radius_mm * 1e-3)

@@ -240,8 +240,7 @@ class AttractorsConfig(Section):
 
 
 class EnsembleConfig(Section):
-    """Settings of an ensemble: motions that are averaged because a single one is not representative
-    (chaos)."""
+    """Settings of an ensemble: many motions that are averaged if a single one is chaotic."""
 
     members: Annotated[int, Field(ge=4, le=100_000)] = Field(
         16, description="motions from different initial states, per design"

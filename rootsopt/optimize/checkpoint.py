@@ -27,7 +27,7 @@ from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation
 from rootsopt.status import Status
 
 _SHOWN = 5
-"""Number of differences above which an error message lists only the first ones."""
+"""Maximum number of differences that an error message lists."""
 Key = tuple[int, int]
 """Key of an evaluation: (number of the local search, number of the evaluation in it). The screening
 is search -1."""

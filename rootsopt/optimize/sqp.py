@@ -161,8 +161,7 @@ class Epigraph:
         return total, np.concatenate([SCALE * found.slope, steps])
 
     def constraints(self, z) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the values of all constraints c ≥ 0, and their gradients, at SLSQP's variables
-        `z`.
+        """Return the values (≥ 0 if satisfied) and gradients of all constraints at SLSQP's `z`.
 
         First come t - b_i for the branches b_i of each maximum t, then the constraints of the
         problem."""

@@ -102,7 +102,8 @@ class RunFolder(ResultFolder):
     def _refuse_places(self) -> None:
         """Raise `InputError` if a finished run could not replace the target.
 
-        Such a target is a mount point, the current folder, a folder above it, or not a folder."""
+        Such a target is a mount point, the current folder or one above it, or something that is not
+        a folder."""
         target = self.target
         if os.path.lexists(target) and not target.is_dir():
             raise InputError(f"{str(self.path)!r}: is not a folder; choose another output folder")

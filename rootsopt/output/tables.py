@@ -223,9 +223,8 @@ def _word(row: Mapping[str, Any]) -> Text:
 def attractor_table(rows: list[dict[str, Any]], lost: Mapping[str, float]) -> RenderableType:
     """Return a table of coexisting motions, one column per motion.
 
-    `rows`: one {attractor, share, reached, status, ...} per motion, with `share` the share of
-    initial states that lead to the motion. `lost`: share of the initial states that lead to no
-    motion, by status label."""
+    `rows`: one {attractor, share, reached, status, ...} per motion. `lost`: share of the initial
+    states that lead to no motion, by status label."""
     table = _table("Coexisting motions", *(f"motion {row['attractor']}" for row in rows))
     labels = {
         "share": "share of initial states",

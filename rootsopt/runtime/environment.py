@@ -167,7 +167,7 @@ def use_compiled_loops() -> None:
     """Make XLA compile each loop into a single function on CPUs.
 
     Call this before JAX computes anything. If XLA_FLAGS already contains extra options for the
-    backend, it is left unchanged."""
+    backend, leave it unchanged."""
     flags = os.environ.get(_XLA_FLAGS, "")
     if "xla_backend_extra_options" not in flags:
         checked = flags.strip() in ("", os.environ.get(_CHECKED))
@@ -179,7 +179,7 @@ def use_compiled_loops() -> None:
 
 @contextlib.contextmanager
 def explained() -> Iterator[None]:
-    """Turn an out-of-memory error of Python or XLA inside the `with` block into `InputError`."""
+    """Turn an out-of-memory error (Python or XLA) in the `with` block into an `InputError`."""
     try:
         yield
     except MemoryError:
