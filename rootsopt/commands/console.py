@@ -1,4 +1,4 @@
-"""The command `rootsopt`, which runs one of its commands by name: `rootsopt COMMAND ...`."""
+"""The command `rootsopt COMMAND ...`, which runs the command of this name."""
 
 import sys
 from collections.abc import Sequence

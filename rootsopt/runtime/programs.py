@@ -303,8 +303,9 @@ def _modules(kind: _Kind) -> set[str]:
 def _sources(modules: set[str]) -> list[str] | None:
     """Return digests of the source files on which a program depends.
 
-    These are all files of this package, and the files of those `modules` that belong neither to
-    Python nor to a package with a known version. Return `None` if a file is missing."""
+    These are all files of this package, and the files of those `modules` that may change unnoticed.
+    Modules of Python, and of packages with a known version, are left out. Return `None` if a file
+    is missing."""
     digests = [_package_digest()]
     for name in sorted(modules):
         top = name.partition(".")[0]
