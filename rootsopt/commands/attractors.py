@@ -16,7 +16,7 @@ PURPOSE = "Find the coexisting motions of a scene and the initial states that le
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Run `rootsopt attractors`: check the config, search, and write files into `folder`.
+    """Run `rootsopt attractors`: find the coexisting motions, and write files into `folder`.
 
     Return the `Outcome`. Raises `InputError` if the config is invalid."""
     import numpy as np

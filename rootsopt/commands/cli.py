@@ -35,15 +35,16 @@ os.environ.setdefault("EQX_ON_ERROR", "off")
 class Outcome(NamedTuple):
     """The result of a command.
 
-    `code`: exit code; `show`: function that prints the result on a console."""
+    `code`: exit code; `show`: function that prints the result on a rich console."""
 
     code: int
     show: "Callable[[Console], None]"
 
 
 Body = Callable[[Config, argparse.Namespace, "RunFolder"], Outcome]
-"""Function that does a command's work: it takes the config, the options and the result folder, and
-writes the files."""
+"""Function that does a command's work and returns its `Outcome`.
+
+It takes the config, the options and the result folder, and writes the files."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -55,7 +56,7 @@ class _Parser(argparse.ArgumentParser):
 def parser(command: str, purpose: str) -> argparse.ArgumentParser:
     """Return a parser with the arguments that every command takes.
 
-    `command`: name of the command; `purpose`: text that describes it in its help."""
+    `command`: name of the command; `purpose`: description of the command in its help."""
     result = _Parser(
         prog=f"rootsopt {command}",
         description=purpose,
@@ -107,9 +108,9 @@ def _add_import(arguments: argparse.ArgumentParser) -> None:
 
 
 def _import_extensions(command: str, argv: Sequence[str] | None) -> None:
-    """Import the files and modules that `--import` names, before config keys are listed and read.
+    """Import the files and modules named by `--import`, before config keys are listed and read.
 
-    Raises `InputError` if an import fails."""
+    `command`, `argv`: as in `run`. Raises `InputError` if an import fails."""
     early = _Parser(prog=f"rootsopt {command}", add_help=False, allow_abbrev=False)
     _add_import(early)
     names = early.parse_known_args(argv)[0].imports
@@ -128,13 +129,13 @@ def run(
 ) -> int:
     """Run a command and return its exit code.
 
-    Parse the arguments `argv` (`None`: those of the process), load the config and choose float64.
-    Then call `body` with a new result folder, put the folder in place and print the result.
-    `InputError` and `OSError` become exit code 2.
+    `command`: name of the command; `purpose`: description in its help; `body`: function that does
+    the work; `argv`: arguments (`None`: those of the process); `add_options`: function that adds
+    the command's own arguments to the parser.
 
-    `command`, `purpose`: as in `parser`; `add_options`: function that adds the command's own
-    arguments to the parser.
-    """
+    Parse the arguments, load the config and select double precision. Then call `body` with a new
+    result folder, move the folder to its final path and print the result. `InputError` and
+    `OSError` give exit code 2."""
     environment.own_process()
     try:
         _import_extensions(command, argv)
@@ -186,7 +187,7 @@ def _in_folder(command: str, body: Body, config: Config, options: argparse.Names
 
 @contextlib.contextmanager
 def waiting(console: "Console", what: str) -> Iterator[None]:
-    """Show the text `what` during a `with` block. If `console` is not a terminal, show nothing."""
+    """Show the text `what` during a `with` block, if `console` is a terminal."""
     if not console.is_terminal:
         yield
         return
@@ -198,9 +199,8 @@ def use_cache() -> None:
     """Cache compiled programs between processes, in the user's cache folder.
 
     The environment variable ROOTSOPT_CACHE may name another folder, or turn the cache off. If the
-    folder cannot be used, the programs are compiled again. If other users could change its content,
-    the folder is not used and one line on stderr says so.
-    """
+    folder cannot be used, the cache is off. If other users could change the folder's content, the
+    cache is off too, and one line on stderr says why."""
     import platformdirs
 
     from rootsopt.runtime import programs

@@ -1,4 +1,4 @@
-"""`rootsopt COMMAND ...`: run a command by its name."""
+"""The command `rootsopt COMMAND ...`, which runs the command of this name."""
 
 import sys
 from collections.abc import Sequence
@@ -49,5 +49,5 @@ def _called(arguments: list[str]) -> int:
 
 
 def console() -> None:
-    """Run `rootsopt` with the arguments of the process, and end the process with the exit code."""
+    """Run `rootsopt` with the arguments of the process, then exit with its exit code."""
     door.leave(main())

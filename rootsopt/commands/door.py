@@ -1,10 +1,9 @@
 """Signals, standard streams and exit code of a command's process.
 
 A program may change these settings of its process, but a library must leave them alone. A command
-therefore changes signal handlers and file descriptors only while it runs as its own process
-(`main()` without arguments), not if it is called from Python with arguments. This module imports
-little, so that an interrupt is handled even while other modules are being imported.
-"""
+runs as its own process if `main()` is called without arguments. Only then does it change signal
+handlers and file descriptors, not if Python code calls it with arguments. This module imports
+little, so that an interrupt is handled even while other modules are being imported."""
 
 import contextlib
 import errno
@@ -18,19 +17,21 @@ from typing import Any
 OK, BAD_INPUT, NO_RESULT = 0, 2, 3
 _NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 _GONE = (errno.EPIPE, errno.EBADF, errno.ESHUTDOWN)
-"""Error numbers of a write to a stream that nobody reads. They do not change the exit code."""
+"""Numbers of the errors that occur if nobody reads a stream. They do not change the exit code."""
 _WAITING = "rootsopt signals"
 _SHOW_CURSOR = "\x1b[?25h"
 
 
 class Signals:
-    """Handling of SIGINT and SIGTERM during a run of `command`.
+    """Handles SIGINT and SIGTERM while a command runs.
 
-    A thread waits for the signals, because the main thread may stay in compiled code for a long
-    time. The first signal stops the run at once: `abandon` is called to remove unfinished files,
-    one line on stderr says what happened, and the exit code is 3. If `patient` is true, the first
-    signal only sets the event `stop` and prints `promise`; the second signal stops the run.
-    """
+    `command`: name of the command in messages. A thread waits for the signals, because the main
+    thread may stay in compiled code for a long time. The first signal stops the run at once with
+    exit code 3. Before that, `abandon` is called to remove unfinished files, and one line on stderr
+    says what happened.
+
+    If `patient` is true, the first signal only sets the event `stop` and prints `promise`. The
+    second signal then stops the run."""
 
     def __init__(self, command: str):
         self.command = command
@@ -43,7 +44,7 @@ class Signals:
         self._wakeup = -1
 
     def install(self) -> None:
-        """Handle the signals that have their default handler; leave other handlers in place.
+        """Handle each signal that has Python's default handler; leave other handlers in place.
 
         Outside the main thread, do nothing."""
         if threading.current_thread() is not threading.main_thread():
@@ -98,7 +99,7 @@ class Signals:
 
 
 def _nothing(number: int, frame: object) -> None:
-    """Do nothing on a signal in the main thread, so that it continues."""
+    """Ignore a signal in the main thread, because another thread responds to it."""
 
 
 _running: Signals | None = None
@@ -106,11 +107,10 @@ _running: Signals | None = None
 
 @contextlib.contextmanager
 def patience(promise: str) -> Iterator[threading.Event]:
-    """Yield an event. The first signal sets this event and does not stop the run.
+    """Yield an event that the first signal sets, instead of stopping the run.
 
-    `promise`: text that tells the user what the run does after the signal. If the command does not
-    run as its own process, no signal sets the event.
-    """
+    `promise`: message that tells the user what the run does after the signal. No signal sets the
+    event unless the command runs as its own process."""
     signals = _running
     if signals is None:
         yield threading.Event()
@@ -123,8 +123,8 @@ def patience(promise: str) -> Iterator[threading.Event]:
 def leaving(abandon: Callable[[], str]) -> Iterator[None]:
     """Call `abandon` if a signal stops the process during the `with` block.
 
-    `abandon`: function that cleans up and returns a text for the user. If the command does not run
-    as its own process, it is not called."""
+    `abandon`: function that cleans up and returns a message for the user. It is not called unless
+    the command runs as its own process."""
     signals = _running
     if signals is None:
         yield
@@ -139,8 +139,8 @@ def leaving(abandon: Callable[[], str]) -> Iterator[None]:
 class _Stream:
     """A standard stream whose errors do not end the run.
 
-    An `OSError` is stored in `error`, unless it only means that nobody reads the stream. Later
-    output is discarded."""
+    After an `OSError`, further output is discarded. The error is stored in `error`, unless it only
+    means that nobody reads the stream."""
 
     def __init__(self, stream: Any, number: int | None):
         self.stream, self.number = stream, number
@@ -148,7 +148,7 @@ class _Stream:
         self.closed_early = False
 
     def write(self, text: str) -> int:
-        """Write `text` and return its length. An `OSError` is not raised."""
+        """Write `text` and return its length, without raising an `OSError`."""
         if not self.closed_early:
             self._guarded(lambda: self.stream.write(text))
         return len(text)
@@ -158,7 +158,7 @@ class _Stream:
             self.write(line)
 
     def flush(self) -> None:
-        """Flush the stream. An `OSError` is not raised."""
+        """Flush the stream, without raising an `OSError`."""
         if not self.closed_early:
             self._guarded(self.stream.flush)
 
@@ -197,8 +197,8 @@ def _nowhere(number: int) -> None:
 def _streams(own: bool) -> Iterator[_Stream]:
     """Replace stdout and stderr with `_Stream` objects during the `with` block; yield stdout.
 
-    `own`: whether the command runs as its own process. If so, closed standard streams are first
-    redirected to the null device."""
+    `own`: whether the command runs as its own process. If so, standard streams that are closed are
+    first redirected to the null device."""
     if own:
         for number in (0, 1, 2):
             try:
@@ -225,12 +225,11 @@ def _streams(own: bool) -> Iterator[_Stream]:
 
 
 def through(command: str, work: Callable[[], int], own: bool) -> int:
-    """Run a command's `work` and return its exit code, with signals and streams handled.
+    """Run a command's `work` and return its exit code; handle signals and stream errors.
 
     `command`: name of the command in messages; `work`: function that returns the exit code; `own`:
     whether the command runs as its own process. If nobody reads stdout (as in `| true`), the exit
-    code does not change. If writing to stdout fails for another reason, the exit code is 2.
-    """
+    code does not change. If writing to stdout fails for another reason, the exit code is 2."""
     global _running
     if not own or _running is not None:
         with _streams(own=False) as out:
@@ -268,11 +267,10 @@ def _code(command: str, code: int, out: _Stream) -> int:
 
 
 def leave(code: int) -> None:
-    """End the process with the exit code `code`, even if a signal arrives meanwhile.
+    """End the process with the exit code `code`, even if a signal arrives in the meantime.
 
-    If other threads are still running, end the process without waiting for them. If Python shut
-    down while they run, the process could abort with a different exit code.
-    """
+    Threads that are still running are not waited for. If Python shut down while they run, the
+    process could abort with a different exit code."""
     for number in _NAMES:
         with contextlib.suppress(ValueError, OSError):
             signal.signal(number, lambda *_: os._exit(code))

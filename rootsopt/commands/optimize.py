@@ -19,12 +19,13 @@ PURPOSE = "Optimise the design parameters for low contact force and compare with
 
 
 _PATIENCE = 5.0
-"""Time (s) after an interrupt above which the command stops waiting for the search to end. In this
-time, the search may simulate the best design so far again from rest."""
+"""Time (s) after an interrupt above which the command no longer waits for the search to end.
+
+In this time, the search may simulate its best design again from rest."""
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Run `rootsopt optimize`: check the config, search, and write files into `folder`.
+    """Run `rootsopt optimize`: search for the best design, and write files into `folder`.
 
     Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
     began = time.perf_counter()
@@ -95,7 +96,9 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
 
 def _checkpoint(config: "Config", options: "argparse.Namespace", folder: "RunFolder"):
-    """Return the checkpoint beside the result folder, begun anew or resumed."""
+    """Return the checkpoint file of this run, beside the result folder.
+
+    With the option `--resume`, it contains the evaluations of the interrupted run."""
     from rootsopt.optimize.checkpoint import Checkpoint
     from rootsopt.output import files
 
@@ -104,12 +107,11 @@ def _checkpoint(config: "Config", options: "argparse.Namespace", folder: "RunFol
 
 
 def _searched(config: "Config", progress, stop: threading.Event, checkpoint):
-    """Run the search; return the config without `auto`, the chosen settings and the result.
+    """Run the search; return (config, settings chosen for `auto`, result).
 
-    In the returned config, chosen settings replace `auto`. The result is `None` if the search was
-    stopped before the baseline was simulated. `progress`: function as from `_progress`, or `None`;
-    `stop`: event that stops the search.
-    """
+    In the returned config, the chosen settings replace `auto`. The result is `None` if the search
+    was stopped before the baseline was simulated. `progress`: function as from `_progress`, or
+    `None`; `stop`: event that stops the search; `checkpoint`: file for the evaluations."""
     from rootsopt.optimize.search import Search, until_stopped
     from rootsopt.response.choice import resolve
 
@@ -145,7 +147,9 @@ def _nothing_known(config: "Config", folder: "RunFolder") -> "Outcome":
 
 
 def _contradiction(config: "Config", folder: "RunFolder", result) -> "Outcome":
-    """Write the files of a run whose constraints contradict each other: why, and nothing else."""
+    """Write the files of a run that found no design because its constraints are in conflict.
+
+    Return the `Outcome`, with exit code 3."""
     from rootsopt.commands import cli
     from rootsopt.output import files, tables
 
@@ -165,7 +169,7 @@ def _contradiction(config: "Config", folder: "RunFolder", result) -> "Outcome":
 
 
 def _alike(config: "Config", result) -> dict:
-    """Return {"resembles": classical designs nearest to an optimised free form}.
+    """Return {"resembles": classical profiles nearest to the optimised one, one row per family}.
 
     Return {} if the optimised family is itself classical, or if there is no optimised design."""
     from rootsopt.config.families import family_of
@@ -183,7 +187,7 @@ def _alike(config: "Config", result) -> dict:
 
 
 def _message(result) -> str:
-    """Return the status and advice of a search that was interrupted or found nothing, as text."""
+    """Return the status and advice for a search that was interrupted or found no better design."""
     return f"{result.status.label}: {_advice(result)}"
 
 
@@ -209,7 +213,7 @@ def _advice(result) -> str:
 
 
 def _interrupted(result) -> str:
-    """Return one or two sentences on how far an interrupted search has come."""
+    """Return one or two sentences on what an interrupted search has achieved."""
     count = len(result.history)
     begin = f"The search was stopped after {count} design{'s' if count != 1 else ''}"
     if not result.baseline.usable:
@@ -284,7 +288,7 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
 def _progress(console) -> Iterator:
     """Yield a function (done, expected, best objective) that updates a progress bar.
 
-    Yield `None` if the console is not a terminal; there is no progress bar then."""
+    Yield `None` if the console is not a terminal: then there is no progress bar."""
     if not console.is_terminal:
         yield None
         return

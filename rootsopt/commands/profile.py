@@ -19,12 +19,11 @@ PURPOSE = (
     "solids or an animation."
 )
 EXPORT = "dxf,svg"
-"""Default value of `--export` for this command. Drawings are fast (less than 1 s); a solid takes
-10 s."""
+"""Default value of `--export` for this command. Drawings take less than 1 s, a solid takes 10 s."""
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Run `rootsopt profile`: check the config, compute the geometry, write files into `folder`.
+    """Run `rootsopt profile`: compute the geometry, and write files into `folder`.
 
     Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
     from rootsopt import export
@@ -91,7 +90,7 @@ def _coefficients(given: str | None) -> int | None:
 
 
 def _projected(folder: "RunFolder", config: "Config", count: int) -> str:
-    """Write free_form.yaml: the config with its profile converted to a free form.
+    """Write free_form.yaml: the config with its profile approximated by a free form.
 
     `count`: number of coefficients of the free form. Return a message for the user."""
     from rootsopt.scene.families import free_form_of

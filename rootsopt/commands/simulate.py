@@ -16,7 +16,7 @@ PURPOSE = "Simulate one design in one scene: steady state, contact force, its gr
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Run `rootsopt simulate`: check the config, simulate, and write files into `folder`.
+    """Run `rootsopt simulate`: simulate the design, and write files into `folder`.
 
     Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
     from rich.console import Console

@@ -17,7 +17,7 @@ PURPOSE = "Simulate one design at many speeds, each from rest: contact force and
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Run `rootsopt sweep`: check the config, simulate all speeds, and write files into `folder`.
+    """Run `rootsopt sweep`: simulate the design at all speeds, and write files into `folder`.
 
     Return the `Outcome`. Raises `InputError` if the config is invalid."""
     from rich.console import Console

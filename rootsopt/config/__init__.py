@@ -1,9 +1,8 @@
 """Reads a config from YAML and returns typed settings.
 
 Only this package knows the config's file format. Each key carries its unit; `rootsopt.scene`
-converts to SI. A wrong file, key or value raises `InputError`, with one message that names the key,
-the value and what is allowed.
-"""
+converts to SI. A wrong file, key or value raises `InputError`. Its message names the key and the
+value, and says what is allowed."""
 
 from rootsopt.config.families import FAMILY_KEYS
 from rootsopt.config.reading import Config, describe_families, describe_keys, load, parse
@@ -12,7 +11,7 @@ from rootsopt.config.study import EnsembleConfig, SolverConfig
 from rootsopt.config.units import hint
 
 load_config = load
-"""Alias of `load`: the name under which the package `rootsopt` exports it."""
+"""Alias of `load`, under the name that the package `rootsopt` exports."""
 DESIGN_KEYS = FAMILY_KEYS["cic"]
 """Config keys of the design parameters of a CIC rotor."""
 

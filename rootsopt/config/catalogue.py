@@ -1,4 +1,4 @@
-"""Registers the built-in profile families, in the same way as any other family."""
+"""Registers the built-in profile families, by the same function as any other family."""
 
 import dataclasses
 import math
@@ -11,18 +11,20 @@ if TYPE_CHECKING:
     from rootsopt.config.scene import ProfileConfig
 
 _LONGEST = 5e4
-"""Length (mm) above which a config is rejected, whatever its pitch radius."""
+"""Length (mm) of a profile above which a config is rejected, whatever its pitch radius."""
 _SHARES = 0.002, 10.0
-"""Range (pitch radii) of the parameters of a profile that are lengths; a config outside this range
-is rejected."""
+"""Range (pitch radii) outside which a length of a profile is rejected."""
 _NO_FLOOR = 0.0, 10.0
-"""Range (pitch radii) that replaces `_SHARES` for a length whose lower limit is set by its key (in
-mm) or by its family."""
+"""Range (pitch radii) outside which a length with a lower limit of its own is rejected.
+
+It replaces `_SHARES` where the key or the family sets the lower limit."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _LandAngle(Parameter):
-    """Half angle of a tip land. Its bounds must stay below a quarter of the lobe pitch."""
+    """Half angle of a tip land, the circular arc about the rotor axis at the tip of a lobe.
+
+    Its bounds must stay below a quarter of the lobe pitch."""
 
     def usually(self, pitch_radius_mm: float, lobes: int) -> Pair:
         return 0.0, 45.0 / lobes
@@ -37,7 +39,9 @@ class _LandAngle(Parameter):
 
 
 class _Dependent(Parameter):
-    """Length without default bounds. Instead, the `ranges` of its family limit a search."""
+    """Length without default bounds, because its range depends on the other parameters.
+
+    A search takes the limits from the `ranges` of the family."""
 
     def bounds(self, profile: "ProfileConfig") -> Pair:
         del profile

@@ -1,10 +1,9 @@
 """Reads one YAML document as plain data, within size limits.
 
 The language is YAML 1.1 as PyYAML reads it, with some exceptions that suit a config. `1e5` is a
-number; `1:30`, `2020-01-01`, `yes` and `off` are words; `010` is ten. A key may appear once in a
-section. Tags yield plain data only. Anchors, aliases and merge keys work while their expansion is
-small.
-"""
+number; `1:30`, `2020-01-01`, `yes` and `off` are words; `010` is ten. A key may appear only once in
+a section. Tags yield plain data only. Anchors, aliases and merge keys are allowed, but the document
+must stay within the limits after their expansion."""
 
 import re
 from collections.abc import Callable
@@ -20,9 +19,9 @@ from rootsopt.errors import InputError
 MOST_BYTES = 128 * 1024
 """Text size (bytes) above which a document is rejected. A typical config has about 2000 bytes."""
 _MOST_NODES = 5000
-"""Number of keys, values, lists and sections above which a document is rejected. Aliases are
-expanded before counting.
-"""
+"""Number of keys, values, lists and sections above which a document is rejected.
+
+Each use of an alias counts as a copy."""
 _DEEPEST = 32
 """Number of nested levels (sections and lists) above which a document is rejected."""
 _LONGEST_VALUE = 4096
@@ -38,8 +37,8 @@ _MERGE = _TAG + "merge"
 def read_document(text: str, source: str) -> Any:
     """Return a YAML text as dictionaries, lists and plain values.
 
-    `source` names the text in messages. No dictionary or list appears twice in the result.
-    Raises `InputError` if the text is too large or not valid."""
+    `source`: name of the text in messages. Aliases become separate copies. Raises `InputError` if
+    the text is too large or not valid."""
     if len(text.encode("utf-8", "surrogatepass")) > MOST_BYTES:
         raise InputError(
             f"{source}: must have at most {MOST_BYTES} bytes, but has more; is that a config?"
@@ -53,7 +52,7 @@ def read_document(text: str, source: str) -> Any:
 
 
 def _told(error: Exception) -> str:
-    """Return the line number and the problem of a YAML error, as text for a message."""
+    """Return the line number and the problem of a YAML error, in words for a message."""
     mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
     place = f" (line {mark.line + 1})" if mark is not None else ""
     problem = getattr(error, "problem", None)
@@ -78,7 +77,9 @@ def _unshared(data: Any) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's SafeLoader with limits and messages for configs, applied as nodes are composed."""
+    """PyYAML's SafeLoader with size limits, and with messages for users of a config.
+
+    The limits are checked while the document is read."""
 
     yaml_implicit_resolvers = {}  # noqa: RUF012
     yaml_constructors = {}  # noqa: RUF012
@@ -110,8 +111,10 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def _count(self, nodes: int, height: int, mark) -> None:
-        """Count a complete node, with its number of `nodes` and levels (`height`), in its
-        parent."""
+        """Add a complete node to the counts of its parent.
+
+        `nodes`: number of nodes in it, including itself; `height`: number of nested levels; `mark`:
+        position in the text. Raises an error if a limit is exceeded."""
         if len(self._open) + height > _DEEPEST:
             raise _wrong(f"there are more than {_DEEPEST} nested levels", mark)
         if not self._open:
@@ -163,7 +166,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _check_merge(node: Node) -> None:
-    """Reject a merge key whose value is not a section or a list of sections."""
+    """Raise an error unless the value of a merge key is a section or a list of sections."""
     parts = node.value if isinstance(node, SequenceNode) else [node]
     for part in parts:
         if not isinstance(part, MappingNode):
@@ -210,7 +213,7 @@ def _real(text: str) -> float:
 
 
 def _scalar(kind: str, read: Callable[[str], Any]) -> None:
-    """Use `read` to convert scalars of a `kind`.
+    """Register `read` as the function that converts scalars of a YAML type `kind`.
 
     `read` must raise `ValueError`, `KeyError` or `OverflowError` for text that is not valid."""
 

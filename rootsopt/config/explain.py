@@ -13,7 +13,7 @@ from rootsopt.config.units import hint, unit_of
 from rootsopt.config.words import named, shown
 
 _MOST_NAMES = 12
-"""Number of valid keys above which a message lists only the first ones."""
+"""Maximum number of valid keys that a message lists."""
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
@@ -50,7 +50,7 @@ _UNKNOWN = ("extra_forbidden", "invalid_key")
 
 
 def _split(model: type[BaseModel], location: tuple) -> tuple[list[Any], list[Any]]:
-    """Split the location of a pydantic error into the config's keys and the parts after them."""
+    """Split the location of a pydantic error into the config's keys and the remaining parts."""
     place: list[Any] = []
     inner: type[BaseModel] | None = model
     for number, part in enumerate(location):
@@ -63,9 +63,11 @@ def _split(model: type[BaseModel], location: tuple) -> tuple[list[Any], list[Any
 
 
 def _branch(first, problems, place):
-    """Return the problem to report for a key that accepts a word or a number.
+    """Return the problem to report for a key that accepts either a word or a number.
 
-    For a number, this is what is wrong with the number, not that it is not a word."""
+    `first`: first of the `problems`; `place`: list of keys that leads to this key. For a number
+    that is not allowed, pydantic first reports that it is not one of the words. Return the problem
+    with the number instead."""
     if first["type"] != "literal_error" or not _is_number(first.get("input")):
         return first
     size = len(place)
@@ -78,7 +80,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_real(field: FieldInfo | None) -> bool:
-    """Return whether a key takes real numbers, not only whole ones."""
+    """Return whether a key accepts real numbers, not just whole numbers."""
     return field is not None and "float" in str(field.annotation)
 
 
@@ -121,7 +123,7 @@ def _allowed(kind: str, value: Any, context: dict, message: str, field: FieldInf
 
 
 def _advice(place: list, kind: str, value: Any, field: FieldInfo | None) -> str:
-    """Return the end of a message: a guess at what the user meant, or "" if there is none."""
+    """Return a guess at what the user meant, as the end of a message; "" if there is none."""
     if field is None:
         return ""
     if kind in ("greater_than_equal", "less_than_equal", "less_than") and _is_number(value):
@@ -190,7 +192,7 @@ def all_keys(model: type[BaseModel], prefix: str = ""):
 
 
 class Limits(NamedTuple):
-    """Range of a number: at least `ge`, above `gt`, at most `le`, below `lt`; `None`: no limit."""
+    """Limits of a number x: `ge` ≤ x, `gt` < x, x ≤ `le`, x < `lt`. `None`: no such limit."""
 
     ge: float | None = None
     gt: float | None = None
@@ -199,9 +201,9 @@ class Limits(NamedTuple):
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Ends (low, high) of the range, infinite where there is no limit.
+        """Ends (low, high) of the range, infinite if there is no limit.
 
-        An end that is excluded from the range (`gt`, `lt`) is also returned."""
+        An end is also returned if the range excludes it."""
         low = self.ge if self.ge is not None else self.gt
         high = self.le if self.le is not None else self.lt
         return (float("-inf") if low is None else low, float("inf") if high is None else high)
@@ -210,7 +212,7 @@ class Limits(NamedTuple):
 def limits_of(annotation: Any, metadata: Any = ()) -> Limits:
     """Return the limits that a field's `annotation` and `metadata` set for its numbers.
 
-    In a list these are the limits of each number, in a dictionary those of its values."""
+    For a list, these are the limits of each number; for a dictionary, those of each value."""
     found: dict[str, Any] = {}
     for mark in metadata:
         for inner in mark.metadata if isinstance(mark, FieldInfo) else (mark,):
@@ -231,7 +233,7 @@ def limits_of(annotation: Any, metadata: Any = ()) -> Limits:
 
 
 def _range(field: FieldInfo) -> str:
-    """Return the range of a key's numbers in words; "" for a key without limits."""
+    """Return the range of a key's numbers in words, or "" for a key without limits."""
     limits = limits_of(field.annotation, field.metadata)
     words = []
     if limits.ge is not None or limits.gt is not None:

@@ -36,34 +36,37 @@ MARGINS = (
 )
 """Names of the margins that are ≥ 0 in a sound profile (see `rootsopt.profiles.validity`)."""
 ENTRY_POINTS = "rootsopt.families"
-"""Entry-point group in which installed packages offer families, each under its own name."""
+"""Name of the entry-point group in which installed packages offer families.
+
+The name of each entry point is that of its family."""
 _ANY_LENGTH, _ANY_ANGLE, _ANY_NUMBER = (0.01, 1.5), (0.0, 90.0), (0.0, 2.0)
-"""Usual ranges of a length (pitch radii), an angle (°) and a plain number, for parameters that
-specify no usual range."""
+"""Usual range of a length (pitch radii), of an angle (°) and of a plain number.
+
+They apply to parameters that specify no usual range."""
 _AROUND = (0.5, 1.5)
 """Default bounds of a parameter without a usual range, as multiples of the config's own value."""
 _WORD = re.compile(r"[a-z][a-z0-9_]*")
 
 Pair = tuple[float, float]
 Hook = Callable[..., Any] | str
-"""A function, or its import name "module:function"."""
+"""A function, or the text "module:function" from which it is imported when first needed."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """A design parameter in the config, shared by all families that name it.
+    """A design parameter in the config, shared by all families that use its key.
 
     `key`: name in the config; it ends in the unit, `_mm` or `_deg`, if there is one.
     `help`: meaning, in a few words.
     `lowest`, `highest`: least and greatest value in a config.
-    `below`: whether `highest` itself is excluded.
-    `radii`: for a length that scales with the rotor, its least and greatest value in pitch radii.
+    `below`: whether values must be less than `highest`, rather than at most `highest`.
+    `radii`: least and greatest value in pitch radii, for a length that scales with the rotor.
     `usual`: usual range, in pitch radii if `radii` is given; also the default bounds of an
     optimisation. `None`: the default bounds are 0.5 to 1.5 times the config's own value.
     `default_bounds`: default bounds that replace `usual` and are written out in every config.
     `bounds_limits`: limits of the bounds, if they are narrower than `lowest` and `highest`.
     `bounds_note`: text for `--help` that replaces the generated description of the default bounds.
-    `count`: least and greatest length if the key holds a list of parameters; `None`: one number.
+    `count`: least and greatest number of entries, if the key holds a list. `None`: a single number.
     """
 
     key: str
@@ -80,25 +83,26 @@ class Parameter:
 
     @property
     def argument(self) -> str:
-        """Name of the corresponding argument of `Family.maker`: the key without its unit."""
+        """Name of the argument of `Family.maker` for this key: the key without its unit."""
         return self.key.removesuffix("_mm").removesuffix("_deg")
 
     @property
     def unit(self) -> float:
-        """SI value of one unit of the key."""
+        """SI value of one unit of the key, for example 1e-3 for a key in mm."""
         return si_unit(self.key)
 
     def limits(self, pitch_radius_mm: float) -> Pair | None:
-        """Return the least and greatest length (mm) allowed at this pitch radius.
+        """Return the least and greatest length (mm) allowed at this pitch radius (mm).
 
-        `None`: the limits do not depend on the pitch radius."""
+        Return `None` if the limits do not depend on the pitch radius."""
         if self.radii is None:
             return None
         return self.radii[0] * pitch_radius_mm, self.radii[1] * pitch_radius_mm
 
     def usually(self, pitch_radius_mm: float, lobes: int) -> Pair:
-        """Return the usual range (low, high), in the key's unit, for this size and number of
-        lobes."""
+        """Return the usual range (low, high), in the key's unit.
+
+        `pitch_radius_mm`, `lobes`: pitch radius (mm) and number of lobes of the rotor."""
         del lobes
         if self.usual is not None and self.radii is None:
             return self.usual
@@ -108,9 +112,9 @@ class Parameter:
         return _ANY_ANGLE if self.key.endswith("_deg") else _ANY_NUMBER
 
     def bounds(self, profile: "ProfileConfig") -> Pair:
-        """Return the bounds (low, high), in the key's unit, that apply if the config gives none.
+        """Return the default bounds (low, high) for this `profile`, in the key's unit.
 
-        The field `default_bounds` is not used here: it is the default in the config."""
+        They apply if neither the config nor `default_bounds` gives bounds."""
         if self.usual is not None:
             return self.usually(profile.pitch_radius_mm, profile.lobes)
         value = abs(getattr(profile, self.key))
@@ -119,11 +123,13 @@ class Parameter:
     def check_bounds(self, bounds: Pair, lobes: int) -> None:
         """Raise `InputError` for bounds that are impossible with this number of lobes.
 
-        `bounds`: (low, high) in the key's unit. By default, all bounds are accepted. A subclass may
+        `bounds`: (low, high) in the key's unit. This method accepts all bounds; a subclass may
         reject some."""
 
     def field(self, families: list[str]) -> tuple[Any, Any]:
-        """Return (annotation, pydantic field) of the key; its description names the `families`."""
+        """Return (annotation, pydantic field) of the key.
+
+        The field's description names the `families` that use the key."""
         limits = between(self.lowest, self.highest)
         if self.below:
             limits = Field(ge=self.lowest, lt=self.highest)
@@ -135,7 +141,7 @@ class Parameter:
         return kind | None, Field(None, description=f"{', '.join(families)}: {self.help}")
 
     def bounds_field(self) -> tuple[Any, Any]:
-        """Return (annotation, pydantic field) of the bounds of this parameter."""
+        """Return (annotation, pydantic field) for the optimisation bounds of the key."""
         least, most = self.bounds_limits or (self.lowest, self.highest)
         note = f"{self._bounds_words()}; from {least:g} to {most:g}"
         kind: Any = Pair if self.default_bounds is not None else Pair | None
@@ -156,22 +162,31 @@ class Parameter:
 class Family:
     """A profile family: its config keys and how its profiles are made.
 
-    `name`: the word in `profile.family`; `help`: one line on the curves of its addendum. `maker`:
-    function that returns a `Profile` from `lobes`, `pitch_radius` (m) and the parameters in SI
-    units. Each parameter is passed under its key without the unit, as in `maker(lobes,
-    pitch_radius, arc_center=0.03)`. `None`: the profile is read from a file. `parameters`: design
-    parameters, in the order of their values in a design; a list-valued parameter comes last.
-    `example`: values, by key, of a sound design with three lobes and a pitch radius of 33 mm.
-    `remedy`: what to change if a profile is not sound; completes a message, without a full stop.
-    `inherent`: names from `MARGINS` of the margins that may be negative in this family. `limits`:
-    called with the `ProfileConfig`; raises `InputError` if a closed-form limit is violated.
-    `by_limits`: whether these limits ensure a sound profile, so that the margins are not checked.
-    `ranges`: called with `lobes`, `pitch_radius_mm` and the values by key; returns (low, high) by
-    key for parameters whose range depends on the others. The optimiser searches such a parameter as
-    a fraction of this range, within its bounds.
+    `name`: word in `profile.family`. `help`: one line on the curves of its addendum.
 
-    A subclass may override `make`, `check` and `dependent` instead of giving functions.
-    """
+    `maker`: function that returns a `Profile` from `lobes`, `pitch_radius` (m) and the parameters
+    in SI units. Each parameter is passed under its key without the unit, as in `maker(lobes,
+    pitch_radius, arc_center=0.03)`. `None`: the profile is read from a file.
+
+    `parameters`: design parameters, in the order of their values in a design. A parameter whose
+    value is a list comes last.
+
+    `example`: values, by key, of a sound design with three lobes and a pitch radius of 33 mm.
+
+    `remedy`: advice on what to change if a profile is not sound. It completes a sentence, without a
+    full stop.
+
+    `inherent`: names of margins from `MARGINS` that may be negative in this family.
+
+    `limits`: function of the `ProfileConfig` that raises `InputError` if the profile violates a
+    closed-form limit. `by_limits`: whether these limits ensure a sound profile, so that the margins
+    are not checked.
+
+    `ranges`: function of `lobes`, `pitch_radius_mm` and all parameters by key. It returns (low,
+    high) by key for parameters whose range depends on the others. The optimiser searches such a
+    parameter as a fraction of this range, within its bounds.
+
+    A subclass may override `make`, `check` and `dependent` instead of providing functions."""
 
     name: str
     help: str
@@ -190,21 +205,23 @@ class Family:
         return tuple(parameter.key for parameter in self.parameters)
 
     def split(self, design: Any) -> list[Any]:
-        """Split a design (d,) into one entry per parameter: a number, or for a list a slice."""
+        """Split a design (d,) into one entry per parameter.
+
+        An entry is a number, or an array if the key holds a list."""
         places = enumerate(self.parameters)
         return [design[k] if one.count is None else design[k:] for k, one in places]
 
     @property
     def classical(self) -> bool:
-        """Whether profiles are made from named numbers only, not from a list or a file."""
+        """Whether every parameter is a single number, and the profile is not read from a file."""
         lists = any(parameter.count is not None for parameter in self.parameters)
         return self.maker is not None and not lists
 
     def make(self, lobes: int, pitch_radius: Any, **parameters: Any) -> Any:
-        """Return the `Profile` with a `pitch_radius` (m) and `parameters` (SI units).
+        """Return the `Profile` with this number of lobes, `pitch_radius` (m) and `parameters`.
 
-        The names of the `parameters` are the keys without units. Raises `TypeError` for a family
-        whose profiles are read from files."""
+        `parameters`: values in SI units, under their keys without units. Raises `TypeError` for a
+        family whose profiles are read from files."""
         return _found(self.maker)(lobes, pitch_radius, **parameters)
 
     def check(self, profile: "ProfileConfig") -> None:
@@ -231,11 +248,10 @@ FAMILY_KEYS: dict[str, tuple[str, ...]] = {}
 
 
 def register_family(family: Family) -> Family:
-    """Add a family to the table, which configs, commands and the optimiser use, and return it.
+    """Add a family to the table of profile families, and return it.
 
-    Raises `ValueError` if the family is incomplete, its name is taken, or one of its keys has
-    another meaning in another family.
-    """
+    Configs, commands and the optimiser use this table. Raises `ValueError` if the family is
+    incomplete, its name is taken, or one of its keys has another meaning in another family."""
     _check(family)
     _families[family.name] = family
     _origins[family.name] = sys._getframe(1).f_globals.get("__name__", "")
@@ -259,7 +275,7 @@ def parameters() -> dict[str, Parameter]:
 
 
 def is_list(key: str) -> bool:
-    """Return whether a key holds a list of design parameters."""
+    """Return whether a key holds a list of design parameters rather than a single number."""
     return key in _parameters and _parameters[key].count is not None
 
 
@@ -269,7 +285,7 @@ def users_of(key: str) -> list[str]:
 
 
 def follow(update: Callable[[], None]) -> None:
-    """Register a function `update` that is called after each change to the table of families.
+    """Register a function `update` to be called after each change to the table of families.
 
     Functions are called in the order in which they were registered."""
     _followers.append(update)
@@ -277,7 +293,7 @@ def follow(update: Callable[[], None]) -> None:
 
 @contextlib.contextmanager
 def for_a_time() -> Iterator[None]:
-    """Return a context manager that removes, on exit, families registered inside it; for tests.
+    """Return a context manager that removes the families registered in its `with` block, for tests.
 
     Programs compiled for these families stay in memory: do not reuse the families' names."""
     before = dict(_families)
@@ -292,7 +308,7 @@ def for_a_time() -> Iterator[None]:
 
 
 def find_installed(name: str) -> None:
-    """Load any installed package that offers a family with this `name`.
+    """Load the installed packages that offer a family with this `name`, if there are any.
 
     Raises `InputError` if loading fails."""
     from importlib.metadata import entry_points  # Slow: scans all installed packages.
@@ -306,8 +322,8 @@ def find_installed(name: str) -> None:
 def outside_modules() -> set[str]:
     """Return the names of modules outside this package that profiles may depend on.
 
-    These are the modules that register families or define their makers, and all modules imported
-    from the same folders."""
+    These are the modules that register families or define their functions, and all modules imported
+    from the folders of these modules."""
     names = set(_origins.values())
     for family in _families.values():
         for hook in (family.maker, family.limits, family.ranges, type(family)):
@@ -427,8 +443,8 @@ def _wrong(argument: str, wanted: str, found: Any) -> ValueError:
 def replace_fields(model: Any, fields: Mapping[str, Any]) -> None:
     """Replace all fields of a pydantic `model` in place.
 
-    `fields`: maps each name to a complete `FieldInfo`, or to a pair (annotation, field) from which
-    one is created."""
+    `fields`: a complete `FieldInfo` for each name, or a pair (annotation, field) from which to make
+    one."""
     new = {name: field for name, field in fields.items() if not isinstance(field, FieldInfo)}
     made = create_model("Fields", **new).model_fields
     found = {name: made.get(name, field) for name, field in fields.items()}
@@ -438,7 +454,7 @@ def replace_fields(model: Any, fields: Mapping[str, Any]) -> None:
 
 
 def import_named(name: str) -> None:
-    """Import a module by name, or a Python file by path, unless this has been done before.
+    """Import a module by name, or a Python file by path, unless it has been imported before.
 
     The module may register families. Raises `InputError` if the import fails."""
     with _explained(f"`--import` {placed(name)}"):
@@ -462,7 +478,9 @@ def import_named(name: str) -> None:
 
 @contextlib.contextmanager
 def _explained(what: str) -> Iterator[None]:
-    """Turn any error that an outside module raises into a one-line `InputError`."""
+    """Turn any error in the `with` block into a one-line `InputError`.
+
+    `what`: what the block loads, as the start of the message."""
     try:
         yield
     # Any exception here is caused by that module.

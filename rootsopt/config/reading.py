@@ -47,7 +47,7 @@ _MOST_PARTS = 8
 
 
 class Config(Section):
-    """A complete config: everything that a run needs."""
+    """The settings of a run: all sections of a config."""
 
     profile: ProfileConfig
     rotor: RotorConfig
@@ -77,11 +77,10 @@ class Config(Section):
         return self.profile.design_keys
 
     def replaced(self, values: Mapping[str, Any]) -> "Config":
-        """Return a copy of the config with new `values`, checked in the same way as a file.
+        """Return a copy of the config in which some `values` are replaced.
 
-        `values`: maps dotted keys to values.
-
-        Raises `InputError` for an unknown key or a value that is not allowed."""
+        `values`: new values by dotted key. They are checked in the same way as a file. Raises
+        `InputError` for an unknown key or a value that is not allowed."""
         data = self.model_dump(mode="json", exclude_none=True)
         for key, value in values.items():
             *path, last = key.split(".")
@@ -96,10 +95,11 @@ class Config(Section):
 
     @property
     def needs_search(self) -> tuple[str, ...]:
-        """Keys set in this config that need fidelity `search`.
+        """Keys set in this config that require `solver.fidelity: search`.
 
-        Friction and supports need the point of contact. An outline or a centre distance error needs
-        the gap of flanks that do not roll perfectly. Only the search provides these."""
+        Friction and supports need the point of contact. An outline file or a centre distance error
+        needs the gap between flanks that do not roll perfectly. Only this fidelity provides them.
+        """
         parts = {
             "contact.friction": self.contact.friction,
             "scene.supports": self.scene.supports,
@@ -112,8 +112,8 @@ class Config(Section):
     def load_torque(self) -> float:
         """Load torque on rotor 2 (N·m); for a gas load, an estimate of its mean.
 
-        The estimate serves to set scales. It assumes an outer radius of 1.4 pitch radii and an area
-        efficiency of 0.45."""
+        The estimate is only used to choose scales. It assumes an outer radius of 1.4 pitch radii
+        and an area efficiency of 0.45."""
         load = self.scene.load
         if load.torque_N_m is not None:
             return load.torque_N_m
@@ -174,10 +174,10 @@ follow(lambda: replace_fields(Config, dict(Config.model_fields)))
 
 
 def load(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Config:
-    """Read a config file and apply `dotted.key=value` overrides.
+    """Read a config file from `path`, apply `overrides`, and return the config.
 
-    Raises `InputError` if the file, a key or a value is wrong.
-    """
+    `overrides`: texts of the form `dotted.key=value`, as for `--set`. Raises `InputError` if the
+    file, a key or a value is wrong."""
     return parse(_read(Path(path)), overrides, source=str(path), folder=Path(path).parent)
 
 
@@ -187,10 +187,11 @@ def parse(
     source: str = "config",
     folder: str | Path = ".",
 ) -> Config:
-    """Read a config from YAML text and apply `dotted.key=value` overrides.
+    """Read a config from YAML `text`, apply `overrides`, and return the config.
 
-    `source`: name of the text in messages. Paths in the text are relative to `folder`; paths in
-    `overrides` are relative to the current folder. The returned config has absolute paths.
+    `overrides`: texts of the form `dotted.key=value`. `source`: name of the text in messages. Paths
+    in the text are relative to `folder`; paths in `overrides` are relative to the current folder.
+    The returned config has absolute paths.
 
     Raises `InputError` if the text, a key or a value is wrong."""
     name = placed(source)
@@ -214,7 +215,9 @@ def parse(
 
 
 def _find_family(data: dict) -> None:
-    """Load the installed package that offers the config's family, unless already registered."""
+    """Load the installed package that offers the config's family.
+
+    `data`: the config as plain values. Do nothing if the family is already registered."""
     profile = data.get("profile")
     name = profile.get("family") if isinstance(profile, dict) else None
     if isinstance(name, str) and bare(name) not in map(bare, families()):
@@ -222,7 +225,9 @@ def _find_family(data: dict) -> None:
 
 
 def _place_files(data: dict, folder: Path) -> None:
-    """Make the path of the outline file absolute, in place, if it is relative to `folder`."""
+    """Make a relative path of the outline file in `data` absolute, in place.
+
+    `folder`: folder to which the path is relative."""
     profile = data.get("profile")
     if isinstance(profile, dict) and isinstance(profile.get("outline_file"), str):
         profile["outline_file"] = str((folder / profile["outline_file"]).absolute())

@@ -20,8 +20,10 @@ from rootsopt.config.units import hint
 from rootsopt.config.words import shown
 
 _USUAL = 0.01, 2.0
-"""Usual range of a profile's lengths (pitch radii). If a length outside its limits would lie in
-this range when read in another unit, the message suggests that unit."""
+"""Usual range (pitch radii) of a profile's lengths.
+
+If a length is outside its limits but would lie in this range in another unit, the message suggests
+this unit."""
 
 
 class ProfileConfig(Section):
@@ -211,7 +213,7 @@ class ContactConfig(Section):
 
     @property
     def rounding_mm(self) -> float:
-        """Smoothing length (mm), which is always set in a complete config."""
+        """Smoothing length (mm). It is set in every complete config."""
         assert self.smoothing_mm is not None
         return self.smoothing_mm
 

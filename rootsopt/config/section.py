@@ -1,4 +1,4 @@
-"""Base class of the config's sections, and the number types that they use."""
+"""Base class of the config's sections, and types for their numbers."""
 
 import re
 import types
@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 def between(low: float, high: float) -> Any:
-    """Return a pydantic field that restricts a finite number to `low` … `high`, both included."""
+    """Return a pydantic field for a finite number from `low` to `high`, both included."""
     return Field(ge=low, le=high, allow_inf_nan=False)
 
 
@@ -25,7 +25,7 @@ Torque = Annotated[float, between(0, 1e7)]
 
 
 class Section(BaseModel):
-    """A config section: immutable; it rejects unknown keys and converts no types.
+    """An immutable section of the config that rejects unknown keys and values of the wrong type.
 
     A word from a list of choices may be in upper or lower case, with spaces, `-` or `_` between its
     parts. The section stores the word as listed."""
@@ -52,7 +52,7 @@ class Section(BaseModel):
 def choices(annotation: Any) -> tuple[str, ...]:
     """Return the words that a type allows for a value, or for the keys of a dictionary.
 
-    Return () for a type that is not a choice of words."""
+    Return () for a type without a list of choices."""
     if get_origin(annotation) is Literal:
         return get_args(annotation)
     if get_origin(annotation) in (Union, types.UnionType, Annotated, dict):
@@ -61,12 +61,12 @@ def choices(annotation: Any) -> tuple[str, ...]:
 
 
 def bare(word: str) -> str:
-    """Return a word in lower case, without spaces, `-` and `_`, for comparison with choices."""
+    """Return a word in lower case, without spaces, `-` and `_`, for comparison with other words."""
     return re.sub(r"[-_\s]", "", word.casefold())
 
 
 def tuples(data: Any) -> Any:
-    """Convert the lists of a section to tuples, because YAML has no tuples.
+    """Return a section's `data` with tuples in place of lists, because YAML has no tuples.
 
     Return anything but a dictionary unchanged."""
     if isinstance(data, dict):

@@ -1,20 +1,21 @@
-"""Chooses a default smoothing length to suit the scene if the config gives none."""
+"""Chooses the smoothing length of a scene if the config gives none."""
 
 import math
 
 _LONGEST = 1e-4
-"""Greatest default smoothing length (mm), used unless a limit from `_SHARES` is smaller."""
+"""Greatest default smoothing length (mm). A limit from `_SHARES` can be smaller."""
 _SHARES = {"twist": 0.05, "depth": 0.02, "damping": 0.1}
-"""Greatest default smoothing length as a fraction of each of three lengths.
+"""Greatest default smoothing length, as a fraction of each of three lengths.
 
-`twist`: the timing gear's deflection at the pitch radius under the full load. With a longer
-smoothing length, the gear would operate in the rounded zone at the edge of its backlash, where its
-stiffness differs. `depth`: the flanks' penetration under the full load. `damping`: the depth of
-full damping."""
+`twist`: deflection of the timing gear under the full load, at the pitch radius. With a longer
+smoothing length, the gear would work in the rounded edge of its backlash, where its stiffness
+differs. `depth`: penetration of the flanks under the full load. `damping`: penetration at which the
+damping is full."""
 _LEAST = {"float64": 1e-6, "float32": 1e-5}
-"""Least default smoothing length (mm), by precision. A shorter length would need more solver steps
-and make the gradient less accurate. In single precision, the gap has a rounding error of about 4e-6
-mm."""
+"""Least default smoothing length (mm) for each precision.
+
+A shorter length would need more solver steps and make the gradient less accurate. In single
+precision, the gap has a rounding error of about 4e-6 mm."""
 _LEAST_LOAD = 1e-3
 """Load torque (N·m) below which the smoothing length does not depend on the load."""
 
@@ -28,11 +29,12 @@ def following_mm(
 ) -> float:
     """Return the default smoothing length (mm) of a scene, with two significant digits.
 
-    `load_torque` (N·m): torque on rotor 2. `gear_stiffness` (N·m/rad): stiffness of the timing
-    gear, `None` without a gear. `contact`: stiffness (N/mm^e), exponent e and depth of full damping
-    (mm) of the flanks. `precision`: `float64` or `float32`. Smoothing over this length changes the
-    forces by less than 1e-4 of their values (measured by `python -m experiments.smoothing`).
-    """
+    `load_torque`: torque on rotor 2 (N·m). `pitch_radius_mm`: pitch radius (mm). `gear_stiffness`:
+    stiffness of the timing gear (N·m/rad), `None` without a gear. `contact`: stiffness (N/mm^e),
+    exponent e and depth of full damping (mm) of the flanks. `precision`: `float64` or `float32`.
+
+    This smoothing changes the forces by less than 1e-4 of their values. The command `python -m
+    experiments.smoothing` measures this."""
     torque = max(load_torque, _LEAST_LOAD)
     stiffness, exponent, full = contact
     force = torque / (pitch_radius_mm * 1e-3)

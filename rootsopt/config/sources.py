@@ -1,4 +1,4 @@
-"""Rejects paths that are not regular files, and states why a file cannot be read."""
+"""Checks that a path names a regular file, and states why a file cannot be read."""
 
 import os
 import stat
@@ -8,7 +8,7 @@ from rootsopt.errors import InputError
 
 
 def reason(error: Exception) -> str:
-    """Return the text of an error, with a lower-case first letter, for the middle of a sentence."""
+    """Return an error's text with its first letter in lower case, for use within a sentence."""
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return text[:1].lower() + text[1:]
 
@@ -23,10 +23,10 @@ _KINDS = (
 
 
 def regular_file(path: str | os.PathLike, what: str) -> Path:
-    """Return `path` after a check that it is not something whose reading may never end.
+    """Return `path`; raise `InputError` if it is a folder, pipe, device or socket.
 
-    `what`: name of the expected file in the message, as in "a config". A missing file is accepted,
-    because the reader reports it. Raises `InputError` for a folder, pipe, device or socket."""
+    Reading one of these might never end. A missing file is accepted, because reading it reports the
+    problem. `what`: name of the expected file in the message, as in "a config"."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):

@@ -11,7 +11,7 @@ from rootsopt.config.words import shown
 
 _Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 _LEAST_WEIGHT = 1e-6
-"""Sum of the weights below which an objective is rejected as empty."""
+"""Sum of all weights below which an objective is rejected as empty."""
 _MOST_LINES = 32
 """Number of spectral lines above which an objective is rejected."""
 
@@ -207,7 +207,7 @@ _Rates = tuple[Annotated[float, between(-1e6, 1e6)], Annotated[float, between(-1
 
 
 class AttractorsConfig(Section):
-    """Grid of initial states from which a search for coexisting motions starts."""
+    """Grid of initial states for `rootsopt attractors`, which finds coexisting motions."""
 
     relatives: Annotated[int, Field(ge=1, le=1000)] = Field(
         12, description="initial relative rotations tried"
@@ -240,7 +240,7 @@ class AttractorsConfig(Section):
 
 
 class EnsembleConfig(Section):
-    """Settings of an ensemble of motions, averaged if one motion is not representative (chaos)."""
+    """Settings of an ensemble: many motions that are averaged if a single one is chaotic."""
 
     members: Annotated[int, Field(ge=4, le=100_000)] = Field(
         16, description="motions from different initial states, per design"
@@ -317,7 +317,7 @@ class ConstraintsConfig(Section):
 
 
 class BoundsConfig(Section):
-    """Bounds of the search: (low, high) for each design parameter of the family.
+    """Bounds (low, high) of each design parameter in an optimisation.
 
     The keys are the parameters of all registered families."""
 
@@ -351,7 +351,7 @@ follow(_derive)
 
 
 class OptimizerConfig(Section):
-    """Method, starts and bounds of the search for a design."""
+    """Method, starts and bounds of the optimisation."""
 
     method: Literal["auto", "slsqp", "adam", "rmsprop", "sgd"] = Field(
         "auto",

@@ -1,4 +1,4 @@
-"""Units in the names of keys, and hints for values that seem to be in another unit."""
+"""Units in the names of keys, and hints for values that seem to be given in another unit."""
 
 import math
 
@@ -31,12 +31,12 @@ _UNITS: dict[str, tuple[str, dict[str, float]]] = {
 
 
 def unit_of(key: str) -> str:
-    """Return the unit in the name of a key; "" if it has none."""
+    """Return the unit in the name of a key, or "" if the name has none."""
     return next((unit for end, (unit, _) in _UNITS.items() if key.endswith(end)), "")
 
 
 def si_unit(key: str) -> float:
-    """Return the SI value of one unit of a design parameter's key (mm, degrees or none)."""
+    """Return the SI value of one unit of a design parameter's key (mm, ° or no unit)."""
     if key.endswith("_deg"):
         return math.pi / 180
     return 1e-3 if key.endswith("_mm") else 1.0
@@ -45,8 +45,8 @@ def si_unit(key: str) -> float:
 def hint(key: object, value: float, low: float, high: float) -> str:
     """Return the end of a message that asks whether an out-of-range `value` is in another unit.
 
-    A unit fits if the converted value lies between `low` and `high`. For a key without a unit, ask
-    whether the value is a percentage. Return "" if nothing fits."""
+    `low`, `high`: range of the key. A unit is suggested if the converted value lies in this range.
+    For a key without a unit, a percentage may be suggested. Return "" if nothing fits."""
     name = str(key)
     for end, (_, others) in _UNITS.items():
         if name.endswith(end):

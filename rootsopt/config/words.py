@@ -1,4 +1,4 @@
-"""Formats values, names and whole messages as one line of bounded length."""
+"""Turns values, names and whole messages into one line of limited length."""
 
 import reprlib
 from typing import Any
@@ -6,11 +6,11 @@ from typing import Any
 LONGEST = 500
 """Length (characters) above which a message about a config is shortened."""
 _VALUE, _NAME, _PATH = 80, 60, 160
-"""Lengths (characters) above which a string value, a key and a path in a message are shortened."""
+"""Lengths (characters) of a string value, a key and a path above which a message shortens them."""
 
 
 class _Bounded(reprlib.Repr):
-    """A `repr` that shortens long values without processing the part that it leaves out."""
+    """A `repr` that shortens long values and does not process the omitted part."""
 
     def __init__(self):
         super().__init__()
@@ -28,25 +28,25 @@ _repr = _Bounded().repr
 
 
 def shown(value: Any) -> str:
-    """Return a value as text for a message: its `repr`, shortened."""
+    """Return a value as text for a message: its `repr`, shortened if it is long."""
     return clipped(_repr(value), 2 * _VALUE)
 
 
 def named(part: Any) -> str:
-    """Return a config key as text for a message: shortened and printable."""
+    """Return a config key as printable text for a message, shortened if it is long."""
     text = clipped(part if isinstance(part, str) else shown(part), _NAME)
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
 def placed(path: Any) -> str:
-    """Return a path as text for a message: printable, and only its end if it is long."""
+    """Return a path as printable text for a message. Only the end of a long path is shown."""
     text = str(path)
     text = text if len(text) <= _PATH else "..." + text[3 - _PATH :]
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
 def clipped(text: str, longest: int = LONGEST) -> str:
-    """Shorten a text to at most `longest` characters by leaving out its middle."""
+    """Shorten a text to at most `longest` characters by omitting its middle."""
     if len(text) <= longest:
         return text
     tail = longest // 3
@@ -54,5 +54,5 @@ def clipped(text: str, longest: int = LONGEST) -> str:
 
 
 def sentence(text: str) -> str:
-    """Return a message as one line of bounded length."""
+    """Return a message as one line of at most `LONGEST` characters."""
     return clipped(" ".join(text[: 100 * LONGEST].split()))

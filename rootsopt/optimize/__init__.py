@@ -1,10 +1,12 @@
-"""Gradient-based optimisation of a rotor pair: problem, search, verification."""
+"""Gradient-based optimisation of a rotor pair: design problem, search and verification."""
 
 from collections.abc import Sequence
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command `rootsopt optimize` and return the exit code."""
+    """Run the command `rootsopt optimize` with the arguments `argv` and return the exit code.
+
+    If `argv` is `None`, use the arguments of the process."""
     from rootsopt.commands.optimize import main as command
 
     return command(argv)

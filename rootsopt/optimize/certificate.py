@@ -1,11 +1,14 @@
 """First-order certificate of an optimum: Karush-Kuhn-Tucker residual and multipliers.
 
-A point is a first-order optimum if non-negative multipliers of active constraints and bounds, and
-shares of the active branches that add up to 1 per group, make the gradient of the Lagrangian zero.
-They are computed from the point alone by non-negative least squares, so the certificate does not
-depend on the method that found the point. See Nocedal and Wright, Numerical Optimization (2006),
-section 12.3; for maxima of branches, the same conditions of the epigraph form.
-"""
+The objective is a smooth function plus maxima over branches (`rootsopt.optimize.local`). At a
+first-order optimum, the gradient of the Lagrangian is zero. The Lagrangian contains the active
+constraints and bounds, each with a non-negative multiplier. It also contains the active branches,
+each with a non-negative share. The shares of one maximum add up to 1.
+
+Multipliers and shares are computed from the point alone, by non-negative least squares. The
+certificate therefore does not depend on the method that found the point. See Nocedal and Wright,
+Numerical Optimization (2006), section 12.3. For the maxima, these are the conditions of the
+epigraph form, in which a variable bounds each branch from above."""
 
 from typing import NamedTuple
 
@@ -16,21 +19,26 @@ from scipy.optimize import nnls
 from rootsopt.optimize.local import Local
 
 NEAR = 1e-4
-"""Distance from a limit, or of a branch from the greatest one, up to which it can be active."""
+"""Distance above which a limit or a branch cannot be active.
+
+For a constraint, the distance is its scaled slack. For a bound, it is measured in the unit box. For
+a branch, it is the difference from the greatest branch."""
 _WEIGHT = 1e4
-"""Weight of the condition that shares add up to 1. It holds exactly where the residual is 0."""
+"""Weight, in the least-squares problem, of the condition that the shares of a maximum sum to 1."""
 _NEGLIGIBLE = 1e-6
-"""Length of a constraint's gradient up to which the constraint cannot hold a design."""
+"""Norm of a constraint's scaled gradient below which the constraint counts as inactive."""
 
 
 class Certificate(NamedTuple):
-    """First-order conditions at a point.
+    """First-order conditions at a point, for d design parameters and m constraints.
 
-    `residual`: length of the Lagrangian's gradient, together with the products of multipliers and
-    distances from the limits (complementarity), in the objective's unit per side of the unit box;
-    `violation`: greatest violation of a constraint; `multipliers` (m,) of the constraints, `lower`
-    and `upper` (d,) of the bounds; `shares`: one array (k,) per group, which add up to 1.
-    """
+    `residual`: norm of all conditions that should be zero, in the objective's unit per side of the
+    unit box. One condition is the Lagrangian's gradient. The others are complementarity products:
+    each multiplier or share, times the distance of its limit or branch from being active.
+
+    `violation`: greatest scaled violation of a constraint. `multipliers` (m,): those of the
+    constraints. `lower`, `upper` (d,): multipliers of the bounds. `shares`: one array (k,) for each
+    maximum over k branches, whose entries add up to 1."""
 
     residual: float
     violation: float
@@ -40,14 +48,17 @@ class Certificate(NamedTuple):
     shares: tuple[NDArray[np.float64], ...]
 
     def holds(self, tolerance: float, feasibility: float) -> bool:
-        """Return whether the point is a first-order optimum within the tolerances."""
+        """Return whether the conditions hold within tolerances.
+
+        `tolerance`: greatest accepted `residual`; `feasibility`: greatest accepted `violation`."""
         return self.residual <= tolerance and self.violation <= feasibility
 
 
 def certify(local: Local, point: NDArray[np.float64], near: float = NEAR) -> Certificate:
-    """Return the certificate of a `point` (d,) of the unit box, from what is known there.
+    """Return the certificate of a `point` (d,) of the unit box.
 
-    `near`: distance up to which limits and branches can be active."""
+    `local`: objective and constraints at the point, with gradients. `near`: distance above which
+    limits and branches cannot be active, as in `NEAR`."""
     size, rows = len(point), []
     gaps: list[NDArray[np.float64]] = []
     chosen: list[NDArray[np.bool_]] = []

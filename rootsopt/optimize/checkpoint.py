@@ -1,12 +1,12 @@
-"""Evaluations of a search, kept in a file as they are made, so that a killed search can go on.
+"""Stores the evaluations of a search in a file, so that a killed search can be resumed.
 
-A search is deterministic: the same evaluations lead to the same points. So a resumed search begins
-again and takes what is in the file instead of simulating it. From there on it continues with the
-same numbers, to the last bit, as if it had not been interrupted.
+A search is deterministic: the same evaluations lead to the same points. A resumed search starts
+from the beginning, but reads stored evaluations from the file instead of simulating them. It then
+continues with the same numbers, to the last bit, as an uninterrupted search.
 
-The file has one JSON object per line. JSON keeps every float exactly. The first line tells which
-config and which versions the evaluations belong to. A last line that is cut off is ignored.
-"""
+The file has one JSON object per line. JSON preserves every float exactly. The first line, the
+header, states the config and the versions on which the evaluations depend. An incomplete last line
+is ignored."""
 
 import contextlib
 import dataclasses
@@ -27,19 +27,21 @@ from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation
 from rootsopt.status import Status
 
 _SHOWN = 5
-"""Number of differences that a refusal lists."""
+"""Maximum number of differences that an error message lists."""
 Key = tuple[int, int]
-"""Number of the local search, and of its evaluation."""
+"""Key of an evaluation: (number of the local search, number of the evaluation in it). The screening
+is search -1."""
 
 
 class Checkpoint:
-    """The evaluations of one search in a file.
+    """A file with the evaluations of one search.
 
-    `header`: what they depend on, as nested mappings of plain values. With `resume`, evaluations in
-    the file are used again; without, the file is begun anew.
+    `path`: path of the file. `header`: everything on which the evaluations depend, as nested
+    mappings of plain values. `resume`: whether to reuse the evaluations in the file; otherwise,
+    start a new file.
 
-    Raises `InputError` with `resume` if there is no file, or if it belongs to another header.
-    """
+    With `resume`, raises `InputError` if there is no file or if its header differs from `header`.
+    Raises `OSError` if the file cannot be opened for writing."""
 
     def __init__(self, path: Path, header: Mapping[str, Any], resume: bool = False):
         self.path = path
@@ -55,7 +57,9 @@ class Checkpoint:
             self._write(plain)
 
     def _read(self, header: Mapping[str, Any]) -> int:
-        """Read the file; return the number of bytes of its whole lines."""
+        """Read the evaluations, and return the size (bytes) of the complete lines.
+
+        Raises `InputError` if the file cannot be read or if its header differs from `header`."""
         try:
             data = self.path.read_bytes()
         except OSError:
@@ -81,7 +85,7 @@ class Checkpoint:
         return kept
 
     def _compare(self, found: Any, header: Mapping[str, Any]) -> None:
-        """Raise `InputError` if the file belongs to another header."""
+        """Raise `InputError` if the header `found` in the file differs from `header`."""
         old, new = _flat(found), _flat(header)
         keys = [key for key in sorted({*old, *new}) if old.get(key) != new.get(key)]
         if keys:
@@ -93,7 +97,9 @@ class Checkpoint:
             )
 
     def known(self, key: Key, point: NDArray[np.float64]) -> Evaluation | None:
-        """Return the evaluation of this number at this `point` (d,), if the file has it."""
+        """Return the evaluation stored under `key`, or `None` unless it belongs to `point` (d,).
+
+        Only evaluations that were read from a resumed file are found."""
         with self._lock:
             found = self._known.get(key)
             if found is None or found[0] != point.tolist():
@@ -102,14 +108,16 @@ class Checkpoint:
             return found[1]
 
     def add(self, key: Key, point: NDArray[np.float64], evaluation: Evaluation) -> None:
-        """Write an evaluation to the file at once."""
+        """Append the `evaluation` of a `point` (d,) to the file, and flush it to the disk.
+
+        An `OSError`, such as a full disk, is ignored."""
         self._added = True
         row = {"key": [*key], "point": point.tolist(), "evaluation": _plain(evaluation)}
         self._write(row)
 
     @property
     def empty(self) -> bool:
-        """Whether there is no evaluation to go on with."""
+        """Whether no evaluation has been read or added."""
         return not self._known and not self._added
 
     def _write(self, row: Mapping[str, Any]) -> None:
@@ -125,7 +133,7 @@ class Checkpoint:
                 os.fsync(self._file.fileno())
 
     def close(self, remove: bool = True) -> None:
-        """Close the file, and remove it: a run that has ended needs it no more."""
+        """Close the file. Also delete it if `remove` is true: a finished run no longer needs it."""
         with self._lock:
             self._file.close()
         if remove:
@@ -133,12 +141,12 @@ class Checkpoint:
 
 
 def _item(value: Any) -> Any:
-    """Return a NumPy number or array as plain values."""
+    """Convert a NumPy number to a plain number, and an array to nested lists."""
     return np.asarray(value).tolist()
 
 
 def _flat(tree: Any, name: str = "") -> dict[str, Any]:
-    """Return the leaves of nested mappings by dotted key."""
+    """Return the values in nested mappings as one mapping with dotted keys."""
     if not isinstance(tree, dict):
         return {name: tree}
     found: dict[str, Any] = {}
@@ -148,7 +156,7 @@ def _flat(tree: Any, name: str = "") -> dict[str, Any]:
 
 
 def _plain(evaluation: Evaluation) -> dict[str, Any]:
-    """Return an evaluation without series as plain values."""
+    """Return an evaluation as plain values for JSON, without its time series."""
     names = (field.name for field in dataclasses.fields(Evaluation))
     found = {name: getattr(evaluation, name) for name in names}
     maxima, state = evaluation.maxima, evaluation.state
@@ -166,7 +174,7 @@ def _plain(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _evaluation(found: Mapping[str, Any]) -> Evaluation:
-    """Return the evaluation that `_plain` has written."""
+    """Return the evaluation from the plain values that `_plain` returned."""
     values = dict(found)
     parts = values.pop("parts", None)
     if values["state"] is not None:

@@ -13,15 +13,16 @@ def optimize_design(
 ) -> Optimization:
     """Find the design that minimises the objective of a `config`, and compare it with the baseline.
 
-    `progress` is called with (evaluations done, evaluations expected, best objective). The result
-    has `baseline` and `optimized` as `Evaluation` (`optimized` is None if no better design was
-    confirmed), `improvement`, `constraints`, `history` and a `status`.
+    `progress`: function called after each evaluation with (evaluations done, evaluations expected,
+    best objective so far).
 
-    Raises `InputError` for a config that cannot be optimised; RuntimeError if JAX is not set to the
-    precision of the config.
+    Return an `Optimization`. Its main fields are `baseline`, `optimized` (`None` if no better
+    design was confirmed), `improvement`, `constraints`, `history` and `status`.
+
+    Raises `InputError` if the config cannot be optimised. Raises `RuntimeError` if JAX is not set
+    to the precision of the config.
 
     >>> found = rootsopt.optimize_design(rootsopt.load_config("configs/cic.yaml"))
-    >>> found.optimized.design, found.improvement["mean_force_N"]
-    """
+    >>> found.optimized.design, found.improvement["mean_force_N"]"""
     check_geometry(config)
     return Search(resolve(config)[0], progress).run()

@@ -1,9 +1,8 @@
-"""Constraints that contradict each other: which ones, by how much, and what could be met instead.
+"""Explains why no design satisfies all constraints, and which limits could be met instead.
 
-The least violation is the minimum of the greatest scaled violation (elastic mode, see Nocedal and
-Wright, Numerical Optimization (2006), section 18.5). The constraints that hold this minimum are
-those in conflict. Only the geometry is needed, so no design is simulated.
-"""
+A search minimises the greatest scaled violation of all constraints (elastic mode). See Nocedal and
+Wright, Numerical Optimization (2006), section 18.5. The constraints that keep this minimum above
+zero are in conflict. Only the geometry is needed, so no design is simulated."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -18,15 +17,16 @@ from rootsopt.optimize.sqp import Found, Stops, descend
 
 _STOPS = Stops(residual=1e-7, feasibility=1e-9, evaluations=300)
 _PART = 1e-3
-"""Share in the least violation above which a constraint takes part in the conflict."""
+"""Share of a constraint in the least violation above which the constraint counts as in conflict.
+The shares of all constraints add up to 1."""
 
 
 class Conflict(NamedTuple):
-    """A constraint that contradicts others, in its unit.
+    """A constraint that is in conflict with others.
 
-    `name`, `sense`, `limit`, `unit`; `together`: value that it reaches in the design of least
-    violation; `alone`: nearest limit that can be met while all others hold, None if there is none.
-    """
+    `name`: name in reports; `sense`: "<=" or ">="; `limit`: required limit; `unit`: unit of all
+    values. `together`: value in the design of least violation. `alone`: nearest limit that can be
+    met while all other constraints hold, or `None` if no such design was found."""
 
     name: str
     sense: str
@@ -39,9 +39,9 @@ class Conflict(NamedTuple):
 class Infeasible(NamedTuple):
     """Why no design satisfies all constraints.
 
-    `violation`: the least possible value of the greatest scaled violation; `conflicts`: the
-    constraints that hold it; `design` of least violation in config units.
-    """
+    `violation`: least possible value of the greatest scaled violation; `conflicts`: the constraints
+    in conflict; `design`: design of least violation, in config units by key. If no design could be
+    evaluated, `violation` is NaN and the others are empty."""
 
     violation: float
     conflicts: tuple[Conflict, ...]
@@ -49,7 +49,7 @@ class Infeasible(NamedTuple):
 
     @property
     def message(self) -> str:
-        """Explanation with the nearest limits that can be met."""
+        """Message for the user: constraints in conflict, and limits that can be met."""
         lines = []
         for one in self.conflicts:
             unit = f" {one.unit}" if one.unit else ""
@@ -64,13 +64,15 @@ class Infeasible(NamedTuple):
         )
 
     def record(self) -> dict[str, Any]:
-        """Return the entries for the result file."""
+        """Return the entries `violation`, `conflicts` and `design` of the result file."""
         conflicts = [one._asdict() for one in self.conflicts]
         return {"violation": self.violation, "conflicts": conflicts, "design": self.design}
 
 
 def explain(problem: Problem, starts: Sequence[NDArray[np.float64]]) -> Infeasible:
-    """Return why no design satisfies all constraints of a `problem`, from searches at `starts`."""
+    """Return why no design satisfies all constraints of a `problem`.
+
+    `starts`: points (d,) of the unit box from which to search for the least violation."""
     constraints = problem.space.constraints
     nothing = np.zeros(0), np.zeros((0, len(problem.space.lower)))
 
@@ -100,7 +102,10 @@ def explain(problem: Problem, starts: Sequence[NDArray[np.float64]]) -> Infeasib
 
 
 def _alone(problem: Problem, k: int, starts: Sequence[NDArray[np.float64]]) -> float | None:
-    """Return the nearest limit of constraint `k` that can be met while all others hold."""
+    """Return the nearest limit of constraint `k`, in its unit, that can be met if all others hold.
+
+    `starts`: points (d,) of the unit box from which to search. Return `None` if the searches find
+    no point that satisfies the other constraints."""
 
     def look(point: NDArray[np.float64]) -> Local | None:
         slack, normals = problem.look(point)[2:]
@@ -123,7 +128,7 @@ def _best(found: Sequence[Found]) -> Found | None:
 
 
 def _in_units(constraint: Constraint, slack: float) -> float:
-    """Return the value of a constrained quantity, in the reported unit, from its scaled slack."""
+    """Return a constraint's value in its reported unit, given its scaled `slack`."""
     limit = float(constraint.limit)
     return (limit + constraint.sign * float(slack) * constraint.scale) / constraint.factor
 

@@ -1,12 +1,12 @@
-"""First-order description of an optimisation problem at one point.
+"""Values and gradients of an optimisation problem at one point of the unit box.
 
-The objective is a smooth function plus a sum of maxima over groups of smooth *branches*:
+The objective is a smooth function s plus a sum of maxima over groups g of smooth *branches* b:
 
     f(x) = s(x) + Σ_g max_i b_gi(x),    subject to c_j(x) ≥ 0 and 0 ≤ x ≤ 1.
 
-Branches are, for example, the local maxima of the contact force, or the objective at several speeds
-of which the worst counts. Each branch is smooth where the maximum over them has a corner.
-"""
+For example, the local maxima of the contact force over time are the branches of its peak. If only
+the worst of several speeds counts, the objectives at these speeds are branches. Each branch is
+smooth, even where the maximum has a corner."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 
 class Group(NamedTuple):
-    """The branches of one maximum.
+    """The k branches of one maximum.
 
-    `tags` (k, 2): what tells branches apart at neighbouring points: a kind (whole number), and a
-    phase within the kind, periodic with period 1; `values` (k,); `slopes` (k, d).
-    """
+    `tags` (k, 2): kind and phase of each branch, which identify it at neighbouring points. The kind
+    is a whole number. The phase is periodic with period 1.
+
+    `values` (k,): value of each branch; `slopes` (k, d): its gradient."""
 
     tags: NDArray[np.float64]
     values: NDArray[np.float64]
@@ -28,16 +29,16 @@ class Group(NamedTuple):
 
     @property
     def top(self) -> float:
-        """The greatest branch."""
+        """Greatest value of all branches."""
         return float(np.max(self.values))
 
 
 class Local(NamedTuple):
-    """Values and slopes of objective and constraints at one point x (d,).
+    """Objective and m constraints at one point x (d,), with their gradients.
 
-    `smooth`, `slope` (d,): smooth part of the objective; `groups`: its maxima; `slack` (m,),
-    `normals` (m, d): constraints c ≥ 0 and their gradients.
-    """
+    `smooth`: smooth part of the objective; `slope` (d,): its gradient; `groups`: the maxima that
+    are added to it. `slack` (m,): values of the constraints c ≥ 0; `normals` (m, d): their
+    gradients."""
 
     smooth: float
     slope: NDArray[np.float64]
@@ -47,21 +48,24 @@ class Local(NamedTuple):
 
     @property
     def objective(self) -> float:
-        """Value of the objective."""
+        """Value of the objective: the smooth part plus all maxima."""
         return self.smooth + sum(group.top for group in self.groups)
 
     @property
     def violation(self) -> float:
-        """Greatest violation of a constraint; 0 where all are satisfied."""
+        """Greatest violation of a constraint; 0 if all constraints are satisfied."""
         return max(0.0, -float(np.min(self.slack, initial=0.0)))
 
     def combined(self, shares: tuple[NDArray[np.float64], ...]) -> NDArray[np.float64]:
-        """Return the slope (d,) of the objective with given `shares` (k,) of each group."""
+        """Return the gradient (d,) of the smooth part plus the weighted branches.
+
+        `shares`: one array (k,) per group, with a weight for each branch."""
         pairs = zip(shares, self.groups, strict=True)
         return self.slope + sum((share @ g.slopes for share, g in pairs), np.zeros(len(self.slope)))
 
 
 Look = Callable[[NDArray[np.float64]], Local | None]
-"""Evaluates a problem at a point (d,); None where there is no objective."""
+"""Function that returns the problem at a point (d,), or `None` if there is no objective at this
+point."""
 
 __all__ = ["Group", "Local", "Look"]

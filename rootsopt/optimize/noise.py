@@ -1,10 +1,10 @@
-"""Verify the result of a search whose objective is an average over an ensemble.
+"""Verifies the result of a search whose objective is an average over an ensemble.
 
-The best of many noisy objectives is partly lucky, so the decision does not use the objectives of
-the search. A few candidates are averaged again, over a larger ensemble of other motions. The best
-candidate and the baseline are then averaged over a third ensemble. The design is accepted only if
-it is better by more than `SIGNIFICANT` combined standard errors.
-"""
+The lowest of many noisy objectives is low partly by chance. The decision therefore does not use the
+objectives of the search. The best few designs are averaged again over a larger ensemble of other
+motions. The best of these and the baseline are then averaged over a third ensemble. The design is
+accepted if its objective is lower than the baseline's by more than `SIGNIFICANT` combined standard
+errors."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from rootsopt.response.ensemble import ERRORS, SIGNIFICANT, EnsembleEvaluator
 from rootsopt.response.evaluation import Evaluation
 
 _NEAR = 0.1
-"""Distance in the unit box below which trials count as the same candidate."""
+"""Distance between trials in the unit box below which they count as the same candidate."""
 _CANDIDATES = 3
 """Maximum number of candidates that are averaged again."""
 
@@ -27,13 +27,12 @@ _CANDIDATES = 3
 class Verification(NamedTuple):
     """Outcome of a verification.
 
-    `baseline`: evaluation of the baseline over the ensemble of the decision; `problem`: the design
-    problem relative to `baseline`; `optimized`: evaluation of the best candidate over the same
-    ensemble, None if it was not accepted; `record`: entries for the result file.
+    `baseline`: evaluation of the baseline over the third ensemble, which decides. `problem`: the
+    design problem relative to this baseline. `optimized`: evaluation of the best candidate over the
+    same ensemble, or `None` if it was not accepted. `record`: entries for the result file.
 
-    If there is no usable candidate, `problem` and `baseline` are those of the search. If only the
-    new baseline is not usable, `baseline` is the new one, but `problem` is that of the search.
-    """
+    If no candidate is usable, `problem` and `baseline` are those of the search. If only the new
+    evaluation of the baseline is not usable, `problem` is that of the search."""
 
     problem: Problem
     baseline: Evaluation
@@ -42,31 +41,29 @@ class Verification(NamedTuple):
 
 
 def standard_error(problem: Problem, evaluation: Evaluation) -> float:
-    """Return the standard error of the objective of an evaluation; NaN if it is not usable.
+    """Return the standard error of an evaluation's objective; NaN without a usable steady state.
 
-    The error of the baseline is not included. The value is the weighted sum of the responses'
-    standard errors. This is a close upper bound, since mean and peak rise together.
-    """
+    The result is the weighted sum of the measures' standard errors, without the baseline's own
+    error. This sum is a close upper bound, since the mean and the peak force rise together."""
     steady = evaluation.steady_state
     errors = {name: steady.get(key, float("nan")) for name, key in ERRORS.items()}
     return problem.objective(dataclasses.replace(evaluation, response=errors))
 
 
 def add_errors(rows: list[dict[str, Any]], trials: Sequence, problem: Problem) -> None:
-    """Add the standard error of the objective to the `rows` of a history, in place.
+    """Add the entry `objective_standard_error` to each of the `rows` of a history, in place.
 
-    `rows` and `trials` correspond one to one."""
+    `trials`: trials of the search, one per row and in the same order; `problem`: that of the
+    search."""
     for row, trial in zip(rows, trials, strict=True):
         row["objective_standard_error"] = standard_error(problem, trial.evaluation)
 
 
 def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> Verification:
-    """Choose the best candidate with a second ensemble, and compare it with the baseline in a
-    third.
+    """Choose the best design with a second ensemble; compare it with the baseline in a third.
 
-    `problem`, `evaluator` and `trials` of the search. The second and third ensembles are larger
-    than that of the search. Gradients come from ensembles of the search's size.
-    """
+    `problem`, `evaluator`, `trials`: those of the search. The second and third ensembles are larger
+    than that of the search. Gradients come from ensembles of the search's size."""
     chooser, judge = (evaluator.independent(k).without_gradient() for k in (1, 2))
     settings = judge.settings
     record: dict[str, Any] = {
@@ -111,7 +108,7 @@ def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> 
 
 
 def _with_gradient(evaluation: Evaluation, other: Evaluation) -> Evaluation:
-    """Return `evaluation` with the gradient of `other` and the gradient's standard error."""
+    """Return `evaluation` with the gradient of `other` and the standard error of this gradient."""
     key = "gradient_standard_error"
     errors = {key: other.steady_state[key]} if key in other.steady_state else {}
     steady = evaluation.steady_state | errors
@@ -119,12 +116,11 @@ def _with_gradient(evaluation: Evaluation, other: Evaluation) -> Evaluation:
 
 
 def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[np.float64]]]:
-    """Return the most promising points of the unit box, each with an averaged objective.
+    """Return the most promising designs as (averaged objective, point (d,)), the best first.
 
-    The points are at least `_NEAR` apart. The objective is the average over the trials near a
-    point. Points are ranked by this average plus its standard error. A lucky trial among worse
-    trials therefore ranks low.
-    """
+    The objective is averaged over the trials near a point. Points are ranked by this average plus
+    its standard error, so a lucky trial among worse trials ranks low. The points are at least
+    `_NEAR` apart in the unit box. Their averages are below 1, the objective of the baseline."""
     # The first trial of a descent repeats a screening trial, with the same noise: count it once.
     usable = {tuple(trial.point): trial for trial in trials if trial.candidate}
     points = np.array(list(usable)).reshape(len(usable), -1)
@@ -146,7 +142,7 @@ def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[
 
 
 def most_promising(problem: Problem, trials: Sequence) -> Any:
-    """Return the trial at the best of the `candidates`, or None if there are no candidates."""
+    """Return the trial at the best of the `candidates`, or `None` without candidates."""
     found = candidates(problem, trials)
     if not found:
         return None
@@ -155,9 +151,9 @@ def most_promising(problem: Problem, trials: Sequence) -> Any:
 
 
 def message(record: dict[str, Any]) -> str:
-    """Return a message for the user: that no design was confirmed over an ensemble, and why.
+    """Return a message for the user on why no design was confirmed over an ensemble.
 
-    `record`: `Verification.record`. The message is empty if there was no such verification."""
+    `record`: `Verification.record`. Return "" for the record of a search without an ensemble."""
     if "required_standard_errors" not in record:
         return ""
     advice = (

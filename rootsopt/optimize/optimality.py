@@ -1,4 +1,4 @@
-"""What is known about an optimum: its certificate, what holds it, and how the starts agree."""
+"""What is known about an optimum: certificate, active branches, outcomes of the local searches."""
 
 import dataclasses
 import math
@@ -12,10 +12,10 @@ from rootsopt.optimize.certificate import Certificate
 from rootsopt.optimize.sqp import REASONS
 
 RESIDUAL = 1e-4
-"""First-order residual up to which an optimum counts as converged."""
+"""First-order residual above which a design does not count as converged."""
 _SAME = 1e-4, 0.03
-"""Differences of objective (relative) and point (in the unit box) up to which two local searches
-have found the same optimum."""
+"""Differences above which the optima of two local searches count as distinct: relative difference
+between objectives, and difference in one coordinate of the unit box."""
 
 _REASONS = REASONS | {
     "descent": (
@@ -30,11 +30,12 @@ _REASONS = REASONS | {
 
 
 class StartOutcome(NamedTuple):
-    """What one local search has found.
+    """Outcome of one local search.
 
-    `start`: its number; `objective`, NaN if not usable; `residual`; `reason` for its end;
-    `evaluations`; `design` in config units; `point` (d,) of the unit box.
-    """
+    `start`: number of the search; `objective`: best objective, NaN if no design was usable;
+    `residual`: first-order residual, NaN if not known; `reason`: word for why the search ended;
+    `evaluations`: number of evaluated designs; `design`: best design, in config units by key;
+    `point` (d,): this design in the unit box."""
 
     start: int
     objective: float
@@ -48,10 +49,11 @@ class StartOutcome(NamedTuple):
 class Holder(NamedTuple):
     """A branch of the objective that is active at the optimum.
 
-    `speed_rpm`: NaN for a single speed; `rotation_deg` of rotor 1 at the maximum of the force
-    (degrees from φ1 = 0, NaN where the branch is no maximum); `force_N`: its height; `objective`:
-    value of the branch; `share` of it in the objective's slope.
-    """
+    `speed_rpm`: speed of the branch, NaN if there is only one speed. `objective`: value of the
+    branch. `share`: its weight in the gradient of the objective.
+
+    `rotation_deg`, `force_N`: rotation of rotor 1 (degrees from φ1 = 0) and contact force (N), if
+    the branch is a local maximum of the force over time. Otherwise, both are NaN."""
 
     speed_rpm: float
     rotation_deg: float
@@ -60,15 +62,15 @@ class Holder(NamedTuple):
     share: float
 
     def record(self) -> dict[str, float | None]:
-        """Return the entries for the result file."""
+        """Return the fields for the result file, with `None` in place of NaN."""
         return {k: None if math.isnan(v) else v for k, v in self._asdict().items()}
 
 
 class Optimum(NamedTuple):
-    """One of the distinct optima that the starts have led to.
+    """One of the distinct optima that the local searches have found.
 
-    `objective`; `found`: by how many of the starts; `design` in config units.
-    """
+    `objective`: value at the optimum; `found`: number of searches that ended there; `design`: the
+    design, in config units by key."""
 
     objective: float
     found: int
@@ -79,10 +81,10 @@ class Optimum(NamedTuple):
 class Optimality:
     """What is known about the optimum of a search.
 
-    `method` of the local searches; `certificate` at the verified design; `reason`: a word for why
-    the search stopped; `holders`: branches that are active; `starts`: outcome of each local search;
-    `sensitivities`: rows of the table of scene quantities.
-    """
+    `method`: method of the local searches. `certificate`: first-order conditions at the verified
+    design. `reason`: "converged", or a word for why these conditions do not hold. `holders`:
+    branches of the objective that are active there. `starts`: outcomes of the local searches.
+    `sensitivities`: one row per quantity of the scene, with its effect on the forces."""
 
     method: str
     certificate: Certificate
@@ -98,16 +100,16 @@ class Optimality:
 
     @property
     def message(self) -> str:
-        """Explanation of the reason, with advice."""
+        """Explanation of `reason`, with advice for the user."""
         return _REASONS[self.reason]
 
     @property
     def optima(self) -> list[Optimum]:
-        """Distinct optima among the converged starts, the best first."""
+        """Distinct optima of the converged local searches, the best first."""
         return distinct([one for one in self.starts if one.reason == "converged"])
 
     def record(self) -> dict[str, Any]:
-        """Return the entries for the result file."""
+        """Return the entry `optimality` of the result file."""
         optima = self.optima
         return {
             "method": self.method,
@@ -136,7 +138,7 @@ class Optimality:
 
 
 def distinct(starts: Sequence[StartOutcome]) -> list[Optimum]:
-    """Return the distinct optima among local searches, the best first.
+    """Return the distinct optima among the outcomes of local searches, the best first.
 
     Two searches have found the same optimum if both their objectives and their points agree."""
     groups: list[list[StartOutcome]] = []
@@ -154,16 +156,18 @@ def distinct(starts: Sequence[StartOutcome]) -> list[Optimum]:
 
 
 def unseen(searches: int, optima: int) -> dict[str, float | None]:
-    """Return the Bayesian estimates of optima that were not found.
+    """Return Bayesian estimates of the optima that the local searches have not found.
 
-    `searches`: number of local searches N that ended at an optimum; `optima`: number W of distinct
-    ones. `expected_optima`: posterior mean W (N - 1) / (N - W - 2) of the number of optima.
-    `share_of_starts`: posterior mean W (W + 1) / (N (N - 1)) of the probability that a further
-    start would end at a new one. Both assume that the starts are drawn independently, without
-    knowledge of the number of optima. None where the searches are too few. Source: Boender and
-    Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods, Mathematical
-    Programming 37 (1987) 59-80.
-    """
+    `searches`: number N of local searches that ended at an optimum; `optima`: number W of distinct
+    optima. The result repeats both, and has two estimates. Each is `None` if N is too small:
+
+    - `expected_optima`: posterior mean W (N - 1) / (N - W - 2) of the number of optima;
+    - `share_of_starts`: posterior mean W (W + 1) / (N (N - 1)) of the probability that one more
+      start leads to a new optimum.
+
+    The formulas assume that the starts are drawn independently and that the number of optima is not
+    known beforehand. Source: Boender and Rinnooy Kan, Bayesian stopping rules for multistart global
+    optimization methods, Mathematical Programming 37 (1987) 59-80."""
     count, n = optima, searches
     expected = count * (n - 1) / (n - count - 2) if n > count + 2 else None
     share = min(1.0, count * (count + 1) / (n * (n - 1))) if n > 1 else None

@@ -26,33 +26,37 @@ from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 
 PEAK = "peak_force_N"
-"""Name of the measure that is the greatest of several local maxima."""
+"""Key of the peak force in a response: the greatest of several local maxima of the force."""
 _NO_LINE = 1e-9
-"""Amplitude of a spectral line, relative to the mean force, below which there is no line."""
+"""Amplitude of the baseline's spectral line (relative to its mean force) below which an objective
+that contains this line is rejected."""
 _SAME = 1e-6
-"""Slack and slope of a constraint (scaled) up to which every design meets it with equality."""
+"""Slack and slope of a constraint (both scaled) below which the constraint counts as met with
+equality by every design."""
 _HELD = 1e-6
-"""Multiplier of a bound, or share of a branch, up to which it does not hold the design."""
+"""Multiplier of a bound, or share of a branch, below which the bound or branch counts as inactive.
+"""
 _STEPS = {"mm": 0.1, "deg": 1.0, "": 0.01}
-"""Steps by unit for which the report states the price of a limit."""
+"""Change of a limit, by the unit of the limit, for which the report states the effect on the
+objective."""
 _DRAWN = 5
-"""Maximum number of times that an infeasible point is moved half way towards a feasible one."""
+"""Maximum number of times that an infeasible point is moved halfway towards a feasible point."""
 FEASIBLE = 1e-6
-"""Scaled violation of a constraint below which a point counts as feasible. It is also the distance
-from a bound of the unit box below which the bound counts as active."""
+"""Scaled violation of a constraint above which a point counts as infeasible. It is also the
+distance from a bound of the unit box above which the bound counts as inactive."""
 
 
 @Program
 def _nearest(space: Space, design):
-    """Return the point of the unit box nearest to a design."""
+    """Return the point (d,) of the unit box nearest to a `design` (d,) in config units."""
     return space.point(design)
 
 
 @Program
 def _ranges(space: Space, design):
-    """Return the ranges of the parameters whose range depends on other parameters.
+    """Return {key: (low, high)} for the parameters whose range depends on other parameters.
 
-    The bounds of the config are not included."""
+    The bounds in the config do not affect the result."""
     return space.ranges(design)
 
 
@@ -61,12 +65,11 @@ _slacks_of = Program(Space.slacks_of)
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """A config's design problem, relative to its evaluated baseline.
+    """The design problem of a config, relative to its evaluated baseline.
 
-    `config` of the problem; `baseline`: evaluation of the config's own design; `space`: unit box of
-    the design parameters, with the constraints. In all methods, a *point* is a point (d,) of this
-    box.
-    """
+    `config`: the config; `baseline`: evaluation of the config's own design; `space`: unit box of
+    the d design parameters, with m constraints. In all methods, a *point* (d,) is a point of this
+    box."""
 
     config: Config
     baseline: Evaluation
@@ -74,11 +77,11 @@ class Problem:
 
     @classmethod
     def of(cls, config: Config, scene: Scene, baseline: Evaluation) -> "Problem":
-        """Return the problem of a `config`, with the `scene` and the evaluated `baseline`.
+        """Return the problem of a `config`, with its `scene` and the evaluated `baseline`.
 
-        Limits of constraints that the config leaves open come from the `baseline`. Raises
-        `InputError` if a measure in the objective is 0 for the baseline, since the objective
-        divides each measure by its value for the baseline."""
+        Limits that the config does not give come from the `baseline`. Raises `InputError` if a
+        measure in the objective is 0 for the baseline, because the objective divides by this value.
+        """
         orders = {line_name(order): order for order in config.objective.line_weights}
         counting = [part for part in at_speeds(baseline) if part.share > 0]
         for name, part in itertools.product(objective_weights(config), counting):
@@ -102,22 +105,20 @@ class Problem:
         return cls(config, baseline, Space.of(config, scene, baseline.geometry["area_efficiency"]))
 
     def objective(self, evaluation: Evaluation) -> float:
-        """Return the objective: a weighted sum of measures, each divided by its value for the
-        baseline.
+        """Return the objective of an `evaluation`, which is 1 for the baseline.
 
-        It combines all speeds. The objective is 1 at the baseline, and NaN for a design without a
-        usable steady state."""
+        The objective is a weighted sum of measures, each divided by its value for the baseline. All
+        speeds are combined. The result is NaN without a usable steady state."""
         if not evaluation.usable:
             return float("nan")
         return sum(share * self._value(*pair) for share, *pair in self._counted(evaluation))
 
     def by_speed(self, evaluation: Evaluation) -> list[dict[str, float]]:
-        """Return a row for each speed of `objective.speeds_rpm`, with the keys `speed_rpm`, `share`
-        (weight of the speed) and `objective` (value at this speed alone).
+        """Return one row per speed of `objective.speeds_rpm`, with the objective at this speed.
 
-        The objective is NaN if a measure of the baseline is 0, which is possible only at a speed
-        with share 0. Without `objective.speeds_rpm`, the list is empty.
-        """
+        The keys of a row are `speed_rpm`, `share` (weight of the speed) and `objective`. The
+        objective is NaN if a measure of the baseline is 0, which is possible only if the share is
+        0. Without `objective.speeds_rpm`, the list is empty."""
         parts = zip(at_speeds(evaluation), at_speeds(self.baseline), strict=True)
         return [
             {
@@ -130,10 +131,10 @@ class Problem:
         ]
 
     def look(self, point) -> tuple[NDArray[np.float64], ...]:
-        """Return four arrays at a point (d,): the design (d,), its Jacobian (d, d), the slacks of
-        the c constraints (c,), and their Jacobian (c, d).
+        """Return (design (d,), its Jacobian (d, d), slacks (m,), their Jacobian (m, d)).
 
-        A slack is negative where its constraint is violated."""
+        They are taken at a `point` (d,), and the Jacobians are with respect to this point. The
+        slacks belong to the m constraints. A slack is negative if its constraint is violated."""
         return self._look_at(tuple(np.asarray(point, dtype=np.float64)))
 
     @functools.cached_property
@@ -145,7 +146,9 @@ class Problem:
         return functools.lru_cache(maxsize=1024)(look)
 
     def slope(self, evaluation: Evaluation, point) -> NDArray[np.float64]:
-        """Return the gradient of the objective with respect to the point (d,)."""
+        """Return the gradient (d,) of the objective with respect to the `point` (d,).
+
+        `evaluation`: evaluation of the design at this point, with gradients."""
         _, jacobian, _, _ = self.look(point)
         by_design = np.zeros(len(self.space.lower))
         for share, one, baseline in self._counted(evaluation):
@@ -154,10 +157,12 @@ class Problem:
         return np.asarray(by_design @ np.asarray(jacobian))
 
     def local(self, evaluation: Evaluation, point) -> Local | None:
-        """Return the problem at a `point` to first order; None without a usable steady state.
+        """Return the objective and the constraints at a `point`, with gradients.
 
-        With `Evaluation.maxima`, every local maximum of the force is a branch of the objective. So
-        is every speed, where the worst of several counts, and every coexisting motion."""
+        `evaluation`: evaluation of the design at this point. Return `None` if it has no usable
+        steady state. If it lists local maxima of the force, each maximum is a branch of the
+        objective. Each coexisting motion is a branch too, and each speed if only the worst speed
+        counts."""
         if not evaluation.usable:
             return None
         _, jacobian, slack, normals = self.look(point)
@@ -184,11 +189,12 @@ class Problem:
         return Local(smooth, slope @ jacobian, scaled, slack, normals)
 
     def along_scene(self, moved: Evaluation, certificate: Certificate) -> dict[str, float]:
-        """Return the derivatives of the optimal objective with respect to scene quantities.
+        """Return the derivatives of the optimal objective with respect to scene quantities, by key.
 
-        `moved`: evaluation of the optimum at a single speed, with gradients by scene quantity
-        (`by_scene`). The design follows the optimum, which has no effect to first order (envelope
-        theorem). The result is empty if a term of the objective is not a force."""
+        `moved`: evaluation of the optimum at a single speed, with gradients with respect to scene
+        quantities (`by_scene`); `certificate`: that of the optimum. The design is held fixed,
+        because its own change has no effect to first order (envelope theorem). Return {} if a
+        measure in the objective has no such gradient."""
         weights = self._weights(self.baseline)
         if not weights.keys() <= moved.gradient.keys():
             return {}
@@ -199,16 +205,16 @@ class Problem:
 
     @property
     def cornered(self) -> bool:
-        """Whether the objective contains the peak force of single motions."""
+        """Whether the objective contains the peak force of single motions, which has corners."""
         return PEAK in objective_weights(self.config) and self.config.objective.motion in (
             "reached",
             "worst",
         )
 
     def _branches(self, evaluation: Evaluation, baseline: Evaluation, number: int) -> Group:
-        """Return the objective at one speed as branches, with slopes per config unit.
+        """Return the objective at one speed as branches, with gradients in config units.
 
-        `number`: that of the speed, the kind of the branches."""
+        `number`: number of the speed, used as the kind of the branches."""
         weights = self._weights(baseline)
         tags, values, slopes = [], [], []
         for one in (evaluation, *evaluation.rivals):
@@ -235,34 +241,36 @@ class Problem:
         return counted(self.config, evaluation, self.baseline, self._value)
 
     def _value(self, evaluation: Evaluation, baseline: Evaluation) -> float:
-        """Return the weighted sum of the measures at one speed, each relative to the `baseline`."""
+        """Return the weighted sum of the measures at one speed.
+
+        Each measure is divided by its value for the `baseline` at the same speed."""
         return sum(w * evaluation.response[k] for k, w in self._weights(baseline).items())
 
     def _weights(self, baseline: Evaluation) -> dict[str, float]:
-        """Return the weight of each measure at one speed, divided by the baseline's measure (1/N).
+        """Return the weight of each measure at one speed, divided by the baseline's value (1/N).
 
-        The weight is NaN if the baseline's measure is 0."""
+        A weight is NaN if the baseline's value is 0."""
         weights = objective_weights(self.config)
         forces = {key: baseline.response[key] or math.nan for key in weights}
         return {key: weight / forces[key] for key, weight in weights.items()}
 
     def point(self, design) -> NDArray[np.float64]:
-        """Return the point of the unit box nearest to a design (d,) in config units."""
+        """Return the point (d,) of the unit box nearest to a `design` (d,) in config units."""
         return np.asarray(_nearest(self.space, np.asarray(design, dtype=np.float64)))
 
     def design(self, point) -> Float[Array, " d"]:
-        """Return the design (d,) in config units at a point."""
+        """Return the design (d,) in config units at a `point` (d,)."""
         return jnp.asarray(self.look(point)[0])
 
     def feasible(self, point) -> bool:
-        """Return whether a point satisfies every constraint."""
+        """Return whether a `point` (d,) satisfies every constraint within `FEASIBLE`."""
         return bool(np.min(self.look(point)[2]) >= -FEASIBLE)
 
     def project(self, point) -> NDArray[np.float64]:
-        """Project `point` onto the feasible set, by Gauss-Newton steps on the violated constraints.
+        """Return `point` (d,) moved onto the feasible set by Gauss-Newton steps.
 
-        The result can still be infeasible, such as when the constraints contradict the bounds.
-        """
+        Each step is computed from the violated constraints. The result can still be infeasible, for
+        example if the constraints contradict the bounds."""
         point = np.clip(np.asarray(point, dtype=np.float64), 0.0, 1.0)
         for _ in range(30):
             _, _, slack, jacobian = self.look(point)
@@ -279,12 +287,13 @@ class Problem:
         return np.asarray(point, dtype=np.float64)
 
     def toward(self, point, inside) -> NDArray[np.float64]:
-        """Return a feasible point near `point`, as `project` does, with a fallback to `inside`.
+        """Return a point near `point` (d,) that is feasible if possible.
 
-        `inside`: a feasible point. If `project` finds no feasible point, the point is moved half
-        way towards `inside` and projected again, up to `_DRAWN` times. This helps where no profile
-        exists at `point`.
-        """
+        `inside`: a feasible point. The result is that of `project` if this is feasible. Otherwise,
+        `point` is moved halfway towards `inside` and projected again, up to `_DRAWN` times. If this
+        fails too, the result is the projection of `inside`. This helps where no profile exists at
+        `point`. Families whose closed-form limits ensure a sound profile need only the first
+        projection."""
         found = self.project(point)
         if self.space.family.by_limits:
             return found
@@ -295,12 +304,11 @@ class Problem:
         return found
 
     def descent(self, point, slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return `slope` (d,) without the components that active constraints and bounds forbid.
+        """Return the gradient `slope` (d,) projected so that its negative is a feasible direction.
 
-        The negative of the result is the projection of -`slope` onto the cone of feasible
-        directions: the closest direction that violates no active constraint (a non-negative
-        least-squares problem). The result is zero exactly at a Karush-Kuhn-Tucker point.
-        """
+        The negative of the result is the direction closest to -`slope` that violates no constraint
+        or bound active at `point` (d,). It solves a non-negative least-squares problem. The result
+        is zero exactly at a Karush-Kuhn-Tucker point."""
         _, _, slack, jacobian = self.look(point)
         point = np.asarray(point)
         walls = [row for row, s in zip(jacobian, slack, strict=True) if s < 1e-4]
@@ -316,10 +324,11 @@ class Problem:
     def constraint_rows(
         self, optimized: Evaluation, certificate: Certificate | None = None
     ) -> list[dict]:
-        """Return one row per constraint, with its values, for the report and the result file.
+        """Return one row per constraint for the report and the result file.
 
-        With a `certificate`, each row has a `multiplier`: the change of the objective per unit of
-        the limit. Bounds of the search that hold the design have rows, too."""
+        `optimized`: evaluation of the optimum. Upper limits of parameters whose range depends on
+        the others have rows too. With a `certificate`, each row has a `multiplier`: the change of
+        the objective per unit of the limit. Active bounds of the search then have rows as well."""
         rows = []
         keys = {
             "area_efficiency": "area_efficiency",
@@ -349,8 +358,9 @@ class Problem:
         return rows + self._range_rows(optimized, certificate)
 
     def _always(self, optimized: Evaluation) -> NDArray[np.bool_]:
-        """Return which constraints (m,) every design meets with equality: at the baseline and at
-        the optimum their slack is 0 and does not depend on the design."""
+        """Return a mask (m,) of the constraints that every design meets with equality.
+
+        Their slack is 0 at the baseline and at the optimum, and does not depend on the design."""
         found = np.ones(len(self.space.constraints), bool)
         for one in (self.baseline, optimized):
             _, _, slack, normals = self.look(self.point(list(one.design.values())))
@@ -358,7 +368,7 @@ class Problem:
         return found
 
     def _multiplier(self, row: dict, per_unit: float, optimized: Evaluation) -> dict:
-        """Return the entries of a row that tell what its limit costs.
+        """Return entries for a `row` that state how its limit affects the objective.
 
         `per_unit`: decrease of the objective per unit by which the limit is relaxed."""
         step = _STEPS.get(row["unit"], 1.0)
@@ -372,15 +382,17 @@ class Problem:
         }
 
     def _slacks(self, evaluation: Evaluation) -> NDArray[np.float64]:
-        """Return the scaled slack of every constraint for an evaluated design."""
+        """Return the scaled slacks (m,) of all constraints for an evaluated design."""
         design = np.asarray(list(evaluation.design.values()), dtype=np.float64)
         return np.asarray(_slacks_of(self.space, design))
 
     def _range_rows(
         self, optimized: Evaluation, certificate: Certificate | None = None
     ) -> list[dict]:
-        """Return rows for the upper limits of parameters whose range depends on the others, and,
-        with a `certificate`, for the bounds of the search that hold the design."""
+        """Return rows for limits that are not constraints of the config.
+
+        They are the upper limits of parameters whose range depends on the others. With a
+        `certificate`, active bounds of the search are included."""
         design = np.asarray(list(optimized.design.values()), dtype=np.float64)
         ranges, names = _ranges(self.space, design), list(optimized.design)
         low, high = (np.array(x) for x in (self.space.lower, self.space.upper))
@@ -416,7 +428,9 @@ class Problem:
         return rows
 
     def held_by(self, evaluation: Evaluation, certificate: Certificate) -> list[Holder]:
-        """Return the branches of the objective that are active at an evaluated optimum."""
+        """Return the branches of the objective that are active at an evaluated optimum.
+
+        `evaluation`, `certificate`: those of the optimum."""
         labels: list[list[Holder]] = []
         worst = self.config.objective.over_speeds == "worst"
         parts = zip(at_speeds(evaluation), at_speeds(self.baseline), strict=True)
@@ -447,7 +461,7 @@ class Problem:
 
 
 def words(key: str) -> str:
-    """Return the name of a design parameter in words, without its unit."""
+    """Return a design parameter's name in words: `edge_radius_mm` gives "edge radius"."""
     return key.removesuffix("_mm").removesuffix("_deg").replace("_", " ")
 
 

@@ -1,13 +1,14 @@
-"""The search: screening, local searches, verification with a certificate.
+"""The search: screening, local searches, and verification with a certificate.
 
-Screening chooses the starts from a Sobol sample of feasible designs. From each start, a local
-search begins: sequential quadratic programming on exact gradients (`rootsopt.optimize.sqp`), or a
-descent by an optax update rule. The descent projects the gradient onto the directions that active
-constraints allow, and each step back onto the feasible set. The last orbit is the first guess for
-the next. The best design is simulated again from rest before it is reported, and its first-order
-conditions are checked there. A search can be stopped at any time (`stop`). It then verifies the
-best design found so far.
-"""
+Screening simulates a Sobol sample of feasible designs and chooses the best as starts. From each
+start, a local search begins. It is either sequential quadratic programming on exact gradients
+(`rootsopt.optimize.sqp`), or a descent by an optax update rule. The descent projects the gradient
+onto the directions that active constraints allow, and each new point onto the feasible set. In a
+local search, the last orbit is the first guess for the next.
+
+The best design is simulated again from rest before it is reported, and its first-order conditions
+are checked there. A search can be stopped at any time (`stop`). It then verifies the best design so
+far, unless the objective is an average over an ensemble."""
 
 import dataclasses
 import operator
@@ -51,11 +52,13 @@ _PATIENCE = 4
 _GAIN = 1e-4
 """Relative decrease of the best objective below which a step does not count as a gain."""
 _STATIONARY = 1e-3
-"""Norm of the projected gradient in the unit box below which a descent ends."""
+"""Norm of the projected gradient (objective per side of the unit box) below which a descent ends.
+"""
 _HOLDS_UP = 0.01
-"""Relative change of the objective in the verification above which a design is rejected."""
+"""Relative difference between a design's objectives in search and verification above which the
+design is rejected."""
 _EXPLAINED = 8
-"""Maximum number of starts of the search for the least violation of the constraints."""
+"""Maximum number of points from which the least violation of the constraints is searched for."""
 _POLL = 0.05
 """Interval (s) at which a waiting thread checks whether it should stop."""
 
@@ -68,10 +71,11 @@ objective)."""
 class Trial:
     """One evaluated design of a search.
 
-    `point` (d,) of the unit box; `start`: number of the local search (-1: screening); `iteration`:
-    steps from its start; `evaluation`; `objective`: NaN without a usable steady state; `feasible`:
-    whether all constraints are satisfied; `local`: the problem to first order, None if not known.
-    """
+    `point` (d,): the design in the unit box. `start`: number of the local search, -1 for the
+    screening. `iteration`: number of the evaluation in the local search, from 0. `evaluation`:
+    result of the simulation. `objective`: its objective, NaN without a usable steady state.
+    `feasible`: whether all constraints are satisfied. `local`: objective and constraints with
+    gradients, `None` if not known."""
 
     point: NDArray[np.float64]
     start: int
@@ -83,12 +87,12 @@ class Trial:
 
     @property
     def residual(self) -> float:
-        """Residual of the first-order conditions; NaN if not known."""
+        """Residual of the first-order conditions at the point; NaN if not known."""
         return float("nan") if self.local is None else certify(self.local, self.point).residual
 
     @property
     def candidate(self) -> bool:
-        """Whether the design may be the result: feasible, with a known objective."""
+        """Whether the design may become the result: it is feasible and has an objective."""
         return self.feasible and not np.isnan(self.objective)
 
 
@@ -96,14 +100,17 @@ class Trial:
 class Optimization:
     """Outcome of a search.
 
-    `problem`: None if the baseline has no usable steady state; `baseline`: its evaluation;
-    `optimized`: evaluation of the best design, None if no design better than the baseline was
-    confirmed; `history`: one row per trial; `verification`: objective in the search and in the
-    verification; `interrupted`: whether the search was stopped. `verification["holds_up"]` is None
-    if the search was stopped before the best design could be verified. `optimality`: first-order
-    conditions at the best design, and what the starts found; None for an average over an ensemble
-    or without a verified design. `infeasible`: why no design satisfies all constraints, if so.
-    """
+    `problem`: the design problem, `None` if the baseline has no usable steady state. `baseline`:
+    evaluation of the baseline. `optimized`: evaluation of the best design, `None` if no design
+    better than the baseline was confirmed. `history`: one row per trial.
+
+    `verification`: the best design's objective in the search and in the verification, and
+    `holds_up`: whether they agree. `holds_up` is `None` if the search was stopped before the
+    verification. `interrupted`: whether the search was stopped.
+
+    `optimality`: first-order conditions at the best design, and outcomes of the local searches. It
+    is `None` without a verified design, or if the objective is an average over an ensemble.
+    `infeasible`: why no design satisfies all constraints, `None` if a design does."""
 
     problem: Problem | None
     baseline: Evaluation
@@ -131,7 +138,10 @@ class Optimization:
 
     @property
     def improvement(self) -> dict[str, float]:
-        """Reductions of objective and forces, as fractions of the baseline's values."""
+        """Reductions of the objective and of the mean, peak and RMS force.
+
+        Each is a fraction of the baseline's value. The mapping is empty without an optimised
+        design."""
         if self.problem is None or self.optimized is None:
             return {}
         gains = {"objective": 1 - self.problem.objective(self.optimized)}
@@ -142,7 +152,7 @@ class Optimization:
 
     @property
     def constraints(self) -> list[dict[str, Any]]:
-        """Constraints at the optimum, one row each."""
+        """Constraints at the optimum, one row each; empty without an optimised design."""
         if self.problem is None or self.optimized is None:
             return []
         certificate = None if self.optimality is None else self.optimality.certificate
@@ -150,8 +160,9 @@ class Optimization:
 
     @property
     def objective_by_speed(self) -> list[dict[str, float]]:
-        """Objective at the optimum at each speed, one row each; empty unless there are several
-        speeds."""
+        """Objective of the optimised design at each speed, one row per speed.
+
+        The list is empty without `objective.speeds_rpm` or without an optimised design."""
         if self.problem is None or self.optimized is None:
             return []
         return self.problem.by_speed(self.optimized)
@@ -160,12 +171,12 @@ class Optimization:
 class Search:
     """One optimisation run of a config.
 
-    `progress` is called with (evaluations done, evaluations expected, best objective). `stop`: an
-    event that another thread can set to end the search early. `checkpoint`: keeps every evaluation,
-    and gives back those of an interrupted search.
+    `progress`: function called after each evaluation with (evaluations done, evaluations expected,
+    best objective so far). `stop`: event that another thread can set to end the search early.
+    `checkpoint`: file that stores every evaluation and supplies those of an interrupted search.
 
-    Raises InputError for a profile family without design parameters.
-    """
+    Raises `InputError` if the profile family has no design parameters, or if the optimisation
+    method does not suit the objective."""
 
     def __init__(
         self,
@@ -200,12 +211,12 @@ class Search:
         self._baseline: Evaluation | None = None
 
     def run(self) -> Optimization:
-        """Evaluate the baseline, screen, descend from the starts and verify; return the outcome.
+        """Evaluate the baseline, screen designs, run the local searches and verify the best design.
 
-        After `stop`, the outcome is the best design found before. It is verified, unless the
-        objective is an average over an ensemble.
+        Return the outcome. If `stop` is set, the outcome is the best design so far. It is then
+        verified unless the objective is an average over an ensemble.
 
-        Raises InputError if the objective is not defined for the baseline."""
+        Raises `InputError` if the objective is not defined for the baseline."""
         exact = self.exact.prepare(design_vector(self.config))
         Space.of(self.config, exact.scene, 0.0).prepare()
         exact, baseline = exact.fit()
@@ -259,8 +270,8 @@ class Search:
     def so_far(self) -> Optimization | None:
         """Return what the search has found so far, without verification.
 
-        The result is None until the baseline has been simulated. Another thread can call this
-        method during the search."""
+        Return `None` until the baseline has been simulated. Another thread can call this method
+        during the search."""
         if self._baseline is None:
             return None
         trials = self._in_order()
@@ -287,15 +298,15 @@ class Search:
         return Optimization(self.problem, self._baseline, best.evaluation, rows, verification, True)
 
     def _in_order(self) -> list[Trial]:
-        """Return all trials so far: the screening first, then one descent after another."""
+        """Return all trials so far: those of the screening, then those of each local search."""
         with self._lock:
             return sorted(self._trials, key=lambda trial: (trial.start, trial.iteration))
 
     def _side_by_side(self, work: Callable[..., list[Trial]], tasks: Sequence) -> list[Trial]:
-        """Return the trials of `work(*task)` for all tasks, in the order of the tasks.
+        """Run `work(*task)` for all tasks in parallel, and return all trials.
 
-        If `stop` is set before all tasks end, return an empty list, without waiting for evaluations
-        that are still running."""
+        The trials are in the order of the tasks. If `stop` is set before all tasks end, return an
+        empty list at once: evaluations that are still running are not waited for."""
         pool = ThreadPoolExecutor(os.cpu_count())
         tasks = tasks if not self.stop.is_set() else []
         done = [pool.submit(work, *task) for task in tasks]
@@ -310,7 +321,9 @@ class Search:
             pool.shutdown(wait=not self.stop.is_set(), cancel_futures=True)
 
     def _feasible(self, baseline_point) -> list[NDArray[np.float64]]:
-        """Return the baseline's point and a Sobol sample, made feasible as far as possible."""
+        """Return the baseline's point and a Sobol sample, moved onto the feasible set.
+
+        Points that remain infeasible are left out."""
         start = self.problem.project(baseline_point)
         count, seed = self.settings.screening, self.settings.seed
         sample = sobol(count, seed, len(baseline_point))
@@ -324,7 +337,9 @@ class Search:
         return [self._evaluate(self.fast.without_gradient(), point, -1, 0, key=(-1, number))]
 
     def _starts(self, trials: list[Trial]) -> list[NDArray[np.float64]]:
-        """Return the points of the best screened designs, at least 0.15 apart in the unit box."""
+        """Return the best screened points as starts of the local searches.
+
+        The starts are more than 0.15 apart in the unit box."""
         chosen: list[NDArray[np.float64]] = []
         for trial in sorted(filter(_candidate, trials), key=_objective):
             apart = all(np.linalg.norm(trial.point - p) > 0.15 for p in chosen)
@@ -333,9 +348,9 @@ class Search:
         return chosen
 
     def _solve(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
-        """Search from `point` by sequential quadratic programming and return the trials.
+        """Search from `point` (d,) by sequential quadratic programming, and return the trials.
 
-        `number`: that of the local search."""
+        `number`: number of the local search."""
         trials: list[Trial] = []
         last: list[Trial] = []
 
@@ -355,8 +370,11 @@ class Search:
         return trials
 
     def _repaired(self, found: Found, trials: list[Trial], look: Look) -> Found:
-        """Return the outcome of a local search that ended early, with a better design if the best
-        infeasible trial can be made feasible."""
+        """Return the outcome of a local search, improved if its best trial was infeasible.
+
+        If the search has not converged, its best trial is moved onto the feasible set. The moved
+        design replaces the outcome `found` if it is better. `trials`: trials of the search; `look`:
+        function that evaluates the problem at a point."""
         usable = [trial for trial in trials if trial.local is not None]
         best = min(usable, key=_objective, default=trials[0])
         if found.converged or best.feasible or found.local is None or self.stop.is_set():
@@ -371,7 +389,9 @@ class Search:
         return Found(*outcome)
 
     def _descend(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
-        """Descend from `point` (d,) and return the trials; `number`: index of the descent."""
+        """Descend from `point` (d,) by an update rule, and return the trials.
+
+        `number`: number of the local search."""
         settings = self.settings
         rule = self.method, settings.learning_rate, settings.iterations
         state = _init(*rule, point)
@@ -405,7 +425,10 @@ class Search:
     def _evaluate(
         self, evaluator: Evaluates, point, start, iteration, orbit=None, key=None
     ) -> Trial:
-        """Evaluate a point, or take what the checkpoint has under `key`, and record the trial."""
+        """Evaluate a `point` (d,), or use its stored evaluation, and return it as a new trial.
+
+        `start`, `iteration`: as in `Trial`; `orbit`: first guess of the orbit; `key`: key in the
+        checkpoint, by default (`start`, `iteration`)."""
         point = np.array(point, dtype=np.float64)
         key = (start, iteration) if key is None else key
         kept = None if self.checkpoint is None else self.checkpoint.known(key, point)
@@ -431,7 +454,7 @@ class Search:
     def _verify(self, trials: list[Trial]) -> tuple[Evaluation | None, dict[str, Any]]:
         """Simulate the best designs again, from rest at a tight tolerance, until one is confirmed.
 
-        Return its evaluation, or None, and the record for the result file."""
+        Return (evaluation of this design, or `None`; record for the result file)."""
         ends = {found.point.tobytes() for found in self._found.values()}
         ranked = sorted(filter(_candidate, trials), key=_objective)
         # The ends of local searches come first: points beside them are no better.
@@ -460,7 +483,9 @@ class Search:
         return None, {"holds_up": False, "rejected": failures}
 
     def _optimality(self, optimized: Evaluation, trials: list[Trial]) -> Optimality | None:
-        """Return the first-order conditions at a verified design, and what the starts found."""
+        """Return the first-order conditions at a verified design, and the outcomes of the starts.
+
+        Return `None` if the design has no usable steady state."""
         point = self.problem.point(list(optimized.design.values()))
         local = self.problem.local(optimized, point)
         if local is None:
@@ -479,7 +504,9 @@ class Search:
         return Optimality(self.method, certificate, reason, held, starts, rows)
 
     def _sensitivities(self, optimized: Evaluation, certificate: Certificate) -> list[dict]:
-        """Return the rows of the table of scene quantities; none for several speeds or motions."""
+        """Return one row per scene quantity, with its effect on forces and objective.
+
+        Return an empty list for several speeds, for several motions, or after `stop`."""
         if not isinstance(self.exact, Evaluator) or self.stop.is_set():
             return []
         design = np.array(list(optimized.design.values()))
@@ -500,7 +527,9 @@ class Search:
         return rows
 
     def _outcome(self, number: int, found: Found) -> StartOutcome:
-        """Return the outcome of a local search by sequential quadratic programming."""
+        """Return the outcome of a local search by sequential quadratic programming.
+
+        `number`: number of the search; `found`: what it found."""
         certificate, local = found.certificate, found.local
         reason = found.reason
         if certificate is not None and certificate.holds(RESIDUAL, FEASIBLE):
@@ -516,7 +545,7 @@ class Search:
         )
 
     def _ends(self, trials: list[Trial]) -> list[StartOutcome]:
-        """Return the outcomes of descents: the best trial of each."""
+        """Return the outcomes of all descents, each with the best trial of the descent."""
         starts: dict[int, list[Trial]] = {}
         for trial in trials:
             if trial.start >= 0:
@@ -529,15 +558,16 @@ class Search:
         return found
 
     def _named(self, point) -> dict[str, float]:
-        """Return the design at a point, by key."""
+        """Return the design at a `point` (d,), in config units by key."""
         values = map(float, self.problem.design(point))
         return dict(zip(self.problem.baseline.design, values, strict=True))
 
 
 def method_of(config: Config) -> str:
-    """Return the method of the local searches: that of the config, without `auto`.
+    """Return the method of the local searches, with `auto` replaced by the method it stands for.
 
-    Raises InputError for a method that needs exact gradients, if the config's are averages."""
+    Raises `InputError` if the method needs exact gradients but the objective is an average over an
+    ensemble."""
     method, noisy = config.optimizer.method, config.objective.motion == "ensemble"
     if method == "auto":
         return "adam" if noisy else "slsqp"
@@ -550,11 +580,11 @@ def method_of(config: Config) -> str:
 
 
 def until_stopped(work: Callable[[], T], stop: threading.Event, patience: float) -> T | None:
-    """Run `work()` in its own thread and return its result, or None if it does not end in time.
+    """Run `work()` in its own thread, and return its result, or `None` if it ends too late.
 
-    `stop`: an event that asks `work` to end. After that, this function waits at most `patience`
-    (s). Because of the thread, the wait can be interrupted even during compiled code. The first
-    `KeyboardInterrupt` sets `stop`; a second one is raised."""
+    `stop`: event that asks `work` to end. Once it is set, this function waits at most `patience`
+    (s). The first `KeyboardInterrupt` sets `stop`; a second one is raised. Because `work` has its
+    own thread, an interrupt takes effect even while compiled code is running."""
     future: Future[T] = Future()
 
     def do() -> None:
@@ -586,18 +616,18 @@ def _rule(method: str, learning_rate: float, iterations: int) -> optax.GradientT
 
 @Program
 def _init(method, learning_rate, iterations, point):
-    """Return the state of an update rule at its first point."""
+    """Return the initial state of an update rule at `point` (d,)."""
     return _rule(method, learning_rate, iterations).init(point)
 
 
 @Program
 def _update(method, learning_rate, iterations, slope, state):
-    """Return the step of an update rule, and its next state."""
+    """Return (step (d,), next state) of an update rule, given the gradient `slope` (d,)."""
     return _rule(method, learning_rate, iterations).update(slope, state)
 
 
 def _near(point: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> bool:
-    """Return whether `point` (d,) is closer than 0.02 to one of the points `others`."""
+    """Return whether `point` (d,) is closer than 0.02 to one of the points in `others`."""
     return any(np.linalg.norm(point - other) < 0.02 for other in others)
 
 
@@ -606,7 +636,7 @@ _objective = operator.attrgetter("objective")
 
 
 def _history(trials: list[Trial]) -> list[dict[str, Any]]:
-    """Return the rows of the history, one per trial, each with the best objective so far."""
+    """Return one row per trial for the history, each with the best objective so far."""
     rows, best = [], float("nan")
     for number, trial in enumerate(trials, start=1):
         if trial.candidate:

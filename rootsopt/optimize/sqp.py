@@ -1,12 +1,12 @@
-"""Local search by sequential quadratic programming on the epigraph of an objective with corners.
+"""Local search by sequential quadratic programming, for an objective with corners.
 
-Every maximum over branches becomes a variable t with one constraint b_i(x) ≤ t per branch, so all
-functions are smooth. SciPy's SLSQP (Kraft, A software package for sequential quadratic programming,
-DFVLR-FB 88-28, 1988) solves the smooth problem with exact gradients.
+The corners come from maxima over smooth branches b_i. In the epigraph form, each maximum becomes a
+variable t with one constraint b_i(x) ≤ t per branch, so all functions are smooth. SciPy's SLSQP
+solves this problem with exact gradients. See Kraft, A software package for sequential quadratic
+programming, DFVLR-FB 88-28, 1988.
 
-A point without an objective has a merit above all others there, so the line search shortens its
-step until it finds a usable point. Such a point is never the result.
-"""
+A point without an objective gets a value far above all others, and is never the result. The line
+search then shortens its step until it finds a usable point."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -19,27 +19,27 @@ from rootsopt.optimize.certificate import Certificate, certify
 from rootsopt.optimize.local import Group, Local, Look
 
 SCALE = 0.1
-"""Side of the unit box in the variables of SLSQP, which begins with a unit Hessian."""
+"""Factor from SLSQP's variables z to the point x of the unit box: x = `SCALE` · z. It shortens the
+first step, because SLSQP starts with a unit Hessian."""
 _SLOTS = 4
-"""Number of branches of one group that may appear during a search, besides twice those at its
-start."""
+"""Number of constraints reserved for new branches of a maximum that appear during a search. They
+add to twice the number of branches at the start."""
 _SAME = 0.1
-"""Difference of phases above which branches of neighbouring points are never the same."""
+"""Difference between phases above which branches at neighbouring points count as different."""
 _UNUSABLE = 1e3
-"""Objective of a point that has none, above the best."""
+"""Amount by which the value of a point without an objective exceeds the best objective."""
 _RESTARTS = 6
-"""Maximum number of times that SLSQP begins again, with a new Hessian, at its best point."""
+"""Maximum number of runs of SLSQP. Each starts at the best point, with a unit Hessian."""
 _GAIN = 1e-9
-"""Decrease of the objective below which a restart counts as no progress."""
+"""Decrease of the objective in a run of SLSQP below which the search does not start another run."""
 
 
 class Stops(NamedTuple):
     """When a local search ends.
 
-    `residual`: first-order residual at which it has converged; `feasibility`: violation up to which
-    a point is feasible; `evaluations`: maximum number of points; `asked`: function that tells
-    whether to end at once.
-    """
+    `residual`: first-order residual below which the search has converged; `feasibility`: scaled
+    violation below which a point is feasible; `evaluations`: maximum number of evaluated points;
+    `asked`: function that returns whether to end at once."""
 
     residual: float = 1e-6
     feasibility: float = 1e-6
@@ -50,10 +50,9 @@ class Stops(NamedTuple):
 class Found(NamedTuple):
     """Outcome of a local search.
 
-    `point` (d,): the best feasible point, or the least infeasible one; `local`: the problem there,
-    None if no point was usable; `certificate` of the point; `reason`: word of `REASONS` for the
-    end; `evaluations`: number of points evaluated.
-    """
+    `point` (d,): the best feasible point, or the least infeasible one. `local`: objective and
+    constraints there, `None` if the start was not usable. `certificate`: first-order conditions
+    there. `reason`: key of `REASONS`. `evaluations`: number of evaluated points."""
 
     point: NDArray[np.float64]
     local: Local | None
@@ -63,7 +62,7 @@ class Found(NamedTuple):
 
     @property
     def converged(self) -> bool:
-        """Whether the point satisfies the first-order conditions."""
+        """Whether the first-order conditions hold at the point."""
         return self.reason == "converged"
 
 
@@ -82,15 +81,19 @@ REASONS = {
     "unusable": "The start has no usable steady state. Choose another one.",
     "interrupted": "The search was stopped before its end.",
 }
-"""Reasons why a local search ends, with advice."""
+"""Reasons why a local search ends: each word with its explanation and advice."""
 
 
 class EndError(Exception):
-    """Ends a search from inside a function it calls."""
+    """Raised inside SLSQP's callbacks to end a search."""
 
 
 class Epigraph:
-    """The smooth problem in variables z = (x / `SCALE`, t), with what a search has seen of it."""
+    """The smooth problem that SLSQP solves, with all points evaluated so far.
+
+    The variables z are x / `SCALE`, followed by one variable t per maximum, its upper bound.
+    `look`: function that evaluates the problem at a point; `start` (d,): first point; `first`: the
+    problem there; `stops`: when to end."""
 
     def __init__(self, look: Look, start: NDArray[np.float64], first: Local, stops: Stops):
         self.look, self.stops, self.size = look, stops, len(start)
@@ -103,7 +106,9 @@ class Epigraph:
         self.used = [np.zeros(count) for count in slots]
 
     def at(self, point: NDArray[np.float64]) -> Local | None:
-        """Return the problem at a point, evaluated once."""
+        """Return the problem at a `point` (d,), which is evaluated only on the first call.
+
+        Raises `EndError` if a new evaluation would be needed but the search should end."""
         key = point.tobytes()
         if key not in self.known:
             if self.stops.asked() or self.evaluations >= self.stops.evaluations:
@@ -115,7 +120,9 @@ class Epigraph:
         return self.known[key]
 
     def _judge(self, point, found: Local) -> None:
-        """Keep the best point, and end the search where it satisfies the first-order conditions."""
+        """Keep a new `point` if it is the best one; `found` is the problem there.
+
+        Raises `EndError` if the best point satisfies the first-order conditions."""
         best = self.best[1]
         limit = self.stops.feasibility
         if max(found.violation, limit) < max(best.violation, limit):
@@ -131,17 +138,19 @@ class Epigraph:
                 raise EndError
 
     def point(self, z) -> NDArray[np.float64]:
-        """Return the point of the unit box for the variables of SLSQP."""
+        """Return the point (d,) of the unit box for SLSQP's variables `z`."""
         return np.clip(np.asarray(z[: self.size]) * SCALE, 0.0, 1.0)
 
     def start(self) -> NDArray[np.float64]:
-        """Return the variables at the best point."""
+        """Return SLSQP's variables at the best point so far."""
         point, local = self.best
         self.good = local
         return np.concatenate([point / SCALE, [group.top for group in local.groups]])
 
     def value(self, z) -> tuple[float, NDArray[np.float64]]:
-        """Return the smooth objective and its gradient."""
+        """Return the smooth objective and its gradient at SLSQP's variables `z`.
+
+        The value is far above the best objective if the point is not usable."""
         found = self.at(self.point(z))
         steps = np.ones(len(z) - self.size)
         if found is None:
@@ -152,7 +161,10 @@ class Epigraph:
         return total, np.concatenate([SCALE * found.slope, steps])
 
     def constraints(self, z) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return all constraints ≥ 0 and their gradients: t - b_i, then those of the problem."""
+        """Return the values (≥ 0 if satisfied) and gradients of all constraints at SLSQP's `z`.
+
+        First come t - b_i for the branches b_i of each maximum t, then the constraints of the
+        problem."""
         found = self.at(self.point(z))
         found = self.good if found is None else found
         values, rows = [], []
@@ -171,9 +183,10 @@ class Epigraph:
         return np.concatenate([*values, found.slack]), np.concatenate([*rows, wide])
 
     def _places(self, k: int, group: Group) -> list[int]:
-        """Return the slot of each branch of group `k`; -1 if there is none left.
+        """Return the index, within its group, of the constraint that each branch of group `k` uses.
 
-        A branch keeps its slot from point to point, so that SLSQP sees smooth constraints."""
+        A branch keeps its index from point to point, so that SLSQP sees smooth constraints. The
+        index is -1 if all constraints of the group are taken."""
         slots = self.slots[k]
         apart = np.abs(group.tags[:, None, 1] - slots[None, :, 1])
         apart = np.minimum(apart % 1.0, -apart % 1.0)
@@ -196,7 +209,8 @@ class Epigraph:
 def descend(look: Look, start: NDArray[np.float64], stops: Stops | None = None) -> Found:
     """Search for a local minimum from `start` (d,) in the unit box.
 
-    `look` evaluates the problem at a point; `stops`: when to end."""
+    `look`: function that evaluates the problem at a point; `stops`: when to end, by default
+    `Stops()`."""
     stops = Stops() if stops is None else stops
     start = np.clip(np.asarray(start, dtype=np.float64), 0.0, 1.0)
     first = look(start)

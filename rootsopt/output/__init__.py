@@ -1,1 +1,1 @@
-"""Result folders, files and tables."""
+"""Result folders, result files, and tables for the terminal."""

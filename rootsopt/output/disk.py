@@ -1,8 +1,7 @@
-"""File operations used for everything that is written.
+"""File operations for everything that this package writes.
 
-Each function is small on purpose: tests make every one of these calls fail in turn, or end the
-process at this call. Only the standard library is used.
-"""
+Each function is small on purpose: tests make each call fail in turn, or end the process at this
+call. Only the standard library is used."""
 
 import ctypes
 import errno
@@ -20,7 +19,8 @@ _UNSUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 def create(path: Path, data: bytes) -> None:
     """Write `data` to a new file with the user's usual permissions, and flush it to the disk.
 
-    If this fails, raise the error and leave no file behind."""
+    Raises `OSError` if this fails or if the file exists. In case of failure, no file is left
+    behind."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     file = os.open(path, flags, 0o666)
     try:
@@ -37,12 +37,15 @@ def create(path: Path, data: bytes) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Create one folder. Its parent must exist."""
+    """Create a folder, whose parent must exist. Raises `OSError` if this fails."""
     os.mkdir(path)
 
 
 def make_folders(folder: Path, made: list[Path]) -> None:
-    """Create a folder and its missing parents. Append each to `made` as soon as it is created."""
+    """Create a folder and its missing parents.
+
+    `made`: list to which each folder is appended as soon as it is created. Raises `OSError` if a
+    folder cannot be created."""
     missing = []
     while not folder.is_dir():
         missing.append(folder)
@@ -60,7 +63,9 @@ def make_folders(folder: Path, made: list[Path]) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Flush the list of a folder's entries to the disk, if the file system supports this."""
+    """Flush a folder's list of entries to the disk, if the file system supports this.
+
+    Raises `OSError` if flushing fails for another reason."""
     try:
         folder = os.open(path, os.O_RDONLY)
     except PermissionError:  # where folders cannot be opened
@@ -75,12 +80,16 @@ def sync_folder(path: Path) -> None:
 
 
 def move(source: Path, target: Path) -> None:
-    """Rename the folder `source` to `target` in one step. An empty folder there is replaced."""
+    """Rename the folder `source` to `target` in one step.
+
+    If `target` is an empty folder, it is replaced. Raises `OSError` if renaming fails."""
     os.rename(source, target)
 
 
 def replace(source: Path, target: Path) -> None:
-    """Rename the file `source` to `target` in one step. An existing file there is replaced."""
+    """Rename the file `source` to `target` in one step, replacing an existing file.
+
+    Raises `OSError` if renaming fails."""
     os.replace(source, target)
 
 
@@ -100,7 +109,9 @@ def exchange(first: Path, second: Path) -> bool:
 
 
 def can_exchange(folder: Path) -> bool:
-    """Return whether the file system of `folder` can exchange two folders."""
+    """Return whether the file system of `folder` can exchange the names of two folders.
+
+    Raises `OSError` if the folders for this test cannot be created."""
     pair = [folder / name for name in (".first", ".second")]
     for one in pair:
         os.mkdir(one)
@@ -112,7 +123,7 @@ def can_exchange(folder: Path) -> bool:
 
 
 def _exchanged(call, first: bytes, second: bytes) -> int:
-    """Exchange two folders with the C function `call`; return the error number, 0 for success."""
+    """Exchange two folders with the C function `call`; return its error number, or 0."""
     done = call(_AT_FDCWD, first, _AT_FDCWD, second, _RENAME_EXCHANGE)
     return ctypes.get_errno() if done else 0
 

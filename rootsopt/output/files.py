@@ -1,9 +1,8 @@
-"""Result files, written completely or not at all. Their folder is checked before the work starts.
+"""Result files, each written completely or not at all, in a folder that is checked beforehand.
 
 Every file is written under a temporary name in its folder, then renamed in one step. A reader
-therefore sees either the old file or the whole new file, even after a killed run. Commands write
-whole folders in the same way (`rootsopt.output.runs`).
-"""
+therefore sees either the old file or the complete new file, even after a killed run. Commands write
+whole folders in the same way (`rootsopt.output.runs`)."""
 
 import csv
 import enum
@@ -40,9 +39,8 @@ _LIBRARIES = ("jax", "jaxlib", "diffrax", "optax", "equinox", "numpy")
 class ResultFolder:
     """The folder `path` for result files, created with its parents if it does not exist.
 
-    Raises `InputError` if the folder cannot be created or written to. Folders that were created are
-    then removed.
-    """
+    Raises `InputError` if the folder cannot be created or written to. Folders created in the
+    attempt are then removed."""
 
     def __init__(self, path: str | os.PathLike):
         if not str(path):
@@ -91,7 +89,7 @@ class ResultFolder:
     def write_text(self, name: str, text: str) -> Path:
         """Write `text` as UTF-8 to the file `name`; return the file's path.
 
-        Raises `InputError` if the text or the file cannot be written."""
+        Raises `InputError` if UTF-8 cannot represent the text, or if the file cannot be written."""
         try:
             data = text.encode("utf-8")
         except UnicodeEncodeError as error:
@@ -113,12 +111,14 @@ class ResultFolder:
 
         Floats have 10 significant digits, truth values become `true` and `false`, and `None`
         becomes an empty cell. A column may mix these with text. Raises `ValueError` if the columns
-        differ in length or are not one-dimensional, `InputError` if the file cannot be written.
-        """
+        differ in length or are not one-dimensional. Raises `InputError` if the file cannot be
+        written."""
         return self.write_text(name, _csv(columns))
 
     def write_figure(self, name: str, figure: "Figure") -> Path:
-        """Write a matplotlib figure as PNG to the file `name`; return the file's path."""
+        """Write a matplotlib figure as PNG to the file `name`; return the file's path.
+
+        Raises `InputError` if the file cannot be written."""
         image = io.BytesIO()
         figure.savefig(image, format="png", dpi=DPI)
         return self.write_bytes(name, image.getvalue())
@@ -129,7 +129,7 @@ def _temporary(name: str) -> str:
 
 
 def _plain(data: Any) -> Any:
-    """Convert `data` to types that JSON has; non-finite numbers become `None`."""
+    """Convert `data` to types that JSON supports; non-finite numbers become `None`."""
     if isinstance(data, Mapping):
         return {str(key): _plain(value) for key, value in data.items()}
     if isinstance(data, (list, tuple)):
@@ -177,7 +177,7 @@ def write_config(folder: ResultFolder, config: "Config") -> None:
     """Write config.yaml into `folder`, with a copy of the outline file if the config names one.
 
     The written config names the copy, so that the folder can be moved. Raises `InputError` if the
-    outline file cannot be read, or a file cannot be written."""
+    outline file cannot be read or a file cannot be written."""
     profile = config.profile
     if profile.outline_file is not None:
         source = sources.regular_file(profile.outline_file, "an outline")
@@ -193,13 +193,17 @@ def write_config(folder: ResultFolder, config: "Config") -> None:
 
 
 def profile_columns(outline_mm: ArrayLike) -> dict[str, NDArray[np.float64]]:
-    """Return the columns of `profile_*.csv` for a closed outline (n, 2) in mm."""
+    """Return the columns `x_mm` and `y_mm` of `profile_*.csv`, each (n,).
+
+    `outline_mm` (n, 2): points of the closed outline (mm)."""
     outline = np.asarray(outline_mm)
     return {"x_mm": outline[:, 0], "y_mm": outline[:, 1]}
 
 
 def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
-    """Return the columns of `response_*.csv`: motion and forces over the time of `series`."""
+    """Return the columns of `response_*.csv`: motion and forces over time, each (n,).
+
+    `series`: time series of a motion, in SI units. Units of the columns are in their names."""
     return {
         "time_s": series.time,
         "rotation_deg": np.degrees(series.rotation),
@@ -214,11 +218,10 @@ def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
 def row_columns(
     rows: Sequence[Mapping[str, Any]], keys: Iterable[str] | None = None
 ) -> dict[str, NDArray]:
-    """Return {key: column} from `rows`, for example from the optimisation history.
+    """Return {key: column (n,)} for n `rows`, for example for the rows of a history.
 
-    An absent entry becomes `None`. `keys`: keys of the columns in order; by default, all keys of
-    `rows` in the order of their first appearance.
-    """
+    `keys`: keys of the columns in order. By default, these are all keys of `rows` in the order of
+    their first appearance. An absent entry becomes `None`."""
     if keys is None:
         keys = dict.fromkeys(key for row in rows for key in row)
     columns = {}

@@ -1,8 +1,7 @@
-"""A lock that one process at a time can hold, released when the process ends.
+"""A lock that only one process at a time can hold, released by the system when that process ends.
 
 The package `filelock` is not used, because it empties the lock file even if it does not get the
-lock. The ID of the process that holds the lock would be lost.
-"""
+lock. The file would then lose the ID of the process that holds the lock."""
 
 import contextlib
 import errno
@@ -20,7 +19,9 @@ _TAKEN = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
 
 
 class TakenError(InputError):
-    """Raised if another process holds the lock. `process`: its process ID, `None` if unknown."""
+    """Raised if another process holds the lock.
+
+    `process`: ID of this process, `None` if unknown."""
 
     def __init__(self, process: int | None):
         super().__init__("the lock is held by another process")
@@ -32,8 +33,7 @@ class Lock:
 
     The system releases the lock when the process ends, for whatever reason. If the system has no
     such locks, `held` is `False` and no error is raised. Raises `TakenError` if another process
-    holds the lock, and `OSError` if the file cannot be created.
-    """
+    holds the lock. Raises `OSError` if the file cannot be created."""
 
     def __init__(self, path: Path):
         self.path = path

@@ -2,10 +2,10 @@
 
 The target is the folder that the user names. A run writes into its own temporary folder beside the
 target, `.NAME.PROCESS-XXXXXXXX.rootsopt`. When all files are written, this folder takes the
-target's name in one step. The target therefore contains the earlier run or the new run, never a
-mixture. A lock file beside the target, `.NAME.rootsopt`, keeps other processes out. The temporary
-folder and the lock file disappear when the run ends. The next run removes the remains of a killed
-run.
+target's name in one step. The target therefore contains either the earlier run or the new run,
+never a mixture. A lock file beside the target, `.NAME.rootsopt`, keeps other processes out. The
+temporary folder and the lock file disappear when the run ends. If a run is killed, the next run
+removes what it left behind.
 
 What happens depends on the content of the target:
 
@@ -15,9 +15,8 @@ What happens depends on the content of the target:
 - anything else: the target is refused.
 
 If the file system can exchange two folders (Linux), the target exists at all times. Otherwise the
-earlier run is moved away first. If the process is killed at that moment, the next run puts the
-finished folder in place.
-"""
+earlier run is moved away first. If the process is killed at that moment, the next run moves the
+finished folder to the target."""
 
 import contextlib
 import errno
@@ -39,7 +38,7 @@ from rootsopt.output.files import ResultFolder
 from rootsopt.output.lock import Lock, TakenError
 
 RESULT = "result.json"
-"""Name of the file that is written last and lists all files of a run."""
+"""Name of the file that lists all files of a run and is written last."""
 _CONFIG = "config.yaml"
 _SUFFIX = ".rootsopt"
 _STAGE = re.compile(r"(\..+)\.\d+-[0-9a-f]{8}" + re.escape(_SUFFIX))
@@ -47,8 +46,8 @@ _LONGEST = 150
 """Length (bytes) of a folder's name above which temporary names contain a digest of the name
 instead of the name itself."""
 _PATIENCE = 10.0
-"""Time (s) after a request to stop above which the temporary folder is left behind, because a write
-is still in progress."""
+"""Time (s) after a request to stop above which the temporary folder is left behind. This happens if
+a write is still in progress."""
 _State = Literal["absent", "empty", "ours", "more", "foreign"]
 
 
@@ -59,9 +58,8 @@ class RunFolder(ResultFolder):
     whether to replace an earlier run. Use it as a context manager and call `put_in_place` at the
     end; otherwise the folder is removed.
 
-    Raises `InputError` if the path cannot be used. For example, another process writes there, it
-    contains files that belong to no run, it is not a folder, or its parent is not writable.
-    """
+    Raises `InputError` if the path cannot be used. Examples: another process is writing there, it
+    contains files that belong to no run, it is not a folder, or its parent is not writable."""
 
     def __init__(self, path: str | os.PathLike, command: str = "", overwrite: bool = False):
         name = os.fspath(path)
@@ -102,7 +100,10 @@ class RunFolder(ResultFolder):
         )
 
     def _refuse_places(self) -> None:
-        """Raise `InputError` if a finished run could not replace what is at the target's path."""
+        """Raise `InputError` if a finished run could not replace the target.
+
+        Such a target is a mount point, the current folder or one above it, or something that is not
+        a folder."""
         target = self.target
         if os.path.lexists(target) and not target.is_dir():
             raise InputError(f"{str(self.path)!r}: is not a folder; choose another output folder")
@@ -142,10 +143,10 @@ class RunFolder(ResultFolder):
             )
 
     def _clear(self) -> None:
-        """Deal with the temporary folders of killed runs in the parent folder.
+        """Remove or complete the temporary folders of killed runs in the parent folder.
 
-        A complete run of this target is put in place if the target does not exist. Complete runs of
-        other targets are kept. All other folders of killed runs are removed."""
+        A complete run of this target is moved to the target if the target does not exist. Complete
+        runs of other targets are kept. All other folders of killed runs are removed."""
         for name in sorted(os.listdir(self.target.parent)):
             found = _STAGE.fullmatch(name)
             if found is None:
@@ -166,8 +167,8 @@ class RunFolder(ResultFolder):
     def _state(self) -> _State:
         """Return what is at the target's path.
 
-        `absent`: nothing; `empty`: an empty folder; `ours`: an earlier run and nothing else;
-        `more`: an earlier run and other files; `foreign`: anything else."""
+        `absent`: nothing; `empty`: an empty folder; `ours`: only an earlier run; `more`: an earlier
+        run and other files; `foreign`: anything else."""
         if not os.path.lexists(self.target):
             return "absent"
         if not self.target.is_dir():
@@ -184,12 +185,14 @@ class RunFolder(ResultFolder):
 
     @property
     def checkpoint(self) -> Path:
-        """File beside the folder for what a killed run needs to go on; not part of the run."""
+        """Path of the file from which an interrupted run can be resumed.
+
+        The file lies beside the result folder and is not part of the run."""
         return self._base.with_name(self._base.name + ".checkpoint")
 
     @property
     def place(self) -> Path:
-        """Temporary folder into which files are written."""
+        """Temporary folder into which files are written until the run is complete."""
         return self.stage
 
     def write_bytes(self, name: str, data: bytes) -> Path:
@@ -218,8 +221,8 @@ class RunFolder(ResultFolder):
     def put_in_place(self) -> list[str]:
         """Write `result.json` and move the finished folder to its final path.
 
-        Return messages for the user, if any. Raises `InputError` if this fails; the target is then
-        unchanged."""
+        Return messages for the user, for example the new path of an earlier run. Raises
+        `InputError` if this fails; the target is then unchanged."""
         with self._busy:
             files = sorted(self._written | {RESULT})
             run = {"run": {"command": self.command, "files": files}}
@@ -259,7 +262,7 @@ class RunFolder(ResultFolder):
         return [note]
 
     def _replace(self) -> None:
-        """Put this run in place of the earlier run, and remove the earlier run."""
+        """Move this run to the target's path, and remove the earlier run."""
         if disk.exchange(self.stage, self.target):
             older = self.stage
         else:
@@ -268,7 +271,7 @@ class RunFolder(ResultFolder):
         disk.discard_tree(older)
 
     def _push_aside(self, aside: Path) -> None:
-        """Put this run in place of the earlier run, and move the earlier run to `aside`."""
+        """Move this run to the target's path, and the earlier run to `aside`."""
         if not disk.can_exchange(self.stage):
             self._swap_by(aside)
             return
@@ -282,7 +285,9 @@ class RunFolder(ResultFolder):
             raise
 
     def _swap_by(self, older: Path) -> None:
-        """Move the earlier run to `older`, then this run to the target's path."""
+        """Move the earlier run to `older`, then this run to the target's path.
+
+        If the second step fails, undo the first."""
         disk.move(self.target, older)
         try:
             disk.move(self.stage, self.target)
@@ -308,7 +313,7 @@ class RunFolder(ResultFolder):
             ) from None
 
     def close(self) -> None:
-        """Remove the temporary folder unless it has been put in place, and release the lock.
+        """Release the lock. Remove the temporary folder unless it has been moved to its final path.
 
         A second call does nothing."""
         with self._busy:
@@ -321,10 +326,10 @@ class RunFolder(ResultFolder):
                     disk.discard(folder)
 
     def abandon(self) -> str:
-        """Prevent the run from writing anything more, and close the folder.
+        """Close the folder, and prevent the run from writing any further files.
 
-        Call this from another thread than the run's. Return a message that says whether the final
-        folder is complete or unchanged."""
+        Call this method from a thread other than the run's. Return a message that says whether the
+        final folder is complete or unchanged."""
         if self._busy.acquire(timeout=_PATIENCE):
             self.close()
         return f"{self.path} is {'complete' if self.placed else 'unchanged'}"
@@ -342,7 +347,7 @@ class RunFolder(ResultFolder):
 
 
 def _base(name: str) -> str:
-    """Return the common prefix of the temporary names that belong to the folder `name`."""
+    """Return the prefix that all temporary names for the folder `name` share."""
     if len(os.fsencode(name)) > _LONGEST:
         name = hashlib.sha256(os.fsencode(name)).hexdigest()
     return f".{name}"
@@ -360,7 +365,9 @@ def _files_in(folder: Path) -> set[str]:
 
 
 def _listed(result: Path) -> set[str]:
-    """Return the names of a run's files from the list in its `result` file; empty if none."""
+    """Return the names of a run's files, as its file `result` lists them.
+
+    Return an empty set if this file cannot be read or has no list."""
     try:
         names = json.loads(result.read_bytes())["run"]["files"]
         return {name for name in names if isinstance(name, str)}

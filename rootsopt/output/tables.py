@@ -50,9 +50,8 @@ def comparison_table(
     """Return a table that compares the optimised design with the baseline.
 
     Changes are in % of the baseline. `constraints`: one row {name, baseline, optimized, limit,
-    unit, sense, satisfied, active} per constraint; `improvement`: reductions of the objective, the
-    mean force and the peak force, as fractions of the baseline.
-    """
+    unit, sense, satisfied, active} per constraint; `improvement`: reductions of the objective and
+    the forces, as fractions of the baseline."""
     table = _table("Optimised rotor against baseline", "baseline", "optimised", "change")
     first, second = baseline.record(), optimized.record()
     _group(table, "design", _pairs(first["design"], second["design"]))
@@ -81,9 +80,11 @@ def comparison_table(
 def optimality_table(
     optimality: Mapping[str, Any], constraints: list[dict[str, Any]]
 ) -> RenderableType:
-    """Show the first-order conditions at the optimum, what holds it, and what the starts found.
+    """Return a table of the certificate of the optimum.
 
-    `optimality` is the entry of the result file; `constraints` are its rows."""
+    It shows the first-order conditions, the effect of each active limit, the active branches of the
+    objective, and the optima that the starts found. `optimality`, `constraints`: these entries of
+    the result file."""
     table = _table("Certificate of the optimum", "value", "objective")
     word = optimality["reason"].replace("_", " ")
     _group(
@@ -105,9 +106,9 @@ def optimality_table(
 
 
 def sensitivity_table(rows: list[dict[str, Any]]) -> RenderableType:
-    """Show how forces and objective at the optimum change with the quantities of the scene.
+    """Return a table of how small changes of the scene change the forces and the objective.
 
-    `rows` are `sensitivities` of `optimality` in the result file."""
+    `rows`: entry `sensitivities` of `optimality` in the result file."""
     table = _table("Sensitivity of the optimum", "mean, N", "peak, N", "objective")
     for row in rows:
         length = row["unit"] == "mm" and row["step"] == MICROMETRE
@@ -120,9 +121,9 @@ def sensitivity_table(rows: list[dict[str, Any]]) -> RenderableType:
 
 
 def conflict_table(rows: list[dict[str, Any]]) -> RenderableType:
-    """Show constraints that contradict each other, with the nearest limits that can be met.
+    """Return a table of constraints in conflict, with the nearest limits that can be met.
 
-    `rows` are `conflicts` of `infeasible` in the result file."""
+    `rows`: entry `conflicts` of `infeasible` in the result file."""
     table = _table("Constraints in conflict", "least violation", "with all others")
     for row in rows:
         unit = f" {row['unit']}" if row["unit"] else ""
@@ -162,7 +163,7 @@ def _optima(optimality: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def evaluation_table(evaluation: Evaluation) -> RenderableType:
-    """Return a table of the results of one design in one scene."""
+    """Return a table of all results of one design in one scene."""
     record = evaluation.record()
     table = _table("Simulation of the rotor pair", "value")
     _group(table, "design", _singles(record["design"]))
@@ -181,7 +182,7 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
 def sweep_table(rows: list[dict[str, Any]]) -> RenderableType:
     """Return a table of one design at many speeds.
 
-    `rows`: one per speed, made by `AtSpeed.row`."""
+    `rows`: one per speed, as `AtSpeed.row` returns them."""
     columns = "mean, N", "peak, N", "period", "multiplier", "status"
     table = _table("Contact force over speed", *columns)
     table.columns[0].header = Text("speed, rpm")
@@ -196,12 +197,11 @@ def speeds_table(
     optimized: list[dict[str, Any]] = (),  # type: ignore[assignment]
     objectives: list[dict[str, float]] = (),  # type: ignore[assignment]
 ) -> RenderableType:
-    """Return a table that compares the optimised design with the baseline, one row per speed.
+    """Return a table that compares the optimised design with the baseline at each speed.
 
     Without an optimised design, the table shows the baseline alone. `baseline`, `optimized`: one
     row per speed, as in the entry `speeds` of the result file; `objectives`: one row per speed, as
-    in its entry `objective_by_speed`.
-    """
+    in the entry `objective_by_speed` of the result file."""
     if not optimized:
         return sweep_table(baseline)
     columns = "mean, N", "opt.", "peak, N", "opt.", "objective", "status"
@@ -223,9 +223,8 @@ def _word(row: Mapping[str, Any]) -> Text:
 def attractor_table(rows: list[dict[str, Any]], lost: Mapping[str, float]) -> RenderableType:
     """Return a table of coexisting motions, one column per motion.
 
-    `rows`: one {attractor, share, reached, status, ...} per motion; `lost`: share of the initial
-    states that lead to no motion, for each status label.
-    """
+    `rows`: one {attractor, share, reached, status, ...} per motion. `lost`: share of the initial
+    states that lead to no motion, by status label."""
     table = _table("Coexisting motions", *(f"motion {row['attractor']}" for row in rows))
     labels = {
         "share": "share of initial states",
@@ -241,7 +240,7 @@ def attractor_table(rows: list[dict[str, Any]], lost: Mapping[str, float]) -> Re
 
 
 def geometry_table(record: Mapping[str, Any]) -> RenderableType:
-    """Return a table of the geometry of one profile, from its result record."""
+    """Return a table of the geometry of one profile, from its entries in the result file."""
     table = _table("Rotor profile", "value")
     _group(table, "design", _singles(record.get("design", {})))
     _group(table, "geometry", _singles(record.get("geometry", {})))
@@ -274,7 +273,7 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _group(table: Table, name: str, rows: _Rows) -> None:
-    """Add a heading and its `rows` to a table. Without rows, add one row "none" of dashes."""
+    """Add a heading and its `rows` to a table. Without rows, add a row "none" with dashes."""
     rows = list(rows) or [("none", *[DASH] * (len(table.columns) - 1))]
     table.add_section()
     table.add_row(Text(name, style="bold"))
@@ -297,7 +296,7 @@ def _pairs(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple[st
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of `values` except lists and mappings, which only the result file has."""
+    """Return the entries of `values` that fit into a cell: all except lists and mappings."""
     tables = Mapping, list, tuple
     return {key: value for key, value in values.items() if not isinstance(value, tables)}
 
@@ -327,9 +326,9 @@ def _status(evaluation: Evaluation) -> Text:
 
 
 def _gradients(*gradients: Mapping[str, Mapping[str, float]]) -> list[tuple]:
-    """Return one group (heading, rows of each gradient) per response.
+    """Return one tuple (heading, rows for each of the `gradients`) per response.
 
-    If there are no gradients, return a single group without rows."""
+    Rows are {label: derivative}. Without gradients, return a single heading without rows."""
     found = dict.fromkeys(response for gradient in gradients for response in gradient)
     groups = []
     for response in found:
@@ -340,16 +339,18 @@ def _gradients(*gradients: Mapping[str, Mapping[str, float]]) -> list[tuple]:
 
 
 def _errors(*steady_states: Mapping[str, Any]) -> list[tuple]:
-    """Return groups as in `_gradients` for the gradients' standard errors; [] if there are none."""
+    """Return the same tuples as `_gradients`, for the standard errors of gradients.
+
+    Return an empty list if no steady state has such errors."""
     errors = [steady.get("gradient_standard_error", {}) for steady in steady_states]
     groups = _gradients(*errors) if any(errors) else []
     return [(f"standard error of the {heading}", *rows) for heading, *rows in groups]
 
 
 def _per_unit(row: Mapping[str, float], unit: str) -> dict[str, float]:
-    """Return `row` with keys replaced by labels, for example "d/d(pressure angle), N/deg".
+    """Return the derivatives in `row` with labels as keys.
 
-    `unit`: unit of the response."""
+    `unit`: unit of the response. An example of a label is "d/d(pressure angle), N/deg"."""
     labels = ((key, *_split(key)) for key in row)
     return {
         f"d/d({name}), {f'{unit}/{per}' if per else unit}": row[key] for key, name, per in labels
@@ -389,7 +390,9 @@ def _change(first: Any, second: Any) -> str:
 
 
 def _number(value: Any) -> str:
-    """Format a float with five significant digits, and `None` or a non-finite number as a dash."""
+    """Format a number with five significant digits, or as a dash if it is `None` or not finite.
+
+    Whole numbers, truth values and text are not changed."""
     if value is None:
         return DASH
     if isinstance(value, bool | str):

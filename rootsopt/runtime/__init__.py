@@ -1,1 +1,1 @@
-"""Set-up of the process (environment, precision, threads), compiled programs and their cache."""
+"""Environment, precision and threads of the process; compiled programs and their cache."""

@@ -1,10 +1,10 @@
-"""Protect commands from environment variables that change results.
+"""Protects commands from environment variables that change results.
 
 A command owns its process and computes in double precision with JAX's own defaults. Variables that
 only choose a device, a cache or a log are respected. Variables that change numbers, or make JAX
 stop on purpose, are ignored and named on stderr. Settings that cannot work raise `InputError`
-before anything is computed, because XLA ends the whole process if it finds an unknown flag.
-"""
+before anything is computed. This matters because XLA ends the whole process if it finds an unknown
+flag."""
 
 import contextlib
 import os
@@ -32,7 +32,8 @@ _RESPECTED = (
     "JAX_ONEAPI_VISIBLE_DEVICES",
     "JAX_PJRT_CLIENT_CREATE_OPTIONS",
 )
-"""Prefixes of the JAX variables that are respected: they choose a device, a cache or a log."""
+"""Prefixes of the JAX variables that have their usual effect: they choose a device, a cache or a
+log."""
 
 _REQUIRED = {
     "jax_enable_x64": True,
@@ -48,19 +49,19 @@ _REQUIRED = {
     "jax_no_tracing": False,
     "jax_no_execution": False,
 }
-"""Settings of JAX that every result relies on. Checks for NaN are off: programs use NaN on
-purpose."""
+"""Settings of JAX on which every result relies. JAX's checks for NaN are off, because programs use
+NaN on purpose."""
 
 _XLA_FLAGS = "XLA_FLAGS"
 _CHECKED = "ROOTSOPT_XLA_FLAGS_CHECKED"
-"""Name of the variable that tells child processes which XLA_FLAGS have been tested."""
+"""Name of the variable that tells child processes which value of XLA_FLAGS has been tested."""
 
 # On a CPU, XLA compiles a loop to one function if its buffers are small. Otherwise it calls one
 # function per operation and iteration, which here costs several times the arithmetic itself.
 _LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 
 _UNSOUND = re.compile(r"--?(xla_cpu_enable_fast_math)(?:=(?:true|1|t|yes|y))?(?=\s|$)", re.I)
-"""Pattern of the flags that make the compiler assume that NaN and infinity never occur."""
+"""Pattern of flags that make the compiler assume that NaN and infinity never occur."""
 
 _TRIAL = """
 import sys
@@ -79,20 +80,20 @@ try:
 except (AttributeError, TypeError):
     pass
 """
-"""Script that compiles one operation to test XLA_FLAGS. It imports only the necessary parts of
-JAX."""
+"""Python script that compiles one operation to test XLA_FLAGS. It imports only the necessary parts
+of JAX."""
 _TRIAL_SECONDS = 60.0
 _LOG_PREFIX = re.compile(r"^[IWEF]\d{4} \S+\s+\d+ \S+\] ")
 
 _NARROWEST = 40
-"""Value of the variable COLUMNS (terminal width in characters) below which the variable is ignored:
-tables of that width would lose their numbers."""
+"""Terminal width (characters) in the variable COLUMNS below which the variable is ignored. Narrower
+tables would lose their numbers."""
 
 _noticed: set[str] = set()
 
 
 def say(text: str) -> None:
-    """Print `text` as one line on stderr; do nothing if the process has already printed it."""
+    """Print `text` as one line on stderr, unless this process has already printed it."""
     if text in _noticed:
         return
     _noticed.add(text)
@@ -112,9 +113,8 @@ def shortened(value: str, longest: int = 80) -> str:
 def own_process() -> None:
     """Override environment settings that would disturb a command. Call this before anything else.
 
-    Afterwards, warnings do not become errors, tables are wide enough to read, figures need no
-    display, and the runtime checks of equinox are off. `use_float64` handles the variables of JAX.
-    """
+    Afterwards, warnings do not become errors, tables are wide enough to read, and figures need no
+    display. The runtime checks of equinox are off. `use_float64` handles the variables of JAX."""
     if any(option.lower().startswith("e") for option in sys.warnoptions):
         for entry in [entry for entry in warnings.filters if entry[0] == "error"]:
             warnings.filters.remove(entry)  # type: ignore[attr-defined]
@@ -134,12 +134,9 @@ def own_process() -> None:
 
 
 def use_float64() -> None:
-    """Import JAX, apply the settings that results rely on, and start the device.
+    """Import JAX in double precision, apply the required settings, and start the device.
 
-    The settings include double precision.
-
-    Raises `InputError` if the environment prevents JAX from starting.
-    """
+    Raises `InputError` if the environment prevents JAX from starting."""
     aside = {} if "jax" in sys.modules else _without_settings()
     flags = os.environ.get(_XLA_FLAGS, "").strip()
     if flags:
@@ -167,10 +164,10 @@ def use_float64() -> None:
 
 
 def use_compiled_loops() -> None:
-    """Make XLA compile every loop into a single function on CPUs.
+    """Make XLA compile each loop into a single function on CPUs.
 
-    Call this before JAX computes anything. If XLA_FLAGS already sets these options, it is left
-    unchanged."""
+    Call this before JAX computes anything. If XLA_FLAGS already contains extra options for the
+    backend, leave it unchanged."""
     flags = os.environ.get(_XLA_FLAGS, "")
     if "xla_backend_extra_options" not in flags:
         checked = flags.strip() in ("", os.environ.get(_CHECKED))
@@ -182,7 +179,7 @@ def use_compiled_loops() -> None:
 
 @contextlib.contextmanager
 def explained() -> Iterator[None]:
-    """Turn an out-of-memory error of Python or XLA in the `with` block into an `InputError`."""
+    """Turn an out-of-memory error (Python or XLA) in the `with` block into an `InputError`."""
     try:
         yield
     except MemoryError:
@@ -210,7 +207,9 @@ def _set_aside(named: list[str]) -> None:
 
 
 def _without_settings() -> dict[str, str]:
-    """Remove the JAX variables not in `_RESPECTED` from the environment; return {name: value}."""
+    """Remove the JAX variables from the environment, except those in `_RESPECTED`.
+
+    Return the removed variables as {name: value}."""
     names = [
         name for name in os.environ if name.startswith("JAX_") and not name.startswith(_RESPECTED)
     ]
@@ -218,7 +217,7 @@ def _without_settings() -> dict[str, str]:
 
 
 def _agrees(setting: object, value: str) -> bool:
-    """Return whether a variable's text `value` means the same as the current JAX `setting`."""
+    """Return whether the text `value` of a variable means the same as the current JAX `setting`."""
     words = {"1": "true", "t": "true", "yes": "true", "y": "true", "on": "true"}
     words |= {"0": "false", "f": "false", "no": "false", "n": "false", "off": "false", "": "false"}
     said, force = value.strip().lower(), str(getattr(setting, "value", setting)).lower()
@@ -226,7 +225,7 @@ def _agrees(setting: object, value: str) -> bool:
 
 
 def _require(config) -> list[tuple[str, object]]:
-    """Apply the required settings of JAX.
+    """Apply the settings in `_REQUIRED` to `config`, the configuration object of JAX.
 
     Return (name, former value) of each setting that was changed, except double precision."""
     changed = []
@@ -242,9 +241,9 @@ def _require(config) -> list[tuple[str, object]]:
 
 
 def _start_device(jax) -> None:
-    """Start the platform named in JAX_PLATFORMS, by default the CPU.
+    """Start the platform that JAX_PLATFORMS names, or the CPU if it is not set.
 
-    Raises `InputError` if it does not start."""
+    Raises `InputError` if the platform does not start."""
     chosen = os.environ.get("JAX_PLATFORMS")
     before = jax.config.values.get("jax_platforms")
     jax.config.update("jax_platforms", "cpu" if chosen is None else chosen)
@@ -266,7 +265,7 @@ def _start_device(jax) -> None:
 
 
 def _reason(error: BaseException) -> str:
-    """Return a library's error message as one line, without the library's advice in brackets."""
+    """Return the message of a library's error as one line, without the advice in brackets."""
     text = re.sub(r"\s*\((?:set|you may need)\b[^)]*\)", "", str(error))
     text = " ".join(text.split()).rstrip(".")
     return text if len(text) <= 300 else f"{text[:297]}..."
@@ -275,7 +274,8 @@ def _reason(error: BaseException) -> str:
 def _check_flags(flags: str) -> None:
     """Test `flags`, the value of XLA_FLAGS, in a separate process.
 
-    Raises `InputError` if XLA does not start with them, or if they make results unsafe."""
+    Raises `InputError` if XLA does not start with these flags, or if they can make results wrong.
+    """
     if os.environ.get(_CHECKED) == flags:
         return
     advice = "correct the flag or unset XLA_FLAGS"
@@ -308,7 +308,9 @@ def _check_flags(flags: str) -> None:
 
 
 def _complaint(log: str) -> str:
-    """Return XLA's message about its flags from `log`, the stderr of a process that XLA ended."""
+    """Return XLA's message about its flags.
+
+    `log`: stderr of a process in which XLA did not start."""
     lines = [line for line in log.splitlines() if line.strip()]
     marked = [line for line in lines if re.match(r"^[EF]\d{4} ", line)]
     options = [line for line in lines if line.startswith("xla: ")]

@@ -1,9 +1,8 @@
-"""Compiled programs: compiled ahead of use, in parallel, and cached between processes.
+"""Programs that are compiled before they are needed, in parallel, and cached between processes.
 
 Tracing and compiling take longer than the computations themselves. JAX's own cache stores compiled
-code, but every process must trace and lower a function before it can look up the code. For the
-lookup, a `Program` needs only the function's name, its source and the kinds of its arguments.
-"""
+code, but every process must trace and lower a function before it can look up the code. A `Program`
+looks it up by the function's name, the source code and the kind of its arguments."""
 
 import contextlib
 import functools
@@ -46,7 +45,7 @@ _SETTINGS = (
     "jax_exec_time_optimization_effort",
     "eager_constant_folding",
 )
-"""Settings of JAX that change what is traced or compiled."""
+"""Names of the JAX settings that change what is traced or compiled."""
 _VARIABLES = ("XLA_FLAGS", "EQX_ON_ERROR")
 COMPILER_OPTIONS: dict[str, str | bool] = {
     "xla_cpu_use_fusion_emitters": False,
@@ -54,10 +53,11 @@ COMPILER_OPTIONS: dict[str, str | bool] = {
         "while-loop-invariant-code-motion,while-loop-constant-sinking,simplify-while-loops"
     ),
 }
-"""Compiler options on CPUs. They more than halve the time to compile, and programs run as fast.
+"""Compiler options on CPUs. They more than halve the compile time; programs run equally fast.
 
-They select the older code generator for fused operations. They also turn off three passes over
-loops, which run again and again while an operation leaves nested loops one loop at a time."""
+The first option selects the older code generator for fused operations. The second turns off three
+passes over loops. XLA repeats these passes many times, because one pass moves an operation out of
+only one of several nested loops."""
 _PACKAGE = Path(__file__).parents[1]
 _store: Store | None = None
 # Tracing runs in Python, so it is done one function at a time, in the order of requests. The
@@ -66,11 +66,11 @@ _tracing = threading.RLock()
 
 
 def keep_in(folder: Path | None) -> str | None:
-    """Cache programs in `folder` from now on; `None` turns the cache off.
+    """Cache programs in `folder` from now on, or turn the cache off if `folder` is `None`.
 
-    If the folder cannot be used, turn the cache off and return `None`. If other users could replace
-    the programs in the folder, turn the cache off and return the reason. Otherwise return `None`.
-    """
+    If other users could replace the programs in the folder, turn the cache off and return the
+    reason. Otherwise return `None`. If the folder cannot be used for another reason, the cache is
+    off as well."""
     global _store
     _store = None
     if folder is None:
@@ -85,11 +85,10 @@ def keep_in(folder: Path | None) -> str | None:
 
 
 class _Kind(NamedTuple):
-    """Kind of arguments for which a program is compiled.
+    """Kind of arguments for which a program is compiled: everything except the values of arrays.
 
     `tree`: structure of the arguments; `shapes`: one entry per leaf, (shape, dtype) for an array
-    and `None` for any other leaf; `others`: (type, value) of each leaf that is not an array.
-    """
+    and `None` for any other leaf; `others`: (type, value) of each leaf that is not an array."""
 
     tree: Any
     shapes: tuple[tuple[tuple[int, ...], str] | None, ...]
@@ -99,7 +98,7 @@ class _Kind(NamedTuple):
 class _Made(NamedTuple):
     """A compiled program.
 
-    `call`: function that takes the arrays of the arguments and returns those of the result;
+    `call`: function that takes the arrays among the arguments and returns those of the result;
     `result_shape`: the result with `jax.ShapeDtypeStruct` in place of arrays."""
 
     call: Callable[..., Any]
@@ -110,8 +109,7 @@ class Program:
     """A function whose arguments are JAX pytrees, compiled once for each kind of arguments.
 
     As with `equinox.filter_jit`, arrays are traced. All other leaves are static and must be
-    hashable.
-    """
+    hashable: with new values, the function is compiled again."""
 
     def __init__(self, function: Callable[..., Any]):
         functools.update_wrapper(self, function)
@@ -144,7 +142,8 @@ class Program:
     def result_shape(self, *args: Any) -> Any:
         """Return the result for `args` with `jax.ShapeDtypeStruct` in place of arrays.
 
-        The function is not compiled for this."""
+        The function is not run. If its program is in the cache, the program is loaded; otherwise,
+        the function is only traced."""
         _, kind = _split(args)
         place = self._place(kind)
         kept = place is not None and place.kept
@@ -208,7 +207,10 @@ class Program:
 
 
 class _Place(NamedTuple):
-    """An entry of `store`. `purpose`: digest of everything on which the program depends."""
+    """An entry of the cache.
+
+    `store`: the cache; `name`: name of the entry; `purpose`: digest of everything on which the
+    program depends."""
 
     store: Store
     name: str
@@ -228,7 +230,7 @@ def _outline(leaf: Any) -> Any:
 
 
 def _split(args: tuple) -> tuple[list, _Kind]:
-    """Return (arrays among the leaves of `args`, kind of the arguments)."""
+    """Return (list of the arrays in `args`, kind of `args`)."""
     leaves, tree = jax.tree.flatten(args)
     shapes = tuple(
         (x.shape, str(jax.dtypes.canonicalize_dtype(x.dtype))) if _is_array(x) else None
@@ -239,9 +241,10 @@ def _split(args: tuple) -> tuple[list, _Kind]:
 
 
 def _finished(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-    """Compile a lowered program with those of the `COMPILER_OPTIONS` that XLA_FLAGS does not set.
+    """Compile a lowered program with the `COMPILER_OPTIONS`.
 
-    If this fails, as when the compiler does not know an option, compile without options."""
+    Options that are set in XLA_FLAGS are left out. If compilation fails, for example because the
+    compiler does not know an option, compile without options."""
     said = os.environ.get("XLA_FLAGS", "")
     options = {name: value for name, value in COMPILER_OPTIONS.items() if name not in said}
     if options and jax.default_backend() == "cpu":
@@ -251,7 +254,7 @@ def _finished(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
 
 
 def _joined(kind: _Kind, arrays: Iterator) -> tuple:
-    """Return the arguments made up of their `kind` and `arrays`: the inverse of `_split`."""
+    """Return the arguments with this `kind` and these `arrays`, as the inverse of `_split`."""
     others = iter(kind.others)
     leaves = [next(arrays) if shape else next(others)[1] for shape in kind.shapes]
     return jax.tree.unflatten(kind.tree, leaves)
@@ -267,7 +270,7 @@ def _save(place: _Place, made: _Made, number: int) -> None:
 
 
 def _loaded(place: _Place | None) -> _Made | None:
-    """Return the cached program at `place`, or `None` if there is none that can be loaded."""
+    """Return the cached program at `place`, or `None` if no program can be loaded from it."""
     if place is None:
         return None
     try:
@@ -286,7 +289,7 @@ def _loaded(place: _Place | None) -> _Made | None:
 
 
 def _modules(kind: _Kind) -> set[str]:
-    """Return the names of the modules that define the types in the arguments."""
+    """Return the names of the modules that define the types of the arguments."""
     found = {of.__module__ for of, _ in kind.others}
     trees = [kind.tree]
     while trees:
@@ -300,8 +303,9 @@ def _modules(kind: _Kind) -> set[str]:
 def _sources(modules: set[str]) -> list[str] | None:
     """Return digests of the source files on which a program depends.
 
-    These are all sources of this package, and the files of those `modules` that belong neither to
-    Python nor to a package with a known version. Return `None` if a file is missing."""
+    These are all files of this package, and the files of those `modules` that may change unnoticed.
+    Modules of Python, and of packages with a known version, are left out. Return `None` if a file
+    is missing."""
     digests = [_package_digest()]
     for name in sorted(modules):
         top = name.partition(".")[0]
@@ -317,7 +321,7 @@ def _sources(modules: set[str]) -> list[str] | None:
 
 @functools.cache
 def _package_digest() -> str:
-    """Return one digest of all source files of this package, or "" if there are no files."""
+    """Return a digest of all source files of this package, or "" if there are none."""
     digest, files = hashlib.sha256(), sorted(_PACKAGE.rglob("*.py"))
     for file in files:
         data = file.read_bytes()
@@ -339,7 +343,7 @@ def _machine() -> list[str]:
 
 @functools.cache
 def _versions() -> list[str]:
-    """Return the versions of all libraries that trace or compile programs."""
+    """Return the versions of Python and of all libraries that trace or compile programs."""
     packages = [f"{name} {metadata.version(name)}" for name in _PACKAGES]
     return [platform.python_implementation(), platform.python_version(), *packages]
 

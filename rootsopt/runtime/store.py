@@ -1,10 +1,9 @@
-"""Files of compiled programs: owned by the user, signed, and limited in size.
+"""Files of compiled programs: owned by the user, signed, and limited in total size.
 
-Programs read here are executed, so other users must not be able to change them. This holds for the
-folder, every file in it and every folder above. Each entry is signed together with its name and
+Programs read from these files are executed, so other users must not be able to change them. Nor may
+they change the folder or replace a folder above it. Each entry is signed together with its name and
 purpose, with a key in the user's own state folder. An entry that is damaged, unsigned or stored
-under another name is ignored.
-"""
+under another name is ignored."""
 
 import contextlib
 import hashlib
@@ -22,9 +21,9 @@ except ImportError:  # Windows
     fcntl = None
 
 MOST_BYTES = 200 * 2**20
-"""Total size (bytes) of all entries above which the least recently used are removed."""
+"""Total size (bytes) of all entries above which the least recently used entries are removed."""
 SUFFIX = ".program"
-"""Suffix of the names of entries. It distinguishes them from other files in the folder."""
+"""Suffix of the file names of entries. It distinguishes them from other files in the folder."""
 
 _KEY_NAME = "programs.key"
 _KEY_BYTES = 32
@@ -33,9 +32,7 @@ _MAC_BYTES = hashlib.sha256().digest_size
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _OTHERS_AT_ALL = stat.S_IRWXG | stat.S_IRWXO
 _NEW_SECONDS = 2.0
-"""Age (s) of an unfinished file below which the file is kept: its process may not have locked it
-yet.
-"""
+"""Age (s) of an unfinished file below which it is kept: its process may not have locked it yet."""
 # With these flags, a symbolic link is not followed and a named pipe does not block.
 _SAFELY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 _HAS_OWNERS = hasattr(os, "geteuid")
@@ -43,16 +40,17 @@ _IN_FOLDER = {os.open, os.unlink, os.stat, os.rename} <= os.supports_dir_fd
 
 
 class UnsafeFolderError(Exception):
-    """Raised if other users can change a folder. The message names the folder and the remedy."""
+    """Raised if other users can change or replace a folder.
+
+    The message names the folder and the remedy."""
 
 
 class Folder:
-    """A folder that belongs to the user. It is created if it does not exist, and kept open.
+    """A folder that belongs to the user, created if it does not exist, and kept open.
 
-    Files are opened through the folder's descriptor, because its path may point elsewhere later.
-    Raises `UnsafeFolderError` if other users own the folder or could write to it or replace it, and
-    `OSError` if the folder cannot be created or opened.
-    """
+    Files are opened through the folder's descriptor, because its path may lead to another folder
+    later. Raises `UnsafeFolderError` if other users own the folder, or could write to it or replace
+    it. Raises `OSError` if the folder cannot be created or opened."""
 
     def __init__(self, path: Path):
         try:
@@ -85,11 +83,13 @@ class Folder:
     def open(self, name: str, flags: int) -> int:
         """Open a file in the folder with the `flags` of `os.open`, and return its descriptor.
 
-        Only the user has access to a new file."""
+        A new file is accessible only to the user. Raises `OSError` if the file cannot be opened."""
         return os.open(self._at(name), flags | _SAFELY, 0o600, dir_fd=self._open)
 
     def stat(self, name: str) -> os.stat_result:
-        """Return the `os.stat` result of the file `name`; of a link itself, not of its target."""
+        """Return the `os.stat` result of the file `name`, or of the link itself if it is a link.
+
+        Raises `OSError` if there is no such file."""
         return os.stat(self._at(name), dir_fd=self._open, follow_symlinks=False)
 
     def exists(self, name: str) -> bool:
@@ -107,7 +107,7 @@ class Folder:
     def link(self, name: str, other: str) -> None:
         """Give the file `name` a second name, `other`.
 
-        Raises `FileExistsError` if a file `other` exists."""
+        Raises `FileExistsError` if a file called `other` exists."""
         os.link(self._at(name), self._at(other), src_dir_fd=self._open, dst_dir_fd=self._open)
 
     def replace(self, name: str, other: str) -> None:
@@ -119,11 +119,10 @@ class Folder:
         return os.listdir(self.path if self._open is None else self._open)
 
     def read(self, name: str, most: int, forbidden: int = _OTHERS_WRITE) -> bytes | None:
-        """Return the content of the regular file `name`, which must belong to the user.
+        """Return the content of the regular file `name`, or `None` if it cannot be trusted.
 
-        Return `None` if there is no such file, if it is larger than `most` bytes, or if it has one
-        of the `forbidden` permission bits.
-        """
+        `None` is returned if the file does not exist, belongs to another user, or is larger than
+        `most` bytes. It is also returned if the file has one of the `forbidden` permission bits."""
         try:
             file = self.open(name, os.O_RDONLY)
         except OSError:
@@ -146,11 +145,10 @@ class Folder:
 
     @contextlib.contextmanager
     def unfinished(self, name: str, data: bytes) -> Iterator[str]:
-        """Create a file with `data` and yield its temporary name, which contains `name`.
+        """Create a file with `data`, and yield its temporary name, which contains `name`.
 
-        On exit, remove the file unless it has been renamed. Until then it is locked, so that
-        `sweep` can distinguish it from a file that an ended process has left.
-        """
+        The file is locked during the `with` block, so that `sweep` can distinguish it from a file
+        left by an ended process. On exit, it is removed unless it has been renamed."""
         own = f".{name}.{secrets.token_hex(8)}"
         file = self.open(own, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
         try:
@@ -166,7 +164,9 @@ class Folder:
                 os.close(file)
 
     def sweep(self, middle: str) -> None:
-        """Remove unfinished files left by ended processes, if the file names contain `middle`."""
+        """Remove unfinished files that ended processes have left.
+
+        `middle`: only files whose names contain this text are removed."""
         for name in self.names():
             if not (name.startswith(".") and middle in name):
                 continue
@@ -184,11 +184,10 @@ class Folder:
 
 
 class Store:
-    """Signed entries in a folder.
+    """A folder `path` of signed entries.
 
-    Raises `UnsafeFolderError` if other users could change the entries or read the key, and
-    `OSError` if the folder cannot be used.
-    """
+    Raises `UnsafeFolderError` if other users could change the entries or read the key. Raises
+    `OSError` if the folder cannot be used."""
 
     def __init__(self, path: Path):
         self._folder = Folder(path)
@@ -210,9 +209,9 @@ class Store:
         return data
 
     def write(self, name: str, purpose: str, data: bytes) -> None:
-        """Write `data` as the entry `name`, completely or not at all, signed with its `purpose`.
+        """Write `data` as the entry `name`, completely or not at all.
 
-        Raises `OSError` if writing fails."""
+        The entry is signed together with its `purpose`. Raises `OSError` if writing fails."""
         signed = _HEADER + self._mac(name, purpose, data) + data
         target = name + SUFFIX
         with self._folder.unfinished(target, signed) as made:
@@ -227,7 +226,7 @@ class Store:
         return mac.digest()
 
     def _prune(self) -> None:
-        """Remove the least recently used entries until the rest take at most `MOST_BYTES`."""
+        """Remove the least recently used entries until the rest has at most `MOST_BYTES`."""
         kept = []
         for name in self._folder.names():
             # Only our own files: the folder may hold others.
@@ -245,7 +244,7 @@ class Store:
 
 
 def key_folder() -> Path:
-    """Return the folder of the signing key, in the user's state folder."""
+    """Return the path of the folder of the signing key, in the user's state folder."""
     import platformdirs
 
     return Path(platformdirs.user_state_dir("rootsopt", appauthor=False))
@@ -254,7 +253,8 @@ def key_folder() -> Path:
 def _key() -> bytes:
     """Return the user's signing key; create one if there is no valid key.
 
-    Raises `UnsafeFolderError` if the key cannot be stored where only the user has access."""
+    Raises `UnsafeFolderError` if the key cannot be stored in a place that only the user can access.
+    """
     path = key_folder()
     try:
         if not path.is_absolute():
@@ -299,7 +299,7 @@ def _there(folder: Folder) -> bool:
 
 
 def _make(path: Path) -> None:
-    """Create a folder and the missing folders above it, with access for the user only."""
+    """Create a folder and the missing folders above it, accessible only to the user."""
     missing = []
     while not os.path.lexists(path):
         missing.append(path)
@@ -310,9 +310,9 @@ def _make(path: Path) -> None:
 
 
 def _check(path: Path, found: os.stat_result) -> None:
-    """Raise `UnsafeFolderError` if other users own the folder, or can change or replace it.
+    """Raise `UnsafeFolderError` if other users own a folder, or could change or replace it.
 
-    `found`: `os.stat` result of the folder `path`."""
+    `path`: the folder; `found`: its `os.stat` result."""
     if not _HAS_OWNERS:
         return  # On such systems, folders below the user's home are the user's by default.
     me = os.geteuid()

@@ -13,9 +13,8 @@ import numpy as np
 def on_all_cores(work: Callable[..., Any], *arrays: Any) -> Any:
     """Return `work(*arrays)`, computed in parts along the leading axis (n,), one thread per core.
 
-    All arrays, and all arrays of the result, must have this leading axis. The parts have equal
-    size, so that they share a compiled program.
-    """
+    All arrays, and all arrays of the result, must have this leading axis. The parts are equal in
+    size, so that they share a compiled program."""
     count = arrays[0].shape[0]
     workers = max(1, min(os.cpu_count() or 1, count))
     size = -(-count // workers)

@@ -15,9 +15,9 @@ _COMPILE_EVENTS = (
 class CompileClock:
     """Context manager that measures the time spent on tracing, lowering and compiling.
 
-    JAX reports the duration of each step. Since steps overlap (programs compile in parallel, traces
-    are nested), `seconds` is the time during which at least one step was running.
-    """
+    JAX reports the duration of each of these steps. Steps overlap, because programs compile in
+    parallel and traces are nested. The clock therefore counts the time during which at least one
+    step was running."""
 
     def __init__(self) -> None:
         self._spans: list[tuple[float, float]] = []
@@ -25,7 +25,7 @@ class CompileClock:
 
     @property
     def seconds(self) -> float:
-        """Total time so far (s)."""
+        """Time measured so far (s)."""
         total, reached = 0.0, float("-inf")
         for begin, end in sorted(self._spans):
             total += max(0.0, end - max(begin, reached))
