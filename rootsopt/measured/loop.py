@@ -24,5 +24,5 @@ def signed_area(points: Complex128[np.ndarray, " n"]) -> float:
 
 
 def place(z: complex) -> str:
-    """Return a point x + iy (mm) as text for a message."""
+    """Format a point x + iy (mm) as text for a message."""
     return f"({z.real:.5g}, {z.imag:.5g}) mm"

@@ -12,7 +12,7 @@ from rootsopt.profiles.base import Profile, Segment
 
 
 class Arcs(Profile):
-    """An addendum of n circular arcs; its conjugate is the envelope on the partner.
+    """An addendum of n circular arcs; the dedendum is its envelope on the partner.
 
     On the arc with centre C and radius ρ, the point with normal direction ν is C + ρ n(ν). Its
     support function is C·n + ρ, and the lever of its normal is C × n. The normal meets the pitch
@@ -91,7 +91,9 @@ class Arcs(Profile):
         return tuple(parts)
 
     def _arc(self, nu):
-        """Return the index of the arc at `nu`; the first and last arcs extend beyond their ends."""
+        """Return the index of the arc that has the normal angle `nu` (rad).
+
+        Below the first joint and above the last, return the index of the first or the last arc."""
         return jnp.sum(nu[..., None] > self.joints[1:-1], axis=-1)
 
     def lever(self, nu):

@@ -14,7 +14,9 @@ def arc_involute(
     pressure_angle: Float[ArrayLike, ""],
     involute_length: Float[ArrayLike, ""],
 ) -> "CIC":
-    """Return a CIC rotor without a tip land: arc and involute. The arguments are those of `CIC`."""
+    """Return a CIC rotor without a tip land, whose addendum is an arc and an involute.
+
+    The arguments are those of `CIC`."""
     return CIC(lobes, pitch_radius, pressure_angle, involute_length, 0.0)
 
 
@@ -88,12 +90,14 @@ class CIC(Profile):
 
     def _arc_slide(self, turn):
         """Return the signed distance (m) from the pitch point to the arc's centre, along the
-        normal."""
+        normal.
+
+        `turn`: normal angle (rad) measured from the arc's start."""
         c, r = self.arc_center_radius, self.pitch_radius
         return c * jnp.cos(turn) - jnp.sqrt(r**2 - (c * jnp.sin(turn)) ** 2)
 
     def _arc_turn(self, nu):
-        """Return the normal angle (rad) from the arc's start, limited to the arc."""
+        """Return the normal angle `nu` (rad), clamped to the arc, minus that of the arc's start."""
         return jnp.clip(nu, self.tip_arc_angle, self.arc_end) - self.tip_arc_angle
 
     def roll_angle(self, nu):

@@ -20,9 +20,9 @@ def extended_cycloid(
     1278), whose own formulas were not available. λ0 = 1 gives EE. The outer radius is
     r + (1 + λ0) r_e.
 
-    The crossing is a cusp: dP/dθ vanishes in proportion to δ = π/2N - θ. Powers of δ are therefore
-    divided out of the terms of the normal. In the frame turned by θ, with w = e^{-2iNδ}, the normal
-    is (X δ + iY) / M, with M = |X δ + iY| and
+    The crossing is a cusp: dP/dθ vanishes in proportion to δ = π/2N - θ. The formula of the normal
+    is therefore divided by δ. In the frame turned by θ, with w = e^{-2iNδ}, the normal is (X δ +
+    iY) / M, with M = |X δ + iY| and
 
         X δ + iY = (r + r_e) (1 - λ w) / δ + i r_e w λ′ / δ.
 
