@@ -37,7 +37,7 @@ class Contacts:
     """Contacts at n rotations φ of rotor 1.
 
     `point` (n, 2): contact points (mm, fixed frame); `normal` (n, 2): unit normals from rotor 1 to
-    rotor 2; `present` (n,): mask of the rotations at which there is a contact.
+    rotor 2; `present` (n,): mask of the rotations at which the flanks are in contact.
     """
 
     point: NDArray[np.float64]
@@ -49,7 +49,7 @@ class Contacts:
 def _rolling(profile, roll):
     """Return (pressure angles (rad), signed distances from the pitch point (m)) of contacts.
 
-    `roll` (n,): roll angles of the flank (rad)."""
+    `roll` (n,): roll angles (rad) of the contacts on the flank."""
     half = profile.half_pitch
     beyond = roll > half
     point = profile.addendum(profile.normal_at(jnp.where(beyond, 2 * half - roll, roll)))
@@ -62,8 +62,8 @@ def rolling_contacts(
     """Return the contacts of the drive (or `coast`) flanks in perfect rolling.
 
     `rotation` (n,): rotations φ of rotor 1 (rad). A drive flank is in contact while its roll angle
-    β = -φ is between 0 and π/N, once in every lobe pitch. At other rotations, the contact at the
-    nearer end of this range is returned, marked as not present. The contact point is
+    β = -φ is between 0 and π/N, once in every lobe pitch. At other rotations, the result holds the
+    contact at the nearer end of this range, marked as not present. The contact point is
     (r + s sin ψ, s cos ψ) and the normal is (sin ψ, cos ψ), with the pitch radius r, the pressure
     angle ψ and the distance s from the pitch point. The contact of a coast flank is the mirror
     image in the line of centres, with β = φ.
@@ -102,9 +102,9 @@ def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
 def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: int) -> bytes:
     """Return the content of a GIF of a simulated motion over `periods` mesh periods.
 
-    `periods` is limited to 4 and to the length of `series`. The GIF shows the contacts, and the
-    force over the rotation. An arrow's length is proportional to the largest force in the time
-    interval of its frame.
+    `periods` is limited to 4 and to the length of `series`. The GIF shows the contacts, and a graph
+    of the force over the rotation. An arrow's length is proportional to the largest force in the
+    time interval of its frame.
     """
     pitch = 2 * np.pi / profile.lobes
     whole = max(1, round(float(np.ptp(series.rotation)) / pitch))
@@ -157,7 +157,7 @@ def _force_panel(ax: Axes, series: Series, samples: int):
 
 
 class _Arrow:
-    """A point that marks the contact, and an arrow for its force, on one kind of flank."""
+    """Draws the contact point of the drive or coast flanks, and an arrow for its force."""
 
     def __init__(self, ax: Axes, color: str, longest: float):
         self.longest = longest

@@ -18,7 +18,7 @@ FORMATS = {
     "stl": "rotor.stl and pair.stl, triangles (needs the [cad] extra)",
     "gif": "figures/meshing.gif, the pair in motion with contact and force",
 }
-"""Formats, each with the files that are written and what they contain. Lengths are in mm."""
+"""Help text of each format: the files that are written and their content. Lengths are in mm."""
 _SOLID = ("step", "stl")
 
 
@@ -37,7 +37,7 @@ def add_option(parser: argparse.ArgumentParser, default: str) -> None:
 def chosen(text: str) -> tuple[str, ...]:
     """Return the formats named in `text`, the value of `--export`.
 
-    Raises `InputError` if a format is unknown, or if it is a solid and the CAD kernel is not
+    Raises `InputError` if a format is unknown, or if it needs the CAD kernel and the kernel is not
     installed.
     """
     names = tuple(name.strip() for name in text.lower().split(",") if name.strip())
@@ -109,9 +109,10 @@ def write(
 def write_simulated(
     folder: "ResultFolder", config: "Config", formats: Sequence[str], evaluation: "Evaluation"
 ) -> list[str]:
-    """Write drawings of a simulated design as `write` does; return the names of the files.
+    """Write drawings of a simulated design and return the names of the files.
 
-    The GIF shows the simulated motion. If `evaluation` has no motion, no GIF is written."""
+    `formats`: as in `write`; `evaluation`: result of the simulation. The GIF shows the simulated
+    motion. If `evaluation` has no motion, no GIF is written."""
     series = evaluation.series
     if series is None:
         formats = tuple(name for name in formats if name != "gif")
@@ -120,9 +121,9 @@ def write_simulated(
 
 
 def _solids(drawing, formats, place) -> dict[str, bytes]:
-    """Return the contents of the STEP and STL files by file name. Each solid is made only once.
+    """Return the contents of the STEP and STL files, keyed by file name.
 
-    `place`: folder for temporary files."""
+    `place`: folder for temporary files. The solid of each shape is made only once."""
     import math
 
     from rootsopt.export import solid

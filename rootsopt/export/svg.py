@@ -10,7 +10,7 @@ _STYLE = (
     ".pitch{fill:none;stroke:#0072b2;stroke-width:.25;stroke-dasharray:6 1.5 .5 1.5}"
     ".center{fill:none;stroke:#808080;stroke-width:.25;stroke-dasharray:9 1.5 2 1.5}"
 )
-"""Style sheet; widths and dashes in mm."""
+"""Style sheet of the drawing. Line widths and dash lengths are in mm."""
 
 
 def svg_text(drawing: Drawing) -> str:

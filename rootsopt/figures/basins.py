@@ -24,7 +24,7 @@ _PANELS = 6
 
 
 def plot_basins(ax: Axes, basins: Basins) -> Axes:
-    """Draw a map that shows to which motion each initial state leads.
+    """Draw a map of the initial states, coloured by the motion to which each leads.
 
     Points mark the state of each motion at the start of every mesh period."""
     colors = [_LOST, *_colors(basins)]
@@ -118,7 +118,7 @@ def _pale(color: str) -> str:
 def basin_figures(folder: ResultFolder, basins: Basins, config: Config) -> list[str]:
     """Write basins.png; return the names of the files written.
 
-    Only the motions with the largest shares get a panel that shows their force."""
+    The contact force is shown only for the motions to which the most initial states lead."""
     pairs = list(zip(basins.attractors, _colors(basins), strict=True))
     shown = [(one, color) for one, color in pairs if one.evaluation.series is not None][:_PANELS]
     made = Figure(figsize=(13, 6.6), layout="constrained")

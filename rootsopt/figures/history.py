@@ -58,7 +58,7 @@ def _label(key: str) -> str:
 def _traces(ax, rows, key):
     """Draw each entry of the list-valued parameter `key` over the evaluations of a local search.
 
-    For rows of the screening, draw nothing."""
+    `rows`: rows of the history. If they belong to the screening, nothing is drawn."""
     rows = [row for row in rows if _start(row) >= 0]
     if not rows:
         return
@@ -94,7 +94,7 @@ def _start(row) -> int:
 
 
 def _trace(ax, rows, key, style):
-    """Draw the values of `key` over the evaluations; hollow markers mean a violated constraint."""
+    """Draw the values of `key` over the evaluations, hollow where a constraint is violated."""
     x, y = _values(rows, "evaluation"), _values(rows, key)
     met = np.asarray([bool(row.get("feasible", True)) for row in rows])
     ax.plot(x, y, **(style | {"marker": "", "label": None}), alpha=0.6)
@@ -109,7 +109,7 @@ def _values(rows, key) -> NDArray[np.float64]:
 
 
 def _best(axes, keys, history):
-    """Draw the best objective so far as a line, and mark the best design with a star.
+    """Draw the best objective so far as a line, and mark the best design with a star in each panel.
 
     The panels of list-valued parameters have no star."""
     x, best = [row["evaluation"] for row in history], _values(history, "best_objective")

@@ -1,4 +1,4 @@
-"""Certificate of an optimum: convergence of the local searches, and the price of each limit."""
+"""Figures of an optimum: convergence of the local searches, and what relaxing each limit gains."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -38,7 +38,7 @@ def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: floa
 
 
 def plot_prices(ax: Axes, constraints: Sequence[Mapping[str, Any]]) -> Axes:
-    """Draw the gain in the objective (%) from relaxing each limit by its step, as bars.
+    """Draw bars of the gain in the objective (%) from relaxing each limit by one step.
 
     `constraints`: rows of the result file; those without a multiplier are left out."""
     rows = [row for row in constraints if abs(row.get("multiplier") or 0.0) > 0]

@@ -43,7 +43,7 @@ def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, A
 
 
 def simulation_figures(folder: ResultFolder, evaluation: Evaluation, config: Config) -> list[str]:
-    """Write the figures of one evaluation, of profile and force; return the file names."""
+    """Write the figures of the profile and the force of one evaluation; return the file names."""
     names = profile_figures(folder, config, evaluation.record())
     return names + _force_figures(folder, {config.profile.family.upper(): evaluation}, config)
 
@@ -77,7 +77,7 @@ def certificate_figure(
     constraints: Sequence[Mapping[str, Any]],
     required: float,
 ) -> str:
-    """Write optimum.png: convergence and price of each limit; return its name.
+    """Write optimum.png, the figures of `rootsopt.figures.optimum`; return its name.
 
     `required`: first-order residual of an optimum."""
     made, axes = figure(11, 4.2, 1, 2)

@@ -50,8 +50,7 @@ _GAUSS = np.polynomial.legendre.leggauss(12)
 
 @dataclasses.dataclass(frozen=True)
 class _Flank:
-    """A flank in the frame of its lobe, with the tip on +x. A trailing flank is stored as its
-    mirror image.
+    """A flank in the frame of its lobe, with the tip on +x; a trailing flank is mirrored.
 
     `curve`: curve of the flank (mm); `tip`, `pitch`, `root`: the curve's parameters at the tip, the
     pitch circle and the root; `off`: RMS distance of the points from the curve (mm), 0 without

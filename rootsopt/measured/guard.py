@@ -31,8 +31,7 @@ def short(value: object, width: int = 60) -> str:
 
 @contextlib.contextmanager
 def silenced() -> Iterator[None]:
-    """Suppress a library's log records and warnings, including those of floating-point arithmetic.
-    """
+    """Suppress a library's log records and warnings in the `with` block, also those of NumPy."""
     logger = logging.getLogger(_LOGGER)
     level = logger.level
     if level > logging.CRITICAL:  # Nested: entering again is slow for thousands of entities.

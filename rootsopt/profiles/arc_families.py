@@ -65,15 +65,14 @@ def arcs_epicycloid(
     tip_arc_angle: Float[ArrayLike, ""],
     edge_radius: Float[ArrayLike, ""],
 ) -> Arcs:
-    """Return a lobe made from a single arc, cut off by a tip land and rounded at the edge between
-    them.
+    """Return a lobe of a single arc, cut off by a tip land with rounded edges.
 
     `lobes`: N; `pitch_radius`: r (m). The single arc is that of `arc`: its centre is at the
     distance `arc_center` b (m) from the axis, and its radius is ρ. The land has the half angle
-    `tip_arc_angle` θ1 (rad). The edge is an arc of radius `edge_radius` e (m), tangent to both. The
-    edge's centre lies on the ray θ1 at the distance d = b cos θ1 ± √((ρ - e)² - b² sin² θ1) from
-    the axis. The sign is + for e < ρ. For e > ρ it is -, and the outline turns back. The outer
-    radius is d + e.
+    `tip_arc_angle` θ1 (rad). The edge between arc and land is an arc of radius `edge_radius` e (m),
+    tangent to both. The edge's centre lies on the ray θ1 at the distance d = b cos θ1 ± √((ρ - e)²
+    - b² sin² θ1) from the axis. The sign is + for e < ρ. For e > ρ it is -, and the outline turns
+    back. The outer radius is d + e.
 
     The centre of the edge traces an extended epicycloid on the partner. The edge generates the
     parallel curve at the distance e from this epicycloid. The parallel curve joins the conjugates

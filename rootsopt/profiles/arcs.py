@@ -12,7 +12,7 @@ from rootsopt.profiles.base import Profile, Segment
 
 
 class Arcs(Profile):
-    """An addendum of n circular arcs; the dedendum is its envelope on the partner.
+    """An addendum of n circular arcs, with its envelope on the partner as the conjugate dedendum.
 
     On the arc with centre C and radius ρ, the point with normal direction ν is C + ρ n(ν). Its
     support function is C·n + ρ, and the lever of its normal is C × n. The normal meets the pitch

@@ -162,8 +162,9 @@ class Profile(eqx.Module):
         return _inverse(self, roll_angle)
 
     def lever(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the moment arm r cos ψ (m) of the contact normal at `nu` (rad) about the rotor's
-        axis."""
+        """Return the moment arm r cos ψ (m) of the contact normal about the rotor's axis.
+
+        `nu`: normal angle (rad)."""
         return self.pitch_radius * jnp.sin(nu - self.roll_angle(nu))
 
     def support(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -174,12 +175,12 @@ class Profile(eqx.Module):
         return arm + self.contact_distance(nu)
 
     def mate(self, nu: Float[Array, "*n"], support: bool = True) -> Mate:
-        """Return the point of the partner that meshes with the addendum point at normal angle `nu`
-        (rad).
+        """Return the point of the partner that meshes with an addendum point.
 
-        If `nu` exceeds `pitch_normal`, the partner's point lies on its addendum. It is then the
-        point with normal angle 2 `pitch_normal` - `nu`. `support`: whether to compute the support
-        function, which is otherwise 0."""
+        `nu`: normal angle (rad) of the addendum point. If `nu` exceeds `pitch_normal`, the
+        partner's point lies on its addendum. It is then the point with normal angle 2
+        `pitch_normal` - `nu`. `support`: whether to compute the support function, which is
+        otherwise 0."""
         pitch = self.pitch_normal
         beyond = nu > pitch
         nu = jnp.where(beyond, 2 * pitch - nu, nu)
@@ -196,8 +197,7 @@ class Profile(eqx.Module):
 
     @property
     def conjugate(self) -> bool:
-        """Whether the construction makes the flanks touch throughout the mesh in perfect rolling.
-        """
+        """Whether the flanks are designed to touch throughout the mesh in perfect rolling."""
         return True
 
     @property
@@ -231,8 +231,7 @@ class Profile(eqx.Module):
 
     @property
     def half_pitch(self) -> float:
-        """Angle π/2N (rad), seen from the axis, between a lobe's axis and the pitch crossing of its
-        flank."""
+        """Polar angle π/2N (rad) between a lobe's axis and the pitch crossing of its flank."""
         return jnp.pi / (2 * self.lobes)
 
     @property
@@ -285,11 +284,11 @@ class Profile(eqx.Module):
         return self.speeds(nu)[1]
 
     def dedendum_speed(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the arc length of the dedendum per normal angle `nu` of the partner's addendum
-        (m/rad).
+        """Return the arc length of the dedendum per normal angle of the partner's addendum (m/rad).
 
-        On an involute or land this is the tangential speed r sin ψ + s (1 - ψ′) of the contact
-        point per roll angle. Zero means a cusp, and a negative value means undercut.
+        `nu`: normal angle (rad) of the partner's addendum. On an involute or land this is the
+        tangential speed r sin ψ + s (1 - ψ′) of the contact point per roll angle. Zero means a
+        cusp, and a negative value means undercut.
         """
         return self.speeds(nu)[2]
 
@@ -302,11 +301,11 @@ class Profile(eqx.Module):
 
 
 def _inverse(profile: Profile, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return the greatest normal angle (rad) at this `roll_angle` (rad), by safeguarded Newton
-    steps.
+    """Return the greatest normal angle (rad) at a `roll_angle` (rad), found numerically.
 
-    The search is not differentiated. The plain Newton steps after it carry the derivatives with
-    respect to roll angle and design. They also continue the flank analytically beyond its ends."""
+    The search uses safeguarded Newton steps and is not differentiated. The plain Newton steps after
+    it carry the derivatives with respect to roll angle and design. They also continue the flank
+    analytically beyond its ends."""
     fixed, want = jax.tree.map(lax.stop_gradient, (profile, roll_angle))
 
     def rolled(profile, nu):

@@ -89,8 +89,7 @@ class CIC(Profile):
         return (land, *self._cut(arc, self.tip_arc_angle + jnp.pi / 2), involute)
 
     def _arc_slide(self, turn):
-        """Return the signed distance (m) from the pitch point to the arc's centre, along the
-        normal.
+        """Return the signed distance (m) from pitch point to arc centre, along the normal.
 
         `turn`: normal angle (rad) measured from the arc's start."""
         c, r = self.arc_center_radius, self.pitch_radius

@@ -146,8 +146,7 @@ class Curve(Profile):
         return psi
 
     def _support(self, k, away):
-        """Return the support function (m) at `away` (rad) in normal angle from the node with index
-        `k`.
+        """Return the support function (m), with the same arguments as `_psi`.
 
         The slope -r cos ψ is integrated, starting with the node's value."""
         shares, weights = (jnp.asarray(part, away.dtype) for part in _GAUSS)

@@ -67,8 +67,9 @@ class FreeForm(Profile):
     beyond: Float[Array, " k"]
 
     def __init__(self, lobes, pitch_radius, tip_arc_angle, coefficients):
-        """Build the rotor from `lobes` N, the scalars `pitch_radius` r (m) and `tip_arc_angle` θ1
-        (rad), and `coefficients` (n,)."""
+        """Build the rotor from `lobes` N, two scalars and `coefficients` (n,).
+
+        The scalars are `pitch_radius` r (m) and `tip_arc_angle` θ1 (rad)."""
         self.lobes = lobes
         r = self.pitch_radius = jnp.asarray(pitch_radius)
         self.tip_arc_angle = jnp.asarray(tip_arc_angle)
@@ -119,14 +120,14 @@ class FreeForm(Profile):
         return span, x - span
 
     def _psi(self, span, share):
-        """Return ψ (rad) in the knot span with index `span`, at the fraction `share` of the span.
-        """
+        """Return ψ (rad) in the knot span with index `span`, at the fraction `share` of it."""
         c = jnp.moveaxis(self.turn[span], -1, 0)
         return c[0] + share * (c[1] + share * (c[2] + share * c[3]))
 
     def _within(self, span, share):
-        """Return ∫ r cos ψ dν (m) over the knot spans with index `span`, from the fraction `share`
-        to 1."""
+        """Return ∫ r cos ψ dν (m) over a knot span, from the fraction `share` of it to its end.
+
+        `span`: index of the knot span."""
         nodes, weights = (jnp.asarray(x, self.width.dtype) for x in (_NODES, _WEIGHTS))
         rest = (1 - share)[..., None]
         at = share[..., None] + rest * (1 + nodes) / 2
@@ -160,8 +161,10 @@ class FreeForm(Profile):
         want = roll_angle - starts[span]
 
         def short(c, width, want, share):
-            """Return (β minus the required β (rad) at the fraction `share` of a span, its
-            derivative)."""
+            """Return (β minus the required β (rad) at a fraction of a span, its derivative).
+
+            `share`: the fraction of the span.
+            """
             rise = share * (width + c[1] + share * (c[2] + share * c[3]))
             slope = width + c[1] + share * (2 * c[2] + 3 * share * c[3])
             return rise - want, jnp.maximum(slope, _FLAT * width)
@@ -231,11 +234,11 @@ def _integrals(count: int):
 
 @functools.cache
 def _powers(count: int) -> NDArray[np.float64]:
-    """Return the coefficients (spans, 3, count) of `count` B-splines in powers of the fraction of a
-    span.
+    """Return the coefficients (spans, 3, count) of `count` B-splines in each knot span.
 
-    The Cox-de Boor recursion on polynomials gives the coefficients. Knots are the ends of the
-    spans; the first and the last knot are repeated."""
+    The coefficients multiply powers of the fraction of the span. They follow from the Cox-de Boor
+    recursion on polynomials. Knots are the ends of the spans; the first and the last knot are
+    repeated."""
     spans = count - _DEGREE
     knots = np.clip(np.arange(-_DEGREE, spans + _DEGREE + 1.0), 0, spans)
     basis = np.zeros((spans, _DEGREE + 1, count + _DEGREE))

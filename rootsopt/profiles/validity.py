@@ -15,8 +15,7 @@ _POINTS = 400
 
 
 class Margins(NamedTuple):
-    """Margins of a flank. Each is a least value along the flank, and is not negative if the profile
-    is sound.
+    """Margins of a flank: least values of nine quantities, none negative on a sound profile.
 
     `turning`: range of normal angles of a segment (rad), negative where joints are out of order.
     `convexity`: radius of curvature of the addendum (m).

@@ -1,7 +1,8 @@
 """The scene: everything that is simulated except the design. It builds a rotor pair from a design.
 
 A design is a vector of the config's design parameters, in the config's own units. Gradients are
-therefore per config unit. A family without parameters (EE) has an empty design.
+therefore derivatives with respect to config units. A family without parameters (EE) has an empty
+design.
 """
 
 import dataclasses
@@ -46,20 +47,20 @@ from rootsopt.scene import families, reading
 class Scene(eqx.Module):
     """Everything except the design, in SI units: builds a rotor pair from a design.
 
-    Physical quantities are leaves, with respect to which responses are differentiable. Choices are
-    static, so that one compiled program serves all scenes with the same choices.
+    Physical quantities are arrays, and responses are differentiable with respect to them. Choices
+    are static fields, so that one compiled program serves all scenes with the same choices.
 
     `family`, `lobes`, `pitch_radius` (m): profile; `design_size`: number d of its parameters.
     `fidelity`, `map_size`, `nodes`: contact model and its resolution.
-    `precision`: number type of the integration; `solver`: solver for the steady motion.
-    `straight`: whether the rotors have no helix.
+    `precision`: number type of the integration; `solver`: solver for the steady motion. `straight`:
+    whether the rotors have no helix.
     `length` (m), `density` (kg/m³), `bore_radius` (m, `None`: no bore): body of a rotor.
     `law`, `clearance` (m): contact law, and distance added to every flank gap.
     `speed` (rad/s), `load_torque` (N·m), `pressure` (Pa, `None`: constant torque): operation.
     `gear`, `gear_damping_ratio`, `motor`, `friction`, `supports`: optional parts.
     `deepest`: relative rotation (rad, negative) down to which a contact map must extend.
-    `center_distance_error`: centre distance minus twice the pitch radius (m), or `None`.
-    `outline`: profile read from a file, or `None`; `extra`: further parts.
+    `center_distance_error`: centre distance minus twice the pitch radius (m), or `None`. `outline`:
+    profile read from a file, or `None`; `extra`: further parts.
     """
 
     family: str = eqx.field(static=True)
@@ -153,7 +154,7 @@ class Scene(eqx.Module):
     def two_sided(self) -> bool:
         """Whether drive and coast flanks may touch at the same time.
 
-        This is the case if the axes can leave the nominal centre distance or the flanks are not
+        They may do so if the axes can leave the nominal centre distance or the flanks are not
         conjugate.
         """
         odd = self.supports, self.center_distance_error, self.outline
@@ -161,10 +162,10 @@ class Scene(eqx.Module):
         return moved or any(part is not None for part in odd)
 
     def with_parts(self, *parts: Part) -> "Scene":
-        """Return this scene with further `parts`; their states come last in the state of a motion.
+        """Return this scene with further `parts`.
 
-        Numbers in the parts' fields become arrays, so that responses are differentiable with
-        respect to them."""
+        The states of these parts come last in the state of a motion. Numbers in the parts' fields
+        become arrays, so that responses are differentiable with respect to them."""
         return dataclasses.replace(self, extra=(*self.extra, *_as_arrays(parts)))
 
     def with_law(self, law: ContactLaw) -> "Scene":
@@ -196,7 +197,9 @@ class Scene(eqx.Module):
         return SearchContact.of(profile, distance, two_sided=True)
 
     def _drive(self, load: Load) -> Drive:
-        """Return the drive. A motor for which no torque is given gets the torque of the load."""
+        """Return the drive of a pair under `load`.
+
+        If the motor has no torque of its own, it gets the torque of the load."""
         motor = self.motor
         if motor is None:
             return PrescribedDrive(self.speed)
