@@ -222,8 +222,9 @@ class FlankPair(eqx.Module):
     ) -> Float[Array, " s"]:
         """Return numbers (s,) that are positive where the flags of `switches` are set.
 
-        `rival`: gap (m) of the other minimum next to a cusp. The flag for a common normal gets 1 or
-        -1, because it changes only where the flanks are apart."""
+        `roll`, `found`: as in `switches`; `rival`: gap (m) of the other minimum next to a cusp. The
+        flag for a common normal gets 1 or -1, because it changes only where the flanks are apart.
+        """
         ends = jnp.stack([segment.stop for segment in self.profile.segments()[:-1]] or [0.0])
         normals = jnp.stack([found.normal1, found.normal2])
         beyond = (normals[:, None] - ends).ravel()
@@ -235,7 +236,7 @@ class FlankPair(eqx.Module):
 
     @eqx.filter_jit  # so that all its calls in one program are traced once
     def _closest(self, roll, relative) -> ClosestApproach:
-        """Return the closest approach for a folded `roll`, with rules for its derivatives.
+        """Return the closest approach for a `roll` from `folded`, with rules for its derivatives.
 
         With θ the pose and the design, dG = ∂G/∂θ dθ at the root held fixed (envelope
         theorem) and dν2 = -(∂T/∂θ dθ) / (∂T/∂ν2) (implicit function theorem). The rule is
@@ -281,13 +282,15 @@ class FlankPair(eqx.Module):
         """Return (support function at rotor 1's point (m), at rotor 2's point (m), cosine).
 
         The cosine is the component of the common normal along the line of centres. `normal1`,
-        `normal2`: ν1 and ν2 (rad); `roll`: folded x; `relative`: ε (rad)."""
+        `normal2`: ν1 and ν2 (rad); `roll`: x (rad) from `folded`; `relative`: ε (rad)."""
         mate = self.profile.mate(normal2)
         direction = mate.facing + roll - relative / 2
         return self.profile.support(normal1), mate.support, jnp.cos(direction)
 
     def _mesh(self, normal2, roll, relative):
-        """Return (T, G, ν1, q1, q2) at ν2 = `normal2`, as defined in the module's docstring."""
+        """Return (T, G, ν1, q1, q2) at ν2 = `normal2`, as defined in the module's docstring.
+
+        `roll`: x (rad) from `folded`; `relative`: ε (rad)."""
         profile = self.profile
         mate = profile.mate(normal2)
         normal1 = mate.facing + 2 * roll
@@ -299,20 +302,22 @@ class FlankPair(eqx.Module):
         return offset, gap, normal1, lever1, mate.lever
 
     def _offset(self, normal2, roll, relative):
-        """Return T (m) at ν2 = `normal2`, without the other results of `_mesh`."""
+        """Return the tangential offset T (m) for the arguments of `_mesh`."""
         mate = self.profile.mate(normal2, support=False)
         reach = self.center_distance * jnp.sin(mate.facing + roll - relative / 2)
         return reach - self.profile.lever(mate.facing + 2 * roll) - mate.lever
 
     def _search(self, roll, relative, attempt=0):
-        """Return (number of attempts, closest approach) at a folded `roll`.
+        """Return (number of attempts, closest approach) at x = `roll` (from `folded`), ε =
+        `relative`.
 
-        Attempt 0 is Newton's method from the point of perfect rolling. If its result is not
-        reliable, attempts 1 and 2 follow. They search the last and the first interval of nodes
-        where T falls through zero. These intervals contain the two minima that the gap may have
-        next to a cusp, or if the centre distance is not nominal. The deeper minimum is returned. If
-        the flanks are not conjugate, the gap may have more minima. The attempts then search the two
-        intervals with the least gap. All attempts share one loop, which is compiled once.
+        `attempt`: first attempt. Attempt 0 is Newton's method from the point of perfect rolling. If
+        its result is not reliable, attempts 1 and 2 follow. They search the last and the first
+        interval of nodes where T falls through zero. These intervals contain the two minima that
+        the gap may have next to a cusp, or if the centre distance is not nominal. The deeper
+        minimum is returned. If the flanks are not conjugate, the gap may have more minima. The
+        attempts then search the two intervals with the least gap. All attempts share one loop,
+        which is compiled once.
         """
         nothing = jnp.zeros_like(roll)
         none = ClosestApproach(
@@ -390,7 +395,7 @@ class FlankPair(eqx.Module):
         return (low, high), low + (high - low) * share, present, single
 
     def _root(self, bracket, guess, guarded, roll, relative):
-        """Return (root of T by Newton's method from `guess`, whether the method converged).
+        """Return (root ν2 (rad) of T, whether Newton's method from `guess` has converged to it).
 
         `guarded`: whether T falls through zero in the bracket. The bracket then shrinks around the
         root, and is halved if Newton's step leaves it or is longer than half the previous step.
@@ -425,7 +430,8 @@ class FlankPair(eqx.Module):
 
 
 def _search_one_by_one(pair: FlankPair, roll, relative):
-    """Return the closest approach at a folded `roll`, from a search without derivatives.
+    """Return the closest approach, without derivatives, at x = `roll` (from `folded`), ε =
+    `relative`.
 
     On a CPU, the poses of a batch are searched one by one. A single pose rarely needs the nodes,
     but a batch searched as a whole nearly always does."""

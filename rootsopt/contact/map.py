@@ -49,7 +49,7 @@ def continued_gap(
 def _interpolation_matrix(count: int) -> NDArray[np.float64]:
     """Return the matrix (count + 2, count) that computes the coefficients of a cubic B-spline.
 
-    It multiplies the values at `count` uniform knots. The ends are not-a-knot."""
+    The matrix multiplies the values at `count` uniform knots. The end conditions are not-a-knot."""
     system = np.zeros((count + 2, count + 2))
     for i in range(count):
         system[i + 1, i : i + 3] = [1 / 6, 4 / 6, 1 / 6]

@@ -36,9 +36,9 @@ def signed_distance(nodes: Points, outline: Points, refine: bool = True) -> NDAr
     """Return the signed distance (n,) from `nodes` to a closed counter-clockwise `outline`.
 
     The distance is positive outside, in the unit of `nodes` (n, 2) and `outline` (m, 2). Without
-    `refine`, measure to the nearest straight segment (Eq. 9). With `refine`, a cubic through the
-    segment's two ends, with the outline's own tangents, replaces that segment. The error is then of
-    fourth order in the node spacing, not second.
+    `refine`, the distance is that from the nearest straight segment (Eq. 9). With `refine`, a cubic
+    through the segment's two ends, with the outline's own tangents, replaces that segment. The
+    error is then of fourth order in the node spacing, not second.
     """
     corners = outline[:-1] if np.allclose(outline[0], outline[-1], atol=0) else outline
     count = len(corners)
@@ -73,7 +73,8 @@ def _tangents(corners):
 def _project(nodes, corners, start, stop, tangents):
     """Return (foot points of `nodes` on segments of the outline, tangents of the curve there).
 
-    `start`, `stop`: indices of the ends of the segment for each node; `tangents`: see `_tangents`.
+    `corners`: nodes of the outline; `start`, `stop`: indices of the ends of the segment for each
+    node; `tangents`: see `_tangents`, `None` for straight segments.
     """
     a = corners[start]
     chord = corners[stop] - a

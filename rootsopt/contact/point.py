@@ -27,7 +27,7 @@ def contact_point(
 ) -> ContactPoint:
     """Return position and direction of a contact, given the closest approach `found`.
 
-    `pair`: the flanks; `roll`, `relative`: x and ε (rad) at which `found` was found."""
+    `pair`: the flanks; `roll`, `relative`: x and ε (rad) at which `found` was computed."""
     folded, mirrored = pair.folded(roll)
     support1, support2, radial = pair.reach(found.normal1, found.normal2, folded, relative)
     return ContactPoint(

@@ -156,9 +156,9 @@ def _facing(
     """Return (signed distance (m), segment index) of each point from the segment that faces it.
 
     Where no segment faces a point, the distance is inf. The segment is found by bisection over the
-    nodes. A point near the flank is ahead of all bisectors on the tip's side of its segment, and
-    behind all others. This holds because the chord between any two nodes of a flank stays within a
-    right angle of the tangents at both.
+    nodes. Bisection works because a point near the flank is ahead of all bisectors on the tip's
+    side of its segment, and behind all others. The reason is that the chord between any two nodes
+    of a flank stays within a right angle of the tangents at both.
     """
     x, y = points[:, 0], points[:, 1]
     offset = jnp.sum(nodes * tangent, axis=1)

@@ -157,8 +157,8 @@ class _Look:
 def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
     """Return a design near `start` that locally minimises `_Seen.fault`.
 
-    The search is a sequence of linear programs. Each finds the step that is best to first order,
-    with a limited size relative to `width`. `width` (d,): widths of the parameters' usual ranges.
+    The search is a sequence of linear programs. Each finds the step that is best to first order
+    within a trust region. `width` (d,): widths of the parameters' usual ranges.
     """
     design, size = start, _LONGEST
     for _ in range(_PROGRAMS):

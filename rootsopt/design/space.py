@@ -36,8 +36,8 @@ _SOUND = (
     ("tangents clear of the axis", "star", "mm", 0.0, MM, MM),
     ("root radius", "root", "mm", 0.0, MM, MM),
 )
-"""Constraints that keep a profile sound, in addition to the constraint on the undercut margin. Each
-row lists the fields in the comment above."""
+"""Constraints that keep a profile sound, in addition to the constraint on the undercut margin. The
+columns are name, margin, unit, limit, scale and factor (see `Constraint`)."""
 
 
 class Constraint(eqx.Module):
@@ -88,7 +88,7 @@ class Space(eqx.Module):
         """Return the design space of a config.
 
         `scene`: scene of the config; `area_efficiency`: area efficiency of the baseline design,
-        which is the limit if the config says so. Raises `InputError` if the config's bounds are
+        used if the config's limit is `baseline`. Raises `InputError` if the config's bounds are
         impossible."""
         limits, family = config.constraints, family_of(config.profile.family)
         rows = bounds_of(config)

@@ -320,8 +320,7 @@ class _Stretch:
 
 
 def _merged(pieces: list[DrawnPiece], tolerance: float) -> list[DrawnPiece]:
-    """Return the pieces after joining adjacent arcs of the same circle, also across the outline's
-    start.
+    """Return the pieces with adjacent arcs of the same circle joined, also across the start.
 
     `tolerance`: difference between two circles (mm) above which their arcs are not joined."""
     merged: list[DrawnPiece] = []

@@ -29,7 +29,8 @@ def plot_history(
     `keys`: names of the design parameters; `axes`: a panel for the objective, followed by one for
     each key. `history`: one row per evaluation. A row whose `start` is absent or negative belongs
     to the screening. The entries of a list-valued parameter share one panel, which omits the
-    screening. Crosses at the top mark unusable designs, whose objective is not finite.
+    screening. Crosses at the top mark unusable designs, whose objective is not finite. The result
+    is `axes`.
     """
     keys = ("objective", *keys)
     for ax, key in zip(axes, keys, strict=True):
@@ -94,7 +95,9 @@ def _start(row) -> int:
 
 
 def _trace(ax, rows, key, style):
-    """Draw the values of `key` over the evaluations, hollow where a constraint is violated."""
+    """Draw the values of `key` over the evaluations in `rows`.
+
+    A marker is hollow if the design violates a constraint. `style`: style of the line."""
     x, y = _values(rows, "evaluation"), _values(rows, key)
     met = np.asarray([bool(row.get("feasible", True)) for row in rows])
     ax.plot(x, y, **(style | {"marker": "", "label": None}), alpha=0.6)

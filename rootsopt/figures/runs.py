@@ -79,7 +79,7 @@ def certificate_figure(
 ) -> str:
     """Write optimum.png, the figures of `rootsopt.figures.optimum`; return its name.
 
-    `required`: first-order residual of an optimum."""
+    `history`, `required`: as in `plot_residual`; `constraints`: as in `plot_prices`."""
     made, axes = figure(11, 4.2, 1, 2)
     plot_residual(axes[0, 0], history, required)
     plot_prices(axes[0, 1], constraints)

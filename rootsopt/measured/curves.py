@@ -20,13 +20,13 @@ from rootsopt.measured.guard import guarded
 _TURNING = 0.3
 """Length (pitch radii) that contributes as much to a curve's parameter as a turn of 1 rad."""
 _JUMP, _ABOVE = 0.02, 20.0
-"""Two limits on the change of curvature at a point. If both are exceeded, the point becomes a
-joint. The first is a fraction of the sum of the curvatures (absolute values) on both sides. The
-second is a multiple of the median change at the surrounding points."""
+"""Limits above which a change of curvature at a point makes this point a joint. Both must be
+exceeded. `_JUMP` is a fraction of the sum of the curvatures (absolute values) on both sides.
+`_ABOVE` is a multiple of the median change at the surrounding points."""
 _BESIDE, _AROUND = 3, 12
-"""Numbers of points on each side of a joint. The first is that of the points whose change of
-curvature the joint affects. The second is that of the points from which the median for `_ABOVE` is
-taken, except the affected points."""
+"""Numbers of points on each side of a joint. A joint affects the change of curvature at the nearest
+`_BESIDE` points. The median for `_ABOVE` is taken over the nearest `_AROUND` points, without these.
+"""
 _WINDING = 7.0
 """Sum of the polygon's turns (rad, absolute values) along a flank above which the points are
 rejected as scattered. With smoothing, there is no limit."""
@@ -34,13 +34,13 @@ _SHORTEST = 4
 """Number of intervals between points below which a piece is not split off, because it is too short.
 """
 _MOST_KNOTS, _NO_ROOM = 500, 1
-"""Number of knots above which a smoothing spline is rejected because it follows the noise. The
-second number is the flag that FITPACK returns in this case."""
+"""`_MOST_KNOTS`: number of knots above which a smoothing spline is rejected because it follows the
+noise. `_NO_ROOM`: flag that FITPACK returns in this case."""
 _KEY = "`profile.outline_file`"
 _UNEVEN = "remove points that are much closer together than others"
 _CUSP, _SPARED = 2e-2, 2
-"""Speed |z′| (fraction of the mean speed) below which the end of a piece is a cusp. The second
-number is the number of knot intervals next to a cusp that are not sampled. Slower points next to a
+"""`_CUSP`: speed |z′| (fraction of the mean speed) below which the end of a piece is a cusp.
+`_SPARED`: number of knot intervals next to a cusp that are not sampled. Slower points next to a
 cusp are not sampled either."""
 
 

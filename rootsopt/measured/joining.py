@@ -122,7 +122,8 @@ def _components(pairs: NDArray[np.intp], count: int) -> NDArray[np.intp]:
 def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> NDArray[np.intp]:
     """Return the indices of the chains that do not repeat an earlier chain.
 
-    A chain repeats another if the ends and the points of `_quarters` of both coincide."""
+    `vertex` (n, 2): numbers of the vertices at each chain's ends; `name`: name of the drawing in
+    messages. A chain repeats another if the ends and the points of `_quarters` of both coincide."""
     if not chains:
         return np.zeros(0, np.intp)
     quarters = np.array(
@@ -137,7 +138,9 @@ def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> N
 
 
 def _quarters(points: NDArray[np.complex128], backwards: bool) -> NDArray[np.complex128]:
-    """Return the points (3,) at one quarter, one half and three quarters of a chain's length."""
+    """Return the points (3,) at one quarter, one half and three quarters of a chain's length.
+
+    `backwards`: whether the length is measured from the last point."""
     points = points[::-1] if backwards else points
     if len(points) == 2:
         return points[0] + (points[1] - points[0]) * np.array([0.25, 0.5, 0.75])
@@ -146,7 +149,9 @@ def _quarters(points: NDArray[np.complex128], backwards: bool) -> NDArray[np.com
 
 
 def _in_loops(vertex: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the indices of the links that remain after repeatedly removing links at dead ends."""
+    """Return the indices of the links that remain after repeatedly removing links at dead ends.
+
+    `vertex` (n, 2): numbers of the vertices at each link's ends."""
     at: dict[int, set[int]] = {}
     for link, (a, b) in enumerate(vertex.tolist()):
         at.setdefault(a, set()).add(link)
@@ -167,7 +172,8 @@ def _in_loops(vertex: NDArray[np.intp]) -> NDArray[np.intp]:
 def _groups(vertex: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     """Return the indices of the links in each connected group.
 
-    Groups are ordered by the first index in each."""
+    `vertex` (n, 2): numbers of the vertices at each link's ends. Groups are ordered by the first
+    index in each."""
     if not len(vertex):
         return []
     _, which = np.unique(vertex, return_inverse=True)
@@ -183,7 +189,8 @@ def _walked(
 ) -> tuple[NDArray[np.complex128], NDArray[np.bool_]]:
     """Return (points, mask of joints) along the links of one loop or one open path.
 
-    `members`: indices of the links, in any order."""
+    `members`: indices of the links, in any order; `vertex` (n, 2): numbers of the vertices at each
+    chain's ends."""
     at: dict[int, list[int]] = {}
     for link in members.tolist():
         for v in vertex[link].tolist():
@@ -212,8 +219,9 @@ def _widest_gap(
 ) -> tuple[float, complex]:
     """Return (largest distance (mm) from a dead end to the nearest other dead end, its point).
 
-    The point is that of the dead end from which this distance is measured. With fewer than two dead
-    ends, the distance is 0."""
+    `ends`, `vertex` (n, 2): points (mm) and vertices at each chain's ends; `links`: indices of the
+    chains that count. The point is that of the dead end from which this distance is measured. With
+    fewer than two dead ends, the distance is 0."""
     places = ends[links].ravel()
     numbers = vertex[links].ravel()
     single = np.flatnonzero(np.bincount(numbers)[numbers] == 1)

@@ -21,7 +21,7 @@ class Arcs(Profile):
     `center` (n, 2) and `radius` (n,): centres and radii of the arcs (m), in the rotor frame with
     the lobe's axis on +x. `joints` (n + 1,): normal angles (rad) from the tip, 0, to the pitch
     crossing. `names`: names of the arcs. `land`: whether the first arc is centred on the rotor's
-    axis. `lobes`: N; `pitch_radius`: r (m).
+    axis. `lobes`: number of lobes N; `pitch_radius`: r (m).
     """
 
     lobes: int = eqx.field(static=True)
@@ -44,11 +44,11 @@ class Arcs(Profile):
     ) -> "Arcs":
         """Return n tangent arcs from the tip to the pitch crossing.
 
-        `lobes`: N; `pitch_radius`: r (m). `center`: distance (m) of the first arc's centre from the
-        rotor's axis, along the lobe's axis; `None`: the first arc is a land. `radii` (n - 1,):
-        radii (m) of all arcs except the last. `joints` (n - 1,): normal angles (rad) at which these
-        arcs end. The last arc's radius follows from the pitch crossing. `names` (n,): names of the
-        arcs."""
+        `lobes`: number of lobes N; `pitch_radius`: r (m). `center`: distance (m) of the first arc's
+        centre from the rotor's axis, along the lobe's axis; `None`: the first arc is a land.
+        `radii` (n - 1,): radii (m) of all arcs except the last. `joints` (n - 1,): normal angles
+        (rad) at which these arcs end. The last arc's radius follows from the pitch crossing.
+        `names` (n,): names of the arcs."""
         r = jnp.asarray(pitch_radius)
         half = jnp.pi / (2 * lobes)
         crossing = r * jnp.stack([jnp.cos(half), jnp.sin(half)])

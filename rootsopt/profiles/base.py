@@ -43,8 +43,8 @@ _POLISH = 3
 """Number of plain Newton steps after the safeguarded ones. Derivatives of the result are correct up
 to this order."""
 _FLAT = 1e-9
-"""Value of dβ/dν below which a Newton step divides by this value instead. The true value is 0 on an
-arc centred on the pitch circle."""
+"""Value of dβ/dν below which a Newton step divides by this constant instead of by dβ/dν. The
+derivative is 0 on an arc centred on the pitch circle."""
 
 
 class RollPoint(NamedTuple):
@@ -88,8 +88,8 @@ class Mate(NamedTuple):
     """A point of the partner's flank.
 
     `facing`: direction (rad) of the point's outward normal, measured from the axis of the valley
-    between two lobes; `lever`, `support`: lever (m) of this normal and support function (m) of the
-    point."""
+    between two lobes; `lever`: moment arm (m) of this normal about the partner's axis; `support`:
+    support function (m) of the point."""
 
     facing: Float[Array, "*n"]
     lever: Float[Array, "*n"]
@@ -99,10 +99,10 @@ class Mate(NamedTuple):
 class Profile(eqx.Module):
     """Base class of all profiles: one flank of a Roots rotor in roll-angle form.
 
-    `lobes`: N; `pitch_radius`: r (m). A subclass defines `segments`, `roll_angle` and
-    `contact_distance` for normal angles 0 ≤ ν ≤ `pitch_normal`. It continues both functions
-    analytically beyond the pitch crossing and, unless the first segment is a land, over the tip
-    (β odd and s even in ν). This class derives all else. A subclass may override `normal_at`,
+    `lobes`: number of lobes N; `pitch_radius`: r (m). A subclass defines `segments`, `roll_angle`
+    and `contact_distance` for normal angles 0 ≤ ν ≤ `pitch_normal`. It continues both functions
+    analytically beyond the pitch crossing and, unless the first segment is a land, over the tip (β
+    odd and s even in ν). This class derives everything else. A subclass may override `normal_at`,
     `lever` and `support` with a closed form, which is faster and more exact.
     """
 
@@ -177,10 +177,9 @@ class Profile(eqx.Module):
     def mate(self, nu: Float[Array, "*n"], support: bool = True) -> Mate:
         """Return the point of the partner that meshes with an addendum point.
 
-        `nu`: normal angle (rad) of the addendum point. If `nu` exceeds `pitch_normal`, the
-        partner's point lies on its addendum. It is then the point with normal angle 2
-        `pitch_normal` - `nu`. `support`: whether to compute the support function, which is
-        otherwise 0."""
+        `nu`: normal angle (rad) of the addendum point. If `nu` exceeds `pitch_normal`, the result
+        is a point of the partner's addendum, with normal angle 2 `pitch_normal` - `nu`. `support`:
+        whether to compute the support function, which is otherwise 0."""
         pitch = self.pitch_normal
         beyond = nu > pitch
         nu = jnp.where(beyond, 2 * pitch - nu, nu)

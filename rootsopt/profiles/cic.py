@@ -53,10 +53,10 @@ class CIC(Profile):
     tip_direction: Float[Array, "2"]
 
     def __init__(self, lobes, pitch_radius, pressure_angle, involute_length, tip_arc_angle):
-        """Build the rotor from `lobes` N and scalars.
+        """Build the rotor.
 
-        The scalars are `pitch_radius` r (m), `pressure_angle` α (rad), `involute_length` u (m) and
-        `tip_arc_angle` θ1 (rad, half the angle of the tip land)."""
+        `lobes`: number of lobes N; `pitch_radius`: r (m); `pressure_angle`: α (rad);
+        `involute_length`: u (m); `tip_arc_angle`: θ1 (rad), half the angle of the tip land."""
         self.lobes = lobes
         r = self.pitch_radius = jnp.asarray(pitch_radius)
         alpha = self.pressure_angle = jnp.asarray(pressure_angle)

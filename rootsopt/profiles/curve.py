@@ -19,7 +19,7 @@ INTERVALS = 48
 reproduced to about 1e-11 pitch radii."""
 _STEPS = 4
 """Number of Newton steps in the search for the normal angle at a given roll angle. The search
-starts from a table accurate to about 1e-4."""
+starts from a table accurate to about 1e-4 rad."""
 _GAUSS = np.polynomial.legendre.leggauss(4)
 """Gauss-Legendre nodes and weights for an interval or a part of it. The integral is exact to
 rounding error."""
@@ -52,9 +52,10 @@ class Curve(Profile):
     """An addendum of given curves, each tangent to the next.
 
     The profile stores the pressure angle ψ as a function of the normal angle ν: quintics between
-    nodes that match its value and two derivatives there. From ψ follow β = ν - π/2 + ψ, the lever
-    r cos ψ, and the support function by quadrature from the pitch crossing. The law of gearing
-    therefore holds for the quintics themselves, even where they deviate from the given curve.
+    nodes, which match the given curve's ψ and two derivatives there. From ψ follow β = ν - π/2 + ψ,
+    the lever r cos ψ, and the support function by quadrature from the pitch crossing. The law of
+    gearing therefore holds for the quintics themselves, even where they deviate from the given
+    curve.
 
     `names`, `lands`: as in `Piece`, one per piece; `sharp`: whether the last piece ends in a cusp;
     `node` (n,): normal angles (rad); `series` (n, 6): coefficients of ψ (rad) in powers of the
@@ -86,8 +87,8 @@ class Curve(Profile):
         """Return the addendum made of `pieces`, with `intervals` quintics each.
 
         The pieces extend from the lobe's axis to the pitch crossing and have the same normal where
-        they meet. `lobes`: N; `pitch_radius`: r (m). `sharp`: whether the last piece ends in a
-        cusp."""
+        they meet. `lobes`: number of lobes N; `pitch_radius`: r (m). `sharp`: whether the last
+        piece ends in a cusp."""
         r = jnp.asarray(pitch_radius)
         t = jnp.arange(intervals + 1, dtype=r.dtype) / intervals
         turning = [functools.partial(_turning, _rolling(piece, r)) for piece in pieces]

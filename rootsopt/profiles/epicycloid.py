@@ -21,7 +21,7 @@ class TippedEpicycloid(Profile):
 
     `rolling_radius`: r_e (m). `joint`: normal angle (rad) at which the tip arc ends.
     `arc_center_radius`: c (m). `arc_radius`: radius of the tip arc (m). `land`: whether the arc is
-    centred on the rotor's axis (c = 0). `lobes`: N; `pitch_radius`: r (m).
+    centred on the rotor's axis (c = 0). `lobes`: number of lobes N; `pitch_radius`: r (m).
     """
 
     lobes: int = eqx.field(static=True)
@@ -33,10 +33,10 @@ class TippedEpicycloid(Profile):
     arc_radius: Float[Array, ""]
 
     def __init__(self, lobes, pitch_radius, rolling_radius, joint, land=False):
-        """Build the rotor from `lobes` N and three scalars.
+        """Build the rotor.
 
-        The scalars are `pitch_radius` r (m), `rolling_radius` r_e (m) and the normal angle `joint`
-        (rad). `land`: whether the tip arc is a land."""
+        `lobes`: number of lobes N; `pitch_radius`: r (m); `rolling_radius`: r_e (m); `joint`:
+        normal angle (rad) at which the tip arc ends; `land`: whether the tip arc is a land."""
         self.lobes, self.land = lobes, land
         r = self.pitch_radius = jnp.asarray(pitch_radius)
         self.rolling_radius = jnp.asarray(rolling_radius)
@@ -80,7 +80,7 @@ class TippedEpicycloid(Profile):
         return on_arc, jnp.where(on_arc, nu, 0.0)
 
     def _tilt(self, nu):
-        """Return ν - β (rad) of the arc's normals."""
+        """Return ν - β (rad) on the tip arc at the normal angle `nu` (rad)."""
         return jnp.arcsin(self.arc_center_radius * jnp.sin(nu) / self.pitch_radius)
 
     def roll_angle(self, nu):
@@ -120,9 +120,10 @@ def circle_epicycloid(
 ) -> TippedEpicycloid:
     """Return a profile with a tip arc centred on the lobe's axis, followed by an epicycloid.
 
-    `lobes`: N; `pitch_radius`: r (m); `rolling_radius`: r_e of the epicycloid (m); `tip_arc_turn`:
-    normal angle ν (rad) at which the arc ends. For ν = π/2 - π r / (4 N r_e), the arc is centred on
-    the pitch circle (roll angle β = 0 at its end), and the whole arc meshes at one instant."""
+    `lobes`: number of lobes N; `pitch_radius`: r (m); `rolling_radius`: r_e of the epicycloid (m);
+    `tip_arc_turn`: normal angle ν (rad) at which the arc ends. For ν = π/2 - π r / (4 N r_e), the
+    arc is centred on the pitch circle (roll angle β = 0 at its end), and the whole arc meshes at
+    one instant."""
     return TippedEpicycloid(lobes, pitch_radius, rolling_radius, tip_arc_turn)
 
 
@@ -133,9 +134,9 @@ def hypo_epicycloid(
 
     One land is at the tip, the other at the root.
 
-    `lobes`: N; `pitch_radius`: r (m). The land at the tip has the half angle `tip_arc_angle` θ1
-    (rad). Identical rotors at 1:1 need the same rolling circle for both arches. ψ must be π/2 where
-    the land starts: r_e = r (π/2N - θ1) / π. Without a land this is EE. (Derivation.)
+    `lobes`: number of lobes N; `pitch_radius`: r (m). The land at the tip has the half angle
+    `tip_arc_angle` θ1 (rad). Identical rotors need the same rolling circle for both arches. ψ must
+    be π/2 where the land starts: r_e = r (π/2N - θ1) / π. Without a land this is EE. (Derivation.)
     """
     rolling = jnp.asarray(pitch_radius) * (1 / (2 * lobes) - jnp.asarray(tip_arc_angle) / jnp.pi)
     return TippedEpicycloid(lobes, pitch_radius, rolling, tip_arc_angle, land=True)

@@ -28,16 +28,16 @@ _FIRMLY = 1e3
 """Factor on the row of the pitch crossing in the least-squares fit of a free form. All other rows
 have the factor 1."""
 _FLAT = 1e-9
-"""Value of dβ/dν below which a Newton step divides by this value instead. The true value is 0 on an
-arc centred on the pitch circle."""
+"""Value of dβ/dν below which a Newton step divides by this constant instead of by dβ/dν. The
+derivative is 0 on an arc centred on the pitch circle."""
 
 
 class FreeForm(Profile):
     """A tip land, followed by a free curve with any number of coefficients.
 
     A turn of the normal dν changes the roll angle by dβ = (1 - τ) dν and the pressure angle by dψ =
-    -τ dν. The rate τ(ν) is a quadratic B-spline with even knots from the end of the land to the
-    pitch crossing. ψ(ν) is a cubic B-spline that starts at π/2.
+    -τ dν. The rate τ(ν) is a quadratic B-spline with evenly spaced knots from the end of the land
+    to the pitch crossing. ψ(ν) is a cubic B-spline that starts at π/2.
 
     If no coefficient exceeds 1 (the value on an arc centred on the pitch circle), the roll angle
     does not turn back. If no coefficient is below 0 (the value on an involute), ψ never rises.
@@ -52,10 +52,11 @@ class FreeForm(Profile):
     coefficients. The spline is a function of ν, not of β, because ψ(β) jumps on an arc centred on
     the pitch circle.
 
-    `lobes`: N; `pitch_radius`: r (m). `tip_arc_angle`: θ1 (rad), half the angle of the land.
-    `coefficients` (n,), n ≥ 3: coefficients of τ, from the land to the pitch crossing. `width`:
-    width of a knot span (rad). `turn` (n - 2, 4): coefficients of ψ (rad) in each span, in powers
-    of the fraction of the span. `beyond` (n - 2,): support function (m) at the end of each span.
+    `lobes`: number of lobes N; `pitch_radius`: r (m). `tip_arc_angle`: θ1 (rad), half the angle of
+    the land. `coefficients` (n,), n ≥ 3: coefficients of τ, from the land to the pitch crossing.
+    `width`: width of a knot span (rad). `turn` (n - 2, 4): coefficients of ψ (rad) in each span, in
+    powers of the fraction of the span. `beyond` (n - 2,): support function (m) at the end of each
+    span.
     """
 
     lobes: int = eqx.field(static=True)
@@ -67,9 +68,10 @@ class FreeForm(Profile):
     beyond: Float[Array, " k"]
 
     def __init__(self, lobes, pitch_radius, tip_arc_angle, coefficients):
-        """Build the rotor from `lobes` N, two scalars and `coefficients` (n,).
+        """Build the rotor.
 
-        The scalars are `pitch_radius` r (m) and `tip_arc_angle` θ1 (rad)."""
+        `lobes`: number of lobes N; `pitch_radius`: r (m); `tip_arc_angle`: θ1 (rad), half the angle
+        of the land; `coefficients` (n,): coefficients of τ."""
         self.lobes = lobes
         r = self.pitch_radius = jnp.asarray(pitch_radius)
         self.tip_arc_angle = jnp.asarray(tip_arc_angle)

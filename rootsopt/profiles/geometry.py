@@ -27,8 +27,8 @@ class Geometry(eqx.Module):
 
     `outer_radius` r_a, `root_radius`: greatest and least distance (m) of the outline from the axis.
     `area`: A (m²). `area_efficiency`: 1 - A/(π r_a²). `polar_area_moment`: ∫r² dA about the axis
-    (m⁴). `undercut_margin`: least `Profile.dedendum_speed` (m per rad). `seal_width`: arc length of
-    the whole tip land (m).
+    (m⁴). `undercut_margin`: least `Profile.dedendum_speed` (m/rad). `seal_width`: arc length of the
+    whole tip land (m).
     """
 
     outer_radius: Float[Array, ""]

@@ -51,8 +51,8 @@ class Outline(Profile):
     Roll angle and contact distance are those at which each curve's own normals meet the pitch
     circle.
 
-    `lobes`: N; `pitch_radius`: r (m). `area`, `polar_area_moment`, `outer_radius`, `root_radius`,
-    `seal_width`: see `Geometry`.
+    `lobes`: number of lobes N; `pitch_radius`: r (m). `area`, `polar_area_moment`, `outer_radius`,
+    `root_radius`, `seal_width`: see `Geometry`.
     """
 
     lobes: int = eqx.field(static=True)

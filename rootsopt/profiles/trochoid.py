@@ -12,7 +12,7 @@ def extended_cycloid(
 ) -> Curve:
     """Return an epicycloid traced by a point at varying distance from the rolling circle's centre.
 
-    `lobes`: N; `pitch_radius`: r (m). With r_e = r / 2N the curve is
+    `lobes`: number of lobes N; `pitch_radius`: r (m). With r_e = r / 2N the curve is
     P(θ) = e^{iθ} [r + r_e + λ(θ) r_e e^{2iNθ}], from the tip (θ = 0) to the pitch crossing
     (θ = π/2N). The ratio λ varies from `trochoid_ratio` λ0 at the tip to 1 at the crossing:
     λ = 1 + (λ0 - 1) u³ (10 - 15 u + 6 u²) with u = 1 - 2Nθ/π. This quintic has zero first and

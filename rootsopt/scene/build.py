@@ -96,8 +96,8 @@ class Scene(eqx.Module):
         """Return the scene of a config.
 
         `deepest`: relative rotation (rad, negative) down to which the contact map must extend; by
-        default, an estimate. If the config does not give the map's size, use a default size.
-        (`evaluate` chooses the size from `solver.map_error` instead.)
+        default, an estimate. If the config does not give the map's size, the map has a default
+        size. (`evaluate` chooses the size from `solver.map_error` instead.)
 
         Raises `RuntimeError` if JAX is not set to the precision that the config needs, and
         `InputError` if an outline file cannot be used."""
@@ -178,7 +178,8 @@ class Scene(eqx.Module):
     def contact(self, profile: Profile) -> Contact:
         """Return the contact of `profile` at this scene's fidelity.
 
-        Raises `InputError` for fidelity `auto`: replace it by a fidelity first."""
+        Raises `InputError` if the fidelity is `auto`, which must first be replaced by another one.
+        """
         if self.fidelity == "map":
             return MapContact.of(profile, self.deepest, *self.map_size)
         if self.fidelity == "linear":
@@ -228,8 +229,9 @@ class Scene(eqx.Module):
         """Return (rotor pair, its derivatives along `directions`, geometry of one rotor).
 
         `design` (d,): in config units. `directions` (n, d): directions in the design space, by
-        default one per parameter; (): no derivatives. The derivatives have the pair's own
-        structure, with a leading axis (n,). Raises `InputError` as `pair_and_shape` does."""
+        default one per parameter. With `()`, no derivatives are computed. The derivatives have the
+        pair's own structure, with a leading axis (n,). Raises `InputError` as `pair_and_shape`
+        does."""
         if directions is None:
             directions = jnp.eye(design.shape[0])
         return along(lambda design: self.pair_and_shape(design), design, directions)
