@@ -238,7 +238,8 @@ class FlankPair(eqx.Module):
     def _closest(self, roll, relative) -> ClosestApproach:
         """Return the closest approach for a `roll` from `folded`, with rules for its derivatives.
 
-        With θ the pose and the design, dG = ∂G/∂θ dθ at the root held fixed (envelope
+        `relative`: ε (rad). With θ the pose and the design, dG = ∂G/∂θ dθ at the root held fixed
+        (envelope
         theorem) and dν2 = -(∂T/∂θ dθ) / (∂T/∂ν2) (implicit function theorem). The rule is
         itself differentiable, so that second derivatives are those of the true gap.
         """
@@ -308,16 +309,15 @@ class FlankPair(eqx.Module):
         return reach - self.profile.lever(mate.facing + 2 * roll) - mate.lever
 
     def _search(self, roll, relative, attempt=0):
-        """Return (number of attempts, closest approach) at x = `roll` (from `folded`), ε =
-        `relative`.
+        """Return (number of attempts, closest approach) for a `roll` from `folded`.
 
-        `attempt`: first attempt. Attempt 0 is Newton's method from the point of perfect rolling. If
-        its result is not reliable, attempts 1 and 2 follow. They search the last and the first
-        interval of nodes where T falls through zero. These intervals contain the two minima that
-        the gap may have next to a cusp, or if the centre distance is not nominal. The deeper
-        minimum is returned. If the flanks are not conjugate, the gap may have more minima. The
-        attempts then search the two intervals with the least gap. All attempts share one loop,
-        which is compiled once.
+        `relative`: ε (rad); `attempt`: number of the first attempt. Attempt 0 is Newton's method
+        from the point of perfect rolling. If its result is not reliable, attempts 1 and 2 follow.
+        They search the last and the first interval of nodes where T falls through zero. These
+        intervals contain the two minima that the gap may have next to a cusp, or if the centre
+        distance is not nominal. The deeper minimum is returned. If the flanks are not conjugate,
+        the gap may have more minima. The attempts then search the two intervals with the least gap.
+        All attempts share one loop, which is compiled once.
         """
         nothing = jnp.zeros_like(roll)
         none = ClosestApproach(
@@ -358,10 +358,10 @@ class FlankPair(eqx.Module):
     def _bracket(self, attempt, roll, relative):
         """Return an interval between two nodes where T falls through zero.
 
-        For conjugate flanks, attempt 1 takes the last such interval and attempt 2 the first. For
-        other flanks, attempt 1 takes the interval with the least gap and attempt 2 that with the
-        second least gap. The result is ((low, high), first guess, whether such an interval exists,
-        whether there is at most one)."""
+        `roll`, `relative`: as in `_mesh`. For conjugate flanks, attempt 1 takes the last such
+        interval and attempt 2 the first. For other flanks, attempt 1 takes the interval with the
+        least gap and attempt 2 that with the second least gap. The result is ((low, high), first
+        guess, whether such an interval exists, whether there is at most one)."""
         profile, nodes = self.profile, self.nodes
         turned = _rotate(nodes.turned, 2 * profile.turn_ratio * roll)
         normal1 = nodes.facing + 2 * roll
@@ -397,9 +397,10 @@ class FlankPair(eqx.Module):
     def _root(self, bracket, guess, guarded, roll, relative):
         """Return (root ν2 (rad) of T, whether Newton's method from `guess` has converged to it).
 
-        `guarded`: whether T falls through zero in the bracket. The bracket then shrinks around the
-        root, and is halved if Newton's step leaves it or is longer than half the previous step.
-        Halving is needed because T has a kink where ν1 crosses a segment's end.
+        `bracket`: (low, high) (rad); `roll`, `relative`: as in `_mesh`. `guarded`: whether T falls
+        through zero in the bracket. The bracket then shrinks around the root, and is halved if
+        Newton's step leaves it or is longer than half the previous step. Halving is needed because
+        T has a kink where ν1 crosses a segment's end.
         """
         tolerance = _CONVERGED[guess.dtype.itemsize]
         limit = jnp.where(guarded, _GUARDED_STEPS, _NEWTON_STEPS)
@@ -430,11 +431,10 @@ class FlankPair(eqx.Module):
 
 
 def _search_one_by_one(pair: FlankPair, roll, relative):
-    """Return the closest approach, without derivatives, at x = `roll` (from `folded`), ε =
-    `relative`.
+    """Return the closest approach, without derivatives, for a `roll` from `FlankPair.folded`.
 
-    On a CPU, the poses of a batch are searched one by one. A single pose rarely needs the nodes,
-    but a batch searched as a whole nearly always does."""
+    `relative`: ε (rad). On a CPU, the poses of a batch are searched one by one. A single pose
+    rarely needs the nodes, but a batch searched as a whole nearly always does."""
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
 
     def search(dynamic, roll, relative):

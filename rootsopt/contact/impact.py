@@ -118,10 +118,11 @@ class ImpactLaw(ContactLaw):
     def _parts(self, depth, rate):
         """Return (whether in contact, elastic force (N), total force (N) before release, width).
 
-        The total force is the sum of elastic force and damping force. The width is the fraction of
-        the elastic force over which the release is rounded. Only the release uses the quotient of
-        the two forces. At the onset, both are so small that its derivative would overflow in single
-        precision. The release is not rounded where the square of the elastic force is out of range.
+        `depth`: penetration (m); `rate`: its rate (m/s). The total force is the sum of elastic
+        force and damping force. The width is the fraction of the elastic force over which the
+        release is rounded. Only the release uses the quotient of the two forces. At the onset, both
+        are so small that its derivative would overflow in single precision. The release is not
+        rounded where the square of the elastic force is out of range.
         """
         delta = ramp(depth, self.smoothing)
         safe = jnp.where(delta > 0, delta, self.full_damping_depth)

@@ -37,8 +37,8 @@ def continued_gap(
 ) -> Float[Array, ""]:
     """Return the gap (m) at x = `roll` and ε = `relative` (rad), continued over the tip land.
 
-    Where the tip land passes, the flanks have no common normal. There, the gap is continued from
-    the land's end by a parabola in x and ε.
+    `pair`: the flanks. Where the tip land passes, the flanks have no common normal. There, the gap
+    is continued from the land's end by a parabola in x and ε.
     """
     contact = pair(roll, relative)
     away = roll - lax.stop_gradient(_land_end(pair.profile)) - relative / 2

@@ -77,7 +77,9 @@ class NearContact(Contact):
         return self.pair.margins(roll, found, other)
 
     def _moved(self, which: int, roll, relative) -> ClosestApproach:
-        """Return the closest approach after one Newton step from the root with index `which`."""
+        """Return the closest approach after one Newton step from the root with index `which`.
+
+        `roll`, `relative`: x and ε (rad)."""
         pair = self.pair
         root = lax.stop_gradient(self.roots[0, which])
         folded, mirrored = pair.folded(roll)

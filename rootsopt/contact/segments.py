@@ -127,7 +127,9 @@ class NodeContact(Contact):
         return 2 * self.pitch_radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
     def _transfer(self, points, angle, other_angle):
-        """Return the other rotor's `points` (..., 2) in the frame of a rotor at `angle` a (rad)."""
+        """Return the other rotor's `points` (..., 2) in the frame of a rotor at `angle` a (rad).
+
+        `other_angle`: angle a (rad) of the other rotor."""
         turn = angle - other_angle
         cos, sin = jnp.cos(turn), jnp.sin(turn)
         return self._center(angle) - points @ jnp.array([[cos, sin], [-sin, cos]])
@@ -155,10 +157,11 @@ def _facing(
 ) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
     """Return (signed distance (m), segment index) of each point from the segment that faces it.
 
-    Where no segment faces a point, the distance is inf. The segment is found by bisection over the
-    nodes. Bisection works because a point near the flank is ahead of all bisectors on the tip's
-    side of its segment, and behind all others. The reason is that the chord between any two nodes
-    of a flank stays within a right angle of the tangents at both.
+    `nodes`, `tangent`, `normal`: as in `NodeContact`, for one rotor. Where no segment faces a
+    point, the distance is inf. The segment is found by bisection over the nodes. Bisection works
+    because a point near the flank is ahead of all bisectors on the tip's side of its segment, and
+    behind all others. The reason is that the chord between any two nodes of a flank stays within a
+    right angle of the tangents at both.
     """
     x, y = points[:, 0], points[:, 1]
     offset = jnp.sum(nodes * tangent, axis=1)

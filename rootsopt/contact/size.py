@@ -42,6 +42,8 @@ class MapSize(NamedTuple):
 def size_map(profile: Profile, deepest: float, error: float) -> MapSize:
     """Return the smallest map down to ε = `deepest` (rad) with a penetration error ≤ `error` (m).
 
+    `profile`: profile of both rotors.
+
     If no size in the list meets the error, return the smallest whose error is at most 1.5 times the
     least in the list.
     """

@@ -208,6 +208,9 @@ def _target(profile: Profile):
 def _compared(family: str, lobes: int, radius: Float[Array, ""], target, design):
     """Return the fields of `_Seen` for a `design`: distances, margins and their derivatives.
 
+    `family`, `lobes`, `radius`: family, number of lobes and pitch radius (m) of the member;
+    `target`: result of `_target`.
+
     Distances are measured along the normals of the `target`, between points with the same normal
     angle on the addendum. To first order, these are the distances between the flanks."""
     nu, places, normals = target

@@ -59,11 +59,12 @@ def _rolling(profile, roll):
 def rolling_contacts(
     profile: Profile, rotation: Float[np.ndarray, " n"], coast: bool = False
 ) -> Contacts:
-    """Return the contacts of the drive (or `coast`) flanks in perfect rolling.
+    """Return the contacts of two rotors with this `profile` in perfect rolling.
 
-    `rotation` (n,): rotations φ of rotor 1 (rad). A drive flank is in contact while its roll angle
-    β = -φ is between 0 and π/N, once in every lobe pitch. At other rotations, the result holds the
-    contact at the nearer end of this range, marked as not present. The contact point is
+    `rotation` (n,): rotations φ of rotor 1 (rad); `coast`: whether the contacts are those of the
+    coast flanks, not of the drive flanks. A drive flank is in contact while its roll angle β = -φ
+    is between 0 and π/N, once in every lobe pitch. At other rotations, the result holds the contact
+    at the nearer end of this range, marked as not present. The contact point is
     (r + s sin ψ, s cos ψ) and the normal is (sin ψ, cos ψ), with the pitch radius r, the pressure
     angle ψ and the distance s from the pitch point. The contact of a coast flank is the mirror
     image in the line of centres, with β = φ.
@@ -80,8 +81,9 @@ def rolling_contacts(
 def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
     """Return the content of a GIF of the pair in perfect rolling over one lobe pitch.
 
-    The GIF shows the contact and the direction of its force. It does not show the size of the
-    force, which only a simulation can give.
+    `drawing`, `profile`: drawing and profile of the rotor. The GIF shows the contact and the
+    direction of its force. It does not show the size of the force, which only a simulation can
+    give.
     """
     rotation = 2 * np.pi / profile.lobes * np.arange(_FRAMES) / _FRAMES
     flanks = [rolling_contacts(profile, rotation, coast) for coast in (False, True)]
@@ -102,6 +104,7 @@ def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
 def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: int) -> bytes:
     """Return the content of a GIF of a simulated motion over `periods` mesh periods.
 
+    `drawing`, `profile`: drawing and profile of the rotor; `series`: the simulated motion.
     `periods` is limited to 4 and to the length of `series`. The GIF shows the contacts, and a graph
     of the force over the rotation. An arrow's length is proportional to the largest force in the
     time interval of its frame.
@@ -136,7 +139,7 @@ def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: 
 
 
 def _force_panel(ax: Axes, series: Series, samples: int):
-    """Draw the flank forces over the rotation; return the line that marks a frame's rotation.
+    """Draw the flank forces over the rotation on `ax`; return the line that marks a rotation.
 
     `samples`: number of samples of `series` that are drawn."""
     shown = slice(0, samples)

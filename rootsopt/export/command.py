@@ -23,7 +23,9 @@ _SOLID = ("step", "stl")
 
 
 def add_option(parser: argparse.ArgumentParser, default: str) -> None:
-    """Add the option `--export` to a command. `default`: its value if the option is not given."""
+    """Add the option `--export` to the `parser` of a command.
+
+    `default`: value of the option if the user does not give it."""
     formats = "; ".join(f"{name}: {files}" for name, files in FORMATS.items())
     parser.add_argument(
         "--export",
@@ -68,9 +70,9 @@ def write(
 ) -> list[str]:
     """Write drawings of a `design` into `folder`; return the names of the files.
 
-    `formats`: keys of `FORMATS`; `design`: values of the design parameters (config units), keyed by
-    config key. If `series` holds a simulated motion, the GIF shows `periods` mesh periods of it.
-    Otherwise the GIF shows perfect rolling.
+    `config`: config of the rotor; `formats`: keys of `FORMATS`; `design`: values of the design
+    parameters (config units), keyed by config key. If `series` holds a simulated motion, the GIF
+    shows `periods` mesh periods of it. Otherwise the GIF shows perfect rolling.
     """
     if not formats:
         return []
@@ -111,8 +113,8 @@ def write_simulated(
 ) -> list[str]:
     """Write drawings of a simulated design and return the names of the files.
 
-    `formats`: as in `write`; `evaluation`: result of the simulation. The GIF shows the simulated
-    motion. If `evaluation` has no motion, no GIF is written."""
+    `folder`, `config`, `formats`: as in `write`; `evaluation`: result of the simulation. The GIF
+    shows the simulated motion. If `evaluation` has no motion, no GIF is written."""
     series = evaluation.series
     if series is None:
         formats = tuple(name for name in formats if name != "gif")

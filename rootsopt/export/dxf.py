@@ -22,7 +22,7 @@ _STYLES = {
 
 
 def dxf_bytes(drawing: Drawing) -> bytes:
-    """Return the content of a DXF file (R2010, mm) of one rotor.
+    """Return the content of a DXF file (R2010, mm) of a `drawing` of one rotor.
 
     The outline's entities are in counter-clockwise order, and adjacent entities share their ends.
     """

@@ -140,7 +140,7 @@ DrawnPiece = Arc | Spline
 
 
 def outline_pieces(profile: Profile) -> list[DrawnPiece]:
-    """Return the pieces of the closed counter-clockwise outline (mm).
+    """Return the pieces (mm) of the closed counter-clockwise outline of a `profile`.
 
     Every piece starts at the end of the previous piece. The outline starts at the root before the
     lobe on +x. If the arcs on both sides of this root are joined, the outline starts at the start
@@ -157,14 +157,15 @@ def outline_pieces(profile: Profile) -> list[DrawnPiece]:
 
 
 def area(pieces: list[DrawnPiece]) -> float:
-    """Return the area (mm²) inside a closed outline, exact for arcs and splines."""
+    """Return the area (mm²) inside the closed outline `pieces`, exact for arcs and splines."""
     return sum(map(_swept, pieces))
 
 
 def polyline(pieces: list[DrawnPiece], chord: float) -> Complex128[np.ndarray, " n"]:
-    """Return a closed polygon (mm) with points on the outline, about `chord` (mm) apart or closer.
+    """Return a closed polygon (n,) in mm whose corners lie on the outline `pieces`.
 
-    The first point is repeated at the end."""
+    Successive corners are about `chord` (mm) apart or closer. The first corner is repeated at the
+    end."""
     parts = []
     for piece in pieces:
         count = max(2, int(np.ceil(piece.length / chord)))

@@ -92,7 +92,7 @@ def pair(
 
 
 def step_bytes(shape: "Shape") -> bytes:
-    """Return the content of a STEP file (mm) of a solid or an assembly."""
+    """Return the content of a STEP file (mm) of `shape`, a solid or an assembly."""
     from build123d import export_step
 
     file = io.BytesIO()
@@ -133,8 +133,9 @@ def _edge(piece: DrawnPiece) -> "Edge":
 def _side(piece: DrawnPiece, length: float, helix: float) -> "Face":
     """Return the side face of the rotor over one piece of the outline.
 
-    The face is a cylinder over an arc of a straight rotor, otherwise a B-spline surface. The
-    kernel's own twisted sweeps are not used: they have a relative error of 1e-4 near a cusp.
+    `length`, `helix`: as in `rotor`. The face is a cylinder over an arc of a straight rotor,
+    otherwise a B-spline surface. The kernel's own twisted sweeps are not used: they have a relative
+    error of 1e-4 near a cusp.
     """
     from build123d import Face, Vector
 

@@ -116,7 +116,7 @@ def _pale(color: str) -> str:
 
 
 def basin_figures(folder: ResultFolder, basins: Basins, config: Config) -> list[str]:
-    """Write basins.png; return the names of the files written.
+    """Write basins.png into `folder`; return the names of the files written.
 
     The contact force is shown only for the motions to which the most initial states lead."""
     pairs = list(zip(basins.attractors, _colors(basins), strict=True))

@@ -15,7 +15,8 @@ def plot_profiles(
 ) -> Axes:
     """Draw closed outlines on top of each other, with the pitch circle.
 
-    `outlines`: points (n, 2) in mm of each outline, keyed by its name. The result is `ax`."""
+    `outlines`: points (n, 2) in mm of each outline, keyed by its name; `pitch_radius_mm`: pitch
+    radius. The result is `ax`."""
     _overlay(ax, outlines, pitch_radius_mm)
     reach = 1.06 * max(np.max(np.hypot(*points.T)) for points in outlines.values())
     ax.plot(0, 0, "+", color="black", markersize=9)
@@ -29,7 +30,8 @@ def plot_flank(
     """Draw one flank of each outline from the tip (on the +x axis) to the root, enlarged.
 
     `outlines`: points (n, 2) in mm of each closed outline, keyed by its name; `lobes`: number of
-    lobes. The rest of an outline follows by symmetry. The result is `ax`.
+    lobes; `pitch_radius_mm`: pitch radius. The rest of an outline follows by symmetry. The result
+    is `ax`.
     """
     _overlay(ax, outlines, pitch_radius_mm)
     flanks = []
@@ -69,7 +71,7 @@ def plot_meshing(
     """Draw the meshing pair at several angles of rotor 1, one panel per angle.
 
     `axes`: one for each of `angles_deg`; `outline_mm` (n, 2): closed outline, equal for both
-    rotors. The result is `axes`."""
+    rotors; `lobes`: number of lobes; `pitch_radius_mm`: pitch radius. The result is `axes`."""
     center = 2 * pitch_radius_mm
     for ax, angle in zip(axes, angles_deg, strict=True):
         turn = np.radians(angle)

@@ -21,7 +21,7 @@ from rootsopt.scene import design_keys, outline_mm
 
 
 def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, Any]) -> list[str]:
-    """Write the figures of one design's profile; return the file names.
+    """Write the figures of one design's profile into `folder`; return the file names.
 
     `record`: the design's record in the result file. The figures are profiles.png, meshing.png and,
     for a profile read from a file, conjugacy.png."""
@@ -43,7 +43,8 @@ def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, A
 
 
 def simulation_figures(folder: ResultFolder, evaluation: Evaluation, config: Config) -> list[str]:
-    """Write the figures of the profile and the force of one evaluation; return the file names."""
+    """Write the profile and force figures of one evaluation into `folder`; return the file names.
+    """
     names = profile_figures(folder, config, evaluation.record())
     return names + _force_figures(folder, {config.profile.family.upper(): evaluation}, config)
 
@@ -55,9 +56,10 @@ def optimization_figures(
     history: Sequence[Mapping[str, Any]],
     config: Config,
 ) -> list[str]:
-    """Write the figures of an optimisation; return the file names.
+    """Write the figures of an optimisation into `folder`; return the file names.
 
-    `history`: one row per evaluation, as in `plot_history`; if empty, its figure is omitted."""
+    `baseline`, `optimized`: evaluations of the design before and after the optimisation. `history`:
+    one row per evaluation, as in `plot_history`; if empty, its figure is omitted."""
     designs = {"baseline": baseline, "optimised": optimized}
     outlines = {name: _outline(config, one.design) for name, one in designs.items()}
     names = [

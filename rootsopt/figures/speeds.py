@@ -82,7 +82,7 @@ def speed_figure(
 ) -> list[str]:
     """Write speeds.png, mean and peak force over speed; return the names of the files written.
 
-    `designs`: as in `plot_speeds`."""
+    `designs`: as in `plot_speeds`; `title`: title of the figure."""
     made, axes = figure(9, 6.6, 2, 1, sharex=True)
     for ax, force in zip(axes[:, 0], LABELS, strict=True):
         plot_speeds(ax, designs, force).set_ylim(0, None)

@@ -124,6 +124,9 @@ def from_dxf(data: bytes, name: str) -> Loop:
 def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
     """Check the raw tags of a DXF file and return the number of entities of each kind.
 
+    `data`: content of the file; `binary`: whether the file is a binary DXF; `name`: its name in
+    messages.
+
     Raises `InputError` if the file is incomplete, if a number of an entity is invalid, or if there
     are too many entities. This check is needed because the library reads "1,5" as 1. It also
     accepts a number that is cut off at the end of the file.
@@ -201,7 +204,9 @@ def _on_layer(entities: list[Any], name: str) -> list[Any]:
 
 
 def _exploded(inserts: list[Any], name: str) -> list[Any]:
-    """Return the entities of inserted and nested blocks, placed as they appear in the drawing."""
+    """Return the entities of inserted and nested blocks, placed as they appear in the drawing.
+
+    `inserts`: the library's block inserts; `name`: name of the drawing in messages."""
     found: list[Any] = []
     stack = [(insert, 1) for insert in reversed(inserts)]
     handled = 0

@@ -195,7 +195,7 @@ class _Plane:
     below: bool
 
     def __call__(self, z: Any) -> Any:
-        """Convert a point or vector x + iy from the entity's plane to the drawing's plane (mm).
+        """Convert points or vectors `z` = x + iy from the entity's plane to the drawing's (mm).
 
         CAD stores mirrored entities in a plane seen from below, whose x axis is reversed."""
         return self.scale * (-np.conj(z) if self.below else z)
@@ -318,7 +318,10 @@ def _read_polyline(entity: Any):
 def _polyline(corners, bulges, closed, spatial, plane, fault) -> list[Stroke]:
     """Return the straight runs and arcs (mm) of a polyline.
 
-    A side with a bulge is an arc; its bulge is the tangent of a quarter of the arc's angle."""
+    `corners`: corners x + iy; `bulges`: bulge of the side after each corner; `closed`: whether a
+    last side returns to the first corner; `spatial`: whether the corners are in the drawing's
+    coordinates. A side with a bulge is an arc; its bulge is the tangent of a quarter of the arc's
+    angle."""
     del fault
     corners = plane.scale * corners if spatial else plane(corners)
     bulges = -bulges if plane.below and not spatial else bulges

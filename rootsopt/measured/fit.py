@@ -377,7 +377,9 @@ def _land(nu, lever, curvature_radius, radius) -> float:
 
 
 def _integrals(flank: _Flank, lobes: int) -> tuple[float, float]:
-    """Return (area in mm², polar moment of area in mm⁴) of the rotor made from a flank."""
+    """Return (area in mm², polar moment of area in mm⁴) of a rotor with `lobes` lobes.
+
+    `flank`: flank of the rotor; all other flanks are its images."""
     nodes, weights = _GAUSS
     area = moment = 0.0
     for place, low, high in flank.curve.between(flank.tip, flank.root):

@@ -187,7 +187,7 @@ def _groups(vertex: NDArray[np.intp]) -> list[NDArray[np.intp]]:
 def _walked(
     chains: list[Loop], members: NDArray[np.intp], vertex: NDArray[np.intp]
 ) -> tuple[NDArray[np.complex128], NDArray[np.bool_]]:
-    """Return (points, mask of joints) along the links of one loop or one open path.
+    """Return (points, mask of joints) along the links of one loop or one open path in `chains`.
 
     `members`: indices of the links, in any order; `vertex` (n, 2): numbers of the vertices at each
     chain's ends."""

@@ -36,7 +36,7 @@ _NOT_FILES = (
 
 
 def read(path: Path) -> Loop:
-    """Return the outline in a CSV (.csv, .txt) or DXF file as a closed loop (mm).
+    """Return the outline in the CSV (.csv, .txt) or DXF file `path` as a closed loop (mm).
 
     CSV: x and y in mm, separated by commas, semicolons, tabs or blanks, with or without a header.
     The columns are those that the header calls x and y (or `x_mm`, `y_mm`), or else the first two.

@@ -300,7 +300,7 @@ class Profile(eqx.Module):
 
 
 def _inverse(profile: Profile, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return the greatest normal angle (rad) at a `roll_angle` (rad), found numerically.
+    """Return the greatest normal angle (rad) of `profile` at a `roll_angle` (rad), by a search.
 
     The search uses safeguarded Newton steps and is not differentiated. The plain Newton steps after
     it carry the derivatives with respect to roll angle and design. They also continue the flank

@@ -16,7 +16,8 @@ def arc_involute(
 ) -> "CIC":
     """Return a CIC rotor without a tip land, whose addendum is an arc and an involute.
 
-    The arguments are those of `CIC`."""
+    `lobes`: number of lobes N; `pitch_radius`: r (m); `pressure_angle`: α (rad); `involute_length`:
+    u (m). See `CIC`."""
     return CIC(lobes, pitch_radius, pressure_angle, involute_length, 0.0)
 
 

@@ -23,10 +23,10 @@ def departure(profile: Profile, other: Profile, nodes: int = _NODES) -> float:
 
 
 def flank_points(profile: Profile, nodes: int = _NODES) -> NDArray[np.float64]:
-    """Return points (n, 2) in m on a flank from tip to root, evenly spaced in normal angle.
+    """Return points (n, 2) in m on a flank of `profile` from tip to root.
 
-    The ends of segments are further points. `nodes`: least number of points on each side of the
-    pitch circle."""
+    The points are evenly spaced in normal angle; the ends of segments are further points. `nodes`:
+    least number of points on each side of the pitch circle."""
     stop = float(profile.pitch_normal)
     ends = [float(s.stop) for s in profile.segments()]
     return np.asarray(_points(profile, np.union1d(np.linspace(0, stop, nodes), ends)))

@@ -165,7 +165,8 @@ class FreeForm(Profile):
         def short(c, width, want, share):
             """Return (β minus the required β (rad) at a fraction of a span, its derivative).
 
-            `share`: the fraction of the span.
+            `c`: coefficients of ψ in the span; `width`: width of the span (rad); `want`: required β
+            minus β at the span's start (rad); `share`: the fraction.
             """
             rise = share * (width + c[1] + share * (c[2] + share * c[3]))
             slope = width + c[1] + share * (2 * c[2] + 3 * share * c[3])

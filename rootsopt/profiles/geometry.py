@@ -102,7 +102,7 @@ def _rule(quadrature: Quadrature) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 def _given(profile: Outline) -> Geometry:
-    """Return the geometry of an outline, as computed when its file was read.
+    """Return the geometry of the outline `profile`, as computed when its file was read.
 
     The undercut margin is NaN, because the dedendum of an outline is not the partner's envelope."""
     return Geometry(
@@ -117,7 +117,7 @@ def _given(profile: Outline) -> Geometry:
 
 
 def flank_nodes(profile: Profile, points: int) -> Float[Array, " n"]:
-    """Return normal angles (n,) in rad of about `points` nodes along the addendum.
+    """Return normal angles (n,) in rad of about `points` nodes along the addendum of `profile`.
 
     Every segment end is a node. On each segment, nodes are denser where the arc element is longer,
     on the addendum or on its conjugate."""
@@ -145,7 +145,7 @@ def _both(profile, nu):
 
 @Program
 def _element(profile, nu):
-    """Return the density of nodes per normal angle `nu` (m/rad).
+    """Return the density of nodes (m/rad) of `profile` at the normal angles `nu` (rad).
 
     The density is the longer of the two conjugate arc elements plus a constant. The constant
     ensures enough nodes at sharp points, such as the pitch crossing of EE."""
@@ -155,7 +155,7 @@ def _element(profile, nu):
 
 
 def flank(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
-    """Return coordinates (n, 2) in m of one flank, from tip centre to root centre.
+    """Return points (n, 2) in m on one flank of `profile`, from tip centre to root centre.
 
     `points`: approximate number of nodes on each side of the pitch circle."""
     nu = flank_nodes(profile, points)
@@ -164,7 +164,7 @@ def flank(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
 
 
 def outline(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
-    """Return the closed counter-clockwise outline (n, 2) in m, with a lobe tip on +x.
+    """Return the closed counter-clockwise outline (n, 2) in m of `profile`, with a lobe tip on +x.
 
     The first point is repeated at the end. `points`: approximate number of nodes on each side of
     the pitch circle of each flank."""

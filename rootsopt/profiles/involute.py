@@ -38,7 +38,8 @@ def ranges(
 ) -> dict[str, tuple[Float[Array, ""], Float[Array, ""]]]:
     """Return {"involute_length_mm": (shortest, longest)}, the range (mm) in which a search stays.
 
-    The range follows from `lobes` N and the other arguments, whose names end with their units.
+    The range follows from the number of lobes `lobes`, the pitch radius `pitch_radius_mm`, the
+    pressure angle `pressure_angle_deg` and half the tip land's angle, `tip_arc_angle_deg`.
     `involute_length_mm` is not used. The longest involute is `CIC.longest_involute`, so that u ≤
     u_max holds by construction."""
     del involute_length_mm
@@ -48,7 +49,7 @@ def ranges(
 
 
 def check(profile: "ProfileConfig") -> None:
-    """Raise `InputError` if the profile's involute is too short or too long, or is undercut."""
+    """Raise `InputError` if the involute of a `profile` is too short, too long or undercut."""
     alpha: Any = getattr(profile, _ANGLE)
     length: Any = getattr(profile, _LENGTH)
     tip: Any = getattr(profile, _TIP) or 0.0

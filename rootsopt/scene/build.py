@@ -137,14 +137,18 @@ class Scene(eqx.Module):
         return float(self.law.depth_at(force))
 
     def inertia(self, shape: Geometry) -> Float[Array, ""]:
-        """Return the moment of inertia (kg·m²) of one rotor of this geometry about its axis."""
+        """Return the moment of inertia (kg·m²) of one rotor about its axis.
+
+        `shape`: geometry of the rotor."""
         moment = shape.polar_area_moment
         if self.bore_radius is not None:
             moment = moment - jnp.pi / 2 * self.bore_radius**4
         return self.density * self.length * moment
 
     def mass(self, shape: Geometry) -> Float[Array, ""]:
-        """Return the mass (kg) of one rotor of this geometry."""
+        """Return the mass (kg) of one rotor.
+
+        `shape`: geometry of the rotor."""
         area = shape.area
         if self.bore_radius is not None:
             area = area - jnp.pi * self.bore_radius**2

@@ -32,7 +32,7 @@ def profile_of(
 ) -> Profile:
     """Return the profile of a `family` with a `design` (d,) in config units.
 
-    `pitch_radius` is in m."""
+    `lobes`: number of lobes; `pitch_radius`: pitch radius (m)."""
     found = family_of(family)
     values = {
         parameter.argument: value * parameter.unit

@@ -111,7 +111,7 @@ def parts_of(config: Config) -> dict[str, Any]:
 
 
 def map_size(config: Config) -> tuple[int, int]:
-    """Return the numbers of points of the contact map over roll angle and relative rotation."""
+    """Return (number of points over roll, over relative rotation) of a config's contact map."""
     solver = config.solver
     return solver.map_rolls or _ROLLS, solver.map_relatives or _RELATIVES
 
