@@ -43,8 +43,7 @@ def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, A
 
 
 def simulation_figures(folder: ResultFolder, evaluation: Evaluation, config: Config) -> list[str]:
-    """Write the profile and force figures of one evaluation into `folder`; return the file names.
-    """
+    """Write the profile and force figures of an evaluation into `folder`; return the file names."""
     names = profile_figures(folder, config, evaluation.record())
     return names + _force_figures(folder, {config.profile.family.upper(): evaluation}, config)
 
