@@ -28,9 +28,9 @@ class Contact(eqx.Module):
     """Gap and levers of the drive flanks of two rotors.
 
     A pose is the roll coordinate x = -(φ1 + φ2)/2 and the relative rotation ε = φ2 - φ1 (rad), with
-    the rotations φ1 and φ2 of the rotors. A contact returns the gap and its levers. They satisfy d
-    gap = -lever1 dφ1 + lever2 dφ2, so that forces come from a potential. The gap's period in x is
-    2π/N. The coast flanks follow by x → -x, ε → -ε.
+    the rotations φ1 and φ2 of the rotors. A contact returns the gap and its levers. The gap and the
+    levers satisfy d gap = -lever1 dφ1 + lever2 dφ2, so that forces come from a potential. The gap's
+    period in x is 2π/N. The coast flanks follow by x → -x, ε → -ε.
 
     A scene may also need the point of contact or another centre distance. By default, a contact
     does not support these and raises `InputError`.

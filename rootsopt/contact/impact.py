@@ -38,8 +38,9 @@ def balanced_ramp(x: Float[Array, "*n"], width: Float[Array, "*#n"]) -> Float[Ar
     """Return max(0, x) with its corner rounded on 0 < x < w = `width` and its integral unchanged.
 
     Beyond the rounded zone, a spring with this force stores the same energy as one with a sharp
-    corner. `x` and `width` have the same unit. The function is C¹: `ramp` plus the multiple of t²
-    (1 - t)² that restores the integral, which is w (9 t² - 12 t³ + 5 t⁴) / 2 with t = x/w.
+    corner. `x` and `width` have the same unit. The function is C¹. In the rounded zone it is w (9
+    t² - 12 t³ + 5 t⁴) / 2 with t = x/w: `ramp` plus the multiple of t² (1 - t)² that restores the
+    integral.
     """
     safe = jnp.where(width > 0, width, 1.0)
     t = jnp.clip(x / safe, 0.0, 1.0)

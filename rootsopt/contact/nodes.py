@@ -1,8 +1,8 @@
 """Gap between the nodes of one outline and the segments of another: Eq. 9 of the paper.
 
-Tests use this method as the reference for the fast search. It is slow, but assumes neither roll
-angles nor conjugacy: it needs only a closed outline and a pose. It uses only NumPy and SciPy, and
-has no derivatives.
+Tests use this method as the reference for the fast search. The method is slow, but assumes neither
+roll angles nor conjugacy: it needs only a closed outline and a pose. The module uses only NumPy and
+SciPy, and its results have no derivatives.
 """
 
 import numpy as np

@@ -82,8 +82,8 @@ def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
     """Return the content of a GIF of the pair in perfect rolling over one lobe pitch.
 
     `drawing`, `profile`: drawing and profile of the rotor. The GIF shows the contact and the
-    direction of its force. It does not show the size of the force, which only a simulation can
-    give.
+    direction of its force. The size of the force is not shown, because only a simulation can give
+    it.
     """
     rotation = 2 * np.pi / profile.lobes * np.arange(_FRAMES) / _FRAMES
     flanks = [rolling_contacts(profile, rotation, coast) for coast in (False, True)]

@@ -69,7 +69,7 @@ def number(value: float) -> str:
 
 
 def _around_peak(run: Series, turns: float) -> slice:
-    """Return a slice of the samples of `run`: `turns` revolutions around the largest force.
+    """Return the slice of `run`'s samples that covers `turns` revolutions around the largest force.
 
     Near an end of the run, the slice is shifted to lie within the run."""
     count = len(run.time)

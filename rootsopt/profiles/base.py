@@ -1,9 +1,9 @@
 """The roll-angle form: one description of a conjugate flank for all profile families.
 
 Two identical rotors with `N` lobes roll 1:1 on pitch circles of radius `r`. A family
-describes only the *addendum* of one flank, as a function of the normal angle `nu`. This is the
-polar angle of the outward normal in the rotor frame, measured from the lobe's axis. The family
-defines two functions:
+describes only the *addendum* of one flank, as a function of the normal angle `nu`. The normal
+angle is the polar angle of the outward normal in the rotor frame, measured from the lobe's axis.
+The family defines two functions:
 
 - `roll_angle(nu)` is β, the polar angle, on the rotor, of the pitch point at the moment
   the flank point is in contact;
@@ -100,10 +100,10 @@ class Profile(eqx.Module):
     """Base class of all profiles: one flank of a Roots rotor in roll-angle form.
 
     `lobes`: number of lobes N; `pitch_radius`: r (m). A subclass defines `segments`, `roll_angle`
-    and `contact_distance` for normal angles 0 ≤ ν ≤ `pitch_normal`. It continues both functions
-    analytically beyond the pitch crossing and, unless the first segment is a land, over the tip (β
-    odd and s even in ν). This class derives everything else. A subclass may override `normal_at`,
-    `lever` and `support` with a closed form, which is faster and more exact.
+    and `contact_distance` for normal angles 0 ≤ ν ≤ `pitch_normal`. The subclass continues both
+    functions analytically beyond the pitch crossing and, unless the first segment is a land, over
+    the tip (β odd and s even in ν). This class derives everything else. A subclass may override
+    `normal_at`, `lever` and `support` with a closed form, which is faster and more exact.
     """
 
     lobes: eqx.AbstractVar[int]
@@ -224,7 +224,10 @@ class Profile(eqx.Module):
     def lever_from(
         self, nu: Float[Array, "*n"], cos: Float[Array, "*n"], sin: Float[Array, "*n"]
     ) -> Float[Array, "*n"]:
-        """Return the lever (m) at `nu` (rad), given cos κν and sin κν (κ: see `turn_ratio`)."""
+        """Return the lever (m) at the normal angle `nu` (rad), given `cos` = cos κν and `sin` = sin
+        κν.
+
+        `turn_ratio` is κ."""
         del cos, sin
         return self.lever(nu)
 
@@ -235,21 +238,21 @@ class Profile(eqx.Module):
 
     @property
     def pitch_normal(self) -> Float[Array, ""]:
-        """Normal angle at the pitch crossing (rad)."""
+        """Normal angle (rad) at the pitch crossing."""
         return self.segments()[-1].stop
 
     def addendum(self, nu: Float[Array, "*n"]) -> RollPoint:
-        """Return the addendum point with normal angle `nu` (rad)."""
+        """Return the addendum point at the normal angle `nu` (rad)."""
         beta = self.roll_angle(nu)
         return RollPoint(beta, beta + jnp.pi / 2 - nu, self.contact_distance(nu))
 
     def dedendum(self, nu: Float[Array, "*n"]) -> RollPoint:
-        """Return the dedendum point that meshes with the partner's addendum point `nu` (rad)."""
+        """Return the dedendum point that meshes with the partner's addendum point at `nu` (rad)."""
         point = self.addendum(nu)
         return RollPoint(jnp.pi / self.lobes - point.beta, point.psi, -point.s)
 
     def position(self, point: RollPoint) -> Float[Array, "*n 2"]:
-        """Return the point's coordinates (m) in the rotor frame, with a lobe tip on +x."""
+        """Return the coordinates (m) of a `point` in the rotor frame, with a lobe tip on +x."""
         beta, psi, s = point
         radial = self.pitch_radius + s * jnp.sin(psi)
         tangential = s * jnp.cos(psi)

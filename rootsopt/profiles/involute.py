@@ -19,8 +19,8 @@ Beyond u_max the roll angle turns back and two points of a flank mesh at once. A
 no interference (< 1 nm) up to 5 % excess; the paper's printed Table 1 has 1.2 %."""
 _CLEAR = 1e-6
 """Excess (pitch radii) of the involute length over its lower limit below which a config is
-rejected. At this limit, the centre of the tip arc reaches the pitch circle. It also lies there with
-the longest involute."""
+rejected. At this limit, the centre of the tip arc reaches the pitch circle. The centre also lies on
+this circle if the involute has its greatest length."""
 _LEAST_INVOLUTE = 0.002
 """Involute length (fraction of the longest) below which a config is rejected. A shorter involute
 has no effect, and its length was probably given in metres."""
