@@ -16,9 +16,9 @@ where q are the levers, h the support functions and E is the centre distance. Th
 is the root of T. Newton's method searches for it from the point of perfect rolling. It may fail to
 converge, or find another root. In these cases, the search brackets the root between two of a fixed
 set of nodes and refines it inside this bracket. The search then cannot lose the root where
-curvature jumps or the flanks conform. A root at which T falls with increasing ν2 is a minimum of the gap. By the
-envelope theorem, ∂G/∂φ1 = -q1 and ∂G/∂φ2 = q2. These derivatives also give the virtual work of a
-unit contact force.
+curvature jumps or the flanks conform. A root at which T falls with increasing ν2 is a minimum of
+the gap. By the envelope theorem, ∂G/∂φ1 = -q1 and ∂G/∂φ2 = q2. These derivatives also give the
+virtual work of a unit contact force.
 
 Bracketing on all nodes needs no trigonometric function per node and pose. A pose turns all nodes by
 the same angle, so that their sines and cosines follow from the addition theorem.

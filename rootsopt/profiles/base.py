@@ -224,10 +224,9 @@ class Profile(eqx.Module):
     def lever_from(
         self, nu: Float[Array, "*n"], cos: Float[Array, "*n"], sin: Float[Array, "*n"]
     ) -> Float[Array, "*n"]:
-        """Return the lever (m) at the normal angle `nu` (rad), given `cos` = cos κν and `sin` = sin
-        κν.
+        """Return the lever (m) at the normal angle `nu` (rad), given two trigonometric functions.
 
-        `turn_ratio` is κ."""
+        `cos`, `sin`: cosine and sine of κν, with the factor κ = `turn_ratio`."""
         del cos, sin
         return self.lever(nu)
 
