@@ -6,7 +6,7 @@ forward) has x = -φ. At ε = 0 the pair touches at roll angle β = x, 0 ≤ x �
 
 Both flanks are described by the normal angle of an addendum point. On rotor 1 this angle is ν1. On
 rotor 2, ν2 denotes the dedendum point that meshes with the addendum point ν2 in perfect rolling. If
-the two normals are parallel, ν1 = ν2 - 2(β(ν2) - x), and with the pressure angle λ of that common
+the two normals are parallel, ν1 = ν2 - 2(β(ν2) - x), and with the pressure angle λ of their common
 direction
 
     T = E cos λ - q1(ν1) - q2(ν2)      tangential offset of the two points,
@@ -14,17 +14,18 @@ direction
 
 where q are the levers, h the support functions and E is the centre distance. The closest approach
 is the root of T. Newton's method searches for it from the point of perfect rolling. It may fail to
-converge, or find another root. The search then brackets the root between two of a fixed set of
-nodes and refines it inside this bracket, so that it cannot lose the root where curvature jumps or
-the flanks conform. A root at which T falls with increasing ν2 is a minimum of the gap. By the
-envelope theorem, ∂G/∂φ1 = -q1 and ∂G/∂φ2 = q2. These derivatives also give the virtual work of a
-unit contact force.
+converge, or find another root. In these cases, the search brackets the root between two of a fixed
+set of nodes and refines it inside this bracket. The search then cannot lose the root where
+curvature jumps or the flanks conform. A root at which T falls with increasing ν2 is a minimum of
+the gap. By the envelope theorem, ∂G/∂φ1 = -q1 and ∂G/∂φ2 = q2. These derivatives also give the
+virtual work of a unit contact force.
 
 Bracketing on all nodes needs no trigonometric function per node and pose. A pose turns all nodes by
 the same angle, so that their sines and cosines follow from the addition theorem.
 
-Exchanging the rotors maps x to π/N - x. The search therefore covers only the half with rotor 1's
-addendum in rotor 2's dedendum. Coast flanks follow from mirror symmetry, x → -x, ε → -ε.
+Exchanging the rotors maps x to π/N - x. The search therefore covers only the half of the mesh in
+which rotor 1's addendum meets rotor 2's dedendum. Coast flanks follow from mirror symmetry, x → -x,
+ε → -ε.
 """
 
 from typing import NamedTuple
@@ -88,7 +89,7 @@ class ClosestApproach(NamedTuple):
 class FlankNodes(NamedTuple):
     """Nodes at which T is sampled, with the quantities that do not depend on the pose.
 
-    `normal` (n,): normal angles ν2 (rad).
+    `normal` (n,): normal angles ν2 (rad) of the nodes.
     `facing` (n,): direction (rad) of the common normal at x = 0.
     `direction` (2, n): cosine and sine of `facing`.
     `turned` (2, n): cosine and sine of `Profile.turn_ratio` times `facing`.
@@ -106,7 +107,7 @@ class FlankNodes(NamedTuple):
 
 
 class FlankPair(eqx.Module):
-    """A flank of rotor 1 against its mate on rotor 2.
+    """A flank of rotor 1 and its mate on rotor 2.
 
     Build it with `FlankPair.of(profile)` outside any time loop.
 
@@ -131,9 +132,9 @@ class FlankPair(eqx.Module):
         """Return the flank pair of `profile`, prepared for searches; its nodes have no derivatives.
 
         `center_distance`: E (m), by default the distance of perfect rolling, 2r. At other
-        distances, drive and coast flanks can touch at the same time: set `two_sided`. The search
-        then also covers the half of a land up to the lobe's axis. The other half belongs to the
-        flank on the other side.
+        distances, drive and coast flanks can touch at the same time: set `two_sided` for these. The
+        search then also covers the half of a land up to the lobe's axis. The other half belongs to
+        the flank on the other side.
         """
         frozen = lax.stop_gradient(profile)
         segments = [s for s in frozen.segments() if two_sided or not s.land]
@@ -179,7 +180,7 @@ class FlankPair(eqx.Module):
     def __call__(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> ClosestApproach:
         """Return the closest approach at roll coordinate x = `roll` and ε = `relative` (rad).
 
-        Any angle may be given: `roll` is reduced to one mesh period around the middle of the flank.
+        Any `roll` may be given: it is reduced to one mesh period around the middle of the flank.
         The result is differentiable to any order with respect to both angles, the profile and the
         centre distance. The search itself is never differentiated.
         """
@@ -191,7 +192,9 @@ class FlankPair(eqx.Module):
         )
 
     def folded(self, roll: Float[Array, ""]) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-        """Return (x in the searched half of the mesh (rad), whether the rotors are exchanged)."""
+        """Return (x (rad) in the searched half of the mesh, whether the rotors are exchanged).
+
+        `roll`: any x (rad)."""
         half = self.profile.half_pitch
         centered = roll - half
         centered = centered - 4 * half * jnp.round(centered / (4 * half))
@@ -219,8 +222,9 @@ class FlankPair(eqx.Module):
     ) -> Float[Array, " s"]:
         """Return numbers (s,) that are positive where the flags of `switches` are set.
 
-        `rival`: gap (m) of the other minimum next to a cusp. Whether there is a common normal has
-        no margin: it changes only where the flanks are apart."""
+        `roll`, `found`: as in `switches`; `rival`: gap (m) of the other minimum next to a cusp. The
+        flag for a common normal gets 1 or -1, because it changes only where the flanks are apart.
+        """
         ends = jnp.stack([segment.stop for segment in self.profile.segments()[:-1]] or [0.0])
         normals = jnp.stack([found.normal1, found.normal2])
         beyond = (normals[:, None] - ends).ravel()
@@ -232,9 +236,10 @@ class FlankPair(eqx.Module):
 
     @eqx.filter_jit  # so that all its calls in one program are traced once
     def _closest(self, roll, relative) -> ClosestApproach:
-        """Return the closest approach for a folded `roll`, with its derivatives.
+        """Return the closest approach for a `roll` from `folded`, with rules for its derivatives.
 
-        With θ the pose and the design, dG = ∂G/∂θ dθ at the root held fixed (envelope
+        `relative`: ε (rad). With θ the pose and the design, dG = ∂G/∂θ dθ at the root held fixed
+        (envelope
         theorem) and dν2 = -(∂T/∂θ dθ) / (∂T/∂ν2) (implicit function theorem). The rule is
         itself differentiable, so that second derivatives are those of the true gap.
         """
@@ -275,16 +280,18 @@ class FlankPair(eqx.Module):
         return closest(dynamic, roll, relative)
 
     def reach(self, normal1, normal2, roll, relative):
-        """Return (support of rotor 1's point (m), of rotor 2's point (m), cosine).
+        """Return (support function at rotor 1's point (m), at rotor 2's point (m), cosine).
 
-        The cosine is that of the angle between the common normal and the line of centres.
-        `normal1`, `normal2`: ν1 and ν2 (rad); `roll`: folded x; `relative`: ε (rad)."""
+        The cosine is the component of the common normal along the line of centres. `normal1`,
+        `normal2`: ν1 and ν2 (rad); `roll`: x (rad) from `folded`; `relative`: ε (rad)."""
         mate = self.profile.mate(normal2)
         direction = mate.facing + roll - relative / 2
         return self.profile.support(normal1), mate.support, jnp.cos(direction)
 
     def _mesh(self, normal2, roll, relative):
-        """Return T, G, ν1, q1, q2 at ν2 = `normal2` from the formulas of the module's docstring."""
+        """Return (T, G, ν1, q1, q2) at ν2 = `normal2`, as defined in the module's docstring.
+
+        `roll`: x (rad) from `folded`; `relative`: ε (rad)."""
         profile = self.profile
         mate = profile.mate(normal2)
         normal1 = mate.facing + 2 * roll
@@ -296,19 +303,20 @@ class FlankPair(eqx.Module):
         return offset, gap, normal1, lever1, mate.lever
 
     def _offset(self, normal2, roll, relative):
-        """Return T (m) at ν2 = `normal2`, without the other results of `_mesh`."""
+        """Return the tangential offset T (m) for the arguments of `_mesh`."""
         mate = self.profile.mate(normal2, support=False)
         reach = self.center_distance * jnp.sin(mate.facing + roll - relative / 2)
         return reach - self.profile.lever(mate.facing + 2 * roll) - mate.lever
 
     def _search(self, roll, relative, attempt=0):
-        """Return (number of attempts, closest approach) at a folded `roll`.
+        """Return (number of attempts, closest approach) for a `roll` from `folded`.
 
-        Attempt 0 is Newton's method from the point of perfect rolling. If its result is not
-        reliable, attempts 1 and 2 follow. The gap may have two minima next to a cusp, or if the
-        centre distance is not the nominal one. They lie in the last and the first interval of nodes
-        where T falls through zero; the deeper minimum is returned. If the flanks are not conjugate,
-        the gap may have more minima; the attempts then try the two that are deepest at the nodes.
+        `relative`: ε (rad); `attempt`: number of the first attempt. Attempt 0 is Newton's method
+        from the point of perfect rolling. If its result is not reliable, attempts 1 and 2 follow.
+        They search the last and the first interval of nodes where T falls through zero. These
+        intervals contain the two minima that the gap may have next to a cusp, or if the centre
+        distance is not nominal. The deeper minimum is returned. If the flanks are not conjugate,
+        the gap may have more minima. The attempts then search the two intervals with the least gap.
         All attempts share one loop, which is compiled once.
         """
         nothing = jnp.zeros_like(roll)
@@ -348,12 +356,12 @@ class FlankPair(eqx.Module):
         return attempts % _DONE, best
 
     def _bracket(self, attempt, roll, relative):
-        """Return an interval between nodes where T falls through zero.
+        """Return an interval between two nodes where T falls through zero.
 
-        For conjugate flanks, attempt 1 takes the last such interval and attempt 2 the first. For
-        other flanks, they take the intervals with the least and the second least gap. The result is
-        ((low, high), first guess, whether such an interval exists, whether there is at most
-        one)."""
+        `roll`, `relative`: as in `_mesh`. For conjugate flanks, attempt 1 takes the last such
+        interval and attempt 2 the first. For other flanks, attempt 1 takes the interval with the
+        least gap and attempt 2 that with the second least gap. The result is ((low, high), first
+        guess, whether such an interval exists, whether there is at most one)."""
         profile, nodes = self.profile, self.nodes
         turned = _rotate(nodes.turned, 2 * profile.turn_ratio * roll)
         normal1 = nodes.facing + 2 * roll
@@ -387,11 +395,12 @@ class FlankPair(eqx.Module):
         return (low, high), low + (high - low) * share, present, single
 
     def _root(self, bracket, guess, guarded, roll, relative):
-        """Return (root of T by Newton's method from `guess`, whether the method converged).
+        """Return (root ν2 (rad) of T, whether Newton's method from `guess` has converged to it).
 
-        `guarded`: whether T falls through zero in the bracket. The bracket then shrinks around the
-        root, and is halved if Newton's step leaves it or is longer than half the previous step.
-        Halving is needed because T has a kink where ν1 crosses a segment's end.
+        `bracket`: (low, high) (rad); `roll`, `relative`: as in `_mesh`. `guarded`: whether T falls
+        through zero in the bracket. The bracket then shrinks around the root, and is halved if
+        Newton's step leaves it or is longer than half the previous step. Halving is needed because
+        T has a kink where ν1 crosses a segment's end.
         """
         tolerance = _CONVERGED[guess.dtype.itemsize]
         limit = jnp.where(guarded, _GUARDED_STEPS, _NEWTON_STEPS)
@@ -422,10 +431,10 @@ class FlankPair(eqx.Module):
 
 
 def _search_one_by_one(pair: FlankPair, roll, relative):
-    """Return the closest approach at a folded `roll`, from a search without derivatives.
+    """Return the closest approach, without derivatives, for a `roll` from `FlankPair.folded`.
 
-    On a CPU, the poses of a batch are searched one by one. A single pose rarely needs the nodes,
-    but a batch searched as a whole nearly always does."""
+    `relative`: ε (rad). On a CPU, the poses of a batch are searched one by one. A single pose
+    rarely needs the nodes, but a batch searched as a whole nearly always does."""
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
 
     def search(dynamic, roll, relative):
@@ -446,11 +455,11 @@ def contact_begins(relative: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def _materialized(tree, true):
-    """Return `tree` unchanged, but keep XLA from fusing its arrays with the code that uses them.
+    """Return `tree` unchanged, and keep XLA from fusing its arrays with the code that uses them.
 
-    Otherwise, XLA would recompute the sines of the nodes at every pose. On CPUs, XLA drops
-    optimisation barriers, but it must execute a loop of unknown length. `true`: a traced value that
-    is always true, which the compiler does not know."""
+    Otherwise, XLA would recompute the sines of the nodes at every pose. A loop of unknown length
+    prevents this, whereas XLA drops optimisation barriers on CPUs. `true`: a traced value that is
+    always true, unknown to the compiler."""
 
     def copy(carry):
         return carry[0] + 1, tree
@@ -465,7 +474,7 @@ def _circle(angle):
 
 
 def _share(before, after):
-    """Return the fraction of an interval at which a function, if linear, falls through zero.
+    """Return the fraction of an interval at which a linear function has its zero.
 
     `before`, `after`: values of the function at the interval's ends."""
     fall = before - after
@@ -473,6 +482,8 @@ def _share(before, after):
 
 
 def _rotate(directions, angle):
-    """Return the cosines and sines (2, n) of angles that are all increased by one `angle` (rad)."""
+    """Return the cosines and sines (2, n) of angles, after adding `angle` (rad) to each of them.
+
+    `directions` (2, n): cosines and sines of the original angles."""
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     return cos * directions[0] - sin * directions[1], cos * directions[1] + sin * directions[0]

@@ -28,20 +28,21 @@ class Contact(eqx.Module):
     """Gap and levers of the drive flanks of two rotors.
 
     A pose is the roll coordinate x = -(φ1 + φ2)/2 and the relative rotation ε = φ2 - φ1 (rad), with
-    the rotations φ1 and φ2 of the rotors. A contact returns the gap and its levers. They satisfy
-    d gap = -lever1 dφ1 + lever2 dφ2, so that forces come from a potential. The gap's period in x is
-    2π/N. The coast flanks follow by x → -x, ε → -ε.
+    the rotations φ1 and φ2 of the rotors. A contact returns the gap and its levers. The gap and the
+    levers satisfy d gap = -lever1 dφ1 + lever2 dφ2, so that forces come from a potential. The gap's
+    period in x is 2π/N. The coast flanks follow by x → -x, ε → -ε.
 
     A scene may also need the point of contact or another centre distance. By default, a contact
-    raises `InputError` for these.
+    does not support these and raises `InputError`.
     """
 
     @abc.abstractmethod
     def __call__(
         self, roll: Float[Array, ""], relative: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """Return the gap (m) and the levers (m) of rotor 1 and rotor 2 at x = `roll` and
-        ε = `relative` (rad)."""
+        """Return the gap (m) and the levers (m) of rotor 1 and rotor 2 at a pose.
+
+        `roll`, `relative`: x and ε (rad)."""
 
     @property
     def smooth(self) -> bool:
@@ -57,34 +58,35 @@ class Contact(eqx.Module):
 
     @property
     def two_sided(self) -> bool:
-        """Whether the gap is also valid for flanks turned away from each other (ε > 0).
+        """Whether the gap is also valid where the flanks are turned away from each other (ε > 0).
 
         Such flanks can touch if the axes are displaced or the flanks are not conjugate."""
         return False
 
     @property
     def length_scale(self) -> Float[Array, ""] | None:
-        """Length (m) whose rounding error is that of the gap: about the pitch radius.
+        """Length (m) from which the rounding error of the gap follows: about the pitch radius.
 
-        The levers have about the same length. `None`: the gap's rounding error is negligible."""
+        The gap's error is the rounding error of a number of this size. The levers have about the
+        same size. `None`: the gap's rounding error is negligible."""
         return None
 
     @property
     def center_distance(self) -> Float[Array, ""]:
         """Distance between the rotors' axes (m).
 
-        Raises `InputError` if a contact supports the nominal distance only."""
+        Raises `InputError` if the contact supports only the nominal distance."""
         raise self._lacks("another centre distance", "displaced axes need")
 
     def at_distance(self, distance: Float[Array, ""]) -> "Contact":
         """Return the contact of the same flanks at another centre `distance` (m).
 
-        Raises `InputError` if a contact supports the nominal distance only."""
+        Raises `InputError` if the contact supports only the nominal distance."""
         del distance
         raise self._lacks("another centre distance", "displaced axes need")
 
     def approach(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> Approach:
-        """Return gap and levers at x = `roll` and ε = `relative` (rad).
+        """Return the gap and the levers (m) at x = `roll` and ε = `relative` (rad).
 
         The result also holds what `point` and `switches` need at the same pose."""
         return Approach(*self(roll, relative))
@@ -102,19 +104,22 @@ class Contact(eqx.Module):
     def switches(self, roll: Float[Array, ""], approach: Approach) -> Bool[Array, " s"]:
         """Return flags (s,) that identify the smooth piece of the gap at x = `roll` (rad).
 
-        One flag changes at each surface in the space of poses where a derivative jumps."""
+        `approach`: result of `approach` at the same pose. A flag changes wherever a derivative of
+        the gap jumps."""
         del roll, approach
         return jnp.zeros(0, bool)
 
     def margins(self, roll: Float[Array, ""], approach: Approach) -> Float[Array, " s"]:
         """Return numbers (s,) that are positive where the flags of `switches` are set.
 
-        By default they are 1 and -1. Those of `NearContact` are smooth across the instant at which
-        their flag changes, and zero there."""
+        By default, a number is 1 or -1. In `NearContact`, a number whose flag changes during
+        contact passes smoothly through zero. `roll`, `approach`: as in `switches`."""
         return jnp.where(self.switches(roll, approach), 1.0, -1.0)
 
     def on_side(self, side: Float[Array, ""]) -> "Contact":
-        """Return the contact for one side of the flanks (1 drive, -1 coast); by default itself."""
+        """Return the contact to use for one side of the flanks; by default, this contact.
+
+        `side`: 1 for the drive flanks, -1 for the coast flanks."""
         del side
         return self
 

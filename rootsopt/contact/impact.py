@@ -35,11 +35,12 @@ def smooth_step(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def balanced_ramp(x: Float[Array, "*n"], width: Float[Array, "*#n"]) -> Float[Array, "*n"]:
-    """Return max(0, x), with its corner rounded on 0 < x < w = `width` and the same integral.
+    """Return max(0, x) with its corner rounded on 0 < x < w = `width` and its integral unchanged.
 
-    Beyond the rounded zone, a spring with this force stores the same energy as with a sharp corner.
-    The function is C¹: `ramp` plus the multiple of t² (1 - t)² that restores the integral, which is
-    w (9 t² - 12 t³ + 5 t⁴) / 2 with t = x/w.
+    Beyond the rounded zone, a spring with this force stores the same energy as one with a sharp
+    corner. `x` and `width` have the same unit. The function is C¹. In the rounded zone it is w (9
+    t² - 12 t³ + 5 t⁴) / 2 with t = x/w: `ramp` plus the multiple of t² (1 - t)² that restores the
+    integral.
     """
     safe = jnp.where(width > 0, width, 1.0)
     t = jnp.clip(x / safe, 0.0, 1.0)
@@ -48,11 +49,11 @@ def balanced_ramp(x: Float[Array, "*n"], width: Float[Array, "*#n"]) -> Float[Ar
 
 
 def balanced_step(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return a C¹ step from 0 to 1 on 0 < x < 1, with the same integral as a sharp step at 0.
+    """Return a C¹ step from 0 to 1 on 0 < x < 1 that has the integral of a sharp step at 0.
 
-    With this onset, a damper removes the same momentum from a motion that crosses the zone as with
-    a sharp onset. The step therefore exceeds 1 inside the zone, by up to half. It is never
-    negative. `smooth_step` would omit half a width of damping on every crossing.
+    A motion that crosses the zone 0 < x < 1 loses the same momentum to a damper with this onset as
+    to one with a sharp onset. The step is never negative, but exceeds 1 inside the zone, by up to
+    half. With `smooth_step`, each crossing would lack the damping over half the zone.
     """
     t = jnp.clip(x, 0.0, 1.0)
     return t**2 * (18 - 32 * t + 15 * t**2)
@@ -63,9 +64,9 @@ def force_rounding(
 ) -> Float[Array, ""]:
     """Return the relative rounding error of the force at a penetration `depth` (m).
 
-    The gap is a difference between lengths of about the pitch `radius` (m), and has their rounding
-    error. The force is a power of the gap, with the law's `exponent`. Without contact, the error is
-    0.
+    `exponent`: exponent of the penetration in the law; `radius`: pitch radius (m). The penetration
+    is a difference between lengths of about the pitch radius, and has their rounding error. Without
+    contact, the result is 0.
     """
     deep = jnp.where(depth > 0, depth, jnp.inf)
     return exponent * float(jnp.finfo(depth.dtype).eps) * radius / deep
@@ -74,7 +75,7 @@ def force_rounding(
 class ImpactLaw(ContactLaw):
     """IMPACT contact force between two flanks (SI units).
 
-    `stiffness`: K (N/m^e); `exponent`: e ≥ 1; `damping`: C (N·s/m), reached at full depth;
+    `stiffness`: K (N/m^e); `exponent`: e ≥ 1; `damping`: C (N·s/m), reached at the penetration d;
     `full_damping_depth`: d (m); `smoothing`: h (m), 0 for the law without rounding.
     """
 
@@ -96,10 +97,11 @@ class ImpactLaw(ContactLaw):
         return jnp.where(positive, jnp.where(releasing, rounded, jnp.maximum(total, 0.0)), 0.0)
 
     def switches(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Bool[Array, "5"]:
-        """Return flags (5,) that identify the law's smooth piece.
+        """Return flags (5,) that identify the smooth piece of the law.
 
-        In order: in contact, beyond the rounding of the onset, fully damped, not released, beyond
-        the rounding of the release."""
+        `depth`: penetration (m); `rate`: its rate (m/s). In order, the flags are: in contact;
+        beyond the rounding of the onset; fully damped; not released; beyond the rounding of the
+        release."""
         positive, elastic, total, width = self._parts(depth, rate)
         depths = jnp.stack([jnp.zeros_like(depth), self.smoothing, self.full_damping_depth])
         limits = jnp.stack([jnp.zeros_like(elastic), width * elastic])
@@ -117,11 +119,11 @@ class ImpactLaw(ContactLaw):
     def _parts(self, depth, rate):
         """Return (whether in contact, elastic force (N), total force (N) before release, width).
 
-        The width is the fraction of the elastic force over which the release is rounded. The
-        damping force is added to the elastic force; their quotient is used only near the release.
-        At the onset both forces are so small that the quotient's derivative would overflow in
-        single precision. (The release is not rounded where the square of the elastic force is out
-        of range.)
+        `depth`: penetration (m); `rate`: its rate (m/s). The total force is the sum of elastic
+        force and damping force. The width is the fraction of the elastic force over which the
+        release is rounded. Only the release uses the quotient of the two forces. At the onset, both
+        are so small that its derivative would overflow in single precision. The release is not
+        rounded where the square of the elastic force is out of range.
         """
         delta = ramp(depth, self.smoothing)
         safe = jnp.where(delta > 0, delta, self.full_damping_depth)

@@ -11,10 +11,10 @@ from jaxtyping import Array, Bool, Float
 class ContactLaw(eqx.Module):
     """Normal force between two flanks (SI units).
 
-    The force is zero without penetration, never adhesive, and continuous. Where one of its
-    derivatives jumps, an entry of `switches` must change. All numbers of a law are arrays, with
-    respect to which responses are differentiable. `exponent`: exact or approximate exponent of the
-    penetration in the static force.
+    The force must be zero without penetration, never negative (adhesive), and continuous. Where one
+    of its derivatives jumps, an entry of `switches` must change. All numbers of a law are arrays,
+    and responses are differentiable with respect to them. `exponent`: exact or approximate exponent
+    of the penetration in the static force.
     """
 
     exponent: eqx.AbstractVar[Float[Array, ""]]
@@ -32,15 +32,18 @@ class ContactLaw(eqx.Module):
         The result must be differentiable with respect to the force and the law."""
 
     def switches(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Bool[Array, " s"]:
-        """Return flags (s,) that identify the law's smooth piece; by default, whether it acts."""
+        """Return flags (s,) that identify the smooth piece of the law.
+
+        `depth`: penetration (m); `rate`: its rate (m/s). By default, the only flag says whether
+        there is penetration."""
         del rate
         return jnp.stack([depth > 0])
 
     def margins(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, " s"]:
         """Return numbers (s,) that are positive where the flags of `switches` are set.
 
-        Each is smooth across the instant at which its flag changes, and zero there. A law that
-        overrides `switches` but not `margins` cannot be used by collocation."""
+        `depth`, `rate`: as in `switches`. Each number passes smoothly through zero where its flag
+        changes. A law that overrides `switches` but not `margins` cannot be used by collocation."""
         del rate
         return jnp.stack([depth])
 
@@ -52,8 +55,8 @@ class ContactLaw(eqx.Module):
     def depth_absorbing(self, work: Float[Array, ""]) -> Float[Array, ""]:
         """Return the penetration (m) at which the static force has absorbed `work` (J).
 
-        By default, assume a power law with the law's `exponent`. The solver uses this depth to
-        choose its steps only; no result depends on it."""
+        By default, assume a power law with the law's `exponent`. The solver uses this depth only to
+        choose its steps."""
         e = self.exponent
         unit = self.depth_at(jnp.ones_like(work))
         return ((e + 1) * work * unit**e) ** (1 / (e + 1))

@@ -22,8 +22,8 @@ from rootsopt.profiles.base import Profile
 class LinearContact(Contact):
     """Gap and levers of a flank pair at a pose, to first order in ε.
 
-    Call an instance with roll coordinate x and relative rotation ε (rad), see `Contact`. `profile`:
-    both rotors' profile.
+    Call an instance with the roll coordinate x and the relative rotation ε (rad), which `Contact`
+    defines. `profile`: both rotors' profile.
     """
 
     profile: Profile
@@ -35,7 +35,7 @@ class LinearContact(Contact):
 
     @classmethod
     def of(cls, profile: Profile) -> "LinearContact":
-        """Return the contact of `profile`; nothing is precomputed."""
+        """Return the contact of `profile`. Nothing is computed in advance."""
         return cls(profile)
 
     def __call__(

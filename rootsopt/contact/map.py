@@ -1,9 +1,9 @@
-"""C² map of the flank gap over the pose: the fast fidelity.
+"""C² map of the flank gap over the pose: a fast approximation of the search.
 
-The gap of `closest.FlankPair` is tabulated once per design on a uniform grid over roll
-coordinate and relative rotation, and interpolated by bicubic B-splines. Levers are the
-derivatives of the interpolated gap itself, so that forces still come from a potential.
-Derivatives with respect to the design enter at the grid points, by the envelope theorem.
+The gap of `closest.FlankPair` is tabulated once per design on a uniform grid over roll coordinate
+and relative rotation, and interpolated by bicubic B-splines. Levers are the derivatives of the
+interpolated gap, so that forces still come from a potential. Derivatives with respect to the design
+enter at the grid points, by the envelope theorem.
 """
 
 import functools
@@ -35,10 +35,10 @@ def first_roll(deepest: Float[Array, ""] | float, half_pitch: float) -> Float[Ar
 def continued_gap(
     pair: FlankPair, roll: Float[Array, ""], relative: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Return the gap (m) at x = `roll` and ε = `relative` (rad), also where it is not defined.
+    """Return the gap (m) at x = `roll` and ε = `relative` (rad), continued over the tip land.
 
-    Where the tip land passes, the flanks have no common normal. A parabola then continues the gap
-    from the land's end.
+    `pair`: the flanks. Where the tip land passes, the flanks have no common normal. There, the gap
+    is continued from the land's end by a parabola in x and ε.
     """
     contact = pair(roll, relative)
     away = roll - lax.stop_gradient(_land_end(pair.profile)) - relative / 2
@@ -47,8 +47,9 @@ def continued_gap(
 
 @functools.lru_cache(maxsize=32)
 def _interpolation_matrix(count: int) -> NDArray[np.float64]:
-    """Return the matrix (count + 2, count) from values at uniform knots to cubic B-spline
-    coefficients, with not-a-knot ends."""
+    """Return the matrix (count + 2, count) that computes the coefficients of a cubic B-spline.
+
+    The matrix multiplies the values at `count` uniform knots. The end conditions are not-a-knot."""
     system = np.zeros((count + 2, count + 2))
     for i in range(count):
         system[i + 1, i : i + 3] = [1 / 6, 4 / 6, 1 / 6]
@@ -62,7 +63,9 @@ def _interpolation_matrix(count: int) -> NDArray[np.float64]:
 
 
 def _weights(t):
-    """Return (values, slopes, second derivatives) of the 4 B-splines at fraction t of a cell."""
+    """Return (values, slopes, second derivatives) of the 4 B-splines that are not zero in a cell.
+
+    `t`: position in the cell, from 0 to 1."""
     u = 1 - t
     value = jnp.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]) / 6
     slope = jnp.stack([-(u**2), 3 * t**2 - 4 * t, -3 * u**2 + 4 * u, t**2]) / 2
@@ -73,9 +76,9 @@ def _weights(t):
 class MapContact(Contact):
     """Gap and levers of a flank pair at a pose, from a spline map.
 
-    Call an instance with roll coordinate x and relative rotation ε (rad), see `Contact`. Below
-    ε = `deepest` the gap continues linearly in ε. A simulation can therefore continue, and its
-    caller can see that the map must be larger.
+    Call an instance with the roll coordinate x and the relative rotation ε (rad), which `Contact`
+    defines. Below ε = `deepest`, the gap is extrapolated linearly in ε. A simulation can then
+    continue, and its caller can see that the map must be larger.
 
     `coefficients` (m, n): coefficients of the B-spline, in metres; `first_roll`, `deepest`: roll
     and ε (rad) of the first grid point; `roll_step`, `relative_step`: grid steps (rad);
@@ -93,7 +96,7 @@ class MapContact(Contact):
     def of(
         cls, profile: Profile, deepest: Float[Array, ""], rolls: int, relatives: int
     ) -> "MapContact":
-        """Return the map of `profile` down to ε = `deepest` < 0 (rad).
+        """Return the map of the gap of `profile` down to ε = `deepest` < 0 (rad).
 
         The grid has `rolls` points over x and `relatives` points over ε, both at least 8."""
         pair = FlankPair.of(profile)
@@ -138,7 +141,9 @@ class MapContact(Contact):
 
 @jax.custom_jvp
 def _bicubic(coefficients, x, y):
-    """Return the spline's value and its derivatives ∂x, ∂y, ∂x∂y at x, y in units of cells."""
+    """Return the spline's value and derivatives ∂x, ∂y, ∂x∂y at (`x`, `y`), in units of cells.
+
+    `coefficients` (m, n): coefficients of the B-spline."""
     i, j = (lax.stop_gradient(jnp.floor(t)).astype(jnp.int32) for t in (x, y))
     return _sums(_local(coefficients, i, j), _weights(x - i), _weights(y - j))
 
@@ -164,10 +169,10 @@ def _local(coefficients, i, j):
 
 
 def _sums(local, across, along):
-    """Return f, ∂x f, ∂y f, ∂x∂y f as sums Σ c w(x) v(y).
+    """Return f, ∂x f, ∂y f, ∂x∂y f as sums Σ c w(x) v(y) over 4 × 4 coefficients c in `local`.
 
-    w is a value or first derivative from `across`, v one from `along`, c an entry of `local`. The
-    compiler fuses such sums, while a matrix product would be a library call."""
+    `across`, `along`: values and derivatives of the B-splines in x (w) and in y (v). The compiler
+    fuses such sums, while a matrix product would be a library call."""
     value, slope = (jnp.sum(local * w, axis=1) for w in along[:2])
     return (
         jnp.sum(across[0] * value),

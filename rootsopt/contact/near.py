@@ -11,21 +11,23 @@ from rootsopt.contact.gap import Approach, Contact
 from rootsopt.contact.point import ContactPoint, contact_point
 
 _FARTHEST = 0.06
-"""Newton step (rad) above which a pose counts as one without a common normal."""
+"""Magnitude of the Newton step (rad) above which the flanks count as having no common normal."""
 _BEYOND = 0.05
-"""Normal angle (rad) beyond the search's nodes up to which a root is accepted."""
+"""Distance (rad) from the range of the search's nodes above which a root outside it is rejected.
+The flanks then count as having no common normal."""
 
 
 class NearContact(Contact):
     """Gap and levers from one Newton step, next to a closest approach that is already known.
 
     `pair`: the flanks; `roots` (sides, 2): normal angles ν2 (rad) near the closest approach and,
-    for flanks with a cusp, near the other minimum of the gap. There is one row for the flanks that
-    can touch or, if both sides can, one for the drive and one for the coast flanks.
+    for flanks with a cusp, near the other minimum of the gap. If both drive and coast flanks can
+    touch, each has a row; otherwise there is one row.
 
-    T is linearised at the root, which gives ν2 to second order in the distance from it. Repeated
-    evaluations, each from the roots that the last one returned in `Approach.place`, converge like
-    Newton's method. Derivatives follow the root (implicit function theorem).
+    The tangential offset T of `closest` is linearised at the given root. The error of ν2 is
+    therefore of second order in the distance from this root. Repeated evaluations, each from the
+    normal angles that the previous one returned in `Approach.place`, converge like Newton's method.
+    Derivatives follow the root (implicit function theorem).
     """
 
     pair: FlankPair
@@ -33,7 +35,7 @@ class NearContact(Contact):
 
     @property
     def jumps(self) -> bool:
-        """Whether the levers may jump from one minimum of the gap to another of equal depth."""
+        """Whether the levers may jump where two minima of the gap are equally deep."""
         return self.pair.profile.cusp or not self.pair.rolling
 
     @property
@@ -75,7 +77,9 @@ class NearContact(Contact):
         return self.pair.margins(roll, found, other)
 
     def _moved(self, which: int, roll, relative) -> ClosestApproach:
-        """Return the closest approach one Newton step from the root of this number."""
+        """Return the closest approach after one Newton step from the root with index `which`.
+
+        `roll`, `relative`: x and ε (rad)."""
         pair = self.pair
         root = lax.stop_gradient(self.roots[0, which])
         folded, mirrored = pair.folded(roll)

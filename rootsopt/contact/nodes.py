@@ -1,8 +1,8 @@
 """Gap between the nodes of one outline and the segments of another: Eq. 9 of the paper.
 
-Tests use this method as the reference for the fast search. It is slow, but assumes neither roll
-angles nor conjugacy: it needs only two closed outlines and a pose. It uses only NumPy and SciPy,
-and nothing here is differentiated.
+Tests use this method as the reference for the fast search. The method is slow, but assumes neither
+roll angles nor conjugacy: it needs only a closed outline and a pose. The module uses only NumPy and
+SciPy, and its results have no derivatives.
 """
 
 import numpy as np
@@ -22,9 +22,10 @@ def place_pair(
 ) -> tuple[Points, Points]:
     """Return both outlines (n, 2) in the fixed frame: rotor 1 at the origin, rotor 2 at (E, 0).
 
-    `outline` (n, 2) is closed, with a lobe tip on +x. Angles (rad) are positive in each rotor's own
-    direction of rotation, so that rotor 2 is the mirror image. At φ1 = φ2 = 0 a lobe of rotor 1
-    points at a valley of rotor 2. The unit of length is the outline's.
+    `outline` (n, 2): closed outline of both rotors, with a lobe tip on +x. E is `center_distance`;
+    `lobes`: number of lobes; `phi1`, `phi2`: rotations φ1 and φ2 (rad). Rotations are positive in
+    each rotor's own direction of rotation, so that rotor 2 is the mirror image. At φ1 = φ2 = 0 a
+    lobe of rotor 1 points at a valley of rotor 2. All lengths have the unit of `outline`.
     """
     first = _rotate(outline, phi1)
     second = _rotate(outline, phi2 + np.pi / lobes) * [-1.0, 1.0]
@@ -35,9 +36,9 @@ def signed_distance(nodes: Points, outline: Points, refine: bool = True) -> NDAr
     """Return the signed distance (n,) from `nodes` to a closed counter-clockwise `outline`.
 
     The distance is positive outside, in the unit of `nodes` (n, 2) and `outline` (m, 2). Without
-    `refine`, measure to the nearest straight segment (Eq. 9). With `refine`, a cubic through the
-    segment's two ends, with the outline's own tangents, replaces that segment. The error is then of
-    fourth order in the node spacing, not second.
+    `refine`, the distance is that from the nearest straight segment (Eq. 9). With `refine`, a cubic
+    through the segment's two ends, with the outline's own tangents, replaces that segment. The
+    error is then of fourth order in the node spacing, not second.
     """
     corners = outline[:-1] if np.allclose(outline[0], outline[-1], atol=0) else outline
     count = len(corners)
@@ -59,7 +60,9 @@ def signed_distance(nodes: Points, outline: Points, refine: bool = True) -> NDAr
 
 
 def _tangents(corners):
-    """Return unit tangents (n, 2) of the circle through each node and its two neighbours."""
+    """Return unit tangents (n, 2) at the nodes `corners` (n, 2) of a closed outline.
+
+    The tangent at a node is that of the circle through it and its two neighbours."""
     before = corners - np.roll(corners, 1, axis=0)
     after = np.roll(corners, -1, axis=0) - corners
     weight = np.linalg.norm(before, axis=1)[:, None], np.linalg.norm(after, axis=1)[:, None]
@@ -68,7 +71,11 @@ def _tangents(corners):
 
 
 def _project(nodes, corners, start, stop, tangents):
-    """Return (foot points of `nodes` on the segments start → stop, tangents of the curve there)."""
+    """Return (foot points of `nodes` on segments of the outline, tangents of the curve there).
+
+    `corners`: nodes of the outline; `start`, `stop`: indices of the ends of the segment for each
+    node; `tangents`: see `_tangents`, `None` for straight segments.
+    """
     a = corners[start]
     chord = corners[stop] - a
     length2 = np.einsum("ij,ij->i", chord, chord)
@@ -100,11 +107,11 @@ def pair_gap(
     reach: float | None = None,
     refine: bool = True,
 ) -> float:
-    """Return the least signed distance between the two rotors at one pose, in the outline's unit.
+    """Return the least signed distance between the rotors at one pose, in the unit of `outline`.
 
     `outline`, `lobes`, `center_distance`, `phi1`, `phi2`: as in `place_pair`. `refine`: as in
     `signed_distance`. `reach`: distance beyond rotor 2's outer circle above which a node of rotor 1
-    is ignored. The default, 0.05 outer radii, includes all nodes that can touch.
+    is ignored. By default, it is 0.05 outer radii, which includes all nodes that can touch.
     """
     first, second = place_pair(outline, lobes, center_distance, phi1, phi2)
     outer = np.max(np.hypot(outline[:, 0], outline[:, 1]))

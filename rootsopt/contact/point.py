@@ -12,8 +12,8 @@ class ContactPoint(NamedTuple):
     """Position and direction of a flank contact.
 
     n is the common normal, directed from rotor 1 to rotor 2; O1 and O2 are the axes.
-    `support1`: (P - O1)·n (m), distance of the contact P from axis 1 along n.
-    `support2`: (O2 - P)·n (m), distance from axis 2 along n.
+    `support1`: (P - O1)·n (m), where P is the point of contact.
+    `support2`: (O2 - P)·n (m).
     `radial`: component of n along the line of centres.
     """
 
@@ -25,9 +25,9 @@ class ContactPoint(NamedTuple):
 def contact_point(
     pair: FlankPair, roll: Float[Array, ""], relative: Float[Array, ""], found: ClosestApproach
 ) -> ContactPoint:
-    """Return position and direction of the closest approach `found` at x = `roll`, ε = `relative`.
+    """Return position and direction of a contact, given the closest approach `found`.
 
-    Both angles are in rad."""
+    `pair`: the flanks; `roll`, `relative`: x and ε (rad) at which `found` was computed."""
     folded, mirrored = pair.folded(roll)
     support1, support2, radial = pair.reach(found.normal1, found.normal2, folded, relative)
     return ContactPoint(

@@ -27,7 +27,9 @@ class SearchContact(Contact):
         center_distance: Float[Array, ""] | None = None,
         two_sided: bool = False,
     ) -> "SearchContact":
-        """Return the contact of `profile`; the other arguments are those of `FlankPair.of`."""
+        """Return the contact of `profile`.
+
+        `center_distance` (m), `two_sided`: as in `FlankPair.of`."""
         return cls(FlankPair.of(profile, center_distance, two_sided), 1 + two_sided)
 
     @property

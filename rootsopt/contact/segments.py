@@ -12,10 +12,10 @@ jump from segment to segment: their error is of first order in the node spacing,
 second order.
 
 Let N be the number of lobes, x the roll coordinate and ε the relative rotation (see `Contact`), E
-the vector between the axes, and R(a) the rotation by a. With a = x + ε/2 for rotor 1 and
-a = π/N - x + ε/2 for rotor 2, a point z of the flank of one rotor, in its own frame with a tip on
-+x, lies at R(a) (E - R(-a′) z) in the frame of the other rotor; a belongs to that other rotor and
-a′ to the point's rotor. Exchanging the rotors only exchanges a and a′.
+the vector between the axes, and R(a) the rotation by a. The angle a is x + ε/2 for rotor 1 and
+π/N - x + ε/2 for rotor 2. Let z be a point of a flank in the frame of its own rotor, with a tip on
++x. In the frame of the other rotor, it lies at R(a) (E - R(-a′) z), with the angle a of the other
+rotor and a′ of its own. Exchanging the rotors only exchanges a and a′.
 """
 
 import equinox as eqx
@@ -43,11 +43,11 @@ _DEEPEST = 0.1
 class NodeContact(Contact):
     """Gap and levers of a flank pair at a pose, from two polylines.
 
-    Call an instance with roll coordinate x and relative rotation ε (rad), see `Contact`. The first
-    axis of each array is the rotor (1, 2); coordinates are in that rotor's frame. `nodes` (2, n,
-    2): nodes (m); `tangent` (2, n, 2): unit tangents at the nodes, normal to the bisectors;
-    `normal` (2, n - 1, 2): outward unit normals of the segments; `pitch_radius`: r (m);
-    `half_pitch`: π/2N (rad).
+    Call an instance with the roll coordinate x and the relative rotation ε (rad), which `Contact`
+    defines. The first axis of each array is the rotor (1, 2); coordinates are in that rotor's
+    frame. `nodes` (2, n, 2): nodes (m); `tangent` (2, n, 2): unit tangents at the nodes, normal to
+    the bisectors; `normal` (2, n - 1, 2): outward unit normals of the segments; `pitch_radius`: r
+    (m); `half_pitch`: π/2N (rad).
 
     Tip lands carry no torque and have no nodes. The flank of rotor 1 is its addendum, extended a
     little beyond the pitch crossing and, unless there is a land, over the tip. The flank of rotor 2
@@ -69,9 +69,9 @@ class NodeContact(Contact):
     def of(cls, profile: Profile, nodes: int) -> "NodeContact":
         """Return the contact of `profile` with `nodes` per flank, half of them on the addendum.
 
-        Nodes are evenly spaced with respect to the longer of the two mating arc elements plus a
-        constant. The constant ensures enough nodes at the pitch crossing of EE, where the flank is
-        sharp. Raises `ValueError` for fewer than 16 nodes.
+        The density of nodes is the longer of the two mating arc elements plus a constant. The
+        constant ensures enough nodes at the pitch crossing of EE, where the flank is sharp. Raises
+        `ValueError` for fewer than 16 nodes.
         """
         if nodes < 16:
             raise ValueError(f"Argument `nodes` must be at least 16, but is {nodes}.")
@@ -127,7 +127,9 @@ class NodeContact(Contact):
         return 2 * self.pitch_radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
     def _transfer(self, points, angle, other_angle):
-        """Return the other rotor's `points` (..., 2) in the frame of a rotor at `angle` a (rad)."""
+        """Return the other rotor's `points` (..., 2) in the frame of a rotor at `angle` a (rad).
+
+        `other_angle`: angle a (rad) of the other rotor."""
         turn = angle - other_angle
         cos, sin = jnp.cos(turn), jnp.sin(turn)
         return self._center(angle) - points @ jnp.array([[cos, sin], [-sin, cos]])
@@ -135,7 +137,10 @@ class NodeContact(Contact):
     def _search(
         self, angles: Float[Array, " 2"]
     ) -> tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""], Bool[Array, ""]]:
-        """Return the deepest pair: (rotor of the segment, node, segment, whether a pair exists)."""
+        """Return the deepest pair of node and segment at `angles` a (rad) of the two rotors.
+
+        The result is (index of the segment's rotor, of the node, of the segment, whether a pair
+        exists)."""
         points = jax.vmap(self._transfer)(self.nodes[::-1], angles, angles[::-1])
         gap, segment = jax.vmap(_facing)(points, self.nodes, self.tangent, self.normal)
         gap = jnp.where(gap > -_DEEPEST * self.pitch_radius, gap, jnp.inf)
@@ -150,11 +155,12 @@ def _facing(
     tangent: Float[Array, "n 2"],
     normal: Float[Array, "n-1 2"],
 ) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
-    """Return (signed distance in m, segment index) for each point and the segment that faces it.
+    """Return (signed distance (m), segment index) of each point from the segment that faces it.
 
-    Where no segment faces a point, the distance is inf. The segment is found by bisection over the
-    nodes. A point near the flank is ahead of all bisectors on the tip's side of its segment, and
-    behind all others. This holds because the chord between any two nodes of a flank stays within a
+    `nodes`, `tangent`, `normal`: as in `NodeContact`, for one rotor. Where no segment faces a
+    point, the distance is inf. The segment is found by bisection over the nodes. Bisection works
+    because a point near the flank is ahead of all bisectors on the tip's side of its segment, and
+    behind all others. The reason is that the chord between any two nodes of a flank stays within a
     right angle of the tangents at both.
     """
     x, y = points[:, 0], points[:, 1]

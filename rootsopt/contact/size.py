@@ -1,9 +1,9 @@
 """Finds the size that a contact map needs for a given error.
 
-The gap is computed by search along a few fine lines through the map. For each of a fixed list of
-sizes, the map's spline is fitted to this gap (SciPy, one dimension at a time). The error is that of
-the penetration where the flanks overlap. The list is fixed because every size needs its own
-compiled program.
+The gap is computed by search along a few fine lines through the map. For each size in a fixed list,
+the map's spline is fitted to this gap (SciPy, one dimension at a time). The error is that of the
+penetration where the flanks overlap. The list is fixed because every size needs its own compiled
+program.
 """
 
 from typing import NamedTuple
@@ -21,16 +21,16 @@ from rootsopt.runtime.programs import Program
 ROLLS = (96, 128, 192, 256, 384, 512, 768, 1024, 1536)
 RELATIVES = (16, 24, 32, 48)
 _FINE = 3073, 193
-"""Number of points on a line along the roll, and on a line along ε."""
+"""Number of points on each fine line along the roll, and on each fine line along ε."""
 _LINES = 5, 33
-"""Number of lines along the roll, at geometrically spaced ε, and of lines along ε, at evenly spaced
+"""Number of fine lines along the roll, at geometrically spaced ε, and along ε, at evenly spaced
 rolls."""
 
 
 class MapSize(NamedTuple):
     """Size of a contact map.
 
-    `rolls`, `relatives`: number of points over roll and over ε; `error`: error (m) of the
+    `rolls`, `relatives`: number of points over roll and over ε; `error`: estimated error (m) of the
     penetration; `enough`: whether the map meets the requested error."""
 
     rolls: int
@@ -42,8 +42,10 @@ class MapSize(NamedTuple):
 def size_map(profile: Profile, deepest: float, error: float) -> MapSize:
     """Return the smallest map down to ε = `deepest` (rad) with a penetration error ≤ `error` (m).
 
-    If no listed size meets the error, return the smallest whose error is at most 1.5 times the
-    least error in the list.
+    `profile`: profile of both rotors.
+
+    If no size in the list meets the error, return the smallest whose error is at most 1.5 times the
+    least in the list.
     """
     along_roll, along_relative = _probe(profile, jnp.asarray(deepest))
     half = float(profile.half_pitch)
@@ -56,7 +58,9 @@ def size_map(profile: Profile, deepest: float, error: float) -> MapSize:
 
 @Program
 def _probe(profile, deepest):
-    """Return (points, gap (lines, points)) on fine lines along the roll, and the same along ε."""
+    """Return (points, gap (lines, points)) on fine lines along the roll, and the same along ε.
+
+    The points are rolls or ε (rad); the gap is in m."""
     pair = FlankPair.of(profile)
     half = profile.half_pitch
     first = first_roll(deepest, half)
@@ -75,9 +79,9 @@ def _smallest(
     probed: tuple[Array, Array],
     error: float,
 ) -> tuple[int, float]:
-    """Return (least number of points in `ladder` with at most this `error` (m), its error (m)).
+    """Return (least number of points in `ladder` whose error is at most `error` (m), this error).
 
-    If none meets the error, the number is the least whose error is at most 1.5 times the best.
+    If no number meets the error, return the least whose error is at most 1.5 times the least error.
 
     `start`, `stop`: range of the map (rad); `probed`: points and gap on fine lines."""
     from scipy.interpolate import CubicSpline  # Imported for maps only: it takes 0.5 s.

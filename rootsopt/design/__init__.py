@@ -1,1 +1,1 @@
-"""The design space: bounds of the parameters, the unit box that they define, and constraints."""
+"""The space of designs: bounds of the parameters, mapping to the unit box, and constraints."""

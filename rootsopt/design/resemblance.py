@@ -25,16 +25,17 @@ from rootsopt.runtime.programs import Program
 from rootsopt.scene.families import classical, profile_of
 
 _NODES = 96
-"""Number of nodes on each side of the pitch circle at which a search measures distances."""
+"""Number of nodes on each side of the pitch circle at which a search compares two flanks."""
 _SAMPLE = 128
-"""Number of sampled members of a family; the searches start from the best of them."""
+"""Number of sampled members of a family. The searches start from the best of them."""
 _STARTS = 3
 """Number of searches per family."""
 _PROGRAMS, _LONGEST, _SHORTEST = 80, 0.2, 1e-9
-"""Number of linear programs after which a search ends; greatest step of a program, and the step
-size below which a search ends, both as fractions of the parameters' usual ranges."""
+"""Limits of a search: number of linear programs after which the search ends; greatest step; step
+below which the search ends. Steps are fractions of the parameters' usual ranges."""
 _UNSOUND_WEIGHT = 10.0
-"""Weight of a negative margin (relative to its scale) against the distance (pitch radii)."""
+"""Factor of the penalty for a negative margin. The penalty is this factor times the margin's
+magnitude (relative to its scale), and is added to the distance (pitch radii)."""
 _UNSOUND = 1e-6
 """Magnitude of a negative margin (relative to its scale) above which a member counts as unsound."""
 
@@ -43,7 +44,7 @@ class Likeness(NamedTuple):
     """The member of a family that is nearest to a profile.
 
     `family`: name of the family; `design`: the member's parameters by key, in config units;
-    `departure`: greatest distance (m) between the flanks of member and profile."""
+    `departure`: greatest distance (m) between the flanks of the member and the profile."""
 
     family: str
     design: dict[str, float]
@@ -95,7 +96,7 @@ def _nearest(profile: Profile, family: str) -> Likeness | None:
 
 
 class _Seen(NamedTuple):
-    """Comparison of a family's member with the profile.
+    """Comparison of a member of a family with a profile.
 
     `distance` (n,): signed distances between the flanks (pitch radii); `margin` (m,): margins
     relative to their scales; `distance_slope` (n, d), `margin_slope` (m, d): derivatives of both
@@ -120,8 +121,8 @@ class _Seen(NamedTuple):
     def fault(self) -> float:
         """Value that a search minimises: the greatest distance (pitch radii) plus a penalty.
 
-        The penalty is the magnitude of the worst margin, if negative, times its weight. The value
-        is infinite if any number is not finite."""
+        The penalty is `_UNSOUND_WEIGHT` times the magnitude of the least margin if that is
+        negative, otherwise 0. The value is infinite if any number is not finite."""
         if not self.finite:
             return math.inf
         lacking = max(0.0, -float(np.min(self.margin)))
@@ -129,12 +130,15 @@ class _Seen(NamedTuple):
 
     @property
     def away(self) -> float:
-        """Greatest distance (pitch radii) between member and profile; infinite if it is unsound."""
+        """Greatest distance (pitch radii) between the flanks; infinite if the member is unsound."""
         return float(np.max(np.abs(self.distance))) if self.sound else math.inf
 
 
 class _Look:
-    """Compares the member of a `family` with a given design to a `profile`; caches results."""
+    """Compares members of a `family` with a `profile`, and caches the results.
+
+    Call an instance with the member's design.
+    """
 
     def __init__(self, profile: Profile, family: str):
         self.family, self.lobes, self.radius = family, profile.lobes, profile.pitch_radius
@@ -151,10 +155,11 @@ class _Look:
 
 
 def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
-    """Return a design near `start` with a locally least `fault`.
+    """Return a design near `start` that locally minimises `_Seen.fault`.
 
-    The search is a sequence of linear programs. Each finds the step that is best to first order and
-    at most a fraction of `width`, the widths of the parameters' usual ranges."""
+    The search is a sequence of linear programs. Each finds the step that is best to first order
+    within a trust region. `width` (d,): widths of the parameters' usual ranges.
+    """
     design, size = start, _LONGEST
     for _ in range(_PROGRAMS):
         seen = look(design)
@@ -169,10 +174,10 @@ def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
 
 
 def _promising(seen: _Seen, width, size: float) -> NDArray[np.float64]:
-    """Return the step (d,), in units of `width`, with the least fault to first order.
+    """Return the step (d,), in units of `width`, that minimises the fault to first order.
 
-    No entry of the step exceeds `size`. The linear program minimises a bound on all distances plus
-    a weighted bound on negative margins."""
+    No entry of the step exceeds `size` in magnitude. The linear program minimises a bound on all
+    distances plus a weighted bound on negative margins."""
     count, distances, soundness = len(width), len(seen.distance), len(seen.margin)
     by_step = np.concatenate([seen.distance_slope, -seen.distance_slope, -seen.margin_slope])
     one, none = np.ones((2 * distances, 1)), np.zeros((2 * distances, 1))
@@ -188,9 +193,10 @@ def _promising(seen: _Seen, width, size: float) -> NDArray[np.float64]:
 
 @Program
 def _target(profile: Profile):
-    """Return (normal angles (n,) in rad, points (2, n, 2) in m, outward unit normals (2, n, 2)).
+    """Return (normal angles, points, outward unit normals) of the profile that is compared.
 
-    The first axis of points and normals has two entries: addendum and dedendum."""
+    The normal angles (n,) are in rad. The points (m) and the normals have shape (2, n, 2), with the
+    addendum first and the dedendum second."""
     nu = profile.pitch_normal * jnp.linspace(0.0, 1.0, _NODES)
     points = [side(nu) for side in (profile.addendum, profile.dedendum)]
     places = jnp.stack([profile.position(point) for point in points])
@@ -200,10 +206,13 @@ def _target(profile: Profile):
 
 @Program
 def _compared(family: str, lobes: int, radius: Float[Array, ""], target, design):
-    """Return the fields of `_Seen` for a `design`: distances, margins, derivatives of both.
+    """Return the fields of `_Seen` for a `design`: distances, margins and their derivatives.
+
+    `family`, `lobes`, `radius`: family, number of lobes and pitch radius (m) of the member;
+    `target`: result of `_target`.
 
     Distances are measured along the normals of the `target`, between points with the same normal
-    angle on the addendum. To first order they are the distances between the flanks."""
+    angle on the addendum. To first order, these are the distances between the flanks."""
     nu, places, normals = target
 
     def both(design):

@@ -1,8 +1,8 @@
 """The unit box of the design parameters, and the constraints in it.
 
 Each design parameter is mapped linearly from its bounds to the range 0 … 1. If its range depends on
-the other parameters, it is mapped from that range within its bounds instead. Constraints depend on
-the geometry alone and are cheap. For families whose closed-form limits do not ensure a sound
+the other parameters, the part of this range within the bounds is mapped instead. Constraints depend
+on the geometry alone and are cheap. For families whose closed-form limits do not ensure a sound
 profile, the margins of `rootsopt.profiles.validity` are further constraints.
 """
 
@@ -36,15 +36,16 @@ _SOUND = (
     ("tangents clear of the axis", "star", "mm", 0.0, MM, MM),
     ("root radius", "root", "mm", 0.0, MM, MM),
 )
-"""Constraints that keep a profile sound, in addition to that on the undercut margin."""
+"""Constraints that keep a profile sound, in addition to the constraint on the undercut margin. The
+columns are name, margin, unit, limit, scale and factor (see `Constraint`)."""
 
 
 class Constraint(eqx.Module):
     """A constraint: value ≥ limit, or value ≤ limit for a `ceiling`.
 
-    `name`: name in reports; `quantity`: name of a field of `Geometry`, or of `Margins` if `margin`
-    is true; `limit`: limit in SI units; `scale`: divisor that makes the slack of order one; `unit`:
-    unit in reports; `factor`: SI value of one such unit.
+    `name`: name in reports; `quantity`: name of the limited field of `Geometry`, or of `Margins` if
+    `margin` is true; `limit`: limit in SI units; `scale`: divisor (SI) that brings the slack to the
+    order of one; `unit`: unit in reports; `factor`: SI value of one such unit.
     """
 
     name: str = eqx.field(static=True)
@@ -62,7 +63,7 @@ class Constraint(eqx.Module):
         return -1.0 if self.ceiling else 1.0
 
     def slack(self, shape: Geometry, found: Margins | None = None) -> Float[Array, ""]:
-        """Return the scaled distance from the limit, ≥ 0 if the constraint is satisfied.
+        """Return the distance from the limit, divided by `scale`; ≥ 0 if the constraint holds.
 
         `shape`, `found`: geometry and margins of the design. `found` is needed only if `margin` is
         true."""
@@ -84,9 +85,11 @@ class Space(eqx.Module):
 
     @classmethod
     def of(cls, config: Config, scene: Scene, area_efficiency: float) -> "Space":
-        """Return the design space of a config whose baseline design has this `area_efficiency`.
+        """Return the design space of a config.
 
-        Raises `InputError` if the config's bounds are impossible."""
+        `scene`: scene of the config; `area_efficiency`: area efficiency of the baseline design,
+        used if the config's limit is `baseline`. Raises `InputError` if the config's bounds are
+        impossible."""
         limits, family = config.constraints, family_of(config.profile.family)
         rows = bounds_of(config)
         floor = limits.area_efficiency_min
@@ -140,7 +143,7 @@ class Space(eqx.Module):
         return jnp.clip(jnp.stack(shares), 0.0, 1.0)
 
     def ranges(self, values) -> dict[str, tuple[Float[Array, ""], Float[Array, ""]]]:
-        """Return {key: (low, high)} for the parameters whose range depends on the others.
+        """Return {key: (low, high)} of the parameters whose range depends on the other parameters.
 
         `values` (d,): the design. Values and ranges are in config units."""
         radius = self.scene.pitch_radius / MM
@@ -148,8 +151,9 @@ class Space(eqx.Module):
         return dict(self.family.dependent(self.scene.lobes, radius, **named))
 
     def _within(self, values):
-        """Yield (index in the design, low, high) for parameters in `ranges`, within their
-        bounds."""
+        """Yield (index, low, high) of each parameter in `ranges`, with the range cut to its bounds.
+
+        `values` (d,): the design. The index is that in the design; ranges are in config units."""
         for key, (least, most) in self.ranges(values).items():
             place = self.family.keys.index(key)
             most = jnp.minimum(most, self.upper[place])
@@ -172,7 +176,7 @@ class Space(eqx.Module):
         return jnp.stack([c.slack(shape, found) for c in self.constraints])
 
     def prepare(self) -> None:
-        """Start to compile, in the background, the program that a search in this space needs."""
+        """Start compiling, in the background, the program that a search in this space needs."""
         # Import in advance: it takes 0.5 s.
         threading.Thread(target=importlib.import_module, args=("scipy.stats.qmc",)).start()
         slacks_and_slopes.prepare(self, jax.ShapeDtypeStruct(self.lower.shape, self.lower.dtype))
@@ -182,7 +186,8 @@ class Space(eqx.Module):
 def slacks_and_slopes(space: Space, point):
     """Return (design (d,), its Jacobian (d, d), slacks (m,), their Jacobian (m, d)) at `point`.
 
-    The Jacobians are derivatives with respect to `point` in the unit box."""
+    The design is in config units. The Jacobians are derivatives with respect to `point` (d,) in the
+    unit box."""
 
     def both(point):
         values = space.design(point), space.slacks(point)

@@ -37,7 +37,7 @@ class Contacts:
     """Contacts at n rotations φ of rotor 1.
 
     `point` (n, 2): contact points (mm, fixed frame); `normal` (n, 2): unit normals from rotor 1 to
-    rotor 2; `present` (n,): mask of the rotations at which there is a contact.
+    rotor 2; `present` (n,): mask of the rotations at which the flanks are in contact.
     """
 
     point: NDArray[np.float64]
@@ -49,7 +49,7 @@ class Contacts:
 def _rolling(profile, roll):
     """Return (pressure angles (rad), signed distances from the pitch point (m)) of contacts.
 
-    `roll` (n,): roll angles of the flank (rad)."""
+    `roll` (n,): roll angles (rad) of the contacts on the flank."""
     half = profile.half_pitch
     beyond = roll > half
     point = profile.addendum(profile.normal_at(jnp.where(beyond, 2 * half - roll, roll)))
@@ -59,11 +59,12 @@ def _rolling(profile, roll):
 def rolling_contacts(
     profile: Profile, rotation: Float[np.ndarray, " n"], coast: bool = False
 ) -> Contacts:
-    """Return the contacts of the drive (or `coast`) flanks in perfect rolling.
+    """Return the contacts of two rotors with this `profile` in perfect rolling.
 
-    `rotation` (n,): rotations φ of rotor 1 (rad). A drive flank is in contact while its roll angle
-    β = -φ is between 0 and π/N, once in every lobe pitch. At other rotations, the contact at the
-    nearer end of this range is returned, marked as not present. The contact point is
+    `rotation` (n,): rotations φ of rotor 1 (rad); `coast`: whether the contacts are those of the
+    coast flanks, not of the drive flanks. A drive flank is in contact while its roll angle β = -φ
+    is between 0 and π/N, once in every lobe pitch. At other rotations, the result holds the contact
+    at the nearer end of this range, marked as not present. The contact point is
     (r + s sin ψ, s cos ψ) and the normal is (sin ψ, cos ψ), with the pitch radius r, the pressure
     angle ψ and the distance s from the pitch point. The contact of a coast flank is the mirror
     image in the line of centres, with β = φ.
@@ -80,8 +81,9 @@ def rolling_contacts(
 def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
     """Return the content of a GIF of the pair in perfect rolling over one lobe pitch.
 
-    The GIF shows the contact and the direction of its force. It does not show the size of the
-    force, which only a simulation can give.
+    `drawing`, `profile`: drawing and profile of the rotor. The GIF shows the contact and the
+    direction of its force. The size of the force is not shown, because only a simulation can give
+    it.
     """
     rotation = 2 * np.pi / profile.lobes * np.arange(_FRAMES) / _FRAMES
     flanks = [rolling_contacts(profile, rotation, coast) for coast in (False, True)]
@@ -102,9 +104,10 @@ def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
 def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: int) -> bytes:
     """Return the content of a GIF of a simulated motion over `periods` mesh periods.
 
-    `periods` is limited to 4 and to the length of `series`. The GIF shows the contacts, and the
-    force over the rotation. An arrow's length is proportional to the largest force in the time
-    interval of its frame.
+    `drawing`, `profile`: drawing and profile of the rotor; `series`: the simulated motion.
+    `periods` is limited to 4 and to the length of `series`. The GIF shows the contacts, and a graph
+    of the force over the rotation. An arrow's length is proportional to the largest force in the
+    time interval of its frame.
     """
     pitch = 2 * np.pi / profile.lobes
     whole = max(1, round(float(np.ptp(series.rotation)) / pitch))
@@ -136,7 +139,7 @@ def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: 
 
 
 def _force_panel(ax: Axes, series: Series, samples: int):
-    """Draw the flank forces over the rotation; return the line that marks a frame's rotation.
+    """Draw the flank forces over the rotation on `ax`; return the line that marks a rotation.
 
     `samples`: number of samples of `series` that are drawn."""
     shown = slice(0, samples)
@@ -157,7 +160,7 @@ def _force_panel(ax: Axes, series: Series, samples: int):
 
 
 class _Arrow:
-    """A point that marks the contact, and an arrow for its force, on one kind of flank."""
+    """Draws the contact point of the drive or coast flanks, and an arrow for its force."""
 
     def __init__(self, ax: Axes, color: str, longest: float):
         self.longest = longest

@@ -18,12 +18,14 @@ FORMATS = {
     "stl": "rotor.stl and pair.stl, triangles (needs the [cad] extra)",
     "gif": "figures/meshing.gif, the pair in motion with contact and force",
 }
-"""Formats, each with the files that are written and what they contain. Lengths are in mm."""
+"""Help text of each format: the files that are written and their content. Lengths are in mm."""
 _SOLID = ("step", "stl")
 
 
 def add_option(parser: argparse.ArgumentParser, default: str) -> None:
-    """Add the option `--export` to a command. `default`: its value if the option is not given."""
+    """Add the option `--export` to the `parser` of a command.
+
+    `default`: value of the option if the user does not give it."""
     formats = "; ".join(f"{name}: {files}" for name, files in FORMATS.items())
     parser.add_argument(
         "--export",
@@ -37,7 +39,7 @@ def add_option(parser: argparse.ArgumentParser, default: str) -> None:
 def chosen(text: str) -> tuple[str, ...]:
     """Return the formats named in `text`, the value of `--export`.
 
-    Raises `InputError` if a format is unknown, or if it is a solid and the CAD kernel is not
+    Raises `InputError` if a format is unknown, or if it needs the CAD kernel and the kernel is not
     installed.
     """
     names = tuple(name.strip() for name in text.lower().split(",") if name.strip())
@@ -68,9 +70,9 @@ def write(
 ) -> list[str]:
     """Write drawings of a `design` into `folder`; return the names of the files.
 
-    `formats`: keys of `FORMATS`; `design`: values of the design parameters (config units), keyed by
-    config key. If `series` holds a simulated motion, the GIF shows `periods` mesh periods of it.
-    Otherwise the GIF shows perfect rolling.
+    `config`: config of the rotor; `formats`: keys of `FORMATS`; `design`: values of the design
+    parameters (config units), keyed by config key. If `series` holds a simulated motion, the GIF
+    shows `periods` mesh periods of it. Otherwise the GIF shows perfect rolling.
     """
     if not formats:
         return []
@@ -109,9 +111,10 @@ def write(
 def write_simulated(
     folder: "ResultFolder", config: "Config", formats: Sequence[str], evaluation: "Evaluation"
 ) -> list[str]:
-    """Write drawings of a simulated design as `write` does; return the names of the files.
+    """Write drawings of a simulated design and return the names of the files.
 
-    The GIF shows the simulated motion. If `evaluation` has no motion, no GIF is written."""
+    `folder`, `config`, `formats`: as in `write`; `evaluation`: result of the simulation. The GIF
+    shows the simulated motion. If `evaluation` has no motion, no GIF is written."""
     series = evaluation.series
     if series is None:
         formats = tuple(name for name in formats if name != "gif")
@@ -120,9 +123,9 @@ def write_simulated(
 
 
 def _solids(drawing, formats, place) -> dict[str, bytes]:
-    """Return the contents of the STEP and STL files by file name. Each solid is made only once.
+    """Return the contents of the STEP and STL files, keyed by file name.
 
-    `place`: folder for temporary files."""
+    `place`: folder for temporary files. The solid of each shape is made only once."""
     import math
 
     from rootsopt.export import solid

@@ -1,4 +1,4 @@
-"""Content of the drawing of one rotor, for every format (mm)."""
+"""Content of the drawing of one rotor, shared by all formats (mm)."""
 
 import dataclasses
 
@@ -65,5 +65,5 @@ class Drawing:
 
     @property
     def reach(self) -> float:
-        """Distance (mm) from the axis to the ends of the centre lines."""
+        """Distance (mm) from the rotor's axis to the ends of the centre lines."""
         return 1.08 * self.outer_radius

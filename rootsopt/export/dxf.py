@@ -9,7 +9,7 @@ from rootsopt.export.drawing import Drawing
 from rootsopt.export.pieces import Arc
 
 OUTLINE, BORE, PITCH, CENTER, TEXT = "OUTLINE", "BORE", "PITCH_CIRCLE", "CENTER_LINES", "TEXT"
-"""Names of the layers."""
+"""Names of the DXF layers: outline, bore, pitch circle, centre lines and notes."""
 _MILLIMETRES = 4
 # Layer: colour index of AutoCAD (7 is black on white), line type, line width in 1/100 mm.
 _STYLES = {
@@ -22,7 +22,7 @@ _STYLES = {
 
 
 def dxf_bytes(drawing: Drawing) -> bytes:
-    """Return the content of a DXF file (R2010, mm) of one rotor.
+    """Return the content of a DXF file (R2010, mm) of a `drawing` of one rotor.
 
     The outline's entities are in counter-clockwise order, and adjacent entities share their ends.
     """

@@ -22,11 +22,12 @@ from rootsopt.profiles import Profile
 from rootsopt.runtime.programs import Program
 
 TOLERANCE = 1e-7
-"""Deviation (pitch radii) of a spline from the true flank above which the spline is refined. The
-error in area is at most the deviation times the perimeter, which for every rotor is less than 1e-6
-of the area."""
+"""Deviation (pitch radii) of a spline from the true flank above which nodes are added to the
+spline. The error in area is at most the deviation times the perimeter, which for every rotor is
+less than 1e-6 of the area."""
 ROUND = 1e-9
-"""Deviation (pitch radii) from a circle above which a segment is not drawn as an arc."""
+"""Deviation (pitch radii) of a segment from a circle above which the segment is drawn as a spline,
+not as an arc."""
 _MM = 1e3
 _SAMPLES = 65
 """Number of points at which a segment is compared with a circle."""
@@ -36,10 +37,11 @@ true flank."""
 _MOST_NODES = 4096
 _UNEVEN = 100
 """Ratio of a spline's longest to its shortest knot span above which the spline is split in two.
-Spans shrink towards a cusp. At a higher ratio, programs that integrate a whole edge by a fixed rule
-are off by more than 1e-6."""
+Spans shrink towards a cusp. At a higher ratio, some programs make relative errors above 1e-6,
+because they integrate over a whole edge with a fixed quadrature rule."""
 _BLOCK = 512
-"""Number of points evaluated at once. It is constant, so that one compiled program serves all."""
+"""Number of points evaluated at once. It is constant, so that one compiled program serves any
+number of points."""
 _GAUSS = np.polynomial.legendre.leggauss(8)
 
 
@@ -48,7 +50,7 @@ class Arc:
     """Part of a circle.
 
     `center`: the circle's centre (mm); `radius`: > 0 (mm); `begin`: angle of the first point (rad);
-    `sweep`: angle covered (rad), > 0 counter-clockwise.
+    `sweep`: angle covered (rad), positive if counter-clockwise.
     """
 
     center: complex
@@ -57,7 +59,7 @@ class Arc:
     sweep: float
 
     def at(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
-        """Return the points (mm) at `share` of the arc, from 0 at its start to 1 at its end."""
+        """Return the points (mm) at fractions `share` of the arc, from 0 (start) to 1 (end)."""
         angle = self.begin + np.asarray(share) * self.sweep
         return np.asarray(self.center + self.radius * np.exp(1j * angle))
 
@@ -79,7 +81,7 @@ class Arc:
         return dataclasses.replace(self, center=center, begin=self.begin + angle)
 
     def mirrored(self) -> "Arc":
-        """Return the mirror image in the x axis, in reverse direction."""
+        """Return the mirror image of the arc in the x axis, with its direction reversed."""
         begin = -(self.begin + self.sweep)
         return dataclasses.replace(self, center=complex(np.conj(self.center)), begin=begin)
 
@@ -96,9 +98,9 @@ class Spline:
     controls: Complex128[np.ndarray, " n"]
 
     def at(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
-        """Return the points (mm) at `share` of the parameter, from 0 at the start to 1 at the end.
+        """Return the points (mm) at fractions `share` of the parameter, from 0 (start) to 1 (end).
 
-        The parameter is nearly the arc length."""
+        The parameter is close to the arc length."""
         first, last = self.knots[0], self.knots[-1]
         return np.asarray(BSpline(self.knots, self.controls, 3)(first + share * (last - first)))
 
@@ -119,7 +121,7 @@ class Spline:
         return dataclasses.replace(self, controls=self.controls * np.exp(1j * angle))
 
     def mirrored(self) -> "Spline":
-        """Return the mirror image in the x axis, in reverse direction."""
+        """Return the mirror image of the spline in the x axis, with its direction reversed."""
         knots = self.knots[0] + (self.knots[-1] - self.knots[::-1])
         return Spline(knots, np.conj(self.controls[::-1]))
 
@@ -138,11 +140,11 @@ DrawnPiece = Arc | Spline
 
 
 def outline_pieces(profile: Profile) -> list[DrawnPiece]:
-    """Return the pieces of the closed counter-clockwise outline (mm).
+    """Return the pieces (mm) of the closed counter-clockwise outline of a `profile`.
 
     Every piece starts at the end of the previous piece. The outline starts at the root before the
-    lobe on +x. If the arcs on both sides of this root are joined, it starts at the beginning of the
-    joined arc.
+    lobe on +x. If the arcs on both sides of this root are joined, the outline starts at the start
+    of the joined arc.
 
     Raises `InputError` if a segment of the flank needs too many nodes to come within `TOLERANCE` of
     the true flank.
@@ -155,14 +157,15 @@ def outline_pieces(profile: Profile) -> list[DrawnPiece]:
 
 
 def area(pieces: list[DrawnPiece]) -> float:
-    """Return the area (mm²) inside a closed outline, exact for arcs and splines."""
+    """Return the area (mm²) inside the closed outline `pieces`, exact for arcs and splines."""
     return sum(map(_swept, pieces))
 
 
 def polyline(pieces: list[DrawnPiece], chord: float) -> Complex128[np.ndarray, " n"]:
-    """Return a closed polygon with points about `chord` (mm) apart or closer.
+    """Return a closed polygon (n,) in mm whose corners lie on the outline `pieces`.
 
-    The first point is repeated at the end."""
+    Successive corners are about `chord` (mm) apart or closer. The first corner is repeated at the
+    end."""
     parts = []
     for piece in pieces:
         count = max(2, int(np.ceil(piece.length / chord)))
@@ -198,9 +201,10 @@ def _flank(profile: Profile) -> list[DrawnPiece]:
 
 @Program
 def _points(profile, nu):
-    """Return one tuple for the addendum and one for the dedendum, at normal angles `nu` (rad).
+    """Return the values on the addendum and on the dedendum at normal angles `nu` (rad).
 
-    Each is (points (m), directions of the outward normal (rad), arc length per `nu` (m/rad))."""
+    The values are (points (m), directions of the outward normal (rad), arc length per `nu`
+    (m/rad))."""
     _, addendum, dedendum = profile.speeds(nu)
     below = profile.dedendum(nu)
     turned = below.beta + jnp.pi / 2 - below.psi
@@ -210,7 +214,7 @@ def _points(profile, nu):
 
 @dataclasses.dataclass(frozen=True)
 class _Stretch:
-    """One segment of the addendum, or of the dedendum, from normal angle `start` to `stop`."""
+    """One segment of the addendum or `dedendum`, from normal angle `start` to `stop` (rad)."""
 
     profile: Profile
     start: float
@@ -256,8 +260,8 @@ class _Stretch:
     def _arc(self, tolerance: float) -> Arc | None:
         """Return the segment as an arc, or `None` if it is not one.
 
-        The circle P = C + ρ n is fitted to sampled points P and normals n by least squares. A
-        point that is farther than `tolerance` (mm) from the circle excludes an arc."""
+        The circle P = C + ρ n is fitted to sampled points P and normals n by least squares. If a
+        point deviates from the circle by more than `tolerance` (mm), the segment is not an arc."""
         points, normals, _ = self.look(np.linspace(0, 1, _SAMPLES))
         spread = normals - normals.mean()
         turning = np.sum(np.abs(spread) ** 2)
@@ -275,7 +279,8 @@ class _Stretch:
     def _spline(self, tolerance: float) -> Spline:
         """Return a cubic spline over arc length, within `tolerance` (mm) of the segment.
 
-        Nodes are added until it is within `tolerance`. Raises `InputError` if it needs too many."""
+        Nodes are added until the spline is within `tolerance`. Raises `InputError` if it needs too
+        many nodes."""
         nodes = np.linspace(0, 1, 5)
         while len(nodes) <= _MOST_NODES:
             spline, error = self._fitted(nodes)
@@ -316,9 +321,9 @@ class _Stretch:
 
 
 def _merged(pieces: list[DrawnPiece], tolerance: float) -> list[DrawnPiece]:
-    """Join adjacent arcs of the same circle, also the last piece with the first.
+    """Return the pieces with adjacent arcs of the same circle joined, also across the start.
 
-    `tolerance`: difference between two circles (mm) up to which they count as the same."""
+    `tolerance`: difference between two circles (mm) above which their arcs are not joined."""
     merged: list[DrawnPiece] = []
     for piece in pieces:
         if merged and (joined := _joined(merged[-1], piece, tolerance)):
@@ -340,7 +345,7 @@ def _joined(one: DrawnPiece, other: DrawnPiece, tolerance: float) -> Arc | None:
 
 
 def _closed(pieces: list[DrawnPiece]) -> list[DrawnPiece]:
-    """Move the ends of every spline onto the ends of the adjacent pieces.
+    """Return the pieces with the ends of every spline moved onto the ends of the adjacent pieces.
 
     Before this step, the ends differ by rounding errors."""
     closed = list(pieces)

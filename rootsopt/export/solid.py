@@ -29,13 +29,13 @@ CHORD = 0.005
 TURN = 0.05
 """Greatest angle (rad) between neighbouring facets of a curved face of an STL file."""
 _STEP = np.pi / 48
-"""Greatest twist (rad) between adjacent knots of a helical face. With this step, a cubic spline of
-the rotation is off by 5e-8 of the radius."""
+"""Greatest twist (rad) between adjacent knots of a helical face. With this step, a cubic spline
+deviates from the rotation by 5e-8 of the radius."""
 _SPANS = 8
 """Minimum number of knot spans of a face along the rotor's axis. A straight rotor would need only
-one span. But most programs compute a volume with the kernel's Gauss quadrature, which is finer with
-more spans. With one span, their volume is off by 2e-4 next to a cusp, although the solid itself is
-exact to 1e-8."""
+one span. However, most programs compute the volume by the kernel's Gauss quadrature, which uses
+more points with more spans. With one span, the computed volume has a relative error of 2e-4 next to
+a cusp, although the solid itself is exact to 1e-8."""
 
 
 def require_kernel() -> None:
@@ -92,7 +92,7 @@ def pair(
 
 
 def step_bytes(shape: "Shape") -> bytes:
-    """Return the content of a STEP file (mm) of a solid or an assembly."""
+    """Return the content of a STEP file (mm) of `shape`, a solid or an assembly."""
     from build123d import export_step
 
     file = io.BytesIO()
@@ -103,8 +103,8 @@ def step_bytes(shape: "Shape") -> bytes:
 def stl_bytes(shape: "Shape", place: Path | None = None) -> bytes:
     """Return the content of a binary STL file (mm) within `CHORD` and `TURN` of the shape.
 
-    The kernel writes a temporary file in the folder `place` (`None`: the system's folder for
-    temporary files). Raises `InputError` if the kernel fails to make triangles.
+    The kernel writes a temporary file in the folder `place`. `None`: the system's folder for
+    temporary files. Raises `InputError` if the kernel fails to make triangles.
     """
     from build123d import export_stl
 
@@ -133,8 +133,9 @@ def _edge(piece: DrawnPiece) -> "Edge":
 def _side(piece: DrawnPiece, length: float, helix: float) -> "Face":
     """Return the side face of the rotor over one piece of the outline.
 
-    The face is a cylinder over an arc of a straight rotor, otherwise a B-spline surface. The
-    kernel's own twisted sweeps are not used: they are off by 1e-4 near a cusp.
+    `length`, `helix`: as in `rotor`. The face is a cylinder over an arc of a straight rotor,
+    otherwise a B-spline surface. The kernel's own twisted sweeps are not used: they have a relative
+    error of 1e-4 near a cusp.
     """
     from build123d import Face, Vector
 

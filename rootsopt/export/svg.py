@@ -10,11 +10,11 @@ _STYLE = (
     ".pitch{fill:none;stroke:#0072b2;stroke-width:.25;stroke-dasharray:6 1.5 .5 1.5}"
     ".center{fill:none;stroke:#808080;stroke-width:.25;stroke-dasharray:9 1.5 2 1.5}"
 )
-"""Style sheet; widths and dashes in mm."""
+"""Style sheet of the drawing. Line widths and dash lengths are in mm."""
 
 
 def svg_text(drawing: Drawing) -> str:
-    """Return the content of an SVG file of one rotor.
+    """Return the content of an SVG file of a `drawing` of one rotor.
 
     One user unit is 1 mm. The rotor's y axis points up on the page."""
     reach = drawing.reach + 1
@@ -42,7 +42,7 @@ def svg_text(drawing: Drawing) -> str:
 
 
 def outline_path(pieces: list[DrawnPiece]) -> str:
-    """Return the closed outline as SVG path data, with splines as Bézier curves."""
+    """Return the closed outline `pieces` as SVG path data, with splines as Bézier curves."""
     return f"M{_point(pieces[0].start)}" + "".join(map(_command, pieces)) + "Z"
 
 

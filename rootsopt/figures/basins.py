@@ -24,9 +24,9 @@ _PANELS = 6
 
 
 def plot_basins(ax: Axes, basins: Basins) -> Axes:
-    """Draw a map that shows to which motion each initial state leads.
+    """Draw a map of the initial states, coloured by the motion to which each leads.
 
-    Points mark the state of each motion at the start of every mesh period."""
+    Points mark the state of each motion at the start of every mesh period. The result is `ax`."""
     colors = [_LOST, *_colors(basins)]
     bounds = np.arange(len(colors) + 1) - 1.5
     pale = [_pale(color) for color in colors]
@@ -116,9 +116,9 @@ def _pale(color: str) -> str:
 
 
 def basin_figures(folder: ResultFolder, basins: Basins, config: Config) -> list[str]:
-    """Write basins.png; return the names of the files written.
+    """Write basins.png into `folder`; return the names of the files written.
 
-    Only the motions with the largest shares get a panel that shows their force."""
+    The contact force is shown only for the motions to which the most initial states lead."""
     pairs = list(zip(basins.attractors, _colors(basins), strict=True))
     shown = [(one, color) for one, color in pairs if one.evaluation.series is not None][:_PANELS]
     made = Figure(figsize=(13, 6.6), layout="constrained")

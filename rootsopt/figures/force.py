@@ -26,10 +26,11 @@ def plot_force(
 ) -> Sequence[Axes] | NDArray:
     """Draw the contact force over time, one panel per design, all on one scale.
 
-    `series`, `responses`: simulated motion and response of each design, keyed by its name. Mean and
-    peak are taken from the response (`mean_force_N`, `peak_force_N`), which is more accurate than
-    the samples. All panels cover the same number of revolutions, at most a few, and each includes
-    the largest force of its design. Time is 0 at the start of each panel.
+    `axes`: one for each design; `series`, `responses`: simulated motion and response of each
+    design, keyed by its name. Mean and peak are taken from the response (`mean_force_N`,
+    `peak_force_N`), which is more accurate than the samples. All panels cover the same number of
+    revolutions, at most a few, and each includes the largest force of its design. Time is 0 at the
+    start of each panel. The result is `axes`.
     """
     turns = min(_MOST_TURNS, *(np.ptp(run.rotation) / (2 * np.pi) for run in series.values()))
     for ax, (name, run) in zip(axes, series.items(), strict=True):
@@ -68,7 +69,7 @@ def number(value: float) -> str:
 
 
 def _around_peak(run: Series, turns: float) -> slice:
-    """Return a slice of the samples of `run`: `turns` revolutions around the largest force.
+    """Return the slice of `run`'s samples that covers `turns` revolutions around the largest force.
 
     Near an end of the run, the slice is shifted to lie within the run."""
     count = len(run.time)
@@ -81,7 +82,7 @@ def _around_peak(run: Series, turns: float) -> slice:
 def amplitude_spectrum(
     signal: ArrayLike, step: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (frequencies above 0, one-sided amplitudes at them) of a `signal` (n,).
+    """Return (frequencies above 0, one-sided amplitudes at these frequencies) of a `signal` (n,).
 
     The samples must be a constant `step` apart and cover whole periods, without repeating the first
     sample at the end. No window function is used: a cosine of amplitude a gives one line of height
@@ -103,8 +104,9 @@ def plot_spectrum(
 ) -> Sequence[Axes] | NDArray:
     """Draw the amplitude spectrum of the contact force, one panel per design, all on one scale.
 
-    `series`: simulated motion of each design, keyed by its name; `harmonics`: number of multiples
-    of the mesh frequency that the axis covers. The mean (0 Hz) is omitted.
+    `axes`: one for each design; `series`: simulated motion of each design, keyed by its name;
+    `mesh_frequency_Hz`: mesh frequency (Hz); `harmonics`: number of multiples of the mesh frequency
+    on the frequency axis. The mean (0 Hz) is omitted. The result is `axes`.
     """
     limit = (harmonics + 0.5) * mesh_frequency_Hz
     top = 0.0

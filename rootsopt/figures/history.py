@@ -29,7 +29,8 @@ def plot_history(
     `keys`: names of the design parameters; `axes`: a panel for the objective, followed by one for
     each key. `history`: one row per evaluation. A row whose `start` is absent or negative belongs
     to the screening. The entries of a list-valued parameter share one panel, which omits the
-    screening. Crosses at the top mark unusable designs, whose objective is not finite.
+    screening. Crosses at the top mark unusable designs, whose objective is not finite. The result
+    is `axes`.
     """
     keys = ("objective", *keys)
     for ax, key in zip(axes, keys, strict=True):
@@ -58,7 +59,7 @@ def _label(key: str) -> str:
 def _traces(ax, rows, key):
     """Draw each entry of the list-valued parameter `key` over the evaluations of a local search.
 
-    For rows of the screening, draw nothing."""
+    `rows`: rows of the history. If they belong to the screening, nothing is drawn."""
     rows = [row for row in rows if _start(row) >= 0]
     if not rows:
         return
@@ -94,7 +95,9 @@ def _start(row) -> int:
 
 
 def _trace(ax, rows, key, style):
-    """Draw the values of `key` over the evaluations; hollow markers mean a violated constraint."""
+    """Draw the values of `key` over the evaluations in `rows`.
+
+    A marker is hollow if the design violates a constraint. `style`: style of the line."""
     x, y = _values(rows, "evaluation"), _values(rows, key)
     met = np.asarray([bool(row.get("feasible", True)) for row in rows])
     ax.plot(x, y, **(style | {"marker": "", "label": None}), alpha=0.6)
@@ -109,7 +112,7 @@ def _values(rows, key) -> NDArray[np.float64]:
 
 
 def _best(axes, keys, history):
-    """Draw the best objective so far as a line, and mark the best design with a star.
+    """Draw the best objective so far as a line, and mark the best design with a star in each panel.
 
     The panels of list-valued parameters have no star."""
     x, best = [row["evaluation"] for row in history], _values(history, "best_objective")

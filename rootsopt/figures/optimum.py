@@ -1,4 +1,4 @@
-"""Certificate of an optimum: convergence of the local searches, and the price of each limit."""
+"""Figures of an optimum: convergence of the local searches, and what relaxing each limit gains."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -16,8 +16,9 @@ _WIDEST = 40
 def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: float) -> Axes:
     """Draw the first-order residual over the iterations of each local search.
 
-    `history`: rows with `start`, `iteration` and `residual`; `required`: residual of an optimum.
-    Trials of the screening, and trials without a residual, are left out."""
+    `history`: rows with `start`, `iteration` and `residual`; `required`: residual up to which a
+    design counts as an optimum. Trials of the screening, and trials without a residual, are left
+    out. The result is `ax`."""
     starts = sorted({int(row["start"]) for row in history if int(row["start"]) >= 0})
     for start in starts:
         rows = [row for row in history if int(row["start"]) == start]
@@ -38,9 +39,10 @@ def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: floa
 
 
 def plot_prices(ax: Axes, constraints: Sequence[Mapping[str, Any]]) -> Axes:
-    """Draw the gain in the objective (%) from relaxing each limit by its step, as bars.
+    """Draw bars of the gain in the objective (%) from relaxing each limit by one step.
 
-    `constraints`: rows of the result file; those without a multiplier are left out."""
+    `constraints`: rows of the result file; those without a multiplier are left out. The result is
+    `ax`."""
     rows = [row for row in constraints if abs(row.get("multiplier") or 0.0) > 0]
     rows.sort(key=lambda row: row["relaxed_objective_percent"], reverse=True)
     names = []

@@ -21,7 +21,7 @@ from rootsopt.scene import design_keys, outline_mm
 
 
 def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, Any]) -> list[str]:
-    """Write the figures of one design's profile; return the file names.
+    """Write the figures of one design's profile into `folder`; return the file names.
 
     `record`: the design's record in the result file. The figures are profiles.png, meshing.png and,
     for a profile read from a file, conjugacy.png."""
@@ -43,7 +43,7 @@ def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, A
 
 
 def simulation_figures(folder: ResultFolder, evaluation: Evaluation, config: Config) -> list[str]:
-    """Write the figures of one evaluation, of profile and force; return the file names."""
+    """Write the profile and force figures of an evaluation into `folder`; return the file names."""
     names = profile_figures(folder, config, evaluation.record())
     return names + _force_figures(folder, {config.profile.family.upper(): evaluation}, config)
 
@@ -55,9 +55,10 @@ def optimization_figures(
     history: Sequence[Mapping[str, Any]],
     config: Config,
 ) -> list[str]:
-    """Write the figures of an optimisation; return the file names.
+    """Write the figures of an optimisation into `folder`; return the file names.
 
-    `history`: one row per evaluation, as in `plot_history`; if empty, its figure is omitted."""
+    `baseline`, `optimized`: evaluations of the design before and after the optimisation. `history`:
+    one row per evaluation, as in `plot_history`; if empty, its figure is omitted."""
     designs = {"baseline": baseline, "optimised": optimized}
     outlines = {name: _outline(config, one.design) for name, one in designs.items()}
     names = [
@@ -77,9 +78,9 @@ def certificate_figure(
     constraints: Sequence[Mapping[str, Any]],
     required: float,
 ) -> str:
-    """Write optimum.png: convergence and price of each limit; return its name.
+    """Write optimum.png, the figures of `rootsopt.figures.optimum`; return its name.
 
-    `required`: first-order residual of an optimum."""
+    `history`, `required`: as in `plot_residual`; `constraints`: as in `plot_prices`."""
     made, axes = figure(11, 4.2, 1, 2)
     plot_residual(axes[0, 0], history, required)
     plot_prices(axes[0, 1], constraints)

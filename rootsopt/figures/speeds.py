@@ -17,7 +17,8 @@ from rootsopt.response.speeds import AtSpeed
 _MARKERS = {"periodic": "o", "averaged": "s", "chaotic": "x", "not_settled": "+"}
 _NO_FORCE = "v"
 _FEW = 24
-"""Number of speeds above which steady motions are not marked one by one on the line."""
+"""Number of speeds above which a line has no markers at its steady motions, except at isolated
+ones."""
 LABELS = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
 
 
@@ -26,7 +27,7 @@ def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[AtSpeed]], force: str) 
 
     `designs`: evaluations of each design at all speeds, keyed by its name; `force`: key of the
     force in `Evaluation.response`. Lines connect steady motions. Other motions are drawn as single
-    markers, at the bottom if their force is not known.
+    markers, at the bottom of the panel if their force is not known. The result is `ax`.
     """
     for (name, parts), color, dashes in zip(designs.items(), COLORS, DASHES * 2, strict=False):
         speeds = np.array([part.speed_rpm for part in parts])
@@ -81,7 +82,7 @@ def speed_figure(
 ) -> list[str]:
     """Write speeds.png, mean and peak force over speed; return the names of the files written.
 
-    `designs`: as in `plot_speeds`."""
+    `designs`: as in `plot_speeds`; `title`: title of the figure."""
     made, axes = figure(9, 6.6, 2, 1, sharex=True)
     for ax, force in zip(axes[:, 0], LABELS, strict=True):
         plot_speeds(ax, designs, force).set_ylim(0, None)

@@ -1,1 +1,1 @@
-"""Import of a drawn or measured outline: read it, check it, make a profile from it."""
+"""Import of a drawn or measured outline: read the file, check it, make a profile from it."""

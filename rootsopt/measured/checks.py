@@ -8,17 +8,17 @@ class Checks:
     """Deviations and margins of an imported outline.
 
     `points`: number of points of the outline as read, without repeated points.
-    `turned_deg`: angle (°) by which the outline was turned to put a lobe on +x.
+    `turned_deg`: angle (°) by which the outline was turned to put a lobe's axis on +x.
     `reversed`: whether the points ran clockwise as read.
-    `axis_offset_um`: distance of the centroid from the origin (µm).
+    `axis_offset_um`: distance (µm) of the outline's centroid from the origin.
     `lobe_deviation_um`: greatest normal distance between a flank and the mean of the same flank of
     all lobes (µm).
     `flank_deviation_um`: greatest normal distance between the mean leading flank and the mirrored
     mean trailing flank (µm).
     `fit_deviation_um`: RMS distance of the leading flank's points from the fitted curve (µm); 0 if
     the curve passes through them.
-    `star_margin_mm`: least distance between a tangent and the axis (mm), negative if a tangent
-    passes the axis on the wrong side.
+    `star_margin_mm`: least distance (mm) between a tangent of the flank and the rotor's axis,
+    negative if a tangent passes the axis on the wrong side.
     `convexity_margin_mm`: least radius of curvature of the addendum (mm).
     """
 
@@ -33,5 +33,5 @@ class Checks:
     convexity_margin_mm: float
 
     def record(self) -> dict[str, float | int | bool]:
-        """Return the fields by name, for the result file."""
+        """Return the fields as a dictionary, keyed by field name, for the result file."""
         return dataclasses.asdict(self)

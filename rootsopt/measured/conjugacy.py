@@ -23,8 +23,8 @@ class Conjugacy:
     """Gap of a pair in pure rolling: relative rotation ε = 0, nominal centre distance.
 
     `roll` (n,): roll angle (rad) of rotor 1 over a quarter of a lobe pitch, 0 with a tip of rotor 1
-    on the line of centres. By symmetry, the other quarters repeat this one, with the rotors or the
-    flanks exchanged.
+    on the line of centres. By symmetry, the other three quarters give the same gaps, with the
+    rotors or the flanks exchanged.
     `gap` (n,): gap (m) of the drive flanks or of the coast flanks, whichever is smaller; negative
     if they overlap, NaN if neither pair of flanks has points that face each other.
     """
@@ -34,12 +34,12 @@ class Conjugacy:
 
     @property
     def least(self) -> float:
-        """Least gap (m), negative if flanks overlap."""
+        """Least gap (m) over all roll angles, negative if flanks overlap."""
         return float(np.nanmin(self.gap))
 
     @property
     def most(self) -> float:
-        """Greatest gap (m)."""
+        """Greatest gap (m) over all roll angles."""
         return float(np.nanmax(self.gap))
 
     def record(self) -> dict[str, float]:
@@ -47,8 +47,8 @@ class Conjugacy:
 
         `mesh_gap_min_um`, `mesh_gap_max_um`: least and greatest gap (µm). `mesh_gap_min_at_deg`,
         `mesh_gap_max_at_deg`: roll angles (°) of these gaps. `interference_um`: greatest overlap
-        (µm), 0 without overlap. `backlash_um`: twice the least gap (µm), 0 with overlap; it is the
-        normal backlash of a lobe between its two neighbours."""
+        (µm), 0 without overlap. `backlash_um`: twice the least gap (µm), 0 with overlap. It is the
+        play, along the normal, of a lobe between the partner's two lobes."""
         return {
             "mesh_gap_min_um": self.least / _MICRON,
             "mesh_gap_min_at_deg": float(np.degrees(self.roll[np.nanargmin(self.gap)])),
@@ -84,5 +84,5 @@ def _gaps(profile, roll):
 
 
 def gaps_um(found: Conjugacy) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (roll angles (n,) in degrees, gaps (n,) in µm) of `found`, for a figure."""
+    """Return (roll angles (n,) in degrees, gaps (n,) in µm) of a `Conjugacy`, for a figure."""
     return np.degrees(found.roll), found.gap / _MICRON

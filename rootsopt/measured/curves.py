@@ -20,26 +20,28 @@ from rootsopt.measured.guard import guarded
 _TURNING = 0.3
 """Length (pitch radii) that contributes as much to a curve's parameter as a turn of 1 rad."""
 _JUMP, _ABOVE = 0.02, 20.0
-"""Two limits on the change of curvature at a point, above which the point becomes a joint. The
-first is a fraction of the sum of the curvatures (absolute values) on both sides. The second is a
-multiple of the median change at the points around. Both must be exceeded."""
+"""Limits above which a change of curvature at a point makes this point a joint. Both must be
+exceeded. `_JUMP` is a fraction of the sum of the curvatures (absolute values) on both sides.
+`_ABOVE` is a multiple of the median change at the surrounding points."""
 _BESIDE, _AROUND = 3, 12
-"""Number of points on each side whose change of curvature a joint affects; number of points on each
-side from which the median for `_ABOVE` is taken, without those affected."""
+"""Numbers of points on each side of a joint. A joint affects the change of curvature at the nearest
+`_BESIDE` points. The median for `_ABOVE` is taken over the nearest `_AROUND` points, without these.
+"""
 _WINDING = 7.0
-"""Sum of the turns (rad, absolute values) between successive steps along a flank above which its
-points are rejected as scattered. With smoothing, there is no limit."""
+"""Sum of the polygon's turns (rad, absolute values) along a flank above which the points are
+rejected as scattered. With smoothing, there is no limit."""
 _SHORTEST = 4
-"""Number of intervals between points below which a piece is too short to be split off."""
+"""Number of intervals between points below which a piece is not split off, because it is too short.
+"""
 _MOST_KNOTS, _NO_ROOM = 500, 1
-"""Number of knots above which a smoothing spline is rejected because it follows the noise; flag
-that FITPACK returns in this case."""
+"""`_MOST_KNOTS`: number of knots above which a smoothing spline is rejected because it follows the
+noise. `_NO_ROOM`: flag that FITPACK returns in this case."""
 _KEY = "`profile.outline_file`"
 _UNEVEN = "remove points that are much closer together than others"
 _CUSP, _SPARED = 2e-2, 2
-"""Speed |z′| (fraction of the mean speed) below which the end of a piece is a cusp; number of knot
-intervals next to a cusp that are not sampled. Points that are slower than this speed are not
-sampled either."""
+"""`_CUSP`: speed |z′| (fraction of the mean speed) below which the end of a piece is a cusp.
+`_SPARED`: number of knot intervals next to a cusp that are not sampled. Slower points next to a
+cusp are not sampled either."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,13 +54,16 @@ class MeasuredCurve:
     pieces: tuple[BSpline, ...]
 
     def derivatives(self, t: NDArray[np.float64], place: int) -> NDArray[np.complex128]:
-        """Return z and its derivatives z′, z″, z‴ with respect to t: (4, n) at `t` (n,).
+        """Return z, z′, z″, z‴ as an array (4, n) at the parameters `t` (n,).
 
-        `place`: index of the piece that is evaluated."""
+        Derivatives are with respect to t; lengths are in mm. `place`: index of the piece that is
+        evaluated."""
         return np.stack([self.pieces[place](t, order) for order in range(4)])
 
     def __call__(self, t: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return z, z′, z″, z‴ (4, n) at `t` (n,), each from the piece that contains its `t`."""
+        """Return z, z′, z″, z‴ as an array (4, n) at the parameters `t` (n,).
+
+        Each value of `t` is evaluated on the piece that contains it. Lengths are in mm."""
         place = np.clip(np.searchsorted(self.ends, t, side="right") - 1, 0, len(self.pieces) - 1)
         found = np.empty((4, len(t)), complex)
         for k in map(int, np.unique(place)):
@@ -100,8 +105,8 @@ def stretch(
 ) -> tuple[NDArray[np.float64], Frame]:
     """Return (parameters, `Frame` at them): `count` samples of one piece of `curve`.
 
-    The samples run from t = `low` to t = `high`; `place`: index of the piece. Next to a cusp, where
-    z′ vanishes, the data hardly determine the curve. The last intervals before the cusp are
+    The samples run from t = `low` to t = `high`; `place`: index of the piece. The data hardly
+    determine the curve next to a cusp, where z′ vanishes. The last intervals before the cusp are
     therefore not sampled, and the tangent and its turning are extrapolated to the cusp.
     """
     ends = np.array([low, high])
@@ -137,8 +142,8 @@ def through(
 
     `joints`: mask of the points at which curvature may jump; `pitch_radius`: in mm. If `smoothing`
     is 0, the curve has one spline between every two successive joints, quintic if there are enough
-    points. Points at which the polygon's own curvature jumps are joints, too. If `smoothing` is
-    greater than 0, the curve is a single quintic spline and `joints` is ignored.
+    points. Points at which the curvature of the polygon through the points jumps are also joints.
+    If `smoothing` is greater than 0, the curve is a single quintic spline and `joints` is ignored.
 
     Raises `InputError` if the points are too few or scattered, or if `smoothing` is too small.
     """
@@ -207,7 +212,7 @@ def _parameter(points: NDArray[np.complex128], weight: float) -> NDArray[np.floa
 
 
 def _curvature(points: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (curvatures at a polygon's inner corners in 1/mm, lengths of its sides in mm)."""
+    """Return (curvatures (1/mm) at the inner corners of a polygon, lengths (mm) of its sides)."""
     steps = np.diff(points)
     lengths = np.abs(steps)
     return 2 * np.angle(steps[1:] / steps[:-1]) / (lengths[1:] + lengths[:-1]), lengths

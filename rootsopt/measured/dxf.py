@@ -30,10 +30,10 @@ is rejected."""
 _POINTS = 500_000
 """Total number of points on all entities above which a drawing is rejected."""
 _DEEPEST = 8
-"""Depth of nesting of blocks above which a drawing is rejected."""
+"""Number of levels of nested blocks above which a drawing is rejected."""
 _LARGEST = 1e9
 """Absolute value of a number in an entity (drawing units) above which a drawing is rejected as
-damaged. A drawing of this size or larger (mm) is rejected, too."""
+damaged. A drawing whose diagonal (mm) reaches this value is also rejected."""
 _BINARY = b"AutoCAD Binary DXF\r\n\x1a\x00"
 _NOT = "is not a DXF file that can be read"
 _AGAIN = "export it again (DXF R2000 or newer) or save the outline as CSV"
@@ -62,8 +62,8 @@ _UNITS = {
     23: 3 * _SURVEY_FOOT,
     24: 5280 * _SURVEY_FOOT,
 }
-"""Length (mm) of each unit by its code in $INSUNITS. Other codes, such as those of astronomical
-units (17 to 20), are rejected."""
+"""Length (mm) of each drawing unit, keyed by its code in $INSUNITS. Other codes, such as those of
+astronomical units (17 to 20), are rejected."""
 
 
 def from_dxf(data: bytes, name: str) -> Loop:
@@ -122,11 +122,14 @@ def from_dxf(data: bytes, name: str) -> Loop:
 
 
 def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
-    """Check the raw tags of a DXF file; return the number of entities of each kind.
+    """Check the raw tags of a DXF file and return the number of entities of each kind.
+
+    `data`: content of the file; `binary`: whether the file is a binary DXF; `name`: its name in
+    messages.
 
     Raises `InputError` if the file is incomplete, if a number of an entity is invalid, or if there
-    are too many entities. This check is needed because the library reads "1,5" as 1, and accepts a
-    number that is cut off at the end of the file.
+    are too many entities. This check is needed because the library reads "1,5" as 1. It also
+    accepts a number that is cut off at the end of the file.
     """
     tags = binary_tags_loader(data) if binary else recover.bytes_loader(io.BytesIO(data))
     counted: Counter[str] = Counter()
@@ -201,7 +204,9 @@ def _on_layer(entities: list[Any], name: str) -> list[Any]:
 
 
 def _exploded(inserts: list[Any], name: str) -> list[Any]:
-    """Return the entities of inserted and nested blocks, placed as they appear in the drawing."""
+    """Return the entities of inserted and nested blocks, placed as they appear in the drawing.
+
+    `inserts`: the library's block inserts; `name`: name of the drawing in messages."""
     found: list[Any] = []
     stack = [(insert, 1) for insert in reversed(inserts)]
     handled = 0

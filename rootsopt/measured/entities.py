@@ -48,7 +48,7 @@ class Stroke(abc.ABC):
     curved: bool
     """Whether the segment's ends are joints (see `Loop`)."""
     least: int
-    """Number of intervals with which the segment is sampled to measure its extent."""
+    """Number of intervals into which the segment is divided when its extent is measured."""
 
     @abc.abstractmethod
     def intervals(self, spacing: float) -> int:
@@ -58,7 +58,7 @@ class Stroke(abc.ABC):
 
     @abc.abstractmethod
     def points(self, count: int) -> NDArray[np.complex128]:
-        """Return points (mm, as x + iy) from end to end.
+        """Return points (mm, as x + iy) along the segment, including both ends.
 
         `count`: number of intervals. A spline may return more points than `count` + 1. A polygonal
         line ignores `count` and returns its corners."""
@@ -83,7 +83,9 @@ class _Corners(Stroke):
 
 @dataclasses.dataclass(frozen=True)
 class _Ellipse(Stroke):
-    """Elliptic or circular arc: center + major cos t + minor sin t, t = start to start + sweep."""
+    """An elliptic or circular arc: the points center + major cos t + minor sin t.
+
+    The angle t runs from start to start + sweep (rad)."""
 
     center: complex
     major: complex
@@ -149,8 +151,8 @@ def chain(parts: list[Stroke], spacing: float) -> Loop:
 class Entity:
     """One entity of a drawing, in the drawing's units.
 
-    `kind`: its DXF type; `what`: its name in messages; `normal`: normal of its plane; `data`:
-    first arguments of the function in `_KINDS` that makes its segments."""
+    `kind`: DXF type; `what`: name in messages; `normal`: normal of the entity's plane; `data`:
+    first arguments of the function in `_KINDS` that makes the segments."""
 
     kind: str
     what: str
@@ -159,7 +161,7 @@ class Entity:
 
     @classmethod
     def of(cls, entity: Any, name: str) -> "Entity":
-        """Build the entity from an ezdxf entity; `name` names the drawing in messages.
+        """Build the entity from an ezdxf `entity`. `name`: name of the drawing in messages.
 
         Raises `InputError` if the entity cannot be read."""
         kind = entity.dxftype()
@@ -193,7 +195,7 @@ class _Plane:
     below: bool
 
     def __call__(self, z: Any) -> Any:
-        """Convert a point or vector x + iy from the entity's plane to the drawing's plane (mm).
+        """Convert points or vectors `z` = x + iy from the entity's plane to the drawing's (mm).
 
         CAD stores mirrored entities in a plane seen from below, whose x axis is reversed."""
         return self.scale * (-np.conj(z) if self.below else z)
@@ -201,7 +203,7 @@ class _Plane:
 
 @dataclasses.dataclass(frozen=True)
 class _Fault:
-    """Makes the errors that an entity raises. `what`: name of the entity in messages."""
+    """Builds the `InputError` for one entity. `what`: name of the entity in messages."""
 
     what: str
 
@@ -213,7 +215,7 @@ class _Fault:
 
 
 def _plain(points: Iterable[Any]) -> NDArray[np.complex128]:
-    """Return points (x, y) or (x, y, z) of the library as complex numbers x + iy."""
+    """Convert the library's points (x, y) or (x, y, z) to complex numbers x + iy; z is dropped."""
     rows = np.array([(p[0], p[1]) for p in points], float).reshape(-1, 2)
     return rows[:, 0] + 1j * rows[:, 1]
 
@@ -314,7 +316,12 @@ def _read_polyline(entity: Any):
 
 
 def _polyline(corners, bulges, closed, spatial, plane, fault) -> list[Stroke]:
-    """Return the straight runs and arcs of a polyline. An arc's bulge is tan(its angle / 4)."""
+    """Return the straight runs and arcs (mm) of a polyline.
+
+    `corners`: corners x + iy; `bulges`: bulge of the side after each corner; `closed`: whether a
+    last side returns to the first corner; `spatial`: whether the corners are in the drawing's
+    coordinates. A side with a bulge is an arc; its bulge is the tangent of a quarter of the arc's
+    angle."""
     del fault
     corners = plane.scale * corners if spatial else plane(corners)
     bulges = -bulges if plane.below and not spatial else bulges
@@ -336,7 +343,8 @@ def _polyline(corners, bulges, closed, spatial, plane, fault) -> list[Stroke]:
 
 
 _SPATIAL = ("LINE", "SPLINE")
-"""Kinds of entities whose stated plane is ignored."""
+"""Kinds of entities whose points are in the drawing's coordinates, so that their stated plane is
+ignored."""
 _KINDS = {
     "LINE": (_read_line, _line),
     "ARC": (_read_arc, _arc),

@@ -16,8 +16,8 @@ from rootsopt.profiles.outline import Outline, Table
 
 _MM = 1e-3
 NODES = 1536
-"""Number of nodes in each table, of the addendum and of the dedendum. It is fixed, so that one
-compiled program serves all outlines."""
+"""Number of nodes in the table of the addendum, and in that of the dedendum. The number is fixed,
+so that one compiled program serves all outlines."""
 _PIECES = NODES // 4
 """Number of smooth pieces of an addendum or dedendum above which an outline is rejected."""
 _BEYOND = 0.3
@@ -26,19 +26,19 @@ extend beyond its tip and beyond its root."""
 _SHARES = 400
 """Number of points at which two flanks are compared."""
 _FOLD = 1e-3
-"""Polar angle (rad) of a backward run of the outline above which the outline is rejected. Smaller
-runs are noise and rounding. Also the distance (pitch radii) by which a tangent may pass the axis on
-the wrong side."""
+"""Polar angle (rad) covered by a backward run of the outline above which the outline is rejected.
+Smaller runs are noise and rounding. An outline is also rejected if a tangent passes the axis on the
+wrong side by more than this distance (pitch radii)."""
 _OFF = 0.02
-"""Deviation between flanks (pitch radii) above which an outline is rejected. It is also the
-greatest allowed `profile.outline_smoothing_mm`, in pitch radii."""
+"""Deviation between flanks (pitch radii) above which an outline is rejected. This is also the value
+(pitch radii) above which `profile.outline_smoothing_mm` is rejected."""
 _LAND = 1e-3, 0.5 * np.pi / 180
 """Two limits for the tip land, which is an arc about the rotor's axis. The first is the moment arm
 of the normal about the axis (pitch radii) above which the land ends. The second is the range of
 normal angles on one flank (rad) below which the land is ignored."""
 _CORNER = 1e-2
-"""Change of the normal's direction (rad) at a joint below which the change is averaged out. A joint
-with a larger change is a corner."""
+"""Change of the normal's direction (rad) at a joint below which both sides get the mean direction.
+A joint with a larger change is a corner."""
 _AT = 1e-6
 """Distance (pitch radii) from the pitch circle below which a joint is taken as the point where the
 flank crosses the circle."""
@@ -50,7 +50,7 @@ _GAUSS = np.polynomial.legendre.leggauss(12)
 
 @dataclasses.dataclass(frozen=True)
 class _Flank:
-    """A flank in the frame of its lobe, with the tip on +x. A trailing flank is mirrored.
+    """A flank in the frame of its lobe, with the tip on +x; a trailing flank is mirrored.
 
     `curve`: curve of the flank (mm); `tip`, `pitch`, `root`: the curve's parameters at the tip, the
     pitch circle and the root; `off`: RMS distance of the points from the curve (mm), 0 without
@@ -63,16 +63,17 @@ class _Flank:
     off: float
 
     def at(self, share: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return z, z′, z″, z‴ (4, n) at `share` (n,): 0 at the tip, 1 at the root.
+        """Return z, z′, z″, z‴ as an array (4, n) at `share` (n,).
 
-        A share is a fraction of the range of the curve's parameter."""
+        A share is a fraction of the range of the curve's parameter: 0 at the tip, 1 at the root.
+        Lengths are in mm, and derivatives are with respect to the parameter."""
         return self.curve(self.tip + (self.root - self.tip) * share)
 
 
 def imported(
     loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: float
 ) -> tuple[Outline, Checks]:
-    """Return (profile, deviations) of the outline of a rotor with N = `lobes` lobes.
+    """Return (profile, deviations) for the outline of a rotor with N = `lobes` lobes.
 
     `loop`: points of the outline; `pitch_radius_mm`: pitch radius; `smoothing_mm`: RMS scatter of
     the points (mm), 0 for a curve through them.
@@ -176,7 +177,9 @@ def _check_lobes(points, lobes, radius):
 
 
 def _moment(points, order):
-    """Return the exact ∬ z^order dA of a polygon, by Green's theorem as ∮ z̄ z^order dz / 2i."""
+    """Return ∬ z^order dA of a polygon, exactly, with the corners `points` (z = x + iy).
+
+    By Green's theorem, the moment is ∮ z̄ z^order dz / 2i."""
     start, step = points, np.roll(points, -1) - points
     nodes, weights = np.polynomial.legendre.leggauss(order // 2 + 2)
     z = start[:, None] + step[:, None] * (1 + nodes) / 2
@@ -186,8 +189,10 @@ def _moment(points, order):
 def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
     """Return the leading (`side` = 1) or trailing (-1) flank of the lobe with index `lobe`.
 
-    The curve is also fitted to points beyond tip and root, which belong to neighbouring flanks.
-    Raises `InputError` if the points do not include the tip, the root and the pitch crossing."""
+    `points`, `joints`: points (mm) of the outline and mask of the joints; `lobes`: number of lobes;
+    `radius`: pitch radius (mm); `smoothing`: RMS scatter (mm). The curve is also fitted to points
+    beyond tip and root, which belong to neighbouring flanks. Raises `InputError` if the points do
+    not include the tip, the root and the pitch crossing."""
     local = points * np.exp(-2j * np.pi * lobe / lobes)
     if side < 0:
         local, joints = np.conj(local)[::-1], joints[::-1]
@@ -244,9 +249,9 @@ def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
 
 
 def _distances(flank: _Flank, own: _Flank) -> NDArray[np.float64]:
-    """Return the distances (n,) of points on `flank` from the flank `own` (mm, positive outside).
+    """Return the signed distances (n,) in mm of points on `flank` from the flank `own`.
 
-    They are measured along the normals of `own`."""
+    Distances are measured along the normals of `own`, and are positive outside it."""
     share = np.linspace(0.0, 1.0, _SHARES)
     place = flank.at(share)[0]
     for _ in range(4):
@@ -263,8 +268,8 @@ def _distances(flank: _Flank, own: _Flank) -> NDArray[np.float64]:
 def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray[np.float64], Frame]]:
     """Return (parameters, `Frame` at them) for each piece of a flank from `start` to `stop`.
 
-    The pieces have `NODES` parameters in total; those of a joint occur in both its pieces. Raises
-    `InputError` if there are too many pieces."""
+    The pieces have `NODES` parameters in total. The parameter of a joint occurs in both adjacent
+    pieces. Raises `InputError` if there are too many pieces."""
     parts = flank.curve.between(start, stop)
     if len(parts) > _PIECES:
         raise InputError(
@@ -282,10 +287,10 @@ def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray[np.
 
 
 def _outline(flank: _Flank, lobes: int, radius: float) -> tuple[Outline, float, float]:
-    """Return (profile, star margin in mm, convexity margin in mm) of a rotor with this flank.
+    """Return (profile, star margin in mm, convexity margin in mm) of a rotor with this `flank`.
 
-    The margins are defined in `Checks`. Raises `InputError` if the addendum is not convex or the
-    flank folds back."""
+    `radius`: pitch radius (mm). The margins are defined in `Checks`. Raises `InputError` if the
+    addendum is not convex or the flank folds back."""
     upper = _stretch(flank, flank.tip, flank.pitch)
     lower = _stretch(flank, flank.pitch, flank.root)
     t, z, direction, speed, turning = (
@@ -346,7 +351,8 @@ def _row(part: tuple[NDArray[np.float64], Frame]) -> tuple[NDArray, ...]:
 def _agreed(t: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the directions of the normal (rad), averaged over both sides of each joint.
 
-    A joint at which they differ by `_CORNER` or more is a corner and is left unchanged."""
+    `t`: curve parameters, equal on both sides of a joint. A joint is a corner if the directions
+    differ by `_CORNER` or more; they are then left unchanged."""
     joint = np.flatnonzero((np.diff(t) == 0) & (np.abs(np.diff(direction)) < _CORNER))
     agreed = direction.copy()
     agreed[joint] = agreed[joint + 1] = (direction[joint] + direction[joint + 1]) / 2
@@ -358,7 +364,10 @@ def _table(node: NDArray, value: NDArray, slope: NDArray) -> Table:
 
 
 def _land(nu, lever, curvature_radius, radius) -> float:
-    """Return the arc length (mm) of the tip land on both sides of the tip; 0 without a land."""
+    """Return the arc length (mm) of the tip land on both sides of the tip; 0 without a land.
+
+    `nu`: normal angles (rad) of the addendum's nodes; `lever`, `curvature_radius`: values (mm) at
+    the nodes; `radius`: pitch radius (mm)."""
     miss, turn = _LAND
     beyond = np.flatnonzero(np.abs(lever) > miss * radius)
     end = beyond[0] if len(beyond) else len(nu) - 1
@@ -368,7 +377,9 @@ def _land(nu, lever, curvature_radius, radius) -> float:
 
 
 def _integrals(flank: _Flank, lobes: int) -> tuple[float, float]:
-    """Return (area in mm², polar moment of area in mm⁴) of the rotor made from a flank."""
+    """Return (area in mm², polar moment of area in mm⁴) of a rotor with `lobes` lobes.
+
+    `flank`: flank of the rotor; all other flanks are its images."""
     nodes, weights = _GAUSS
     area = moment = 0.0
     for place, low, high in flank.curve.between(flank.tip, flank.root):

@@ -16,11 +16,11 @@ from rootsopt.errors import InputError
 
 _LOGGER = "ezdxf"
 _REASON = 120
-"""Length (characters) above which a library's own message is cut."""
+"""Number of characters above which a library's own message is shortened."""
 
 
 def short(value: object, width: int = 60) -> str:
-    """Return `value` as printable text for a message, cut to about `width` characters."""
+    """Return `value` as printable text for a message, shortened to about `width` characters."""
     text = value if isinstance(value, str) else str(value)
     size = len(text)
     text = text[:width] if size > width else text
@@ -31,7 +31,7 @@ def short(value: object, width: int = 60) -> str:
 
 @contextlib.contextmanager
 def silenced() -> Iterator[None]:
-    """Keep log records, warnings and floating-point warnings of a library off the console."""
+    """Suppress a library's log records and warnings in the `with` block, also those of NumPy."""
     logger = logging.getLogger(_LOGGER)
     level = logger.level
     if level > logging.CRITICAL:  # Nested: entering again is slow for thousands of entities.

@@ -1,6 +1,7 @@
 """Joins a drawing's entities into closed loops.
 
-A chain is the points on one entity. A link is a chain whose ends are at different vertices.
+A chain is the points on one entity. A vertex is a place where ends of chains meet. A link is a
+chain whose two ends are at different vertices.
 """
 
 import numpy as np
@@ -13,9 +14,9 @@ from rootsopt.errors import InputError
 from rootsopt.measured.loop import Loop, place, signed_area
 
 TOGETHER = 1e-3
-"""Distance (mm) below which two ends of entities are joined at one vertex."""
+"""Distance (mm) below which two ends of entities share a vertex."""
 _CROWDED = 50
-"""Mean number of other ends within `TOGETHER` of an end above which a drawing is rejected."""
+"""Mean number of other ends closer than `TOGETHER` to an end above which a drawing is rejected."""
 
 
 def joined(chains: list[Loop], layer: str, name: str) -> Loop:
@@ -85,7 +86,9 @@ def _where(chains: list[Loop], which: NDArray) -> list[Loop]:
 
 
 def _closing(joints: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a closed chain's mask of joints without the last point, which repeats the first."""
+    """Return the mask of a closed chain's joints without its last point, which repeats the first.
+
+    The first point is a joint if either of the two is."""
     joints = joints.copy()
     joints[0] |= joints[-1]
     return joints[:-1]
@@ -117,9 +120,10 @@ def _components(pairs: NDArray[np.intp], count: int) -> NDArray[np.intp]:
 
 
 def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> NDArray[np.intp]:
-    """Return the indices of the chains, except those that repeat an earlier chain.
+    """Return the indices of the chains that do not repeat an earlier chain.
 
-    A chain repeats another if their ends and the points of `_quarters` coincide."""
+    `vertex` (n, 2): numbers of the vertices at each chain's ends; `name`: name of the drawing in
+    messages. A chain repeats another if the ends and the points of `_quarters` of both coincide."""
     if not chains:
         return np.zeros(0, np.intp)
     quarters = np.array(
@@ -134,7 +138,9 @@ def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> N
 
 
 def _quarters(points: NDArray[np.complex128], backwards: bool) -> NDArray[np.complex128]:
-    """Return the points (3,) at one quarter, one half and three quarters of a chain's length."""
+    """Return the points (3,) at one quarter, one half and three quarters of a chain's length.
+
+    `backwards`: whether the length is measured from the last point."""
     points = points[::-1] if backwards else points
     if len(points) == 2:
         return points[0] + (points[1] - points[0]) * np.array([0.25, 0.5, 0.75])
@@ -143,7 +149,9 @@ def _quarters(points: NDArray[np.complex128], backwards: bool) -> NDArray[np.com
 
 
 def _in_loops(vertex: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the indices of the links that remain after repeatedly removing links at dead ends."""
+    """Return the indices of the links that remain after repeatedly removing links at dead ends.
+
+    `vertex` (n, 2): numbers of the vertices at each link's ends."""
     at: dict[int, set[int]] = {}
     for link, (a, b) in enumerate(vertex.tolist()):
         at.setdefault(a, set()).add(link)
@@ -162,7 +170,10 @@ def _in_loops(vertex: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def _groups(vertex: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Return the indices of the links in each connected group, ordered by the first index."""
+    """Return the indices of the links in each connected group.
+
+    `vertex` (n, 2): numbers of the vertices at each link's ends. Groups are ordered by the first
+    index in each."""
     if not len(vertex):
         return []
     _, which = np.unique(vertex, return_inverse=True)
@@ -176,9 +187,10 @@ def _groups(vertex: NDArray[np.intp]) -> list[NDArray[np.intp]]:
 def _walked(
     chains: list[Loop], members: NDArray[np.intp], vertex: NDArray[np.intp]
 ) -> tuple[NDArray[np.complex128], NDArray[np.bool_]]:
-    """Return (points, mask of joints) along the links of one loop or one open path.
+    """Return (points, mask of joints) along the links of one loop or one open path in `chains`.
 
-    `members`: indices of the links, in any order."""
+    `members`: indices of the links, in any order; `vertex` (n, 2): numbers of the vertices at each
+    chain's ends."""
     at: dict[int, list[int]] = {}
     for link in members.tolist():
         for v in vertex[link].tolist():
@@ -205,7 +217,11 @@ def _walked(
 def _widest_gap(
     ends: NDArray[np.complex128], vertex: NDArray[np.intp], links: NDArray[np.intp]
 ) -> tuple[float, complex]:
-    """Return the largest distance (mm) from a dead end to the nearest other one, and its point."""
+    """Return (largest distance (mm) from a dead end to the nearest other dead end, its point).
+
+    `ends`, `vertex` (n, 2): points (mm) and vertices at each chain's ends; `links`: indices of the
+    chains that count. The point is that of the dead end from which this distance is measured. With
+    fewer than two dead ends, the distance is 0."""
     places = ends[links].ravel()
     numbers = vertex[links].ravel()
     single = np.flatnonzero(np.bincount(numbers)[numbers] == 1)

@@ -19,10 +19,12 @@ class Loop:
 
 
 def signed_area(points: Complex128[np.ndarray, " n"]) -> float:
-    """Return the area of a closed polygon (mm²), positive if it runs counter-clockwise."""
+    """Return the area (mm²) of the closed polygon with the corners `points` (mm, as x + iy).
+
+    The area is positive if the polygon runs counter-clockwise."""
     return float(np.sum(np.imag(np.conj(points) * np.roll(points, -1)))) / 2
 
 
 def place(z: complex) -> str:
-    """Return a point x + iy (mm) as text for a message."""
+    """Format a point `z` = x + iy (mm) as text for a message."""
     return f"({z.real:.5g}, {z.imag:.5g}) mm"

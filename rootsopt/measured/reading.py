@@ -1,4 +1,4 @@
-"""Reads outlines from CSV and DXF files as one closed loop of points (mm, as x + iy)."""
+"""Reads a CSV or DXF file as one closed loop of points (mm, as x + iy)."""
 
 import os
 import stat
@@ -14,16 +14,16 @@ from rootsopt.measured.table import from_csv
 __all__ = ["Loop", "read", "signed_area"]
 
 _WIDEST = 5.0
-"""Distance between the last and the first point (multiple of the longest step between others) above
-which a loop is rejected as open."""
+"""Distance between the last and the first point above which a loop is rejected as open. The unit is
+the longest step between successive points."""
 _BYTES = 50_000_000
 """Size (bytes) above which a file is rejected."""
 _POINTS = 500_000
 """Number of points above which an outline is rejected. Reading and fitting take about 20 µs per
 point."""
 _SIZES = 0.1, 1e5
-"""Size (mm) below which, and size above which, an outline is rejected, because its units must be
-wrong."""
+"""Least and greatest size (mm) of an outline. Outside this range it is rejected, because its units
+must be wrong."""
 _SAME = 1e-9
 """Distance (fraction of the outline's greatest coordinate) below which successive points are merged
 into one."""
@@ -36,15 +36,15 @@ _NOT_FILES = (
 
 
 def read(path: Path) -> Loop:
-    """Return the outline in a CSV (.csv, .txt) or DXF file as a closed loop (mm).
+    """Return the outline in the CSV (.csv, .txt) or DXF file `path` as a closed loop (mm).
 
     CSV: x and y in mm, separated by commas, semicolons, tabs or blanks, with or without a header.
     The columns are those that the header calls x and y (or `x_mm`, `y_mm`), or else the first two.
 
     DXF, text or binary: the closed loop of the largest area formed by LINE, ARC, ELLIPSE, SPLINE,
-    LWPOLYLINE and POLYLINE. Only entities on the layer OUTLINE count. If there are none, entities
-    drawn directly count; if there are none of these either, those in blocks count. Lengths are in
-    the unit that the file states, otherwise in mm. The ends of a LINE and the corners of a polyline
+    LWPOLYLINE and POLYLINE. Only entities on the layer OUTLINE are used. If that layer is empty,
+    entities drawn directly are used, and otherwise those in blocks. Lengths are in the unit that
+    the file states, or in mm if it states none. The ends of a LINE and the corners of a polyline
     are read as points on a smooth curve, not as corners of the outline.
 
     Raises `InputError` if the file cannot be read or contains no closed outline.
@@ -64,7 +64,7 @@ def read(path: Path) -> Loop:
 
 
 def _bytes(path: Path, name: str) -> bytes:
-    """Return the content of a regular file. `name`: name of the file in messages.
+    """Return the content of the file at `path`. `name`: name of the file in messages.
 
     Raises `InputError` if `path` is not a regular file, or the file is unreadable, too large or
     empty."""
@@ -100,7 +100,7 @@ def _bytes(path: Path, name: str) -> bytes:
 
 
 def _closed(loop: Loop, name: str) -> Loop:
-    """Return the loop without repeated points.
+    """Return the loop without repeated points. `name`: name of the file in messages.
 
     Raises `InputError` if the loop is open, or if its size or number of points is out of range."""
     points = loop.points

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 def record(config: Config) -> dict[str, Any]:
     """Return {"outline": {...}} for the result file: the records of `Checks` and `Conjugacy`.
 
-    Return {} if the profile is not read from a file."""
+    Return {} if the config names no outline file."""
     if not config.profile.from_file:
         return {}
     from rootsopt.measured.source import outline_of

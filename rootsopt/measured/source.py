@@ -19,8 +19,8 @@ _NOTABLE = 1.0
 def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
     """Return (profile, deviations) of the outline file that a config names.
 
-    Recent results are kept, so that an unchanged file is not read again. Raises `InputError` if the
-    file does not contain the outline of a rotor that can be simulated."""
+    Recent results are cached, so that an unchanged file is not read again. Raises `InputError` if
+    the file does not contain the outline of a rotor that can be simulated."""
     path = Path(config.outline_file or "")
     try:
         found = path.stat()

@@ -21,7 +21,7 @@ _WIDE = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 
 
 def from_csv(data: bytes, name: str) -> Loop:
-    """Return the points (mm) of a table, in the order of its lines and without joints.
+    """Return the points (mm) of a table in the order of its lines, as a `Loop` without joints.
 
     `data`: content of the file; `name`: name of the file in messages. Raises `InputError` if the
     table cannot be read or a line is not a point."""
@@ -91,7 +91,7 @@ def _number(cell: str, split: str | None) -> float | None:
 
 
 def _columns(header: list[str]) -> tuple[int, int]:
-    """Return the indices of the columns of x and y, from their names in the `header`.
+    """Return the indices of the x and y columns, found by their names in the `header`.
 
     If the names do not identify both columns, return 0 and 1."""
     names = [cell.strip() for cell in header]

@@ -1,4 +1,4 @@
-"""Rotor profiles: the common roll-angle description, and one module per family."""
+"""Rotor profiles: a base class that describes a flank by its roll angle, and the families."""
 
 from rootsopt.profiles.arc_families import arc, arcs_epicycloid, five_arcs, four_arcs
 from rootsopt.profiles.arcs import Arcs

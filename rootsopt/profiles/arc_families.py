@@ -14,8 +14,9 @@ from rootsopt.profiles.arcs import Arcs
 def arc(lobes: int, pitch_radius: Float[ArrayLike, ""], arc_center: Float[ArrayLike, ""]) -> Arcs:
     """Return a lobe of one circular arc through both pitch crossings (literature: "single arc").
 
-    `lobes`: N; `pitch_radius`: r (m). `arc_center`: b (m), distance of the arc's centre from the
-    rotor's axis, along the lobe's axis. The arc's radius is √(r² + b² - 2 r b cos π/2N)."""
+    `lobes`: number of lobes N; `pitch_radius`: r (m). `arc_center`: b (m), distance of the arc's
+    centre from the rotor's axis, along the lobe's axis. The arc's radius is √(r² + b² - 2 r b cos
+    π/2N)."""
     return Arcs.chain(lobes, pitch_radius, arc_center, (), (), ("arc",))
 
 
@@ -28,11 +29,11 @@ def four_arcs(
 ) -> Arcs:
     """Return a flank of four curves: two tangent arcs on the addendum, and their conjugates.
 
-    `lobes`: N; `pitch_radius`: r (m). The centre of the tip arc lies on the lobe's axis, at the
-    distance `arc_center` b (m) from the rotor's axis. Its radius is `tip_arc_radius` ρ (m). It ends
-    at the normal angle `tip_arc_turn` (rad). The flank arc continues to the pitch crossing, which
-    determines its radius. If ρ is the radius of the single arc (`arc`), both arcs lie on one
-    circle.
+    `lobes`: number of lobes N; `pitch_radius`: r (m). The centre of the tip arc lies on the lobe's
+    axis, at the distance `arc_center` b (m) from the rotor's axis. The tip arc has the radius
+    `tip_arc_radius` ρ (m) and ends at the normal angle `tip_arc_turn` (rad). The flank arc
+    continues to the pitch crossing, which determines the flank arc's radius. If ρ is the radius of
+    the single arc (`arc`), both arcs lie on one circle.
     """
     names = ("tip arc", "flank arc")
     return Arcs.chain(lobes, pitch_radius, arc_center, (tip_arc_radius,), (tip_arc_turn,), names)
@@ -48,9 +49,10 @@ def five_arcs(
 ) -> Arcs:
     """Return a lobe of five tangent arcs: a tip land, and on each side a tip arc and a flank arc.
 
-    `lobes`: N; `pitch_radius`: r (m). The land of half angle `tip_arc_angle` θ1 (rad) has the
-    radius `outer_radius` (m). The tip arc has the radius `tip_arc_radius` (m) and ends at the
-    normal angle `tip_arc_turn` (rad). The flank arc continues to the pitch crossing.
+    `lobes`: number of lobes N; `pitch_radius`: r (m). The land has the half angle `tip_arc_angle`
+    θ1 (rad) and the radius `outer_radius` (m). The tip arc has the radius `tip_arc_radius` (m) and
+    ends at the normal angle `tip_arc_turn` (rad). The flank arc continues to the pitch crossing,
+    which determines the flank arc's radius.
     """
     names = ("tip land", "tip arc", "flank arc")
     radii, joints = (outer_radius, tip_arc_radius), (tip_arc_angle, tip_arc_turn)
@@ -64,13 +66,15 @@ def arcs_epicycloid(
     tip_arc_angle: Float[ArrayLike, ""],
     edge_radius: Float[ArrayLike, ""],
 ) -> Arcs:
-    """Return circular arcs joined by a conjugate epicycloid: a single arc cut off by a tip land.
+    """Return a lobe of a single arc, cut off by a tip land with rounded edges.
 
-    `lobes`: N; `pitch_radius`: r (m). The lobe is a single arc (see `arc`) with its centre at
-    `arc_center` b (m) and the radius ρ, cut off by a land of half angle `tip_arc_angle` θ1 (rad).
-    The edge between them is an arc of radius `edge_radius` e (m), tangent to both. The edge's
-    centre lies on the ray θ1 at the distance d = b cos θ1 ± √((ρ - e)² - b² sin² θ1) from the axis.
-    The outer radius is d + e. With e > ρ (sign -) the outline would turn back.
+    `lobes`: number of lobes N; `pitch_radius`: r (m). The single arc is that of `arc`: its centre
+    is at the distance `arc_center` b (m) from the axis, and its radius is ρ. The land has the half
+    angle `tip_arc_angle` θ1 (rad). The edge between arc and land is an arc of radius `edge_radius`
+    e (m), tangent to both. The edge's centre lies on the ray θ1 at the distance d = b cos θ1 ± √((ρ
+    - e)²
+    - b² sin² θ1) from the axis. The sign is + for e < ρ. For e > ρ it is -, and the outline turns
+      back. The outer radius is d + e.
 
     The centre of the edge traces an extended epicycloid on the partner. The edge generates the
     parallel curve at the distance e from this epicycloid. The parallel curve joins the conjugates
@@ -78,10 +82,10 @@ def arcs_epicycloid(
 
     If the centre of the edge lies outside the pitch circle (d > r), its contact moves backwards:
     sin(ν - β) = (d / r) sin(ν - θ1) gives dβ/dν = 1 - d cos(ν - θ1) / (r sin ψ) < 0. The dedendum
-    stays sound, because its arc length, (r sin ψ - 2 s) dβ/dν + s, grows. However, edge and arc
-    then mesh at the same time, and carry the gas trapped between them to the other side. An edge
-    with d ≤ r has no such carryover. Its radius is at least the tip's height above the pitch
-    circle. (Derivation.)
+    is not undercut, because its arc length per ν, (r sin ψ - 2 s) dβ/dν + s, stays positive.
+    However, edge and arc then mesh at the same time, and carry the gas trapped between them to the
+    other side. An edge with d ≤ r has no such carryover. Its radius is at least the tip's height
+    above the pitch circle. (Derivation.)
     """
     r = jnp.asarray(pitch_radius)
     b, theta, e = jnp.asarray(arc_center), jnp.asarray(tip_arc_angle), jnp.asarray(edge_radius)

@@ -12,7 +12,7 @@ from rootsopt.profiles.base import Profile, Segment
 
 
 class Arcs(Profile):
-    """An addendum of n circular arcs; its conjugate is the envelope on the partner.
+    """An addendum of n circular arcs, with its envelope on the partner as the conjugate dedendum.
 
     On the arc with centre C and radius ρ, the point with normal direction ν is C + ρ n(ν). Its
     support function is C·n + ρ, and the lever of its normal is C × n. The normal meets the pitch
@@ -21,7 +21,7 @@ class Arcs(Profile):
     `center` (n, 2) and `radius` (n,): centres and radii of the arcs (m), in the rotor frame with
     the lobe's axis on +x. `joints` (n + 1,): normal angles (rad) from the tip, 0, to the pitch
     crossing. `names`: names of the arcs. `land`: whether the first arc is centred on the rotor's
-    axis. `lobes`: N; `pitch_radius`: r (m).
+    axis. `lobes`: number of lobes N; `pitch_radius`: r (m).
     """
 
     lobes: int = eqx.field(static=True)
@@ -44,11 +44,11 @@ class Arcs(Profile):
     ) -> "Arcs":
         """Return n tangent arcs from the tip to the pitch crossing.
 
-        `lobes`: N; `pitch_radius`: r (m). `center`: distance (m) of the first arc's centre from the
-        rotor's axis, along the lobe's axis; `None`: the first arc is a land. `radii` (n - 1,):
-        radii (m) of all arcs except the last. `joints` (n - 1,): normal angles (rad) at which these
-        arcs end. The last arc's radius follows from the pitch crossing. `names` (n,): names of the
-        arcs."""
+        `lobes`: number of lobes N; `pitch_radius`: r (m). `center`: distance (m) of the first arc's
+        centre from the rotor's axis, along the lobe's axis; `None`: the first arc is a land.
+        `radii` (n - 1,): radii (m) of all arcs except the last. `joints` (n - 1,): normal angles
+        (rad) at which these arcs end. The last arc's radius follows from the pitch crossing.
+        `names` (n,): names of the arcs."""
         r = jnp.asarray(pitch_radius)
         half = jnp.pi / (2 * lobes)
         crossing = r * jnp.stack([jnp.cos(half), jnp.sin(half)])
@@ -91,7 +91,9 @@ class Arcs(Profile):
         return tuple(parts)
 
     def _arc(self, nu):
-        """Return the index of the arc at `nu`; the first and last arcs extend beyond their ends."""
+        """Return the index of the arc that has the normal angle `nu` (rad).
+
+        Below the first joint and above the last, return the index of the first or the last arc."""
         return jnp.sum(nu[..., None] > self.joints[1:-1], axis=-1)
 
     def lever(self, nu):

@@ -1,9 +1,9 @@
 """The roll-angle form: one description of a conjugate flank for all profile families.
 
 Two identical rotors with `N` lobes roll 1:1 on pitch circles of radius `r`. A family
-describes only the *addendum* of one flank, as a function of the normal angle `nu`. This is the
-polar angle of the outward normal in the rotor frame, measured from the lobe's axis. The family
-defines two functions:
+describes only the *addendum* of one flank, as a function of the normal angle `nu`. The normal
+angle is the polar angle of the outward normal in the rotor frame, measured from the lobe's axis.
+The family defines two functions:
 
 - `roll_angle(nu)` is β, the polar angle, on the rotor, of the pitch point at the moment
   the flank point is in contact;
@@ -34,16 +34,17 @@ from jax import lax
 from jaxtyping import Array, Float
 
 _BRACKETS = 16
-"""Number of intervals per segment, one of which brackets the normal angle at a given roll angle."""
+"""Number of equal intervals into which a segment is divided. The search for the normal angle at a
+given roll angle starts in one of these intervals."""
 _STEPS = 10
 """Number of safeguarded Newton steps in the search for the normal angle at a given roll angle. A
 step that leaves the bracket is replaced by a bisection."""
 _POLISH = 3
-"""Number of plain Newton steps after the safeguarded ones; also the greatest order of derivatives
-that they carry."""
+"""Number of plain Newton steps after the safeguarded ones. Derivatives of the result are correct up
+to this order."""
 _FLAT = 1e-9
-"""Value of dβ/dν below which a Newton step divides by this value instead. The true value is 0 on an
-arc centred on the pitch circle."""
+"""Value of dβ/dν below which a Newton step divides by this constant instead of by dβ/dν. The
+derivative is 0 on an arc centred on the pitch circle."""
 
 
 class RollPoint(NamedTuple):
@@ -62,8 +63,8 @@ class Segment(NamedTuple):
     """A smooth part of the addendum between two normal angles.
 
     `name`: name in figures and messages; `start`, `stop`: normal angles (rad) at its ends; `land`:
-    whether the segment is concentric with the rotor (ψ = π/2). A land transmits no torque, so the
-    search for flank contact usually skips it.
+    whether the segment is an arc centred on the rotor's axis (ψ = π/2). A land transmits no torque,
+    so the search for flank contact usually skips it.
     """
 
     name: str
@@ -75,8 +76,8 @@ class Segment(NamedTuple):
 class Quadrature(NamedTuple):
     """Rule for integrals over one smooth part of a profile (see `Profile.stretches`).
 
-    `nodes`: number of Gauss-Legendre nodes; `graded`: whether they are denser near both ends;
-    `between`: number of equal intervals whose ends are also checked for undercut."""
+    `nodes`: number of Gauss-Legendre nodes; `graded`: whether the nodes are denser near both ends;
+    `between`: number of equal intervals; undercut is also checked at their ends."""
 
     nodes: int
     graded: bool
@@ -86,8 +87,9 @@ class Quadrature(NamedTuple):
 class Mate(NamedTuple):
     """A point of the partner's flank.
 
-    `facing`: direction (rad) of its outward normal, from the axis of the valley between two lobes;
-    `lever`, `support`: lever of this normal and support function of the point (m)."""
+    `facing`: direction (rad) of the point's outward normal, measured from the axis of the valley
+    between two lobes; `lever`: moment arm (m) of this normal about the partner's axis; `support`:
+    support function (m) of the point."""
 
     facing: Float[Array, "*n"]
     lever: Float[Array, "*n"]
@@ -97,11 +99,11 @@ class Mate(NamedTuple):
 class Profile(eqx.Module):
     """Base class of all profiles: one flank of a Roots rotor in roll-angle form.
 
-    `lobes`: N; `pitch_radius`: r (m). A subclass defines `segments`, `roll_angle` and
-    `contact_distance` for normal angles 0 ≤ ν ≤ `pitch_normal`. It continues both functions
-    analytically beyond the pitch crossing and, unless the first segment is a land, over the tip
-    (β odd and s even in ν). This class derives all else. A subclass may override `normal_at`,
-    `lever` and `support` with a closed form, which is faster and more exact.
+    `lobes`: number of lobes N; `pitch_radius`: r (m). A subclass defines `segments`, `roll_angle`
+    and `contact_distance` for normal angles 0 ≤ ν ≤ `pitch_normal`. The subclass continues both
+    functions analytically beyond the pitch crossing and, unless the first segment is a land, over
+    the tip (β odd and s even in ν). This class derives everything else. A subclass may override
+    `normal_at`, `lever` and `support` with a closed form, which is faster and more exact.
     """
 
     lobes: eqx.AbstractVar[int]
@@ -112,63 +114,72 @@ class Profile(eqx.Module):
         """Return the smooth segments of the addendum, from the tip to the pitch crossing."""
 
     def stretches(self) -> tuple[Segment, ...]:
-        """Return the smooth parts for quadrature: segments, cut where integrands are not smooth.
+        """Return the parts of the addendum on which integrals are computed separately.
 
-        A segment is cut where only a few derivatives are continuous, and at a minimum of the
-        pressure angle. At a minimum, a normal may almost touch the pitch circle, where ψ has a
-        square-root singularity. By default, no segment is cut."""
+        The parts are the segments, split at two kinds of points. The first are points at which only
+        a few derivatives are continuous. The second are minima of the pressure angle. There, a
+        normal may almost touch the pitch circle, where ψ has a square-root singularity. By default,
+        no segment is split."""
         return self.segments()
 
     @property
     def quadrature(self) -> Quadrature:
         """Rule for integrals over each part in `stretches`.
 
-        By default, nodes are denser near the ends. They integrate a square-root singularity of ψ to
-        rounding error, even if it lies 1e-4 of the part's length beyond an end."""
+        By default, nodes are denser near the ends. The rule integrates a square-root singularity of
+        ψ to rounding error, even if the singularity lies only 1e-4 of the part's length beyond an
+        end."""
         return Quadrature(64, True, 128)
 
     def _cut(self, segment: Segment, place: Float[Array, ""]) -> tuple[Segment, Segment]:
-        """Split a segment at the normal angle `place` (rad), clipped to the segment's range."""
+        """Return the two parts of a segment split at the normal angle `place` (rad).
+
+        A `place` outside the segment is moved to the segment's nearest end."""
         name, start, stop, land = segment
         middle = jnp.clip(lax.stop_gradient(place), start, stop)
         return Segment(name, start, middle, land), Segment(name, middle, stop, land)
 
     @abc.abstractmethod
     def roll_angle(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the roll angle β(ν) in rad.
+        """Return the roll angle β(ν) (rad) of an addendum point.
 
-        In a profile free of interference, β does not decrease with ν."""
+        `nu`: normal angle (rad). In a profile free of interference, β does not decrease with ν."""
 
     @abc.abstractmethod
     def contact_distance(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the signed distance s(ν) (m) from pitch point to contact point."""
+        """Return the signed distance s(ν) (m) from the pitch point to the contact point.
+
+        `nu`: normal angle (rad).
+        """
 
     def normal_at(self, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return ν(β) in rad, the inverse of `roll_angle` up to the pitch crossing.
+        """Return the normal angle ν (rad) at a `roll_angle` β (rad) between tip and pitch crossing.
 
-        Where several points mesh at one instant, or the roll angle turns back, return the point
-        nearest to the pitch crossing. The default is a numerical search, differentiated as an
-        implicit function; a closed form is faster.
+        Where several points mesh at one instant, or the roll angle turns back, return the normal
+        angle of the point nearest to the pitch crossing. The default is a numerical search with the
+        derivatives of the implicit function; a closed form is faster.
         """
         return _inverse(self, roll_angle)
 
     def lever(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the moment arm r cos ψ (m) of the contact normal about the rotor's axis."""
+        """Return the moment arm r cos ψ (m) of the contact normal about the rotor's axis.
+
+        `nu`: normal angle (rad)."""
         return self.pitch_radius * jnp.sin(nu - self.roll_angle(nu))
 
     def support(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the support function P·n = r sin ψ + s (m) of the addendum.
+        """Return the support function P·n = r sin ψ + s (m) of the addendum at `nu` (rad).
 
         Its derivative with respect to ν is -lever."""
         arm = self.pitch_radius * jnp.cos(nu - self.roll_angle(nu))
         return arm + self.contact_distance(nu)
 
     def mate(self, nu: Float[Array, "*n"], support: bool = True) -> Mate:
-        """Return the partner's point that meshes with the addendum point `nu` (normal angle, rad).
+        """Return the point of the partner that meshes with an addendum point.
 
-        If `nu` exceeds `pitch_normal`, return a point of the partner's addendum: that of `nu`
-        reflected at `pitch_normal`. `support`: whether to compute the support function; otherwise
-        it is 0."""
+        `nu`: normal angle (rad) of the addendum point. If `nu` exceeds `pitch_normal`, the result
+        is a point of the partner's addendum, with normal angle 2 `pitch_normal` - `nu`. `support`:
+        whether to compute the support function, which is otherwise 0."""
         pitch = self.pitch_normal
         beyond = nu > pitch
         nu = jnp.where(beyond, 2 * pitch - nu, nu)
@@ -185,7 +196,7 @@ class Profile(eqx.Module):
 
     @property
     def conjugate(self) -> bool:
-        """Whether the flanks touch throughout the mesh at perfect rolling, by construction."""
+        """Whether the flanks are designed to touch throughout the mesh in perfect rolling."""
         return True
 
     @property
@@ -199,8 +210,8 @@ class Profile(eqx.Module):
     def turn_ratio(self) -> float:
         """Factor κ of the angle κν whose cosine and sine `lever_from` receives.
 
-        The contact search computes both by the addition theorem, without a trigonometric function
-        per node."""
+        The contact search computes this cosine and sine by the addition theorem, and thus evaluates
+        no trigonometric function at the nodes."""
         return 1.0
 
     @property
@@ -213,32 +224,34 @@ class Profile(eqx.Module):
     def lever_from(
         self, nu: Float[Array, "*n"], cos: Float[Array, "*n"], sin: Float[Array, "*n"]
     ) -> Float[Array, "*n"]:
-        """Return the lever (m) at `nu` (rad), given cos κν and sin κν (κ: see `turn_ratio`)."""
+        """Return the lever (m) at the normal angle `nu` (rad), given two trigonometric functions.
+
+        `cos`, `sin`: cosine and sine of κν, with the factor κ = `turn_ratio`."""
         del cos, sin
         return self.lever(nu)
 
     @property
     def half_pitch(self) -> float:
-        """Polar angle π/2N between a lobe's axis and its pitch crossing (rad)."""
+        """Polar angle π/2N (rad) between a lobe's axis and the pitch crossing of its flank."""
         return jnp.pi / (2 * self.lobes)
 
     @property
     def pitch_normal(self) -> Float[Array, ""]:
-        """Normal angle at the pitch crossing (rad)."""
+        """Normal angle (rad) at the pitch crossing."""
         return self.segments()[-1].stop
 
     def addendum(self, nu: Float[Array, "*n"]) -> RollPoint:
-        """Return the addendum point with normal angle `nu` (rad)."""
+        """Return the addendum point at the normal angle `nu` (rad)."""
         beta = self.roll_angle(nu)
         return RollPoint(beta, beta + jnp.pi / 2 - nu, self.contact_distance(nu))
 
     def dedendum(self, nu: Float[Array, "*n"]) -> RollPoint:
-        """Return the dedendum point that meshes with the partner's addendum point `nu` (rad)."""
+        """Return the dedendum point that meshes with the partner's addendum point at `nu` (rad)."""
         point = self.addendum(nu)
         return RollPoint(jnp.pi / self.lobes - point.beta, point.psi, -point.s)
 
     def position(self, point: RollPoint) -> Float[Array, "*n 2"]:
-        """Return the point's coordinates (m) in the rotor frame, with a lobe tip on +x."""
+        """Return the coordinates (m) of a `point` in the rotor frame, with a lobe tip on +x."""
         beta, psi, s = point
         radial = self.pitch_radius + s * jnp.sin(psi)
         tangential = s * jnp.cos(psi)
@@ -248,7 +261,10 @@ class Profile(eqx.Module):
         )
 
     def roll_rate(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return dβ/dν: 0 on a tip arc centred on the pitch circle, 1 on an involute."""
+        """Return dβ/dν at the normal angle `nu` (rad).
+
+        The value is 0 on a tip arc centred on the pitch circle, and 1 on an involute.
+        """
         return jax.jvp(self.roll_angle, (nu,), (jnp.ones_like(nu),))[1]
 
     def speeds(
@@ -256,35 +272,41 @@ class Profile(eqx.Module):
     ) -> tuple[RollPoint, Float[Array, "*n"], Float[Array, "*n"]]:
         """Return (addendum point, speed of the addendum, speed of the dedendum) at `nu` (rad).
 
-        A speed is arc length per normal angle `nu` (m/rad). The dedendum is the partner's curve
+        A speed is the arc length per normal angle `nu` (m/rad). The dedendum is the partner's curve
         that meshes with the addendum."""
         point, rate = self.addendum(nu), self.roll_rate(nu)
         sliding = self.pitch_radius * jnp.sin(point.psi)
         return point, sliding * rate + point.s, (sliding - 2 * point.s) * rate + point.s
 
     def addendum_speed(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return arc length per normal angle (m/rad) on the addendum: its radius of curvature."""
+        """Return the arc length of the addendum per normal angle (m/rad), its radius of curvature.
+
+        `nu`: normal angle (rad)."""
         return self.speeds(nu)[1]
 
     def dedendum_speed(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return arc length on the dedendum per normal angle of the partner (m/rad).
+        """Return the arc length of the dedendum per normal angle of the partner's addendum (m/rad).
 
-        On an involute or land this is the tangential speed r sin ψ + s (1 - ψ′) of the
-        contact point per roll angle. Zero means a cusp, a negative value undercut.
+        `nu`: normal angle (rad) of the partner's addendum. On an involute or land this is the
+        tangential speed r sin ψ + s (1 - ψ′) of the contact point per roll angle. Zero means a
+        cusp, and a negative value means undercut.
         """
         return self.speeds(nu)[2]
 
     def dedendum_curvature_radius(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the signed radius of curvature of the dedendum (m), positive where convex."""
+        """Return the signed radius of curvature of the dedendum (m), positive where convex.
+
+        `nu`: normal angle (rad) of the partner's addendum."""
         turning = 2 * self.roll_rate(nu) - 1
         return self.dedendum_speed(nu) / turning
 
 
 def _inverse(profile: Profile, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return the greatest normal angle (rad) at this roll angle, by safeguarded Newton steps.
+    """Return the greatest normal angle (rad) of `profile` at a `roll_angle` (rad), by a search.
 
-    The search is not differentiated. The plain Newton steps after it carry the derivatives with
-    respect to roll angle and design, and continue the flank analytically beyond its ends."""
+    The search uses safeguarded Newton steps and is not differentiated. The plain Newton steps after
+    it carry the derivatives with respect to roll angle and design. They also continue the flank
+    analytically beyond its ends."""
     fixed, want = jax.tree.map(lax.stop_gradient, (profile, roll_angle))
 
     def rolled(profile, nu):

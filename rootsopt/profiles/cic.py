@@ -14,7 +14,10 @@ def arc_involute(
     pressure_angle: Float[ArrayLike, ""],
     involute_length: Float[ArrayLike, ""],
 ) -> "CIC":
-    """Return a CIC rotor without a tip land: arc and involute. The arguments are those of `CIC`."""
+    """Return a CIC rotor without a tip land, whose addendum is an arc and an involute.
+
+    `lobes`: number of lobes N; `pitch_radius`: r (m); `pressure_angle`: α (rad); `involute_length`:
+    u (m). See `CIC`."""
     return CIC(lobes, pitch_radius, pressure_angle, involute_length, 0.0)
 
 
@@ -51,10 +54,10 @@ class CIC(Profile):
     tip_direction: Float[Array, "2"]
 
     def __init__(self, lobes, pitch_radius, pressure_angle, involute_length, tip_arc_angle):
-        """Build the rotor from `lobes` N and scalars.
+        """Build the rotor.
 
-        The scalars are `pitch_radius` r (m), `pressure_angle` α (rad), `involute_length` u (m) and
-        `tip_arc_angle` θ1 (rad, half the angle of the tip land)."""
+        `lobes`: number of lobes N; `pitch_radius`: r (m); `pressure_angle`: α (rad);
+        `involute_length`: u (m); `tip_arc_angle`: θ1 (rad), half the angle of the tip land."""
         self.lobes = lobes
         r = self.pitch_radius = jnp.asarray(pitch_radius)
         alpha = self.pressure_angle = jnp.asarray(pressure_angle)
@@ -87,13 +90,14 @@ class CIC(Profile):
         return (land, *self._cut(arc, self.tip_arc_angle + jnp.pi / 2), involute)
 
     def _arc_slide(self, turn):
-        """Return the signed distance (m) from the pitch point to the arc's centre, along the
-        normal."""
+        """Return the signed distance (m) from pitch point to arc centre, along the normal.
+
+        `turn`: normal angle (rad) measured from the arc's start."""
         c, r = self.arc_center_radius, self.pitch_radius
         return c * jnp.cos(turn) - jnp.sqrt(r**2 - (c * jnp.sin(turn)) ** 2)
 
     def _arc_turn(self, nu):
-        """Return the normal angle (rad) from the arc's start, limited to the arc."""
+        """Return the normal angle `nu` (rad), clamped to the arc, minus that of the arc's start."""
         return jnp.clip(nu, self.tip_arc_angle, self.arc_end) - self.tip_arc_angle
 
     def roll_angle(self, nu):

@@ -15,11 +15,11 @@ from jaxtyping import Array, Float
 from rootsopt.profiles.base import Profile, Quadrature, Segment
 
 INTERVALS = 48
-"""Number of intervals per piece. With one quintic per interval, the deviation from a smooth curve
-is about 1e-11 r."""
+"""Number of intervals per piece of the addendum. With one quintic per interval, a smooth curve is
+reproduced to about 1e-11 pitch radii."""
 _STEPS = 4
 """Number of Newton steps in the search for the normal angle at a given roll angle. The search
-starts from a table accurate to about 1e-4."""
+starts from a table accurate to about 1e-4 rad."""
 _GAUSS = np.polynomial.legendre.leggauss(4)
 """Gauss-Legendre nodes and weights for an interval or a part of it. The integral is exact to
 rounding error."""
@@ -28,8 +28,8 @@ rounding error."""
 class Piece(NamedTuple):
     """A convex part of an addendum, given as a curve.
 
-    `name`: name of the piece's segment; `position`: function from t to the point (2,) in m, with t
-    rising from 0 to 1 towards the pitch crossing; `land`: as in `Segment`."""
+    `name`: name of the piece's segment; `position`: function from t to the point (2,) in m, where t
+    rises from 0 to 1 towards the pitch crossing; `land`: as in `Segment`."""
 
     name: str
     position: Callable[[Float[Array, ""]], Float[Array, "2"]]
@@ -52,9 +52,10 @@ class Curve(Profile):
     """An addendum of given curves, each tangent to the next.
 
     The profile stores the pressure angle ψ as a function of the normal angle ν: quintics between
-    nodes that match its value and two derivatives there. From ψ follow β = ν - π/2 + ψ, the lever
-    r cos ψ, and the support function by quadrature from the pitch crossing. The law of gearing
-    therefore holds for the quintics themselves, even where they deviate from the given curve.
+    nodes, which match the given curve's ψ and two derivatives there. From ψ follow β = ν - π/2 + ψ,
+    the lever r cos ψ, and the support function by quadrature from the pitch crossing. The law of
+    gearing therefore holds for the quintics themselves, even where they deviate from the given
+    curve.
 
     `names`, `lands`: as in `Piece`, one per piece; `sharp`: whether the last piece ends in a cusp;
     `node` (n,): normal angles (rad); `series` (n, 6): coefficients of ψ (rad) in powers of the
@@ -86,8 +87,8 @@ class Curve(Profile):
         """Return the addendum made of `pieces`, with `intervals` quintics each.
 
         The pieces extend from the lobe's axis to the pitch crossing and have the same normal where
-        they meet. `lobes`: N; `pitch_radius`: r (m). `sharp`: whether the last piece ends in a
-        cusp."""
+        they meet. `lobes`: number of lobes N; `pitch_radius`: r (m). `sharp`: whether the last
+        piece ends in a cusp."""
         r = jnp.asarray(pitch_radius)
         t = jnp.arange(intervals + 1, dtype=r.dtype) / intervals
         turning = [functools.partial(_turning, _rolling(piece, r)) for piece in pieces]
@@ -138,7 +139,7 @@ class Curve(Profile):
         return k, nu - self.node[k]
 
     def _psi(self, k, away):
-        """Return ψ (rad) at a distance `away` (rad) from node k."""
+        """Return ψ (rad) at `away` (rad) in normal angle from the node with index `k`."""
         series = self.series[k]
         psi = series[..., 5]
         for power in (4, 3, 2, 1, 0):
@@ -146,9 +147,9 @@ class Curve(Profile):
         return psi
 
     def _support(self, k, away):
-        """Return the support function (m) at a distance `away` (rad) from node k.
+        """Return the support function (m), with the same arguments as `_psi`.
 
-        The slope -r cos ψ is integrated from the node's value."""
+        The slope -r cos ψ is integrated, starting with the node's value."""
         shares, weights = (jnp.asarray(part, away.dtype) for part in _GAUSS)
         inside = away[..., None] * (1 + shares) / 2
         mean = jnp.sum(jnp.cos(self._psi(k[..., None], inside)) * weights, axis=-1) / 2
@@ -193,9 +194,10 @@ class Curve(Profile):
 
 
 def _quintics(node, psi, slope, bend):
-    """Return coefficients (n, 6) of ψ (rad) in powers of the distance from each node.
+    """Return coefficients (n, 6) of ψ (rad) in powers of the distance (rad) from each node.
 
-    At the last node of a piece, they are the coefficients of a parabola."""
+    `node`, `psi`, `slope`, `bend` (n,): normal angle ν (rad), ψ (rad), dψ/dν and d²ψ/dν² at the
+    nodes. At the last node of a piece, the coefficients are those of a parabola."""
     here = node, psi, slope, bend
     following = (jnp.append(row[1:], row[-1:]) for row in here)
 
@@ -217,7 +219,9 @@ def _quintics(node, psi, slope, bend):
 
 
 def _rolling(piece, pitch_radius):
-    """Return a piece as a function from t to (β, ψ) in rad."""
+    """Return the function from t to (β, ψ) in rad for a `Piece` or `RollPiece`.
+
+    `pitch_radius`: r (m)."""
     if isinstance(piece, RollPiece):
         return piece.roll
 

@@ -9,23 +9,24 @@ from rootsopt.profiles.base import Profile
 from rootsopt.runtime.programs import Program
 
 _NODES = 400
-"""Number of nodes on each side of the pitch circle. Chords then deviate from the flank by about
-1e-7 r."""
+"""Least number of nodes on each side of the pitch circle. Chords then deviate from the flank by
+about 1e-7 pitch radii."""
 
 
 def departure(profile: Profile, other: Profile, nodes: int = _NODES) -> float:
     """Return the greatest distance (m) between the flanks of two profiles, from tip to root.
 
-    The distance is measured from each flank to the other; the greater result counts. `nodes`: least
-    number of points on each side of the pitch circle."""
+    Distances are measured from each flank to the other, and the greatest of all is returned.
+    `nodes`: least number of points on each side of the pitch circle."""
     first, second = (flank_points(one, nodes) for one in (profile, other))
     return float(max(distances(first, second).max(), distances(second, first).max()))
 
 
 def flank_points(profile: Profile, nodes: int = _NODES) -> NDArray[np.float64]:
-    """Return points (n, 2) in m on a flank from tip to root, dense where the normal turns.
+    """Return points (n, 2) in m on a flank of `profile` from tip to root.
 
-    `nodes`: least number of points on each side of the pitch circle."""
+    The points are evenly spaced in normal angle; the ends of segments are further points. `nodes`:
+    least number of points on each side of the pitch circle."""
     stop = float(profile.pitch_normal)
     ends = [float(s.stop) for s in profile.segments()]
     return np.asarray(_points(profile, np.union1d(np.linspace(0, stop, nodes), ends)))

@@ -19,7 +19,7 @@ class EE(Profile):
     pitch_radius: Float[Array, ""]
 
     def __init__(self, lobes, pitch_radius):
-        """Build the rotor from `lobes` N and `pitch_radius` r (m), a scalar."""
+        """Build the rotor with `lobes` N lobes and the scalar `pitch_radius` r (m)."""
         self.lobes = lobes
         self.pitch_radius = jnp.asarray(pitch_radius)
 

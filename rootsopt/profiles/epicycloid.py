@@ -13,15 +13,15 @@ class TippedEpicycloid(Profile):
 
     On the epicycloid of rolling radius r_e, with κ = r / 2 r_e, the pressure angle is
     ψ = κ (π/2N - β) and s = 2 r_e sin ψ, so that ds/dβ = -r cos ψ. Its conjugate is the hypocycloid
-    of the same circle. EE has r_e = r / 2N, with which ψ reaches π/2 on the lobe's axis. The tip
-    arc is tangent to the epicycloid at the joint, and its centre C lies on the lobe's axis. With
-    normal ν and pressure angle ψ at the joint, C lies at the distance c = r cos ψ / sin ν from the
-    rotor's axis. No epicycloid with r_e < r is undercut: the arc length of its conjugate per ν is
-    4 r_e (r - r_e) sin ψ / (r + 2 r_e). (Derivation; no source of the formulas was available.)
+    of the same circle. EE is the case r_e = r / 2N, in which ψ reaches π/2 on the lobe's axis. The
+    tip arc is tangent to the epicycloid at the joint, and its centre C lies on the lobe's axis.
+    With normal ν and pressure angle ψ at the joint, C lies at the distance c = r cos ψ / sin ν from
+    the rotor's axis. No epicycloid with r_e < r is undercut: the arc length of its conjugate per ν
+    is 4 r_e (r - r_e) sin ψ / (r + 2 r_e). (Derivation; no source of the formulas was available.)
 
     `rolling_radius`: r_e (m). `joint`: normal angle (rad) at which the tip arc ends.
     `arc_center_radius`: c (m). `arc_radius`: radius of the tip arc (m). `land`: whether the arc is
-    centred on the rotor's axis (c = 0). `lobes`: N; `pitch_radius`: r (m).
+    centred on the rotor's axis (c = 0). `lobes`: number of lobes N; `pitch_radius`: r (m).
     """
 
     lobes: int = eqx.field(static=True)
@@ -33,8 +33,10 @@ class TippedEpicycloid(Profile):
     arc_radius: Float[Array, ""]
 
     def __init__(self, lobes, pitch_radius, rolling_radius, joint, land=False):
-        """Build the rotor from `lobes` N and the scalars `pitch_radius` r (m), `rolling_radius` r_e
-        (m) and `joint` (rad). `land`: make the tip arc a land."""
+        """Build the rotor.
+
+        `lobes`: number of lobes N; `pitch_radius`: r (m); `rolling_radius`: r_e (m); `joint`:
+        normal angle (rad) at which the tip arc ends; `land`: whether the tip arc is a land."""
         self.lobes, self.land = lobes, land
         r = self.pitch_radius = jnp.asarray(pitch_radius)
         self.rolling_radius = jnp.asarray(rolling_radius)
@@ -62,7 +64,7 @@ class TippedEpicycloid(Profile):
         return self.half_pitch + jnp.pi / 2
 
     def _psi(self, nu):
-        """Return ψ (rad) on the epicycloid."""
+        """Return ψ (rad) on the epicycloid at the normal angle `nu` (rad)."""
         r, rolling = self.pitch_radius, self.rolling_radius
         return (self._stop - nu) * r / (r + 2 * rolling)
 
@@ -73,12 +75,12 @@ class TippedEpicycloid(Profile):
         return (self.pitch_radius + 2 * self.rolling_radius) * jnp.sin(self._psi(nu))
 
     def _on_arc(self, nu):
-        """Return (whether `nu` is on the arc, `nu` if it is on the arc and 0 otherwise)."""
+        """Return (whether the normal angle `nu` is on the arc, `nu` on the arc and 0 elsewhere)."""
         on_arc = nu < self.joint
         return on_arc, jnp.where(on_arc, nu, 0.0)
 
     def _tilt(self, nu):
-        """Return ν - β (rad) of the arc's normals."""
+        """Return ν - β (rad) on the tip arc at the normal angle `nu` (rad)."""
         return jnp.arcsin(self.arc_center_radius * jnp.sin(nu) / self.pitch_radius)
 
     def roll_angle(self, nu):
@@ -116,11 +118,12 @@ def circle_epicycloid(
     rolling_radius: Float[ArrayLike, ""],
     tip_arc_turn: Float[ArrayLike, ""],
 ) -> TippedEpicycloid:
-    """Return the profile of a tip arc, centred on the lobe's axis, followed by an epicycloid.
+    """Return a profile with a tip arc centred on the lobe's axis, followed by an epicycloid.
 
-    `lobes`: N; `pitch_radius`: r (m); `rolling_radius`: r_e of the epicycloid (m); `tip_arc_turn`:
-    normal angle ν (rad) at which the arc ends. For ν = π/2 - π r / (4 N r_e), the arc is centred on
-    the pitch circle (roll angle β = 0 at its end), and the whole arc meshes at one instant."""
+    `lobes`: number of lobes N; `pitch_radius`: r (m); `rolling_radius`: r_e of the epicycloid (m);
+    `tip_arc_turn`: normal angle ν (rad) at which the arc ends. For ν = π/2 - π r / (4 N r_e), the
+    arc is centred on the pitch circle (roll angle β = 0 at its end), and the whole arc meshes at
+    one instant."""
     return TippedEpicycloid(lobes, pitch_radius, rolling_radius, tip_arc_turn)
 
 
@@ -131,9 +134,9 @@ def hypo_epicycloid(
 
     One land is at the tip, the other at the root.
 
-    `lobes`: N; `pitch_radius`: r (m). The land has the half angle `tip_arc_angle` θ1 (rad). For
-    identical rotors at 1:1, the rolling circle of both arches is the same. ψ must be π/2 where the
-    land starts: r_e = r (π/2N - θ1) / π. Without a land this is EE. (Derivation.)
+    `lobes`: number of lobes N; `pitch_radius`: r (m). The land at the tip has the half angle
+    `tip_arc_angle` θ1 (rad). Identical rotors need the same rolling circle for both arches. ψ must
+    be π/2 where the land starts: r_e = r (π/2N - θ1) / π. Without a land this is EE. (Derivation.)
     """
     rolling = jnp.asarray(pitch_radius) * (1 / (2 * lobes) - jnp.asarray(tip_arc_angle) / jnp.pi)
     return TippedEpicycloid(lobes, pitch_radius, rolling, tip_arc_angle, land=True)

@@ -20,23 +20,24 @@ _STEPS = 8
 """Number of safeguarded Newton steps in the search for the normal angle at a given roll angle. A
 step that leaves the bracket is replaced by a bisection."""
 _POLISH = 3
-"""Number of plain Newton steps after the safeguarded ones; also the greatest order of derivatives
-that they carry."""
+"""Number of plain Newton steps after the safeguarded ones. Derivatives of the result are correct up
+to this order."""
 _SAMPLES = 40
 """Number of points per knot span in the least-squares fit of a free form."""
 _FIRMLY = 1e3
-"""Weight of the pitch crossing in the fit of a free form; all other points have a weight of 1."""
+"""Factor on the row of the pitch crossing in the least-squares fit of a free form. All other rows
+have the factor 1."""
 _FLAT = 1e-9
-"""Value of dβ/dν below which a Newton step divides by this value instead. The true value is 0 on an
-arc centred on the pitch circle."""
+"""Value of dβ/dν below which a Newton step divides by this constant instead of by dβ/dν. The
+derivative is 0 on an arc centred on the pitch circle."""
 
 
 class FreeForm(Profile):
-    """A tip land and a free addendum, with any number of coefficients.
+    """A tip land, followed by a free curve with any number of coefficients.
 
-    A turn of the normal dν changes the roll angle by dβ = (1 - τ) dν and the pressure angle by
-    dψ = -τ dν. The rate τ(ν) is a quadratic B-spline with even knots from the end of the land to
-    the pitch crossing. ψ(ν) is a cubic B-spline that starts at π/2.
+    A turn of the normal dν changes the roll angle by dβ = (1 - τ) dν and the pressure angle by dψ =
+    -τ dν. The rate τ(ν) is a quadratic B-spline with evenly spaced knots from the end of the land
+    to the pitch crossing. ψ(ν) is a cubic B-spline that starts at π/2.
 
     If no coefficient exceeds 1 (the value on an arc centred on the pitch circle), the roll angle
     does not turn back. If no coefficient is below 0 (the value on an involute), ψ never rises.
@@ -51,10 +52,11 @@ class FreeForm(Profile):
     coefficients. The spline is a function of ν, not of β, because ψ(β) jumps on an arc centred on
     the pitch circle.
 
-    `lobes`: N; `pitch_radius`: r (m). `tip_arc_angle`: θ1 (rad), half the angle of the land.
-    `coefficients` (n,), n ≥ 3: coefficients of τ, from the land to the pitch crossing. `width`:
-    width of a knot span (rad). `turn` (n - 2, 4): coefficients of ψ (rad) in each span, in powers
-    of the fraction of the span. `beyond` (n - 2,): support function (m) at the end of each span.
+    `lobes`: number of lobes N; `pitch_radius`: r (m). `tip_arc_angle`: θ1 (rad), half the angle of
+    the land. `coefficients` (n,), n ≥ 3: coefficients of τ, from the land to the pitch crossing.
+    `width`: width of a knot span (rad). `turn` (n - 2, 4): coefficients of ψ (rad) in each span, in
+    powers of the fraction of the span. `beyond` (n - 2,): support function (m) at the end of each
+    span.
     """
 
     lobes: int = eqx.field(static=True)
@@ -66,8 +68,10 @@ class FreeForm(Profile):
     beyond: Float[Array, " k"]
 
     def __init__(self, lobes, pitch_radius, tip_arc_angle, coefficients):
-        """Build the rotor from `lobes` N, the scalars `pitch_radius` r (m) and `tip_arc_angle` θ1
-        (rad), and `coefficients` (n,)."""
+        """Build the rotor.
+
+        `lobes`: number of lobes N; `pitch_radius`: r (m); `tip_arc_angle`: θ1 (rad), half the angle
+        of the land; `coefficients` (n,): coefficients of τ."""
         self.lobes = lobes
         r = self.pitch_radius = jnp.asarray(pitch_radius)
         self.tip_arc_angle = jnp.asarray(tip_arc_angle)
@@ -112,18 +116,20 @@ class FreeForm(Profile):
     def _place(self, nu):
         """Return (index of the knot span at `nu`, fraction of this span).
 
-        The first and the last span extend beyond the spline."""
+        The first and the last span are extended beyond the ends of the spline."""
         x = (nu - self.tip_arc_angle) / self.width
         span = jnp.clip(jnp.floor(lax.stop_gradient(x)), 0, self._spans - 1).astype(int)
         return span, x - span
 
     def _psi(self, span, share):
-        """Return ψ (rad) at a fraction of a span."""
+        """Return ψ (rad) in the knot span with index `span`, at the fraction `share` of it."""
         c = jnp.moveaxis(self.turn[span], -1, 0)
         return c[0] + share * (c[1] + share * (c[2] + share * c[3]))
 
     def _within(self, span, share):
-        """Return ∫ r cos ψ dν (m) from a fraction of a span to the span's end."""
+        """Return ∫ r cos ψ dν (m) over a knot span, from the fraction `share` of it to its end.
+
+        `span`: index of the knot span."""
         nodes, weights = (jnp.asarray(x, self.width.dtype) for x in (_NODES, _WEIGHTS))
         rest = (1 - share)[..., None]
         at = share[..., None] + rest * (1 + nodes) / 2
@@ -157,7 +163,11 @@ class FreeForm(Profile):
         want = roll_angle - starts[span]
 
         def short(c, width, want, share):
-            """Return β minus the required β (rad) at a fraction of the span, and its derivative."""
+            """Return (β minus the required β (rad) at a fraction of a span, its derivative).
+
+            `c`: coefficients of ψ in the span; `width`: width of the span (rad); `want`: required β
+            minus β at the span's start (rad); `share`: the fraction.
+            """
             rise = share * (width + c[1] + share * (c[2] + share * c[3]))
             slope = width + c[1] + share * (2 * c[2] + 3 * share * c[3])
             return rise - want, jnp.maximum(slope, _FLAT * width)
@@ -181,7 +191,8 @@ def project(profile: Profile, count: int) -> FreeForm:
     """Return the free form of `count` coefficients nearest to a `profile`, with the same tip land.
 
     `count`: number of coefficients, at least 3. The coefficients come from a linear least-squares
-    fit of the pressure angle as a function of the normal angle. They are kept between -1 and 1.
+    fit of the pressure angle as a function of the normal angle. The fit keeps them between -1 and
+    1.
     """
     from scipy.optimize import lsq_linear  # Imported here only: it takes 0.2 s.
 
@@ -207,9 +218,10 @@ def _pressure_angles(profile: Profile, nu):
 
 
 def _integrals(count: int):
-    """Return a function that integrates each B-spline from 0 to fractions (n,) of the length.
+    """Return a function that integrates each of `count` B-splines from 0 to given fractions (n,).
 
-    The function returns an array (n, count), in units of the whole length."""
+    The fractions are those of the whole spline's length. The function returns the integrals (n,
+    count), divided by this length."""
     powers = _powers(count) / np.arange(1, 2 + _DEGREE)[:, None]
     spans = len(powers)
     before = np.cumsum(powers.sum(axis=1), axis=0) - powers.sum(axis=1)
@@ -225,10 +237,11 @@ def _integrals(count: int):
 
 @functools.cache
 def _powers(count: int) -> NDArray[np.float64]:
-    """Return coefficients (spans, 3, count) of each B-spline in powers of the fraction of a span.
+    """Return the coefficients (spans, 3, count) of `count` B-splines in each knot span.
 
-    The Cox-de Boor recursion on polynomials gives the coefficients. Knots are the ends of the
-    spans; the first and the last knot are repeated."""
+    The coefficients multiply powers of the fraction of the span. They follow from the Cox-de Boor
+    recursion on polynomials. Knots are the ends of the spans; the first and the last knot are
+    repeated."""
     spans = count - _DEGREE
     knots = np.clip(np.arange(-_DEGREE, spans + _DEGREE + 1.0), 0, spans)
     basis = np.zeros((spans, _DEGREE + 1, count + _DEGREE))

@@ -14,7 +14,8 @@ from rootsopt.profiles.outline import Outline
 from rootsopt.runtime.programs import Program
 
 _GRADING = 4.0
-"""Factor g of graded nodes: Gauss-Legendre nodes x become tanh(g x) / tanh(g).
+"""Constant g of the graded quadrature rule, which maps Gauss-Legendre nodes x to tanh(g x) /
+tanh(g).
 
 Powers, hyperbolic tangents and double exponentials with 32 to 96 nodes were compared. The integrand
 was a square root that starts 0.3 to 1e-4 of the length beyond an end. This rule had the least
@@ -24,10 +25,10 @@ error, 1e-13."""
 class Geometry(eqx.Module):
     """Geometry of one rotor's cross-section (SI units).
 
-    `outer_radius` r_a, `root_radius`: greatest and least distance of the outline from the axis (m).
+    `outer_radius` r_a, `root_radius`: greatest and least distance (m) of the outline from the axis.
     `area`: A (m²). `area_efficiency`: 1 - A/(π r_a²). `polar_area_moment`: ∫r² dA about the axis
-    (m⁴). `undercut_margin`: least `Profile.dedendum_speed` (m per rad). `seal_width`: arc length of
-    the whole tip land (m).
+    (m⁴). `undercut_margin`: least `Profile.dedendum_speed` (m/rad). `seal_width`: arc length of the
+    whole tip land (m).
     """
 
     outer_radius: Float[Array, ""]
@@ -42,9 +43,9 @@ class Geometry(eqx.Module):
 def geometry(profile: Profile) -> Geometry:
     """Return the `Geometry` of a profile, with area and inertia exact to rounding.
 
-    Area and inertia follow from Green's theorem on the roll-angle form. With the support function
-    h = P·n and the arc length element dl, dA = h dl / 2 and ∫r² dA = ∫ |P|² h dl / 4 over the
-    outline. The values of an `Outline` are those measured when its file was read.
+    Area and inertia follow from Green's theorem on the roll-angle form. With the support function h
+    = P·n and the arc length element dl, dA = h dl / 2 and ∫r² dA = ∫ |P|² h dl / 4 over the
+    outline. For an `Outline`, return the values computed when its file was read.
     """
     if isinstance(profile, Outline):
         return _given(profile)
@@ -87,9 +88,9 @@ def geometry(profile: Profile) -> Geometry:
 
 @functools.cache
 def _rule(quadrature: Quadrature) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (nodes as fractions of the part's length, weights) for one smooth part of a profile.
+    """Return (nodes, weights) of the quadrature rule on a part of length 1.
 
-    Points that are only checked for undercut have weight 0."""
+    Points at which only undercut is checked have weight 0."""
     nodes, weights = np.polynomial.legendre.leggauss(quadrature.nodes)
     if quadrature.graded:
         weights = weights * _GRADING / np.cosh(_GRADING * nodes) ** 2 / np.tanh(_GRADING)
@@ -101,9 +102,9 @@ def _rule(quadrature: Quadrature) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 def _given(profile: Outline) -> Geometry:
-    """Return the geometry of an outline, measured when its file was read.
+    """Return the geometry of the outline `profile`, as computed when its file was read.
 
-    The undercut margin is NaN, because an outline is not the envelope of a partner."""
+    The undercut margin is NaN, because the dedendum of an outline is not the partner's envelope."""
     return Geometry(
         outer_radius=profile.outer_radius,
         root_radius=profile.root_radius,
@@ -116,10 +117,10 @@ def _given(profile: Outline) -> Geometry:
 
 
 def flank_nodes(profile: Profile, points: int) -> Float[Array, " n"]:
-    """Return normal angles (n,) in rad of about `points` nodes along the addendum.
+    """Return normal angles (n,) in rad of about `points` nodes along the addendum of `profile`.
 
-    Every segment end is a node. On each segment, nodes are dense where the longer of the two
-    conjugate arc elements is long."""
+    Every segment end is a node. On each segment, nodes are denser where the arc element is longer,
+    on the addendum or on its conjugate."""
     segments = [s for s in profile.segments() if float(s.stop) > float(s.start)]
     lengths, curves = [], []
     for segment in segments:
@@ -144,17 +145,17 @@ def _both(profile, nu):
 
 @Program
 def _element(profile, nu):
-    """Return the node density over the normal angle (m/rad).
+    """Return the density of nodes (m/rad) of `profile` at the normal angles `nu` (rad).
 
-    The longer of the two conjugate arc elements resolves both flanks evenly. An added constant
-    ensures enough nodes at sharp spots, such as the pitch crossing of EE."""
+    The density is the longer of the two conjugate arc elements plus a constant. The constant
+    ensures enough nodes at sharp points, such as the pitch crossing of EE."""
     _, addendum, dedendum = profile.speeds(nu)
     longest = jnp.maximum(jnp.abs(addendum), jnp.abs(dedendum))
     return longest + 0.3 * profile.pitch_radius
 
 
 def flank(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
-    """Return coordinates (n, 2) in m of one flank, from tip centre to root centre.
+    """Return points (n, 2) in m on one flank of `profile`, from tip centre to root centre.
 
     `points`: approximate number of nodes on each side of the pitch circle."""
     nu = flank_nodes(profile, points)
@@ -163,7 +164,7 @@ def flank(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
 
 
 def outline(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
-    """Return the closed counter-clockwise outline (n, 2) in m, with a lobe tip on +x.
+    """Return the closed counter-clockwise outline (n, 2) in m of `profile`, with a lobe tip on +x.
 
     The first point is repeated at the end. `points`: approximate number of nodes on each side of
     the pitch circle of each flank."""

@@ -19,13 +19,14 @@ Beyond u_max the roll angle turns back and two points of a flank mesh at once. A
 no interference (< 1 nm) up to 5 % excess; the paper's printed Table 1 has 1.2 %."""
 _CLEAR = 1e-6
 """Excess (pitch radii) of the involute length over its lower limit below which a config is
-rejected. At the limit, the tip arc's centre is on the pitch circle for the second time."""
+rejected. At this limit, the centre of the tip arc reaches the pitch circle. The centre also lies on
+this circle if the involute has its greatest length."""
 _LEAST_INVOLUTE = 0.002
 """Involute length (fraction of the longest) below which a config is rejected. A shorter involute
 has no effect, and its length was probably given in metres."""
 _SHORTEST = 0.1
-"""Least involute length (fraction of the longest) in a search. The bounds in a config can only
-raise this limit."""
+"""Least involute length (fraction of the longest) that a search tries. The bounds in a config can
+only raise this limit."""
 
 
 def ranges(
@@ -35,10 +36,12 @@ def ranges(
     involute_length_mm: Float[Array, ""],
     tip_arc_angle_deg: Float[Array, ""] | float = 0.0,
 ) -> dict[str, tuple[Float[Array, ""], Float[Array, ""]]]:
-    """Return {"involute_length_mm": (shortest, longest)}, the range (mm) that a search may use.
+    """Return {"involute_length_mm": (shortest, longest)}, the range (mm) in which a search stays.
 
-    The other parameters determine this range. The longest involute is `CIC.longest_involute`, so
-    that u ≤ u_max holds by construction."""
+    The range follows from the number of lobes `lobes`, the pitch radius `pitch_radius_mm`, the
+    pressure angle `pressure_angle_deg` and half the tip land's angle, `tip_arc_angle_deg`.
+    `involute_length_mm` is not used. The longest involute is `CIC.longest_involute`, so that u ≤
+    u_max holds by construction."""
     del involute_length_mm
     half = jnp.pi / (2 * lobes)
     longest = pitch_radius_mm * jnp.sin(pressure_angle_deg * DEG) * (half - tip_arc_angle_deg * DEG)
@@ -46,7 +49,7 @@ def ranges(
 
 
 def check(profile: "ProfileConfig") -> None:
-    """Raise `InputError` unless the profile's involute exists and meshes without undercut."""
+    """Raise `InputError` if the involute of a `profile` is too short, too long or undercut."""
     alpha: Any = getattr(profile, _ANGLE)
     length: Any = getattr(profile, _LENGTH)
     tip: Any = getattr(profile, _TIP) or 0.0

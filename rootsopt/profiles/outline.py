@@ -12,8 +12,8 @@ class Table(eqx.Module):
     """k functions of x as cubic Hermite interpolants.
 
     `node` (n,): values of x, not decreasing; `value`, `slope` (n, k): values and derivatives of the
-    functions at the nodes. The slopes may jump at a node that is given twice. Beyond the ends, the
-    first and the last cubic are continued.
+    functions at the nodes. Slopes may jump at a node that occurs twice. Beyond the ends, the first
+    and the last cubic are continued.
     """
 
     node: Float[Array, " n"]
@@ -21,7 +21,7 @@ class Table(eqx.Module):
     slope: Float[Array, "n k"]
 
     def __call__(self, x: Float[Array, "*m"]) -> tuple[Float[Array, "*m"], ...]:
-        """Return the values of the k functions at `x`, each of the shape of `x`."""
+        """Return the values of the k functions at `x`, each in the shape of `x`."""
         index = jnp.searchsorted(self.node, x, side="right") - 1
         index = jnp.clip(index, 0, self.node.shape[0] - 2)
         start, stop = self.node[index], self.node[index + 1]
@@ -39,19 +39,20 @@ class Table(eqx.Module):
 class Outline(Profile):
     """A flank from a drawing or a measurement.
 
-    `crown`: support function h and lever q (m) of the addendum as functions of its normal angle ν,
-    from the tip to the pitch circle. The addendum is convex, so that ν identifies its points.
-    `valley`: normal direction F from the valley's axis (rad), h and q (m) of the dedendum. The
-    table's parameter runs from 0 at the root to `pitch_normal` at the pitch circle. F cannot
-    replace this parameter, because a dedendum may have convex and concave parts. dh = -q dF, and dq
-    = h dF minus the arc length element along the tangent.
+    `crown`: support function h (m) and lever q (m) of the addendum as functions of its normal angle
+    ν, from the tip to the pitch circle. The addendum is convex, so that ν identifies its points.
+    `valley`: F (rad), h and q (m) of the dedendum, where F is the direction of the normal from the
+    valley's axis. The table's parameter runs from 0 at the root to `pitch_normal` at the pitch
+    circle. F cannot replace this parameter, because a dedendum may have convex and concave parts.
+    dh = -q dF, and dq = h dF minus the arc length element along the tangent.
 
     Beyond its ends, the addendum is continued by its circles of curvature; over the tip, by its
-    mirror image. The law of gearing is not assumed: `mate` is the given dedendum. Roll angle and
-    contact distance are those at which each curve's own normals meet the pitch circle.
+    mirror image. The law of gearing is not assumed: `mate` returns points of the given dedendum.
+    Roll angle and contact distance are those at which each curve's own normals meet the pitch
+    circle.
 
-    `lobes`: N; `pitch_radius`: r (m). `area`, `polar_area_moment`, `outer_radius`, `root_radius`,
-    `seal_width`: see `Geometry`.
+    `lobes`: number of lobes N; `pitch_radius`: r (m). `area`, `polar_area_moment`, `outer_radius`,
+    `root_radius`, `seal_width`: see `Geometry`.
     """
 
     lobes: int = eqx.field(static=True)
@@ -110,8 +111,9 @@ class Outline(Profile):
         return False
 
     def _rolled(self, direction, mate):
-        """Return a point in roll-angle form, from its normal's `direction` (rad) and lever.
+        """Return the point with this normal in roll-angle form.
 
+        `direction`: direction of the normal (rad); `mate`: lever and support function of the point.
         For a normal that misses the pitch circle, use the normal's point nearest to the circle."""
         psi = jnp.arccos(jnp.clip(mate.lever / self.pitch_radius, -1.0, 1.0))
         s = mate.support - self.pitch_radius * jnp.sin(psi)

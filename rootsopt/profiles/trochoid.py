@@ -12,7 +12,7 @@ def extended_cycloid(
 ) -> Curve:
     """Return an epicycloid traced by a point at varying distance from the rolling circle's centre.
 
-    `lobes`: N; `pitch_radius`: r (m). With r_e = r / 2N the curve is
+    `lobes`: number of lobes N; `pitch_radius`: r (m). With r_e = r / 2N the curve is
     P(θ) = e^{iθ} [r + r_e + λ(θ) r_e e^{2iNθ}], from the tip (θ = 0) to the pitch crossing
     (θ = π/2N). The ratio λ varies from `trochoid_ratio` λ0 at the tip to 1 at the crossing:
     λ = 1 + (λ0 - 1) u³ (10 - 15 u + 6 u²) with u = 1 - 2Nθ/π. This quintic has zero first and
@@ -20,9 +20,9 @@ def extended_cycloid(
     1278), whose own formulas were not available. λ0 = 1 gives EE. The outer radius is
     r + (1 + λ0) r_e.
 
-    The crossing is a cusp: dP/dθ vanishes in proportion to δ = π/2N - θ. Powers of δ are therefore
-    divided out of the terms of the normal. In the frame turned by θ, with w = e^{-2iNδ}, the normal
-    is (X δ + iY) / M, with M = |X δ + iY| and
+    The crossing is a cusp: dP/dθ vanishes in proportion to δ = π/2N - θ. The formula of the normal
+    is therefore divided by δ. In the frame turned by θ, with w = e^{-2iNδ}, the normal is (X δ +
+    iY) / M, with M = |X δ + iY| and
 
         X δ + iY = (r + r_e) (1 - λ w) / δ + i r_e w λ′ / δ.
 

@@ -9,13 +9,13 @@ from rootsopt.profiles.base import Profile
 from rootsopt.runtime.programs import Program
 
 PURE = ("turning", "rolling", "order")
-"""Names of the margins that are angles or ratios, not lengths."""
+"""Names of the margins that are angles or ratios. All others are lengths or lengths per angle."""
 _POINTS = 400
 """Number of points per segment at which margins are evaluated."""
 
 
 class Margins(NamedTuple):
-    """Margins of a flank: least values along it, not negative if the profile is sound.
+    """Margins of a flank: least values of nine quantities, none negative on a sound profile.
 
     `turning`: range of normal angles of a segment (rad), negative where joints are out of order.
     `convexity`: radius of curvature of the addendum (m).
@@ -46,10 +46,10 @@ class Margins(NamedTuple):
 
 @Program
 def margins(profile: Profile) -> Margins:
-    """Return the margins of a profile, each the least value over `_POINTS` points per segment.
+    """Return the margins of a profile.
 
-    Both sides of a joint are evaluated. A minimum between points is that of the parabola through
-    three points."""
+    Least values along the flank are taken over `_POINTS` points per segment. Both sides of a joint
+    are evaluated. Between the points, a minimum is that of the parabola through three points."""
     segments = profile.segments()
     start = jnp.stack([s.start for s in segments])[:, None]
     length = jnp.stack([s.stop for s in segments])[:, None] - start

@@ -1,7 +1,8 @@
 """The scene: everything that is simulated except the design. It builds a rotor pair from a design.
 
 A design is a vector of the config's design parameters, in the config's own units. Gradients are
-therefore per config unit. A family without parameters (EE) has an empty design.
+therefore derivatives with respect to config units. A family without parameters (EE) has an empty
+design.
 """
 
 import dataclasses
@@ -46,20 +47,20 @@ from rootsopt.scene import families, reading
 class Scene(eqx.Module):
     """Everything except the design, in SI units: builds a rotor pair from a design.
 
-    Physical quantities are leaves, with respect to which responses are differentiable. Choices are
-    static, so that one compiled program serves all scenes with the same choices.
+    Physical quantities are arrays, and responses are differentiable with respect to them. Choices
+    are static fields, so that one compiled program serves all scenes with the same choices.
 
     `family`, `lobes`, `pitch_radius` (m): profile; `design_size`: number d of its parameters.
     `fidelity`, `map_size`, `nodes`: contact model and its resolution.
-    `precision`: number type of the integration; `solver`: solver for the steady motion.
-    `straight`: whether the rotors have no helix.
+    `precision`: number type of the integration; `solver`: solver for the steady motion. `straight`:
+    whether the rotors have no helix.
     `length` (m), `density` (kg/m³), `bore_radius` (m, `None`: no bore): body of a rotor.
     `law`, `clearance` (m): contact law, and distance added to every flank gap.
     `speed` (rad/s), `load_torque` (N·m), `pressure` (Pa, `None`: constant torque): operation.
     `gear`, `gear_damping_ratio`, `motor`, `friction`, `supports`: optional parts.
     `deepest`: relative rotation (rad, negative) down to which a contact map must extend.
-    `center_distance_error`: centre distance minus twice the pitch radius (m), or `None`.
-    `outline`: profile read from a file, or `None`; `extra`: further parts.
+    `center_distance_error`: centre distance minus twice the pitch radius (m), or `None`. `outline`:
+    profile read from a file, or `None`; `extra`: further parts.
     """
 
     family: str = eqx.field(static=True)
@@ -95,8 +96,8 @@ class Scene(eqx.Module):
         """Return the scene of a config.
 
         `deepest`: relative rotation (rad, negative) down to which the contact map must extend; by
-        default, an estimate. If the config does not give the map's size, use a default size.
-        (`evaluate` chooses the size from `solver.map_error` instead.)
+        default, an estimate. If the config does not give the map's size, the map has a default
+        size. (`evaluate` chooses the size from `solver.map_error` instead.)
 
         Raises `RuntimeError` if JAX is not set to the precision that the config needs, and
         `InputError` if an outline file cannot be used."""
@@ -136,14 +137,18 @@ class Scene(eqx.Module):
         return float(self.law.depth_at(force))
 
     def inertia(self, shape: Geometry) -> Float[Array, ""]:
-        """Return the moment of inertia (kg·m²) of one rotor of this geometry about its axis."""
+        """Return the moment of inertia (kg·m²) of one rotor about its axis.
+
+        `shape`: geometry of the rotor."""
         moment = shape.polar_area_moment
         if self.bore_radius is not None:
             moment = moment - jnp.pi / 2 * self.bore_radius**4
         return self.density * self.length * moment
 
     def mass(self, shape: Geometry) -> Float[Array, ""]:
-        """Return the mass (kg) of one rotor of this geometry."""
+        """Return the mass (kg) of one rotor.
+
+        `shape`: geometry of the rotor."""
         area = shape.area
         if self.bore_radius is not None:
             area = area - jnp.pi * self.bore_radius**2
@@ -153,7 +158,7 @@ class Scene(eqx.Module):
     def two_sided(self) -> bool:
         """Whether drive and coast flanks may touch at the same time.
 
-        This is the case if the axes can leave the nominal centre distance or the flanks are not
+        They may do so if the axes can leave the nominal centre distance or the flanks are not
         conjugate.
         """
         odd = self.supports, self.center_distance_error, self.outline
@@ -161,10 +166,10 @@ class Scene(eqx.Module):
         return moved or any(part is not None for part in odd)
 
     def with_parts(self, *parts: Part) -> "Scene":
-        """Return this scene with further `parts`; their states come last in the state of a motion.
+        """Return this scene with further `parts`.
 
-        Numbers in the parts' fields become arrays, so that responses are differentiable with
-        respect to them."""
+        The states of these parts come last in the state of a motion. Numbers in the parts' fields
+        become arrays, so that responses are differentiable with respect to them."""
         return dataclasses.replace(self, extra=(*self.extra, *_as_arrays(parts)))
 
     def with_law(self, law: ContactLaw) -> "Scene":
@@ -177,7 +182,8 @@ class Scene(eqx.Module):
     def contact(self, profile: Profile) -> Contact:
         """Return the contact of `profile` at this scene's fidelity.
 
-        Raises `InputError` for fidelity `auto`: replace it by a fidelity first."""
+        Raises `InputError` if the fidelity is `auto`, which must first be replaced by another one.
+        """
         if self.fidelity == "map":
             return MapContact.of(profile, self.deepest, *self.map_size)
         if self.fidelity == "linear":
@@ -196,7 +202,9 @@ class Scene(eqx.Module):
         return SearchContact.of(profile, distance, two_sided=True)
 
     def _drive(self, load: Load) -> Drive:
-        """Return the drive. A motor for which no torque is given gets the torque of the load."""
+        """Return the drive of a pair under `load`.
+
+        If the motor has no torque of its own, it gets the torque of the load."""
         motor = self.motor
         if motor is None:
             return PrescribedDrive(self.speed)
@@ -225,8 +233,9 @@ class Scene(eqx.Module):
         """Return (rotor pair, its derivatives along `directions`, geometry of one rotor).
 
         `design` (d,): in config units. `directions` (n, d): directions in the design space, by
-        default one per parameter; (): no derivatives. The derivatives have the pair's own
-        structure, with a leading axis (n,). Raises `InputError` as `pair_and_shape` does."""
+        default one per parameter. With `()`, no derivatives are computed. The derivatives have the
+        pair's own structure, with a leading axis (n,). Raises `InputError` as `pair_and_shape`
+        does."""
         if directions is None:
             directions = jnp.eye(design.shape[0])
         return along(lambda design: self.pair_and_shape(design), design, directions)

@@ -30,7 +30,7 @@ def check_geometry(config: Config) -> None:
 
 @Program
 def _shape(scene: Scene, design):
-    """Return the geometry of a design in config units."""
+    """Return the geometry of a design (d,) in config units."""
     return geometry(scene.profile(design))
 
 

@@ -1,4 +1,4 @@
-"""Makes and checks profiles, given family names, keys and units as in a config."""
+"""Makes and checks profiles from family names, keys and units as they appear in a config."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,11 +17,13 @@ from rootsopt.profiles.validity import PURE, margins
 from rootsopt.runtime.programs import Program
 
 _ROUNDING = 1e-9
-"""Magnitude of a negative margin (relative to its scale) up to which the margin counts as 0."""
+"""Magnitude (relative to its scale) above which a negative margin makes a profile unsound."""
 
 
 def classical() -> tuple[str, ...]:
-    """Return the names of the registered families without a list of parameters or a file."""
+    """Return the names of the registered families whose parameters are single numbers.
+
+    Families with a list of parameters, or with a file, are left out."""
     return tuple(name for name, family in families().items() if family.classical)
 
 
@@ -30,7 +32,7 @@ def profile_of(
 ) -> Profile:
     """Return the profile of a `family` with a `design` (d,) in config units.
 
-    `pitch_radius` is in m."""
+    `lobes`: number of lobes; `pitch_radius`: pitch radius (m)."""
     found = family_of(family)
     values = {
         parameter.argument: value * parameter.unit
@@ -40,7 +42,9 @@ def profile_of(
 
 
 def keys_of(config: ProfileConfig) -> tuple[str, ...]:
-    """Return the names of a config's design parameters, the entries of a list numbered from 1."""
+    """Return the names of a config's design parameters.
+
+    The entries of a list-valued parameter are numbered from 1."""
     return config.design_keys
 
 
@@ -50,7 +54,7 @@ def design_of(config: ProfileConfig) -> Float[Array, " d"]:
 
 
 def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:
-    """Return a copy of a config's profile with another `design` (d,) in config units."""
+    """Return a copy of a profile's config with the given `design` (d,) in config units."""
     given = [float(value) for value in np.asarray(design)]
     family = family_of(config.family)
     values = zip(family.parameters, family.split(given), strict=True)
@@ -60,7 +64,7 @@ def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:
 
 
 def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, float]:
-    """Return (config of a free form fitted to a profile, greatest distance (m) from it).
+    """Return (config of a free form fitted to a profile, greatest distance (m) between the flanks).
 
     `config`: config of the given profile; `count`: number of coefficients. Raises `InputError` for
     an outline from a file."""
@@ -101,7 +105,8 @@ def outline(config: ProfileConfig) -> Outline | None:
 def check(config: ProfileConfig) -> None:
     """Raise `InputError` unless the profile is sound.
 
-    For an outline from a file, raise it only if the flanks never face each other."""
+    A profile read from a file is sound if the file holds a usable outline and the flanks face each
+    other somewhere in the mesh."""
     if (given := outline(config)) is not None:
         conjugacy(given)
         return
@@ -126,9 +131,10 @@ def check(config: ProfileConfig) -> None:
 
 
 def margins_of(config: ProfileConfig) -> dict[str, float]:
-    """Return the margins of a config's profile for the result file; {} for an outline from a file.
+    """Return the margins of a config's profile for the result file.
 
-    Each key is the name of a margin followed by its unit, as in `order_deg`."""
+    Each key is the name of a margin followed by its unit, as in `order_deg`. For an outline from a
+    file, the result is {}."""
     if config.from_file:
         return {}
     radius = jnp.asarray(config.pitch_radius_mm * MM)
@@ -143,7 +149,7 @@ def margins_of(config: ProfileConfig) -> dict[str, float]:
 
 @Program
 def _margins(family, lobes, pitch_radius, design):
-    """Return the margins of the profile of a design in config units."""
+    """Return the margins (SI units) of the profile of a design in config units."""
     return margins(profile_of(family, lobes, pitch_radius, design))
 
 

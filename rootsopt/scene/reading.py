@@ -1,4 +1,4 @@
-"""Converts a config into the pieces of a scene: SI quantities, contact law, parts, solver."""
+"""Converts a config into the parts of a scene: SI quantities, contact law, parts, solver."""
 
 import math
 from typing import Any
@@ -17,8 +17,8 @@ from rootsopt.dynamics.steady import Solver
 from rootsopt.scene import families
 
 _ORBIT_STEPS = 4
-"""Number of solver steps allowed for a whole orbit, as a multiple of the number that the config
-allows per mesh period."""
+"""Limit on the number of solver steps for a whole orbit, as a multiple of the number that the
+config allows per mesh period."""
 _ROLLS, _RELATIVES = 384, 16
 """Default size of a contact map: number of points over roll and over relative rotation."""
 
@@ -29,7 +29,7 @@ def design_vector(config: Config) -> Float[Array, " d"]:
 
 
 def design_keys(config: Config) -> tuple[str, ...]:
-    """Return the names of the entries of `design_vector`."""
+    """Return the names of the design parameters, in the order of `design_vector`."""
     return families.keys_of(config.profile)
 
 
@@ -79,7 +79,7 @@ def gear_of(config: Config) -> TimingGear | None:
 
 
 def parts_of(config: Config) -> dict[str, Any]:
-    """Return those of motor, friction and supports that a config has, keyed by `Scene` field names.
+    """Return the motor, friction and supports that a config has, keyed by `Scene` field names.
 
     Numbers that `Scene` sets later, such as those that depend on the design, are NaN."""
     scene, friction = config.scene, config.contact.friction
@@ -111,13 +111,13 @@ def parts_of(config: Config) -> dict[str, Any]:
 
 
 def map_size(config: Config) -> tuple[int, int]:
-    """Return the numbers of points of the contact map over roll angle and relative rotation."""
+    """Return (number of points over roll, over relative rotation) of a config's contact map."""
     solver = config.solver
     return solver.map_rolls or _ROLLS, solver.map_relatives or _RELATIVES
 
 
 def expected_rotation(config: Config) -> float:
-    """Return an estimate (rad, negative) of the relative rotation of largest magnitude in a scene.
+    """Return an estimate (rad, negative) of the most negative relative rotation in a scene.
 
     Its magnitude is a length divided by the pitch radius, but at most a quarter of π/2N. The length
     is 1.3 times the sum of clearance and half the backlash, plus 1.5 times the penetration under 20
