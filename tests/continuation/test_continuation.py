@@ -166,17 +166,28 @@ def branch():
 
 
 def test_points_agree_with_orbits_closed_for_themselves(branch):
-    """Mean, peak and RMS of stable points are those an `Evaluator` finds, started nearby."""
+    """Mean, peak and RMS of stable points are those an `Evaluator` finds, started nearby.
+
+    So is the greatest multiplier. Beside a grazing touch, such as near the fold, it changes with
+    the square root of the state's error: there it must lie among those of the neighbouring points.
+    """
     stable = [point for point in branch.points if point.stable]
-    for point in stable[:: len(stable) // 3]:
+    sizes = [np.max(np.abs(point.multipliers)) for point in stable]
+    steady = 0
+    for number in range(0, len(stable), len(stable) // 6):
+        point, near = stable[number], sizes[max(number - 1, 0) : number + 2]
         alone = Evaluator.of(config_at(point.value))(start=0.999 * point.state, series=False)
         assert alone.status is Status.PERIODIC
         found = [alone.response[f"{name}_force_N"] for name in ("mean", "peak", "rms")]
         np.testing.assert_allclose([point.mean, point.peak, point.rms], found, rtol=1e-6)
         largest = alone.steady_state["floquet_multiplier"]
-        # Derivatives beside a grazing touch depend on the solver's steps, which differ here.
-        assert np.max(np.abs(point.multipliers)) == pytest.approx(largest, rel=1e-2)
+        if np.ptp(near) < 0.1 * largest:
+            steady += 1
+            assert sizes[number] == pytest.approx(largest, rel=1e-5)
+        else:
+            assert min(near) < largest < max(near)
         np.testing.assert_allclose(point.state, alone.state, atol=1e-6, rtol=0)
+    assert steady >= 2
 
 
 def test_every_point_is_closed(branch):

@@ -122,7 +122,7 @@ class GasLoad(Load):
             if segment.land:
                 continue
             begin, end = profile.roll_angle(jnp.stack([segment.start, segment.stop]))
-            share = (addendum - (begin + end - _BRIEF) / 2) / _BRIEF
+            share = _spread_share(addendum, begin, end)
             before = vane(jnp.where(addendum < jnp.minimum(begin, end), normal, segment.start))
             after = vane(jnp.where(addendum > end, normal, segment.stop))
             spread = before + smooth_step(share) * (after - before)
@@ -131,13 +131,7 @@ class GasLoad(Load):
         return self.pressure_length / 2 * squares
 
     def switches(self, motion, own) -> Bool[Array, " s"]:
-        del own
-        phi, half = motion.phi, self.profile.half_pitch
-        roll = self._roll(phi)
-        addendum = half - jnp.abs(roll - half)
-        ends = [segment.stop for segment in self.profile.segments()[:-1]]
-        passed = [self.profile.normal_at(addendum) > end for end in ends]
-        return jnp.stack([jnp.sin(phi * self.profile.lobes) > 0, roll > half, *passed])
+        return self.margins(motion, own) > 0
 
     def margins(self, motion, own) -> Float[Array, " s"]:
         del own
@@ -146,4 +140,18 @@ class GasLoad(Load):
         addendum = half - jnp.abs(roll - half)
         ends = [segment.stop for segment in self.profile.segments()[:-1]]
         passed = [self.profile.normal_at(addendum) - end for end in ends]
+        # The ends of a spread jump.
+        for segment in self.profile.segments():
+            if not segment.land:
+                begin, end = self.profile.roll_angle(jnp.stack([segment.start, segment.stop]))
+                share = _spread_share(addendum, begin, end)
+                brief = end - begin < _BRIEF
+                passed += [jnp.where(brief, edge, 1.0) for edge in (share, share - 1)]
         return jnp.stack([jnp.sin(phi * self.profile.lobes), roll - half, *passed])
+
+
+def _spread_share(addendum, begin, end):
+    """Return how far a jump is passed at the roll angle `addendum`: 0 at its start, 1 at its end.
+
+    The jump is spread over `_BRIEF` around the middle of `begin` and `end` (all in rad)."""
+    return (addendum - (begin + end - _BRIEF) / 2) / _BRIEF
