@@ -52,8 +52,9 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
         except BaseException:
             checkpoint.close(remove=checkpoint.empty)
             raise
-    # A stopped search can go on later. One that has ended needs its checkpoint no more.
-    checkpoint.close(remove=checkpoint.empty or not stop.is_set())
+    checkpoint.close(remove=checkpoint.empty)
+    if not stop.is_set():  # A stopped search can go on later.
+        folder.remove_afterwards(checkpoint.path)
     if result is None:
         return _nothing_known(config, folder)
     if result.infeasible is not None:
@@ -98,12 +99,23 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 def _checkpoint(config: "Config", options: "argparse.Namespace", folder: "RunFolder"):
     """Return the checkpoint file of this run, beside the result folder.
 
-    With the option `--resume`, it contains the evaluations of the interrupted run."""
-    from rootsopt.optimize.checkpoint import Checkpoint
+    With the option `--resume`, it contains the evaluations of the interrupted run. Without it, an
+    existing checkpoint is moved aside until this run is in place."""
+    from rootsopt.optimize.checkpoint import Checkpoint, set_aside
     from rootsopt.output import files
+    from rootsopt.runtime.environment import say
 
+    path = folder.checkpoint
+    older = None if options.resume else set_aside(path)
+    if older is not None:
+        folder.remove_afterwards(older)
+        say(
+            f"an interrupted run has left a checkpoint, which is now {str(older)!r} and goes when "
+            f"this run is done; to go on with that run instead, stop this one, move the file back "
+            f"to {path.name!r}, and add `--resume`"
+        )
     header = {"config": config.model_dump(mode="json"), "versions": files.versions()}
-    return Checkpoint(folder.checkpoint, header, options.resume)
+    return Checkpoint(path, header, options.resume)
 
 
 def _searched(config: "Config", progress, stop: threading.Event, checkpoint):

@@ -140,6 +140,16 @@ class Checkpoint:
             self.path.unlink(missing_ok=True)
 
 
+def set_aside(path: Path) -> Path | None:
+    """Rename the checkpoint `path` of an interrupted run, and return its new path.
+
+    The new name ends in `.old`; an older file of that name is replaced. Return `None` if there is
+    no checkpoint. Raises `OSError` if the file cannot be renamed."""
+    if not path.is_file():
+        return None
+    return path.replace(path.with_name(path.name + ".old"))
+
+
 def _item(value: Any) -> Any:
     """Convert a NumPy number to a plain number, and an array to nested lists."""
     return np.asarray(value).tolist()
@@ -190,4 +200,4 @@ def _evaluation(found: Mapping[str, Any]) -> Evaluation:
     return SpeedsEvaluation(**values, parts=every)
 
 
-__all__ = ["Checkpoint"]
+__all__ = ["Checkpoint", "set_aside"]

@@ -71,6 +71,7 @@ class RunFolder(ResultFolder):
         self.command, self.overwrite = command, overwrite
         self.placed = False
         self._written: set[str] = set()
+        self._spent: list[Path] = []
         self._result: Mapping[str, Any] | None = None
         self._made: list[Path] = []
         self._lock: Lock | None = None
@@ -218,6 +219,12 @@ class RunFolder(ResultFolder):
         self._result = data
         return self.path / name
 
+    def remove_afterwards(self, file: Path) -> None:
+        """Remove `file`, which is not part of the run, as soon as the run is in place.
+
+        If the run ends before that, the file stays."""
+        self._spent.append(file)
+
     def put_in_place(self) -> list[str]:
         """Write `result.json` and move the finished folder to its final path.
 
@@ -232,6 +239,8 @@ class RunFolder(ResultFolder):
                     disk.sync_folder(folder)
                 notes = self._take_place()
             self.placed = True
+            for file in self._spent:
+                disk.discard(file)
             with contextlib.suppress(OSError):
                 disk.sync_folder(self.target.parent)
         return notes

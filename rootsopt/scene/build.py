@@ -57,7 +57,8 @@ class Scene(eqx.Module):
     `length` (m), `density` (kg/m³), `bore_radius` (m, `None`: no bore): body of a rotor.
     `law`, `clearance` (m): contact law, and distance added to every flank gap.
     `speed` (rad/s), `load_torque` (N·m), `pressure` (Pa, `None`: constant torque): operation.
-    `gear`, `gear_damping_ratio`, `motor`, `friction`, `supports`: optional parts.
+    `gear`, `motor`, `friction`, `supports`: optional parts. `gear_damping_ratio`: damping of the
+    gear as a share of critical damping, which `Scene` adds to `gear.damping` (0 from a config).
     `deepest`: relative rotation (rad, negative) down to which a contact map must extend.
     `center_distance_error`: centre distance minus twice the pitch radius (m), or `None`. `outline`:
     profile read from a file, or `None`; `extra`: further parts.
@@ -259,7 +260,7 @@ class Scene(eqx.Module):
         if gear is not None:
             # I_r = I1 I2 / (I1 + I2) of two equal rotors.
             damping = 2 * self.gear_damping_ratio * jnp.sqrt(gear.stiffness * inertia / 2)
-            gear = eqx.tree_at(lambda g: g.damping, gear, damping)
+            gear = eqx.tree_at(lambda g: g.damping, gear, gear.damping + damping)
         force = jnp.maximum(self.load_torque, 1e-3) / self.pitch_radius
         angle = self.law.depth_at(force) / self.pitch_radius
         for part in (gear, *self.extra):

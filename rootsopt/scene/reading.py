@@ -65,7 +65,8 @@ def law_of(config: Config) -> ImpactLaw:
 def gear_of(config: Config) -> TimingGear | None:
     """Return the timing gear of a config in SI units; `None` if the config has no gear.
 
-    The damping is 0 here. `Scene` sets it later, because it depends on the rotors' inertia."""
+    The damping is 0 here. `Scene` adds the damping that follows from the damping ratio, because it
+    depends on the rotors' inertia."""
     gear, radius = config.scene.timing_gear, config.profile.pitch_radius_mm * MM
     if gear is None:
         return None

@@ -1,1 +1,1 @@
-"""Fuzzing of the commands: configs, outline files, kills; run by `make fuzz`."""
+"""Fuzzing of the commands: configs, outline files, environments, kills; run by `make fuzz`."""

@@ -7,7 +7,13 @@ import argparse
 import importlib
 import sys
 
-CAMPAIGNS = {"configs": 50_000, "outlines": 1_000, "kills": 300, "environment": 200}
+CAMPAIGNS = {
+    "configs": 50_000,
+    "outlines": 1_000,
+    "kills": 300,
+    "resumes": 20,
+    "environment": 200,
+}
 """Cases of each campaign; module `tests.fuzz.NAME` has `run(report, seed)`."""
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from rootsopt.config import parse
 from rootsopt.errors import InputError
-from rootsopt.optimize.checkpoint import Checkpoint
+from rootsopt.optimize.checkpoint import Checkpoint, set_aside
 from rootsopt.optimize.search import Search
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.status import Status
@@ -59,6 +59,17 @@ def test_floats_come_back_to_the_last_bit(tmp_path):
     assert again.known((0, 4), point) is None
     again.close()
     assert not path.exists()
+
+
+def test_a_run_that_does_not_resume_keeps_the_older_checkpoint(tmp_path):
+    path = tmp_path / "c"
+    assert set_aside(path) is None
+    Checkpoint(path, HEADER).close(remove=False)
+    older = set_aside(path)
+    assert older == tmp_path / "c.old"
+    assert not path.exists()
+    older.rename(path)
+    Checkpoint(path, HEADER, resume=True).close()
 
 
 def test_other_configs_and_missing_files_are_refused(tmp_path):

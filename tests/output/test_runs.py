@@ -46,6 +46,22 @@ def test_an_earlier_run_is_moved_aside_or_replaced(tmp_path):
     assert found == [digest_of(text) for text in ("fourth", "first", "second")]
 
 
+def test_what_a_run_needs_no_more_goes_when_it_is_in_place(tmp_path):
+    spent, gone = tmp_path / "spent", tmp_path / "gone"
+    spent.touch()
+    with RunFolder(tmp_path / "run") as run:
+        run.remove_afterwards(spent)
+        run.remove_afterwards(gone)
+        run.write_json("result.json", {})
+    assert spent.exists()  # The run was given up.
+    with RunFolder(tmp_path / "run") as run:
+        run.remove_afterwards(spent)
+        run.remove_afterwards(gone)
+        run.write_json("result.json", {})
+        run.put_in_place()
+    assert os.listdir(tmp_path) == ["run"]
+
+
 def test_files_that_are_not_the_runs_own_are_never_deleted(tmp_path):
     target = tmp_path / "run"
     write_run(target, "old")
