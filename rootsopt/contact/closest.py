@@ -1,8 +1,8 @@
 """Closest approach of the two flanks of a meshing pair, from true geometry.
 
-The pose is the pair of roll coordinate x and relative rotation ε = φ2 - φ1 (rad): with
-the mean angle φ = (φ1 + φ2)/2, a *drive* flank of rotor 1 (the one that pushes rotor 2
-forward) has x = -φ. At ε = 0 the pair touches at roll angle β = x, 0 ≤ x ≤ π/N.
+The pose is the pair of roll coordinate x and relative rotation ε = φ2 - φ1 (rad). The *drive* flank
+of rotor 1 pushes rotor 2 forward; it has x = -φ, where φ = (φ1 + φ2)/2 is the mean angle. At ε = 0
+the pair touches at roll angle β = x, 0 ≤ x ≤ π/N.
 
 Both flanks are described by the normal angle of an addendum point. On rotor 1 this angle is ν1. On
 rotor 2, ν2 denotes the dedendum point that meshes with the addendum point ν2 in perfect rolling. If
@@ -20,8 +20,8 @@ curvature jumps or the flanks conform. A root at which T falls with increasing �
 the gap. By the envelope theorem, ∂G/∂φ1 = -q1 and ∂G/∂φ2 = q2. These derivatives also give the
 virtual work of a unit contact force.
 
-Bracketing on all nodes needs no trigonometric function per node and pose. A pose turns all nodes by
-the same angle, so that their sines and cosines follow from the addition theorem.
+Bracketing evaluates T at all nodes. A pose turns all nodes by the same angle. Their sines and
+cosines therefore follow from the addition theorem, without a trigonometric function per node.
 
 Exchanging the rotors maps x to π/N - x. The search therefore covers only the half of the mesh in
 which rotor 1's addendum meets rotor 2's dedendum. Coast flanks follow from mirror symmetry, x → -x,
@@ -54,15 +54,18 @@ _DONE = 8
 # common normal. The exception is a fraction of the flank, about √|ε|, next to a cusp at the pitch
 # crossing.
 _USUAL = -5e-3
-# Distance (rad) before a cusp below which a contact belongs to the cusp. The limit lies between the
-# two minima, which are several |ε| apart.
+# Distance of ν2 (rad) before the cusp at the pitch crossing below which a contact counts as the
+# minimum beyond the cusp. The two minima of the gap are several |ε| apart, and this limit lies
+# between them.
 _NEAR_CUSP = 1e-3
 # Penetration (pitch radii) above which a pair of points on flanks that are not conjugate is
 # ignored.
 _DEEPEST = 0.1
-# Rounding of T relative to the pitch radius, by bytes of a number.
+# Magnitude of T (pitch radii) below which T at a node may be zero except for rounding, by bytes of
+# a number.
 _SLACK = {8: 1e-13, 4: 1e-6}
-# Nodes between the edge of a land and the next node; their distance from the edge doubles.
+# Number of extra nodes between the edge of a land and the next node. Their distances from the edge
+# double from one to the next.
 _CROWD = 12
 
 
@@ -238,10 +241,10 @@ class FlankPair(eqx.Module):
     def _closest(self, roll, relative) -> ClosestApproach:
         """Return the closest approach for a `roll` from `folded`, with rules for its derivatives.
 
-        `relative`: ε (rad). With θ the pose and the design, dG = ∂G/∂θ dθ at the root held fixed
-        (envelope
-        theorem) and dν2 = -(∂T/∂θ dθ) / (∂T/∂ν2) (implicit function theorem). The rule is
-        itself differentiable, so that second derivatives are those of the true gap.
+        `relative`: ε (rad). G, T and ν2 are defined in the module's docstring. Let θ be the pose,
+        the profile and the centre distance. Then dG = ∂G/∂θ dθ at constant ν2 (envelope theorem),
+        and dν2 = -(∂T/∂θ dθ) / (∂T/∂ν2) (implicit function theorem). The rules are themselves
+        differentiable, so that second derivatives are those of the true gap.
         """
         dynamic, static = eqx.partition(self, eqx.is_inexact_array)
 
@@ -433,8 +436,9 @@ class FlankPair(eqx.Module):
 def _search_one_by_one(pair: FlankPair, roll, relative):
     """Return the closest approach, without derivatives, for a `roll` from `FlankPair.folded`.
 
-    `relative`: ε (rad). On a CPU, the poses of a batch are searched one by one. A single pose
-    rarely needs the nodes, but a batch searched as a whole nearly always does."""
+    `relative`: ε (rad). On a CPU, the poses of a batch are searched one at a time. If the flanks
+    are `rolling`, one pose rarely needs the bracketing on all nodes (`FlankPair._bracket`). A batch
+    searched as a whole would do it for every pose."""
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
 
     def search(dynamic, roll, relative):

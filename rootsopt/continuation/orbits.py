@@ -1,9 +1,9 @@
 """Periodic orbits as the solutions of equations in a state and a parameter.
 
-The unknowns are the state at φ1 = 0 and the parameter. At every value of the parameter, ε is
-measured in the unit of the first config. The equations require that the state returns after k mesh
-periods. Their derivatives come from the linearised steps of the motion.
-`rootsopt.continuation.branch` follows the curves of solutions.
+The unknowns are the state at φ1 = 0 and the parameter. The unit of ε stays that of the first config
+when the parameter changes. The equations require that the state returns after k mesh periods. Their
+derivatives come from the linearised solver steps. `rootsopt.continuation.branch` follows the curves
+of solutions.
 """
 
 import dataclasses
@@ -154,10 +154,10 @@ def _check(config: Config, parameter: str) -> None:
 class _Shot(NamedTuple):
     """Result of integrating k mesh periods from a state.
 
-    `out`: the flow; `grid`: solver steps of the flow, with step ends added where the equation is
-    not smooth; `lost`: whether the rotors no longer run as a pair (see `RotorPair.lost`);
-    `touching`: whether there is contact, at uniform times; `scale` (rad): unit of ε in the config
-    at this value of the parameter.
+    `out`: the flow; `grid`: step ends for repeating the integration (see `_shoot`); `lost`: whether
+    |ε| has reached its limit at a sample, or `RotorPair.lost` holds at the end; `touching`: whether
+    flanks or gear touch, at `_LOOKS` uniform times; `scale` (rad): unit of ε in the config at this
+    value of the parameter.
     """
 
     out: Flow
@@ -213,8 +213,10 @@ class Orbits:
         self.unit = float(_unit(self.scene, self.names, self.values))
 
     def value(self, place: NDArray[np.float64]) -> float:
-        """Return the value of the parameter in `place` (config's unit), exact at both ends of the
-        range."""
+        """Return the value of the parameter (config's unit) at a `place`.
+
+        `place` (n + 1,): unknowns, whose last entry is the parameter as a fraction of its range. At
+        either end of the range, the value is that of `limits`, without rounding."""
         share = place[-1]
         return float(self.limits.high if share == 1 else self.limits.low + share * self.width)
 
@@ -334,7 +336,9 @@ def _longest_gap(touching: NDArray[np.bool_]) -> float:
 def _build(
     scene: Scene, names: tuple[str, ...], values: Float[Array, " p"]
 ) -> tuple[RotorPair, Float[Array, ""]]:
-    """Return the pair with these parameter `values` (config's units), and its unit of ε (rad)."""
+    """Return the pair with these parameter `values` (config's units), and its unit of ε (rad).
+
+    `names`: names of the parameters, as from `parameters`; `scene`: everything else."""
     at = dict(zip(names, values, strict=True))
     gear = scene.gear
     if gear is not None:
@@ -372,11 +376,14 @@ def _shoot(  # Eleven parameters, since a compiled program takes its arrays one 
     repeat: Bool[Array, ""],
     refine: Bool[Array, ""],
 ) -> _Shot:
-    """Integrate `period` mesh periods from a `state` with ε in the fixed `unit` (rad).
+    """Integrate `period` mesh periods from the scaled `state` (n,), with ε in the fixed `unit`
+    (rad).
 
-    Derivatives are with respect to the state and along `direction` (p,) of the parameters. If
-    `repeat`, the steps of `grid` are repeated. If `refine`, step ends are added to the returned
-    grid where the equation is not smooth, and in long steps.
+    `names`, `values` (p,): names of the parameters, as from `parameters`, and their values
+    (config's units), which replace those of `scene`. Derivatives are with respect to the state, and
+    along `direction` (p,), a change of `values`. If `repeat`, the solver takes the steps of `grid`
+    instead of adaptive ones. If `refine`, the returned grid is that of the flow, with step ends
+    added where the equation is not smooth, and in long steps. Otherwise, it is `grid`.
     """
 
     def build(values):
@@ -413,7 +420,8 @@ def _without_long(grid: Float[Array, " steps"], period: Float[Array, ""]) -> Flo
     """Return `grid` with step ends added, so that no step is much longer than `_STEP`.
 
     In free flight, the error control takes steps so long that a short contact may be missed. The
-    flow would then jump between neighbouring states.
+    end state would then jump when the initial state changes a little. `period`: length of the
+    motion (mesh periods).
     """
     ends = _STEP * jnp.arange(1, LONGEST / _STEP)
     after = jnp.searchsorted(grid, ends)

@@ -29,14 +29,15 @@ gap is a difference between lengths that are ten thousand times a penetration, s
 are large. With a finer tolerance, the iterations would not end, and a repeated step cannot be
 shortened. The actual error is smaller, because every iteration is a full Newton step."""
 _FIRST_STEP = 1e-3, 0.05
-"""Limits of the first step: an absolute length (mesh periods), and a multiple of
-`Timescales.swing`. The smaller limit is the length of the first step. The error control rejects a
-first step that is too long."""
+"""Two lengths for the first step: an absolute length (mesh periods), and a multiple of
+`Timescales.swing`. The smaller one is used. The error control rejects a first step that is too
+long."""
 _LONGEST = 1 / 32, 1 / 8, 4.0
-"""Limits of all steps: an absolute length (mesh periods), and a multiple of `Timescales.fall`. The
-smaller limit applies. In free flight, the error control alone would let a step skip a short contact
-of the gear. The third number, divided by `max_steps`, is the least value (mesh periods) of the
-second limit. Steps of this length use at most a quarter of `max_steps` per mesh period."""
+"""Upper limits on the step length: an absolute length (mesh periods), and a multiple of
+`Timescales.fall`. The smaller limit applies. In free flight, the error control alone would let a
+step skip a short contact of the gear. The third number, divided by `max_steps`, is the least value
+(mesh periods) of the second limit. Steps of this length use at most a quarter of `max_steps` per
+mesh period."""
 
 
 class Integrator(eqx.Module):

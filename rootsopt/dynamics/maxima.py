@@ -47,7 +47,9 @@ one."""
 _LEAST = 1e-3
 """Fraction of the greatest force below which a maximum is left out."""
 _SHOULDER = 0.02
-"""Difference from the greatest force, relative to that force, below which shoulders are listed."""
+"""Difference from the greatest force, as a fraction of that force, above which a shoulder is not
+listed. A shoulder is an instant at which the force almost has a maximum (see the module's
+docstring)."""
 _SHORTEST = 1e-9
 """Minimum time (mesh periods) from the start of a step to a maximum inside it. An earlier maximum
 is moved to this time."""
@@ -168,8 +170,8 @@ def shoulders(forces: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the indices (k,) of shoulders among uniform samples (m,) of one cycle, greatest force
     first.
 
-    A shoulder is a sample at which the slope of the force is closest to 0, without a change of
-    sign."""
+    A shoulder is a sample at which the slope of the force comes closest to 0, without a change of
+    sign. Only shoulders close to the greatest force count (`_SHOULDER`)."""
     slope = np.roll(forces, -1) - np.roll(forces, 1)
     before, after, steep = np.roll(slope, 1), np.roll(slope, -1), np.abs(slope)
     same = (np.sign(before) == np.sign(slope)) & (np.sign(after) == np.sign(slope))

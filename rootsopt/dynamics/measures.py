@@ -74,9 +74,9 @@ class Measures(eqx.Module):
     ) -> tuple[Float[Array, " lines"], list[Float[Array, " d"]]]:
         """Return the amplitudes (N) of the spectral lines of a closed orbit, and their derivatives.
 
-        `others` and `slopes`: values and derivatives of the measures that follow mean, mean square
-        and peak; `period`: mesh periods of the orbit. The amplitude is 0 if the motion does not
-        contain the line."""
+        `others` (q - 2,) and `slopes` (q - 2, d): the measures that follow the mean square in
+        `values`, and their derivatives; `period`: period of the orbit (mesh periods). A line that
+        the motion does not contain has amplitude 0."""
         sizes, rows = [], []
         for k, order in enumerate(self.orders):
             cos, sin = others[k], others[k + self.orders.shape[0]]
@@ -90,10 +90,11 @@ class Measures(eqx.Module):
     def named(self, response: Any, period: int) -> dict[str, tuple[float, Any]]:
         """Return the response of a closed orbit as a dict whose keys are names in the result file.
 
-        `response` (r, 1 + d): rows mean, mean square, peak, then the other `values`. The first
-        column holds the value, the other d columns its derivatives. `period` of the orbit (mesh
-        periods). Each name maps to a pair: the value (N) and its derivatives (d,). The amplitude of
-        a line is 0 if the motion does not contain the line.
+        `response` (r, 1 + d): one row each for mean, mean square and peak, then for the measures
+        that follow the mean square in `values`. Column 0 holds the value, the other d columns its
+        derivatives. `period`: period of the orbit (mesh periods). Each name maps to a pair: the
+        value (N) and its derivatives (d,). A requested spectral line that the motion does not
+        contain has amplitude 0.
         """
         rows = np.asarray(response, np.float64)
         mean, square, peak, *others = rows

@@ -55,8 +55,8 @@ _AGREE = 10.0, 1e-3, 3e-2
 derivatives are reported. The limit is the first number times the square root of the tolerance, at
 least the second number and at most the third."""
 _SMALL = 1e-9, 1e-3
-"""Lower and upper bounds (scaled) of the Newton step below which the solver steps are kept. Between
-them, this limit is a thousand tolerances."""
+"""Bounds (scaled) of a limit: the Newton step below which the solver steps are kept. The limit is a
+thousand tolerances, but at least the first and at most the second number."""
 
 
 class Orbit(NamedTuple):
@@ -141,7 +141,10 @@ class _Closer(eqx.Module):
     """The loop of `orbit_or_window`, with the settings of one call.
 
     `start` returns the initial state of the loop, `go_on` whether the loop continues, and `step`
-    its next state."""
+    its next state. `shots`: maximum number of integrations; `closed`: residual (scaled) at which
+    Newton's method stops; `tolerance`: relative tolerance of the integrator; `check`: whether to
+    compare derivatives with those on halved steps. The other fields are arguments of
+    `orbit_or_window` or fields of `Shots`."""
 
     pair: RotorPair
     tangents: RotorPair
@@ -283,7 +286,11 @@ class _Closer(eqx.Module):
 
     def _kept(self, now: _Closing, start, out: Flow, size, residual, improving):
         """Return whether to keep the steps of `out`, whether to search for kinks along `out`, and
-        whether to discard the steps kept so far."""
+        whether to discard the steps kept so far.
+
+        `start`: scaled initial state of `out`; `size`: greatest entry of the Newton step (scaled);
+        `residual`: residual (scaled) of `out`; `improving`: whether it is less than half the least
+        one before on the same grid."""
         done, smooth = now.orbit.newton_steps + 1, self.pair.smooth
         known = size < jnp.clip(1000 * self.tolerance, *_SMALL)
         following = now.repeat | known | (done >= jnp.minimum(self.shots // 3, _KEPT))
@@ -341,10 +348,12 @@ def close_orbit(
     period: Int[Array, ""],
     shots: Shots,
 ) -> Orbit:
-    """Close the orbit of `period` mesh periods near the scaled `state` (n,), and differentiate it.
+    """Find the periodic orbit of `period` mesh periods near the scaled `state` (n,), by shooting.
 
-    `tangents`: d pair / d design, stacked along a leading axis; `shots`: settings. See
-    `orbit_or_window`.
+    The result includes the derivatives of the orbit. `tangents`: d pair / d design, stacked along a
+    leading axis; `shots`: integrator, measures of the force and limits of Newton's method. Nothing
+    is raised if Newton's method fails: the result is that of its last integration. `Orbit.residual`
+    and `Orbit.flow.solved` show whether it has failed. See `orbit_or_window`.
     """
     return orbit_or_window(pair, tangents, state, period, shots)[0]
 
@@ -367,9 +376,11 @@ def orbit_or_window(
 
     Newton's method stops if the residual is at most `shots.closed` or, if greater, the limit from
     `_CLOSED`. It also stops if the residual no longer halves, or after `shots.count` integrations
-    (half as many more if the steps were halved). Once the Newton step is small, the solver steps
-    are kept, with step ends added at kinks. Φ is then smooth and closes to rounding, and its
-    derivative is as accurate as the motion.
+    (half as many more if the steps were halved). If the orbit is still open then, nothing is
+    raised: the result is that of the last integration.
+
+    Once the Newton step is small, the solver steps are kept, with step ends added at kinks. Φ is
+    then smooth and closes to rounding, and its derivative is as accurate as the motion.
     """
     count, dtype = state.shape[0], state.dtype
     tolerance = shots.integrator.tolerance(dtype)

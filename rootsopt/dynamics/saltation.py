@@ -19,7 +19,7 @@ from rootsopt.dynamics.pair import FlankForce
 
 LONGEST = 4e-6
 """Length of a step (mesh periods) above which the step is not checked for a jump. The short steps
-around changes (`rootsopt.dynamics.switches`) are all shorter."""
+around switches (`rootsopt.dynamics.switches`) are all shorter."""
 _FASTER = 20.0
 """Rate of change of a lever (pitch radii per mesh period) above which the change counts as a jump.
 Along a flank of the EE family the rate is at most 2π, for any number of lobes."""

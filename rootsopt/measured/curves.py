@@ -40,8 +40,8 @@ _KEY = "`profile.outline_file`"
 _UNEVEN = "remove points that are much closer together than others"
 _CUSP, _SPARED = 2e-2, 2
 """`_CUSP`: speed |z′| (fraction of the mean speed) below which the end of a piece is a cusp.
-`_SPARED`: number of knot intervals next to a cusp that are not sampled. Slower points next to a
-cusp are not sampled either."""
+`_SPARED`: number of knot intervals next to a cusp that are not sampled. Beyond these, points are
+not sampled either until the speed exceeds the limit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +145,9 @@ def through(
     points. Points at which the curvature of the polygon through the points jumps are also joints.
     If `smoothing` is greater than 0, the curve is a single quintic spline and `joints` is ignored.
 
-    Raises `InputError` if the points are too few or scattered, or if `smoothing` is too small.
+    Raises `InputError` if the points are too few or, without smoothing, too scattered; if
+    `smoothing` is so small that the spline would follow the noise; or if a spline cannot be
+    computed.
     """
     if len(points) < 8:
         raise InputError(

@@ -16,7 +16,8 @@ from rootsopt.measured.loop import Loop, place, signed_area
 TOGETHER = 1e-3
 """Distance (mm) below which two ends of entities share a vertex."""
 _CROWDED = 50
-"""Mean number of other ends closer than `TOGETHER` to an end above which a drawing is rejected."""
+"""Mean number of other points within `TOGETHER` of a point, above which a drawing is rejected. The
+points are the ends of all chains, or those of `_quarters`. Points at the same place count once."""
 
 
 def joined(chains: list[Loop], layer: str, name: str) -> Loop:
@@ -88,7 +89,7 @@ def _where(chains: list[Loop], which: NDArray) -> list[Loop]:
 def _closing(joints: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the mask of a closed chain's joints without its last point, which repeats the first.
 
-    The first point is a joint if either of the two is."""
+    The first point becomes a joint if it or the last point is one."""
     joints = joints.copy()
     joints[0] |= joints[-1]
     return joints[:-1]
@@ -217,11 +218,13 @@ def _walked(
 def _widest_gap(
     ends: NDArray[np.complex128], vertex: NDArray[np.intp], links: NDArray[np.intp]
 ) -> tuple[float, complex]:
-    """Return (largest distance (mm) from a dead end to the nearest other dead end, its point).
+    """Return (gap (mm), point (mm)): the widest gap between dead ends, and the dead end from which
+    it is measured.
 
     `ends`, `vertex` (n, 2): points (mm) and vertices at each chain's ends; `links`: indices of the
-    chains that count. The point is that of the dead end from which this distance is measured. With
-    fewer than two dead ends, the distance is 0."""
+    chains that count. A dead end is an end of these chains that shares its vertex with no other.
+    Its gap is the distance to the nearest other dead end. With fewer than two dead ends, the gap is
+    0 and the point is the first of `ends`."""
     places = ends[links].ravel()
     numbers = vertex[links].ravel()
     single = np.flatnonzero(np.bincount(numbers)[numbers] == 1)

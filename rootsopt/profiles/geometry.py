@@ -18,8 +18,8 @@ _GRADING = 4.0
 tanh(g).
 
 Powers, hyperbolic tangents and double exponentials with 32 to 96 nodes were compared. The integrand
-was a square root that starts 0.3 to 1e-4 of the length beyond an end. This rule had the least
-error, 1e-13."""
+was a square root whose branch point lies 1e-4 to 0.3 of the length beyond an end. This rule had the
+least error, 1e-13."""
 
 
 class Geometry(eqx.Module):
@@ -41,11 +41,11 @@ class Geometry(eqx.Module):
 
 
 def geometry(profile: Profile) -> Geometry:
-    """Return the `Geometry` of a profile, with area and inertia exact to rounding.
+    """Return the `Geometry` of a profile; area and polar moment of area are exact to rounding.
 
-    Area and inertia follow from Green's theorem on the roll-angle form. With the support function h
-    = P·n and the arc length element dl, dA = h dl / 2 and ∫r² dA = ∫ |P|² h dl / 4 over the
-    outline. For an `Outline`, return the values computed when its file was read.
+    Both follow from Green's theorem on the roll-angle form. With the support function h = P·n and
+    the arc length element dl, dA = h dl / 2 and ∫r² dA = ∫ |P|² h dl / 4 over the outline. For an
+    `Outline`, return the values computed when its file was read.
     """
     if isinstance(profile, Outline):
         return _given(profile)
@@ -119,8 +119,8 @@ def _given(profile: Outline) -> Geometry:
 def flank_nodes(profile: Profile, points: int) -> Float[Array, " n"]:
     """Return normal angles (n,) in rad of about `points` nodes along the addendum of `profile`.
 
-    Every segment end is a node. On each segment, nodes are denser where the arc element is longer,
-    on the addendum or on its conjugate."""
+    Every segment end is a node. On each segment, nodes are denser where the arc length per normal
+    angle is greater, on the addendum or on its conjugate."""
     segments = [s for s in profile.segments() if float(s.stop) > float(s.start)]
     lengths, curves = [], []
     for segment in segments:

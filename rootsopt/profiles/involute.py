@@ -14,13 +14,15 @@ if TYPE_CHECKING:
 
 _ANGLE, _LENGTH, _TIP = "pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg"
 _OVERLENGTH = 0.02
-"""Excess of the involute length u over u_max (fraction of u_max) above which a config is rejected.
-Beyond u_max the roll angle turns back and two points of a flank mesh at once. A node search finds
-no interference (< 1 nm) up to 5 % excess; the paper's printed Table 1 has 1.2 %."""
+"""Excess of the involute length u over u_max = `CIC.longest_involute` (fraction of u_max) above
+which a config is rejected. Beyond u_max the roll angle turns back and two points of a flank mesh at
+once. A node search finds no interference (< 1 nm) up to 5 % excess; the paper's printed Table 1 has
+1.2 %."""
 _CLEAR = 1e-6
 """Excess (pitch radii) of the involute length over its lower limit below which a config is
-rejected. At this limit, the centre of the tip arc reaches the pitch circle. The centre also lies on
-this circle if the involute has its greatest length."""
+rejected. At this limit, the centre of the tip arc lies on the pitch circle, and one of the arc's
+normals is tangent to the circle. With a shorter involute, some of these normals miss the circle:
+their points touch nothing on the other rotor."""
 _LEAST_INVOLUTE = 0.002
 """Involute length (fraction of the longest) below which a config is rejected. A shorter involute
 has no effect, and its length was probably given in metres."""
@@ -49,7 +51,10 @@ def ranges(
 
 
 def check(profile: "ProfileConfig") -> None:
-    """Raise `InputError` if the involute of a `profile` is too short, too long or undercut."""
+    """Raise `InputError` if no valid CIC rotor has the dimensions of `profile`.
+
+    The tip land may be too wide; the involute too short or too long; the radius of the tip arc not
+    positive; or the dedendum undercut."""
     alpha: Any = getattr(profile, _ANGLE)
     length: Any = getattr(profile, _LENGTH)
     tip: Any = getattr(profile, _TIP) or 0.0

@@ -48,7 +48,7 @@ class Outline(Profile):
 
     Beyond its ends, the addendum is continued by its circles of curvature; over the tip, by its
     mirror image. The law of gearing is not assumed: `mate` returns points of the given dedendum.
-    Roll angle and contact distance are those at which each curve's own normals meet the pitch
+    Roll angle and contact distance of a point follow from where its own normal meets the pitch
     circle.
 
     `lobes`: number of lobes N; `pitch_radius`: r (m). `area`, `polar_area_moment`, `outer_radius`,
@@ -87,6 +87,7 @@ class Outline(Profile):
         return self._crown(nu)[1]
 
     def _valley(self, nu):
+        """Return the dedendum's point at the table's parameter `nu` (rad), clamped to the table."""
         return Mate(*self.valley(jnp.clip(nu, self.valley.node[0], self.valley.node[-1])))
 
     def mate(self, nu, support=True):
@@ -111,10 +112,12 @@ class Outline(Profile):
         return False
 
     def _rolled(self, direction, mate):
-        """Return the point with this normal in roll-angle form.
+        """Return, as a `RollPoint`, the point of the outline whose outward normal has the given
+        direction.
 
-        `direction`: direction of the normal (rad); `mate`: lever and support function of the point.
-        For a normal that misses the pitch circle, use the normal's point nearest to the circle."""
+        `direction`: polar angle of the normal (rad) from the lobe's axis; `mate`: lever and support
+        function of the point (`facing` is not used). If the normal misses the pitch circle, the
+        point of the normal nearest to the circle replaces the pitch point."""
         psi = jnp.arccos(jnp.clip(mate.lever / self.pitch_radius, -1.0, 1.0))
         s = mate.support - self.pitch_radius * jnp.sin(psi)
         return RollPoint(direction + psi - jnp.pi / 2, psi, s)

@@ -1,8 +1,9 @@
 """Find the events of a motion, and check the events that a mesh assumes.
 
 An event is an instant at which a flag of the equation (`RotorPair.switches`) changes. The flags are
-evaluated at all Gauss points and on both sides of the end of each element, with a search for the
-contact. Events inside elements are located by bisection.
+evaluated at all Gauss points and on both sides of the end of each element. At each of these
+instants, the contact is found by a search (`SearchContact`), not from a closest approach already
+known (`NearContact`). Events inside elements are located by bisection.
 """
 
 from typing import NamedTuple
@@ -19,8 +20,9 @@ from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.pair import RotorPair
 
 _ASIDE = 2e-7, 0.02
-"""Greatest distance from an element's end at which flags are evaluated: in mesh periods, and as a
-fraction of the shorter of the two adjacent elements. The smaller distance applies."""
+"""Distance from an element's end, before and after it, at which flags are evaluated. The first
+number (mesh periods) or, if that is smaller, the second number times the length of the shorter
+adjacent element."""
 _HALVINGS = 30
 """Number of bisections that locate an event."""
 _SAME = 3e-9
@@ -79,9 +81,10 @@ def ranks(pair: RotorPair) -> list[int]:
     """Return the rank of each margin. If several flags change at one instant, the margin with the
     least rank determines the event.
 
-    Margins that do not depend on the contact come first, since their zeros are known best. The
-    change to the other minimum of the gap next to a cusp comes second, because other flags change
-    with it. The rank -1 marks a flag whose change is not an event by itself."""
+    Margins that do not depend on the contact have rank 0, since their zeros are known best. Rank 1
+    is the change to the other minimum of the gap next to a cusp, because other flags change with
+    it. The rank -1 marks a flag whose change is not an event by itself. All other margins have
+    greater ranks, in their order."""
     assert isinstance(pair.contact, SearchContact)
     nothing = jnp.zeros(())
     law = jax.eval_shape(pair.law.margins, nothing, nothing).shape[0]
@@ -201,7 +204,7 @@ def _merged(times, which, rank):
     group = jnp.cumsum(apart) - 1
     least = jax.ops.segment_min(importance, group, times.shape[0])
     chosen = real & (importance == least[group])
-    # One of each group.
+    # Keep one event of each group.
     first = jnp.cumsum(chosen) - 1
     begun = jax.ops.segment_min(jnp.where(chosen, first, times.shape[0]), group, times.shape[0])
     chosen &= first == begun[group]

@@ -1,4 +1,6 @@
-"""First elements of an orbit, from an integration of the motion near the end of the transient."""
+"""Initial mesh and motion for closing an orbit by collocation.
+
+Both come from an integration over the orbit's period, from the end of the transient."""
 
 import diffrax
 import jax.numpy as jnp
@@ -21,8 +23,9 @@ def seeded(
     """Return the motion from the scaled `state` at φ1 = 0 over `period` mesh periods, and whether
     the solver succeeded.
 
-    `used`: number of elements; `sizes`: sizes of the arrays for elements and for times. Elements
-    are short where the integrator's steps are short."""
+    `used`: number of elements; `sizes`: sizes of the arrays for elements and for times. All
+    elements cover the same number of solver steps, so that they are short where the integrator's
+    steps are short. The mesh has no events, and `Elements.roots` are 0."""
     dtype = state.dtype
     length = period.astype(dtype)
     capacity, room = sizes

@@ -92,7 +92,10 @@ def own_column(elements: Elements, lines: Lines) -> Columns:
 
 
 def condensed(elements: Elements, lines: Lines, columns: Columns) -> Condensed:
-    """Eliminate the slopes of all elements."""
+    """Return the linear equations of all `elements` after elimination of the slopes.
+
+    `lines`: equation linearised along the motion `elements`; `columns`: right-hand sides. In unused
+    blocks of elements, the result is 0."""
     mesh = elements.mesh
     shares = jnp.stack([mesh.left, mesh.right, mesh.lengths], axis=1)
     return in_blocks(_condensed, mesh.used, shares, elements.slopes, lines, columns)
@@ -101,10 +104,11 @@ def condensed(elements: Elements, lines: Lines, columns: Columns) -> Condensed:
 def _condensed(
     shares: Float[Array, "e 3"], own: Float[Array, "e s n"], lines: Lines, columns: Columns
 ) -> Condensed:
-    """Eliminate the slopes of some elements.
+    """Return the linear equations of a block of e elements after elimination of the slopes.
 
     `shares`: start and end of each element as fractions of its interval, and its length (mesh
-    periods); `own`: its slopes."""
+    periods); `own`: its slopes; `lines`, `columns`: linearised equation and right-hand sides of the
+    block."""
     count, points, states = own.shape
     left, right_end, lengths = shares.T
     length = lengths[:, None, None, None]
@@ -114,7 +118,7 @@ def _condensed(
     matrix = jnp.eye(points * states).reshape(points, states, points, states) - (
         length[..., None] * by_state[:, :, :, None] * GAUSS.integral[:, None, :, None]
     )
-    # A longer interval is a longer element: its states move, at the same relative place.
+    # If the interval becomes longer, so does the element, and the states at its Gauss points move.
     stretch = share[:, None, None, None] * jnp.sum(
         by_state * rise[:, :, None], axis=-1, keepdims=True
     )
@@ -156,8 +160,10 @@ def _eliminated(system: Float[Array, "e m c"]) -> Float[Array, "e m k"]:
 
 
 def chained(elements: Elements, lines: Lines, columns: Columns, parts: Condensed) -> Step:
-    """Solve for the changes of the states, slopes and event times; `parts`: result of
-    `condensed`."""
+    """Return the changes of states, slopes and event times that solve the linear equations.
+
+    `elements`: motion along which the equation is linearised; `lines`, `columns`: linearised
+    equation and right-hand sides; `parts`: result of `condensed` for them."""
     mesh = elements.mesh
     states, width = elements.state.shape[1], columns.gap.shape[-1]
     last, fixed = mesh.last, mesh.which[mesh.interval + 1] < 0
@@ -166,10 +172,14 @@ def chained(elements: Elements, lines: Lines, columns: Columns, parts: Condensed
     pushed = jnp.pad(columns.margin, ((0, 0), (states, 0)))
 
     def along(carry, k):
-        """Advance over element k.
+        """Return `carry` for the next element; then, for element k, the first two entries of
+        `carry`, and the shift of the interval's end (0 unless the element is the last of its
+        interval).
 
-        `carry`: change of the state at its start, as a function of the first state and the
-        right-hand sides."""
+        `carry`: change of the state at the start of element k if the interval's end stays;
+        derivative of this change with respect to the shift of that end; shift of the interval's
+        start. Changes and shifts are linear in the change of the first state and in the right-hand
+        sides, with one column for each."""
         now, by_end, begun = carry
         part = rise[k]
         after = jnp.sum(part[:, :states, None] * now, axis=1)

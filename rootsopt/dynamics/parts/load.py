@@ -74,10 +74,10 @@ class GasLoad(Load):
 
     ρ is computed for perfect rolling at φ1; the effect of ε on ρ, of order ε, is neglected.
     Averaged over a turn, the torques on both rotors together equal the displaced volume times Δp /
-    2π. This is exact unless a whole tip arc meshes at one instant (a canonical CIC profile). There
-    ρ jumps, and the jump is spread over the roll angle `_BRIEF`, for two reasons. The real pressure
-    does not jump at a wide gap. Besides, the derivatives of a jump that moves with the design would
-    need separate treatment.
+    2π. This is exact unless a whole tip arc meshes at one instant (as on a CIC profile whose
+    involute has its greatest length). There ρ jumps, and the jump is spread over the roll angle
+    `_BRIEF`, for two reasons. The real pressure does not jump at a wide gap. Besides, the
+    derivatives of a jump that moves with the design would need separate treatment.
 
     `pressure_length` (N/m): pressure difference Δp (Pa) times the rotor's length L (m); `profile`
     of the rotors; `outer_radius` r_a (m); `torque`: mean torque against one rotor (N·m).
@@ -105,6 +105,8 @@ class GasLoad(Load):
         return jnp.abs(phi - pitch * jnp.round(phi / pitch))
 
     def _torque(self, phi, rotor):
+        """Return the torque (N·m) against a rotor at φ1 = `phi` (rad); `rotor`: 1 for rotor 1, -1
+        for rotor 2."""
         profile = self.profile
         half = profile.half_pitch
         roll = self._roll(phi)
@@ -140,7 +142,7 @@ class GasLoad(Load):
         addendum = half - jnp.abs(roll - half)
         ends = [segment.stop for segment in self.profile.segments()[:-1]]
         passed = [self.profile.normal_at(addendum) - end for end in ends]
-        # The ends of a spread jump.
+        # The start and the end of each spread jump.
         for segment in self.profile.segments():
             if not segment.land:
                 begin, end = self.profile.roll_angle(jnp.stack([segment.start, segment.stop]))
@@ -151,7 +153,10 @@ class GasLoad(Load):
 
 
 def _spread_share(addendum, begin, end):
-    """Return how far a jump is passed at the roll angle `addendum`: 0 at its start, 1 at its end.
+    """Return the fraction of a spread jump's roll angle that lies before `addendum`: 0 at its
+    start, 1 at its end.
 
-    The jump is spread over `_BRIEF` around the middle of `begin` and `end` (all in rad)."""
+    The jump is spread over the roll angle `_BRIEF`, centred midway between `begin` and `end`, the
+    roll angles at the ends of a flank segment. `addendum`: roll angle of the addendum point in
+    contact. All angles are in rad. Outside the jump, the fraction is negative or exceeds 1."""
     return (addendum - (begin + end - _BRIEF) / 2) / _BRIEF
