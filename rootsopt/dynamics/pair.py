@@ -412,6 +412,7 @@ class RotorPair(eqx.Module):
                 sliding = _Sliding(point, speed, normal, tangent)
         return _Touch(-gap - self.clearance, closing, roll, approach, sliding)
 
+    @eqx.filter_jit
     def switches(
         self, tau: Float[Array, ""], state: Float[Array, " n"]
     ) -> tuple[Bool[Array, " s"], Bool[Array, " s"]]:
@@ -445,6 +446,7 @@ class RotorPair(eqx.Module):
         flags = jnp.concatenate([flags, *(part.switches(motion, own) for part, own in acting)])
         return flags, jnp.pad(counts, (0, flags.size - counts.size), constant_values=True)
 
+    @eqx.filter_jit
     def margins(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> Margins:
         """Return the `Margins` at rotation `tau` (mesh periods) and scaled `state`."""
         motion, acting = self._moving(tau, state)

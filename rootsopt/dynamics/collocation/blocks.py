@@ -20,15 +20,19 @@ def in_blocks(function: Any, used: Int[Array, ""], *arrays: Any) -> Any:
 
     `function` maps arrays (e, …) of e elements to arrays (e, …); `used`: number of elements in use.
     Blocks without such elements are not evaluated; their results are 0."""
-    shapes = jax.eval_shape(function, *arrays)
     count = jax.tree.leaves(arrays)[0].shape[0]
     size = min(BLOCK, count)
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    function = jax.jit(function)  # so that it is traced once for the shapes and the values
+
+    def sliced(begin):
+        return jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, begin, size), arrays)
+
+    shapes = jax.eval_shape(function, *sliced(0))
+    nothing = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes)
 
     def block(number, found):
         begin = number * size
-        part = jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, begin, size), arrays)
-        new = function(*part)
+        new = function(*sliced(begin))
         return jax.tree.map(
             lambda old, x: lax.dynamic_update_slice_in_dim(old, x, begin, 0), found, new
         )

@@ -7,6 +7,7 @@ parameters, and elements move with the events. Therefore no kink or jump crosses
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -132,6 +133,7 @@ def located_peak(equation: Equation, elements: Elements, force: Float[Array, "e 
     return Peak(rivals[top], share[top], roots[top], best[top])
 
 
+@eqx.filter_jit
 def response(equation: Equation, elements: Elements, force: Any, tangents: Any) -> Found:
     """Return the forces of the closed orbit `elements` and their derivatives.
 
