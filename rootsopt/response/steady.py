@@ -263,7 +263,8 @@ def _once(scene, design, start, numbers):
     dynamic, static = eqx.partition((scene, design, start), eqx.is_array)
 
     def solve(dynamic):
-        return _solve(*eqx.combine(dynamic, static), numbers)
+        scene, design, start = eqx.combine(dynamic, static)
+        return _solve(scene, design, start, numbers)
 
     # On a CPU, the motions of a batch are computed one by one. As arrays, all of them would take
     # as many steps as the longest, and both branches of every condition: 20 times longer.
