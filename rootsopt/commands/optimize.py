@@ -33,6 +33,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
     from rootsopt import export
     from rootsopt.commands import cli
+    from rootsopt.optimize.checkpoint import aside
     from rootsopt.output import tables
     from rootsopt.runtime.timing import CompileClock
     from rootsopt.scene import check_geometry
@@ -54,7 +55,8 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
             raise
     checkpoint.close(remove=checkpoint.empty)
     if not stop.is_set():  # A stopped search can go on later.
-        folder.remove_afterwards(checkpoint.path)
+        for file in (checkpoint.path, aside(checkpoint.path)):
+            folder.remove_afterwards(file)
     if result is None:
         return _nothing_known(config, folder)
     if result.infeasible is not None:
@@ -100,7 +102,7 @@ def _checkpoint(config: "Config", options: "argparse.Namespace", folder: "RunFol
     """Return the checkpoint file of this run, beside the result folder.
 
     With the option `--resume`, it contains the evaluations of the interrupted run. Without it, an
-    existing checkpoint is moved aside until this run is in place."""
+    existing checkpoint is moved aside until a run has ended."""
     from rootsopt.optimize.checkpoint import Checkpoint, set_aside
     from rootsopt.output import files
     from rootsopt.runtime.environment import say
@@ -108,11 +110,10 @@ def _checkpoint(config: "Config", options: "argparse.Namespace", folder: "RunFol
     path = folder.checkpoint
     older = None if options.resume else set_aside(path)
     if older is not None:
-        folder.remove_afterwards(older)
         say(
             f"an interrupted run has left a checkpoint, which is now {str(older)!r} and goes when "
-            f"this run is done; to go on with that run instead, stop this one, move the file back "
-            f"to {path.name!r}, and add `--resume`"
+            f"this run has ended; to go on with the interrupted run, stop this one, move the file "
+            f"back to {path.name!r}, and add `--resume`"
         )
     header = {"config": config.model_dump(mode="json"), "versions": files.versions()}
     return Checkpoint(path, header, options.resume)

@@ -140,14 +140,17 @@ class Checkpoint:
             self.path.unlink(missing_ok=True)
 
 
-def set_aside(path: Path) -> Path | None:
-    """Rename the checkpoint `path` of an interrupted run, and return its new path.
+def aside(path: Path) -> Path:
+    """Return the path to which `set_aside` moves the checkpoint `path`."""
+    return path.with_name(path.name + ".old")
 
-    The new name ends in `.old`; an older file of that name is replaced. Return `None` if there is
-    no checkpoint. Raises `OSError` if the file cannot be renamed."""
-    if not path.is_file():
-        return None
-    return path.replace(path.with_name(path.name + ".old"))
+
+def set_aside(path: Path) -> Path | None:
+    """Move the checkpoint `path` of an interrupted run to `aside(path)`, and return that path.
+
+    An older file of that name is replaced. Return `None` if there is no checkpoint. Raises
+    `OSError` if the file cannot be moved."""
+    return path.replace(aside(path)) if path.is_file() else None
 
 
 def _item(value: Any) -> Any:
@@ -200,4 +203,4 @@ def _evaluation(found: Mapping[str, Any]) -> Evaluation:
     return SpeedsEvaluation(**values, parts=every)
 
 
-__all__ = ["Checkpoint", "set_aside"]
+__all__ = ["Checkpoint", "aside", "set_aside"]

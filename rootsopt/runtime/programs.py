@@ -232,12 +232,17 @@ def _outline(leaf: Any) -> Any:
 def _split(args: tuple) -> tuple[list, _Kind]:
     """Return (list of the arrays in `args`, kind of `args`)."""
     leaves, tree = jax.tree.flatten(args)
-    shapes = tuple(
-        (x.shape, str(jax.dtypes.canonicalize_dtype(x.dtype))) if _is_array(x) else None
-        for x in leaves
-    )
+    wide = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    shapes = tuple((x.shape, _precision(x.dtype, wide)) if _is_array(x) else None for x in leaves)
     others = tuple((type(x), x) for x in leaves if not _is_array(x))
     return [x for x in leaves if _is_array(x)], _Kind(tree, shapes, others)
+
+
+@functools.cache
+def _precision(dtype: Any, wide: bool) -> str:
+    """Return the name of the type that JAX uses for `dtype`; `wide`: whether it allows 64 bits."""
+    del wide
+    return str(jax.dtypes.canonicalize_dtype(dtype))
 
 
 def _finished(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
