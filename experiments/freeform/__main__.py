@@ -23,6 +23,8 @@ def body(run: Run) -> int:
     for name, row in found["designs"].items():
         print(f"{name:10s}", *(f"{key} {value:.5g}" for key, value in row.items()))
     print(f"{found['evaluations']} designs, {found['departure_um']:.1f} um from the best CIC")
+    if found["optimality"]:
+        print("search: {reason}, residual {residual:.2g}".format(**found["optimality"]))
     for row in found["resembles"]:
         print(f"{row['family']:18s} {row['departure_um']:8.1f} um  {row['design']}")
     return OK

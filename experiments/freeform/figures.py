@@ -35,8 +35,8 @@ def comparison(results: Results) -> Figure:
     axes[0, 1].set_title("Pressure angle")
     axes[1, 0].set(xlabel="normal angle ν (°)", ylabel="share τ = -dψ/dν")
     axes[1, 0].set_title("The share τ that the coefficients set")
-    axes[1, 1].set(xlabel="radius (mm)", ylabel="normal distance from the best CIC (µm)")
-    axes[1, 1].set_title("Departure, positive outwards")
+    axes[1, 1].set(xlabel="radius (mm)", ylabel="normal distance (µm)")
+    axes[1, 1].set_title("Departure from the best CIC, positive outwards")
     for ax in axes.ravel():
         grid_below(ax)
     handles, names = axes[0, 0].get_legend_handles_labels()

@@ -83,6 +83,7 @@ def run(quick: bool, config: str = CONFIG) -> Results:
             for name, one in designs.items()
         },
         "evaluations": len(result.history),
+        "optimality": {} if result.optimality is None else result.optimality.record(),
         "departure_um": departure(found, start) / UM,
         "resembles": [] if quick else [one.record() for one in likenesses(found)],
     }
