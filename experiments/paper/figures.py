@@ -49,6 +49,7 @@ def uniqueness_figure(alone: list[Row], solved: list[Row]) -> Figure:
         ax.set(
             xlabel="change of the quantity (%)", title=title, yscale="log", ylim=(LOWEST, HIGHEST)
         )
+        ax.yaxis.set_major_formatter("{x:g}")
         grid_below(ax)
     axes[0, 0].set_ylabel("largest error of the four forces (%)")
     axes[0, -1].legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
@@ -68,6 +69,7 @@ def search_figure(found: Found) -> Figure:
                     label=label, rasterized=True)  # fmt: skip
         ax.axhline(10, color="black", linestyle="--", linewidth=1)
         ax.set(xlabel=quantity.label, yscale="log", ylim=(1, 300))
+        ax.yaxis.set_major_formatter("{x:g}")
         if quantity.logarithmic:
             ax.set_xscale("log")
             ax.xaxis.set_minor_formatter(NullFormatter())
