@@ -301,7 +301,7 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
 def _progress(console) -> Iterator:
     """Yield a function (done, expected, best objective) that updates a progress bar.
 
-    Yield `None` if the console is not a terminal: then there is no progress bar."""
+    Yield `None` if the console is not a terminal, where no progress bar is shown."""
     if not console.is_terminal:
         yield None
         return

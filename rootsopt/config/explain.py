@@ -123,7 +123,7 @@ def _allowed(kind: str, value: Any, context: dict, message: str, field: FieldInf
 
 
 def _advice(place: list, kind: str, value: Any, field: FieldInfo | None) -> str:
-    """Return a guess at what the user meant, as the end of a message; "" if there is none."""
+    """Return a guess at what the user meant, as the end of a message; "" without a guess."""
     if field is None:
         return ""
     if kind in ("greater_than_equal", "less_than_equal", "less_than") and _is_number(value):

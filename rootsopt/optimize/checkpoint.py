@@ -40,7 +40,7 @@ class Checkpoint:
     mappings of plain values. `resume`: whether to reuse the evaluations in the file; otherwise,
     start a new file.
 
-    With `resume`, raises `InputError` if there is no file or if its header differs from `header`.
+    With `resume`, raises `InputError` if the file does not exist or has another header.
     Raises `OSError` if the file cannot be opened for writing."""
 
     def __init__(self, path: Path, header: Mapping[str, Any], resume: bool = False):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rootsopt.config import load
+from rootsopt.dynamics.parts import Motion
 from rootsopt.scene import Scene, design_vector, outline_mm
 from tests.scene.test_scene import pair_of
 
@@ -82,3 +83,23 @@ def test_gas_torque_has_no_jump_and_its_derivative_is_that_of_differences(length
         # Where pieces meet the difference straddles a kink.
         off = abs(found - expected) > 1e-5 * np.max(abs(expected))
         assert np.mean(off) < 0.002
+
+
+@pytest.mark.parametrize("length", [8.89, 9.0])
+def test_steps_end_where_a_spread_jump_begins_and_ends(length):
+    """Wherever the slope of the torque bends, a flag changes. The bends come from the torque."""
+    config = load("configs/cic.yaml", [*GAS, f"profile.involute_length_mm={length}"])
+    pair = eqx.filter_jit(Scene.pair)(Scene.from_config(config), design_vector(config))
+    phi = jnp.linspace(0.02, 1.02, 10001)
+
+    def flags(phi):
+        still = jnp.zeros(())
+        return pair.load.switches(Motion(phi, still, still, jnp.ones(())), None)
+
+    bend = np.asarray(jax.jit(jax.vmap(jax.grad(jax.grad(pair.load.torque2))))(phi))
+    changed = np.any(np.diff(np.asarray(jax.jit(jax.vmap(flags))(phi)), axis=0), axis=1)
+    # The ramp over 0.01 rad bends a hundred times more than the smooth torque beside it.
+    jumps = np.flatnonzero(abs(np.diff(bend)) > 0.3 * np.max(abs(bend)))
+    assert len(jumps) >= 2
+    places = np.flatnonzero(changed)
+    assert all(np.min(abs(places - jump)) <= 1 for jump in jumps)

@@ -5,10 +5,12 @@ import json
 import numpy as np
 import pytest
 
+from rootsopt.commands import optimize as command
 from rootsopt.config import parse
 from rootsopt.errors import InputError
 from rootsopt.optimize.checkpoint import Checkpoint, set_aside
 from rootsopt.optimize.search import Search
+from rootsopt.output.runs import RunFolder
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.status import Status
 
@@ -70,6 +72,30 @@ def test_a_run_that_does_not_resume_keeps_the_older_checkpoint(tmp_path):
     assert not path.exists()
     older.rename(path)
     Checkpoint(path, HEADER, resume=True).close()
+
+
+def test_the_command_keeps_its_checkpoint_until_the_run_is_in_place(tmp_path, monkeypatch):
+    """A kill while files are written must not lose the search; nor must a run that is given up."""
+    kept, older = (tmp_path / f".run.checkpoint{end}" for end in ("", ".old"))
+    kept.write_text("of an earlier run")
+
+    def searched(config, progress, stop, checkpoint):
+        checkpoint.add((0, 0), np.zeros(1), evaluation(0.1))
+        return config, {}, None
+
+    def given_up(self):
+        raise InputError("no space")
+
+    put = RunFolder.put_in_place
+    monkeypatch.setattr(command, "_searched", searched)
+    monkeypatch.setattr(RunFolder, "put_in_place", given_up)
+    arguments = ["configs/cic.yaml", "-o", str(tmp_path / "run")]
+    assert command.main(arguments) == 2
+    assert older.read_text() == "of an earlier run"
+    assert kept.exists()
+    monkeypatch.setattr(RunFolder, "put_in_place", put)
+    command.main([*arguments, "--resume"])
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 def test_other_configs_and_missing_files_are_refused(tmp_path):

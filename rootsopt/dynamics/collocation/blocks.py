@@ -22,7 +22,7 @@ def in_blocks(function: Any, used: Int[Array, ""], *arrays: Any) -> Any:
     Blocks without such elements are not evaluated; their results are 0."""
     count = jax.tree.leaves(arrays)[0].shape[0]
     size = min(BLOCK, count)
-    function = jax.jit(function)  # so that it is traced once for the shapes and the values
+    function = jax.jit(function)  # traced once, for shapes and values
 
     def sliced(begin):
         return jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, begin, size), arrays)

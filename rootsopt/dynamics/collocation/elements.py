@@ -1,4 +1,4 @@
-"""A motion as polynomials on elements, some of which end at events.
+"""A motion as polynomials on elements. Every event is the end of an element.
 
 Events are instants at which the equation of motion is not smooth. They divide the period into
 *intervals*. Each interval consists of one or more elements, at fixed fractions of its length. All

@@ -20,7 +20,7 @@ def shared(
     used: Int[Array, ""],
     capacity: int,
 ) -> Mesh:
-    """Return a mesh of `used` elements, some of which end at events.
+    """Return a mesh of `used` elements, with element ends at the events.
 
     `times`, `which` (m,): as in `Mesh`; `events`: number of events; `density`: times (p,) in mesh
     periods, and desired number of elements up to each time (p,), in any unit; `capacity`: size of
@@ -110,7 +110,7 @@ def aligned(
     density: tuple[Float[Array, " p"], Float[Array, " p"]],
     used: Int[Array, ""],
 ) -> Elements:
-    """Return the motion `elements` on a mesh of `used` elements, some of which end at `events`.
+    """Return the motion `elements` on a mesh of `used` elements, with ends at the `events`.
 
     `events`: times (mesh periods; inf beyond the last), and indices of their margins; `density`: as
     for `shared`. The mesh also has an element end at φ1 = 0. A motion whose mesh starts at φ1 = 0
