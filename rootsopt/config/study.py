@@ -10,6 +10,9 @@ from rootsopt.config.units import hint
 from rootsopt.config.words import shown
 
 _Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
+_NODES_RTOL = 3e-5
+"""Default tolerance for fidelity `nodes`. Its force has a step at every node, which needs many
+solver steps at finer tolerances, and limits the accuracy of forces to about 1e-3."""
 _LEAST_WEIGHT = 1e-6
 """Sum of all weights below which an objective is rejected as empty."""
 _MOST_LINES = 32
@@ -47,10 +50,12 @@ class SolverConfig(Section):
     rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] = Field(
         1e-8,
         description="tolerance on the orbit and its statistics; refined where the orbit does not "
-        "close",
+        f"close; {_NODES_RTOL:g} by default for fidelity nodes",
     )
     transient_rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] = Field(
-        1e-7, description="tolerance during the transient"
+        1e-7,
+        description=f"tolerance during the transient; {_NODES_RTOL:g} by default for fidelity "
+        "nodes",
     )
     max_steps_per_period: Annotated[int, Field(ge=64, le=10**6)] = Field(
         4096, description="solver steps allowed per mesh period"
@@ -72,6 +77,13 @@ class SolverConfig(Section):
     precision: Literal["float64", "float32"] = Field(
         "float64", description="of the integration; float32 reaches tolerances down to 2e-6"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _coarse_nodes(cls, data):
+        if isinstance(data, dict) and data.get("fidelity") == "nodes":
+            return {"rtol": _NODES_RTOL, "transient_rtol": _NODES_RTOL} | data
+        return data
 
 
 class ObjectiveConfig(Section):

@@ -11,17 +11,28 @@ from rootsopt.contact.point import ContactPoint
 from rootsopt.errors import InputError
 
 
+class Edges(NamedTuple):
+    """Distance of a pose from the roll coordinates at which a gap jumps.
+
+    `distance` (rad): continuous, with a kink at every jump of the gap, for example the sum of the
+    distances from all of them; `by_roll`: its derivative with respect to x."""
+
+    distance: Float[Array, ""]
+    by_roll: Float[Array, ""]
+
+
 class Approach(NamedTuple):
     """Gap and levers of two flanks at a pose.
 
     `gap`: gap (m), negative when the flanks penetrate; `lever1`, `lever2`: levers (m) of rotor 1
     and rotor 2; `place`: further result of the contact that its `point` and `switches` use, or
-    `None`."""
+    `None`; `edges`: see `Edges`, for a contact whose gap jumps, or `None`."""
 
     gap: Float[Array, ""]
     lever1: Float[Array, ""]
     lever2: Float[Array, ""]
     place: Any = None
+    edges: Edges | None = None
 
 
 class Contact(eqx.Module):
@@ -46,14 +57,17 @@ class Contact(eqx.Module):
 
     @property
     def smooth(self) -> bool:
-        """Whether gap and levers are smooth wherever no flag of `switches` changes."""
+        """Whether gap and levers are smooth wherever no flag of `switches` changes.
+
+        If they are not, forces have no derivatives: these are NaN."""
         return True
 
     @property
     def jumps(self) -> bool:
         """Whether levers may jump where a flag of `switches` changes.
 
-        A contact with jumps needs a `length_scale`."""
+        A contact with jumps needs a `lever_scale`. If the gap itself jumps as well, `approach`
+        must also return `Edges`."""
         return False
 
     @property
@@ -67,9 +81,14 @@ class Contact(eqx.Module):
     def length_scale(self) -> Float[Array, ""] | None:
         """Length (m) from which the rounding error of the gap follows: about the pitch radius.
 
-        The gap's error is the rounding error of a number of this size. The levers have about the
-        same size. `None`: the gap's rounding error is negligible."""
+        The gap's error is the rounding error of a number of this size. `None`: the gap's rounding
+        error is negligible."""
         return None
+
+    @property
+    def lever_scale(self) -> Float[Array, ""] | None:
+        """Typical size of the levers (m); by default, `length_scale`."""
+        return self.length_scale
 
     @property
     def center_distance(self) -> Float[Array, ""]:

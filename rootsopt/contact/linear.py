@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from rootsopt.contact.gap import Contact
+from rootsopt.contact.gap import Approach, Contact, Edges
 from rootsopt.profiles.base import Profile
 
 
@@ -29,9 +29,13 @@ class LinearContact(Contact):
     profile: Profile
 
     @property
-    def smooth(self) -> bool:
-        """False: the levers jump without a change of `switches`."""
-        return False
+    def jumps(self) -> bool:
+        """True: gap and levers jump where contact begins or ends, or an arc meshes at once."""
+        return True
+
+    @property
+    def lever_scale(self) -> Float[Array, ""]:
+        return self.profile.pitch_radius
 
     @classmethod
     def of(cls, profile: Profile) -> "LinearContact":
@@ -47,15 +51,15 @@ class LinearContact(Contact):
         land). Before that point, there is no contact: the gap is the pitch radius and the levers
         are zero. The penetration starts at zero, unless the whole tip arc meshes at once.
         """
+        return self.approach(roll, relative)[:3]
+
+    def approach(self, roll, relative) -> Approach:
         profile = self.profile
-        half = profile.half_pitch
-        centered = roll - half
-        centered = centered - 4 * half * jnp.round(centered / (4 * half))
+        folded, mirrored = _folded(profile, roll)
         # Beyond the pitch crossing the rotors are exchanged; the lever, r cos ψ, is even.
-        mirror = jnp.where(centered > 0, -1.0, 1.0)
-        folded = half - jnp.abs(centered)
-        first = profile.segments()[0]
-        touching = profile.normal_at(folded) > (first.stop if first.land else first.start)
+        mirror = jnp.where(mirrored, -1.0, 1.0)
+        normal = profile.normal_at(folded)
+        touching = normal > _first(profile)
 
         def arm(x):
             return profile.lever(profile.normal_at(x))
@@ -64,8 +68,34 @@ class LinearContact(Contact):
         # φ̄ = -x: ∂G/∂φ1 = -∂G/∂x / 2 - ∂G/∂ε = -lever1, ∂G/∂φ2 = lever2.
         by_roll = mirror * slope * relative
         zero = jnp.zeros_like(lever)
-        return (
-            jnp.where(touching, lever * relative, lax.stop_gradient(profile.pitch_radius)),
-            jnp.where(touching, lever + by_roll / 2, zero),
-            jnp.where(touching, lever - by_roll / 2, zero),
+        # The gap may jump at the ends of segments and, slightly, at the pitch crossing.
+        ends = [end for segment in profile.segments() for end in (segment.start, segment.stop)]
+        places = profile.roll_angle(jnp.stack(ends)).at[-1].set(profile.half_pitch)
+        apart = folded - places
+        return Approach(
+            gap=jnp.where(touching, lever * relative, lax.stop_gradient(profile.pitch_radius)),
+            lever1=jnp.where(touching, lever + by_roll / 2, zero),
+            lever2=jnp.where(touching, lever - by_roll / 2, zero),
+            place=normal,
+            edges=Edges(jnp.sum(jnp.abs(apart)), mirror * jnp.sum(jnp.sign(apart))),
         )
+
+    def switches(self, roll, approach: Approach):
+        normal, profile = approach.place, lax.stop_gradient(self.profile)
+        ends = jnp.stack([_first(profile), *(one.stop for one in profile.segments()[:-1])])
+        return jnp.append(normal > ends, _folded(profile, roll)[1])
+
+
+def _folded(profile: Profile, roll: Float[Array, ""]):
+    """Return (x (rad) in the half of the mesh before the pitch crossing, whether the rotors are
+    exchanged), from any x = `roll` (rad)."""
+    half = profile.half_pitch
+    centered = roll - half
+    centered = centered - 4 * half * jnp.round(centered / (4 * half))
+    return half - jnp.abs(centered), centered > 0
+
+
+def _first(profile: Profile) -> Float[Array, ""]:
+    """Return the normal angle (rad) of the first point of a flank that can carry torque."""
+    first = profile.segments()[0]
+    return first.stop if first.land else first.start

@@ -174,11 +174,11 @@ class Equation(eqx.Module):
             rates = pair.lapse(y[: self.states]) * jnp.append(rates, jnp.ones_like(self.force_unit))
         return jnp.concatenate([slope, rates, *([marks(contact)] if marked else [])])
 
-    def advanced(self, begin, end, y, dynamic) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    def advanced(self, begin, end, y, dynamic) -> tuple[Float[Array, " m"], Float[Array, " rows"]]:
         """Return y, and its derivative dy/dτ, after one step from `begin` to `end` (mesh periods).
 
-        The derivatives of y with respect to state and parameters account for the moving instants of
-        jumps."""
+        The derivative is followed by the `marks` if the contact may jump. The derivatives of y with
+        respect to state and parameters account for the moving instants of jumps."""
         pair = eqx.combine(dynamic, self.static)
         term = diffrax.ODETerm(functools.partial(self.derivative, marked=pair.jumps))
         if not pair.jumps:
@@ -187,16 +187,18 @@ class Equation(eqx.Module):
         marked = jnp.pad(y, (0, MARKS))
         after, slopes = one_step(self.solver, term, begin, end, marked, dynamic)
         period = pair.mesh_period * (pair.lapse(y[: self.states]) if pair.free else 1.0)
-        moved = saltation(end - begin, slopes, period, pair.contact.length_scale)
-        return after[:-MARKS] + moved, slopes[-1, :-MARKS]
+        moved = saltation(end - begin, slopes, period, pair.contact.lever_scale)
+        return after[:-MARKS] + moved, slopes[-1]
 
     def with_force(self, begin, end, y, dynamic) -> Float[Array, " rows"]:
-        """Return y after one step from `begin` to `end` (mesh periods), and the contact force
-        (`force_unit`) there."""
+        """Return y after one step from `begin` to `end` (mesh periods), then the first of the
+        `marks` if the contact may jump, then the contact force (`force_unit`)."""
         after, slope = self.advanced(begin, end, y, dynamic)
-        free = eqx.combine(dynamic, self.static).free
+        pair = eqx.combine(dynamic, self.static)
         force = slope[self.states]
-        return jnp.append(after, force / slope[-1] if free else force)
+        last = y.shape[0]
+        force = force / slope[last - 1] if pair.free else force
+        return jnp.concatenate([after, slope[last : last + pair.jumps], force[None]])
 
 
 class _Recorded(NamedTuple):
@@ -421,15 +423,16 @@ def _peak_force(
 ) -> Float[Array, ""]:
     """Return the peak force (in `force_unit`), differentiable in reverse mode."""
     begin, y = taken.begins[peak.holds], taken.before[peak.holds]
-    there = equation.with_force(begin, peak.time, y, dynamic)[:-1]
+    size = y.shape[0]
+    there = equation.with_force(begin, peak.time, y, dynamic)[:size]
 
-    def force_beside(side):
-        return equation.with_force(peak.time, peak.time + side, there, dynamic)[-1]
+    def beside(side):
+        return equation.with_force(peak.time, peak.time + side, there, dynamic)[size:]
 
-    forces = jax.vmap(force_beside)(peak.beside)
-    frozen = lax.stop_gradient(forces)
+    found = jax.vmap(beside)(peak.beside)
+    frozen = lax.stop_gradient(found)
     value, weights = one_sided(frozen, peak.noise)
-    return value + jnp.dot(weights, forces - frozen)
+    return value + jnp.sum(weights * (found - frozen))
 
 
 def _linearized(
@@ -458,6 +461,6 @@ def _linearized(
     columns = count + jax.tree.leaves(moved)[0].shape[0]
     unit = jnp.eye(size, columns, dtype=taken.end.dtype).at[count:].set(0.0)
     along, there, beside = propagated(linear_step, unit, taken.last, peak.holds, sides)
-    slopes = jax.vmap(Linear.after, (0, None))(beside, there)[:, -1]
-    value, weights = one_sided(beside.value[:, -1], peak.noise)
-    return along, value, weights @ slopes
+    slopes = jax.vmap(Linear.after, (0, None))(beside, there)[:, size:]
+    value, weights = one_sided(beside.value[:, size:], peak.noise)
+    return along, value, jnp.tensordot(weights, slopes)

@@ -254,7 +254,7 @@ def _differentiated(
         found = linearized(
             lambda y, dynamic: equation.with_force(begin, end, y, dynamic), y, dynamic, moved, count
         )
-        rows = jnp.append(jnp.arange(count), found.value.shape[0] - 1)
+        rows = jnp.append(jnp.arange(count), jnp.arange(y.shape[0], found.value.shape[0]))
         return jax.tree.map(lambda x: x[rows], _Pieces(*found))
 
     # One loop linearises the steps of the orbit, then those up to the maxima, then those beside
@@ -297,10 +297,10 @@ def _differentiated(
     along = _along(kept, orbit.moved, taken)[holds]
     there = _after(reached, along)[:, :count]
     every = jnp.repeat(there, sides.shape[0], axis=0)
-    slopes = _after(near, every)[:, -1].reshape(times.shape[0], sides.shape[0], -1)
-    forces = near.value[:, -1].reshape(times.shape[0], sides.shape[0])
-    values, weights = jax.vmap(one_sided, (0, None))(forces, noise)
-    return unit * values, unit * jnp.einsum("ks,ksd->kd", weights, slopes)
+    shape = times.shape[0], sides.shape[0], near.value.shape[1] - count
+    slopes = _after(near, every)[:, count:].reshape(*shape, -1)
+    values, weights = jax.vmap(one_sided, (0, None))(near.value[:, count:].reshape(shape), noise)
+    return unit * values, unit * jnp.einsum("ksf,ksfd->kd", weights, slopes)
 
 
 def _after(pieces: _Pieces, before: Float[Array, "jobs n d"]) -> Float[Array, "jobs rows d"]:

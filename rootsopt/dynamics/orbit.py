@@ -379,6 +379,9 @@ def orbit_or_window(
     (half as many more if the steps were halved). If the orbit is still open then, nothing is
     raised: the result is that of the last integration.
 
+    If the pair is not `smooth`, the linearised steps miss how its jumps move, so that derivatives
+    with respect to the design are NaN.
+
     Once the Newton step is small, the solver steps are kept, with step ends added at kinks. Φ is
     then smooth and closes to rounding, and its derivative is as accurate as the motion.
     """
@@ -410,6 +413,8 @@ def orbit_or_window(
     orbit = found.orbit
     slope = orbit.flow.slope
     moved = solved(jnp.eye(count, dtype=dtype) - orbit.monodromy, slope[:count, count:])
+    if not pair.smooth:
+        moved = jnp.full_like(moved, jnp.nan)  # All derivatives by parameters become NaN.
     return orbit._replace(
         multiplier=spectral_radius(orbit.monodromy),
         response=orbit.flow.response,

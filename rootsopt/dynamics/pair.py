@@ -47,7 +47,8 @@ class FlankForce(NamedTuple):
     gap); `closing`: rate of `depth` (m/s); `lever1`, `lever2`: levers (m) of the deeper flank;
     `torque1`, `torque2`: contact torques (N·m) on the rotors, each positive in its rotor's sense of
     rotation; `push`: contact force (N) on rotor 2 in x and y, None if no part lets the axes move.
-    The force on rotor 1 is equal and opposite.
+    The force on rotor 1 is equal and opposite. `edges`: distance (rad) of the pose from the jumps
+    of the gap (see `Edges`) and its rate (rad/s), None for a contact whose gap is continuous.
     """
 
     drive: Float[Array, "*n"]
@@ -59,6 +60,7 @@ class FlankForce(NamedTuple):
     torque1: Float[Array, "*n"]
     torque2: Float[Array, "*n"]
     push: Float[Array, "*n 2"] | None = None
+    edges: Float[Array, "*n 2"] | None = None
 
     @property
     def total(self) -> Float[Array, "*n"]:
@@ -348,7 +350,7 @@ class RotorPair(eqx.Module):
         The field `drive` holds the normal force on either side; `coast` is zero."""
         touch = self._touch(side, motion)
         force = self.law(touch.depth, touch.closing)
-        _, lever1, lever2, _ = touch.approach
+        lever1, lever2 = touch.approach.lever1, touch.approach.lever2
         forward, sliding = side * force, touch.sliding
         torque1, torque2 = -lever1 * forward, lever2 * forward
         push = None
@@ -362,6 +364,10 @@ class RotorPair(eqx.Module):
             torque2 += side * drag * sliding.point.support2
             if push is not None and sliding.tangent is not None:
                 push += drag * sliding.tangent
+        edges = touch.approach.edges
+        if edges is not None:
+            turning = -side * (motion.speed + motion.rate / 2)
+            edges = jnp.stack([edges.distance, edges.by_roll * turning])
         return FlankForce(
             drive=force,
             coast=jnp.zeros_like(force),
@@ -372,6 +378,7 @@ class RotorPair(eqx.Module):
             torque1=torque1,
             torque2=torque2,
             push=push,
+            edges=edges,
         )
 
     def _touch(self, side: Float[Array, ""], motion: Motion) -> _Touch:
@@ -391,7 +398,7 @@ class RotorPair(eqx.Module):
             contact = contact.at_distance(jnp.hypot(*line))
         roll, turned = -side * (motion.phi + motion.relative / 2), side * relative
         approach = contact.approach(roll, turned)
-        gap, lever1, lever2, _ = approach
+        gap, lever1, lever2 = approach[:3]
         other = motion.speed + motion.rate
         closing = side * (lever1 * motion.speed - lever2 * other)
         sliding = None

@@ -36,6 +36,8 @@ counts as curvature, not as noise. The forces next to a smooth peak may also sca
 _LEAST = 1e-9
 """Fall of the force on both sides of a peak together, relative to the peak, below which the peak
 does not count as a corner. The fall may then be rounding."""
+_KINK = 1e-3
+"""Relative change of a mark's rate at a jump below which the mark does not show the jump."""
 
 
 def motion(
@@ -216,13 +218,14 @@ def locate_peak(
 
 
 def one_sided(
-    forces: Float[Array, "7"], noise: Float[Array, ""] | float = 0.0
-) -> tuple[Float[Array, ""], Float[Array, "7"]]:
-    """Return the peak force, and weights (7,). The derivative of the peak is the weighted sum of
-    the derivatives of `forces`.
+    found: Float[Array, "7 values"], noise: Float[Array, ""] | float = 0.0
+) -> tuple[Float[Array, ""], Float[Array, "7 values"]]:
+    """Return the peak force, and weights (7, values). The derivative of the peak is the weighted
+    sum of the derivatives of `found`.
 
-    `forces`: contact force at the times `BESIDE` around the located peak, in any unit; `noise`:
-    relative error of `forces` in addition to rounding. There are three cases:
+    `found`: at the times `BESIDE` around the located peak, the contact force in any unit (last
+    column). If the contact may jump, the first of its `rootsopt.dynamics.saltation.marks` stands
+    before it. `noise`: relative error of the forces in addition to rounding. There are three cases:
 
     Smooth peak: the derivative of the peak is the derivative of the force at a fixed instant
     (envelope theorem). This instant is the vertex of the parabola through the forces, because
@@ -232,8 +235,9 @@ def one_sided(
     both sides. The weights are such that the same mean of the time derivatives is zero.
 
     Jump (such as with the `linear` contact): rounding decides on which side of the jump the located
-    instant lies. The side with the greater force is used.
+    instant lies. The side with the greater force is used. The peak moves with the jump.
     """
+    forces = found[:, -1]
     here, before, earlier, after, later, left, right = forces
     none, one = jnp.zeros_like(here), jnp.ones_like(here)
     # Each slope is taken on one side only: the place of the corner is not known well enough.
@@ -260,4 +264,28 @@ def one_sided(
     single = (jnp.arange(len(BESIDE)) == highest).astype(forces.dtype)
     weights = jnp.where(corner, at_corner, jnp.where(highest == 0, at_vertex, single))
     above = jnp.where(corner, 0.0, bend / 2 * vertex**2)
+    weights = weights[:, None]
+    if found.shape[1] > 1:
+        moved = jnp.where(corner | smooth, 0.0, _with_jump(forces, found[:, 0]))
+        weights = jnp.concatenate([moved[:, None], weights], axis=1)
     return forces[highest] + above, weights
+
+
+def _with_jump(forces: Float[Array, "7"], marks: Float[Array, "7"]) -> Float[Array, "7"]:
+    """Return weights (7,) for the derivatives of `marks`: their sum is the change of a peak at a
+    jump due to the motion of the jump.
+
+    `forces`, `marks`: contact force and first mark at the times `BESIDE`. The change is F dt*/dp,
+    where F is the rate of the force on the greater side and t* the instant of the jump. For t*, see
+    `rootsopt.dynamics.saltation`. Rates are differences, taken on one side of the jump each."""
+
+    def rates(values):
+        _, _, earlier, _, later, left, right = values
+        return earlier - left, right - later
+
+    before, after = rates(marks)
+    closing = before - after
+    kinked = jnp.abs(closing) > _KINK * jnp.maximum(jnp.abs(before), jnp.abs(after))
+    rising = jnp.where(forces[4] > forces[2], *rates(forces)[::-1])
+    moved = jnp.where(kinked, rising / jnp.where(kinked, closing, 1.0), 0.0)
+    return jnp.zeros_like(forces).at[2].set(-moved).at[4].set(moved)

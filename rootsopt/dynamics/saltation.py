@@ -8,7 +8,9 @@ P. C. Müller, Chaos, Solitons & Fractals 5 (1995) 1671-1681):
     dy = (f₋ - f₊) dt*,        dt* = -d(δ₋ - δ₊) / (dδ₋/dτ - dδ₊/dτ).
 
 f is the right-hand side of the equation of motion and δ the penetration, before (₋) and after (₊)
-the jump. Besides the states, y also contains the integrals over the motion.
+the jump. Where the gap itself jumps, at given poses, δ is the distance of the pose from them
+(`rootsopt.contact.gap.Edges`), which is continuous and has a kink there. Besides the states, y also
+contains the integrals over the motion.
 """
 
 import jax.numpy as jnp
@@ -35,8 +37,12 @@ rate, both levers). A jump of the levers shows in them."""
 
 
 def marks(contact: FlankForce) -> Float[Array, "4"]:
-    """Return penetration (m), its rate (m/s) and both levers (m), which together reveal a jump."""
-    return jnp.stack([contact.depth, contact.closing, contact.lever1, contact.lever2])
+    """Return penetration (m), its rate (m/s) and both levers (m), which together reveal a jump.
+
+    For a contact with `Edges`, the first two are the distance from the edges (rad) and its rate
+    (rad/s) instead."""
+    event = (contact.depth, contact.closing) if contact.edges is None else tuple(contact.edges)
+    return jnp.stack([*event, contact.lever1, contact.lever2])
 
 
 def saltation(
@@ -55,7 +61,7 @@ def saltation(
     Raises ValueError if `length` is None: a contact that jumps must state the size of its levers.
     """
     if length is None:
-        raise ValueError("A contact that `jumps` must have a `length_scale`, but it is None.")
+        raise ValueError("A contact that `jumps` must have a `lever_scale`, but it is None.")
     first, last = slopes[0], slopes[-1]
     depth = first[-4] - last[-4]
     frozen = lax.stop_gradient(slopes)

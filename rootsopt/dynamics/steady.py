@@ -285,13 +285,15 @@ class _Attempts(eqx.Module):
         scales = pair.law.exponent, self.radius, pair.force_scale
         found = verdict(orbit, start, within, rtols, open_by.astype(dtype), scales)
         numbers = jnp.concatenate([orbit.response, orbit.state])
+        # A pair that is not smooth never has derivatives: that is no failure.
+        unknown = ~jnp.all(jnp.isfinite(orbit.sensitivity)) & pair.smooth
         status = _first(
             (~orbit.flow.solved, Status.SOLVER_FAILED),
             (found.idle, Status.IDLE),
             (~jnp.all(jnp.isfinite(numbers)), Status.NON_FINITE),
             # Before the derivatives: an orbit that amplifies errors has no known derivative.
             (~found.steady, Status.NOT_SETTLED),
-            (~jnp.all(jnp.isfinite(orbit.sensitivity)), Status.NON_FINITE),
+            (unknown, Status.NON_FINITE),
             (~found.certain, Status.INACCURATE),
             default=Status.PERIODIC.code,
         )

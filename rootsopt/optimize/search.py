@@ -566,9 +566,14 @@ class Search:
 def method_of(config: Config) -> str:
     """Return the method of the local searches, with `auto` replaced by the method it stands for.
 
-    Raises `InputError` if the method needs exact gradients but the objective is an average over an
-    ensemble."""
+    Raises `InputError` if the search needs exact gradients but there are none: the objective is an
+    average over an ensemble, or the contact is not smooth."""
     method, noisy = config.optimizer.method, config.objective.motion == "ensemble"
+    if config.solver.fidelity == "nodes" and not noisy:
+        raise InputError(
+            "`solver.fidelity` must be search, map, linear or auto for an optimisation, but is "
+            "nodes: polylines give forces without a gradient"
+        )
     if method == "auto":
         return "adam" if noisy else "slsqp"
     if method == "slsqp" and noisy:

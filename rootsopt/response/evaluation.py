@@ -330,7 +330,8 @@ class Evaluator:
         } | self._map_statistics()
         steady: dict[str, Any] = {"kind": "transient"}
         response: dict[str, float] = {}
-        gradient = self._gradient(design, found) if status is Status.PERIODIC else {}
+        known = status is Status.PERIODIC and pair.smooth
+        gradient = self._gradient(design, found) if known else {}
         hint, motion, state = "", None, None
         if status in CLOSED:
             named = self.scene.solver.measures.named(orbit.response[:, None], period)
@@ -342,6 +343,7 @@ class Evaluator:
             terms, slopes = self._terms(design, response, gradient)
             response |= terms
             gradient |= slopes if gradient else {}
+            hint = "" if pair.smooth else _NO_GRADIENT
         elif status is Status.IDLE:
             steady = {"kind": "idle"}
             names = self.scene.solver.measures.named(np.zeros((len(orbit.response), 1)), 1)
@@ -601,6 +603,10 @@ def unsettled(
     return steady, response, _window_series(pair, window) if series else None
 
 
+_NO_GRADIENT = (
+    " The contact force jumps at many places, so that it has no gradient. For a gradient, set "
+    "solver.fidelity to search, map or linear."
+)
 _KINDS = {Status.CHAOTIC: "chaotic", Status.IDLE: "idle"}
 
 

@@ -349,3 +349,46 @@ def test_single_precision_is_kept(build):
     contact = built(build, CIC(3, *values))
     pose = (jnp.asarray(v, jnp.float32) for v in (0.4, -1e-4))
     assert all(v.dtype == jnp.float32 for v in eqx.filter_jit(contact)(*pose))
+
+
+# Linear contact's jumps
+
+
+@few_profiles
+def test_edges_of_linear_contact(profile):
+    """Their distance is continuous with the stated slope, and has a kink wherever the gap jumps."""
+    contact = built(LinearContact.of, profile)
+    rolls = np.linspace(-0.1, np.pi / profile.lobes + 0.1, 4001)
+
+    @eqx.filter_jit
+    def look(rolls):
+        return jax.vmap(lambda roll: contact.approach(roll, jnp.asarray(-1e-4)))(rolls)
+
+    found = look(rolls)
+    distance, slope, gap = map(np.asarray, (*found.edges, found.gap))
+    step = rolls[1] - rolls[0]
+    most = 2.0 * np.abs(slope).max() * step
+    assert np.max(np.abs(np.diff(distance))) < most
+    straight = slope[1:] == slope[:-1]
+    np.testing.assert_allclose(np.diff(distance)[straight], slope[1:][straight] * step, atol=1e-12)
+    jumps = np.flatnonzero(np.abs(np.diff(gap)) > 1e-3 * R)
+    assert len(jumps) == 2
+    assert not np.any(straight[jumps])
+
+
+@few_profiles
+def test_switches_of_linear_contact(profile):
+    """A flag changes between any two poses between which the gap jumps."""
+    contact = built(LinearContact.of, profile)
+    rolls = np.linspace(-0.1, np.pi / profile.lobes + 0.1, 4001)
+
+    @eqx.filter_jit
+    def look(roll):
+        found = contact.approach(roll, jnp.asarray(-1e-4))
+        return found.gap, found.lever1, contact.switches(roll, found)
+
+    gap, lever, flags = (np.asarray(x) for x in jax.vmap(look)(rolls))
+    changes = np.any(flags[1:] != flags[:-1], axis=1)
+    assert 2 <= changes.sum() < 10
+    assert np.all(changes[np.abs(np.diff(gap)) > 1e-3 * R])
+    assert np.all(changes[np.abs(np.diff(lever)) > 1e-2 * R])

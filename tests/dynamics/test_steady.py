@@ -259,10 +259,10 @@ def test_both_modes_differentiate_the_same_motion(sharp, orbits, monkeypatch):
     1e-8 of it, while the gap leaves 3e-13 of the force unknown. Two programs that round
     differently find weights 3e-5 apart, and slopes of the peak 1e-7 apart.
     """
-    weights = jnp.array([1.0, 0, 0, 0, 0, 0.5, -0.5])
-    assert weights.shape == (len(BESIDE),)
+    weights = jnp.array([[1.0], [0], [0], [0], [0], [0.5], [-0.5]])
+    assert weights.shape == (len(BESIDE), 1)
     monkeypatch.setattr(
-        "rootsopt.dynamics.flow.one_sided", lambda forces, noise: (forces[0], weights)
+        "rootsopt.dynamics.flow.one_sided", lambda found, noise: (found[0, -1], weights)
     )
     evaluation = orbits["paper"][1]
     state, design = jnp.asarray(evaluation.state), jnp.array(DESIGNS["paper"])
@@ -326,11 +326,11 @@ def test_recorded_steps_give_the_same_motion(sharp, orbits):
 @pytest.mark.long
 def test_repeated_steps_tell_of_their_error(sharp, orbits):
     """Steps chosen for this motion repeat it within a tolerance or so; half as many do not, nor
-    those of another motion. Steps just chosen tell nothing, nor do those over a contact that jumps.
+    those of another motion. Steps just chosen tell nothing, nor do those over contact by nodes.
     """
     state, one = jnp.asarray(orbits["shorter involute"][1].state), jnp.asarray(1.0)
     design, how = jnp.array(DESIGNS["shorter involute"]), integrator(1e-8)
-    linear = Evaluator.of(config_of("solver.fidelity=linear"))
+    nodes = Evaluator.of(config_of("solver.fidelity=nodes"))
 
     def strains(model):
         pair = pair_of(model, design)
@@ -347,7 +347,7 @@ def test_repeated_steps_tell_of_their_error(sharp, orbits):
     none, own, halved, foreign = strains(sharp.scene)
     assert none == 0 < own < 2
     assert min(halved, foreign) > 10
-    assert strains(linear.scene) == [0, 0, 0, 0]
+    assert strains(nodes.scene) == [0, 0, 0, 0]
 
 
 def test_peak_on_a_corner_has_its_gradient():
@@ -386,7 +386,8 @@ def test_weights_of_a_peak():
     times = np.array(BESIDE)
 
     def weights(force, noise=0.0):
-        value, found = one_sided(jnp.asarray(force(times)), noise)
+        value, found = one_sided(jnp.asarray(force(times))[:, None], noise)
+        found = found[:, 0]
         assert np.sum(found) == pytest.approx(1)
         return float(value), np.asarray(found)
 

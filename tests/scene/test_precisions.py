@@ -8,6 +8,7 @@ import dataclasses
 import json
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -16,8 +17,11 @@ from rootsopt.commands import simulate
 from rootsopt.config import load
 from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.integrator import METHODS, Integrator
+from rootsopt.errors import InputError
+from rootsopt.optimize.search import method_of
 from rootsopt.response import choice
 from rootsopt.response.evaluation import Evaluator, _series
+from rootsopt.response.steady import steady_response
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 
@@ -29,6 +33,8 @@ TIGHT = {"float64": 1e-6, "float32": 1e-3}
 contact."""
 SLOPES = {"float64": 1e-3, "float32": 0.05}
 """The same of the gradient of the mean, relative to its greatest component."""
+NODES = 5e-3
+"""Relative difference of the forces of contact by nodes: the force has a step at every node."""
 
 
 def config_of(precision, contact="search", method="tsit5", *overrides):
@@ -100,6 +106,37 @@ def test_a_whole_command_in_single_precision(tmp_path):
     assert (tmp_path / "figures" / "meshing.gif").stat().st_size > 10_000
 
 
+# Contact by nodes
+
+
+def test_nodes_give_forces_without_a_gradient():
+    """At their own default tolerance, near the forces of the search; the message says so. Its
+    derivatives in Python are NaN, and an optimisation is refused before it simulates anything."""
+    config = config_of("float64", "nodes")
+    assert config.solver.rtol == config.solver.transient_rtol == 3e-5
+    given = config_of("float64", "nodes", "tsit5", "solver.rtol=1e-6")
+    assert (given.solver.rtol, given.solver.transient_rtol) == (1e-6, 3e-5)
+    found = Evaluator.of(config)(series=False)
+    truth = Evaluator.of(load(CIC))(series=False)
+    assert found.status is Status.PERIODIC
+    assert found.response["mean_force_N"] == pytest.approx(
+        truth.response["mean_force_N"], rel=NODES
+    )
+    assert found.gradient == {}
+    assert "no gradient" in found.message
+    with pytest.raises(InputError, match=r"`solver\.fidelity` must be search.*nodes"):
+        method_of(config)
+
+
+@pytest.mark.long
+def test_derivatives_by_nodes_are_not_numbers():
+    config = config_of("float64", "nodes")
+    scene = Scene.from_config(config)
+    value, slope = jax.value_and_grad(lambda x: steady_response(scene, x).mean)(config.design)
+    assert np.isfinite(value)
+    assert np.all(np.isnan(slope))
+
+
 # The whole grid
 
 
@@ -128,8 +165,11 @@ def test_grid(contact, method, precision, gradient, truths):
     found = Evaluator.of(config)()
     assert found.status is Status.PERIODIC
     truth = truths(config.solver.fidelity)
-    tight = 1e-3 if contact == "auto" else TIGHT[precision]
+    tight = {"auto": 1e-3, "nodes": NODES}.get(contact, TIGHT[precision])
     assert found.response == pytest.approx(truth.response, rel=tight)
+    if contact == "nodes":
+        assert found.gradient == {}
+        return
     slopes, expected = (one.gradient["mean_force_N"] for one in (found, truth))
     most = max(map(abs, expected.values()))
     assert slopes == pytest.approx(expected, abs=SLOPES[precision] * most)
