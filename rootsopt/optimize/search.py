@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import optax
@@ -38,8 +38,11 @@ from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.sensitivity import by_scene, quantities
 from rootsopt.response.wrapper import Evaluates
 from rootsopt.runtime.programs import Program
-from rootsopt.scene import design_vector
+from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
+
+if TYPE_CHECKING:
+    from rootsopt.optimize.robust import Robustness
 
 T = TypeVar("T")
 RULES: dict[str, Callable[..., optax.GradientTransformation]] = {
@@ -110,7 +113,8 @@ class Optimization:
 
     `optimality`: first-order conditions at the best design, and outcomes of the local searches. It
     is `None` without a verified design, or if the objective is an average over an ensemble.
-    `infeasible`: why no design satisfies all constraints, `None` if a design does."""
+    `infeasible`: why no design satisfies all constraints, `None` if a design does. `robustness`:
+    the nominal optimum and the comparison with it, if scene or design scatter (`tolerances`)."""
 
     problem: Problem | None
     baseline: Evaluation
@@ -120,6 +124,7 @@ class Optimization:
     interrupted: bool = False
     optimality: Optimality | None = None
     infeasible: Infeasible | None = None
+    robustness: "Robustness | None" = None
 
     @property
     def status(self) -> Status:
@@ -178,6 +183,9 @@ class Search:
     Raises `InputError` if the profile family has no design parameters, or if the optimisation
     method does not suit the objective."""
 
+    first = 0
+    """Number of the first local search."""
+
     def __init__(
         self,
         config: Config,
@@ -226,7 +234,7 @@ class Search:
         self.exact = exact = exact.relative_to(baseline)
         # The search needs gradients and a ranking of designs, not the last digits.
         self.fast = exact.at_tolerance(max(1e-6, self.config.solver.rtol)).surveying()
-        self.problem = Problem.of(self.config, exact.scene, baseline)
+        self.problem = self._problem(exact.scene, baseline)
         if self.problem.cornered:
             self.exact = exact.with_maxima()
         # Second-order convergence needs more digits than a descent.
@@ -247,7 +255,7 @@ class Search:
             trials = self._side_by_side(self._screen, list(enumerate(points)))
         starts = self._starts(trials) or points[:1]
         work = self._solve if self.method == "slsqp" else self._descend
-        trials += self._side_by_side(work, list(enumerate(starts)))
+        trials += self._side_by_side(work, list(enumerate(starts, self.first)))
         if self.stop.is_set():
             if self.noisy and (found := self.so_far()) is not None:
                 return found
@@ -266,6 +274,15 @@ class Search:
         settled = self.problem, baseline, optimized, rows, verification
         optimality = None if optimized is None else self._optimality(optimized, trials)
         return Optimization(*settled, self.stop.is_set(), optimality)
+
+    def _problem(self, scene: Scene, baseline: Evaluation) -> Problem:
+        """Return the design problem, given the scene and the evaluated `baseline`."""
+        return Problem.of(self.config, scene, baseline)
+
+    def _local(self, start: int, evaluation: Evaluation, point) -> Local | None:
+        """Return objective and constraints at a `point` (d,) of the local search `start`."""
+        del start
+        return self.problem.local(evaluation, point)
 
     def so_far(self) -> Optimization | None:
         """Return what the search has found so far, without verification.
@@ -442,7 +459,7 @@ class Search:
         feasible = self.problem.feasible(point)
         local = None
         if start >= 0 and not self.noisy:
-            local = self.problem.local(evaluation, point)
+            local = self._local(start, evaluation, point)
         trial = Trial(point, start, iteration, evaluation, objective, feasible, local)
         with self._lock:
             self._trials.append(trial)
