@@ -241,7 +241,8 @@ class TolerantSearch:
     def _compared(self, stage: RobustSearch, found: Optimization) -> tuple[dict, dict]:
         """Return baseline and both optima in fresh scenes, and the numbers of these scenes."""
         tolerances = self.config.tolerances
-        assert tolerances is not None and self._nominal is not None
+        assert tolerances is not None
+        assert self._nominal is not None
         assert isinstance(found.problem, RobustProblem)
         if not tolerances.check_samples or self.stop.is_set():
             return {}, {}

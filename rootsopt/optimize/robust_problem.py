@@ -16,7 +16,7 @@ from rootsopt.optimize.optimality import Holder
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.risk import Combined, combine
 from rootsopt.response.evaluation import Evaluation
-from rootsopt.response.tolerances import ToleranceEvaluation
+from rootsopt.response.tolerances import ToleranceEvaluation, nominal_of
 from rootsopt.scene import Scene
 
 _HELD = 1e-6
@@ -47,7 +47,9 @@ class RobustProblem(Problem):
 
     def values(self, evaluation: ToleranceEvaluation) -> NDArray[np.float64]:
         """Return the objective in each scene of the sample (n,), 1 for the nominal baseline."""
-        return np.array([super(RobustProblem, self).objective(p.evaluation) for p in _of(evaluation)])
+        return np.array(
+            [super(RobustProblem, self).objective(p.evaluation) for p in _of(evaluation)]
+        )
 
     def combined(self, evaluation: ToleranceEvaluation) -> Combined:
         """Return the combination of the objectives in all scenes, with its weights.
@@ -108,6 +110,10 @@ class RobustProblem(Problem):
         scaled = tuple(self._scaled(group) for group in groups)
         limits = parts[0].slack, parts[0].normals
         return Local(smooth / self.reference, slope / self.reference, scaled, *limits)
+
+    def by_speed(self, evaluation: Evaluation) -> list[dict[str, float]]:
+        """Return one row per speed in the nominal scene, as `Problem.by_speed` does."""
+        return super().by_speed(nominal_of(evaluation))
 
     def shares(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the shares (n,) with which the maxima of each scene become groups in `local`."""
