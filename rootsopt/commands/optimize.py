@@ -249,6 +249,7 @@ def _interrupted(result) -> str:
 
 def _write(folder, config, options, result, choice, compiled, ran) -> None:
     from rootsopt.output import files
+    from rootsopt.response.speeds import at_speeds
     from rootsopt.response.tolerances import nominal_of
     from rootsopt.scene import outline_mm
 
@@ -302,7 +303,7 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
 
             names = {"baseline": result.baseline, "optimised": result.optimized}
             known = {name: nominal_of(one) for name, one in names.items() if one is not None}
-            designs = {name: one.parts for name, one in known.items()}
+            designs = {name: at_speeds(one) for name, one in known.items()}
             speed_figure(folder, designs, "Contact force over the speeds of the objective")
 
 

@@ -31,9 +31,8 @@ def plot_distribution(ax: Axes, designs: Mapping[str, ArrayLike], label: str) ->
     known = {name: np.asarray(values, float) for name, values in designs.items()}
     known = {name: values[np.isfinite(values)] for name, values in known.items()}
     known = {name: values for name, values in known.items() if values.size}
-    if known:
-        every = np.concatenate(list(known.values()))
-        edges = np.histogram_bin_edges(every, _BINS)
+    every = np.concatenate([np.zeros(0), *known.values()])
+    edges = np.histogram_bin_edges(every, _BINS).tolist()
     for name, values in known.items():
         color, dashes = _STYLES[name]
         style = {"color": color, "linestyle": dashes}

@@ -35,7 +35,7 @@ from rootsopt.scene import Scene
 
 OBJECTIVE = "objective"
 """Name of the objective among the compared quantities."""
-COMPARED = (OBJECTIVE, *RESPONSES)
+COMPARED: tuple[str, ...] = (OBJECTIVE, *RESPONSES)
 """Quantities that are compared over fresh scenes: the objective (1 for the baseline in the nominal
 scene), and mean, peak and RMS force (N)."""
 _LEVEL = 0.95
@@ -311,7 +311,7 @@ def _scattered(
         rows = list(pool.map(at, scenes))
     labels = [label for label, _ in rows]
     columns = np.array([values for _, values in rows]).T
-    values = dict(zip(COMPARED, columns, strict=True))
+    values: dict[str, NDArray[np.float64]] = dict(zip(COMPARED, columns, strict=True))
     usable = np.isfinite(values[OBJECTIVE])
     assert problem.config.tolerances is not None
     combined = float("nan")
