@@ -53,7 +53,7 @@ def test_config_names_distributions_in_two_ways():
         ("uniform", 0.02, 0.02),
         ("triangular", pytest.approx(0.23875), pytest.approx(0.23875)),
     ]
-    later = config_of(*SPREAD, "tolerances.over.contact.clearance_mm.uniform=0.001")
+    later = config_of(*SPREAD, "tolerances.over.contact.clearance_mm={uniform: 0.001}")
     assert later.scatters[0].kind == "uniform"
     assert config_of().tolerances is None
     assert config_of().scatters == ()
