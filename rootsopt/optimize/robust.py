@@ -40,7 +40,7 @@ COMPARED: tuple[str, ...] = (OBJECTIVE, *RESPONSES)
 scene), and mean, peak and RMS force (N)."""
 _LEVEL = 0.95
 """Level of the quantile that the comparison reports."""
-_APART = 1e-9
+_APART = 1e-6
 """Distance of two designs in the unit box below which they count as the same."""
 
 
