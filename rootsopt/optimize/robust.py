@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
+from rootsopt.optimize.certificate import Certificate
 from rootsopt.optimize.checkpoint import Checkpoint
 from rootsopt.optimize.local import Local
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.risk import combine
 from rootsopt.optimize.robust_problem import RobustProblem
-from rootsopt.optimize.search import Optimization, Progress, Search
-from rootsopt.response.evaluation import RESPONSES, Evaluation
+from rootsopt.optimize.search import Optimization, Progress, Search, sensitivity_rows
+from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.response.scatter import Shift, draw, shifts
 from rootsopt.response.tolerances import (
     ToleranceEvaluation,
@@ -169,6 +170,17 @@ class RobustSearch(Search):
             if apart and self.problem.feasible(point) and len(chosen) < self.settings.starts:
                 chosen.append(point)
         return chosen
+
+    def _sensitivities(self, optimized: Evaluation, certificate: Certificate) -> list[dict]:
+        """Return one row per scene quantity, with its effect on the forces in the nominal scene.
+
+        Return an empty list for several speeds, for several motions, or after `stop`."""
+        del certificate
+        assert isinstance(self.exact, ToleranceEvaluator)
+        single = self.exact.single
+        if not isinstance(single, Evaluator) or self.stop.is_set():
+            return []
+        return sensitivity_rows(single, nominal_of(optimized), lambda moved: {})
 
     def _local(self, start: int, evaluation: Evaluation, point) -> Local | None:
         problem = self.problem

@@ -526,22 +526,13 @@ class Search:
         Return an empty list for several speeds, for several motions, or after `stop`."""
         if not isinstance(self.exact, Evaluator) or self.stop.is_set():
             return []
-        design = np.array(list(optimized.design.values()))
-        fitted = self.exact.fit(design, optimized.state, series=False)[0]
-        moved = by_scene(fitted, optimized)
-        if moved is None:
-            return []
-        objective = self.problem.along_scene(moved, certificate)
         level = self.problem.objective(optimized)
-        rows = []
-        for one in quantities(self.config):
-            forces = {name: one.step * row[one.key] for name, row in moved.gradient.items()}
-            row = {"quantity": one.name, "key": one.key, "unit": one.unit, "value": one.value}
-            row |= {"step": one.step} | forces
-            if objective:
-                row["objective_percent"] = 100 * one.step * objective[one.key] / level
-            rows.append(row)
-        return rows
+
+        def percent(moved: Evaluation) -> dict[str, float]:
+            slopes = self.problem.along_scene(moved, certificate)
+            return {key: 100 * slope / level for key, slope in slopes.items()}
+
+        return sensitivity_rows(self.exact, optimized, percent)
 
     def _outcome(self, number: int, found: Found) -> StartOutcome:
         """Return the outcome of a local search by sequential quadratic programming.
@@ -578,6 +569,33 @@ class Search:
         """Return the design at a `point` (d,), in config units by key."""
         values = map(float, self.problem.design(point))
         return dict(zip(self.problem.baseline.design, values, strict=True))
+
+
+def sensitivity_rows(
+    evaluator: Evaluator,
+    optimized: Evaluation,
+    percent: Callable[[Evaluation], dict[str, float]],
+) -> list[dict[str, Any]]:
+    """Return one row per scene quantity, with its effect on the forces of an optimum.
+
+    `evaluator`, `optimized`: of one motion at one speed; `percent`: function that returns the
+    derivatives of the objective (% per unit, by key) from an evaluation with gradients with respect
+    to the quantities; {}: not known. Return an empty list if there are no such gradients."""
+    design = np.array(list(optimized.design.values()))
+    fitted = evaluator.fit(design, optimized.state, series=False)[0]
+    moved = by_scene(fitted, optimized)
+    if moved is None:
+        return []
+    objective = percent(moved)
+    rows = []
+    for one in quantities(evaluator.config):
+        forces = {name: one.step * row[one.key] for name, row in moved.gradient.items()}
+        row = {"quantity": one.name, "key": one.key, "unit": one.unit, "value": one.value}
+        row |= {"step": one.step} | forces
+        if objective:
+            row["objective_percent"] = one.step * objective[one.key]
+        rows.append(row)
+    return rows
 
 
 def method_of(config: Config) -> str:

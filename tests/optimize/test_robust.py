@@ -276,6 +276,9 @@ def test_optimize_command(tmp_path, capsys):
     assert record["nominal"]["optimality"]["residual"] >= 0
     assert result["optimality"]["residual"] >= 0
     assert len(result["optimized"]["samples"]) == 2
+    (row,) = (r for r in result["optimality"]["sensitivities"] if "clearance" in r["quantity"])
+    assert row["peak_force_N"] != 0
+    assert "objective_percent" not in row
     # Simulated again from rest, the robust optimum is no worse than the nominal one.
     reached = 1 - result["improvement"]["objective"]
     assert reached <= record["nominal"]["robust_objective"] + 1e-6
