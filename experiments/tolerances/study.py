@@ -40,8 +40,9 @@ _MACHINE = (
     "scene.load.torque_N_m: {relative_normal: 0.05}"
 )
 CASES = {
-    "shipped": Case(
-        "shipped scene, mean + 2 sigma",
+    "shipped": Case("shipped scene, mean + 2 sigma", (_PLAY, f"tolerances.over={{{_MACHINE}}}")),
+    "center_distance": Case(
+        "shipped scene with centre distance, mean + 2 sigma",
         (
             _PLAY,
             "scene.center_distance_error_mm=0",
@@ -59,6 +60,8 @@ CASES = {
     ),
 }
 """Cases by name."""
+USUAL = ("shipped",)
+"""Cases that run by default."""
 QUICK = (
     "tolerances.over={contact.clearance_mm: {normal: 0.002}}",
     "tolerances.samples=2",
