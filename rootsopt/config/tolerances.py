@@ -16,8 +16,6 @@ DISTRIBUTIONS = (*_KINDS, *(_RELATIVE + kind for kind in _KINDS))
 _SECTIONS = ("rotor", "contact", "scene")
 _NOT_PHYSICAL = ("rotor.helix_deg", "contact.smoothing_mm")
 """Numbers of these sections that cannot scatter: settings, not quantities of the simulated pair."""
-_WIDEST = 1e9
-"""Width of a distribution above which a config is rejected."""
 _DEEPEST = 4
 """Number of nested sections above which the keys of `tolerances.over` are rejected."""
 
@@ -41,7 +39,7 @@ class Scatter(NamedTuple):
 class TolerancesConfig(Section):
     """Scatter of scene and design, for a robust optimum. Without this section, nothing scatters."""
 
-    over: dict[str, dict[str, float]] = Field(
+    over: dict[str, dict[str, Annotated[float, Field(gt=0, le=1e9)]]] = Field(
         description="distribution by key, as {contact.clearance_mm: {normal: 0.002}}; normal: "
         "standard deviation; uniform, triangular: half width; relative_normal, relative_uniform, "
         "relative_triangular: the same as a fraction of the key's value"
@@ -91,16 +89,11 @@ class TolerancesConfig(Section):
                     f"{place} must be one distribution, as in {{normal: 0.002}}, but is "
                     f"{shown(given)}"
                 )
-            ((name, width),) = given.items()
+            (name,) = given
             if name not in DISTRIBUTIONS:
                 raise ValueError(
                     f"{place} must be one of {', '.join(DISTRIBUTIONS)}, but is {shown(name)}"
                     + _near(name, DISTRIBUTIONS)
-                )
-            if not 0 < width <= _WIDEST:
-                raise ValueError(
-                    f"{place} must have a width greater than 0 (at most {_WIDEST:g}), but has "
-                    f"{width:g}; remove the key if it does not scatter"
                 )
         return self
 
