@@ -144,6 +144,10 @@ class RobustSearch(Search):
         self.exact = ToleranceEvaluator.of(config, self.exact)
         self._shares: dict[int, NDArray[np.float64]] = {}
 
+    def _warm(self, baseline: Evaluation) -> None:
+        """Do nothing: the first stage has compiled all programs."""
+        del baseline
+
     def _problem(self, scene: Scene, baseline: Evaluation) -> Problem:
         return RobustProblem.of(self.config, scene, baseline)
 
@@ -266,8 +270,20 @@ class TolerantSearch:
         designs = {name: nominal_of(one) for name, one in known.items() if one is not None}
         drawn = draw(self.config, tolerances.check_samples, fresh=True)
         single = stage.fast.single if isinstance(stage.fast, ToleranceEvaluator) else stage.fast
-        asked = self.stop.is_set
-        fresh = compare(single, found.problem, designs, shifts(self.config, drawn), asked)
+        best = found.problem.objective(found.optimized) if found.optimized else float("nan")
+        before = self._done + len(found.history)
+        per, total = 1 + tolerances.samples, len(drawn) * len(designs)
+        expected, lock, ended = before + total // per, threading.Lock(), [0]
+
+        def tick() -> bool:
+            # As many scenes as a design of the search has count as one design.
+            with lock:
+                ended[0] += 1
+                if ended[0] % per == 0:
+                    self.progress(before + ended[0] // per, expected, best)
+            return self.stop.is_set()
+
+        fresh = compare(single, found.problem, designs, shifts(self.config, drawn), tick)
         if self.stop.is_set():
             return {}, {}
         keys = [one.key for one in self.config.scatters]
@@ -279,14 +295,14 @@ def compare(
     problem: RobustProblem,
     designs: Mapping[str, Evaluation],
     scenes: Sequence[Shift],
-    stop: Callable[[], bool] = lambda: False,
+    tick: Callable[[], bool] = lambda: False,
 ) -> dict[str, Scattered]:
     """Simulate designs in many scenes, and return each design's `Scattered` by name.
 
     `evaluator`: that of the nominal scene; `problem`: defines the objective; `designs`: their
     evaluations in the nominal scene, the first one is the baseline. Each motion starts at the
-    design's orbit in the nominal scene. Equal designs are simulated only once. `stop`: function
-    that returns whether to give up, with an incomplete result."""
+    design's orbit in the nominal scene. Equal designs are simulated only once. `tick`: function
+    called before each simulation; if it returns True, the simulation is left out."""
     found: dict[str, Scattered] = {}
     points = {name: problem.point(list(one.design.values())) for name, one in designs.items()}
     reference = 1.0
@@ -295,7 +311,7 @@ def compare(
         if twin is not None:
             found[name] = found[twin]
             continue
-        one = _scattered(evaluator, problem, nominal, scenes, stop)
+        one = _scattered(evaluator, problem, nominal, scenes, tick)
         if not found:
             reference = one.combined
         found[name] = dataclasses.replace(one, combined=one.combined / reference)
@@ -307,12 +323,13 @@ def _scattered(
     problem: RobustProblem,
     nominal: Evaluation,
     scenes: Sequence[Shift],
-    stop: Callable[[], bool],
+    tick: Callable[[], bool],
 ) -> Scattered:
+    """Simulate one design in many scenes. Arguments: see `compare`."""
     design = np.array(list(nominal.design.values()))
 
     def at(shift: Shift) -> tuple[str, list[float]]:
-        if stop():
+        if tick():
             return "interrupted", [float("nan")] * len(COMPARED)
         one = in_scene(evaluator, shift, design, nominal.state).evaluation
         forces = [one.response.get(name, float("nan")) for name in RESPONSES]

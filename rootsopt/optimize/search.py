@@ -241,9 +241,7 @@ class Search:
         self.sharp = self.exact.surveying()
         self._baseline = baseline
         if self.problem.cornered and self.method == "slsqp":
-            # Compile what the maxima need during the screening.
-            again = list(baseline.design.values()), baseline.state, False
-            threading.Thread(target=self.sharp, args=again, daemon=True).start()
+            self._warm(baseline)
         start = self.problem.point(list(baseline.design.values()))
         points = self._feasible(start)
         if not points:
@@ -274,6 +272,11 @@ class Search:
         settled = self.problem, baseline, optimized, rows, verification
         optimality = None if optimized is None else self._optimality(optimized, trials)
         return Optimization(*settled, self.stop.is_set(), optimality)
+
+    def _warm(self, baseline: Evaluation) -> None:
+        """Compile what the maxima need, in the background during the screening."""
+        again = list(baseline.design.values()), baseline.state, False
+        threading.Thread(target=self.sharp, args=again, daemon=True).start()
 
     def _problem(self, scene: Scene, baseline: Evaluation) -> Problem:
         """Return the design problem, given the scene and the evaluated `baseline`."""
