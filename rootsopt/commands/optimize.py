@@ -84,6 +84,11 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
                 out.print(tables.optimality_table(result.optimality.record(), numbers[0]))
                 if result.optimality.sensitivities:
                     out.print(tables.sensitivity_table([*result.optimality.sensitivities]))
+            if result.robustness is not None and result.robustness.fresh:
+                record = result.robustness.record()
+                designs = {"baseline": result.baseline, "robust": result.optimized}
+                shown = {name: one.design for name, one in designs.items()}
+                out.print(tables.robustness_table(record, shown))
             if alike:
                 out.print(tables.likeness_table(alike["resembles"]))
         if result.interrupted or result.optimized is None:
@@ -125,14 +130,15 @@ def _searched(config: "Config", progress, stop: threading.Event, checkpoint):
     In the returned config, the chosen settings replace `auto`. The result is `None` if the search
     was stopped before the baseline was simulated. `progress`: function as from `_progress`, or
     `None`; `stop`: event that stops the search; `checkpoint`: file for the evaluations."""
-    from rootsopt.optimize.search import Search, until_stopped
+    from rootsopt.optimize.robust import search_of
+    from rootsopt.optimize.search import until_stopped
     from rootsopt.response.choice import resolve
 
     state: dict[str, Any] = {"config": config, "choice": {}}
 
     def work():
         state["config"], state["choice"] = resolve(config)
-        state["search"] = Search(state["config"], progress, stop, checkpoint)
+        state["search"] = search_of(state["config"], progress, stop, checkpoint)
         return state["search"].run()
 
     result = until_stopped(work, stop, _PATIENCE)
@@ -243,15 +249,16 @@ def _interrupted(result) -> str:
 
 def _write(folder, config, options, result, choice, compiled, ran) -> None:
     from rootsopt.output import files
+    from rootsopt.response.speeds import at_speeds
+    from rootsopt.response.tolerances import nominal_of
     from rootsopt.scene import outline_mm
-    from rootsopt.scene.families import with_design
 
     records = {"baseline": result.baseline, "optimized": result.optimized}
     files.write_config(folder, config)
     if result.optimized is not None:
-        profile = with_design(config.profile, list(result.optimized.design.values()))
-        best = config.model_copy(update={"profile": profile})
-        folder.write_text("optimized.yaml", best.to_yaml())
+        folder.write_text("optimized.yaml", _designed(config, result.optimized).to_yaml())
+    if result.robustness is not None:
+        _write_robustness(folder, config, options, result.robustness)
     data: dict = {name: e.record() if e is not None else None for name, e in records.items()}
     for name, evaluation in records.items():
         if evaluation is None:
@@ -270,6 +277,8 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
         data["objective_by_speed"] = result.objective_by_speed
     if result.optimality is not None:
         data["optimality"] = result.optimality.record()
+    if result.robustness is not None:
+        data["robustness"] = result.robustness.record()
     data["verification"] = result.verification
     data["status"], data["message"] = result.status.label, _advice(result)
     data["statistics"] = {
@@ -293,8 +302,37 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
             from rootsopt.figures.speeds import speed_figure
 
             names = {"baseline": result.baseline, "optimised": result.optimized}
-            designs = {name: one.parts for name, one in names.items() if one is not None}
+            known = {name: nominal_of(one) for name, one in names.items() if one is not None}
+            designs = {name: at_speeds(one) for name, one in known.items()}
             speed_figure(folder, designs, "Contact force over the speeds of the objective")
+
+
+def _designed(config: "Config", evaluation) -> "Config":
+    """Return `config` with the design of an `evaluation`."""
+    from rootsopt.scene.families import with_design
+
+    profile = with_design(config.profile, list(evaluation.design.values()))
+    return config.model_copy(update={"profile": profile})
+
+
+def _write_robustness(folder, config, options, robustness) -> None:
+    """Write the nominal optimum, and the files of the comparison over fresh scenes."""
+    nominal = robustness.nominal.optimized
+    if nominal is not None:
+        folder.write_text("nominal.yaml", _designed(config, nominal).to_yaml())
+    if not robustness.fresh:
+        return
+    columns = dict(robustness.scenes)
+    for name, one in robustness.fresh.items():
+        columns |= {f"{name}_{key}": values for key, values in one.values.items()}
+    folder.write_csv("tolerances.csv", columns)
+    if not options.no_figures:
+        from rootsopt.figures.tolerances import distributions
+
+        designs = {name: one.values for name, one in robustness.fresh.items()}
+        count = len(next(iter(robustness.scenes.values())))
+        made = distributions(designs, f"Contact force in {count} fresh scenes")
+        folder.write_figure("figures/tolerances.png", made)
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
 from rootsopt.config.document import MOST_BYTES, read_document
-from rootsopt.config.explain import describe, explain
+from rootsopt.config.explain import all_keys, describe, explain
 from rootsopt.config.families import (
     families,
     family_of,
@@ -37,6 +37,7 @@ from rootsopt.config.study import (
     SolverConfig,
     SweepConfig,
 )
+from rootsopt.config.tolerances import Scatter, TolerancesConfig, scatterable, unknown_key
 from rootsopt.config.units import hint
 from rootsopt.config.words import named, placed, sentence, shown
 from rootsopt.errors import InputError
@@ -65,6 +66,7 @@ class Config(Section):
     ensemble: EnsembleConfig = Field(default_factory=lambda: EnsembleConfig.model_validate({}))
     sweep: SweepConfig = Field(default_factory=lambda: SweepConfig.model_validate({}))
     optimizer: OptimizerConfig = Field(default_factory=lambda: OptimizerConfig.model_validate({}))
+    tolerances: TolerancesConfig | None = Field(None, description="absent: nothing scatters")
 
     @property
     def design(self) -> NDArray[np.float64]:
@@ -92,6 +94,33 @@ class Config(Section):
             return Config.model_validate(data)
         except ValidationError as error:
             raise InputError(sentence(f"{explain(error, Config)}")) from None
+
+    @property
+    def scatters(self) -> tuple[Scatter, ...]:
+        """Distributions of the keys that scatter; empty without `tolerances`."""
+        return () if self.tolerances is None else self.tolerances.scatters(scatterable(self))
+
+    def moved(self, values: Mapping[str, float]) -> "Config":
+        """Return a copy in which some numbers are replaced, without checking them.
+
+        `values`: new numbers by dotted key, as `scatterable` lists them. Design parameters are
+        replaced as well."""
+        data: Config = self
+        design = {f"profile.{key}": k for k, key in enumerate(self.design_keys)}
+        for key, value in values.items():
+            if key not in design:
+                data = _with(data, key, value)
+                continue
+            parameters = dict(self.profile.parameters)
+            name = key.removeprefix("profile.")
+            if name not in parameters:
+                name, _, number = name.rpartition("_")
+                entries = [*getattr(data.profile, name)]
+                entries[int(number) - 1] = value
+                data = _with(data, f"profile.{name}", tuple(entries))
+            else:
+                data = _with(data, key, value)
+        return data
 
     @property
     def needs_search(self) -> tuple[str, ...]:
@@ -164,6 +193,40 @@ class Config(Section):
             )
         return self
 
+    @model_validator(mode="after")
+    def _scattering(self):
+        tolerances = self.tolerances
+        if tolerances is None:
+            return self
+        valid, known = scatterable(self), dict.fromkeys(all_keys(Config))
+        for key in tolerances.over:
+            if key not in valid:
+                raise ValueError(unknown_key(key, valid, known))
+        if self.objective.motion == "ensemble":
+            raise ValueError(
+                "`tolerances` must be absent for `objective.motion` ensemble, whose averages have "
+                "noise; remove `tolerances`, or set `objective.motion` to reached, worst or "
+                "weighted"
+            )
+        if self.objective.speeds_rpm and "scene.speed_rpm" in tolerances.over:
+            raise ValueError(
+                "`tolerances.over` must not name `scene.speed_rpm` if `objective.speeds_rpm` lists "
+                "the speeds; remove one of them"
+            )
+        alone = self.model_copy(update={"tolerances": None})
+        for one in tolerances.scatters(valid):
+            for end in (one.nominal - one.half, one.nominal + one.half):
+                data = alone.moved({one.key: end}).model_dump(mode="json", exclude_none=True)
+                try:
+                    Config.model_validate(data)
+                except ValidationError as error:
+                    raise ValueError(
+                        f"`tolerances.over.{one.key}` lets the key reach {end:.6g}, but "
+                        f"{explain(error, Config)}; narrow the distribution or move the nominal "
+                        f"value, {one.nominal:.6g}"
+                    ) from None
+        return self
+
     def to_yaml(self) -> str:
         """Return the resolved config as YAML, with every default written out."""
         data = self.model_dump(mode="json", exclude_none=True)
@@ -171,6 +234,13 @@ class Config(Section):
 
 
 follow(lambda: replace_fields(Config, dict(Config.model_fields)))
+
+
+def _with(config: Any, key: str, value: Any) -> Any:
+    """Return a copy of a config section in which the entry at a dotted key is `value`."""
+    name, _, rest = key.partition(".")
+    inner = _with(getattr(config, name), rest, value) if rest else value
+    return config.model_copy(update={name: inner})
 
 
 def load(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Config:

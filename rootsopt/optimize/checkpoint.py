@@ -24,6 +24,7 @@ from rootsopt.dynamics.maxima import Maxima
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation
+from rootsopt.response.tolerances import AtSample, ToleranceEvaluation
 from rootsopt.status import Status
 
 _SHOWN = 5
@@ -183,13 +184,15 @@ def _plain(evaluation: Evaluation) -> dict[str, Any]:
     if isinstance(evaluation, SpeedsEvaluation):
         parts = evaluation.parts
         found["parts"] = [[p.speed_rpm, p.share, _plain(p.evaluation)] for p in parts]
+    if isinstance(evaluation, ToleranceEvaluation):
+        found["scenes"] = [[part.values, _plain(part.evaluation)] for part in evaluation.parts]
     return found
 
 
 def _evaluation(found: Mapping[str, Any]) -> Evaluation:
     """Return the evaluation from the plain values that `_plain` returned."""
     values = dict(found)
-    parts = values.pop("parts", None)
+    parts, scenes = values.pop("parts", None), values.pop("scenes", None)
     if values["state"] is not None:
         values["state"] = np.asarray(values["state"], np.float64)
     if values["maxima"] is not None:
@@ -197,6 +200,9 @@ def _evaluation(found: Mapping[str, Any]) -> Evaluation:
         values["maxima"] = Maxima(times, forces, slopes)
     values["status"] = Status[values["status"]]
     values["rivals"] = tuple(_evaluation(one) for one in values["rivals"])
+    if scenes is not None:
+        samples = tuple(AtSample(numbers, _evaluation(one)) for numbers, one in scenes)
+        return ToleranceEvaluation(**values, parts=samples)
     if parts is None:
         return Evaluation(**values)
     every = tuple(AtSpeed(speed, share, _evaluation(one)) for speed, share, one in parts)

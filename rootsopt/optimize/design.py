@@ -3,7 +3,8 @@
 from collections.abc import Callable
 
 from rootsopt.config import Config
-from rootsopt.optimize.search import Optimization, Search
+from rootsopt.optimize.robust import search_of
+from rootsopt.optimize.search import Optimization
 from rootsopt.response.choice import resolve
 from rootsopt.scene import check_geometry
 
@@ -25,4 +26,4 @@ def optimize_design(
     >>> found = rootsopt.optimize_design(rootsopt.load_config("configs/cic.yaml"))
     >>> found.optimized.design, found.improvement["mean_force_N"]"""
     check_geometry(config)
-    return Search(resolve(config)[0], progress).run()
+    return search_of(resolve(config)[0], progress).run()

@@ -53,17 +53,22 @@ class Holder(NamedTuple):
     branch. `share`: its weight in the gradient of the objective.
 
     `rotation_deg`, `force_N`: rotation of rotor 1 (degrees from φ1 = 0) and contact force (N), if
-    the branch is a local maximum of the force over time. Otherwise, both are NaN."""
+    the branch is a local maximum of the force over time. Otherwise, both are NaN. `scene`: number
+    of the scene in the sample of `tolerances`, from 0; `None` if nothing scatters."""
 
     speed_rpm: float
     rotation_deg: float
     force_N: float
     objective: float
     share: float
+    scene: int | None = None
 
     def record(self) -> dict[str, float | None]:
-        """Return the fields for the result file, with `None` in place of NaN."""
-        return {k: None if math.isnan(v) else v for k, v in self._asdict().items()}
+        """Return the fields for the result file, with `None` in place of NaN.
+
+        `scene` is left out if nothing scatters."""
+        given = {k: v for k, v in self._asdict().items() if v is not None}
+        return {k: None if math.isnan(v) else v for k, v in given.items()}
 
 
 class Optimum(NamedTuple):

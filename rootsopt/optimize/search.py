@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import optax
@@ -38,8 +38,11 @@ from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.sensitivity import by_scene, quantities
 from rootsopt.response.wrapper import Evaluates
 from rootsopt.runtime.programs import Program
-from rootsopt.scene import design_vector
+from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
+
+if TYPE_CHECKING:
+    from rootsopt.optimize.robust import Robustness
 
 T = TypeVar("T")
 RULES: dict[str, Callable[..., optax.GradientTransformation]] = {
@@ -110,7 +113,8 @@ class Optimization:
 
     `optimality`: first-order conditions at the best design, and outcomes of the local searches. It
     is `None` without a verified design, or if the objective is an average over an ensemble.
-    `infeasible`: why no design satisfies all constraints, `None` if a design does."""
+    `infeasible`: why no design satisfies all constraints, `None` if a design does. `robustness`:
+    the nominal optimum and the comparison with it, if scene or design scatter (`tolerances`)."""
 
     problem: Problem | None
     baseline: Evaluation
@@ -120,6 +124,7 @@ class Optimization:
     interrupted: bool = False
     optimality: Optimality | None = None
     infeasible: Infeasible | None = None
+    robustness: "Robustness | None" = None
 
     @property
     def status(self) -> Status:
@@ -178,6 +183,9 @@ class Search:
     Raises `InputError` if the profile family has no design parameters, or if the optimisation
     method does not suit the objective."""
 
+    first = 0
+    """Number of the first local search."""
+
     def __init__(
         self,
         config: Config,
@@ -226,16 +234,14 @@ class Search:
         self.exact = exact = exact.relative_to(baseline)
         # The search needs gradients and a ranking of designs, not the last digits.
         self.fast = exact.at_tolerance(max(1e-6, self.config.solver.rtol)).surveying()
-        self.problem = Problem.of(self.config, exact.scene, baseline)
+        self.problem = self._problem(exact.scene, baseline)
         if self.problem.cornered:
             self.exact = exact.with_maxima()
         # Second-order convergence needs more digits than a descent.
         self.sharp = self.exact.surveying()
         self._baseline = baseline
         if self.problem.cornered and self.method == "slsqp":
-            # Compile what the maxima need during the screening.
-            again = list(baseline.design.values()), baseline.state, False
-            threading.Thread(target=self.sharp, args=again, daemon=True).start()
+            self._warm(baseline)
         start = self.problem.point(list(baseline.design.values()))
         points = self._feasible(start)
         if not points:
@@ -247,7 +253,7 @@ class Search:
             trials = self._side_by_side(self._screen, list(enumerate(points)))
         starts = self._starts(trials) or points[:1]
         work = self._solve if self.method == "slsqp" else self._descend
-        trials += self._side_by_side(work, list(enumerate(starts)))
+        trials += self._side_by_side(work, list(enumerate(starts, self.first)))
         if self.stop.is_set():
             if self.noisy and (found := self.so_far()) is not None:
                 return found
@@ -266,6 +272,20 @@ class Search:
         settled = self.problem, baseline, optimized, rows, verification
         optimality = None if optimized is None else self._optimality(optimized, trials)
         return Optimization(*settled, self.stop.is_set(), optimality)
+
+    def _warm(self, baseline: Evaluation) -> None:
+        """Compile what the maxima need, in the background during the screening."""
+        again = list(baseline.design.values()), baseline.state, False
+        threading.Thread(target=self.sharp, args=again, daemon=True).start()
+
+    def _problem(self, scene: Scene, baseline: Evaluation) -> Problem:
+        """Return the design problem, given the scene and the evaluated `baseline`."""
+        return Problem.of(self.config, scene, baseline)
+
+    def _local(self, start: int, evaluation: Evaluation, point) -> Local | None:
+        """Return objective and constraints at a `point` (d,) of the local search `start`."""
+        del start
+        return self.problem.local(evaluation, point)
 
     def so_far(self) -> Optimization | None:
         """Return what the search has found so far, without verification.
@@ -442,7 +462,7 @@ class Search:
         feasible = self.problem.feasible(point)
         local = None
         if start >= 0 and not self.noisy:
-            local = self.problem.local(evaluation, point)
+            local = self._local(start, evaluation, point)
         trial = Trial(point, start, iteration, evaluation, objective, feasible, local)
         with self._lock:
             self._trials.append(trial)
@@ -509,22 +529,13 @@ class Search:
         Return an empty list for several speeds, for several motions, or after `stop`."""
         if not isinstance(self.exact, Evaluator) or self.stop.is_set():
             return []
-        design = np.array(list(optimized.design.values()))
-        fitted = self.exact.fit(design, optimized.state, series=False)[0]
-        moved = by_scene(fitted, optimized)
-        if moved is None:
-            return []
-        objective = self.problem.along_scene(moved, certificate)
         level = self.problem.objective(optimized)
-        rows = []
-        for one in quantities(self.config):
-            forces = {name: one.step * row[one.key] for name, row in moved.gradient.items()}
-            row = {"quantity": one.name, "key": one.key, "unit": one.unit, "value": one.value}
-            row |= {"step": one.step} | forces
-            if objective:
-                row["objective_percent"] = 100 * one.step * objective[one.key] / level
-            rows.append(row)
-        return rows
+
+        def percent(moved: Evaluation) -> dict[str, float]:
+            slopes = self.problem.along_scene(moved, certificate)
+            return {key: 100 * slope / level for key, slope in slopes.items()}
+
+        return sensitivity_rows(self.exact, optimized, percent)
 
     def _outcome(self, number: int, found: Found) -> StartOutcome:
         """Return the outcome of a local search by sequential quadratic programming.
@@ -561,6 +572,33 @@ class Search:
         """Return the design at a `point` (d,), in config units by key."""
         values = map(float, self.problem.design(point))
         return dict(zip(self.problem.baseline.design, values, strict=True))
+
+
+def sensitivity_rows(
+    evaluator: Evaluator,
+    optimized: Evaluation,
+    percent: Callable[[Evaluation], dict[str, float]],
+) -> list[dict[str, Any]]:
+    """Return one row per scene quantity, with its effect on the forces of an optimum.
+
+    `evaluator`, `optimized`: of one motion at one speed; `percent`: function that returns the
+    derivatives of the objective (% per unit, by key) from an evaluation with gradients with respect
+    to the quantities; {}: not known. Return an empty list if there are no such gradients."""
+    design = np.array(list(optimized.design.values()))
+    fitted = evaluator.fit(design, optimized.state, series=False)[0]
+    moved = by_scene(fitted, optimized)
+    if moved is None:
+        return []
+    objective = percent(moved)
+    rows = []
+    for one in quantities(evaluator.config):
+        forces = {name: one.step * row[one.key] for name, row in moved.gradient.items()}
+        row = {"quantity": one.name, "key": one.key, "unit": one.unit, "value": one.value}
+        row |= {"step": one.step} | forces
+        if objective:
+            row["objective_percent"] = one.step * objective[one.key]
+        rows.append(row)
+    return rows
 
 
 def method_of(config: Config) -> str:

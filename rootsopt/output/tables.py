@@ -38,6 +38,12 @@ _NAMES = {
     "rms_force_N": ("RMS force", "N"),
     "peak_norm_force_N": ("p-norm of the force", "N"),
 }
+_STATISTICS = {
+    "mean": "mean",
+    "sigma": "standard deviation",
+    "quantile_95": "95 % quantile",
+    "worst": "worst",
+}
 _Rows = Iterable[tuple[str | Text, ...]]
 
 
@@ -120,6 +126,34 @@ def sensitivity_table(rows: list[dict[str, Any]]) -> RenderableType:
     return table
 
 
+def robustness_table(
+    robustness: Mapping[str, Any], designs: Mapping[str, Mapping[str, float]]
+) -> RenderableType:
+    """Return a table of baseline, nominal and robust optimum over fresh scenes that scatter.
+
+    `robustness`: this entry of the result file; `designs`: design of `baseline` and `robust`."""
+    fresh = robustness["fresh"]
+    scenes = next(iter(fresh.values()))["scenes"]
+    table = _table(f"Baseline and optima in {scenes} fresh scenes", *fresh)
+    known = dict(designs)
+    if robustness["nominal"]["optimized"] is not None:
+        known["nominal"] = robustness["nominal"]["optimized"]["design"]
+    keys = [*next(iter(known.values()))]
+    cells = ((_label(key), *(_number(known[name][key]) for name in fresh)) for key in keys)
+    _group(table, "design", cells)
+    combined = [_number(one["combined_objective"]) for one in fresh.values()]
+    _group(table, "robust objective", [("relative to the baseline", *combined)])
+    for name in ("objective", "mean_force_N", "peak_force_N"):
+        rows = (
+            (word, *(_number(one[name][key]) for one in fresh.values()))
+            for key, word in _STATISTICS.items()
+        )
+        _group(table, _label(name), rows)
+    shares = [f"{100 * one['failed_share']:.3g} %" for one in fresh.values()]
+    _group(table, "scenes", [("without a usable motion", *shares)])
+    return table
+
+
 def conflict_table(rows: list[dict[str, Any]]) -> RenderableType:
     """Return a table of constraints in conflict, with the nearest limits that can be met.
 
@@ -140,6 +174,8 @@ def _price(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _held(row: Mapping[str, Any]) -> tuple[str, ...]:
     at = "" if row["speed_rpm"] is None else f"{_number(row['speed_rpm'])} rpm"
+    if "scene" in row:
+        at = f"scene {row['scene']} of the sample"
     if row["rotation_deg"] is not None:
         at += f" peak of {_number(row['force_N'])} N at {row['rotation_deg']:.2f} deg"
     return at.strip() or "motion", f"{row['share']:.3f}", _number(row["objective"])

@@ -185,6 +185,13 @@ class Evaluator:
         """Return another evaluator at the speed `speed_rpm`."""
         return dataclasses.replace(self, scene=at_speed(self.scene, speed_rpm))
 
+    def shifted(self, shift: Scene) -> "Evaluator":
+        """Return another evaluator whose scene's arrays are moved by those of `shift`.
+
+        `shift`: change in SI units, as a `Scene` with None in place of all that is not moved."""
+        moved = eqx.apply_updates(self.scene, jax.tree.map(jnp.asarray, shift))
+        return dataclasses.replace(self, scene=moved)
+
     def with_maxima(self) -> "Evaluator":
         """Return another evaluator that adds all local maxima of the force to an evaluation."""
         return dataclasses.replace(self, maxima=True)

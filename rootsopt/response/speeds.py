@@ -130,6 +130,7 @@ def _states(parts: Sequence[AtSpeed]) -> NDArray[np.float64]:
 
 
 def _rows(start: NDArray[np.float64], number: int) -> NDArray[np.float64]:
+    start = np.atleast_2d(start)
     states = start[start[:, 0] == number, 1:]
     return states[0] if len(states) == 1 else states
 

@@ -61,6 +61,12 @@ class Evaluates(Protocol):
         """Return another evaluator at the speed `speed_rpm`."""
         ...
 
+    def shifted(self, shift: Scene) -> "Evaluates":
+        """Return another evaluator whose scene's arrays are moved by those of `shift`.
+
+        `shift`: change in SI units, as a `Scene` with None in place of all that is not moved."""
+        ...
+
     def at_tolerance(self, rtol: float) -> "Evaluates":
         """Return another evaluator with the orbit tolerance `rtol`."""
         ...
@@ -131,6 +137,10 @@ class Wrapper:
     def at_speed(self: W, speed_rpm: float) -> W:
         """Return another evaluator at the speed `speed_rpm`."""
         return self._around(self.single.at_speed(speed_rpm))
+
+    def shifted(self: W, shift: Scene) -> W:
+        """Return another evaluator whose scene's arrays are moved by those of `shift`."""
+        return self._around(self.single.shifted(shift))
 
     def at_tolerance(self: W, rtol: float) -> W:
         """Return another evaluator with the orbit tolerance `rtol`."""

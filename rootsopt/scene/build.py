@@ -123,6 +123,19 @@ class Scene(eqx.Module):
             **reading.parts_of(config),
         )
 
+    def renewed(self, config: Config) -> "Scene":
+        """Return this scene with the physical quantities of another `config`.
+
+        The config must have the same parts as that of this scene. Profile, solver and the range of
+        the contact map stay the same."""
+        return dataclasses.replace(
+            self,
+            law=reading.law_of(config),
+            gear=reading.gear_of(config),
+            **reading.quantities(config),
+            **reading.parts_of(config),
+        )
+
     def profile(self, design: Float[Array, " d"]) -> Profile:
         """Return the profile of a design (d,) in config units."""
         if self.outline is not None:

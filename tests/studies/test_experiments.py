@@ -114,6 +114,19 @@ def test_smoothing(tmp_path, programs):
 
 
 @pytest.mark.long
+def test_tolerances(tmp_path, programs):
+    """All designs in every fresh scene; the robust optimum is no worse over the search's sample."""
+    run("tolerances", tmp_path, programs, "--case", "shipped")
+    rows = rows_of(tmp_path / "tolerances.csv")
+    assert [row["design"] for row in rows] == ["baseline", "nominal", "robust"]
+    assert numbers(rows, "robust_objective")[0] == 1 > max(numbers(rows, "robust_objective")[1:])
+    scenes = rows_of(tmp_path / "tolerances_scenes.csv")
+    mean = np.mean(numbers(scenes, "robust_peak_force_N"))
+    assert mean == pytest.approx(float(rows[2]["peak_force_N_mean"]), rel=1e-8)
+    assert is_picture(tmp_path / "tolerances.png")
+
+
+@pytest.mark.long
 def test_speed(tmp_path):
     """The slowest speed is as good as standstill; resonances lie where the harmonics meet them."""
     run("speed", tmp_path, os.environ | {"JAX_PLATFORMS": "cpu"})

@@ -1,0 +1,188 @@
+"""Config section `tolerances`: how far the numbers of scene and design scatter in manufacture."""
+
+import difflib
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, NamedTuple
+
+from pydantic import Field, model_validator
+
+from rootsopt.config.section import Section, bare, between
+from rootsopt.config.words import named, shown
+
+_KINDS = ("normal", "uniform", "triangular")
+_RELATIVE = "relative_"
+DISTRIBUTIONS = (*_KINDS, *(_RELATIVE + kind for kind in _KINDS))
+"""Names of the distributions. The width of a `relative_` one is a fraction of the key's value."""
+_SECTIONS = ("rotor", "contact", "scene")
+_NOT_PHYSICAL = ("rotor.helix_deg", "contact.smoothing_mm")
+"""Numbers of these sections that cannot scatter: settings, not quantities of the simulated pair."""
+_DEEPEST = 4
+"""Number of nested sections above which the keys of `tolerances.over` are rejected."""
+
+
+class Scatter(NamedTuple):
+    """Distribution of one key of the config. It is symmetric about the config's own value.
+
+    `key`: dotted key; `kind`: `normal`, `uniform` or `triangular`; `nominal`: the config's value;
+    `width`: standard deviation of a normal distribution before it is cut off, else half the width;
+    `half`: distance from the nominal value beyond which no value lies. All numbers are in the
+    key's unit.
+    """
+
+    key: str
+    kind: str
+    nominal: float
+    width: float
+    half: float
+
+
+class TolerancesConfig(Section):
+    """Scatter of scene and design, for a robust optimum. Without this section, nothing scatters."""
+
+    over: dict[str, dict[str, Annotated[float, Field(gt=0, le=1e9)]]] = Field(
+        description="distribution by key, as {contact.clearance_mm: {normal: 0.002}}; normal: "
+        "standard deviation; uniform, triangular: half width; relative_normal, relative_uniform, "
+        "relative_triangular: the same as a fraction of the key's value"
+    )
+    normal_limit: Annotated[float, between(0.5, 8)] = Field(
+        4.0, description="standard deviations at which normal distributions are cut off"
+    )
+    samples: Annotated[int, Field(ge=2, le=1024)] = Field(
+        16, description="scenes simulated for each design of the search: a fixed Sobol sample"
+    )
+    combine: Literal["mean_plus_k_sigma", "quantile", "worst"] = Field(
+        "mean_plus_k_sigma",
+        description="objective over these scenes: mean plus k standard deviations, a quantile, or "
+        "the worst scene",
+    )
+    k: Annotated[float, between(0, 10)] = Field(
+        2.0, description="standard deviations added to the mean"
+    )
+    quantile: Annotated[float, Field(ge=0.5, lt=1)] = Field(
+        0.95, description="share of the scenes whose objective lies below the quantile"
+    )
+    check_samples: Annotated[int, Field(ge=0, le=100_000)] = Field(
+        1000,
+        description="other random scenes in which baseline, nominal and robust optimum are "
+        "compared; 0: no comparison",
+    )
+    seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = Field(0, description="seed of all samples")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _flat(cls, data):
+        if not isinstance(data, dict) or not isinstance(data.get("over"), dict):
+            return data
+        return data | {"over": _flattened(data["over"])}
+
+    @model_validator(mode="after")
+    def _one_each(self):
+        if not self.over:
+            raise ValueError(
+                "`tolerances.over` must name at least one key, as in {contact.clearance_mm: "
+                "{normal: 0.002}}; add one or remove `tolerances`"
+            )
+        for key, given in self.over.items():
+            place = f"`tolerances.over.{named(key)}`"
+            if len(given) != 1:
+                raise ValueError(
+                    f"{place} must be one distribution, as in {{normal: 0.002}}, but is "
+                    f"{shown(given)}"
+                )
+            (name,) = given
+            if name not in DISTRIBUTIONS:
+                raise ValueError(
+                    f"{place} must be one of {', '.join(DISTRIBUTIONS)}, but is {shown(name)}"
+                    + _near(name, DISTRIBUTIONS)
+                )
+        return self
+
+    def scatters(self, values: Mapping[str, float]) -> tuple[Scatter, ...]:
+        """Return the distributions, in the order of the config.
+
+        `values`: the config's own value of each key. Raises ValueError for a relative distribution
+        of a key whose value is 0."""
+        found = []
+        for key, given in self.over.items():
+            ((name, width),) = given.items()
+            kind = name.removeprefix(_RELATIVE)
+            nominal = values[key]
+            if kind != name and nominal == 0:
+                raise ValueError(
+                    f"`tolerances.over.{key}` must be {kind}, not {name}, because "
+                    f"`{key}` is 0; give the width in the key's unit"
+                )
+            size = width * abs(nominal) if kind != name else width
+            half = self.normal_limit * size if kind == "normal" else size
+            found.append(Scatter(key, kind, nominal, size, half))
+        return tuple(found)
+
+
+def scatterable(config: Any) -> dict[str, float]:
+    """Return the numbers of a config that may scatter, by dotted key.
+
+    They are the numbers of `rotor`, `contact` and `scene` that this config has, and its design
+    parameters. An entry of a list is numbered from 1, as in `profile.coefficients_2`."""
+    found: dict[str, float] = {}
+
+    def walk(section: Section, prefix: str) -> None:
+        for name in type(section).model_fields:
+            value = getattr(section, name)
+            if isinstance(value, Section):
+                walk(value, f"{prefix}{name}.")
+            elif isinstance(value, float) and prefix + name not in _NOT_PHYSICAL:
+                found[prefix + name] = value
+
+    for name in _SECTIONS:
+        walk(getattr(config, name), f"{name}.")
+    profile = config.profile
+    designs = zip(profile.design_keys, profile.design, strict=True)
+    return found | {f"profile.{key}": float(value) for key, value in designs}
+
+
+def unknown_key(key: str, valid: Mapping[str, float], known: Mapping[str, Any]) -> str:
+    """Return a message for a key of `tolerances.over` that cannot scatter.
+
+    `valid`: result of `scatterable`; `known`: all keys of a config."""
+    text = f"`tolerances.over` must name numbers of this config's scene, but names `{named(key)}`"
+    if key in known and key.split(".")[0] in _SECTIONS and key not in _NOT_PHYSICAL:
+        return (
+            f"{text}, which the config does not have as a number; give `{key}` its nominal value "
+            "first, as 0 for an error of mounting"
+        )
+    if key in known:
+        return (
+            f"{text}, which does not scatter; valid are numbers of rotor, contact and scene, and "
+            "the design parameters of profile"
+        )
+    return text + (_near(key, valid) or f"; valid are {', '.join(valid)}")
+
+
+def _near(word: str, words: Any) -> str:
+    """Return a guess at which of the `words` was meant, as the end of a message, or ""."""
+    last = {one.split(".")[-1]: one for one in words}
+    if word.split(".")[-1] in last and word not in words:
+        return f"; did you mean `{last[word.split('.')[-1]]}`?"
+    found = difflib.get_close_matches(word[:80], [*words], n=1, cutoff=0.5)
+    return f"; did you mean `{found[0]}`?" if found else ""
+
+
+def _flattened(data: dict, prefix: str = "", depth: int = 0) -> dict[str, Any]:
+    """Return {dotted key: distribution} from nested sections, as overrides with dots make them.
+
+    A later entry replaces an earlier one of the same key."""
+    words = {bare(word): word for word in DISTRIBUTIONS}
+    found: dict[str, Any] = {}
+    for key, value in data.items():
+        name = f"{prefix}{key}"
+        nested = isinstance(value, dict) and any(isinstance(one, dict) for one in value.values())
+        if nested and depth < _DEEPEST:
+            found |= _flattened(value, f"{name}.", depth + 1)
+        elif isinstance(value, dict):
+            found[name] = {words.get(bare(str(kind)), kind): v for kind, v in value.items()}
+        else:
+            found[name] = value
+    return found
+
+
+__all__ = ["DISTRIBUTIONS", "Scatter", "TolerancesConfig", "scatterable", "unknown_key"]

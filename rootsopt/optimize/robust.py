@@ -1,0 +1,385 @@
+"""The robust optimum: the best design if numbers of scene and design scatter (`tolerances`).
+
+The search has two stages. The first one finds the nominal optimum, as without `tolerances`. In the
+second one, local searches begin at the optima of the first stage. Each of their designs is
+simulated in every scene of a fixed sample, and a rule combines the objectives. At the end,
+baseline, nominal optimum and robust optimum are simulated in many fresh scenes."""
+
+import dataclasses
+import os
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.config import Config
+from rootsopt.optimize.certificate import Certificate
+from rootsopt.optimize.checkpoint import Checkpoint
+from rootsopt.optimize.local import Local
+from rootsopt.optimize.problem import Problem
+from rootsopt.optimize.risk import combine
+from rootsopt.optimize.robust_problem import RobustProblem
+from rootsopt.optimize.search import Optimization, Progress, Search, sensitivity_rows
+from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
+from rootsopt.response.scatter import Shift, draw, shifts
+from rootsopt.response.tolerances import (
+    ToleranceEvaluation,
+    ToleranceEvaluator,
+    in_scene,
+    nominal_of,
+)
+from rootsopt.response.wrapper import Evaluates
+from rootsopt.scene import Scene
+
+OBJECTIVE = "objective"
+"""Name of the objective among the compared quantities."""
+COMPARED: tuple[str, ...] = (OBJECTIVE, *RESPONSES)
+"""Quantities that are compared over fresh scenes: the objective (1 for the baseline in the nominal
+scene), and mean, peak and RMS force (N)."""
+_LEVEL = 0.95
+"""Level of the quantile that the comparison reports."""
+_APART = 1e-6
+"""Distance of two designs in the unit box below which they count as the same."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scattered:
+    """One design in n fresh scenes.
+
+    `values`: arrays (n,) by the names `COMPARED`, NaN where the motion is not usable; `statuses`:
+    number of scenes by status label; `combined`: the search's combination over the usable scenes,
+    divided by that of the baseline."""
+
+    values: dict[str, NDArray[np.float64]]
+    statuses: dict[str, int]
+    combined: float
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Mask (n,) of the scenes in which the motion is usable."""
+        return np.isfinite(self.values[OBJECTIVE])
+
+    def statistics(self, name: str) -> dict[str, float]:
+        """Return statistics of one of the `COMPARED` quantities over the usable scenes.
+
+        They are mean, its standard error, standard deviation, 95 % quantile and greatest value.
+        All are NaN if no scene is usable."""
+        found = self.values[name][self.usable]
+        if not found.size:
+            return dict.fromkeys(
+                ("mean", "standard_error", "sigma", "quantile_95", "worst"), float("nan")
+            )
+        sigma = float(np.std(found))
+        return {
+            "mean": float(np.mean(found)),
+            "standard_error": sigma / float(np.sqrt(len(found))),
+            "sigma": sigma,
+            "quantile_95": float(np.quantile(found, _LEVEL)),
+            "worst": float(np.max(found)),
+        }
+
+    def record(self) -> dict[str, Any]:
+        """Return the record for the result file."""
+        return {
+            "scenes": len(self.usable),
+            "failed_share": float(np.mean(~self.usable)) if len(self.usable) else 0.0,
+            "statuses": self.statuses,
+            "combined_objective": self.combined,
+            **{name: self.statistics(name) for name in COMPARED},
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Robustness:
+    """What the search found besides the robust optimum.
+
+    `nominal`: outcome of the first stage; `begun`: robust objective of the nominal optimum over the
+    sample of the search, NaN if it is not usable; `fresh`: designs in fresh scenes by name
+    (`baseline`, `nominal`, `robust`), empty without `tolerances.check_samples`; `scenes`: sampled
+    numbers of these scenes, arrays (n,) by key."""
+
+    nominal: Optimization
+    begun: float
+    fresh: dict[str, Scattered]
+    scenes: dict[str, NDArray[np.float64]]
+
+    def record(self) -> dict[str, Any]:
+        """Return the entry `robustness` of the result file."""
+        nominal = self.nominal
+        optimality = nominal.optimality
+        best = nominal.optimized
+        return {
+            "nominal": {
+                "optimized": None if best is None else best.record(),
+                "improvement": nominal.improvement,
+                "constraints": nominal.constraints,
+                "optimality": None if optimality is None else optimality.record(),
+                "verification": nominal.verification,
+                "status": nominal.status.label,
+                "robust_objective": None if np.isnan(self.begun) else self.begun,
+            },
+            "fresh": {name: one.record() for name, one in self.fresh.items()},
+        }
+
+
+class RobustSearch(Search):
+    """The second stage: local searches from the optima of the first stage, over a sample.
+
+    `nominal`: outcome of the first stage, with a problem; other arguments: see `Search`."""
+
+    def __init__(
+        self,
+        config: Config,
+        nominal: Optimization,
+        progress: Progress | None = None,
+        stop: threading.Event | None = None,
+        checkpoint: Checkpoint | None = None,
+    ):
+        super().__init__(config, progress, stop, checkpoint)
+        self.nominal, self.first = nominal, self.settings.starts
+        self.settings = self.settings.model_copy(update={"screening": 0})
+        self.exact = ToleranceEvaluator.of(config, self.exact)
+        self._shares: dict[int, NDArray[np.float64]] = {}
+
+    def _warm(self, baseline: Evaluation) -> None:
+        """Do nothing: the first stage has compiled all programs."""
+        del baseline
+
+    def _problem(self, scene: Scene, baseline: Evaluation) -> Problem:
+        return RobustProblem.of(self.config, scene, baseline)
+
+    def _feasible(self, baseline_point) -> list[NDArray[np.float64]]:
+        """Return the points of the nominal optimum and of the other optima of the first stage.
+
+        Without an optimum, return the baseline's point, moved onto the feasible set."""
+        found = []
+        if self.nominal.optimized is not None:
+            found.append(self.problem.point(list(self.nominal.optimized.design.values())))
+        if self.nominal.optimality is not None:
+            optima = self.nominal.optimality.optima
+            found += [self.problem.point(list(one.design.values())) for one in optima]
+        found = found or [baseline_point]
+        self._sample = [self.problem.project(point) for point in found]
+        return [point for point in self._sample if self.problem.feasible(point)]
+
+    def _starts(self, trials) -> list[NDArray[np.float64]]:
+        """Return those optima of the first stage that lie apart in the unit box."""
+        del trials
+        chosen: list[NDArray[np.float64]] = []
+        for point in self._sample:
+            apart = all(np.linalg.norm(point - other) > 0.03 for other in chosen)
+            if apart and self.problem.feasible(point) and len(chosen) < self.settings.starts:
+                chosen.append(point)
+        return chosen
+
+    def _sensitivities(self, optimized: Evaluation, certificate: Certificate) -> list[dict]:
+        """Return one row per scene quantity, with its effect on the forces in the nominal scene.
+
+        Return an empty list for several speeds, for several motions, or after `stop`."""
+        del certificate
+        assert isinstance(self.exact, ToleranceEvaluator)
+        single = self.exact.single
+        if not isinstance(single, Evaluator) or self.stop.is_set():
+            return []
+        return sensitivity_rows(single, nominal_of(optimized), lambda moved: {})
+
+    def _local(self, start: int, evaluation: Evaluation, point) -> Local | None:
+        problem = self.problem
+        assert isinstance(problem, RobustProblem)
+        if not (isinstance(evaluation, ToleranceEvaluation) and evaluation.usable):
+            return None
+        shares = self._shares.get(start)
+        if shares is None:
+            shares = problem.shares(problem.combined(evaluation).weights)
+            self._shares[start] = shares
+        return problem.local(evaluation, point, shares)
+
+
+class TolerantSearch:
+    """Both stages of the search, and the comparison over fresh scenes.
+
+    Arguments: see `Search`. `config` must have `tolerances`."""
+
+    def __init__(
+        self,
+        config: Config,
+        progress: Progress | None = None,
+        stop: threading.Event | None = None,
+        checkpoint: Checkpoint | None = None,
+    ):
+        self.config, self.checkpoint = config, checkpoint
+        self.progress = progress or (lambda done, expected, best: None)
+        self.stop = threading.Event() if stop is None else stop
+        self._done, self._expected = 0, 0
+        self._nominal: Optimization | None = None
+        self._stage: Search = Search(without(config), self._report, self.stop, checkpoint)
+
+    def run(self) -> Optimization:
+        """Run both stages and the comparison. Return the outcome of the second stage.
+
+        If the first stage ends without a problem to solve, or `stop` is set, return its outcome.
+
+        Raises `InputError` if the objective is not defined for the baseline."""
+        nominal = self._stage.run()
+        if self.stop.is_set() or nominal.problem is None or nominal.infeasible is not None:
+            return nominal
+        self._done, self._expected = len(nominal.history), self._stage.expected
+        self._nominal = nominal
+        stage = RobustSearch(self.config, nominal, self._report, self.stop, self.checkpoint)
+        self._stage = stage
+        found = stage.run()
+        if found.problem is None:
+            return found
+        return self._with(found, *self._compared(stage, found))
+
+    def so_far(self) -> Optimization | None:
+        """Return what the search has found so far, as `Search.so_far` does."""
+        found = self._stage.so_far()
+        if found is None:
+            return self._nominal
+        return found if self._nominal is None else self._with(found, {}, {})
+
+    def _with(self, found: Optimization, fresh, scenes) -> Optimization:
+        assert self._nominal is not None
+        count = len(self._nominal.history)
+        rows = [row | {"evaluation": row["evaluation"] + count} for row in found.history]
+        begun = next((row["objective"] for row in rows), float("nan"))
+        robustness = Robustness(self._nominal, float(begun), fresh, scenes)
+        history = [*self._nominal.history, *rows]
+        return dataclasses.replace(found, history=history, robustness=robustness)
+
+    def _report(self, done: int, expected: int, best: float) -> None:
+        self.progress(self._done + done, self._expected + expected, best)
+
+    def _compared(self, stage: RobustSearch, found: Optimization) -> tuple[dict, dict]:
+        """Return baseline and both optima in fresh scenes, and the numbers of these scenes."""
+        tolerances = self.config.tolerances
+        assert tolerances is not None
+        assert self._nominal is not None
+        assert isinstance(found.problem, RobustProblem)
+        if not tolerances.check_samples or self.stop.is_set():
+            return {}, {}
+        known = {
+            "baseline": found.baseline,
+            "nominal": self._nominal.optimized,
+            "robust": found.optimized,
+        }
+        designs = {name: nominal_of(one) for name, one in known.items() if one is not None}
+        drawn = draw(self.config, tolerances.check_samples, fresh=True)
+        single = stage.fast.single if isinstance(stage.fast, ToleranceEvaluator) else stage.fast
+        best = found.problem.objective(found.optimized) if found.optimized else float("nan")
+        before = self._done + len(found.history)
+        per, total = 1 + tolerances.samples, len(drawn) * len(designs)
+        expected, lock, ended = before + total // per, threading.Lock(), [0]
+
+        def tick() -> bool:
+            # As many scenes as a design of the search has count as one design.
+            with lock:
+                ended[0] += 1
+                if ended[0] % per == 0:
+                    self.progress(before + ended[0] // per, expected, best)
+            return self.stop.is_set()
+
+        fresh = compare(single, found.problem, designs, shifts(self.config, drawn), tick)
+        if self.stop.is_set():
+            return {}, {}
+        keys = [one.key for one in self.config.scatters]
+        return fresh, dict(zip(keys, drawn.T, strict=True))
+
+
+def compare(
+    evaluator: Evaluates,
+    problem: RobustProblem,
+    designs: Mapping[str, Evaluation],
+    scenes: Sequence[Shift],
+    tick: Callable[[], bool] = lambda: False,
+) -> dict[str, Scattered]:
+    """Simulate designs in many scenes, and return each design's `Scattered` by name.
+
+    `evaluator`: that of the nominal scene; `problem`: defines the objective; `designs`: their
+    evaluations in the nominal scene, the first one is the baseline. Each motion starts at the
+    design's orbit in the nominal scene. Equal designs are simulated only once. `tick`: function
+    called before each simulation; if it returns True, the simulation is left out."""
+    found: dict[str, Scattered] = {}
+    points = {name: problem.point(list(one.design.values())) for name, one in designs.items()}
+    reference = 1.0
+    for name, nominal in designs.items():
+        twin = next((k for k in found if _same(points[k], points[name])), None)
+        if twin is not None:
+            found[name] = found[twin]
+            continue
+        one = _scattered(evaluator, problem, nominal, scenes, tick)
+        if not found:
+            reference = one.combined
+        found[name] = dataclasses.replace(one, combined=one.combined / reference)
+    return found
+
+
+def _scattered(
+    evaluator: Evaluates,
+    problem: RobustProblem,
+    nominal: Evaluation,
+    scenes: Sequence[Shift],
+    tick: Callable[[], bool],
+) -> Scattered:
+    """Simulate one design in many scenes. Arguments: see `compare`."""
+    design = np.array(list(nominal.design.values()))
+
+    def at(shift: Shift) -> tuple[str, list[float]]:
+        if tick():
+            return "interrupted", [float("nan")] * len(COMPARED)
+        one = in_scene(evaluator, shift, design, nominal.state).evaluation
+        forces = [one.response.get(name, float("nan")) for name in RESPONSES]
+        values = [problem.objective(one), *forces] if one.usable else [float("nan")] * len(COMPARED)
+        return one.status.label, values
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        rows = list(pool.map(at, scenes))
+    labels = [label for label, _ in rows]
+    columns = np.array([values for _, values in rows]).T
+    values: dict[str, NDArray[np.float64]] = dict(zip(COMPARED, columns, strict=True))
+    usable = np.isfinite(values[OBJECTIVE])
+    assert problem.config.tolerances is not None
+    combined = float("nan")
+    if usable.any():
+        combined = combine(problem.config.tolerances, values[OBJECTIVE][usable]).value
+    counts = {label: labels.count(label) for label in dict.fromkeys(labels)}
+    return Scattered(values, counts, combined)
+
+
+def _same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    return bool(np.max(np.abs(one - other), initial=0.0) < _APART)
+
+
+def without(config: Config) -> Config:
+    """Return `config` without `tolerances`."""
+    return config.model_copy(update={"tolerances": None})
+
+
+def search_of(
+    config: Config,
+    progress: Progress | None = None,
+    stop: threading.Event | None = None,
+    checkpoint: Checkpoint | None = None,
+) -> Search | TolerantSearch:
+    """Return the search that a `config` needs: with `tolerances`, a `TolerantSearch`.
+
+    Arguments: see `Search`."""
+    kind = Search if config.tolerances is None else TolerantSearch
+    return kind(config, progress, stop, checkpoint)
+
+
+__all__ = [
+    "COMPARED",
+    "OBJECTIVE",
+    "RobustSearch",
+    "Robustness",
+    "Scattered",
+    "TolerantSearch",
+    "compare",
+    "search_of",
+    "without",
+]

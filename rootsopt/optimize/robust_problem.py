@@ -1,0 +1,178 @@
+"""The design problem over a sample of scenes that scatter.
+
+The objective in each scene is that of `Problem`, relative to the baseline in the nominal scene. A
+rule (`rootsopt.optimize.risk`) combines the scenes to one number, which is divided by its value for
+the baseline. The robust objective of the baseline is therefore 1, too."""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.config import Config
+from rootsopt.optimize.certificate import Certificate
+from rootsopt.optimize.local import Group, Local
+from rootsopt.optimize.optimality import Holder
+from rootsopt.optimize.problem import Problem
+from rootsopt.optimize.risk import Combined, combine
+from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.tolerances import ToleranceEvaluation, nominal_of
+from rootsopt.scene import Scene
+
+_HELD = 1e-6
+"""Share of a scene below which it does not hold the optimum."""
+_KINDS = 64
+"""Kinds of branches per scene. There are at most 33 speeds, and each is a kind."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RobustProblem(Problem):
+    """A design problem whose objective combines the scenes of a sample.
+
+    `reference`: the combination for the baseline, by which the objective is divided. The field
+    `baseline` is the evaluation in the nominal scene. Methods also accept an evaluation in the
+    nominal scene alone, for which they return what `Problem` returns."""
+
+    reference: float = 1.0
+
+    @classmethod
+    def of(cls, config: Config, scene: Scene, baseline: Evaluation) -> "RobustProblem":
+        """Return the problem of a `config` with `tolerances`, as `Problem.of` does.
+
+        `baseline`: a usable `ToleranceEvaluation` of the config's own design."""
+        assert isinstance(baseline, ToleranceEvaluation)
+        problem = Problem.of(config, scene, baseline.nominal)
+        found = cls(config, problem.baseline, problem.space)
+        return dataclasses.replace(found, reference=found.combined(baseline).value)
+
+    def values(self, evaluation: ToleranceEvaluation) -> NDArray[np.float64]:
+        """Return the objective in each scene of the sample (n,), 1 for the nominal baseline."""
+        return np.array(
+            [super(RobustProblem, self).objective(p.evaluation) for p in _of(evaluation)]
+        )
+
+    def combined(self, evaluation: ToleranceEvaluation) -> Combined:
+        """Return the combination of the objectives in all scenes, with its weights.
+
+        It is not yet divided by that of the baseline."""
+        assert self.config.tolerances is not None
+        return combine(self.config.tolerances, self.values(evaluation))
+
+    def objective(self, evaluation: Evaluation) -> float:
+        """Return the robust objective of an `evaluation`, which is 1 for the baseline.
+
+        The result is NaN without a usable steady state in every scene."""
+        if not isinstance(evaluation, ToleranceEvaluation):
+            return super().objective(evaluation)
+        if not evaluation.usable:
+            return float("nan")
+        return self.combined(evaluation).value / self.reference
+
+    def slope(self, evaluation: Evaluation, point) -> NDArray[np.float64]:
+        """Return the gradient (d,) of the robust objective with respect to the `point` (d,)."""
+        if not isinstance(evaluation, ToleranceEvaluation):
+            return super().slope(evaluation, point)
+        weights = self.combined(evaluation).weights
+        rows = [super(RobustProblem, self).slope(p.evaluation, point) for p in _of(evaluation)]
+        return np.asarray(weights @ np.array(rows) / self.reference)
+
+    def local(
+        self, evaluation: Evaluation, point, shares: NDArray[np.float64] | None = None
+    ) -> Local | None:
+        """Return the robust objective and the constraints at a `point`, with gradients.
+
+        If the worst scene counts, its scenes are branches of one maximum. Otherwise the maxima of
+        each scene (local maxima of the force, for example) are groups, weighted by `shares` (n,):
+        numbers ≥ 0 that must be the same throughout a local search. By default they are the
+        weights at this point, without those below 0. What the groups leave of the objective is
+        described by the gradient of the greatest branch in each scene."""
+        if not isinstance(evaluation, ToleranceEvaluation):
+            return super().local(evaluation, point)
+        if not evaluation.usable:
+            return None
+        assert self.config.tolerances is not None
+        every = [super(RobustProblem, self).local(p.evaluation, point) for p in _of(evaluation)]
+        parts = [part for part in every if part is not None]
+        if self.config.tolerances.combine == "worst":
+            return self._worst(parts)
+        value, weights = combine(self.config.tolerances, [part.objective for part in parts])
+        shares = self.shares(weights) if shares is None else shares
+        smooth, slope = value, np.zeros_like(parts[0].slope)
+        groups: list[Group] = []
+        for part, weight, share in zip(parts, weights, shares, strict=True):
+            slope = slope + weight * top_slope(part)
+            if share <= 0:
+                continue
+            for one in part.groups:
+                smooth -= share * one.top
+                slope = slope - share * one.slopes[np.argmax(one.values)]
+                groups.append(Group(one.tags, share * one.values, share * one.slopes))
+        scaled = tuple(self._scaled(group) for group in groups)
+        limits = parts[0].slack, parts[0].normals
+        return Local(smooth / self.reference, slope / self.reference, scaled, *limits)
+
+    def by_speed(self, evaluation: Evaluation) -> list[dict[str, float]]:
+        """Return one row per speed in the nominal scene, as `Problem.by_speed` does."""
+        return super().by_speed(nominal_of(evaluation))
+
+    def shares(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the shares (n,) with which the maxima of each scene become groups in `local`."""
+        return np.maximum(weights, 0.0)
+
+    def _worst(self, parts: list[Local]) -> Local:
+        branches = [self._scaled(_branches(part, _KINDS * k)) for k, part in enumerate(parts)]
+        group = Group(*(np.concatenate(arrays) for arrays in zip(*branches, strict=True)))
+        zero = np.zeros_like(parts[0].slope)
+        return Local(0.0, zero, (group,), parts[0].slack, parts[0].normals)
+
+    def _scaled(self, group: Group) -> Group:
+        size = self.reference
+        return group._replace(values=group.values / size, slopes=group.slopes / size)
+
+    def held_by(self, evaluation: Evaluation, certificate: Certificate) -> list[Holder]:
+        """Return the worst scenes that are active at an evaluated optimum, if the worst counts.
+
+        If another rule combines the scenes, all scenes hold the optimum, and the list is empty.
+        `evaluation`, `certificate`: those of the optimum."""
+        if not isinstance(evaluation, ToleranceEvaluation):
+            return super().held_by(evaluation, certificate)
+        assert self.config.tolerances is not None
+        if self.config.tolerances.combine != "worst" or not certificate.shares:
+            return []
+        point = self.point(list(evaluation.design.values()))
+        local = self.local(evaluation, point)
+        assert local is not None
+        (group,), (shares,) = local.groups, certificate.shares
+        scenes = (group.tags[:, 0] // _KINDS).astype(int)
+        held = []
+        for scene in np.unique(scenes[shares > _HELD]):
+            mine = scenes == scene
+            top, share = float(np.max(group.values[mine])), float(np.sum(shares[mine]))
+            nothing = float("nan")
+            held.append(Holder(nothing, nothing, nothing, top, share, int(scene)))
+        return held
+
+
+def _of(evaluation: ToleranceEvaluation):
+    return evaluation.samples
+
+
+def top_slope(local: Local) -> NDArray[np.float64]:
+    """Return the gradient (d,) of an objective by the greatest branch of each of its maxima."""
+    rows = (group.slopes[np.argmax(group.values)] for group in local.groups)
+    return local.slope + sum(rows, np.zeros_like(local.slope))
+
+
+def _branches(local: Local, kind: int) -> Group:
+    """Return an objective as the branches of one maximum, with kinds from `kind` on.
+
+    An objective that is a sum of several maxima has one branch, its greatest one."""
+    if len(local.groups) == 1:
+        (group,) = local.groups
+        tags = group.tags + np.array([kind, 0.0])
+        return Group(tags, local.smooth + group.values, local.slope + group.slopes)
+    tags = np.array([[float(kind), 0.0]])
+    return Group(tags, np.array([local.objective]), top_slope(local)[None, :])
+
+
+__all__ = ["RobustProblem", "top_slope"]

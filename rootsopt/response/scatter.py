@@ -1,0 +1,92 @@
+"""Samples of the numbers of scene and design that scatter (`tolerances` of a config).
+
+The search of a robust optimum uses a fixed sample from a scrambled Sobol sequence. Its points cover
+the distributions more evenly than random ones. Fresh samples are pseudo-random and independent, so
+that statistics over them have the usual standard errors.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from rootsopt.config import Config
+from rootsopt.config.tolerances import Scatter
+from rootsopt.design.space import sobol
+from rootsopt.scene import Scene
+
+_FRESH = 1
+"""Number of the random stream from which fresh samples are drawn."""
+
+
+class Shift(NamedTuple):
+    """One sample: how far scene and design are from their nominal values.
+
+    `values`: sampled number of each key that scatters, in the key's unit; `scene`: change of the
+    scene's arrays in SI units, as a `Scene` (None: no array scatters); `design` (d,): change of the
+    design in config units."""
+
+    values: dict[str, float]
+    scene: Scene | None
+    design: NDArray[np.float64]
+
+
+def quantiles(scatter: Scatter, levels: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return the values (n,) of a distribution below which it has the probabilities `levels` (n,).
+
+    Values are in the unit of the key. The normal distribution is cut off at `scatter.half`."""
+    middle = np.asarray(levels, np.float64) - 0.5
+    if scatter.kind == "uniform":
+        away = 2 * scatter.width * middle
+    elif scatter.kind == "triangular":
+        away = scatter.width * np.sign(middle) * (1 - np.sqrt(1 - 2 * np.abs(middle)))
+    else:
+        inside = 2 * ndtr(scatter.half / scatter.width) - 1
+        away = scatter.width * ndtri(0.5 + inside * middle)
+    return scatter.nominal + np.clip(away, -scatter.half, scatter.half)
+
+
+def draw(config: Config, count: int, fresh: bool = False) -> Float[np.ndarray, "n q"]:
+    """Return `count` samples of the q keys that scatter, in the order of `config.scatters`.
+
+    `fresh`: whether the sample is pseudo-random and independent of the search's, instead of the
+    fixed Sobol sample of the search. Both follow from `tolerances.seed` alone."""
+    scatters, tolerances = config.scatters, config.tolerances
+    assert tolerances is not None
+    if fresh:
+        levels = np.random.default_rng([tolerances.seed, _FRESH]).random((count, len(scatters)))
+    else:
+        levels = sobol(count, tolerances.seed, len(scatters))
+    columns = [quantiles(one, levels[:, k]) for k, one in enumerate(scatters)]
+    return np.stack(columns, axis=1)
+
+
+def shifts(config: Config, samples: Float[np.ndarray, "n q"]) -> tuple[Shift, ...]:
+    """Return the n samples (n, q) of `draw` as changes of scene and design."""
+    keys = [one.key for one in config.scatters]
+    inner = [not key.startswith("profile.") for key in keys]
+    here = Scene.from_config(config)
+    found = []
+    for row in np.asarray(samples):
+        values = dict(zip(keys, map(float, row), strict=True))
+        moved = config.moved(values)
+        scene = None
+        if any(inner):
+            only = {key: value for key, value in values.items() if not key.startswith("profile.")}
+            scene = _difference(here, here.renewed(config.moved(only)))
+        found.append(Shift(values, scene, moved.design - config.design))
+    return tuple(found)
+
+
+def _difference(before: Scene, after: Scene) -> Scene:
+    """Return the change of a scene's arrays, as a `Scene` with None in place of all else."""
+    arrays = (eqx.filter(one, eqx.is_inexact_array) for one in (after, before))
+    return jax.tree.map(lambda x, y: np.asarray(x) - np.asarray(y), *arrays)
+
+
+__all__: Sequence[str] = ["Shift", "draw", "quantiles", "shifts"]

@@ -1,0 +1,184 @@
+"""One design in many scenes that scatter (`tolerances` of a config).
+
+The scenes of a sample differ in numbers only, so all of them share the same compiled programs.
+"""
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.config import Config
+from rootsopt.response.evaluation import RESPONSES, Evaluation
+from rootsopt.response.scatter import Shift, draw, shifts
+from rootsopt.response.wrapper import Evaluates, Wrapper
+from rootsopt.scene import design_vector
+from rootsopt.status import Status
+
+
+class AtSample(NamedTuple):
+    """The evaluation in one scene.
+
+    `values`: numbers of the keys that scatter, in their units, empty for the nominal scene;
+    `evaluation` in this scene, of the design moved by its own scatter.
+    """
+
+    values: dict[str, float]
+    evaluation: Evaluation
+
+    def row(self) -> dict[str, Any]:
+        """Return a table row: the sampled numbers, forces and status."""
+        response = self.evaluation.response
+        forces = {name: response.get(name) for name in RESPONSES}
+        return self.values | forces | {"status": self.evaluation.status.label}
+
+
+@dataclasses.dataclass(frozen=True)
+class ToleranceEvaluation(Evaluation):
+    """An `Evaluation` in the nominal scene, together with the evaluations in all scenes of a
+    sample.
+
+    `parts`: that of the nominal scene, then one for each sample. `status`: that of the first part
+    that is not usable. In this case, there is no gradient. If all parts are usable, it is the
+    status of the nominal scene. `state` (m, 1 + n): a row for each known motion, which holds the
+    number of its part, then the state as that part has it.
+    """
+
+    parts: tuple[AtSample, ...] = ()
+
+    @property
+    def nominal(self) -> Evaluation:
+        """Evaluation in the nominal scene."""
+        return self.parts[0].evaluation
+
+    @property
+    def samples(self) -> tuple[AtSample, ...]:
+        """Evaluations in the scenes of the sample, without the nominal scene."""
+        return self.parts[1:]
+
+    def record(self) -> dict[str, Any]:
+        own = {"status": self.status.label, "message": self.message}
+        rows = [part.row() for part in self.samples]
+        return self.nominal.record() | own | {"samples": rows}
+
+
+@dataclasses.dataclass(frozen=True)
+class ToleranceEvaluator(Wrapper):
+    """Evaluates designs in the nominal scene and in every scene of a fixed sample.
+
+    `single`: the evaluator used in each scene; `shifts`: how far the scenes and their designs are
+    from the nominal ones. The response is reported in the nominal scene. A design is usable only
+    if it is usable in every scene.
+    """
+
+    shifts: tuple[Shift, ...] = ()
+
+    @classmethod
+    def of(cls, config: Config, single: Evaluates) -> "ToleranceEvaluator":
+        """Return the evaluator over the fixed sample of `tolerances` in a `config`.
+
+        `single`: evaluator of the config's nominal scene."""
+        assert config.tolerances is not None
+        return cls(single, shifts(config, draw(config, config.tolerances.samples)))
+
+    def relative_to(self, baseline: Evaluation) -> "ToleranceEvaluator":
+        """Return another evaluator that compares coexisting motions in each scene by their forces
+        relative to those of the `baseline` in the nominal scene."""
+        return self._around(self.single.relative_to(nominal_of(baseline)))
+
+    def fit(self, design=None, start=None, series=True) -> tuple["ToleranceEvaluator", Evaluation]:
+        """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
+
+        `design` (d,): in config units, by default the config's own; `start`: the `state` of a
+        neighbouring design's evaluation; `series`: whether to compute the series in the nominal
+        scene. Without a usable motion in the nominal scene, no sample is simulated."""
+        nominal = design_vector(self.config) if design is None else jnp.asarray(design)
+        now, head = self.single.fit(nominal, _rows(start, 0), series)
+        fitted = dataclasses.replace(self, single=now)
+        if not head.usable:
+            return fitted, together((AtSample({}, head),))
+
+        def at(number: int) -> AtSample:
+            shift = self.shifts[number - 1]
+            return in_scene(now, shift, nominal, _rows(start, number))
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            parts = tuple(pool.map(at, range(1, 1 + len(self.shifts))))
+        return fitted, together((AtSample({}, head), *parts))
+
+
+def in_scene(
+    evaluator: Evaluates, shift: Shift, design: Any, start: NDArray[np.float64] | None
+) -> AtSample:
+    """Evaluate a `design` (d,) in a scene that differs from the nominal one by `shift`.
+
+    `evaluator`: that of the nominal scene; `start`: as in `Evaluates.__call__`."""
+    if shift.scene is not None:
+        evaluator = evaluator.shifted(shift.scene)
+    return AtSample(shift.values, evaluator(design + shift.design, start, series=False))
+
+
+def together(parts: Sequence[AtSample]) -> ToleranceEvaluation:
+    """Combine the evaluations in several scenes into one, reported in the nominal scene.
+
+    `parts`: that of the nominal scene first."""
+    head = parts[0].evaluation
+    status, message = overall(parts)
+    seconds = sum(part.evaluation.statistics.get("seconds", 0.0) for part in parts)
+    fields = {field.name: getattr(head, field.name) for field in dataclasses.fields(Evaluation)}
+    fields |= {
+        "gradient": head.gradient if status.usable else {},
+        "status": status,
+        "message": message,
+        "statistics": head.statistics | {"samples": len(parts) - 1, "seconds": seconds},
+        "state": _states(parts) if status.usable else None,
+    }
+    return ToleranceEvaluation(**fields, parts=tuple(parts))
+
+
+def overall(parts: Sequence[AtSample]) -> tuple[Status, str]:
+    """Return status and message of the first part that is not usable. If all parts are usable,
+    return those of the first part."""
+    failed = [part for part in parts if not part.evaluation.usable]
+    if not failed or failed[0] is parts[0]:
+        return parts[0].evaluation.status, parts[0].evaluation.message
+    first, count = failed[0], len(parts) - 1
+    values = ", ".join(f"{key} = {value:.6g}" for key, value in first.values.items())
+    return first.evaluation.status, (
+        f"In {len(failed)} of the {count} scenes of `tolerances`, the motion is not usable. With "
+        f"{values}: {first.evaluation.message}"
+    )
+
+
+def nominal_of(evaluation: Evaluation) -> Evaluation:
+    """Return the evaluation in the nominal scene; any other evaluation is returned unchanged."""
+    return evaluation.nominal if isinstance(evaluation, ToleranceEvaluation) else evaluation
+
+
+def _states(parts: Sequence[AtSample]) -> NDArray[np.float64]:
+    rows = [np.atleast_2d(np.asarray(part.evaluation.state)) for part in parts]
+    return np.concatenate([np.insert(one, 0, k, axis=1) for k, one in enumerate(rows)])
+
+
+def _rows(start: NDArray[np.float64] | None, number: int) -> NDArray[np.float64] | None:
+    """Return the state of one part from the `state` of an evaluation, or None without a state."""
+    if start is None:
+        return None
+    states = start[start[:, 0] == number, 1:]
+    return states[0] if len(states) == 1 else states
+
+
+__all__ = [
+    "AtSample",
+    "ToleranceEvaluation",
+    "ToleranceEvaluator",
+    "in_scene",
+    "nominal_of",
+    "overall",
+    "together",
+]

@@ -1,0 +1,293 @@
+"""Robust optima: objective over many scenes, its gradient, both stages of the search."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from rootsopt.commands.console import main
+from rootsopt.config import load
+from rootsopt.optimize.certificate import certify
+from rootsopt.optimize.local import Group, Local
+from rootsopt.optimize.problem import Problem
+from rootsopt.optimize.robust import Scattered, compare, search_of, without
+from rootsopt.optimize.robust_problem import RobustProblem
+from rootsopt.optimize.search import Search
+from rootsopt.optimize.sqp import Stops, descend
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.scatter import draw, shifts
+from rootsopt.response.sensitivity import by_scene
+from rootsopt.response.tolerances import AtSample, ToleranceEvaluator, together
+from tests.standins import evaluation_of
+
+CIC = "configs/cic.yaml"
+PLAY = "contact.clearance_mm=0.01"
+CLEARANCE = "tolerances.over.contact.clearance_mm.normal={}"
+LOAD = "tolerances.over.scene.load.torque_N_m.relative_normal=0.05"
+TIP = "tolerances.over.profile.tip_arc_angle_deg.normal=0.02"
+POINT = np.array([0.2, 0.3, 0.4])
+RULES = {
+    "mean": (),
+    "quantile": ("tolerances.combine=quantile",),
+    "worst": ("tolerances.combine=worst",),
+}
+
+
+def config_of(*overrides, width=0.002):
+    return load(CIC, (PLAY, CLEARANCE.format(width), *overrides))
+
+
+def problem_of(evaluator, baseline, *overrides):
+    config = config_of(LOAD, TIP, *overrides)
+    return RobustProblem.of(config, evaluator.scene, baseline)
+
+
+@pytest.fixture(scope="module")
+def spread():
+    """Evaluator over four scenes with all maxima, the baseline, and another design."""
+    config = config_of(LOAD, TIP, "solver.rtol=1e-10", "tolerances.samples=4")
+    evaluator = ToleranceEvaluator.of(config, Evaluator.of(config)).with_maxima()
+    baseline = evaluator(series=False)
+    problem = RobustProblem.of(config, evaluator.scene, baseline)
+    return evaluator, baseline, evaluator(problem.design(POINT), baseline.state, series=False)
+
+
+def relative(one, base):
+    """The config's objective by hand: half the mean force, half the peak."""
+    keys = "mean_force_N", "peak_force_N"
+    return sum(0.5 * one.response[key] / base.response[key] for key in keys)
+
+
+def test_objective_combines_the_scenes(spread):
+    """Against combinations by hand; 1 for the baseline; worst ≥ mean + 0 σ."""
+    evaluator, baseline, moved = spread
+    rows = [
+        np.array([relative(part.evaluation, baseline.nominal) for part in one.samples])
+        for one in (moved, baseline)
+    ]
+    expected = {
+        (): [np.mean(row) + 2 * np.std(row) for row in rows],
+        ("tolerances.k=0",): [np.mean(row) for row in rows],
+        ("tolerances.combine=worst",): [np.max(row) for row in rows],
+    }
+    for overrides, (after, before) in expected.items():
+        problem = problem_of(evaluator, baseline, *overrides)
+        assert problem.objective(moved) == pytest.approx(after / before, rel=1e-12)
+        assert problem.objective(baseline) == pytest.approx(1, abs=1e-14)
+        assert problem.objective(moved.nominal) == pytest.approx(
+            relative(moved.nominal, baseline.nominal), rel=1e-12
+        )
+
+
+def test_gradient_agrees_with_central_differences(spread):
+    """Along one direction of the unit box, for every rule; the local model has the same value,
+    slope and limits."""
+    evaluator, baseline, moved = spread
+    direction = np.array([0.6, -0.5, 0.4])
+    # Differences of second order: 1e-4 leaves some 1e-6 of curvature and 1e-6 of tolerance.
+    step = 1e-4
+    first = problem_of(evaluator, baseline)
+    ends = [
+        evaluator(first.design(POINT + sign * step * direction), moved.state, series=False)
+        for sign in (1, -1)
+    ]
+    slopes = []
+    for overrides in RULES.values():
+        problem = problem_of(evaluator, baseline, *overrides)
+        upper, lower = map(problem.objective, ends)
+        slopes.append(float(problem.slope(moved, POINT) @ direction))
+        assert slopes[-1] == pytest.approx((upper - lower) / (2 * step), rel=1e-4)
+        local = problem.local(moved, POINT)
+        assert local.objective == pytest.approx(problem.objective(moved), rel=1e-12)
+        tops = tuple(np.eye(len(g.values))[np.argmax(g.values)] for g in local.groups)
+        # The slope of the highest maximum is computed apart from that of the peak.
+        assert local.combined(tops) @ direction == pytest.approx(slopes[-1], rel=1e-5)
+        np.testing.assert_array_equal(local.slack, problem.look(POINT)[2])
+    assert len(set(np.round(slopes, 4))) == 3
+
+
+def test_small_scatter_is_the_nominal_objective_and_its_sensitivity():
+    """With a tiny σ, mean + kσ is the nominal objective. With a small one, the σ of each force is
+    the force's derivative with respect to the clearance, times the σ of the clearance. The
+    derivative comes from the table of sensitivities, which shares no code with the sample."""
+    width = 1e-5
+    config = config_of("solver.rtol=1e-10", "tolerances.samples=8", width=width)
+    single = Evaluator.of(config)
+    evaluator = ToleranceEvaluator.of(config, single)
+    baseline = evaluator(series=False)
+    known = by_scene(single, baseline.nominal)
+    assert known is not None
+    sample = np.array([part.values["contact.clearance_mm"] for part in baseline.samples])
+    for name in ("mean_force_N", "peak_force_N", "rms_force_N"):
+        forces = np.array([part.evaluation.response[name] for part in baseline.samples])
+        slope = known.gradient[name]["contact.clearance_mm"]
+        # The second derivative, about 1e5 N/mm², adds some 1e-3.
+        assert np.std(forces) == pytest.approx(abs(slope) * np.std(sample), rel=3e-3)
+        assert np.corrcoef(forces, np.sign(slope) * sample)[0, 1] > 0.99999
+    tiny = config_of("solver.rtol=1e-10", "tolerances.samples=8", width=1e-9)
+    evaluator = ToleranceEvaluator.of(tiny, single)
+    baseline = evaluator(series=False)
+    problem = RobustProblem.of(tiny, evaluator.scene, baseline)
+    nominal = Problem.of(tiny, evaluator.scene, baseline.nominal)
+    design = problem.design(POINT)
+    moved = evaluator(design, baseline.state, series=False)
+    assert problem.objective(moved) == pytest.approx(nominal.objective(moved.nominal), abs=1e-5)
+    slopes = problem.slope(moved, POINT), nominal.slope(moved.nominal, POINT)
+    np.testing.assert_allclose(*slopes, rtol=1e-3)
+
+
+def toy(monkeypatch, branches, *overrides):
+    """A robust problem in one variable x, whose scenes have the objectives max over `branches` of
+    (level + slope * (x - place)²): one list of (level, slope, place) per scene."""
+
+    def local_of(number, x):
+        rows = branches[number]
+        values = np.array([level + slope * (x - place) ** 2 for level, slope, place in rows])
+        slopes = np.array([[2 * slope * (x - place)] for _, slope, place in rows])
+        tags = np.array([[0.0, k / len(rows)] for k in range(len(rows))])
+        return Local(0.0, np.zeros(1), (Group(tags, values, slopes),), np.zeros(0),
+                     np.zeros((0, 1)))  # fmt: skip
+
+    def scene(one):
+        return int(one.response["mean_force_N"])
+
+    def local(self, evaluation, point):
+        return local_of(scene(evaluation), float(point[0]))
+
+    def objective(self, evaluation):
+        return local_of(scene(evaluation), evaluation.design["x0"]).objective
+
+    monkeypatch.setattr(Problem, "local", local)
+    monkeypatch.setattr(Problem, "objective", objective)
+    monkeypatch.setattr(Problem, "point", lambda self, design: np.asarray(design))
+    problem = object.__new__(RobustProblem)
+    vars(problem).update(config=config_of(*overrides), baseline=evaluation_of(), reference=1.0)
+
+    def evaluate(x):
+        parts = [AtSample({}, evaluation_of(float(k), design=[x])) for k in range(len(branches))]
+        return together([AtSample({}, evaluation_of(0.0, design=[x])), *parts])
+
+    return problem, evaluate
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_local_search_finds_the_minimum_over_scenes_with_corners(name, monkeypatch):
+    """Each scene is a maximum of two parabolas. The minimum agrees with a fine grid, and the
+    certificate there holds."""
+    draws = np.random.default_rng(5)
+    branches = [
+        [(draws.uniform(0.8, 1), draws.uniform(0.5, 2), draws.uniform(0.1, 0.9)) for _ in range(2)]
+        for _ in range(6)
+    ]
+    problem, evaluate = toy(monkeypatch, branches, *RULES[name])
+    grid = np.linspace(0, 1, 4001)
+    values = [problem.objective(evaluate(x)) for x in grid]
+    shares = problem.shares(problem.combined(evaluate(0.2)).weights)
+
+    def look(point):
+        return problem.local(evaluate(float(point[0])), point, shares)
+
+    found = descend(look, np.array([0.2]), Stops())
+    assert found.local is not None
+    assert found.local.objective <= min(values) + 1e-7
+    assert found.point[0] == pytest.approx(grid[np.argmin(values)], abs=2e-3)
+    if name != "quantile":  # Its corners, where scenes change places, are no maxima.
+        own = problem.local(evaluate(float(found.point[0])), found.point)
+        assert certify(own, found.point).residual < 1e-4
+
+
+def test_the_worst_scenes_hold_the_optimum(monkeypatch):
+    """Two parabolas that cross at 0.5, and one far below: the first two share the optimum."""
+    branches = [[(1, 1, 0.25)], [(1, 1, 0.75)], [(0.1, 1, 0.5)]]
+    problem, evaluate = toy(monkeypatch, branches, "tolerances.combine=worst")
+    found = descend(lambda x: problem.local(evaluate(float(x[0])), x), np.array([0.1]))
+    assert found.converged
+    assert found.point[0] == pytest.approx(0.5, abs=1e-6)
+    held = problem.held_by(evaluate(0.5), found.certificate)
+    assert [one.scene for one in held] == [0, 1]
+    assert [one.share for one in held] == pytest.approx([0.5, 0.5], abs=1e-3)
+    assert held[0].record()["scene"] == 0
+
+
+def test_statistics_of_fresh_scenes():
+    """Scenes without a usable motion are counted, and left out of the statistics."""
+    values = np.array([1.0, 2.0, np.nan, 3.0, 4.0])
+    names = "objective", "mean_force_N", "peak_force_N", "rms_force_N"
+    one = Scattered(dict.fromkeys(names, values), {"periodic": 4, "chaotic": 1}, 2.5)
+    record = one.record()
+    assert record["failed_share"] == 0.2
+    assert record["statuses"]["chaotic"] == 1
+    found = record["peak_force_N"]
+    assert (found["mean"], found["worst"]) == (2.5, 4.0)
+    assert found["sigma"] == pytest.approx(np.sqrt(1.25))
+    assert found["quantile_95"] == pytest.approx(3.85)
+    empty = Scattered(dict.fromkeys(names, np.full(3, np.nan)), {"chaotic": 3}, np.nan)
+    assert np.isnan(empty.statistics("objective")["mean"])
+
+
+def test_fresh_scenes_from_the_neighbouring_orbit(spread):
+    """Forces in fresh scenes are those found from rest; equal designs are simulated once."""
+    evaluator, baseline, moved = spread
+    problem = problem_of(evaluator, baseline)
+    config = problem.config
+    fresh = shifts(config, draw(config, 3, fresh=True))
+    single = evaluator.single
+    designs = {"baseline": baseline.nominal, "nominal": moved.nominal, "robust": moved.nominal}
+    found = compare(single, problem, designs, fresh)
+    assert found["robust"] is found["nominal"] or found["robust"] == found["nominal"]
+    assert found["baseline"].combined == 1
+    for k, shift in enumerate(fresh):
+        alone = Evaluator.of(config.moved(shift.values))
+        one = alone(problem.design(POINT) + shift.design, series=False)
+        peak = found["nominal"].values["peak_force_N"][k]
+        assert peak == pytest.approx(one.response["peak_force_N"], rel=1e-6)
+    assert found["nominal"].statuses == {"periodic": 3}
+    again = compare(single, problem, designs, fresh)
+    for name, values in again["nominal"].values.items():
+        np.testing.assert_array_equal(values, found["nominal"].values[name])
+
+
+def test_without_tolerances_the_search_is_the_plain_one():
+    config = without(config_of())
+    assert type(search_of(config)) is Search
+    assert config.tolerances is None
+    assert "tolerances" not in config.to_yaml()
+
+
+def test_optimize_command(tmp_path, capsys):
+    """A short run end to end: both optima, certificates, table, files, picture."""
+    overrides = [
+        PLAY,
+        "tolerances.over={contact.clearance_mm: {normal: 0.002}}",
+        "tolerances.samples=2",
+        "tolerances.check_samples=4",
+        "optimizer.screening=0",
+        "optimizer.starts=1",
+        "optimizer.iterations=3",
+        "solver.rtol=1e-7",
+    ]
+    options = [f"--set={one}" for one in overrides]
+    assert main(["optimize", CIC, "-o", str(tmp_path), *options]) == 0
+    assert "Baseline and optima in 4 fresh scenes" in capsys.readouterr().out
+    result = json.loads((tmp_path / "result.json").read_text())
+    record = result["robustness"]
+    assert set(record["fresh"]) == {"baseline", "nominal", "robust"}
+    assert record["nominal"]["optimality"]["residual"] >= 0
+    assert result["optimality"]["residual"] >= 0
+    assert len(result["optimized"]["samples"]) == 2
+    (row,) = (r for r in result["optimality"]["sensitivities"] if "clearance" in r["quantity"])
+    assert row["peak_force_N"] != 0
+    assert "objective_percent" not in row
+    # Simulated again from rest, the robust optimum is no worse than the nominal one.
+    reached = 1 - result["improvement"]["objective"]
+    assert reached <= record["nominal"]["robust_objective"] + 1e-6
+    with open(tmp_path / "tolerances.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    peaks = [float(row["robust_peak_force_N"]) for row in rows]
+    found = record["fresh"]["robust"]["peak_force_N"]
+    assert found["mean"] == pytest.approx(np.mean(peaks), rel=1e-8)
+    assert found["worst"] == pytest.approx(np.max(peaks), rel=1e-8)
+    assert (tmp_path / "figures" / "tolerances.png").read_bytes()[:4] == b"\x89PNG"
+    for name in ("nominal", "optimized"):
+        assert load(tmp_path / f"{name}.yaml").tolerances is not None

@@ -1,0 +1,259 @@
+"""Scatter of scene and design: config, samples, scenes, evaluator."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+import scipy.stats
+
+from rootsopt.config import load, parse
+from rootsopt.config.tolerances import scatterable
+from rootsopt.errors import InputError
+from rootsopt.optimize.checkpoint import _evaluation, _plain
+from rootsopt.response.evaluation import Evaluator, _build, _motion
+from rootsopt.response.scatter import draw, quantiles, shifts
+from rootsopt.response.speeds import SpeedsEvaluator, alone
+from rootsopt.response.tolerances import ToleranceEvaluator, nominal_of
+from rootsopt.scene import Scene
+from rootsopt.status import Status
+from tests.standins import evaluation_of
+
+CIC = "configs/cic.yaml"
+PLAY = "contact.clearance_mm=0.01"
+CLEARANCE = "tolerances.over.contact.clearance_mm.normal=0.002"
+BACKLASH = "tolerances.over.scene.timing_gear.backlash_mm.uniform=0.02"
+LOAD = "tolerances.over.scene.load.torque_N_m.relative_triangular=0.05"
+TIP = "tolerances.over.profile.tip_arc_angle_deg.normal=0.02"
+SPREAD = (PLAY, CLEARANCE, BACKLASH, LOAD, TIP)
+
+
+def config_of(*overrides, file=CIC):
+    return load(file, overrides)
+
+
+def programs():
+    """How many programs the evaluators have been compiled to."""
+    return sum(len(one._made) for one in (_build, _motion))
+
+
+def test_config_names_distributions_in_two_ways():
+    """Dotted overrides and a mapping with dotted keys mean the same; the resolved config again."""
+    config = config_of(*SPREAD)
+    over = (
+        "{contact.clearance_mm: {normal: 0.002}, scene.timing_gear.backlash_mm: {Uniform: 0.02}, "
+        "scene.load.torque_N_m: {relative-triangular: 0.05}, "
+        "profile.tip_arc_angle_deg: {normal: 0.02}}"
+    )
+    assert config_of(PLAY, f"tolerances.over={over}") == config == parse(config.to_yaml())
+    widths = [(one.kind, one.width, one.half) for one in config.scatters]
+    assert widths[:3] == [
+        ("normal", 0.002, 0.008),
+        ("uniform", 0.02, 0.02),
+        ("triangular", pytest.approx(0.23875), pytest.approx(0.23875)),
+    ]
+    later = config_of(*SPREAD, "tolerances.over.contact.clearance_mm={uniform: 0.001}")
+    assert later.scatters[0].kind == "uniform"
+    assert config_of().tolerances is None
+    assert config_of().scatters == ()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ([CLEARANCE], ["reach -0.008", "at least 0", "narrow"]),
+        ([PLAY, "tolerances.over.contact.clearence_mm.normal=1"], ["mean `contact.clearance_mm`"]),
+        ([PLAY, "tolerances.over.contact.clearance_mm.nomal=1"], ["mean `normal`"]),
+        ([PLAY, "tolerances.over.contact.clearance_mm.normal=0"], ["greater than 0"]),
+        (["tolerances.over.scene.center_distance_error_mm.normal=1"], ["give", "nominal value"]),
+        (["tolerances.over.solver.rtol.normal=1"], ["solver.rtol", "does not scatter"]),
+        (["tolerances.over.profile.lobes.normal=1"], ["profile.lobes", "design parameters"]),
+        (["tolerances.over.contact.smoothing_mm.normal=1"], ["does not scatter"]),
+        (["tolerances.over={}"], ["tolerances.over", "at least one"]),
+        (["tolerances.over={contact.clearance_mm: 3}"], ["keys with values"]),
+        (
+            ["tolerances.over={contact.clearance_mm: {normal: 1, uniform: 2}}"],
+            ["one distribution"],
+        ),
+        (["tolerances.over.contact.clearance_mm.relative_normal=1"], ["normal, not relative"]),
+        ([BACKLASH, "objective.motion=ensemble"], ["tolerances", "ensemble"]),
+        (
+            ["tolerances.over.scene.speed_rpm.normal=9", "objective.speeds_rpm=[2000]"],
+            ["scene.speed_rpm", "speeds_rpm"],
+        ),
+    ],
+)
+def test_refusals_name_the_key(overrides, words):
+    with pytest.raises(InputError) as caught:
+        config_of(*overrides)
+    message = str(caught.value)
+    for word in words:
+        assert word in message
+
+
+def test_quantiles_agree_with_scipy():
+    levels = np.linspace(0.001, 0.999, 41)
+    clearance, backlash, load_, _ = config_of(*SPREAD).scatters
+    middle, width = load_.nominal, load_.width
+    expected = {
+        clearance: scipy.stats.truncnorm(-4, 4, 0.01, 0.002),
+        backlash: scipy.stats.uniform(0.08, 0.04),
+        load_: scipy.stats.triang(0.5, middle - width, 2 * width),
+    }
+    for one, truth in expected.items():
+        np.testing.assert_allclose(quantiles(one, levels), truth.ppf(levels), rtol=1e-12)
+        ends = quantiles(one, np.array([0.0, 1.0]))
+        np.testing.assert_allclose(ends, one.nominal + one.half * np.array([-1, 1]), rtol=1e-14)
+
+
+def test_samples_have_the_statistics_of_their_distributions():
+    """Mean and standard deviation: a Sobol sample of 1024 within 2 %, a random one within four
+    standard errors. The same seed gives the same sample."""
+    config = config_of(*SPREAD)
+    widths = np.array([one.width for one in config.scatters])
+    sigmas = widths * np.array([1, 1 / np.sqrt(3), 1 / np.sqrt(6), 1])
+    means = np.array([one.nominal for one in config.scatters])
+    for fresh, count, share in ((False, 1024, 0.02), (True, 20_000, 4 / np.sqrt(20_000))):
+        sample = draw(config, count, fresh)
+        np.testing.assert_array_less(np.abs(sample.mean(axis=0) - means), share * sigmas)
+        np.testing.assert_allclose(sample.std(axis=0), sigmas, rtol=max(share, 0.02))
+        np.testing.assert_array_equal(sample, draw(config, count, fresh))
+        assert np.all(np.abs(np.corrcoef(sample.T) - np.eye(4)) < 0.05)
+    other = config_of(*SPREAD, "tolerances.seed=1")
+    for fresh in (False, True):
+        assert not np.any(draw(other, 8, fresh) == draw(config, 8, fresh))
+    assert not np.any(draw(config, 8, True) == draw(config, 8))
+
+
+@pytest.mark.parametrize("file", [CIC, "configs/pump.yaml"])
+def test_shifted_scenes_are_the_scenes_of_moved_configs(file):
+    """Every number that may scatter, moved by 1 %: as in the scene that its config gives."""
+    config = config_of(PLAY, file=file)
+    keys = [key for key, value in scatterable(config).items() if value]
+    keys = [key for key in keys if not key.startswith("profile.")]
+    assert len(keys) >= 10
+    over = {key: {"relative_uniform": 0.01} for key in keys}
+    config = config.replaced({"tolerances": {"over": over}})
+    sample = draw(config, 2)
+    evaluator = Evaluator.of(config)
+    for row, shift in zip(sample, shifts(config, sample), strict=True):
+        moved = Scene.from_config(config.moved(dict(zip(keys, map(float, row), strict=True))))
+        assert shift.scene is not None
+        found = evaluator.shifted(shift.scene).scene
+        # The range of the contact map is a setting, which each motion corrects.
+        moved = eqx.tree_at(lambda scene: scene.deepest, moved, found.deepest)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), found, moved)
+
+
+@pytest.fixture(scope="module")
+def spread():
+    """Evaluator over three scenes, and its evaluation of the own design."""
+    config = config_of(*SPREAD, "solver.rtol=1e-10", "tolerances.samples=3")
+    evaluator = ToleranceEvaluator.of(config, Evaluator.of(config))
+    return evaluator, evaluator(series=False)
+
+
+def test_parts_are_the_evaluations_of_moved_configs(spread):
+    """Each scene from rest is what an evaluator of that scene's config finds, by one program."""
+    evaluator, found = spread
+    before = programs()
+    assert found.status is Status.PERIODIC
+    assert found.response == nominal_of(found).response == found.parts[0].evaluation.response
+    assert len(found.samples) == 3
+    config = evaluator.config
+    for part in found.samples[:2]:
+        moved = config.moved(part.values)
+        design = moved.design
+        assert design[2] == part.values["profile.tip_arc_angle_deg"]
+        single = Evaluator.of(moved)(series=False)
+        for name, force in single.response.items():
+            assert part.evaluation.response[name] == pytest.approx(force, rel=1e-9)
+            slopes = [*single.gradient[name].values()]
+            given = [*part.evaluation.gradient[name].values()]
+            np.testing.assert_allclose(given, slopes, rtol=1e-5, atol=1e-6)
+    assert programs() == before
+    rows = found.record()["samples"]
+    assert [row["status"] for row in rows] == ["periodic"] * 3
+    assert rows[0]["contact.clearance_mm"] == found.samples[0].values["contact.clearance_mm"]
+
+
+def test_scenes_begin_on_their_own_orbits(spread, monkeypatch):
+    evaluator, found = spread
+    seen = []
+    single = Evaluator.fit
+
+    def spy(self, design=None, start=None, series=True):
+        seen.append(start)
+        return single(self, design, start, series)
+
+    monkeypatch.setattr(Evaluator, "fit", spy)
+    again = evaluator(start=found.state, series=False)
+    known = {part.evaluation.state.tobytes() for part in found.parts}
+    assert {np.asarray(start).tobytes() for start in seen} == known
+    assert again.response["mean_force_N"] == pytest.approx(found.response["mean_force_N"], 1e-8)
+    same = _evaluation(_plain(found))
+    assert [part.values for part in same.parts] == [part.values for part in found.parts]
+    np.testing.assert_array_equal(same.state, found.state)
+
+
+@dataclasses.dataclass(frozen=True)
+class Told(Evaluator):
+    """An evaluator whose force is the clearance in µm; it does not settle above 12 µm."""
+
+    def fit(self, design=None, start=None, series=True):
+        clearance = 1e6 * float(self.scene.clearance)
+        status = Status.PERIODIC if clearance < 12 else Status.NOT_SETTLED
+        state = np.array([clearance, float(self.scene.speed)])
+        return self, evaluation_of(clearance, status, state=state)
+
+
+def told(*overrides):
+    config = config_of(PLAY, *overrides)
+    return config, Told(config, Scene.from_config(config))
+
+
+def test_a_scene_without_steady_state_is_a_status():
+    """Status and numbers of the first such scene, how many there are, no gradient, no state."""
+    config, single = told(CLEARANCE, "tolerances.samples=16")
+    found = ToleranceEvaluator.of(config, single)()
+    lost = [p for p in found.samples if not p.evaluation.usable]
+    assert 0 < len(lost) < 16
+    assert found.status is Status.NOT_SETTLED
+    assert found.message.startswith(f"In {len(lost)} of the 16 scenes")
+    assert f"contact.clearance_mm = {lost[0].values['contact.clearance_mm']:.6g}: " in found.message
+    assert found.state is None
+    assert found.response["mean_force_N"] == pytest.approx(10)
+    config, single = told(CLEARANCE, "contact.clearance_mm=0.02")
+    found = ToleranceEvaluator.of(config, single)()
+    assert found.status is Status.NOT_SETTLED
+    assert found.samples == ()
+
+
+def test_scatter_over_several_speeds():
+    """Each scene at every speed; methods that return another evaluator keep the sample."""
+    narrow = "tolerances.over.contact.clearance_mm.uniform=0.001"
+    config, single = told(narrow, "objective.speeds_rpm=[2000, 3000]", "tolerances.samples=2")
+    evaluator = ToleranceEvaluator.of(config, SpeedsEvaluator(single))
+    found = evaluator()
+    assert found.state.shape == (6, 4)
+    for part in found.samples:
+        force = 1e3 * part.values["contact.clearance_mm"]
+        assert [p.speed_rpm for p in part.evaluation.parts] == [2000, 3000]
+        for one in part.evaluation.parts:
+            assert one.evaluation.response["mean_force_N"] == pytest.approx(force, rel=1e-12)
+    again = _evaluation(_plain(found))
+    assert again.samples[1].evaluation.parts[0].speed_rpm == 2000
+    for other in (
+        evaluator.surveying(),
+        evaluator.with_maxima(),
+        evaluator.at_tolerance(1e-6),
+        evaluator.relative_to(found),
+        evaluator.without_gradient(),
+        evaluator.at_speed(2500.0),
+    ):
+        assert type(other) is ToleranceEvaluator
+        assert other.shifts == evaluator.shifts
+    lone = ToleranceEvaluator.of(alone(config), single).at_speed(2500.0)
+    speeds = [part.evaluation.state[1] for part in lone().parts]
+    np.testing.assert_allclose(speeds, 2500 * np.pi / 30)
