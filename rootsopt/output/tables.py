@@ -20,6 +20,7 @@ DASH = "-"
 _UNITS = {
     "_kg_m2": "kg m^2",
     "_N_m": "N m",
+    "_cm3": "cm^3",
     "_mm2": "mm^2",
     "_um": "um",
     "_mm": "mm",
@@ -251,6 +252,55 @@ def geometry_table(record: Mapping[str, Any]) -> RenderableType:
     if record.get("status"):
         _group(table, "status", [("status", str(record["status"]))])
     return Group(table, Text(record.get("message") or ""))
+
+
+def front_table(record: Mapping[str, Any]) -> RenderableType:
+    """Return tables of a front: terms, rates and status of each point, the designs, and the gaps.
+
+    `record`: the front as in the result file."""
+    aims = record["terms"]
+    names = [aim["name"] for aim in aims]
+    words = [_split(name)[0] for name in names]
+    columns = [f"{_label(aim['name'])} ({aim['sense']})" for aim in aims]
+    columns += [f"{words[0]} per {other}" for other in words[1:]]
+    table = _table("Best compromises", *columns, "status")
+    table.columns[0].header = Text("point")
+    base = [_number(record["baseline"]["terms"].get(name)) for name in names]
+    table.add_row("baseline", *base, *[DASH] * len(names))
+    table.add_section()
+    for point in record["points"]:
+        certified = point["status"] == "certified"
+        cells = [point["terms"][name] for name in names] + [*point["rates"].values()]
+        word = Text(point["status"], style="bold green" if certified else "bold red")
+        table.add_row(str(point["point"]), *map(_number, cells), word)
+    if not record["points"]:
+        return Group(table)
+    keys = [*record["points"][0]["design"]]
+    designs = _table("Their designs", *map(_label, keys), "held by")
+    designs.columns[0].header = Text("point")
+    for point in record["points"]:
+        held = ", ".join(point["multipliers"]) or DASH
+        cells = [_number(point["design"][key]) for key in keys]
+        designs.add_row(str(point["point"]), *cells, held)
+    return Group(table, designs, *map(Text, _notes(record)))
+
+
+def _notes(record: Mapping[str, Any]) -> list[str]:
+    """Return one line per gap of a front, and one about the points that were dropped."""
+    notes = []
+    for gap in record["gaps"]:
+        what = "gap" if gap["kind"] == "terms" else "change of design"
+        sure = "confirmed" if gap["confirmed"] else "not confirmed: raise pareto.refinements"
+        notes.append(
+            f"{what} between points {gap['first']} and {gap['second']}: apart by "
+            f"{gap['distance']:.2g} ranges of the terms and {gap['design_distance']:.2g} of the "
+            f"bounds, {sure}"
+        )
+    count: dict[str, int] = {}
+    for point in record["dropped"]:
+        count[point["status"]] = count.get(point["status"], 0) + 1
+    dropped = ", ".join(f"{n} {_words(word)}" for word, n in count.items())
+    return [*notes, f"dropped: {dropped}"] if dropped else notes
 
 
 def likeness_table(rows: list[dict[str, Any]]) -> RenderableType:
