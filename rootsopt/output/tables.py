@@ -39,6 +39,8 @@ _NAMES = {
     "rms_force_N": ("RMS force", "N"),
     "peak_norm_force_N": ("p-norm of the force", "N"),
 }
+_WIDEST_DESIGN = 5
+"""Number of design parameters above which the table of a front leaves out the designs."""
 _Rows = Iterable[tuple[str | Text, ...]]
 
 
@@ -276,13 +278,26 @@ def front_table(record: Mapping[str, Any]) -> RenderableType:
     if not record["points"]:
         return Group(table)
     keys = [*record["points"][0]["design"]]
-    designs = _table("Their designs", *map(_label, keys), "held by")
-    designs.columns[0].header = Text("point")
-    for point in record["points"]:
-        held = ", ".join(point["multipliers"]) or DASH
-        cells = [_number(point["design"][key]) for key in keys]
-        designs.add_row(str(point["point"]), *cells, held)
-    return Group(table, designs, *map(Text, _notes(record)))
+    parts: list[RenderableType] = [table]
+    if len(keys) <= _WIDEST_DESIGN:
+        designs = _table("Their designs (min, max: at that bound)", *map(_label, keys), "limits")
+        designs.columns[0].header = Text("point")
+        for point in record["points"]:
+            limits = [name for name in point["multipliers"] if " bound of " not in name]
+            cells = [_bounded(key, point) for key in keys]
+            designs.add_row(str(point["point"]), *cells, ", ".join(limits) or DASH)
+        parts.append(designs)
+    return Group(*parts, *map(Text, _notes(record)))
+
+
+def _bounded(key: str, point: Mapping[str, Any]) -> str:
+    """Return a design parameter of a point, with the bound at which it is held."""
+    name = _words(key.removesuffix("_mm").removesuffix("_deg"))
+    sides = {"lower": "min", "upper": "max"}
+    held = [
+        word for side, word in sides.items() if f"{side} bound of {name}" in point["multipliers"]
+    ]
+    return " ".join([_number(point["design"][key]), *held])
 
 
 def _notes(record: Mapping[str, Any]) -> list[str]:

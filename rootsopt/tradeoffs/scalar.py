@@ -3,13 +3,14 @@
 The terms u_i are scaled so that less is better, and so that the ends of the front lie at 0 and 1.
 From a reference point r, the design is sought that goes furthest in all terms at once:
 
-    min over x of   max_i (u_i(x) - r_i)  +  ρ Σ_i u_i(x),    i in the terms that lead.
+    min over x of   max_i (u_i(x) - r_i) / d_i  +  ρ Σ_i u_i(x),    i in the terms that lead.
 
 Every point of a front is the optimum for some r, also where the front is not convex. A weighted sum
-does not reach these points. The small second part excludes designs that are worse in one term and
-better in none. See Pascoletti and Serafini, Scalarizing vector optimization problems, Journal of
-Optimization Theory and Applications 42 (1984) 499-524, and Steuer and Choo, An interactive weighted
-Tchebycheff procedure, Mathematical Programming 26 (1983) 326-344.
+does not reach these points. All d_i are 1, except beside a gap. The small second part excludes
+designs that are worse in one term and better in none. See Pascoletti and Serafini, Scalarizing
+vector optimization problems, Journal of Optimization Theory and Applications 42 (1984) 499-524, and
+Steuer and Choo, An interactive weighted Tchebycheff procedure, Mathematical Programming 26 (1983)
+326-344.
 
 The maximum is one `Group` of branches. The shares of its branches, from the certificate, are the
 weights of the terms at the optimum, and their ratios are the rates at which the terms trade."""
@@ -43,17 +44,23 @@ class Scalar(NamedTuple):
     """One scalar objective made of k terms.
 
     `scale`: scale of the terms; `reference` (k,): reference point r, in scaled terms; `leading`:
-    numbers of the terms in the maximum."""
+    numbers of the terms in the maximum; `direction` (k,): d, by default 1 for each term."""
 
     scale: Scale
     reference: NDArray[np.float64]
     leading: tuple[int, ...]
+    direction: NDArray[np.float64] | None = None
+
+    @property
+    def steps(self) -> NDArray[np.float64]:
+        """Direction d (k,)."""
+        return np.ones(len(self.reference)) if self.direction is None else self.direction
 
     def value(self, values: NDArray[np.float64]) -> float:
         """Return the objective for the values (k,) of the terms."""
         u = self.scale.of(values)
         lead = [*self.leading]
-        return float(np.max((u - self.reference)[lead]) + RHO * np.sum(u))
+        return float(np.max(((u - self.reference) / self.steps)[lead]) + RHO * np.sum(u))
 
     def local(self, sample: Sample) -> Local:
         """Return objective and constraints at a `sample`, with gradients."""
@@ -64,8 +71,9 @@ class Scalar(NamedTuple):
             width = self.scale.width[number]
             values = (group.values - self.scale.ideal[number]) / width
             if number in self.leading:
-                lead = values - self.reference[number]
-                together.append(Group(group.tags, lead, group.slopes / width))
+                step = self.steps[number]
+                lead = (values - self.reference[number]) / step
+                together.append(Group(group.tags, lead, group.slopes / (width * step)))
             if sample.cornered[number]:
                 corners.append(Group(group.tags, RHO * values, RHO * group.slopes / width))
             else:
@@ -81,7 +89,8 @@ class Scalar(NamedTuple):
         kinds = np.concatenate([sample.terms[k].tags[:, 0] for k in self.leading]).astype(int)
         found = np.zeros(len(sample.terms))
         np.add.at(found, kinds, certificate.shares[0])
-        return found
+        found = found / self.steps
+        return found / np.sum(found)
 
 
 def rates(

@@ -89,15 +89,21 @@ class Study:
         """Return the terms of an evaluated design by name, in their own units."""
         return {aim.name: evaluation.response[aim.name] for aim in self.aims}
 
+    def completed(self, evaluation: Evaluation) -> Evaluation:
+        """Return an `evaluation` with its geometry, which a search without forces leaves out."""
+        if evaluation.geometry:
+            return evaluation
+        design = jnp.asarray([*evaluation.design.values()])
+        return geometry_of(self.problem.space.scene, self.config, design)
+
     def screened(self, point: NDArray[np.float64]) -> Evaluation | None:
         """Return an evaluation of a `point` (d,) for a screening.
 
         Return `None` if the design has no usable steady state."""
-        design = self.problem.design(point)
         if self.fast is None:
-            found = geometry_of(self.problem.space.scene, self.config, design)
-            return found if np.all(np.isfinite([*found.response.values()])) else None
-        found = self.fast.without_gradient()(design, series=False)
+            sample = self._still(point)
+            return None if sample is None else sample.evaluation
+        found = self.fast.without_gradient()(self.problem.design(point), series=False)
         return found if found.usable else None
 
     def sample(self, point: NDArray[np.float64], orbit: NDArray | None = None) -> Sample | None:
@@ -145,7 +151,8 @@ class Study:
         groups = tuple(
             _single(k, aim, float(value), row) for k, (aim, value, row) in enumerate(rows)
         )
-        evaluation = geometry_of(scene, self.config, jnp.asarray(design))
+        response = {aim.name: float(value) for aim, value in zip(self.aims, values, strict=True)}
+        evaluation = still_evaluation(self.config, design, response)
         cornered = (False,) * len(groups)
         return _finite(Sample(np.array(point), evaluation, groups, cornered, slack, normals))
 
@@ -181,10 +188,22 @@ def geometry_of(scene: Scene, config: Config, design: Float[Array, " d"]) -> Eva
     names = config.pareto.terms
     nothing = jnp.zeros(3), jnp.zeros((3, len(config.design_keys)))
     values, _ = values_of(scene, terms_of(names), design, *nothing)
+    response = dict(zip(names, map(float, np.asarray(values)), strict=True))
+    found = still_evaluation(config, np.asarray(design), response)
+    shape = geometry_record(scene, _shape(scene, design))
+    return dataclasses.replace(found, geometry=shape)
+
+
+def still_evaluation(
+    config: Config, design: NDArray[np.float64], response: dict[str, float]
+) -> Evaluation:
+    """Return the evaluation of a `design` (d,), in config units, without forces and geometry.
+
+    `response`: its terms by name."""
     return Evaluation(
         design=dict(zip(config.design_keys, map(float, design), strict=True)),
-        geometry=geometry_record(scene, _shape(scene, design)),
-        response=dict(zip(names, map(float, np.asarray(values)), strict=True)),
+        geometry={},
+        response=response,
         gradient={},
         steady_state={},
         status=Status.GEOMETRY_ONLY,

@@ -33,7 +33,7 @@ from rootsopt.response.choice import resolve
 from rootsopt.scene import check_geometry
 from rootsopt.tradeoffs.assembly import Node, gaps_of, points_of, selected, spacing_of
 from rootsopt.tradeoffs.front import Front, Standing
-from rootsopt.tradeoffs.gaps import Edge, Search, Spacing, divides
+from rootsopt.tradeoffs.gaps import Edge, Pair, Search, Spacing, divides
 from rootsopt.tradeoffs.lattice import Key, corners, directions, keys, links
 from rootsopt.tradeoffs.scalar import Scalar, Scale, end_scale
 from rootsopt.tradeoffs.study import Sample, Study
@@ -44,6 +44,8 @@ _APART = 0.15
 """Distance in the unit box above which two starts differ."""
 _CHEAP_EVALUATIONS, _CHEAP_STARTS, _CHEAP_SCREENING = 300, 6, 64
 """Least effort per search, starts per end and screened designs, where nothing is simulated."""
+_SHARP = 0.01
+"""Accuracy (width of the gap) with which the sides of a gap are found."""
 _EXPLAINED = 8
 """Maximum number of points from which the least violation of the constraints is searched for."""
 _HOLDS_UP = 0.01
@@ -355,11 +357,42 @@ class Tracer:
         gaps = self._gaps
         gaps.tried[edge.pair] = gaps.tried.get(edge.pair, 0) + 1
         if best is None or not divides(edge, self.scale.of(best.sample.values), *values):
-            gaps.closed[edge.pair] = self._spacing.kind(edge)
+            kind = self._spacing.kind(edge)
+            pair = self._sharpened(edge.pair) if kind == "terms" and len(middle) == 2 else edge.pair
+            gaps.closed[pair], gaps.tried[pair] = kind, gaps.tried[edge.pair]
             return
         with self._lock:
             self._extra.append(best)
         gaps.divided(edge.pair, len(nodes))
+
+    def _sharpened(self, pair: Pair) -> Pair:
+        """Move both sides of a gap between two terms as close together as the front goes on.
+
+        Each side improves its worse term as long as it is better than the other side in the other
+        term. Return the numbers of the sides, which are new where a side has moved."""
+        first, second = sorted(pair, key=lambda k: self._scaled(k)[0])
+        for lead in (0, 1):
+            moving, fixed = (second, first) if lead == 0 else (first, second)
+            start, limit = self._scaled(moving), self._scaled(fixed)
+            apart = start[lead] - limit[lead]
+            direction = np.where(np.arange(2) == lead, 1.0, _SHARP)
+            reference = limit - np.where(np.arange(2) == lead, 0.0, _SHARP * apart)
+            node = self._all()[moving]
+            scalar = Scalar(self.scale, reference, (0, 1), direction)
+            best = self._solved(scalar, node.point, node.sample.evaluation.state, None)
+            if best is None or self.stop.is_set():
+                continue
+            found = self.scale.of(best.sample.values)
+            if found[lead] < start[lead] - _BETTER and found[1 - lead] < limit[1 - lead]:
+                with self._lock:
+                    self._extra.append(best)
+                moved = len(self._all()) - 1
+                first, second = (first, moved) if lead == 0 else (moved, second)
+        return min(first, second), max(first, second)
+
+    def _scaled(self, number: int) -> NDArray[np.float64]:
+        """Return the scaled terms (k,) of a node."""
+        return self.scale.of(self._all()[number].sample.values)
 
     # The result.
 
