@@ -23,6 +23,13 @@ MISSING = (
 )
 """Message for the user if the page cannot be made."""
 
+_BUTTONS = {
+    "responsive": True,
+    "displaylogo": False,
+    "modeBarButtons": [["toImage", "zoom2d", "pan2d", "resetScale2d"]],
+}
+"""Buttons above the figure: those that need no network."""
+
 
 def available() -> bool:
     """Return whether the library that makes the page is installed."""
@@ -35,7 +42,7 @@ def write_page(folder: ResultFolder, front: Front) -> str:
 
     made = _figure(front)
     picture = io.to_html(
-        made, include_plotlyjs=False, full_html=False, div_id="front", config={"responsive": True}
+        made, include_plotlyjs=False, full_html=False, div_id="front", config=_BUTTONS
     )
     points = {str(point.number): _entry(front, point) for point in front.points}
     words = [aim.words for aim in front.aims]
