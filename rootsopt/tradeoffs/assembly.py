@@ -96,6 +96,8 @@ def spacing_of(selection: Selection, pairs: Sequence[Pair], ends: int, divisions
     corners = selection.values[:ends]
     sides = [np.linalg.norm(a - b) for k, a in enumerate(corners) for b in corners[k + 1 :]]
     moves = [edge.design_distance for edge in selection.edges(pairs)]
+    if not sides:
+        return Spacing(np.inf, np.inf)
     return Spacing(float(np.mean(sides)) / divisions, float(np.median(moves)) if moves else 0.0)
 
 

@@ -441,6 +441,8 @@ class Tracer:
             if not np.isfinite(spacing.terms):  # Stopped, or the ends are not in conflict.
                 spacing = spacing_of(selection, [], len(study.aims), self._divisions)
             edges, gaps = gaps_of(selection, self._gaps, spacing)
+            if self.stop.is_set():  # Points that are missing leave no gap.
+                gaps = [gap for gap in gaps if gap.confirmed]
             known = {"points": tuple(points), "dropped": tuple(dropped)}
             known |= {"edges": tuple(edges), "gaps": tuple(gaps)}
         return Front(

@@ -1,5 +1,6 @@
 """Fronts of two and three terms: against independent searches, domination, gaps, rates, files."""
 
+import functools
 import itertools
 import threading
 
@@ -137,10 +138,14 @@ def test_front_of_geometry_is_that_of_another_search(front):
     low, high = np.array([25.0, 0.1, 0.5]), np.array([45.0, 1.0, 8.0])
     compiled = jax.jit(lambda design: geometry(scene.profile(design)))
 
-    def shape(z):
+    @functools.lru_cache
+    def at(*z):
         angle, share, land = low + (high - low) * np.clip(z, 0, 1)
         longest = 33 * np.sin(np.radians(angle)) * (np.pi / 6 - np.radians(land))
         return compiled(jnp.array([angle, share * longest, land]))
+
+    def shape(z):
+        return at(*map(float, z))
 
     assert front.status is Status.GEOMETRY_ONLY
     assert [point.standing for point in front.points] == [Standing.CERTIFIED] * 7
