@@ -50,7 +50,7 @@ _EXPLAINED = 8
 """Maximum number of points from which the least violation of the constraints is searched for."""
 _HOLDS_UP = 0.01
 """Relative difference of a term between search and verification above which a point is dropped."""
-_SAME_ENDS = 1e-9
+_SAME_ENDS = 1e-6
 """Range of a term over the ends, relative to its scale, below which the term is not in conflict."""
 
 Progress = Callable[[int, int], None]
