@@ -8,8 +8,9 @@ intersection, SIAM Journal on Optimization 8 (1998) 631-657, with the objective 
 
 The points are then solved in order, each from a prediction by its solved neighbours: the secant
 through two of them, or the nearest one. A second pass goes back from the other ends. Branches of
-optima can exist side by side, so the better result counts, and any design seen before that would be
-better still begins a further search. Last, neighbours that lie far apart are bisected."""
+optima can exist side by side, so the better result counts. Any design seen before that would be
+better still begins a further search, and so does the best one of another kind. Last, neighbours
+that lie far apart are bisected."""
 
 import os
 import threading
@@ -40,6 +41,8 @@ from rootsopt.tradeoffs.study import Sample, Study
 
 _BETTER = 1e-4
 """Gain (range of a term) that a design seen before must promise to begin a further search."""
+_PROMISING = 0.25
+"""Disadvantage (range of a term) up to which a design of another kind begins a further search."""
 _APART = 0.15
 """Distance in the unit box above which two starts differ."""
 _CHEAP_EVALUATIONS, _CHEAP_STARTS, _CHEAP_SCREENING = 300, 6, 64
@@ -181,7 +184,7 @@ class Tracer:
         starts = self.config.optimizer.starts
         if self.study.sharp is None:
             starts = max(starts, _CHEAP_STARTS)
-        self._expected = count * starts + 2 * (len(keys(count, self._divisions)) - count)
+        self._expected = count * starts + 3 * (len(keys(count, self._divisions)) - count)
         for number, key in enumerate(corners(count, self._divisions)):
             scalar = Scalar(self.scale, np.zeros(count), (number,))
             best: Node | None = None
@@ -236,6 +239,8 @@ class Tracer:
                 for start, orbit in self._predictions(key, ahead=order is inner):
                     best = self._solved(scalar, start, orbit, best)
                 best = self._again(scalar, best)
+                if order is not inner:
+                    best = self._elsewhere(scalar, best)
                 if best is not None:
                     with self._lock:
                         self._nodes[key] = best
@@ -269,6 +274,22 @@ class Tracer:
         if best is None or scalar.value(seen.values) < best.objective - _BETTER:
             return self._solved(scalar, seen.point, seen.orbit, best)
         return best
+
+    def _elsewhere(self, scalar: Scalar, best: Node | None) -> Node | None:
+        """Search from the most promising design seen before that lies apart from `best`.
+
+        Return the better one of the outcome and `best`. With a single start (`optimizer.starts`),
+        or without a promising design, return `best`."""
+        if best is None or self.config.optimizer.starts < 2:
+            return best
+        limit = best.objective + _PROMISING
+        others = [
+            one
+            for one in self._seen
+            if np.linalg.norm(one.point - best.point) > _APART and scalar.value(one.values) < limit
+        ]
+        found = min(others, key=lambda one: scalar.value(one.values), default=None)
+        return best if found is None else self._solved(scalar, found.point, found.orbit, best)
 
     def _solved(
         self, scalar: Scalar, start: NDArray[np.float64], orbit: NDArray | None, best: Node | None

@@ -306,7 +306,7 @@ def test_senses():
     """Of a name on its own, and of the config."""
     given = "pareto.terms=[area_mm2, seal_width_mm, rms_force_N]"
     assert [aim.sign for aim in aims_of(config(given))] == [1, -1, 1]
-    turned = config(given, "pareto.senses={seal_width_mm: min, area_mm2: Max}")
+    turned = config(given, "pareto.senses={seal_width_mm: min, area_mm2: max}")
     assert [aim.sense for aim in aims_of(turned)] == ["max", "min", "min"]
 
 
