@@ -22,7 +22,7 @@ PURPOSE = (
 _PATIENCE = 5.0
 """Time (s) after an interrupt above which the command no longer waits for the search to end.
 
-In this time, points found so far may be simulated again from rest."""
+In this time, the simulation in progress may end."""
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":

@@ -27,8 +27,8 @@ class ParetoConfig(Section):
     )
     divisions: Annotated[int, Field(ge=2, le=20)] = Field(
         5,
-        description="points between two ends of three terms, one end included: n divisions "
-        "give (n + 1) (n + 2) / 2 points",
+        description="steps between two ends of three terms: n steps give (n + 1) (n + 2) / 2 "
+        "points",
     )
     refinements: Annotated[int, Field(ge=0, le=100)] = Field(
         12, description="further points that may be spent on places where neighbours lie far apart"

@@ -467,7 +467,7 @@ class Tracer:
             known = {"points": tuple(points), "dropped": tuple(dropped)}
             known |= {"edges": tuple(edges), "gaps": tuple(gaps)}
         return Front(
-            config=study.config,
+            config=config,
             aims=study.aims,
             baseline=study.problem.baseline,
             baseline_terms=study.term_values(study.problem.baseline) if usable else {},
