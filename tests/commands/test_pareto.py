@@ -3,10 +3,8 @@
 import csv
 import json
 import re
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -109,22 +107,38 @@ def test_contradicting_constraints_end_with_advice(tmp_path, capsys):
     assert {row["name"] for row in result["infeasible"]["conflicts"]} >= {"seal width"}
 
 
+_STOPPED = """
+import contextlib, os, signal, sys
+from rootsopt.commands import door, pareto
+
+@contextlib.contextmanager
+def progress(console):
+    yield lambda done, expected: done == 20 and os.kill(os.getpid(), signal.SIGINT)
+
+pareto._progress = progress
+door.leave(pareto.main())
+"""
+"""A command that gets Ctrl-C after 20 searches."""
+
+
 @pytest.mark.long
 def test_stopped_run_is_whole(tmp_path):
     """Ctrl-C keeps the points found so far, in a complete folder with exit code 3."""
     place = tmp_path / "run"
-    arguments = [sys.executable, "-m", "rootsopt.pareto", CIC, "-o", place, *RADIUS]
-    arguments += ["--set", "pareto.points=101", "--no-figures"]
-    process = subprocess.Popen([*map(str, arguments)], cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    time.sleep(45)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(60) == 3
-    assert process.stderr is not None
-    assert "keeping the points found so far" in process.stderr.read()
+    given = [CIC, "-o", str(place), *RADIUS, "--set", "pareto.points=101"]
+    command = [sys.executable, "-c", _STOPPED, *given]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 3, done.stderr
+    assert "keeping the points found so far" in done.stderr
     result = json.loads((place / "result.json").read_text())
     assert result["status"] == "interrupted"
-    assert 2 <= len(result["points"]) < 101
-    assert (place / design_file(1)).exists()
+    points = result["points"]
+    assert 5 <= len(points) < 30
+    assert {point["status"] for point in points} == {"not_verified"}
+    files = {str(p.relative_to(place)) for p in place.rglob("*") if p.is_file()}
+    assert files == set(result["run"]["files"])
+    assert {design_file(1), "front.csv", "figures/front.png"} <= files
+    assert [point["point"] for point in points] == [*range(1, len(points) + 1)]
 
 
 @pytest.mark.long
