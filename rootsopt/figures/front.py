@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -37,7 +38,7 @@ def plot_front(ax: Axes, front: Front, x: str, y: str) -> Axes:
         marker = "s" if point.end_of else "o"
         at = point.terms[x], point.terms[y]
         ax.plot(*at, marker, color=color, markerfacecolor=fill, markersize=6.5, zorder=3)
-        text = {"textcoords": "offset points", "xytext": (6, -9), "fontsize": 8}
+        text: dict[str, Any] = {"textcoords": "offset points", "xytext": (6, -9), "fontsize": 8}
         ax.annotate(str(point.number), at, color="0.3", **text)
     for point in front.dropped:
         if point.standing in _DROPPED:
@@ -64,7 +65,7 @@ def _legend(made, front: Front) -> None:
     """Add the meaning of all markers that the figure shows below its panels."""
     line = Line2D
     standings = {point.standing for point in front.points}
-    plain = {"color": BLUE, "linestyle": ""}
+    plain: dict[str, Any] = {"color": BLUE, "linestyle": ""}
     entries = [line([], [], marker="o", label="certified", **plain)]
     if standings - {Standing.CERTIFIED}:
         entries.append(line([], [], marker="o", markerfacecolor="white", label="not certified",
