@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from rootsopt.runtime.programs import COMPILER_OPTIONS as COMPILER_OPTIONS
     from rootsopt.scene import Scene as Scene
     from rootsopt.status import Status as Status
+    from rootsopt.tradeoffs.front import Front as Front
+    from rootsopt.tradeoffs.trace import pareto_front as pareto_front
 
 __version__ = "0.1.0"
 
@@ -41,6 +43,7 @@ _PUBLIC = {
     "ContactLaw": "rootsopt.contact.law:ContactLaw",
     "Evaluation": "rootsopt.response.evaluation:Evaluation",
     "Family": "rootsopt.config.families:Family",
+    "Front": "rootsopt.tradeoffs.front:Front",
     "InputError": "rootsopt.errors:InputError",
     "Optimization": "rootsopt.optimize.search:Optimization",
     "Parameter": "rootsopt.config.families:Parameter",
@@ -54,6 +57,7 @@ _PUBLIC = {
     "evaluate": "rootsopt.response.evaluation:evaluate",
     "load_config": "rootsopt.config:load_config",
     "optimize_design": "rootsopt.optimize.design:optimize_design",
+    "pareto_front": "rootsopt.tradeoffs.trace:pareto_front",
     "register_family": "rootsopt.config.families:register_family",
     "register_term": "rootsopt.response.terms:register_term",
     "steady_response": "rootsopt.response.steady:steady_response",

@@ -8,6 +8,7 @@ from rootsopt.commands import door
 COMMANDS = {
     "optimize": "optimise a design and compare it with the baseline",
     "simulate": "simulate one design in one scene",
+    "pareto": "trace the best compromises between two or three terms",
     "sweep": "simulate one design at many speeds",
     "attractors": "find the coexisting motions of one scene",
     "profile": "compute the geometry of one design",

@@ -18,6 +18,7 @@ from rootsopt.config.families import (
     follow,
     replace_fields,
 )
+from rootsopt.config.pareto import ParetoConfig
 from rootsopt.config.scene import (
     ContactConfig,
     ProfileConfig,
@@ -65,6 +66,7 @@ class Config(Section):
     )
     ensemble: EnsembleConfig = Field(default_factory=lambda: EnsembleConfig.model_validate({}))
     sweep: SweepConfig = Field(default_factory=lambda: SweepConfig.model_validate({}))
+    pareto: ParetoConfig = Field(default_factory=lambda: ParetoConfig.model_validate({}))
     optimizer: OptimizerConfig = Field(default_factory=lambda: OptimizerConfig.model_validate({}))
     tolerances: TolerancesConfig | None = Field(None, description="absent: nothing scatters")
 

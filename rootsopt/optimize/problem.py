@@ -22,6 +22,7 @@ from rootsopt.optimize.local import Group, Local
 from rootsopt.optimize.optimality import Holder
 from rootsopt.response.evaluation import Evaluation, objective_weights
 from rootsopt.response.speeds import at_speeds, counted
+from rootsopt.response.terms import sense_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 
@@ -82,6 +83,7 @@ class Problem:
         Limits that the config does not give come from the `baseline`. Raises `InputError` if a
         measure in the objective is 0 for the baseline, because the objective divides by this value.
         """
+        check_senses(config)
         orders = {line_name(order): order for order in config.objective.line_weights}
         counting = [part for part in at_speeds(baseline) if part.share > 0]
         for name, part in itertools.product(objective_weights(config), counting):
@@ -458,6 +460,16 @@ class Problem:
             for share, label in zip(shares, group, strict=True)
             if share > _HELD
         ]
+
+
+def check_senses(config: Config) -> None:
+    """Raise `InputError` if the objective of a `config` has a term of which more is better."""
+    for name, weight in config.objective.terms.items():
+        if weight > 0 and sense_of(name) == "max":
+            raise InputError(
+                f"`objective.terms` must name terms of which less is better, but names {name}; "
+                "limit it under `constraints`, or trade it against others with `rootsopt pareto`"
+            )
 
 
 def words(key: str) -> str:

@@ -20,6 +20,7 @@ DASH = "-"
 _UNITS = {
     "_kg_m2": "kg m^2",
     "_N_m": "N m",
+    "_cm3": "cm^3",
     "_mm2": "mm^2",
     "_um": "um",
     "_mm": "mm",
@@ -44,6 +45,8 @@ _STATISTICS = {
     "quantile_95": "95 % quantile",
     "worst": "worst",
 }
+_WIDEST_DESIGN = 5
+"""Number of design parameters above which the table of a front leaves out the designs."""
 _Rows = Iterable[tuple[str | Text, ...]]
 
 
@@ -287,6 +290,68 @@ def geometry_table(record: Mapping[str, Any]) -> RenderableType:
     if record.get("status"):
         _group(table, "status", [("status", str(record["status"]))])
     return Group(table, Text(record.get("message") or ""))
+
+
+def front_table(record: Mapping[str, Any]) -> RenderableType:
+    """Return tables of a front: terms, rates and status of each point, the designs, and the gaps.
+
+    `record`: the front as in the result file."""
+    aims = record["terms"]
+    names = [aim["name"] for aim in aims]
+    words = [_split(name)[0] for name in names]
+    columns = [f"{_label(aim['name'])} ({aim['sense']})" for aim in aims]
+    columns += [f"{words[0]} per {other}" for other in words[1:]]
+    table = _table("Best compromises", *columns, "status")
+    table.columns[0].header = Text("point")
+    base = [_number(record["baseline"]["terms"].get(name)) for name in names]
+    table.add_row("baseline", *base, *[DASH] * len(names))
+    table.add_section()
+    for point in record["points"]:
+        certified = point["status"] == "certified"
+        cells = [point["terms"][name] for name in names] + [*point["rates"].values()]
+        word = Text(point["status"], style="bold green" if certified else "bold red")
+        table.add_row(str(point["point"]), *map(_number, cells), word)
+    if not record["points"]:
+        return Group(table)
+    keys = [*record["points"][0]["design"]]
+    parts: list[RenderableType] = [table]
+    if len(keys) <= _WIDEST_DESIGN:
+        designs = _table("Their designs (min, max: at that bound)", *map(_label, keys), "limits")
+        designs.columns[0].header = Text("point")
+        for point in record["points"]:
+            limits = [name for name in point["multipliers"] if " bound of " not in name]
+            cells = [_bounded(key, point) for key in keys]
+            designs.add_row(str(point["point"]), *cells, ", ".join(limits) or DASH)
+        parts.append(designs)
+    return Group(*parts, *map(Text, _notes(record)))
+
+
+def _bounded(key: str, point: Mapping[str, Any]) -> str:
+    """Return a design parameter of a point, with the bound at which it is held."""
+    name = _words(key.removesuffix("_mm").removesuffix("_deg"))
+    sides = {"lower": "min", "upper": "max"}
+    held = [
+        word for side, word in sides.items() if f"{side} bound of {name}" in point["multipliers"]
+    ]
+    return " ".join([_number(point["design"][key]), *held])
+
+
+def _notes(record: Mapping[str, Any]) -> list[str]:
+    """Return one line per gap of a front, and one about the points that were dropped."""
+    notes = []
+    for gap in record["gaps"]:
+        what = "gap" if gap["kind"] == "terms" else "change of design"
+        sure = "confirmed" if gap["confirmed"] else "not confirmed: raise pareto.refinements"
+        notes.append(
+            f"{what} between points {gap['first']} and {gap['second']}: apart by "
+            f"{gap['distance']:.2g} ranges of the terms and {gap['design_distance']:.2g} of the "
+            f"bounds, {sure}"
+        )
+    count: dict[str, int] = {}
+    for point in record["dropped"]:
+        count[point["status"]] = count.get(point["status"], 0) + 1
+    dropped = ", ".join(f"{n} {_words(word)}" for word, n in count.items())
+    return [*notes, f"dropped: {dropped}"] if dropped else notes
 
 
 def likeness_table(rows: list[dict[str, Any]]) -> RenderableType:

@@ -1,4 +1,4 @@
-"""Terms of the objective: quantities of a design and its motion to be minimised.
+"""Terms of objective and trade-offs: quantities of a design and its motion.
 
 All terms, built-in or your own, are registered in one table. The gradient of a term follows from
 its formula. JAX differentiates the dependence on the profile, and the chain rule adds the gradients
@@ -7,7 +7,7 @@ of the forces.
 
 import abc
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,6 +20,9 @@ from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 
+_CM = 1e-2
+"""Length of a centimetre (m)."""
+
 
 class Forces(NamedTuple):
     """Mean, peak and RMS of the contact force (N), in the fields `mean`, `peak`, `rms`."""
@@ -30,11 +33,15 @@ class Forces(NamedTuple):
 
 
 class Term(eqx.Module):
-    """A quantity to be minimised, with a name and a weight in `objective.terms`.
+    """A quantity with a name, for `objective.terms` and `pareto.terms`.
 
     To add a term, subclass and write `value`. Store numbers in fields that hold arrays or are
     static. The objective divides a term by its value for the baseline, which must be positive.
-    """
+
+    `sense`: whether less of the quantity is better (`min`) or more (`max`). Only terms to be
+    minimised may have a weight in the objective."""
+
+    sense: ClassVar[Literal["min", "max"]] = "min"
 
     @abc.abstractmethod
     def value(
@@ -55,6 +62,27 @@ class GeometryTerm(Term):
     def value(self, scene, profile, shape, forces):
         del scene, profile, forces
         return getattr(shape, self.field) / self.unit
+
+
+class LargeTerm(GeometryTerm):
+    """A `GeometryTerm` of which more is better."""
+
+    sense: ClassVar[Literal["min", "max"]] = "max"
+
+
+class DisplacementTerm(Term):
+    """A term whose value is the volume (cm³) that a pair displaces per revolution.
+
+    Each rotor carries one pocket per lobe and revolution: all pockets of both rotors together have
+    the volume 2 π r_a² L η, with the outer radius r_a, the rotor length L and the area efficiency
+    η."""
+
+    sense: ClassVar[Literal["min", "max"]] = "max"
+
+    def value(self, scene, profile, shape, forces):
+        del profile, forces
+        swept = 2 * jnp.pi * shape.outer_radius**2 * shape.area_efficiency
+        return swept * scene.length / _CM**3
 
 
 class InertiaTerm(Term):
@@ -94,12 +122,14 @@ def register_term(name: str, term: Term) -> None:
     _terms[name] = term
 
 
-def terms_of(names: Sequence[str]) -> tuple[Term, ...]:
-    """Return the terms registered under `names`. Raises `InputError` for an unknown name."""
+def terms_of(names: Sequence[str], key: str = "objective.terms") -> tuple[Term, ...]:
+    """Return the terms registered under `names`. Raises `InputError` for an unknown name.
+
+    `key`: config key that lists the names, for the message."""
     for name in names:
         if name not in _terms:
             raise InputError(
-                f"`objective.terms` must name registered terms ({', '.join(sorted(_terms))}), but "
+                f"`{key}` must name registered terms ({', '.join(sorted(_terms))}), but "
                 f"names {name}; correct it, or register it with rootsopt.register_term"
             )
     return tuple(_terms[name] for name in names)
@@ -127,6 +157,44 @@ def values_of(
     return every(design, forces), by_design + by_forces @ slopes
 
 
+class _UsedError(Exception):
+    """Raised where a term reads a force."""
+
+
+class _NoForces:
+    """Stands in for `Forces` to find out whether a term reads them."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise _UsedError(name)
+
+    def __iter__(self) -> Any:
+        raise _UsedError("all")
+
+    def __getitem__(self, place: Any) -> Any:
+        raise _UsedError(str(place))
+
+
+def needs_forces(scene: Scene, term: Term, design: Float[Array, " d"]) -> bool:
+    """Return whether the value of a `term` depends on forces, so that it needs a simulation.
+
+    The term is traced once for a `design` (d,) in config units, and nothing is computed."""
+
+    def value(design):
+        profile = scene.profile(design)
+        return jnp.asarray(term.value(scene, profile, geometry(profile), _NoForces()), float)  # pyright: ignore[reportArgumentType]
+
+    try:
+        jax.eval_shape(value, design)
+    except _UsedError:
+        return True
+    return False
+
+
+def sense_of(name: str) -> Literal["min", "max"]:
+    """Return the sense of the term registered under `name`; raise `InputError` if it is unknown."""
+    return terms_of([name])[0].sense
+
+
 def _own() -> dict[str, Any]:
     return {
         "mean_force_N": ForceTerm("mean"),
@@ -135,6 +203,11 @@ def _own() -> dict[str, Any]:
         "polar_inertia_kg_m2": InertiaTerm(),
         "outer_radius_mm": GeometryTerm("outer_radius", MM),
         "area_mm2": GeometryTerm("area", MM**2),
+        "area_efficiency": LargeTerm("area_efficiency", 1.0),
+        "root_radius_mm": LargeTerm("root_radius", MM),
+        "undercut_margin_mm": LargeTerm("undercut_margin", MM),
+        "seal_width_mm": LargeTerm("seal_width", MM),
+        "displaced_volume_cm3": DisplacementTerm(),
     }
 
 

@@ -479,7 +479,7 @@ def _valid(draw: random.Random) -> Case:
         _set(data, part, data.get(part.split(".")[0], {}).get(part.split(".")[1], {}))
     for key in _keys():
         words = choices(field_of(Config, key.split(".")).annotation)  # type: ignore[union-attr]
-        free = not key.startswith(("profile.", "scene.", "sweep.")) and key not in TIED
+        free = not key.startswith(("profile.", "scene.", "sweep.", "pareto.")) and key not in TIED
         if words and free and draw.random() < 0.2:
             word = draw.choice(words)
             _set(data, key, draw.choice((word, word.upper(), word.replace("_", "-").title())))

@@ -1,0 +1,55 @@
+"""Config section of `rootsopt pareto`: terms of a trade-off, and effort spent on its front."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from rootsopt.config.section import Section, tuples
+from rootsopt.config.words import shown
+
+
+class ParetoConfig(Section):
+    """The terms that `rootsopt pareto` trades against each other, and how finely."""
+
+    terms: tuple[str, ...] = Field(
+        ("peak_force_N", "area_efficiency"),
+        description="two or three quantities: forces and lines as in `response`, geometry as in "
+        "`geometry`, displaced_volume_cm3, or registered terms",
+    )
+    senses: dict[str, Literal["min", "max"]] = Field(
+        default_factory=dict,
+        description="sense of a term, as {seal_width_mm: min}, where it should differ from the "
+        "term's own: max for area_efficiency, displaced_volume_cm3, seal_width_mm, "
+        "root_radius_mm and undercut_margin_mm, min for all others",
+    )
+    points: Annotated[int, Field(ge=3, le=101)] = Field(
+        11, description="points along the front of two terms, its ends included"
+    )
+    divisions: Annotated[int, Field(ge=2, le=20)] = Field(
+        5,
+        description="steps between two ends of three terms: n steps give (n + 1) (n + 2) / 2 "
+        "points",
+    )
+    refinements: Annotated[int, Field(ge=0, le=100)] = Field(
+        12, description="further points that may be spent on places where neighbours lie far apart"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lists(cls, data):
+        return tuples(data)
+
+    @model_validator(mode="after")
+    def _few(self):
+        if not 2 <= len(self.terms) <= 3 or len(set(self.terms)) != len(self.terms):
+            raise ValueError(
+                "`pareto.terms` must be two or three different terms, as [peak_force_N, "
+                f"area_efficiency], but is {shown([*self.terms])}"
+            )
+        for name in self.senses:
+            if name not in self.terms:
+                raise ValueError(
+                    f"`pareto.senses` must name terms of `pareto.terms` ({', '.join(self.terms)}), "
+                    f"but names {shown(name)}; add the term, or remove its sense"
+                )
+        return self

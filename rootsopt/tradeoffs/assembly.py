@@ -1,0 +1,175 @@
+"""Puts the points of a front together: what stays, who is whose neighbour, what it costs."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.optimize.certificate import Certificate
+from rootsopt.optimize.problem import words
+from rootsopt.tradeoffs.front import FrontPoint, Gap, Standing, dominated, ordered, repeated
+from rootsopt.tradeoffs.gaps import Edge, Pair, Search, Spacing, along, among, measured
+from rootsopt.tradeoffs.scalar import Scalar, Scale, rates
+from rootsopt.tradeoffs.study import Sample, Study
+
+_HELD = 1e-6
+"""Multiplier of a limit below which the limit counts as inactive."""
+
+
+class Node(NamedTuple):
+    """One point of a front while it is traced.
+
+    `scalar`: its objective; `sample`: the best design; `certificate`: first-order conditions there;
+    `reason`: why the search ended; `end`: number of the term that it is the end of, or -1;
+    `standing`: status, `NOT_VERIFIED` until the design has been simulated again."""
+
+    scalar: Scalar
+    sample: Sample
+    certificate: Certificate
+    reason: str
+    end: int = -1
+    standing: Standing = Standing.NOT_VERIFIED
+
+    @property
+    def objective(self) -> float:
+        """Value of the objective."""
+        return self.scalar.value(self.sample.values)
+
+    @property
+    def point(self) -> NDArray[np.float64]:
+        """The design (d,) in the unit box."""
+        return self.sample.point
+
+
+class Selection(NamedTuple):
+    """Which of n nodes form the front.
+
+    `values` (n, k): scaled terms; `points` (n, d): designs in the unit box; `standings`: status of
+    each node; `same`: number of the node that stands for a repeated one, or -1; `kept`: numbers of
+    the nodes on the front, in order."""
+
+    values: NDArray[np.float64]
+    points: NDArray[np.float64]
+    standings: list[Standing]
+    same: list[int]
+    kept: list[int]
+
+    def edges(self, pairs: Sequence[Pair]) -> list[Edge]:
+        """Return the neighbours on the front.
+
+        `pairs`: pairs of numbers of neighbours; used for three terms only."""
+        if self.values.shape[1] == 2:
+            found = [(min(pair), max(pair)) for pair in along(self.kept)]
+        else:
+            found = among(pairs, self.kept, self.same)
+        return [measured(pair, self.values, self.points) for pair in found]
+
+
+def selected(nodes: Sequence[Node], scale: Scale) -> Selection:
+    """Return which of the `nodes` form the front: those not dominated, repeated or refuted."""
+    count = len(scale.width)
+    values = scale.of(np.array([node.sample.values for node in nodes]).reshape(-1, count))
+    points = np.array([node.sample.point for node in nodes])
+    standings = [node.standing for node in nodes]
+    same = [-1] * len(nodes)
+    alive = [k for k, one in enumerate(standings) if one.kept]
+    # Certified points come first, so that they stand for those which repeat them; ends before all.
+    alive.sort(key=lambda k: (nodes[k].end < 0, standings[k] is not Standing.CERTIFIED))
+    beaten = dominated(values[alive]) if alive else []
+    for k, one in zip(alive, beaten, strict=True):
+        if one:
+            standings[k] = Standing.DOMINATED
+    alive = [k for k in alive if standings[k].kept]
+    for k, first in zip(alive, repeated(values[alive], points[alive]), strict=True):
+        if first >= 0:
+            standings[k], same[k] = Standing.REPEATED, alive[first]
+    alive = [k for k in alive if standings[k].kept]
+    kept = [alive[k] for k in ordered(values[alive])] if alive else []
+    return Selection(values, points, standings, same, kept)
+
+
+def spacing_of(selection: Selection, pairs: Sequence[Pair], ends: int, divisions: int) -> Spacing:
+    """Return the typical distances of neighbours before any bisection.
+
+    `ends`: number of ends, which are the first nodes; `divisions`: steps between two ends."""
+    corners = selection.values[:ends]
+    sides = [np.linalg.norm(a - b) for k, a in enumerate(corners) for b in corners[k + 1 :]]
+    moves = [edge.design_distance for edge in selection.edges(pairs)]
+    if not sides:
+        return Spacing(np.inf, np.inf)
+    return Spacing(float(np.mean(sides)) / divisions, float(np.median(moves)) if moves else 0.0)
+
+
+def points_of(
+    study: Study, nodes: Sequence[Node], selection: Selection, scale: Scale
+) -> tuple[list[FrontPoint], list[FrontPoint]]:
+    """Return (points of the front in order, points that were dropped)."""
+    number = {k: place for place, k in enumerate(selection.kept, start=1)}
+    every = [
+        _point(study, node, number.get(k, 0), standing, scale)
+        for k, (node, standing) in enumerate(zip(nodes, selection.standings, strict=True))
+    ]
+    dropped = [one for k, one in enumerate(every) if k not in number]
+    return [every[k] for k in selection.kept], dropped
+
+
+def gaps_of(
+    selection: Selection, search: Search, spacing: Spacing
+) -> tuple[list[tuple[int, int]], list[Gap]]:
+    """Return (pairs of neighbours without those of gaps, the gaps), in numbers of the front."""
+    number = {k: place for place, k in enumerate(selection.kept, start=1)}
+    edges, gaps = [], []
+    for edge in selection.edges(search.pairs):
+        first, second = sorted(number[k] for k in edge.pair)
+        closed = search.closed.get(edge.pair)
+        if closed is None and spacing.excess(edge) <= 1:
+            edges.append((first, second))
+            continue
+        kind = closed or spacing.kind(edge)
+        tried = search.tried.get(edge.pair, 0)
+        far = edge.distance, edge.design_distance
+        gaps.append(Gap(first, second, kind, *far, tried, closed is not None))
+    return edges, sorted(gaps)
+
+
+def _point(study: Study, node: Node, number: int, standing: Standing, scale: Scale) -> FrontPoint:
+    names = [aim.name for aim in study.aims]
+    signs = np.array([aim.sign for aim in study.aims])
+    weights = node.scalar.weights(node.sample, node.certificate)
+    # Signs turn rates between terms of which less is better into rates between the terms.
+    traded = rates(weights, scale.width)[0] * signs[0] * signs
+    return FrontPoint(
+        number=number,
+        end_of=names[node.end] if node.end >= 0 else "",
+        point=node.sample.point,
+        terms=study.term_values(node.sample.evaluation),
+        evaluation=study.completed(node.sample.evaluation),
+        standing=standing,
+        reason=node.reason,
+        residual=node.certificate.residual,
+        violation=node.certificate.violation,
+        weights=dict(zip(names, map(float, weights), strict=True)),
+        rates={name: float(rate) for name, rate in zip(names[1:], traded[1:], strict=True)},
+        limits=_limits(study, node.certificate),
+    )
+
+
+def _limits(study: Study, certificate: Certificate) -> dict[str, float]:
+    """Return the multipliers of active constraints and bounds by name."""
+    found = {
+        constraint.name: float(multiplier)
+        for constraint, multiplier in zip(
+            study.problem.space.constraints, certificate.multipliers, strict=True
+        )
+        if multiplier > _HELD
+    }
+    keys = study.config.design_keys
+    for side, multipliers in (("lower", certificate.lower), ("upper", certificate.upper)):
+        for key, multiplier in zip(keys, multipliers, strict=True):
+            if multiplier > _HELD:
+                found[f"{side} bound of {words(key)}"] = float(multiplier)
+    return found
+
+
+__all__ = ["Node", "Selection", "gaps_of", "points_of", "selected", "spacing_of"]

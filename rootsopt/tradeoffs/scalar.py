@@ -1,0 +1,123 @@
+"""Turns several terms into one objective, whose optimum is one point of the front.
+
+The terms u_i are scaled so that less is better, and so that the ends of the front lie at 0 and 1.
+From a reference point r, the design is sought that goes furthest in all terms at once:
+
+    min over x of   max_i (u_i(x) - r_i) / d_i  +  ρ Σ_i u_i(x),    i in the terms that lead.
+
+Every point of a front is the optimum for some r, also where the front is not convex. A weighted sum
+does not reach these points. All d_i are 1, except beside a gap. The small second part excludes
+designs that are worse in one term and better in none. See Pascoletti and Serafini, Scalarizing
+vector optimization problems, Journal of Optimization Theory and Applications 42 (1984) 499-524, and
+Steuer and Choo, An interactive weighted Tchebycheff procedure, Mathematical Programming 26 (1983)
+326-344.
+
+The maximum is one `Group` of branches. The shares of its branches, from the certificate, are the
+weights of the terms at the optimum, and their ratios are the rates at which the terms trade."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.optimize.certificate import Certificate
+from rootsopt.optimize.local import Group, Local
+from rootsopt.tradeoffs.study import Sample
+
+RHO = 1e-3
+"""Weight ρ of the sum. Designs that give up more than 1/ρ of one term's range per range of another
+count as worse."""
+
+
+class Scale(NamedTuple):
+    """Scale of k terms: u = (value - `ideal`) / `width`, both (k,)."""
+
+    ideal: NDArray[np.float64]
+    width: NDArray[np.float64]
+
+    def of(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the scaled terms (…, k) for their values (…, k), of which less is better."""
+        return (values - self.ideal) / self.width
+
+
+class Scalar(NamedTuple):
+    """One scalar objective made of k terms.
+
+    `scale`: scale of the terms; `reference` (k,): reference point r, in scaled terms; `leading`:
+    numbers of the terms in the maximum; `direction` (k,): d, by default 1 for each term."""
+
+    scale: Scale
+    reference: NDArray[np.float64]
+    leading: tuple[int, ...]
+    direction: NDArray[np.float64] | None = None
+
+    @property
+    def steps(self) -> NDArray[np.float64]:
+        """Direction d (k,)."""
+        return np.ones(len(self.reference)) if self.direction is None else self.direction
+
+    def value(self, values: NDArray[np.float64]) -> float:
+        """Return the objective for the values (k,) of the terms."""
+        u = self.scale.of(values)
+        lead = [*self.leading]
+        return float(np.max(((u - self.reference) / self.steps)[lead]) + RHO * np.sum(u))
+
+    def local(self, sample: Sample) -> Local:
+        """Return objective and constraints at a `sample`, with gradients."""
+        smooth, slope = 0.0, np.zeros(len(sample.point))
+        together: list[Group] = []
+        corners: list[Group] = []
+        for number, group in enumerate(sample.terms):
+            width = self.scale.width[number]
+            values = (group.values - self.scale.ideal[number]) / width
+            if number in self.leading:
+                step = self.steps[number]
+                lead = (values - self.reference[number]) / step
+                together.append(Group(group.tags, lead, group.slopes / (width * step)))
+            if sample.cornered[number]:
+                corners.append(Group(group.tags, RHO * values, RHO * group.slopes / width))
+            else:
+                smooth += RHO * float(values[0])
+                slope = slope + RHO * group.slopes[0] / width
+        first = Group(*(np.concatenate(arrays) for arrays in zip(*together, strict=True)))
+        return Local(smooth, slope, (first, *corners), sample.slack, sample.normals)
+
+    def weights(self, sample: Sample, certificate: Certificate) -> NDArray[np.float64]:
+        """Return the weights (k,) of the scaled terms in the maximum at an optimum; their sum is 1.
+
+        `sample`, `certificate`: those of the optimum."""
+        kinds = np.concatenate([sample.terms[k].tags[:, 0] for k in self.leading]).astype(int)
+        found = np.zeros(len(sample.terms))
+        np.add.at(found, kinds, certificate.shares[0])
+        found = found / self.steps
+        return found / np.sum(found)
+
+
+def rates(
+    weights: NDArray[np.float64], width: NDArray[np.float64], least: float = 1e-4
+) -> NDArray[np.float64]:
+    """Return the rates (k, k) at which terms trade along the front.
+
+    Entry (i, j) is the change of term i per unit of term j, both in a sense in which less is
+    better: -(w_j / width_j) / (w_i / width_i). `weights` (k,): those of the scaled terms; `width`
+    (k,): their scale. The rate is NaN if a weight is below `least`: one term then does not hold the
+    design, as at an end of the front or beside a gap."""
+    held = np.where(weights >= least, weights / width, np.nan)
+    found = -held[None, :] / held[:, None]
+    np.fill_diagonal(found, np.nan)
+    return found
+
+
+def end_scale(baseline: NDArray[np.float64], screened: NDArray[np.float64]) -> Scale:
+    """Return the scale of k terms before the ends of the front are known.
+
+    `baseline` (k,): values of the baseline; `screened` (n, k): those of all screened designs. The
+    width is the magnitude of the baseline's value, or the range of the screened designs if this
+    value is nearly 0."""
+    magnitude = np.abs(baseline)
+    spread = np.ptp(screened, axis=0) if len(screened) else np.zeros_like(magnitude)
+    width = np.where(magnitude > 1e-3 * spread, magnitude, spread)
+    return Scale(np.zeros_like(width), np.where(width > 0, width, 1.0))
+
+
+__all__ = ["RHO", "Scalar", "Scale", "end_scale", "rates"]

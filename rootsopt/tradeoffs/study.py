@@ -1,0 +1,216 @@
+"""Values and gradients of the terms of a trade-off at designs, with or without a simulation."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from rootsopt.config import Config
+from rootsopt.design.space import Space
+from rootsopt.optimize.local import Group
+from rootsopt.optimize.problem import Problem
+from rootsopt.profiles import geometry
+from rootsopt.response.evaluation import Evaluation, Evaluator, geometry_record
+from rootsopt.response.terms import terms_of, values_of
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene, design_vector
+from rootsopt.status import Status
+from rootsopt.tradeoffs.aims import Aim, aims_of, freed, reporting, simulated
+
+PEAK = "peak_force_N"
+"""Key of the peak force: the greatest of several local maxima, each a smooth branch."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sample:
+    """The k terms at one point of the unit box.
+
+    `point` (d,): the design in the unit box; `evaluation`: evaluation of the design; `terms`: one
+    group of branches per term, in a sense in which less is better, with gradients with respect to
+    the point; `cornered`: for each term, whether it is a maximum over branches; `slack` (m,),
+    `normals` (m, d): constraints, as in `rootsopt.optimize.local`."""
+
+    point: NDArray[np.float64]
+    evaluation: Evaluation
+    terms: tuple[Group, ...]
+    cornered: tuple[bool, ...]
+    slack: NDArray[np.float64]
+    normals: NDArray[np.float64]
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Values (k,) of the terms, in a sense in which less is better."""
+        return np.array([group.top for group in self.terms])
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """Everything that is needed to look at designs of one trade-off.
+
+    `config`: config of the study; `aims`: its k terms; `problem`: unit box and constraints, with
+    the evaluated baseline; `fast`: evaluator for a screening, `sharp`: for a search, `exact`: for
+    reports. All three are `None` if no term depends on forces."""
+
+    config: Config
+    aims: tuple[Aim, ...]
+    problem: Problem
+    fast: Evaluator | None
+    sharp: Evaluator | None
+    exact: Evaluator | None
+
+    @classmethod
+    def of(cls, config: Config) -> "Study":
+        """Return the study of a `config`; evaluate its own design as the baseline.
+
+        Raises `InputError` for unknown terms, or for a scene that cannot be simulated."""
+        aims = aims_of(config)
+        config = freed(config)
+        scene = Scene.from_config(config)
+        if not simulated(config, scene):
+            baseline = geometry_of(scene, config, design_vector(config))
+            space = Space.of(config, scene, baseline.geometry["area_efficiency"])
+            return cls(config, aims, Problem(config, baseline, space), None, None, None)
+        exact, baseline = Evaluator.of(reporting(config)).fit()
+        if any(_is_cornered(aim) for aim in aims):
+            exact = exact.with_maxima()
+        fast = exact.at_tolerance(max(1e-6, config.solver.rtol)).surveying()
+        space = Space.of(config, exact.scene, baseline.geometry["area_efficiency"])
+        problem = Problem(config, baseline, space)
+        return cls(config, aims, problem, fast, exact.surveying(), exact)
+
+    @property
+    def usable(self) -> bool:
+        """Whether the baseline has all terms."""
+        return self.exact is None or self.problem.baseline.usable
+
+    def term_values(self, evaluation: Evaluation) -> dict[str, float]:
+        """Return the terms of an evaluated design by name, in their own units."""
+        return {aim.name: evaluation.response[aim.name] for aim in self.aims}
+
+    def completed(self, evaluation: Evaluation) -> Evaluation:
+        """Return an `evaluation` with its geometry, which a search without forces leaves out."""
+        if evaluation.geometry:
+            return evaluation
+        design = jnp.asarray([*evaluation.design.values()])
+        return geometry_of(self.problem.space.scene, self.config, design)
+
+    def screened(self, point: NDArray[np.float64]) -> Evaluation | None:
+        """Return an evaluation of a `point` (d,) for a screening.
+
+        Return `None` if the design has no usable steady state."""
+        if self.fast is None:
+            sample = self._still(point)
+            return None if sample is None else sample.evaluation
+        found = self.fast.without_gradient()(self.problem.design(point), series=False)
+        return found if found.usable else None
+
+    def sample(self, point: NDArray[np.float64], orbit: NDArray | None = None) -> Sample | None:
+        """Return the terms at a `point` (d,) during a search.
+
+        `orbit`: first guess of the orbit. Return `None` without a usable steady state."""
+        if self.sharp is None:
+            return self._still(point)
+        return self._moving(point, self.sharp(self.problem.design(point), orbit, series=False))
+
+    def verified(self, point: NDArray[np.float64]) -> Sample | None:
+        """Return the terms at a `point` (d,), simulated from rest at the tight tolerance.
+
+        Return `None` without a usable steady state."""
+        if self.exact is None:
+            return self._still(point)
+        return self._moving(point, self.exact(self.problem.design(point), series=False))
+
+    def _moving(self, point: NDArray[np.float64], evaluation: Evaluation) -> Sample | None:
+        if not evaluation.usable:
+            return None
+        _, jacobian, slack, normals = self.problem.look(point)
+        groups = []
+        for number, aim in enumerate(self.aims):
+            maxima = evaluation.maxima if _is_cornered(aim) else None
+            if maxima is not None and maxima.times.size:
+                period = evaluation.steady_state["period"]
+                kinds = np.full(maxima.times.size, float(number))
+                tags = np.stack([kinds, maxima.times / period], axis=1)
+                groups.append(Group(tags, maxima.forces, maxima.slopes @ jacobian))
+                continue
+            slope = np.array([*evaluation.gradient[aim.name].values()])
+            groups.append(_single(number, aim, evaluation.response[aim.name], slope @ jacobian))
+        cornered = tuple(map(_is_cornered, self.aims))
+        return _finite(Sample(np.array(point), evaluation, tuple(groups), cornered, slack, normals))
+
+    def _still(self, point: NDArray[np.float64]) -> Sample | None:
+        design, jacobian, slack, normals = self.problem.look(point)
+        scene = self.problem.space.scene
+        terms = terms_of([aim.name for aim in self.aims])
+        nothing = np.zeros(3), np.zeros((3, len(design)))
+        found = values_of(scene, terms, jnp.asarray(design), *map(jnp.asarray, nothing))
+        values, slopes = map(np.asarray, found)
+        rows = zip(self.aims, values, slopes @ jacobian, strict=True)
+        groups = tuple(
+            _single(k, aim, float(value), row) for k, (aim, value, row) in enumerate(rows)
+        )
+        response = {aim.name: float(value) for aim, value in zip(self.aims, values, strict=True)}
+        evaluation = still_evaluation(self.config, design, response)
+        cornered = (False,) * len(groups)
+        return _finite(Sample(np.array(point), evaluation, groups, cornered, slack, normals))
+
+
+def _is_cornered(aim: Aim) -> bool:
+    """Return whether a term is a maximum over branches that is to be minimised."""
+    return aim.name == PEAK and aim.sense == "min"
+
+
+def _single(number: int, aim: Aim, value: float, slope: NDArray[np.float64]) -> Group:
+    """Return term `number` as a group with one branch."""
+    tags = np.array([[float(number), 0.0]])
+    return Group(tags, aim.sign * np.array([value]), aim.sign * slope[None, :])
+
+
+def _finite(sample: Sample) -> Sample | None:
+    """Return `sample`, or `None` if a number in it is not finite."""
+    arrays = [sample.slack, sample.normals]
+    arrays += [array for group in sample.terms for array in (group.values, group.slopes)]
+    return sample if all(np.all(np.isfinite(array)) for array in arrays) else None
+
+
+@Program
+def _shape(scene: Scene, design):
+    """Return the geometry of a design (d,) in config units."""
+    return geometry(scene.profile(design))
+
+
+def geometry_of(scene: Scene, config: Config, design: Float[Array, " d"]) -> Evaluation:
+    """Return the evaluation of a `design` (d,), in config units, without a simulation.
+
+    Its response holds the terms of `config.pareto`, none of which may depend on forces."""
+    names = config.pareto.terms
+    nothing = jnp.zeros(3), jnp.zeros((3, len(config.design_keys)))
+    values, _ = values_of(scene, terms_of(names), design, *nothing)
+    response = dict(zip(names, map(float, np.asarray(values)), strict=True))
+    found = still_evaluation(config, np.asarray(design), response)
+    shape = geometry_record(scene, _shape(scene, design))
+    return dataclasses.replace(found, geometry=shape)
+
+
+def still_evaluation(
+    config: Config, design: NDArray[np.float64], response: dict[str, float]
+) -> Evaluation:
+    """Return the evaluation of a `design` (d,), in config units, without forces and geometry.
+
+    `response`: its terms by name."""
+    return Evaluation(
+        design=dict(zip(config.design_keys, map(float, design), strict=True)),
+        geometry={},
+        response=response,
+        gradient={},
+        steady_state={},
+        status=Status.GEOMETRY_ONLY,
+        message=Status.GEOMETRY_ONLY.value,
+        statistics={},
+        series=None,
+    )
+
+
+__all__ = ["PEAK", "Sample", "Study", "geometry_of"]

@@ -1,0 +1,500 @@
+"""Traces a front: its ends, the points between them from neighbour to neighbour, and its gaps.
+
+First, each term alone is minimised from several starts. These optima are the ends of the front, and
+reference points are spread evenly between them: on the straight line between two ends, or on a
+triangular grid between three. This is the normal-boundary method of Das and Dennis, Normal-boundary
+intersection, SIAM Journal on Optimization 8 (1998) 631-657, with the objective of
+`rootsopt.tradeoffs.scalar`, which may stay behind the line from a reference point.
+
+The points are then solved in order, each from a prediction by its solved neighbours: the secant
+through two of them, or the nearest one. A second pass goes back from the other ends. Branches of
+optima can exist side by side, so the better result counts. Any design seen before that would be
+better still begins a further search, and so does the best one of another kind. Last, neighbours
+that lie far apart are bisected."""
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.config import FAMILY_KEYS, Config
+from rootsopt.design.space import sobol
+from rootsopt.errors import InputError
+from rootsopt.optimize.certificate import certify
+from rootsopt.optimize.infeasible import Infeasible, explain
+from rootsopt.optimize.local import Local
+from rootsopt.optimize.optimality import RESIDUAL
+from rootsopt.optimize.problem import FEASIBLE
+from rootsopt.optimize.sqp import Stops, descend
+from rootsopt.response.choice import resolve
+from rootsopt.scene import check_geometry
+from rootsopt.tradeoffs.assembly import Node, gaps_of, points_of, selected, spacing_of
+from rootsopt.tradeoffs.front import Front, Standing
+from rootsopt.tradeoffs.gaps import Edge, Pair, Search, Spacing, divides
+from rootsopt.tradeoffs.lattice import Key, corners, directions, keys, links
+from rootsopt.tradeoffs.scalar import Scalar, Scale, end_scale
+from rootsopt.tradeoffs.study import Sample, Study
+
+_BETTER = 1e-4
+"""Gain (range of a term) that a design seen before must promise to begin a further search."""
+_PROMISING = 0.25
+"""Disadvantage (range of a term) up to which a design of another kind begins a further search."""
+_APART = 0.15
+"""Distance in the unit box above which two starts differ."""
+_CHEAP_EVALUATIONS, _CHEAP_STARTS, _CHEAP_SCREENING = 300, 6, 64
+"""Least effort per search, starts per end and screened designs, where nothing is simulated."""
+_SHARP = 0.01
+"""Accuracy (width of the gap) with which the sides of a gap are found."""
+_EXPLAINED = 8
+"""Maximum number of points from which the least violation of the constraints is searched for."""
+_HOLDS_UP = 0.01
+"""Relative difference of a term between search and verification above which a point is dropped."""
+_SAME_ENDS = 1e-6
+"""Range of a term over the ends, relative to its scale, below which the term is not in conflict."""
+
+Progress = Callable[[int, int], None]
+"""Type of a progress callback, with arguments (searches done, searches expected)."""
+
+
+class _Seen(NamedTuple):
+    """A feasible design seen before: `point` (d,), its terms `values` (k,), its `orbit`."""
+
+    point: NDArray[np.float64]
+    values: NDArray[np.float64]
+    orbit: NDArray | None
+
+
+class Tracer:
+    """Traces the front of one config.
+
+    `progress`: function called after each local search; `stop`: event that another thread can set
+    to end early.
+
+    Raises `InputError` if the profile family has no design parameters."""
+
+    def __init__(
+        self,
+        config: Config,
+        progress: Progress | None = None,
+        stop: threading.Event | None = None,
+    ):
+        if not FAMILY_KEYS[config.profile.family]:
+            valid = ", ".join(family for family, found in FAMILY_KEYS.items() if found)
+            raise InputError(
+                f"`profile.family` must be one of {valid} for a trade-off, but is "
+                f"{config.profile.family}: it has no design parameter; use `simulate` for it"
+            )
+        self.config = config
+        self.progress = progress or (lambda done, expected: None)
+        self.stop = threading.Event() if stop is None else stop
+        self._study: Study | None = None
+        self._nodes: dict[Key, Node] = {}
+        self._extra: list[Node] = []
+        self._gaps = Search([])
+        self._spacing = Spacing(np.inf, np.inf)
+        self._scale: Scale | None = None
+        self._seen: list[_Seen] = []
+        self._lock = threading.Lock()
+        self._searches = self._evaluations = 0
+        self._expected = 0
+
+    @property
+    def study(self) -> Study:
+        """The terms at designs; known as soon as the baseline has been evaluated."""
+        assert self._study is not None
+        return self._study
+
+    @property
+    def scale(self) -> Scale:
+        """Scale of the terms; known from the screening on, final once the ends are known."""
+        assert self._scale is not None
+        return self._scale
+
+    def run(self) -> Front:
+        """Evaluate the baseline, find the ends, trace the front, and verify its points.
+
+        Return the front. If `stop` is set, the front has the points found so far.
+
+        Raises `InputError` for unknown terms, or for a scene that cannot be simulated."""
+        study = self._study = Study.of(self.config)
+        if not study.usable or self.stop.is_set():
+            return self._front([])
+        points = self._feasible()
+        if not points:
+            reason = explain(study.problem, self._sample[:_EXPLAINED])
+            return self._front([], infeasible=reason)
+        self._screen(points)
+        if self._seen and self._ends(points[0]):
+            self._trace()
+            self._bisect()
+        return self._front(self._verified(self._all()))
+
+    def so_far(self) -> Front | None:
+        """Return the points found so far, without verification.
+
+        Return `None` until the baseline has been evaluated. Another thread can call this method
+        during the search."""
+        if self._study is None:
+            return None
+        with self._lock:
+            nodes = [*self._nodes.values(), *self._extra]
+        return self._front(nodes)
+
+    # The ends of the front.
+
+    def _feasible(self) -> list[NDArray[np.float64]]:
+        """Return the baseline's point and a Sobol sample, moved onto the feasible set."""
+        settings, problem = self.config.optimizer, self.study.problem
+        start = problem.project(problem.point([*problem.baseline.design.values()]))
+        count = settings.screening
+        if self.study.sharp is None:
+            count = max(count, _CHEAP_SCREENING)
+        sample = sobol(count, settings.seed, len(start))
+        self._sample = [start, *(problem.toward(point, start) for point in sample)]
+        return [point for point in self._sample if problem.feasible(point)]
+
+    def _screen(self, points: Sequence[NDArray[np.float64]]) -> None:
+        """Evaluate `points`, keep their terms, and set the scale for the ends."""
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            found = list(pool.map(self._screened, points))
+        signs = np.array([aim.sign for aim in self.study.aims])
+        names = [aim.name for aim in self.study.aims]
+        for point, evaluation in zip(points, found, strict=True):
+            if evaluation is not None:
+                values = signs * [evaluation.response[name] for name in names]
+                self._seen.append(_Seen(point, values, evaluation.state))
+        self._evaluations += len(points)
+        baseline = signs * [self.study.problem.baseline.response[name] for name in names]
+        every = np.array([one.values for one in self._seen]).reshape(-1, len(names))
+        self._scale = end_scale(baseline, every)
+
+    def _screened(self, point: NDArray[np.float64]):
+        return None if self.stop.is_set() else self.study.screened(point)
+
+    def _ends(self, first: NDArray[np.float64]) -> bool:
+        """Find the end of each term, and set the final scale.
+
+        `first` (d,): the baseline's point. Return whether there is a front to trace between them:
+        all ends exist and are in conflict."""
+        count = len(self.study.aims)
+        starts = self.config.optimizer.starts
+        if self.study.sharp is None:
+            starts = max(starts, _CHEAP_STARTS)
+        self._expected = count * starts + 3 * (len(keys(count, self._divisions)) - count)
+        for number, key in enumerate(corners(count, self._divisions)):
+            scalar = Scalar(self.scale, np.zeros(count), (number,))
+            best: Node | None = None
+            for one in self._apart(scalar, starts, first):
+                best = self._solved(scalar, one.point, one.orbit, best)
+            best = self._again(scalar, best)
+            if best is None:
+                return False
+            with self._lock:
+                self._nodes[key] = best._replace(end=number)
+        ends = np.array([node.sample.values for node in self._nodes.values()])
+        width = np.ptp(ends, axis=0)
+        conflict = bool(np.all(width > _SAME_ENDS * self.scale.width))
+        if conflict:
+            self._scale = Scale(np.min(ends, axis=0), width)
+        return conflict and not self.stop.is_set()
+
+    def _apart(self, scalar: Scalar, count: int, first: NDArray[np.float64]) -> list[_Seen]:
+        """Return at most `count` designs seen before that lie apart, the best by `scalar` first."""
+        chosen: list[_Seen] = []
+        for one in sorted(self._seen, key=lambda one: scalar.value(one.values)):
+            apart = all(np.linalg.norm(one.point - other.point) > _APART for other in chosen)
+            if apart and len(chosen) < count:
+                chosen.append(one)
+        return chosen or [_Seen(first, np.zeros(0), None)]
+
+    # The points between the ends.
+
+    @property
+    def _divisions(self) -> int:
+        """Number of steps from one end to another."""
+        wanted = self.config.pareto
+        return wanted.points - 1 if len(wanted.terms) == 2 else wanted.divisions
+
+    def _reference(self, key: Key) -> NDArray[np.float64]:
+        """Return the reference point (k,) of a `key` of the grid, in scaled terms."""
+        ends = [self._nodes[one].sample.values for one in corners(len(key), self._divisions)]
+        return np.array(key) / self._divisions @ self.scale.of(np.array(ends))
+
+    def _trace(self) -> None:
+        """Solve all points between the ends, in two passes."""
+        count = len(self.study.aims)
+        inner = [key for key in keys(count, self._divisions) if key not in self._nodes]
+        everything = tuple(range(count))
+        for order in (inner, inner[::-1]):
+            for key in order:
+                if self.stop.is_set():
+                    return
+                scalar = Scalar(self.scale, self._reference(key), everything)
+                before = self._nodes.get(key)
+                best = before
+                for start, orbit in self._predictions(key, ahead=order is inner):
+                    best = self._solved(scalar, start, orbit, best)
+                best = self._again(scalar, best)
+                if order is not inner:
+                    best = self._elsewhere(scalar, best)
+                if best is not None:
+                    with self._lock:
+                        self._nodes[key] = best
+
+    def _predictions(self, key: Key, ahead: bool):
+        """Yield (start (d,), orbit) for a `key` of the grid, from its solved neighbours.
+
+        `ahead`: whether this is the first pass; the second begins from the other side. The first
+        start is the secant through two neighbours in line, or the nearest neighbour; if it leads
+        nowhere, the neighbour itself follows."""
+        steps = directions(len(key))
+        for step in steps if ahead else [tuple(-x for x in one) for one in steps]:
+            near = self._nodes.get(tuple(a - b for a, b in zip(key, step, strict=True)))
+            if near is None:
+                continue
+            far = self._nodes.get(tuple(a - 2 * b for a, b in zip(key, step, strict=True)))
+            before = self._evaluations
+            if far is not None and np.max(np.abs(near.point - far.point)) < 2 * _APART:
+                secant = np.clip(2 * near.point - far.point, 0.0, 1.0)
+                yield secant, near.sample.evaluation.state
+                if self._evaluations > before + 1:  # The prediction had a steady state.
+                    return
+            yield near.point, near.sample.evaluation.state
+            return
+
+    def _again(self, scalar: Scalar, best: Node | None) -> Node | None:
+        """Search from the best design seen before if it is better than `best`; return the best."""
+        seen = min(self._seen, key=lambda one: scalar.value(one.values), default=None)
+        if seen is None or self.stop.is_set():
+            return best
+        if best is None or scalar.value(seen.values) < best.objective - _BETTER:
+            return self._solved(scalar, seen.point, seen.orbit, best)
+        return best
+
+    def _elsewhere(self, scalar: Scalar, best: Node | None) -> Node | None:
+        """Search from the most promising design seen before that lies apart from `best`.
+
+        Return the better one of the outcome and `best`. With a single start (`optimizer.starts`),
+        or without a promising design, return `best`."""
+        if best is None or self.config.optimizer.starts < 2:
+            return best
+        limit = best.objective + _PROMISING
+        others = [
+            one
+            for one in self._seen
+            if np.linalg.norm(one.point - best.point) > _APART and scalar.value(one.values) < limit
+        ]
+        found = min(others, key=lambda one: scalar.value(one.values), default=None)
+        return best if found is None else self._solved(scalar, found.point, found.orbit, best)
+
+    def _solved(
+        self, scalar: Scalar, start: NDArray[np.float64], orbit: NDArray | None, best: Node | None
+    ) -> Node | None:
+        """Search from `start` (d,) for the optimum of a `scalar` objective.
+
+        `orbit`: first guess of the orbit. Return the better one of the outcome and `best`."""
+        if self.stop.is_set():
+            return best
+        samples: dict[bytes, Sample] = {}
+        last = [orbit]
+
+        def look(point: NDArray[np.float64]) -> Local | None:
+            sample = self.study.sample(point, last[0])
+            self._evaluations += 1
+            if sample is None:
+                return None
+            last[0] = sample.evaluation.state
+            samples[point.tobytes()] = sample
+            if np.min(sample.slack, initial=0.0) >= -FEASIBLE:
+                self._seen.append(_Seen(sample.point, sample.values, sample.evaluation.state))
+            return scalar.local(sample)
+
+        limit = self.config.optimizer.iterations + 1
+        if self.study.sharp is None:
+            limit = max(limit, _CHEAP_EVALUATIONS)
+        found = descend(look, start, Stops(evaluations=limit, asked=self.stop.is_set))
+        self._searches += 1
+        self.progress(self._searches, max(self._expected, self._searches))
+        if found.local is None or found.certificate is None:
+            return best
+        if found.local.violation > FEASIBLE:
+            return best
+        sample = samples[found.point.tobytes()]
+        node = Node(scalar, sample, found.certificate, found.reason)
+        return node if best is None or node.objective < best.objective else best
+
+    # Gaps.
+
+    def _all(self) -> list[Node]:
+        """Return all nodes, those of the ends first."""
+        with self._lock:
+            return [*self._nodes.values(), *self._extra]
+
+    def _bisect(self) -> None:
+        """Search between neighbours that lie far apart, as long as refinements are left."""
+        self._gaps = Search(links([*self._nodes]))
+        first = selected(self._all(), self.scale)
+        self._spacing = spacing_of(first, self._gaps.pairs, len(self.study.aims), self._divisions)
+        for _ in range(self.config.pareto.refinements):
+            nodes = self._all()
+            selection = selected(nodes, self.scale)
+            wide = self._widest(selection.edges(self._gaps.pairs))
+            if wide is None or self.stop.is_set():
+                return
+            self._divide(wide, nodes)
+
+    def _widest(self, edges: Sequence[Edge]) -> Edge | None:
+        """Return the neighbours that lie furthest apart and may still be bisected."""
+        spacing, gaps = self._spacing, self._gaps
+        open_ones = []
+        for edge in edges:
+            if edge.pair in gaps.closed or spacing.excess(edge) <= 1:
+                continue
+            if spacing.close(edge):
+                gaps.closed[edge.pair] = "design"
+                continue
+            open_ones.append(edge)
+        return max(open_ones, key=spacing.excess, default=None)
+
+    def _divide(self, edge: Edge, nodes: Sequence[Node]) -> None:
+        """Search for a point between two neighbours, and record what was found."""
+        ends = [nodes[k] for k in edge.pair]
+        values = [self.scale.of(node.sample.values) for node in ends]
+        middle = np.mean(values, axis=0)
+        scalar = Scalar(self.scale, middle, tuple(range(len(middle))))
+        best: Node | None = None
+        starts = [node.sample.point for node in ends]
+        orbits = [node.sample.evaluation.state for node in ends]
+        starts.append(np.mean(starts, axis=0))
+        for start, orbit in zip(starts, [*orbits, orbits[0]], strict=True):
+            best = self._solved(scalar, start, orbit, best)
+        best = self._again(scalar, best)
+        if self.stop.is_set():
+            return
+        gaps = self._gaps
+        gaps.tried[edge.pair] = gaps.tried.get(edge.pair, 0) + 1
+        if best is None or not divides(edge, self.scale.of(best.sample.values), *values):
+            kind = self._spacing.kind(edge)
+            pair = self._sharpened(edge.pair) if kind == "terms" and len(middle) == 2 else edge.pair
+            gaps.closed[pair], gaps.tried[pair] = kind, gaps.tried[edge.pair]
+            return
+        with self._lock:
+            self._extra.append(best)
+        gaps.divided(edge.pair, len(nodes))
+
+    def _sharpened(self, pair: Pair) -> Pair:
+        """Move both sides of a gap between two terms as close together as the front goes on.
+
+        Each side improves its worse term as long as it is better than the other side in the other
+        term. Return the numbers of the sides, which are new where a side has moved."""
+        first, second = sorted(pair, key=lambda k: self._scaled(k)[0])
+        for lead in (0, 1):
+            moving, fixed = (second, first) if lead == 0 else (first, second)
+            start, limit = self._scaled(moving), self._scaled(fixed)
+            apart = start[lead] - limit[lead]
+            direction = np.where(np.arange(2) == lead, 1.0, _SHARP)
+            reference = limit - np.where(np.arange(2) == lead, 0.0, _SHARP * apart)
+            node = self._all()[moving]
+            scalar = Scalar(self.scale, reference, (0, 1), direction)
+            best = self._solved(scalar, node.point, node.sample.evaluation.state, None)
+            if best is None or self.stop.is_set():
+                continue
+            found = self.scale.of(best.sample.values)
+            if found[lead] < start[lead] - _BETTER and found[1 - lead] < limit[1 - lead]:
+                with self._lock:
+                    self._extra.append(best)
+                moved = len(self._all()) - 1
+                first, second = (first, moved) if lead == 0 else (moved, second)
+        return min(first, second), max(first, second)
+
+    def _scaled(self, number: int) -> NDArray[np.float64]:
+        """Return the scaled terms (k,) of a node."""
+        return self.scale.of(self._all()[number].sample.values)
+
+    # The result.
+
+    def _verified(self, nodes: list[Node]) -> list[Node]:
+        """Return the nodes with those of the front simulated again from rest, and certified there.
+
+        Nodes that `stop` leaves no time for keep their standing."""
+        if not nodes:
+            return nodes
+        kept = set(selected(nodes, self.scale).kept)
+        found = [*nodes]
+        for k in sorted(kept):
+            if self.stop.is_set():
+                break
+            found[k] = self._checked(nodes[k])
+        return found
+
+    def _checked(self, node: Node) -> Node:
+        """Return a node after its design has been simulated again from rest."""
+        sample = self.study.verified(node.sample.point)
+        self._evaluations += 1
+        if sample is None:
+            return node._replace(standing=Standing.NOT_HELD_UP)
+        before = node.sample.values
+        if np.any(np.abs(sample.values - before) > _HOLDS_UP * np.abs(before)):
+            return node._replace(standing=Standing.NOT_HELD_UP)
+        scalar = node.scalar._replace(scale=self.scale)
+        certificate = certify(scalar.local(sample), sample.point)
+        holds = certificate.holds(RESIDUAL, FEASIBLE)
+        reason = node.reason
+        if holds:
+            reason = "converged"
+        elif reason == "converged":
+            reason = "verification"
+        standing = Standing.CERTIFIED if holds else Standing.NOT_CERTIFIED
+        return Node(scalar, sample, certificate, reason, node.end, standing)
+
+    def _front(self, nodes: Sequence[Node], infeasible: Infeasible | None = None) -> Front:
+        study, config = self.study, self.config
+        usable = study.usable
+        known: dict = {}
+        if nodes:
+            selection = selected(nodes, self.scale)
+            points, dropped = points_of(study, nodes, selection, self.scale)
+            spacing = self._spacing
+            if not np.isfinite(spacing.terms):  # Stopped, or the ends are not in conflict.
+                spacing = spacing_of(selection, [], len(study.aims), self._divisions)
+            edges, gaps = gaps_of(selection, self._gaps, spacing)
+            if self.stop.is_set():  # Points that are missing leave no gap.
+                gaps = [gap for gap in gaps if gap.confirmed]
+            known = {"points": tuple(points), "dropped": tuple(dropped)}
+            known |= {"edges": tuple(edges), "gaps": tuple(gaps)}
+        return Front(
+            config=config,
+            aims=study.aims,
+            baseline=study.problem.baseline,
+            baseline_terms=study.term_values(study.problem.baseline) if usable else {},
+            floor_dropped=study.config.constraints != config.constraints,
+            searches=self._searches,
+            evaluations=self._evaluations,
+            interrupted=self.stop.is_set(),
+            infeasible=infeasible,
+            **known,
+        )
+
+
+def pareto_front(config: Config, progress: Progress | None = None) -> Front:
+    """Trace the front of best compromises between the terms of `config.pareto`.
+
+    `progress`: function called after each local search with (searches done, searches expected).
+
+    Return a `Front`. Its main fields are `points` (each with `terms`, `design`, `rates` and
+    `standing`), `gaps`, `dropped`, `baseline_terms` and `status`.
+
+    Raises `InputError` if the config cannot be optimised, or for unknown terms. Raises
+    `RuntimeError` if JAX is not set to the precision of the config.
+
+    >>> front = rootsopt.pareto_front(rootsopt.load_config("configs/cic.yaml"))
+    >>> [(point.terms, point.design) for point in front.points]"""
+    check_geometry(config)
+    return Tracer(resolve(config)[0], progress).run()
+
+
+__all__ = ["Tracer", "pareto_front"]

@@ -1,0 +1,168 @@
+"""The command `pareto` from outside: files, exit codes, messages, and the whole run with forces."""
+
+import csv
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import rootsopt
+from rootsopt.commands.pareto import main
+from rootsopt.config import load
+from rootsopt.figures import page
+from rootsopt.output.fronts import design_file
+from rootsopt.scene import Scene, design_vector
+from rootsopt.tradeoffs.study import geometry_of
+
+ROOT = Path(__file__).parents[2]
+CIC = str(ROOT / "configs" / "cic.yaml")
+RADIUS = ["--set", "pareto.terms=[outer_radius_mm, area_efficiency]"]
+FEW = [*RADIUS, "--set", "pareto.points=4"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A finished run without a simulation."""
+    place = tmp_path_factory.mktemp("front") / "run"
+    assert main([CIC, "-o", str(place), *FEW]) == 0
+    return place
+
+
+def test_files_of_a_run_belong_together(folder):
+    """Every file of the run is listed; table, result and configs hold the same points."""
+    result = json.loads((folder / "result.json").read_text())
+    files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    assert set(result["run"]["files"]) == files
+    assert {"config.yaml", "front.csv", "figures/front.png", design_file(4)} <= files
+    with (folder / "front.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["point"]) for row in rows] == [1, 2, 3, 4]
+    for row, point in zip(rows, result["points"], strict=True):
+        assert row["status"] == point["status"] == "certified"
+        assert point["certificate"]["residual"] <= point["certificate"]["required_residual"]
+        for name, value in (point["terms"] | point["design"]).items():
+            assert float(row[name]) == pytest.approx(value, rel=1e-9)
+    assert [term["sense"] for term in result["terms"]] == ["min", "max"]
+    assert result["edges"] == [[1, 2], [2, 3], [3, 4]]
+    assert result["status"] == "geometry_only"
+
+
+def test_config_of_a_point_is_its_design(folder):
+    """Each config gives the terms of its point, by a way of its own."""
+    result = json.loads((folder / "result.json").read_text())
+    for point in result["points"]:
+        config = load(folder / design_file(point["point"]))
+        found = geometry_of(Scene.from_config(config), config, design_vector(config))
+        assert found.response == pytest.approx(point["terms"], rel=1e-12)
+        assert found.geometry == pytest.approx(point["geometry"], rel=1e-12)
+
+
+def test_page_opens_without_a_network(folder):
+    pytest.importorskip("plotly")
+    text = (folder / page.PAGE).read_text("utf-8")
+    assert not re.search(r"<(script|link|img)[^>]*(src|href)=", text)
+    (data,) = re.findall(r"^const points = (.*);$", text, re.M)
+    points = json.loads(data)
+    assert [*points] == ["1", "2", "3", "4"]
+    written = (folder / design_file(3)).read_text("utf-8")
+    assert points["3"]["yaml"] == written
+    assert len(points["3"]["outline"]) > 100
+    assert text.count("<tr data-point=") == 4
+
+
+def test_page_is_left_out_without_its_library(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(page.importlib.util, "find_spec", lambda name: None)
+    assert main([CIC, "-o", str(tmp_path / "run"), *FEW, "--set", "pareto.points=3"]) == 0
+    assert "rootsopt[pages]" in capfd.readouterr().err
+    assert not (tmp_path / "run" / page.PAGE).exists()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["pareto.terms=[noise, area_mm2]"], "noise"),
+        (["pareto.points=1"], "pareto.points"),
+        (["profile={family: ee, lobes: 3, pitch_radius_mm: 33}"], "no design parameter"),
+    ],
+)
+def test_bad_input_ends_with_one_line(tmp_path, capsys, overrides, words):
+    given = [part for override in overrides for part in ("--set", override)]
+    assert main([CIC, "-o", str(tmp_path / "run"), *given]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert words in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_contradicting_constraints_end_with_advice(tmp_path, capsys):
+    limits = ["--set", "constraints={area_efficiency_min: 0.48, seal_width_min_mm: 25}"]
+    assert main([CIC, "-o", str(tmp_path / "run"), *FEW, *limits]) == 3
+    out = " ".join(capsys.readouterr().out.split())
+    assert "infeasible" in out
+    assert "seal width" in out
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["points"] == []
+    assert {row["name"] for row in result["infeasible"]["conflicts"]} >= {"seal width"}
+
+
+_STOPPED = """
+import contextlib, os, signal, sys
+from rootsopt.commands import door, pareto
+
+@contextlib.contextmanager
+def progress(console):
+    yield lambda done, expected: done == 20 and os.kill(os.getpid(), signal.SIGINT)
+
+pareto._progress = progress
+door.leave(pareto.main())
+"""
+"""A command that gets Ctrl-C after 20 searches."""
+
+
+@pytest.mark.long
+def test_stopped_run_is_whole(tmp_path):
+    """Ctrl-C keeps the points found so far, in a complete folder with exit code 3."""
+    place = tmp_path / "run"
+    given = [CIC, "-o", str(place), *RADIUS, "--set", "pareto.points=101"]
+    command = [sys.executable, "-c", _STOPPED, *given]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 3, done.stderr
+    assert "keeping the points found so far" in done.stderr
+    result = json.loads((place / "result.json").read_text())
+    assert result["status"] == "interrupted"
+    points = result["points"]
+    assert 5 <= len(points) < 30
+    assert {point["status"] for point in points} == {"not_verified"}
+    files = {str(p.relative_to(place)) for p in place.rglob("*") if p.is_file()}
+    assert files == set(result["run"]["files"])
+    assert {design_file(1), "front.csv", "figures/front.png"} <= files
+    assert [point["point"] for point in points] == [*range(1, len(points) + 1)]
+
+
+@pytest.mark.long
+def test_front_with_forces(tmp_path):
+    """Peak force against area efficiency: the ends are the optima of `optimize`, each point is what
+    a simulation of its config gives, and the rates are slopes of the front."""
+    assert main([CIC, "-o", str(tmp_path / "run"), "--no-figures", "--set", "pareto.points=5"]) == 0
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    points = result["points"]
+    assert [point["status"] for point in points] == ["certified"] * len(points)
+    for point in points[1:3]:
+        config = load(tmp_path / "run" / design_file(point["point"]))
+        force = rootsopt.evaluate(config).response["peak_force_N"]
+        assert force == pytest.approx(point["terms"]["peak_force_N"], rel=1e-6)
+    overrides = ["objective.mean_weight=0", "constraints.area_efficiency_min=0"]
+    alone = rootsopt.optimize_design(rootsopt.load_config(CIC, overrides)).optimized
+    assert alone is not None
+    assert points[0]["end_of"] == "peak_force_N"
+    assert points[0]["terms"]["peak_force_N"] == pytest.approx(
+        alone.response["peak_force_N"], rel=1e-4
+    )
+    for key, value in points[0]["design"].items():
+        assert value == pytest.approx(alone.design[key], rel=1e-2)
+    forces = [point["terms"]["peak_force_N"] for point in points]
+    shares = [point["terms"]["area_efficiency"] for point in points]
+    assert forces == sorted(forces)
+    assert shares == sorted(shares)
