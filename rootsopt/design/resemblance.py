@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from rootsopt.config import ProfileConfig
-from rootsopt.config.families import Parameter, family_of
+from rootsopt.config.families import FREE_FORM, Parameter, family_of
 from rootsopt.config.units import DEG, MM
 from rootsopt.design.space import sobol
 from rootsopt.errors import InputError
@@ -31,8 +31,6 @@ from rootsopt.profiles.validity import PURE, margins
 from rootsopt.runtime.programs import Program
 from rootsopt.scene.families import check, classical, profile_of
 
-FREE_FORM = "free_form"
-"""Name of the family whose members come closest to any profile."""
 COEFFICIENTS = 12
 """Number of coefficients of a free form that is fitted to a profile."""
 _NODES = 128
@@ -112,20 +110,20 @@ def likeness(profile: Profile, family: str) -> Likeness | None:
     return _best(look, profile, starts)
 
 
-def free_likeness(profile: Profile, near: Likeness | None = None) -> Likeness | None:
+def free_likeness(profile: Profile, *near: Likeness) -> Likeness | None:
     """Return the free form of `COEFFICIENTS` coefficients that is nearest to `profile`.
 
-    `near`: a member of another family; the search also starts from its projection. Return `None` if
-    the search finds no sound free form."""
+    `near`: members of other families; searches also start from their projections. Return `None` if
+    the searches find no sound free form."""
     radius, look = profile.pitch_radius, _Look(profile, FREE_FORM)
     parameters = family_of(FREE_FORM).parameters
     size = float(radius) / MM, profile.lobes
     usual = [parameter.usually(*size) for parameter in parameters]
     width = np.array([high - low for low, high in [usual[0], *[usual[1]] * COEFFICIENTS]])
     whole = [profile]
-    if near is not None:
-        design = jnp.asarray(list(near.design.values()))
-        whole.append(profile_of(near.family, profile.lobes, radius, design))
+    for one in near:
+        design = jnp.asarray(list(one.design.values()))
+        whole.append(profile_of(one.family, profile.lobes, radius, design))
     starts = []
     for one in whole:
         free = project(one, COEFFICIENTS)
@@ -291,7 +289,10 @@ def _promising(seen: _Seen, width, size: float, room) -> NDArray[np.float64]:
     count, soundness = len(width), len(seen.margin)
     one, none = np.ones((len(rows), 1)), np.zeros((len(rows), 1))
     bounds = np.block([[-one, none], [np.zeros((soundness, 1)), -np.ones((soundness, 1))]])
-    steps = [(max(-size, min(low, 0.0)), min(size, max(high, 0.0))) for low, high in zip(*room)]
+    steps = [
+        (max(-size, min(low, 0.0)), min(size, max(high, 0.0)))
+        for low, high in zip(*room, strict=True)
+    ]
     found = linprog(
         np.concatenate([np.zeros(count), [1.0, _UNSOUND_WEIGHT]]),
         A_ub=np.hstack([np.concatenate([rows, -seen.margin_slope * width]), bounds]),
