@@ -34,6 +34,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
     from rootsopt import export
     from rootsopt.commands import cli
+    from rootsopt.measured import report as outline_report
     from rootsopt.optimize.checkpoint import aside
     from rootsopt.output import tables
     from rootsopt.runtime.timing import CompileClock
@@ -89,6 +90,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
             if alike:
                 out.print(tables.likeness_table(alike["resembles"]))
         if result.beginning is not None:
+            outline_report.say(config, out)
             out.print(tables.beginning_table(result.beginning.record()))
         if result.interrupted or result.optimized is None:
             out.print(_message(result))

@@ -26,6 +26,9 @@ If a length is outside its limits but would lie in this range in another unit, t
 this unit."""
 
 
+_Place = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
+
+
 class ProfileConfig(Section):
     """The rotor profile.
 
@@ -42,6 +45,17 @@ class ProfileConfig(Section):
         None,
         description="outline: scatter (RMS) of measured points; absent: 0, the curve passes "
         "through them",
+    )
+
+    outline_center: Literal["fit"] | tuple[_Place, _Place] | None = Field(
+        None,
+        description="outline: x and y (mm) of the rotor's axis in the file, or fit: the centre of "
+        "the lobes' rotational symmetry; absent: the origin",
+    )
+    outline_unit: Literal["mm", "cm", "m", "um", "inch"] | None = Field(
+        None,
+        description="outline: unit of the numbers in the file; absent: mm, or the unit that a "
+        "drawing states",
     )
 
     @property
@@ -74,6 +88,7 @@ class ProfileConfig(Section):
         if not isinstance(data, dict):
             return data
         lists = {key for key, parameter in parameters().items() if parameter.count is not None}
+        lists.add("outline_center")
         given = {key: data[key] for key in lists & data.keys() if isinstance(data[key], list)}
         return data | {key: tuple(value) for key, value in given.items()}
 
@@ -105,7 +120,7 @@ class ProfileConfig(Section):
                 raise ValueError(f"`profile.outline_file` is required for family {self.family}")
             return self
         readers = [name for name, family in families().items() if family.maker is None]
-        for key in ("outline_file", "outline_smoothing_mm"):
+        for key in (key for key in _FIELDS if key.startswith("outline_")):
             if getattr(self, key) is not None:
                 raise ValueError(
                     f"`profile.{key}` does not belong to family {self.family}; remove it, or set "

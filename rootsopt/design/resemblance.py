@@ -26,7 +26,7 @@ from rootsopt.config.units import DEG, MM
 from rootsopt.design.space import sobol
 from rootsopt.errors import InputError
 from rootsopt.profiles import Outline, Profile, project
-from rootsopt.profiles.departure import departures, feet, flank_points
+from rootsopt.profiles.departure import beyond, departures, feet, flank_points
 from rootsopt.profiles.validity import PURE, margins
 from rootsopt.runtime.programs import Program
 from rootsopt.scene.families import check, classical, profile_of
@@ -106,8 +106,12 @@ def likeness(profile: Profile, family: str) -> Likeness | None:
     low, high = np.array([parameter.usually(*size) for parameter in parameters]).T
     sample = low + (high - low) * sobol(_SAMPLE, 0, len(keys))
     faults = np.array([look(one).fault for one in sample])
-    starts = [_fitted(look, sample[k], high - low) for k in np.argsort(faults)[:_STARTS]]
-    return _best(look, profile, starts)
+    found = [_fitted(look, sample[k], high - low) for k in np.argsort(faults)[:_STARTS]]
+    if not family_of(family).by_limits:
+        return _best(look, profile, found)
+    # The limits in closed form also admit profiles with slightly negative margins.
+    free = _Look(profile, family, limited=False)
+    return _best(free, profile, [*found, *(_fitted(free, one, high - low) for one in found)])
 
 
 def free_likeness(profile: Profile, *near: Likeness) -> Likeness | None:
@@ -203,12 +207,14 @@ class _Seen(NamedTuple):
 class _Look:
     """Compares members of a `family` with a `profile`, and caches the results.
 
-    Call an instance with the member's design (d,) in config units. `low`, `high`: limits of the
-    parameters in a config, one of each per parameter."""
+    Call an instance with the member's design (d,) in config units. `limited`: whether margins are
+    considered; otherwise, all count as zero."""
 
-    def __init__(self, profile: Profile, family: str):
+    def __init__(self, profile: Profile, family: str, limited: bool = True):
+        self.limited = limited
         self.family, self.lobes, self.radius = family, profile.lobes, profile.pitch_radius
         self.target = flank_points(profile, _NODES) / float(self.radius)
+        self.around = beyond(self.target, profile.lobes)
 
     def limits(self, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the least and the greatest value (d,) of each of `count` design parameters."""
@@ -223,16 +229,19 @@ class _Look:
         values = np.asarray(design, dtype=np.float64)
         found = _member(self.family, self.lobes, self.radius, values)
         line, line_slope, margin, margin_slope = map(np.asarray, found)
+        if not self.limited:
+            margin, margin_slope = 0 * margin, 0 * margin_slope
         if not np.all(np.isfinite(line)):
             nothing = np.full(1, np.nan), np.full((1, len(values)), np.nan)
             return _Seen(nothing[0], margin, nothing[1], margin_slope)
         # From the profile's points to the member. A nearest point moves along with its segment.
-        to = feet(self.target, line, smooth=True)
+        near, near_slope = beyond(line, self.lobes), beyond(line_slope, self.lobes)
+        to = feet(self.target, near, smooth=True)
         share = to.share[:, None, None]
-        moved = (1 - share) * line_slope[to.segment] + share * line_slope[to.segment + 1]
+        moved = (1 - share) * near_slope[to.segment] + share * near_slope[to.segment + 1]
         slope = -np.einsum("nk,nkd->nd", to.toward, moved)
         # From the member's points to the profile, with the same sign.
-        back = feet(line, self.target, smooth=True)
+        back = feet(line, self.around, smooth=True)
         back_slope = -np.einsum("nk,nkd->nd", back.toward, line_slope)
         distance = np.concatenate([to.away, -back.away])
         return _Seen(distance, margin, np.concatenate([slope, back_slope]), margin_slope)

@@ -18,6 +18,8 @@ from rootsopt.runtime.programs import Program
 
 _NODES = 400
 """Least number of nodes on each side of the pitch circle."""
+_BEYOND = 8
+"""Number of points of a neighbouring flank by which a flank is continued beyond its tip or root."""
 _CORNER = 0.1
 """Turn (rad) from one segment of a polygonal line to the next above which the line has a corner."""
 
@@ -60,7 +62,8 @@ def departures(profile: Profile, other: Profile, nodes: int = _NODES) -> Departu
     `nodes`: least number of points on each side of the pitch circle of a flank."""
     first, second = (flank_points(one, nodes) for one in (profile, other))
     there, back = (
-        np.abs(feet(*pair, smooth=True).away) for pair in ((first, second), (second, first))
+        np.abs(feet(points, beyond(line, profile.lobes), smooth=True).away)
+        for points, line in ((first, second), (second, first))
     )
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(first, axis=0), axis=1))])
     rms = np.sqrt(np.trapezoid(there**2, arc) / arc[-1])
@@ -81,6 +84,21 @@ def flank_points(profile: Profile, nodes: int = _NODES) -> NDArray[np.float64]:
 def _points(profile: Profile, nu):
     addendum, dedendum = (profile.position(f(nu)) for f in (profile.addendum, profile.dedendum))
     return jnp.concatenate([addendum, dedendum[::-1]])
+
+
+def beyond(flank: Float[np.ndarray, "n 2 *d"], lobes: int) -> NDArray[np.float64]:
+    """Return a `flank`, from tip to root, with pieces of both neighbouring flanks at its ends.
+
+    `flank`: points in a first axis, coordinates in a second; further axes hold derivatives of the
+    points. `lobes`: number of lobes. The neighbours are mirror images, `_BEYOND` points of each:
+    the tip of a measured flank need not lie on the lobe's axis exactly."""
+    turn = 2 * np.pi / lobes
+    tip = np.array([[1.0, 0.0], [0.0, -1.0]])
+    root = np.array([[np.cos(turn), np.sin(turn)], [np.sin(turn), -np.cos(turn)]])
+    before, after = flank[_BEYOND:0:-1], flank[-2 : -2 - _BEYOND : -1]
+    before = np.einsum("jk,nk...->nj...", tip, before)
+    after = np.einsum("jk,nk...->nj...", root, after)
+    return np.concatenate([before, flank, after])
 
 
 def distances(
