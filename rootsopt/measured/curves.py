@@ -142,11 +142,11 @@ def through(
 ) -> MeasuredCurve:
     """Return the curve through `points` (mm), or at an RMS distance `smoothing` (mm) from them.
 
-    `joints`: mask of the points at which curvature may jump; `pitch_radius`: in mm. If `smoothing`
-    `seen`: estimates for messages. If `smoothing`
-    is 0, the curve has one spline between every two successive joints, quintic if there are enough
-    points. Points at which the curvature of the polygon through the points jumps are also joints.
-    If `smoothing` is greater than 0, the curve is a single quintic spline and `joints` is ignored.
+    `joints`: mask of the points at which curvature may jump; `pitch_radius`: in mm; `seen`:
+    estimates for messages. If `smoothing` is 0, the curve has one spline between every two
+    successive joints, quintic if there are enough points. Points at which the curvature of the
+    polygon through the points jumps are also joints. If `smoothing` is greater than 0, the curve is
+    a single quintic spline and `joints` is ignored.
 
     Raises `InputError` if the points are too few or, without smoothing, too scattered; if
     `smoothing` is so small that the spline would follow the noise; or if a spline cannot be
@@ -159,8 +159,8 @@ def through(
     turned = np.sum(np.abs(np.angle(np.diff(points)[1:] / np.diff(points)[:-1])))
     if smoothing == 0 and turned > _WINDING:
         raise InputError(
-            f"{_KEY} must hold smooth flanks, but from point to point one turns by {turned:.3g} "
-            f"rad in total, a smooth one by 4; {seen.remedy(smoothing)}"
+            f"{_KEY} must hold smooth flanks, but from point to point a flank turns by "
+            f"{turned:.3g} rad in total, a smooth one by 4; {seen.remedy(smoothing)}"
         )
     if smoothing > 0:
         return _smoothed(points, smoothing, seen)
@@ -195,7 +195,7 @@ def _smoothed(points: NDArray[np.complex128], smoothing: float, seen: Estimates)
         raise InputError(
             "`profile.outline_smoothing_mm` must be the scatter (RMS) of the points, but with "
             f"{smoothing:g} a flank needs more than {_MOST_KNOTS} knots to follow them; "
-            f"{seen.remedy(smoothing)}"
+            f"{seen.thinning(float(np.median(np.diff(t)))) or seen.remedy(smoothing)}"
         )
     with guarded(_KEY, "its points cannot be smoothed", "check `profile.outline_smoothing_mm`"):
         spline, _ = make_splprep(sides, u=t, k=5, s=squares)  # type: ignore[arg-type]

@@ -18,6 +18,8 @@ _NEIGHBOURS = 2, 3, 4
 """Numbers of neighbours on each side from which a point is predicted, by a polynomial through all
 of them. The least of these predictions' errors counts: where points are few, errors of a
 polynomial depend on its degree, and scatter does not."""
+_AGREED = 1.5
+"""Ratio of the greatest to the least of these errors above which the scatter is not known."""
 _CLEAR = 8.0
 """Ratio of the distance between neighbours to the scatter below which farther neighbours are taken.
 Closer ones are out of order."""
@@ -40,6 +42,11 @@ _SEEN = 1e-4
 """Scatter (mm) below which no message mentions it."""
 _ENOUGH = 0.7
 """Smoothing (in units of the scatter) above which the scatter counts as smoothed."""
+_APART = 6.0
+"""Ratio of the distance between points to the scatter below which smoothing fails: the length along
+the points is then mostly scatter."""
+_MORE = 1.25
+"""Factor by which a message raises a smoothing that did not suffice."""
 _SURE, _LEAST = 5.0, 1e-3
 """Distance of the centre from the origin above which it is offered: in standard errors, and in
 mm."""
@@ -65,6 +72,25 @@ class Estimates:
         away = abs(self.center)
         return away > _LEAST and away > _SURE * self.center_error
 
+    @property
+    def excess(self) -> str:
+        """Advice if the scatter is so large that no smoothing removes it."""
+        return (
+            f"the points are scattered by about {_two(self.scatter)} um (RMS), too much to be "
+            "smoothed: thin them out, or measure again"
+        )
+
+    def thinning(self, spacing: float) -> str:
+        """Return advice if points scatter more than they are apart; otherwise an empty text.
+
+        `spacing`: distance (mm) between successive points."""
+        if not spacing < _APART * self.scatter:
+            return ""
+        return (
+            f"the points are scattered by about {_two(self.scatter)} um (RMS), but only "
+            f"{_two(spacing)} um apart: keep one in {math.ceil(_APART * self.scatter / spacing)}"
+        )
+
     def rough(self, smoothing: float) -> bool:
         """Return whether the points scatter by more than a `smoothing` (mm) can remove."""
         return self.scatter > _SEEN and smoothing < _ENOUGH * self.scatter
@@ -73,7 +99,7 @@ class Estimates:
         """Return what to change in the config if the outline is not smooth.
 
         `smoothing`: smoothing (mm) of the config."""
-        seen = f"{self.scatter * 1e3:.2g} um"
+        seen = f"{_two(self.scatter)} um"
         if self.rough(smoothing):
             return (
                 f"the points are scattered by about {seen} (RMS): set "
@@ -81,9 +107,12 @@ class Estimates:
             )
         if smoothing > 0 and self.scatter > _SEEN:
             return (
-                f"the points are scattered by about {seen} (RMS), which is smoothed already: "
-                "correct the outline, or raise `profile.outline_smoothing_mm` further"
+                f"the points are scattered by about {seen} (RMS): raise "
+                f"`profile.outline_smoothing_mm` from {smoothing:.3g} to "
+                f"{_MORE * max(smoothing, self.scatter):.2g}, or correct the outline"
             )
+        if math.isnan(self.scatter):
+            return "the points are too few to tell scatter from shape: add points"
         return (
             f"the points are hardly scattered (by about {self.scatter * 1e3:.1g} um): correct the "
             "outline"
@@ -94,9 +123,9 @@ class Estimates:
         if not self.off_center:
             return ""
         return (
-            f"the lobes' centre of symmetry is at ({self.center.real:.5g}, "
-            f"{self.center.imag:.5g}) mm, to about {max(self.center_error, 1e-6):.1g} mm: set "
-            "`profile.outline_center` = fit to move it to the origin"
+            f"the lobes' centre of symmetry is at {written(self.center)} mm, to about "
+            f"{max(self.center_error, 1e-6) * 1e3:.1g} um: set `profile.outline_center` = fit to "
+            "move it to the origin"
         )
 
     def sizing(self, pitch_radius: float, unit: float) -> str:
@@ -115,6 +144,16 @@ class Estimates:
             f"half the sum of its outer and root radius is {self.middle:.5g} mm, which should be "
             "the pitch radius"
         )
+
+
+def _two(length: float) -> str:
+    """Format a length (mm) as text in micrometres, with two digits."""
+    return f"{float(f'{length * 1e3:.2g}'):g}"
+
+
+def written(center: complex) -> str:
+    """Format a `center` = x + iy (mm) as text for a message, to 0.01 µm."""
+    return f"({round(center.real, 5) + 0.0:.10g}, {round(center.imag, 5) + 0.0:.10g})"
 
 
 def unit_of_size(middle: float, pitch_radius: float) -> str | None:
@@ -154,7 +193,12 @@ def scatter(points: Complex128[np.ndarray, " n"]) -> float:
 
 
 def _least(points: NDArray[np.complex128], stride: int) -> float:
-    return min(_across(points, half, stride) for half in _NEIGHBOURS)
+    """Return the scatter of `points` as in `scatter`, with neighbours `stride` points apart.
+
+    The result is NaN if it depends on the number of neighbours: the points are then too few."""
+    found = [_across(points, half, stride) for half in _NEIGHBOURS]
+    least, most = min(found), max(found)
+    return math.nan if most > _AGREED * least and least > _SEEN else least
 
 
 def _across(points: NDArray[np.complex128], half: int, stride: int) -> float:
@@ -202,9 +246,9 @@ def center(points: Complex128[np.ndarray, " n"], lobes: int) -> tuple[complex, f
         slope = (cos * b - sin * a) @ orders
         across = radius / np.hypot(radius, slope)
         # A move of the centre changes radius and angle of every point.
-        turn = np.exp(1j * angle)
-        by_x = -turn.real - slope * turn.imag / radius
-        by_y = -turn.imag + slope * turn.real / radius
+        east, north = np.cos(angle), np.sin(angle)
+        by_x = -east - slope * north / radius
+        by_y = -north + slope * east / radius
         rows = np.concatenate([series, -by_x[:, None], -by_y[:, None]], axis=1)
         rows *= across[:, None]
         inverse = np.linalg.pinv(rows.T @ rows, rcond=1e-12, hermitian=True)

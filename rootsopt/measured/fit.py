@@ -49,6 +49,8 @@ _FAR = 1e3
 is rejected because its units must be wrong."""
 _WANDER = 8.0
 """Distance (in units of the scatter) that smoothed points may lie beside their curve."""
+_MANY = 20.0
+"""Ratio of the flanks' deviation to the scatter below which a message blames the scatter."""
 _ESTIMATED = "scatter_um", "center_x_mm", "center_y_mm", "center_error_um"
 """Names of the fields of `Checks` that may be NaN."""
 _GAUSS = np.polynomial.legendre.leggauss(12)
@@ -153,6 +155,7 @@ def _imported(
             f"{flank_off:.4g}); "
             + (
                 seen.centering()
+                or (_MANY * seen.scatter > worst and seen.excess)
                 or "only rotors of symmetrical lobes are supported, with the axis at the origin"
             )
         )
@@ -236,9 +239,9 @@ def _flank(points, joints, lobe, side, lobes, radius, smoothing, seen) -> _Flank
     """Return the leading (`side` = 1) or trailing (-1) flank of the lobe with index `lobe`.
 
     `points`, `joints`: points (mm) of the outline and mask of the joints; `lobes`: number of lobes;
-    `radius`: pitch radius (mm); `smoothing`: RMS scatter (mm); `seen`: estimates. The curve is also fitted to points
-    beyond tip and root, which belong to neighbouring flanks. Raises `InputError` if the points do
-    not include the tip, the root and the pitch crossing."""
+    `radius`: pitch radius (mm); `smoothing`: RMS scatter (mm); `seen`: estimates for messages. The
+    curve is also fitted to points beyond tip and root, which belong to neighbouring flanks. Raises
+    `InputError` if the points do not include the tip, the root and the pitch crossing."""
     local = points * np.exp(-2j * np.pi * lobe / lobes)
     if side < 0:
         local, joints = np.conj(local)[::-1], joints[::-1]

@@ -11,7 +11,8 @@ class Loop:
     """The points of a closed outline in order; the first point is not repeated at the end.
 
     `points` (n,): points (mm) as x + iy; `joints` (n,): mask of the points at the ends of arcs and
-    splines, where curvature may jump; `unit`: length (mm) of the file's unit. The readers also use this class for open chains of points.
+    splines, where curvature may jump; `unit`: length (mm) of the file's unit. The readers also use
+    this class for open chains of points.
     """
 
     points: Complex128[np.ndarray, " n"]

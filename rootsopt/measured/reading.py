@@ -45,10 +45,11 @@ def read(path: Path, unit: str | None = None, pitch_radius_mm: float | None = No
     DXF, text or binary: the closed loop of the largest area formed by LINE, ARC, ELLIPSE, SPLINE,
     LWPOLYLINE and POLYLINE. Only entities on the layer OUTLINE are used. If that layer is empty,
     entities drawn directly are used, and otherwise those in blocks. Lengths are in the unit that
-    the file states, or in mm if it states none. `unit`: name of the unit of the file's numbers, from
-    `UNITS`; it replaces these rules. `pitch_radius_mm`: pitch radius by which a message names the
-    unit that an outline out of range probably has. The ends of a LINE and the corners of a polyline
+    the file states, or in mm if it states none. The ends of a LINE and the corners of a polyline
     are read as points on a smooth curve, not as corners of the outline.
+
+    `unit`: name (from `UNITS`) of the unit of the file's numbers, instead of these rules.
+    `pitch_radius_mm`: pitch radius, by which a message may name the right unit.
 
     Raises `InputError` if the file cannot be read or contains no closed outline.
     """

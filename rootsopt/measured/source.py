@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rootsopt.measured.checks import Checks
-from rootsopt.measured.estimates import Estimates
+from rootsopt.measured.estimates import Estimates, written
 from rootsopt.measured.fit import imported
 from rootsopt.measured.reading import read
 from rootsopt.profiles.outline import Outline
@@ -54,8 +54,8 @@ def advice(config: "ProfileConfig", checks: Checks) -> list[str]:
     error, scatter = checks.center_error_um, checks.scatter_um
     if given == "fit":
         found.append(
-            f"outline: the axis is the fitted centre of symmetry, ({center.real:.5g}, "
-            f"{center.imag:.5g}) mm in the file, to about {max(error, 1e-3):.1g} um"
+            f"outline: the axis is the fitted centre of symmetry, {written(center)} mm in the "
+            f"file, to about {max(error, 1e-3):.1g} um"
         )
     seen = Estimates(scatter * 1e-3, center - axis, error * 1e-3, config.pitch_radius_mm)
     if seen.centering():
