@@ -182,11 +182,15 @@ def _contradiction(config: "Config", folder: "RunFolder", result) -> "Outcome":
     data = {"baseline": result.baseline.record(), "optimized": None}
     data |= {"status": result.status.label, "message": found.message}
     data |= {"infeasible": found.record(), "versions": files.versions()}
+    if result.beginning is not None:
+        data["beginning"] = result.beginning.record()
     folder.write_json("result.json", data)
     rows = found.record()["conflicts"]
 
     def show(out):
         out.print(tables.conflict_table(rows))
+        if result.beginning is not None:
+            out.print(tables.beginning_table(data["beginning"]))
         out.print(f"{result.status.label}: {found.message}", soft_wrap=True)
 
     return cli.Outcome(cli.NO_RESULT, show)

@@ -159,7 +159,12 @@ def _imported(
                 or "only rotors of symmetrical lobes are supported, with the axis at the origin"
             )
         )
-    outline, star, convexity = _outline(own, lobes, pitch_radius_mm, smoothing_mm, seen)
+    try:
+        outline, star, convexity = _outline(own, lobes, pitch_radius_mm, smoothing_mm, seen)
+    except InputError as error:
+        if size := seen.sizing(pitch_radius_mm, loop.unit):
+            raise InputError(f"{error}; or {size}") from None
+        raise
     centroid = _moment(points, 1) / signed_area(points)
     checks = Checks(
         points=len(points),
