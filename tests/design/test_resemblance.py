@@ -36,6 +36,12 @@ def hausdorff(one, other):
     return max(there, KDTree(other).query(one)[0].max())
 
 
+def denser(points):
+    """Closed polygon with twelve vertices in place of each one, on the same edges."""
+    places = np.arange(12 * len(points) - 11) / 12
+    return np.stack([np.interp(places, np.arange(len(points)), x) for x in points.T], axis=1)
+
+
 @pytest.mark.parametrize("pair", [("cic", "ee"), ("cic", "arc"), ("ellipse", "five arcs")])
 def test_departure_is_the_hausdorff_distance_of_the_closed_outlines(pair):
     one, other = (PROFILES[name] for name in pair)
@@ -54,14 +60,16 @@ def test_departure_is_the_hausdorff_distance_of_the_closed_outlines(pair):
 
 
 def test_smooth_feet_see_the_curve_and_not_its_chords():
-    """Points inside and outside a circle of few vertices; signs and directions, too."""
+    """Points inside and outside a circle of few vertices; signs and directions, too.
+
+    Up to an eighth of the squared turn of a segment, times the distance."""
     angle = np.linspace(0, 1, 12)
     line = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     at = np.linspace(0.2, 0.8, 30)
     for radius in (1.02, 0.98):
         points = radius * np.stack([np.cos(at), np.sin(at)], axis=1)
         found = feet(points, line, smooth=True)
-        assert found.away == pytest.approx(np.full(30, radius - 1), abs=2e-7)
+        assert found.away == pytest.approx(np.full(30, radius - 1), abs=2.5e-5)
         assert np.sum(found.toward * points, axis=1) == pytest.approx(np.full(30, radius), rel=2e-3)
         assert np.max(np.abs(distances(points, line) - 0.02)) > 5e-4
 
@@ -85,7 +93,7 @@ def test_members_of_a_family_are_found_again():
 
 def test_no_optimiser_finds_a_nearer_member():
     """Nelder and Mead's search from the found member and beside it, by the independent distance."""
-    target = polygon(PROFILES["ellipse"], 300)
+    target = denser(polygon(PROFILES["ellipse"], 300))
     found = likeness(PROFILES["ellipse"], "cic")
     assert found is not None
     radius, keys = jnp.asarray(R), [*found.design]
@@ -93,10 +101,9 @@ def test_no_optimiser_finds_a_nearer_member():
 
     def away(design):
         shape = outline(profile_of("cic", 3, radius, jnp.asarray(design)), 300)
-        return hausdorff(np.asarray(shape), target) if design[1] > 0.1 else 1.0
+        return hausdorff(denser(np.asarray(shape)), target) if design[1] > 0.1 else 1.0
 
-    # Vertices 0.1 mm apart: the distances from them are too large by up to 0.01 mm² / 8d.
-    assert away(best) == pytest.approx(found.departure, rel=0.02)
+    assert away(best) == pytest.approx(found.departure, rel=0.01)
     rivals = [
         minimize(away, best * scale, method="Nelder-Mead", options={"maxfev": 40}).fun
         for scale in (1.0, np.array([1.1, 0.8, 0.9]))
