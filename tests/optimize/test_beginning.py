@@ -1,6 +1,5 @@
 """A rotor from a file as baseline: where the search begins, what it finds, what is said of it."""
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -108,7 +107,7 @@ def test_default_bounds_are_widened_and_given_ones_are_kept():
 @pytest.mark.long
 def test_a_measured_rotor_leads_to_the_optimum_of_its_family(tmp_path, capsys):
     """The optimum of the noisy file is that of the family, for the same weights per newton."""
-    path = measured(tmp_path, 5e-3, family="cic")
+    path = measured(tmp_path, 1e-3, family="cic")
     out = tmp_path / "out"
     assert optimize.main([str(path), "-o", str(out), "--no-figures"]) == 0
     said = capsys.readouterr().out
@@ -138,8 +137,6 @@ def test_a_measured_rotor_leads_to_the_optimum_of_its_family(tmp_path, capsys):
         assert after[key] == pytest.approx(found.optimized.response[key], rel=1e-4)
     for key, value in found.optimized.design.items():
         assert result["optimized"]["design"][key] == pytest.approx(value, rel=1e-2)
-    again = dataclasses.replace(found, beginning=None)
-    assert again.beginning is None
     best = load(out / "optimized.yaml")
     assert best.profile.family == "cic"
     assert load(out / "config.yaml").profile.outline_file == str(out / "outline.csv")
