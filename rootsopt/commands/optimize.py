@@ -1,6 +1,7 @@
 """`rootsopt optimize CONFIG`: optimise a design and compare it with the baseline."""
 
 import contextlib
+import hashlib
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -33,6 +34,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
     from rootsopt import export
     from rootsopt.commands import cli
+    from rootsopt.measured import report as outline_report
     from rootsopt.optimize.checkpoint import aside
     from rootsopt.output import tables
     from rootsopt.runtime.timing import CompileClock
@@ -65,7 +67,8 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     alike = {} if result.interrupted else _alike(config, result)
     _write(folder, config, options, result, choice | alike, clock.seconds, ran)
     if result.optimized is not None:
-        export.write_simulated(folder, config, formats, result.optimized)
+        searching = _searching(config, result)
+        export.write_simulated(folder, searching, formats, result.optimized)
     total = time.perf_counter() - began
 
     def show(out: Console) -> None:
@@ -91,6 +94,9 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
                 out.print(tables.robustness_table(record, shown))
             if alike:
                 out.print(tables.likeness_table(alike["resembles"]))
+        if result.beginning is not None:
+            outline_report.say(config, out)
+            out.print(tables.beginning_table(result.beginning.record()))
         if result.interrupted or result.optimized is None:
             out.print(_message(result))
         out.print(
@@ -121,6 +127,11 @@ def _checkpoint(config: "Config", options: "argparse.Namespace", folder: "RunFol
             f"back to {path.name!r}, and add `--resume`"
         )
     header = {"config": config.model_dump(mode="json"), "versions": files.versions()}
+    if config.profile.from_file:
+        from rootsopt.config import sources
+
+        source = sources.regular_file(config.profile.outline_file or "", "an outline")
+        header["outline"] = hashlib.sha256(source.read_bytes()).hexdigest()
     return Checkpoint(path, header, options.resume)
 
 
@@ -177,11 +188,15 @@ def _contradiction(config: "Config", folder: "RunFolder", result) -> "Outcome":
     data = {"baseline": result.baseline.record(), "optimized": None}
     data |= {"status": result.status.label, "message": found.message}
     data |= {"infeasible": found.record(), "versions": files.versions()}
+    if result.beginning is not None:
+        data["beginning"] = result.beginning.record()
     folder.write_json("result.json", data)
     rows = found.record()["conflicts"]
 
     def show(out):
         out.print(tables.conflict_table(rows))
+        if result.beginning is not None:
+            out.print(tables.beginning_table(data["beginning"]))
         out.print(f"{result.status.label}: {found.message}", soft_wrap=True)
 
     return cli.Outcome(cli.NO_RESULT, show)
@@ -193,6 +208,7 @@ def _alike(config: "Config", result) -> dict:
     Return {} if the optimised family is itself classical, or if there is no optimised design."""
     from rootsopt.config.families import family_of
 
+    config = _searching(config, result)
     if family_of(config.profile.family).classical or result.optimized is None:
         return {}
     import jax.numpy as jnp
@@ -203,6 +219,13 @@ def _alike(config: "Config", result) -> dict:
     design = list(result.optimized.design.values())
     found = likenesses(Scene.from_config(config).profile(jnp.asarray(design)))
     return {"resembles": [one.record() for one in found]}
+
+
+def _searching(config: "Config", result) -> "Config":
+    """Return the config of the designs that the search varied.
+
+    It is `config` itself, unless the baseline's profile is from a file."""
+    return config if result.beginning is None else result.beginning.config
 
 
 def _message(result) -> str:
@@ -248,15 +271,18 @@ def _interrupted(result) -> str:
 
 
 def _write(folder, config, options, result, choice, compiled, ran) -> None:
+    from rootsopt.measured import report as outline_report
     from rootsopt.output import files
     from rootsopt.response.speeds import at_speeds
     from rootsopt.response.tolerances import nominal_of
     from rootsopt.scene import outline_mm
 
     records = {"baseline": result.baseline, "optimized": result.optimized}
+    searching = _searching(config, result)
+    configs = {"baseline": config, "optimized": searching}
     files.write_config(folder, config)
     if result.optimized is not None:
-        folder.write_text("optimized.yaml", _designed(config, result.optimized).to_yaml())
+        folder.write_text("optimized.yaml", _designed(searching, result.optimized).to_yaml())
     if result.robustness is not None:
         _write_robustness(folder, config, options, result.robustness)
     data: dict = {name: e.record() if e is not None else None for name, e in records.items()}
@@ -264,13 +290,17 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
         if evaluation is None:
             continue
         design = list(evaluation.design.values())
-        folder.write_csv(f"profile_{name}.csv", files.profile_columns(outline_mm(config, design)))
+        points = outline_mm(configs[name], design)
+        folder.write_csv(f"profile_{name}.csv", files.profile_columns(points))
         if evaluation.series is not None:
             folder.write_csv(f"response_{name}.csv", files.response_columns(evaluation.series))
     rows = result.history
     if rows:
         folder.write_csv("history.csv", {key: [row[key] for row in rows] for key in rows[0]})
     data |= choice
+    if result.beginning is not None:
+        data["beginning"] = result.beginning.record()
+        data |= outline_report.record(config)
     data["improvement"] = result.improvement
     data["constraints"] = result.constraints
     if config.objective.speeds_rpm and result.optimized is not None:
@@ -292,7 +322,9 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
         from rootsopt.figures import runs
 
         if result.optimized is not None:
-            runs.optimization_figures(folder, result.baseline, result.optimized, rows, config)
+            pair = result.baseline, result.optimized
+            given = None if result.beginning is None else config
+            runs.optimization_figures(folder, *pair, rows, searching, given)
             if result.optimality is not None:
                 required = data["optimality"]["required_residual"]
                 runs.certificate_figure(folder, rows, data["constraints"], required)

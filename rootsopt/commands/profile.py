@@ -1,7 +1,7 @@
 """`rootsopt profile CONFIG`: compute the geometry of one design."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rootsopt.commands import door
 
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rootsopt.commands.cli import Outcome
     from rootsopt.config import Config
     from rootsopt.output.runs import RunFolder
+    from rootsopt.profiles import Profile
 
 PURPOSE = (
     "Compute the geometry of one design (radii, area, inertia, margins) and export drawings, "
@@ -56,21 +57,37 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     record |= outline_report.record(config)
     files.write_config(folder, config)
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
-    folder.write_json("result.json", record | {"versions": files.versions()})
     export.write(folder, config, formats, record["design"])
     if not options.no_figures:
         from rootsopt.figures import runs
 
         runs.profile_figures(folder, config, record)
+    alike = resembles(scene.profile(design)) if options.resembles else []
+    if alike:
+        record["resembles"] = alike
+    folder.write_json("result.json", record | {"versions": files.versions()})
     projected = None if coefficients is None else _projected(folder, config, coefficients)
 
     def show(out: "Console") -> None:
         out.print(tables.geometry_table(record))
         outline_report.say(config, out)
+        if alike:
+            out.print(tables.likeness_table(alike, "This profile resembles"))
         if projected is not None:
             out.print(projected, soft_wrap=True)
 
     return cli.Outcome(cli.OK, show)
+
+
+def resembles(profile: "Profile") -> list[dict[str, Any]]:
+    """Return the records of the member of each family that is nearest to a profile, nearest first.
+
+    The families are the classical ones and, last, the free form."""
+    from rootsopt.design.resemblance import free_likeness, likenesses
+
+    named = likenesses(profile)
+    free = free_likeness(profile, *named[:2])
+    return [one.record() for one in (*named, *([] if free is None else [free]))]
 
 
 def _coefficients(given: str | None) -> int | None:
@@ -112,6 +129,12 @@ def _options(parser: "argparse.ArgumentParser") -> None:
         metavar="N",
         help="write free_form.yaml: the same config with the profile as a free form of N "
         "coefficients, as the start of an optimisation",
+    )
+    parser.add_argument(
+        "--resembles",
+        action="store_true",
+        help="find the nearest member of every profile family, and its distance (takes about half "
+        "a minute)",
     )
 
 

@@ -35,6 +35,8 @@ MARGINS = (
     *("turning", "convexity", "reach", "fall", "rolling", "order", "undercut", "star", "root"),
 )
 """Names of the margins that are ≥ 0 in a sound profile (see `rootsopt.profiles.validity`)."""
+FREE_FORM = "free_form"
+"""Name of the family whose members come closest to any profile."""
 ENTRY_POINTS = "rootsopt.families"
 """Name of the entry-point group in which installed packages offer families.
 
@@ -216,6 +218,13 @@ class Family:
         """Whether every parameter is a single number, and the profile is not read from a file."""
         lists = any(parameter.count is not None for parameter in self.parameters)
         return self.maker is not None and not lists
+
+    @property
+    def fitted(self) -> bool:
+        """Whether members with design parameters can be fitted to an outline.
+
+        They can for classical families, and for the free form."""
+        return self.name == FREE_FORM or (self.classical and bool(self.parameters))
 
     def make(self, lobes: int, pitch_radius: Any, **parameters: Any) -> Any:
         """Return the `Profile` with this number of lobes, `pitch_radius` (m) and `parameters`.

@@ -29,6 +29,7 @@ from rootsopt.config.section import Section, bare
 from rootsopt.config.smoothing import following_mm
 from rootsopt.config.sources import regular_file
 from rootsopt.config.study import (
+    NEAREST,
     AttractorsConfig,
     ConstraintsConfig,
     EnsembleConfig,
@@ -176,6 +177,16 @@ class Config(Section):
             raise ValueError(
                 f"`solver.fidelity` must be search (or auto) with `{self.needs_search[0]}`, which "
                 f"no other fidelity supports, but is {fidelity}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _searched_family(self):
+        family, own = self.optimizer.family, self.profile.family
+        if not self.profile.from_file and family not in (NEAREST, own):
+            raise ValueError(
+                f"`optimizer.family` must be {own}, the family of the profile, or be left out, but "
+                f"is {family}: only for an outline from a file can the search vary another family"
             )
         return self
 

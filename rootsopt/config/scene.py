@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from rootsopt.config import catalogue as _catalogue  # noqa: F401  (fills the table)
 from rootsopt.config.families import (
@@ -26,6 +26,14 @@ If a length is outside its limits but would lie in this range in another unit, t
 this unit."""
 
 
+_FARTHEST = 1e5
+"""Absolute value (mm) above which a coordinate of a rotor's axis is rejected."""
+
+
+def _is_bool(value: Any) -> bool:
+    return isinstance(value, bool)
+
+
 class ProfileConfig(Section):
     """The rotor profile.
 
@@ -42,6 +50,17 @@ class ProfileConfig(Section):
         None,
         description="outline: scatter (RMS) of measured points; absent: 0, the curve passes "
         "through them",
+    )
+
+    outline_center: Literal["fit"] | tuple[float, float] | None = Field(
+        None,
+        description="outline: x and y (mm) of the rotor's axis in the file, or fit: the centre of "
+        "the lobes' rotational symmetry; absent: the origin",
+    )
+    outline_unit: Literal["mm", "cm", "m", "um", "inch"] | None = Field(
+        None,
+        description="outline: unit of the numbers in the file; absent: mm, or the unit that a "
+        "drawing states",
     )
 
     @property
@@ -74,8 +93,21 @@ class ProfileConfig(Section):
         if not isinstance(data, dict):
             return data
         lists = {key for key, parameter in parameters().items() if parameter.count is not None}
+        lists.add("outline_center")
         given = {key: data[key] for key in lists & data.keys() if isinstance(data[key], list)}
         return data | {key: tuple(value) for key, value in given.items()}
+
+    @field_validator("outline_center", mode="before")
+    @classmethod
+    def _centered(cls, value):
+        plain = isinstance(value, tuple) and len(value) == 2
+        plain = plain and all(isinstance(x, int | float) and abs(x) <= _FARTHEST for x in value)
+        if value is None or value == "fit" or (plain and not any(map(_is_bool, value))):
+            return value
+        raise ValueError(
+            "`profile.outline_center` must be fit, or x and y of the axis in mm, as in [0.1, 0.2], "
+            f"each at most {_FARTHEST:g}, but is {shown(value)}"
+        )
 
     @model_validator(mode="after")
     def _sized(self):
@@ -105,7 +137,7 @@ class ProfileConfig(Section):
                 raise ValueError(f"`profile.outline_file` is required for family {self.family}")
             return self
         readers = [name for name, family in families().items() if family.maker is None]
-        for key in ("outline_file", "outline_smoothing_mm"):
+        for key in (key for key in _FIELDS if key.startswith("outline_")):
             if getattr(self, key) is not None:
                 raise ValueError(
                     f"`profile.{key}` does not belong to family {self.family}; remove it, or set "

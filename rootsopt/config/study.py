@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.families import follow, parameters, replace_fields
+from rootsopt.config.families import families, follow, parameters, replace_fields
 from rootsopt.config.section import Order, Section, Speed, Weight, between, number, tuples
 from rootsopt.config.units import hint
 from rootsopt.config.words import shown
@@ -13,6 +13,8 @@ _Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 _NODES_RTOL = 3e-5
 """Default tolerance for fidelity `nodes`. Its force has a step at every node, which needs many
 solver steps at finer tolerances, and limits the accuracy of forces to about 1e-3."""
+NEAREST = "nearest"
+"""Word in `optimizer.family` for the named family that is nearest to an outline."""
 _LEAST_WEIGHT = 1e-6
 """Sum of all weights below which an objective is rejected as empty."""
 _MOST_LINES = 32
@@ -381,7 +383,21 @@ class OptimizerConfig(Section):
         48, description="designs screened to place the starts; 0 starts at the baseline only"
     )
     seed: _Seed = Field(0, description="seed of the screening sample")
+    family: str = Field(
+        NEAREST,
+        description="profile family outline: family whose parameters are varied, from the member "
+        "nearest to the outline; nearest: the named family that comes nearest",
+    )
     bounds: BoundsConfig = Field(default_factory=lambda: BoundsConfig.model_validate({}))
 
 
-follow(lambda: replace_fields(OptimizerConfig, dict(OptimizerConfig.model_fields)))
+def _derive_optimizer() -> None:
+    """Set the fields of `OptimizerConfig` from the table of families."""
+    fields = dict(OptimizerConfig.model_fields)
+    words = NEAREST, *(name for name, family in families().items() if family.fitted)
+    described = Field(NEAREST, description=fields["family"].description)
+    replace_fields(OptimizerConfig, fields | {"family": (Literal[words], described)})  # type: ignore
+
+
+_derive_optimizer()
+follow(_derive_optimizer)

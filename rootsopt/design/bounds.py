@@ -2,6 +2,10 @@
 
 from rootsopt.config import Config
 from rootsopt.config.families import Parameter, family_of
+from rootsopt.errors import InputError
+
+_ROOM = 0.1
+"""Room (fraction of the width of the bounds) beyond a design for which bounds are widened."""
 
 
 def bounds_of(config: Config) -> list[tuple[float, float]]:
@@ -14,6 +18,39 @@ def bounds_of(config: Config) -> list[tuple[float, float]]:
         count = len(values) if isinstance(values, tuple) else 1
         found += [_pair(config, parameter)] * count
     return found
+
+
+def widened(config: Config) -> tuple[Config, tuple[str, ...]]:
+    """Return (config whose bounds hold its own design, keys of the widened bounds).
+
+    Only default bounds are widened, by `_ROOM` of their width beyond the design, within the limits
+    of the key. Bounds of the config that differ from the default are kept."""
+    changes: dict[str, tuple[float, float]] = {}
+    lobes, radius = config.profile.lobes, config.profile.pitch_radius_mm
+    for parameter in family_of(config.profile.family).parameters:
+        given = getattr(config.optimizer.bounds, parameter.key)
+        if given is not None and tuple(given) != parameter.default_bounds:
+            continue
+        low, high = given or parameter.bounds(config.profile)
+        value = getattr(config.profile, parameter.key)
+        values = value if isinstance(value, tuple) else (value,)
+        if low <= min(values) and max(values) <= high:
+            continue
+        least, most = parameter.bounds_limits or (parameter.lowest, parameter.highest)
+        sized = parameter.limits(radius) or (least, most)
+        least, most = max(least, sized[0]), min(most, sized[1])
+        room = _ROOM * (high - low)
+        pair = max(least, min(low, min(values) - room)), min(most, max(high, max(values) + room))
+        try:
+            parameter.check_bounds(pair, lobes)
+        except InputError:
+            pair = pair[0], max(high, *values)
+        changes[parameter.key] = pair
+    if not changes:
+        return config, ()
+    bounds = config.optimizer.bounds.model_copy(update=changes)
+    optimizer = config.optimizer.model_copy(update={"bounds": bounds})
+    return config.model_copy(update={"optimizer": optimizer}), tuple(changes)
 
 
 def _pair(config: Config, parameter: Parameter) -> tuple[float, float]:

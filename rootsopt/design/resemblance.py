@@ -1,7 +1,12 @@
-"""Finds the member of each classical family that is nearest to a profile, and its distance.
+"""Finds the member of a profile family that is nearest to a profile, and its distance.
 
 A *member* of a family is a profile with some values of the family's parameters. A family is
 *classical* if its profiles are made from single numbers, not from a list or a file.
+
+The distance is that of the closed outlines (Hausdorff): the greatest distance of a point of either
+outline from the other outline. A search minimises it by linear programs. By the envelope theorem,
+the derivative of a distance from a point to its nearest point needs no derivative of the latter's
+place.
 """
 
 import functools
@@ -15,16 +20,20 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from rootsopt.config.families import family_of
-from rootsopt.config.units import MM
+from rootsopt.config import ProfileConfig
+from rootsopt.config.families import FREE_FORM, Parameter, family_of
+from rootsopt.config.units import DEG, MM
 from rootsopt.design.space import sobol
-from rootsopt.profiles import Profile
-from rootsopt.profiles.departure import departure
+from rootsopt.errors import InputError
+from rootsopt.profiles import Outline, Profile, project
+from rootsopt.profiles.departure import beyond, departures, feet, flank_points
 from rootsopt.profiles.validity import PURE, margins
 from rootsopt.runtime.programs import Program
-from rootsopt.scene.families import classical, profile_of
+from rootsopt.scene.families import check, classical, profile_of
 
-_NODES = 96
+COEFFICIENTS = 12
+"""Number of coefficients of a free form that is fitted to a profile."""
+_NODES = 128
 """Number of nodes on each side of the pitch circle at which a search compares two flanks."""
 _SAMPLE = 128
 """Number of sampled members of a family. The searches start from the best of them."""
@@ -33,6 +42,8 @@ _STARTS = 3
 _PROGRAMS, _LONGEST, _SHORTEST = 80, 0.2, 1e-9
 """Limits of a search: number of linear programs after which the search ends; greatest step; step
 below which the search ends. Steps are fractions of the parameters' usual ranges."""
+_GAIN = 1e-7
+"""Relative decrease of the distance in one step below which a search ends."""
 _UNSOUND_WEIGHT = 10.0
 """Factor of the penalty for a negative margin. The penalty is this factor times the margin's
 magnitude (relative to its scale), and is added to the distance (pitch radii)."""
@@ -44,63 +55,122 @@ class Likeness(NamedTuple):
     """The member of a family that is nearest to a profile.
 
     `family`: name of the family; `design`: the member's parameters by key, in config units;
-    `departure`: greatest distance (m) between the flanks of the member and the profile."""
+    `departure`: Hausdorff distance (m) between the outlines of the member and the profile; `rms`:
+    root mean square of the distances (m) of the profile's points from the member."""
 
     family: str
     design: dict[str, float]
     departure: float
+    rms: float
 
     def record(self) -> dict[str, Any]:
-        """Return the fields as a dictionary for the result file, with the departure in µm."""
+        """Return the fields as a dictionary for the result file, with the distances in µm."""
         return {
             "family": self.family,
             "design": self.design,
             "departure_um": self.departure * 1e6,
+            "departure_rms_um": self.rms * 1e6,
         }
+
+    def config(self, profile: ProfileConfig) -> ProfileConfig:
+        """Return the config of the member, with lobes and pitch radius of `profile`.
+
+        Raises `InputError` or `ValueError` if the member is no valid design."""
+        family, values = family_of(self.family), list(self.design.values())
+        parts = zip(family.parameters, family.split(values), strict=True)
+        named = {one.key: v if one.count is None else tuple(v) for one, v in parts}
+        size = {"lobes": profile.lobes, "pitch_radius_mm": profile.pitch_radius_mm}
+        return ProfileConfig.model_validate({"family": self.family} | size | named)
 
 
 def likenesses(profile: Profile) -> list[Likeness]:
     """Return the member of each classical family that is nearest to `profile`, nearest first.
 
-    The nearest member minimises the greatest distance between its flank and that of `profile`. The
-    search starts from the best members of a Sobol sample, and may therefore miss a nearer member.
-    Families in which the search finds no sound member are left out.
+    The nearest member minimises the Hausdorff distance between the outlines. The search starts from
+    the best members of a Sobol sample, and may therefore miss a nearer member. Families in which
+    the search finds no sound member are left out.
     """
-    found = []
-    for family in classical():
-        likeness = _nearest(profile, family)
-        if likeness is not None:
-            found.append(likeness)
-    return sorted(found, key=lambda one: one.departure)
+    found = [likeness(profile, family) for family in classical()]
+    return sorted((one for one in found if one is not None), key=lambda one: one.departure)
 
 
-def _nearest(profile: Profile, family: str) -> Likeness | None:
-    lobes, radius = profile.lobes, profile.pitch_radius
+def likeness(profile: Profile, family: str) -> Likeness | None:
+    """Return the member of a classical `family` that is nearest to `profile`.
+
+    Return `None` if the search finds no sound member. The search is that of `likenesses`."""
     parameters, keys = family_of(family).parameters, family_of(family).keys
     look = _Look(profile, family)
     if not keys:
-        starts = [np.zeros(0)]
-    else:
-        size = float(radius) / MM, lobes
-        low, high = np.array([parameter.usually(*size) for parameter in parameters]).T
-        sample = low + (high - low) * sobol(_SAMPLE, 0, len(keys))
-        faults = np.array([look(one).fault for one in sample])
-        starts = [_fitted(look, sample[k], high - low) for k in np.argsort(faults)[:_STARTS]]
-    sound = [one for one in starts if look(one).sound]
-    if not sound:
-        return None
-    design = min(sound, key=lambda one: look(one).away)
-    member = profile_of(family, lobes, radius, jnp.asarray(design))
-    named = dict(zip(keys, map(float, design), strict=True))
-    return Likeness(family, named, departure(profile, member))
+        return _best(look, profile, [np.zeros(0)])
+    size = float(profile.pitch_radius) / MM, profile.lobes
+    low, high = np.array([parameter.usually(*size) for parameter in parameters]).T
+    sample = low + (high - low) * sobol(_SAMPLE, 0, len(keys))
+    faults = np.array([look(one).fault for one in sample])
+    found = [_fitted(look, sample[k], high - low) for k in np.argsort(faults)[:_STARTS]]
+    if not family_of(family).by_limits:
+        return _best(look, profile, found)
+    # The limits in closed form also admit profiles with slightly negative margins.
+    free = _Look(profile, family, limited=False)
+    return _best(free, profile, [*found, *(_fitted(free, one, high - low) for one in found)])
+
+
+def free_likeness(profile: Profile, *near: Likeness) -> Likeness | None:
+    """Return the free form of `COEFFICIENTS` coefficients that is nearest to `profile`.
+
+    `near`: members of other families; searches also start from their projections. Return `None` if
+    the searches find no sound free form."""
+    radius, look = profile.pitch_radius, _Look(profile, FREE_FORM)
+    parameters = family_of(FREE_FORM).parameters
+    size = float(radius) / MM, profile.lobes
+    usual = [parameter.usually(*size) for parameter in parameters]
+    width = np.array([high - low for low, high in [usual[0], *[usual[1]] * COEFFICIENTS]])
+    whole = [profile]
+    for one in near:
+        design = jnp.asarray(list(one.design.values()))
+        whole.append(profile_of(one.family, profile.lobes, radius, design))
+    starts = []
+    for one in whole:
+        free = project(one, COEFFICIENTS)
+        land = float(free.tip_arc_angle)
+        if isinstance(one, Outline):
+            land = float(one.seal_width / (2 * one.outer_radius))
+        starts.append(np.array([land / DEG, *map(float, free.coefficients)]))
+    return _best(look, profile, [_fitted(look, start, width) for start in starts])
+
+
+def _best(look: "_Look", profile: Profile, designs) -> Likeness | None:
+    """Return the nearest of several members with the given `designs`, `None` if none is sound."""
+    keys = family_of(look.family).keys
+    size = {"lobes": profile.lobes, "pitch_radius_mm": float(profile.pitch_radius) / MM}
+    blank = ProfileConfig.model_construct(**size)
+    for design in sorted(designs, key=lambda one: look(one).away):
+        if not look(design).sound:
+            break
+        names = list(keys) if len(keys) == len(design) else _numbered(keys, len(design))
+        named = dict(zip(names, map(float, design), strict=True))
+        try:
+            check(Likeness(look.family, named, 0.0, 0.0).config(blank))
+        except (InputError, ValueError):
+            continue
+        member = profile_of(look.family, profile.lobes, profile.pitch_radius, jnp.asarray(design))
+        found = departures(profile, member)
+        return Likeness(look.family, named, found.greatest, found.rms)
+    return None
+
+
+def _numbered(keys: tuple[str, ...], count: int) -> list[str]:
+    """Return the names of `count` design parameters, of which the last ones are one list."""
+    alone = list(keys[:-1])
+    return [*alone, *(f"{keys[-1]}_{k}" for k in range(1, count - len(alone) + 1))]
 
 
 class _Seen(NamedTuple):
     """Comparison of a member of a family with a profile.
 
-    `distance` (n,): signed distances between the flanks (pitch radii); `margin` (m,): margins
-    relative to their scales; `distance_slope` (n, d), `margin_slope` (m, d): derivatives of both
-    with respect to the design."""
+    `distance` (n,): signed distances between the outlines (pitch radii), from points of the profile
+    and from points of the member; `margin` (m,): margins relative to their scales;
+    `distance_slope` (n, d), `margin_slope` (m, d): derivatives of both with respect to the design.
+    """
 
     distance: NDArray[np.float64]
     margin: NDArray[np.float64]
@@ -110,7 +180,7 @@ class _Seen(NamedTuple):
     @property
     def finite(self) -> bool:
         """Whether all numbers in the fields are finite."""
-        return all(np.all(np.isfinite(part)) for part in self)
+        return all(bool(np.all(np.isfinite(part))) for part in self)
 
     @property
     def sound(self) -> bool:
@@ -130,28 +200,63 @@ class _Seen(NamedTuple):
 
     @property
     def away(self) -> float:
-        """Greatest distance (pitch radii) between the flanks; infinite if the member is unsound."""
+        """Greatest distance (pitch radii) of the outlines; infinite if the member is unsound."""
         return float(np.max(np.abs(self.distance))) if self.sound else math.inf
 
 
 class _Look:
     """Compares members of a `family` with a `profile`, and caches the results.
 
-    Call an instance with the member's design.
-    """
+    Call an instance with the member's design (d,) in config units. `limited`: whether margins are
+    considered; otherwise, all count as zero."""
 
-    def __init__(self, profile: Profile, family: str):
+    def __init__(self, profile: Profile, family: str, limited: bool = True):
+        self.limited = limited
         self.family, self.lobes, self.radius = family, profile.lobes, profile.pitch_radius
-        self.target = _target(profile)
+        self.target = flank_points(profile, _NODES) / float(self.radius)
+        self.around = beyond(self.target, profile.lobes)
+
+    def limits(self, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the least and the greatest value (d,) of each of `count` design parameters."""
+        radius = float(self.radius) / MM
+        pairs = [_limits(one, radius) for one in family_of(self.family).parameters]
+        pairs += pairs[-1:] * (count - len(pairs))
+        low, high = np.array(pairs).T
+        return low, high
 
     @functools.lru_cache(maxsize=1024)  # noqa: B019
     def _at(self, design: tuple[float, ...]) -> _Seen:
-        design_array = np.asarray(design, dtype=np.float64)
-        found = _compared(self.family, self.lobes, self.radius, self.target, design_array)
-        return _Seen(*map(np.asarray, found))
+        values = np.asarray(design, dtype=np.float64)
+        found = _member(self.family, self.lobes, self.radius, values)
+        line, line_slope, margin, margin_slope = map(np.asarray, found)
+        if not self.limited:
+            margin, margin_slope = 0 * margin, 0 * margin_slope
+        if not np.all(np.isfinite(line)):
+            nothing = np.full(1, np.nan), np.full((1, len(values)), np.nan)
+            return _Seen(nothing[0], margin, nothing[1], margin_slope)
+        # From the profile's points to the member. A nearest point moves along with its segment.
+        near, near_slope = beyond(line, self.lobes), beyond(line_slope, self.lobes)
+        to = feet(self.target, near, smooth=True)
+        share = to.share[:, None, None]
+        moved = (1 - share) * near_slope[to.segment] + share * near_slope[to.segment + 1]
+        slope = -np.einsum("nk,nkd->nd", to.toward, moved)
+        # From the member's points to the profile, with the same sign.
+        back = feet(line, self.around, smooth=True)
+        back_slope = -np.einsum("nk,nkd->nd", back.toward, line_slope)
+        distance = np.concatenate([to.away, -back.away])
+        return _Seen(distance, margin, np.concatenate([slope, back_slope]), margin_slope)
 
     def __call__(self, design) -> _Seen:
         return self._at(tuple(map(float, design)))
+
+
+def _limits(parameter: Parameter, radius_mm: float) -> tuple[float, float]:
+    """Return the least and the greatest value of a parameter in a config.
+
+    `radius_mm`: pitch radius (mm)."""
+    low, high = parameter.limits(radius_mm) or (parameter.lowest, parameter.highest)
+    low, high = max(low, parameter.lowest), min(high, parameter.highest)
+    return low, high - 1e-9 * (high - low) if parameter.below else high
 
 
 def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
@@ -160,73 +265,72 @@ def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
     The search is a sequence of linear programs. Each finds the step that is best to first order
     within a trust region. `width` (d,): widths of the parameters' usual ranges.
     """
-    design, size = start, _LONGEST
+    low, high = look.limits(len(start))
+    design, size = np.clip(start, low, high), _LONGEST
     for _ in range(_PROGRAMS):
         seen = look(design)
         if not seen.finite or size < _SHORTEST:
             break
-        new = design + width * _promising(seen, width, size)
-        if look(new).fault < seen.fault:
+        room = (low - design) / width, (high - design) / width
+        new = np.clip(design + width * _promising(seen, width, size, room), low, high)
+        found = look(new).fault
+        if found < seen.fault:
+            if size <= 1e-4 and seen.fault - found < _GAIN * seen.fault:
+                return new
             design, size = new, min(2 * size, _LONGEST)
         else:
             size /= 4
     return design
 
 
-def _promising(seen: _Seen, width, size: float) -> NDArray[np.float64]:
+def _promising(seen: _Seen, width, size: float, room) -> NDArray[np.float64]:
     """Return the step (d,), in units of `width`, that minimises the fault to first order.
 
-    No entry of the step exceeds `size` in magnitude. The linear program minimises a bound on all
-    distances plus a weighted bound on negative margins."""
-    count, distances, soundness = len(width), len(seen.distance), len(seen.margin)
-    by_step = np.concatenate([seen.distance_slope, -seen.distance_slope, -seen.margin_slope])
-    one, none = np.ones((2 * distances, 1)), np.zeros((2 * distances, 1))
+    No entry of the step exceeds `size` in magnitude, or leaves the range `room` (low, high), each
+    (d,). The linear program minimises a bound on all distances plus a weighted bound on negative
+    margins. Distances that cannot reach the bound within the step are left out."""
+    slope = seen.distance_slope * width
+    rows = np.concatenate([slope, -slope])
+    value = np.concatenate([seen.distance, -seen.distance])
+    change = size * np.sum(np.abs(rows), axis=1)
+    kept = value + change >= np.max(value - change)
+    rows, value = rows[kept], value[kept]
+    count, soundness = len(width), len(seen.margin)
+    one, none = np.ones((len(rows), 1)), np.zeros((len(rows), 1))
     bounds = np.block([[-one, none], [np.zeros((soundness, 1)), -np.ones((soundness, 1))]])
+    steps = [
+        (max(-size, min(low, 0.0)), min(size, max(high, 0.0)))
+        for low, high in zip(*room, strict=True)
+    ]
     found = linprog(
         np.concatenate([np.zeros(count), [1.0, _UNSOUND_WEIGHT]]),
-        A_ub=np.hstack([by_step * width, bounds]),
-        b_ub=np.concatenate([-seen.distance, seen.distance, seen.margin]),
-        bounds=[(-size, size)] * count + [(0, None)] * 2,
+        A_ub=np.hstack([np.concatenate([rows, -seen.margin_slope * width]), bounds]),
+        b_ub=np.concatenate([-value, seen.margin]),
+        bounds=[*steps, (0, None), (0, None)],
     )
     return np.zeros(count) if found.x is None else found.x[:count]
 
 
 @Program
-def _target(profile: Profile):
-    """Return (normal angles, points, outward unit normals) of the profile that is compared.
+def _member(family: str, lobes: int, radius: Float[Array, ""], design):
+    """Return (flank, its derivatives, margins, their derivatives) of a member of a `family`.
 
-    The normal angles (n,) are in rad. The points (m) and the normals have shape (2, n, 2), with the
-    addendum first and the dedendum second."""
-    nu = profile.pitch_normal * jnp.linspace(0.0, 1.0, _NODES)
-    points = [side(nu) for side in (profile.addendum, profile.dedendum)]
-    places = jnp.stack([profile.position(point) for point in points])
-    angles = jnp.stack([point.beta + jnp.pi / 2 - point.psi for point in points])
-    return nu, places, jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
-
-
-@Program
-def _compared(family: str, lobes: int, radius: Float[Array, ""], target, design):
-    """Return the fields of `_Seen` for a `design`: distances, margins and their derivatives.
-
-    `family`, `lobes`, `radius`: family, number of lobes and pitch radius (m) of the member;
-    `target`: result of `_target`.
-
-    Distances are measured along the normals of the `target`, between points with the same normal
-    angle on the addendum. To first order, these are the distances between the flanks."""
-    nu, places, normals = target
+    `lobes`, `radius`: number of lobes and pitch radius (m); `design` (d,): in config units. The
+    flank (n, 2) runs from tip to root, in pitch radii. The margins (m,) are relative to their
+    scales. Derivatives are with respect to the design, along a last axis."""
 
     def both(design):
         profile = profile_of(family, lobes, radius, design)
-        sides = [profile.position(side(nu)) for side in (profile.addendum, profile.dedendum)]
-        away = jnp.sum((jnp.stack(sides) - places) * normals, axis=-1).ravel() / radius
+        nu = profile.pitch_normal * jnp.linspace(0.0, 1.0, _NODES)
+        upper, lower = (profile.position(f(nu)) for f in (profile.addendum, profile.dedendum))
         found = margins(profile)._asdict()
         scaled = [
             value / (1.0 if name in PURE else radius)
             for name, value in found.items()
             if name not in family_of(family).inherent
         ]
-        values = away, jnp.stack(scaled)
+        values = jnp.concatenate([upper, lower[::-1]]) / radius, jnp.stack(scaled)
         return values, values
 
-    slopes, values = jax.jacfwd(both, has_aux=True)(design)
-    return *values, *slopes
+    (line_slope, margin_slope), (line, margin) = jax.jacfwd(both, has_aux=True)(design)
+    return line, line_slope, margin, margin_slope

@@ -54,13 +54,18 @@ def optimization_figures(
     optimized: Evaluation,
     history: Sequence[Mapping[str, Any]],
     config: Config,
+    given: Config | None = None,
 ) -> list[str]:
     """Write the figures of an optimisation into `folder`; return the file names.
 
     `baseline`, `optimized`: evaluations of the design before and after the optimisation. `history`:
-    one row per evaluation, as in `plot_history`; if empty, its figure is omitted."""
+    one row per evaluation, as in `plot_history`; if empty, its figure is omitted. `config`: config
+    of the optimised design; `given`: that of the baseline, if its profile is of another family."""
     designs = {"baseline": baseline, "optimised": optimized}
-    outlines = {name: _outline(config, one.design) for name, one in designs.items()}
+    outlines = {
+        "baseline": _outline(given or config, baseline.design),
+        "optimised": _outline(config, optimized.design),
+    }
     names = [
         _write(folder, "profiles", _profiles(outlines, config)),
         _write(folder, "meshing", _meshing(outlines["optimised"], config, "optimised rotors")),

@@ -10,7 +10,10 @@ class Checks:
     `points`: number of points of the outline as read, without repeated points.
     `turned_deg`: angle (°) by which the outline was turned to put a lobe's axis on +x.
     `reversed`: whether the points ran clockwise as read.
-    `axis_offset_um`: distance (µm) of the outline's centroid from the origin.
+    `axis_offset_um`: distance (µm) of the outline's centroid from the rotor's axis.
+    `scatter_um`: estimated standard deviation (µm) of the points across the outline.
+    `center_x_mm`, `center_y_mm`: estimated centre (mm) of the lobes' rotational symmetry, in the
+    coordinates of the file. `center_error_um`: standard error (µm) of each of both.
     `lobe_deviation_um`: greatest normal distance between a flank and the mean of the same flank of
     all lobes (µm).
     `flank_deviation_um`: greatest normal distance between the mean leading flank and the mirrored
@@ -26,6 +29,10 @@ class Checks:
     turned_deg: float
     reversed: bool
     axis_offset_um: float
+    scatter_um: float
+    center_x_mm: float
+    center_y_mm: float
+    center_error_um: float
     lobe_deviation_um: float
     flank_deviation_um: float
     fit_deviation_um: float

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_interp_spline, make_splprep, splprep
 
 from rootsopt.errors import InputError
+from rootsopt.measured.estimates import Estimates
 from rootsopt.measured.guard import guarded
 
 _TURNING = 0.3
@@ -137,13 +138,15 @@ def through(
     joints: Bool[np.ndarray, " n"],
     pitch_radius: float,
     smoothing: float,
+    seen: Estimates,
 ) -> MeasuredCurve:
     """Return the curve through `points` (mm), or at an RMS distance `smoothing` (mm) from them.
 
-    `joints`: mask of the points at which curvature may jump; `pitch_radius`: in mm. If `smoothing`
-    is 0, the curve has one spline between every two successive joints, quintic if there are enough
-    points. Points at which the curvature of the polygon through the points jumps are also joints.
-    If `smoothing` is greater than 0, the curve is a single quintic spline and `joints` is ignored.
+    `joints`: mask of the points at which curvature may jump; `pitch_radius`: in mm; `seen`:
+    estimates for messages. If `smoothing` is 0, the curve has one spline between every two
+    successive joints, quintic if there are enough points. Points at which the curvature of the
+    polygon through the points jumps are also joints. If `smoothing` is greater than 0, the curve is
+    a single quintic spline and `joints` is ignored.
 
     Raises `InputError` if the points are too few or, without smoothing, too scattered; if
     `smoothing` is so small that the spline would follow the noise; or if a spline cannot be
@@ -156,12 +159,11 @@ def through(
     turned = np.sum(np.abs(np.angle(np.diff(points)[1:] / np.diff(points)[:-1])))
     if smoothing == 0 and turned > _WINDING:
         raise InputError(
-            "`profile.outline_smoothing_mm` must be the scatter (RMS) of the points, but is 0: "
-            f"from point to point a flank turns by {turned:.3g} rad in total, a smooth one by 4; "
-            "set this key"
+            f"{_KEY} must hold smooth flanks, but from point to point a flank turns by "
+            f"{turned:.3g} rad in total, a smooth one by 4; {seen.remedy(smoothing)}"
         )
     if smoothing > 0:
-        return _smoothed(points, smoothing)
+        return _smoothed(points, smoothing, seen)
     last = len(points) - 1
     ends = [0]
     for joint in np.flatnonzero(joints | _jumps(points)):
@@ -179,7 +181,7 @@ def through(
     return MeasuredCurve(np.array(places), tuple(pieces))
 
 
-def _smoothed(points: NDArray[np.complex128], smoothing: float) -> MeasuredCurve:
+def _smoothed(points: NDArray[np.complex128], smoothing: float, seen: Estimates) -> MeasuredCurve:
     """Return the smoothest quintic spline at an RMS distance `smoothing` (mm) from the points."""
     t = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points)))])
     sides = [np.real(points), np.imag(points)]
@@ -192,7 +194,8 @@ def _smoothed(points: NDArray[np.complex128], smoothing: float) -> MeasuredCurve
     if flag == _NO_ROOM:
         raise InputError(
             "`profile.outline_smoothing_mm` must be the scatter (RMS) of the points, but with "
-            f"{smoothing:g} a flank needs more than {_MOST_KNOTS} knots to follow them; raise it"
+            f"{smoothing:g} a flank needs more than {_MOST_KNOTS} knots to follow them; "
+            f"{seen.thinning(float(np.median(np.diff(t)))) or seen.remedy(smoothing)}"
         )
     with guarded(_KEY, "its points cannot be smoothed", "check `profile.outline_smoothing_mm`"):
         spline, _ = make_splprep(sides, u=t, k=5, s=squares)  # type: ignore[arg-type]

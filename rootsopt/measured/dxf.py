@@ -1,5 +1,6 @@
 """Reads outlines from DXF drawings, text or binary."""
 
+import dataclasses
 import io
 from collections import Counter
 from typing import Any
@@ -8,6 +9,7 @@ import numpy as np
 
 from rootsopt.errors import InputError
 from rootsopt.measured.entities import Entity, chain
+from rootsopt.measured.estimates import UNITS
 from rootsopt.measured.guard import each, guarded, short, silenced
 from rootsopt.measured.joining import joined
 from rootsopt.measured.loop import Loop
@@ -66,10 +68,11 @@ _UNITS = {
 astronomical units (17 to 20), are rejected."""
 
 
-def from_dxf(data: bytes, name: str) -> Loop:
+def from_dxf(data: bytes, name: str, unit: str | None = None) -> Loop:
     """Return the closed loop of the largest area in a drawing, in mm.
 
-    `data`: content of the file; `name`: name of the file in messages. Raises `InputError` if the
+    `data`: content of the file; `name`: name of the file in messages; `unit`: name of the unit of
+    its numbers, instead of the unit that the drawing states. Raises `InputError` if the
     drawing cannot be read, is too large or contains no closed loop."""
     binary = data.startswith(_BINARY)
     counted = _check_tags(data, binary, name)
@@ -79,7 +82,7 @@ def from_dxf(data: bytes, name: str) -> Loop:
             auditor = document.audit()
         else:
             document, auditor = recover.read(io.BytesIO(data))
-        unit = document.header.get("$INSUNITS", 0)
+        code = document.header.get("$INSUNITS", 0)
         kept = Counter(e.dxftype() for e in document.entitydb.values() if e.is_alive)
         reasons = [str(fix.message) for fix in auditor.fixes]
     for kind in _CURVES:
@@ -90,11 +93,13 @@ def from_dxf(data: bytes, name: str) -> Loop:
                 f"{name}: {counted[kind] - kept[kind]} of {counted[kind]} {kind} are not valid "
                 f"({short(reason, 100)}); repair or remove them in the drawing"
             )
-    scale = _UNITS.get(unit) if isinstance(unit, int) else None
+    scale = _UNITS.get(code) if isinstance(code, int) else None
+    if unit is not None:
+        scale = UNITS[unit]
     if scale is None:
         raise InputError(
             f"{name}: $INSUNITS must be the code of a length unit (4: mm, 1: inch, 0: none), but "
-            f"is {short(unit)}; set the drawing's units"
+            f"is {short(code)}; set the drawing's units, or `profile.outline_unit`"
         )
     with silenced():
         entities = [Entity.of(entity, name) for entity in _chosen(document, name)]
@@ -118,7 +123,8 @@ def from_dxf(data: bytes, name: str) -> Loop:
             f"{name}: must hold an outline of at most {_POINTS} points, but its entities need "
             f"{count}; draw the outline alone on a layer {_LAYER}"
         )
-    return joined([chain(part, spacing) for part in parts], _LAYER, name)
+    found = joined([chain(part, spacing) for part in parts], _LAYER, name)
+    return dataclasses.replace(found, unit=scale)
 
 
 def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:

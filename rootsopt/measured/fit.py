@@ -1,6 +1,7 @@
 """Makes a profile from the closed loop of an outline."""
 
 import dataclasses
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from scipy.optimize import brentq
 from rootsopt.errors import InputError
 from rootsopt.measured.checks import Checks
 from rootsopt.measured.curves import Frame, MeasuredCurve, stretch, through
+from rootsopt.measured.estimates import Estimates, estimates
 from rootsopt.measured.loop import Loop, signed_area
 from rootsopt.profiles.outline import Outline, Table
 
@@ -45,6 +47,12 @@ flank crosses the circle."""
 _FAR = 1e3
 """Ratio of an outline's greatest radius to the pitch radius, or its inverse, above which an outline
 is rejected because its units must be wrong."""
+_WANDER = 8.0
+"""Distance (in units of the scatter) that smoothed points may lie beside their curve."""
+_MANY = 20.0
+"""Ratio of the flanks' deviation to the scatter below which a message blames the scatter."""
+_ESTIMATED = "scatter_um", "center_x_mm", "center_y_mm", "center_error_um"
+"""Names of the fields of `Checks` that may be NaN."""
 _GAUSS = np.polynomial.legendre.leggauss(12)
 
 
@@ -71,12 +79,17 @@ class _Flank:
 
 
 def imported(
-    loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: float
+    loop: Loop,
+    lobes: int,
+    pitch_radius_mm: float,
+    smoothing_mm: float,
+    center: Literal["fit"] | tuple[float, float] | None = None,
 ) -> tuple[Outline, Checks]:
     """Return (profile, deviations) for the outline of a rotor with N = `lobes` lobes.
 
     `loop`: points of the outline; `pitch_radius_mm`: pitch radius; `smoothing_mm`: RMS scatter of
-    the points (mm), 0 for a curve through them.
+    the points (mm), 0 for a curve through them; `center`: x and y of the rotor's axis (mm), or
+    "fit" for the centre of the lobes' rotational symmetry. `None`: the origin.
 
     First, the loop is made counter-clockwise and turned to put a lobe's axis on +x. The phase of
     the N-th moment ∬ z^N dA gives this axis. Then the profile is made from one flank: the leading
@@ -93,8 +106,20 @@ def imported(
         )
     # Overflow and division by zero are detected in the result.
     with np.errstate(all="ignore"):
-        outline, checks = _imported(loop, lobes, pitch_radius_mm, smoothing_mm)
-    found = [*jax.tree.leaves(outline), *checks.record().values()]
+        seen = estimates(loop.points, lobes)
+        axis = seen.center if center == "fit" else complex(*(center or (0.0, 0.0)))
+        if not np.isfinite(axis):
+            raise InputError(
+                "`profile.outline_center` must be x and y (mm), because the centre of symmetry "
+                "of this outline cannot be found; give both numbers"
+            )
+        loop = dataclasses.replace(loop, points=loop.points - axis)
+        seen = dataclasses.replace(seen, center=seen.center - axis)
+        outline, checks = _imported(loop, lobes, pitch_radius_mm, smoothing_mm, seen)
+        there = seen.center + axis
+        checks = dataclasses.replace(checks, center_x_mm=there.real, center_y_mm=there.imag)
+    known = (value for name, value in checks.record().items() if name not in _ESTIMATED)
+    found = [*jax.tree.leaves(outline), *known]
     if not all(np.all(np.isfinite(x)) for x in found):
         raise InputError(
             "`profile.outline_file` must hold a smooth outline, but the curve through its points "
@@ -103,15 +128,20 @@ def imported(
     return outline, checks
 
 
-def _imported(loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: float):
+def _imported(
+    loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: float, seen: Estimates
+) -> tuple[Outline, Checks]:
+    """Return (profile, deviations) of a `loop` about the origin.
+
+    `seen`: estimates for messages and for tolerances; for the rest, see `imported`."""
     points, joints = loop.points, loop.joints
     backwards = signed_area(points) < 0
     if backwards:
         points, joints = points[::-1], joints[::-1]
-    _check_lobes(points, lobes, pitch_radius_mm)
+    _check_lobes(loop, lobes, pitch_radius_mm, smoothing_mm, seen)
     turn = np.angle(_moment(points, lobes)) / lobes
     points = points * np.exp(-1j * turn)
-    how = lobes, pitch_radius_mm, smoothing_mm
+    how = lobes, pitch_radius_mm, smoothing_mm, seen
     flanks = [[_flank(points, joints, k, side, *how) for k in range(lobes)] for side in (1, -1)]
     own = flanks[0][0]
     apart = np.array([[_distances(flank, own) for flank in group] for group in flanks])
@@ -122,16 +152,29 @@ def _imported(loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: floa
         raise InputError(
             f"`profile.outline_file` must hold a rotor of {lobes} equal lobes with equal flanks, "
             f"but they differ by up to {worst:.4g} mm (lobes {lobe_off:.4g}, flanks "
-            f"{flank_off:.4g}); only rotors of symmetrical lobes are supported, with the axis at "
-            "the origin"
+            f"{flank_off:.4g}); "
+            + (
+                seen.centering()
+                or (_MANY * seen.scatter > worst and seen.excess)
+                or "only rotors of symmetrical lobes are supported, with the axis at the origin"
+            )
         )
-    outline, star, convexity = _outline(own, lobes, pitch_radius_mm)
+    try:
+        outline, star, convexity = _outline(own, lobes, pitch_radius_mm, smoothing_mm, seen)
+    except InputError as error:
+        if size := seen.sizing(pitch_radius_mm, loop.unit):
+            raise InputError(f"{error}; or {size}") from None
+        raise
     centroid = _moment(points, 1) / signed_area(points)
     checks = Checks(
         points=len(points),
         turned_deg=float(np.degrees(-turn)),
         reversed=bool(backwards),
         axis_offset_um=float(abs(centroid)) / _MM,
+        scatter_um=seen.scatter / _MM,
+        center_x_mm=seen.center.real,
+        center_y_mm=seen.center.imag,
+        center_error_um=seen.center_error / _MM,
         lobe_deviation_um=float(lobe_off) / _MM,
         flank_deviation_um=float(flank_off) / _MM,
         fit_deviation_um=own.off / _MM,
@@ -141,16 +184,21 @@ def _imported(loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: floa
     return outline, checks
 
 
-def _check_lobes(points, lobes, radius):
+def _check_lobes(loop: Loop, lobes: int, radius: float, smoothing: float, seen: Estimates) -> None:
+    """Raise `InputError` unless the `loop` has this number of lobes around the origin.
+
+    `radius`: pitch radius (mm); `smoothing`: RMS scatter (mm) to be removed; `seen`: estimates."""
+    points = loop.points if signed_area(loop.points) > 0 else loop.points[::-1]
+    size, there = seen.sizing(radius, loop.unit), seen.centering()
     away = InputError(
         "`profile.outline_file` must hold an outline around the rotor's axis, the origin, but "
-        "it does not go round the origin once; move the outline there"
+        f"it does not go round the origin once; {there or 'move the outline there'}"
     )
     least, most = np.min(np.abs(points)), np.max(np.abs(points))
     if not radius / _FAR < most < radius * _FAR:
         raise InputError(
             f"`profile.pitch_radius_mm` = {radius:g} must fit the outline, but the outline's "
-            f"greatest radius is {most:.5g} mm; correct the key or the file's units"
+            f"greatest radius is {most:.5g} mm; {size or 'correct the key or the unit of the file'}"
         )
     if not least > most / _FAR**2:
         raise away
@@ -160,19 +208,25 @@ def _check_lobes(points, lobes, radius):
     # Noise may turn back a little. Measure how far the angle falls behind its maximum so far.
     angle = np.cumsum(around)
     back = np.max(np.maximum.accumulate(angle) - angle)
-    if back > _FOLD:
+    wander = _WANDER * seen.scatter if smoothing > 0 and seen.scatter < _OFF * radius else 0.0
+    if back > _FOLD + wander / least:
+        remedy = (
+            seen.remedy(smoothing) if seen.rough(smoothing) else "other rotors are not supported"
+        )
         raise InputError(
             "`profile.outline_file` must hold an outline that does not fold back, seen from the "
-            f"axis, but it does, by {np.degrees(back):.3g} deg; other rotors are not supported"
+            f"axis, but it does, by {np.degrees(back):.3g} deg; {there or remedy}"
         )
-    inside = np.abs(points) < radius
+    # Near the pitch circle, scattered points may cross it several times.
+    inside = (np.abs(points) < radius)[np.abs(np.abs(points) - radius) >= wander]
     crossings = int(np.sum(inside != np.roll(inside, 1)))
     if crossings != 2 * lobes:
+        remedy = size or there or (seen.rough(smoothing) and seen.remedy(smoothing))
         raise InputError(
             f"`profile.lobes` = {lobes} and `profile.pitch_radius_mm` = {radius:g} must fit the "
             f"outline: it crosses the pitch circle {crossings} times, and {lobes} lobes do so "
-            f"{2 * lobes} times (its radii: {np.min(np.abs(points)):.5g} to "
-            f"{np.max(np.abs(points)):.5g} mm); correct the wrong key, or the file's units"
+            f"{2 * lobes} times (its radii: {least:.5g} to {most:.5g} mm); "
+            f"{remedy or 'correct the wrong key'}"
         )
 
 
@@ -186,13 +240,13 @@ def _moment(points, order):
     return np.sum(np.conj(z) * z**order * step[:, None] * weights / 2) / 2j
 
 
-def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
+def _flank(points, joints, lobe, side, lobes, radius, smoothing, seen) -> _Flank:
     """Return the leading (`side` = 1) or trailing (-1) flank of the lobe with index `lobe`.
 
     `points`, `joints`: points (mm) of the outline and mask of the joints; `lobes`: number of lobes;
-    `radius`: pitch radius (mm); `smoothing`: RMS scatter (mm). The curve is also fitted to points
-    beyond tip and root, which belong to neighbouring flanks. Raises `InputError` if the points do
-    not include the tip, the root and the pitch crossing."""
+    `radius`: pitch radius (mm); `smoothing`: RMS scatter (mm); `seen`: estimates for messages. The
+    curve is also fitted to points beyond tip and root, which belong to neighbouring flanks. Raises
+    `InputError` if the points do not include the tip, the root and the pitch crossing."""
     local = points * np.exp(-2j * np.pi * lobe / lobes)
     if side < 0:
         local, joints = np.conj(local)[::-1], joints[::-1]
@@ -204,7 +258,7 @@ def _flank(points, joints, lobe, side, lobes, radius, smoothing) -> _Flank:
     kept = np.flatnonzero((angle > -_BEYOND * half) & (angle < (1 + _BEYOND) * half))
     part = slice(kept[0], kept[-1] + 1) if len(kept) else slice(0)
     local, joints, angle = local[part], joints[part], angle[part]
-    curve = through(local, joints, radius, smoothing)
+    curve = through(local, joints, radius, smoothing, seen)
     low, high = curve.ends[[0, -1]]
     scan = np.linspace(low, high, 4 * len(local))
     z = curve(scan)[0]
@@ -286,10 +340,13 @@ def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray[np.
     return found
 
 
-def _outline(flank: _Flank, lobes: int, radius: float) -> tuple[Outline, float, float]:
+def _outline(
+    flank: _Flank, lobes: int, radius: float, smoothing: float, seen: Estimates
+) -> tuple[Outline, float, float]:
     """Return (profile, star margin in mm, convexity margin in mm) of a rotor with this `flank`.
 
-    `radius`: pitch radius (mm). The margins are defined in `Checks`. Raises `InputError` if the
+    `radius`: pitch radius (mm); `smoothing`: RMS scatter (mm) that the flank's curve leaves;
+    `seen`: estimates for messages. The margins are defined in `Checks`. Raises `InputError` if the
     addendum is not convex or the flank folds back."""
     upper = _stretch(flank, flank.tip, flank.pitch)
     lower = _stretch(flank, flank.pitch, flank.root)
@@ -307,7 +364,7 @@ def _outline(flank: _Flank, lobes: int, radius: float) -> tuple[Outline, float, 
         raise InputError(
             "`profile.outline_file` must have a convex addendum, but its curvature is not positive "
             f"at radius {abs(place):.5g} mm ({np.degrees(np.angle(place)):.3g} deg from the tip); "
-            "if the points are measured, raise `profile.outline_smoothing_mm` to their scatter"
+            f"{seen.remedy(smoothing)}"
         )
     scale = nu[-1] / (flank.root - flank.pitch)
     f, g, h, q = turning[NODES:], speed[NODES:], height[NODES:], lever[NODES:]
@@ -325,8 +382,8 @@ def _outline(flank: _Flank, lobes: int, radius: float) -> tuple[Outline, float, 
     if star < -_FOLD * radius:
         raise InputError(
             "`profile.outline_file` must hold an outline that does not fold back, seen from the "
-            f"axis, but a tangent passes it on the other side by {-star:.4g} mm; if the points are "
-            "measured, raise `profile.outline_smoothing_mm` to their scatter"
+            f"axis, but a tangent passes it on the other side by {-star:.4g} mm; "
+            f"{seen.remedy(smoothing)}"
         )
     area, moment = _integrals(flank, lobes)
     outline = Outline(

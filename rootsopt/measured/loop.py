@@ -11,11 +11,13 @@ class Loop:
     """The points of a closed outline in order; the first point is not repeated at the end.
 
     `points` (n,): points (mm) as x + iy; `joints` (n,): mask of the points at the ends of arcs and
-    splines, where curvature may jump. The readers also use this class for open chains of points.
+    splines, where curvature may jump; `unit`: length (mm) of the file's unit. The readers also use
+    this class for open chains of points.
     """
 
     points: Complex128[np.ndarray, " n"]
     joints: Bool[np.ndarray, " n"]
+    unit: float = 1.0
 
 
 def signed_area(points: Complex128[np.ndarray, " n"]) -> float:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rootsopt.errors import InputError
+from rootsopt.measured.estimates import UNITS, unit_of_size
 from rootsopt.measured.guard import short
 from rootsopt.measured.loop import Loop, signed_area
 from rootsopt.measured.table import from_csv
@@ -35,7 +36,7 @@ _NOT_FILES = (
 )
 
 
-def read(path: Path) -> Loop:
+def read(path: Path, unit: str | None = None, pitch_radius_mm: float | None = None) -> Loop:
     """Return the outline in the CSV (.csv, .txt) or DXF file `path` as a closed loop (mm).
 
     CSV: x and y in mm, separated by commas, semicolons, tabs or blanks, with or without a header.
@@ -46,6 +47,9 @@ def read(path: Path) -> Loop:
     entities drawn directly are used, and otherwise those in blocks. Lengths are in the unit that
     the file states, or in mm if it states none. The ends of a LINE and the corners of a polyline
     are read as points on a smooth curve, not as corners of the outline.
+
+    `unit`: name (from `UNITS`) of the unit of the file's numbers, instead of these rules.
+    `pitch_radius_mm`: pitch radius, by which a message may name the right unit.
 
     Raises `InputError` if the file cannot be read or contains no closed outline.
     """
@@ -59,8 +63,11 @@ def read(path: Path) -> Loop:
     if kind == ".dxf":
         from rootsopt.measured.dxf import from_dxf  # Imported for drawings only: it takes 0.25 s.
 
-        return _closed(from_dxf(data, name), name)
-    return _closed(from_csv(data, name), name)
+        return _closed(from_dxf(data, name, unit), name, unit, pitch_radius_mm)
+    loop = from_csv(data, name)
+    if unit is not None:
+        loop = Loop(loop.points * UNITS[unit], loop.joints, UNITS[unit])
+    return _closed(loop, name, unit, pitch_radius_mm)
 
 
 def _bytes(path: Path, name: str) -> bytes:
@@ -99,8 +106,10 @@ def _bytes(path: Path, name: str) -> bytes:
     return data
 
 
-def _closed(loop: Loop, name: str) -> Loop:
-    """Return the loop without repeated points. `name`: name of the file in messages.
+def _closed(loop: Loop, name: str, unit: str | None, pitch_radius_mm: float | None) -> Loop:
+    """Return the loop without repeated points.
+
+    `name`: name of the file in messages; `unit`, `pitch_radius_mm`: as in `read`.
 
     Raises `InputError` if the loop is open, or if its size or number of points is out of range."""
     points = loop.points
@@ -121,7 +130,8 @@ def _closed(loop: Loop, name: str) -> Loop:
         raise InputError(
             f"{name}: must hold an outline of {low:g} to {high:g} mm, but "
             + ("all its points are in one place" if size == 0 else f"it measures {size:.4g} mm")
-            + "; check its units (CSV: mm; DXF: $INSUNITS)"
+            + "; "
+            + (_unit(points, unit, pitch_radius_mm) or "check its units (CSV: mm; DXF: $INSUNITS)")
         )
     steps = np.abs(np.diff(points))
     gap = abs(points[-1] - points[0])
@@ -135,4 +145,17 @@ def _closed(loop: Loop, name: str) -> Loop:
     owner = np.searchsorted(kept, np.flatnonzero(loop.joints)) % len(kept)
     joints = np.zeros(len(kept), bool)
     joints[owner] = True
-    return Loop(points[kept], joints)
+    return Loop(points[kept], joints, loop.unit)
+
+
+def _unit(points, unit: str | None, pitch_radius_mm: float | None) -> str | None:
+    """Return advice on the unit in which the `points` would fit the pitch radius, or `None`.
+
+    `unit`, `pitch_radius_mm`: as in `read`."""
+    with np.errstate(all="ignore"):
+        radius = np.abs(points - np.mean(points))
+        middle = float(np.max(radius) + np.min(radius)) / 2
+    fitting = None if pitch_radius_mm is None else unit_of_size(middle, pitch_radius_mm)
+    if unit is not None or fitting is None:
+        return None
+    return f"in {fitting} it would fit the pitch radius: set `profile.outline_unit` = {fitting}"

@@ -22,11 +22,15 @@ def record(config: Config) -> dict[str, Any]:
 
 
 def say(config: Config, out: "Console") -> None:
-    """Print a note to `out` if the flanks of an imported outline differ by 1 µm or more."""
+    """Print notes to `out` on an imported outline.
+
+    They say whether its flanks differ by 1 µm or more, whether its points scatter, and whether its
+    centre is not the rotor's axis."""
     if not config.profile.from_file:
         return
-    from rootsopt.measured.source import note, outline_of
+    from rootsopt.measured.source import advice, note, outline_of
 
-    message = note(outline_of(config.profile)[1])
-    if message:
-        out.print(message, soft_wrap=True)
+    checks = outline_of(config.profile)[1]
+    for message in (note(checks), *advice(config.profile, checks)):
+        if message:
+            out.print(message, soft_wrap=True, markup=False, highlight=False)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rootsopt.measured.checks import Checks
+from rootsopt.measured.estimates import Estimates, written
 from rootsopt.measured.fit import imported
 from rootsopt.measured.reading import read
 from rootsopt.profiles.outline import Outline
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
 
 _NOTABLE = 1.0
 """Deviation between flanks (µm) at or above which the user gets a note."""
+_ROUGH = 0.5
+"""Scatter (µm) of points that are not smoothed above which the user gets a note."""
 
 
 def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
@@ -28,13 +31,39 @@ def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
     except (OSError, ValueError):
         stamp = ()  # `read` reports what is wrong.
     smoothing = config.outline_smoothing_mm or 0.0
-    return _kept(path, stamp, config.lobes, config.pitch_radius_mm, smoothing)
+    place = config.outline_unit, config.outline_center
+    return _kept(path, stamp, config.lobes, config.pitch_radius_mm, smoothing, place)
 
 
 @functools.lru_cache(maxsize=16)
-def _kept(path: Path, stamp: tuple[int, ...], lobes: int, radius: float, smoothing: float):
+def _kept(path: Path, stamp, lobes: int, radius: float, smoothing: float, place):
     del stamp
-    return imported(read(path), lobes, radius, smoothing)
+    unit, center = place
+    return imported(read(path, unit, radius), lobes, radius, smoothing, center)
+
+
+def advice(config: "ProfileConfig", checks: Checks) -> list[str]:
+    """Return notes for the user on scatter and centre of a file's points, if the config ignores
+    them.
+
+    `config`: the profile's config; `checks`: those of its outline."""
+    found = []
+    center = complex(checks.center_x_mm, checks.center_y_mm)
+    given = config.outline_center
+    axis = center if given == "fit" else complex(*(given or (0.0, 0.0)))
+    error, scatter = checks.center_error_um, checks.scatter_um
+    if given == "fit":
+        found.append(
+            f"outline: the axis is the fitted centre of symmetry, {written(center)} mm in the "
+            f"file, to about {max(error, 1e-3):.1g} um"
+        )
+    seen = Estimates(scatter * 1e-3, center - axis, error * 1e-3, config.pitch_radius_mm)
+    if seen.centering():
+        found.append(f"outline: {seen.centering()}")
+    smoothing = config.outline_smoothing_mm or 0.0
+    if seen.rough(smoothing) and scatter > _ROUGH:
+        found.append(f"outline: {seen.remedy(smoothing)}")
+    return found
 
 
 def note(checks: Checks) -> str | None:

@@ -96,7 +96,7 @@ def explain(problem: Problem, starts: Sequence[NDArray[np.float64]]) -> Infeasib
         sense = "<=" if one.ceiling else ">="
         limit = float(one.limit) / one.factor
         conflicts.append(Conflict(one.name, sense, limit, one.unit, reached, alone))
-    names = problem.baseline.design
+    names = problem.config.design_keys
     design = dict(zip(names, map(float, problem.design(best.point)), strict=True))
     return Infeasible(best.local.objective, tuple(conflicts), design)
 

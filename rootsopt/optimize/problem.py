@@ -68,9 +68,9 @@ _slacks_of = Program(Space.slacks_of)
 class Problem:
     """The design problem of a config, relative to its evaluated baseline.
 
-    `config`: the config; `baseline`: evaluation of the config's own design; `space`: unit box of
-    the d design parameters, with m constraints. In all methods, a *point* (d,) is a point of this
-    box."""
+    `config`: the config; `baseline`: evaluation of the config's own design, or of the outline that
+    the search is to improve; `space`: unit box of the d design parameters, with m constraints. In
+    all methods, a *point* (d,) is a point of this box."""
 
     config: Config
     baseline: Evaluation
@@ -343,8 +343,7 @@ class Problem:
         for k, c in enumerate(self.space.constraints):
             limit = float(c.limit) / c.factor
             if c.margin:
-                slacks = (self._slacks(one)[k] for one in (self.baseline, optimized))
-                before, after = (limit + c.sign * slack * c.scale / c.factor for slack in slacks)
+                before, after = (self._margin(one, k) for one in (self.baseline, optimized))
             else:
                 before = self.baseline.geometry[keys[c.quantity]]
                 after = optimized.geometry[keys[c.quantity]]
@@ -359,13 +358,24 @@ class Problem:
             rows.append(row)
         return rows + self._range_rows(optimized, certificate)
 
+    def _margin(self, evaluation: Evaluation, k: int) -> float:
+        """Return the value that constraint `k` limits, in its unit, for an evaluated design.
+
+        Return NaN for a rotor from a file, which has no design parameters."""
+        if not evaluation.design:
+            return math.nan
+        one = self.space.constraints[k]
+        slack = float(self._slacks(evaluation)[k])
+        return (float(one.limit) + one.sign * slack * one.scale) / one.factor
+
     def _always(self, optimized: Evaluation) -> NDArray[np.bool_]:
         """Return a mask (m,) of the constraints that every design meets with equality.
 
-        Their slack is 0 at the baseline and at the optimum, and does not depend on the design."""
+        Their slack is 0 at the config's own design and at the optimum, and does not depend on the
+        design."""
         found = np.ones(len(self.space.constraints), bool)
-        for one in (self.baseline, optimized):
-            _, _, slack, normals = self.look(self.point(list(one.design.values())))
+        for design in (self.config.design, list(optimized.design.values())):
+            _, _, slack, normals = self.look(self.point(design))
             found &= (np.abs(slack) < _SAME) & (np.linalg.norm(normals, axis=1) < _SAME)
         return found
 
@@ -402,7 +412,7 @@ class Problem:
         rows = []
         for key, (least, most) in ranges.items():
             place = names.index(key)
-            before, after, limit = self.baseline.design[key], optimized.design[key], float(most)
+            before, after, limit = self.baseline.design.get(key), optimized.design[key], float(most)
             row = _row(words(key), before, after, limit, unit_of(key), limit - after, "<=")
             limited[key] = limit <= high[place]
             low[place], high[place] = max(low[place], float(least)), min(high[place], limit)
@@ -423,7 +433,7 @@ class Problem:
                 if multiplier <= _HELD or (side == "upper" and limited[key]):
                     continue
                 slack = (design[place] - limit) / width * (1 if sense == ">=" else -1)
-                before, after = self.baseline.design[key], float(design[place])
+                before, after = self.baseline.design.get(key), float(design[place])
                 name, unit = f"{side} bound of {words(key)}", unit_of(key)
                 row = _row(name, before, after, float(limit), unit, slack, sense)
                 rows.append(row | self._multiplier(row, multiplier / width, optimized))

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
+from rootsopt.errors import InputError
 from rootsopt.optimize.certificate import Certificate
 from rootsopt.optimize.checkpoint import Checkpoint
 from rootsopt.optimize.local import Local
@@ -367,7 +368,14 @@ def search_of(
 ) -> Search | TolerantSearch:
     """Return the search that a `config` needs: with `tolerances`, a `TolerantSearch`.
 
-    Arguments: see `Search`."""
+    Arguments: see `Search`.
+
+    Raises `InputError` for `tolerances` with a profile from a file: it has no design to move."""
+    if config.tolerances is not None and config.profile.family == "outline":
+        raise InputError(
+            "`tolerances` must be absent for `profile.family` outline; optimise it without them, "
+            "then optimise the `optimized.yaml` of that run with `tolerances`"
+        )
     kind = Search if config.tolerances is None else TolerantSearch
     return kind(config, progress, stop, checkpoint)
 

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
+from rootsopt.optimize.beginning import Beginning, beginning
 from rootsopt.optimize.certificate import Certificate, certify
 from rootsopt.optimize.checkpoint import Checkpoint
 from rootsopt.optimize.infeasible import Infeasible, explain
@@ -114,7 +115,9 @@ class Optimization:
     `optimality`: first-order conditions at the best design, and outcomes of the local searches. It
     is `None` without a verified design, or if the objective is an average over an ensemble.
     `infeasible`: why no design satisfies all constraints, `None` if a design does. `robustness`:
-    the nominal optimum and the comparison with it, if scene or design scatter (`tolerances`)."""
+    the nominal optimum and the comparison with it, if scene or design scatter (`tolerances`).
+    `beginning`: the fitted design that began the search; `None` unless the baseline's profile is
+    from a file."""
 
     problem: Problem | None
     baseline: Evaluation
@@ -125,6 +128,7 @@ class Optimization:
     optimality: Optimality | None = None
     infeasible: Infeasible | None = None
     robustness: "Robustness | None" = None
+    beginning: Beginning | None = None
 
     @property
     def status(self) -> Status:
@@ -193,6 +197,15 @@ class Search:
         stop: threading.Event | None = None,
         checkpoint: Checkpoint | None = None,
     ):
+        self.beginning = beginning(config)
+        self.given = config
+        if self.beginning is not None:
+            config = self.beginning.config
+            if config.objective.motion == "ensemble":
+                raise InputError(
+                    "`objective.motion` must not be ensemble for a rotor from a file, because it "
+                    "has no design parameters; choose another motion"
+                )
         if not FAMILY_KEYS[config.profile.family]:
             valid = ", ".join(family for family, keys in FAMILY_KEYS.items() if keys)
             raise InputError(
@@ -221,13 +234,23 @@ class Search:
     def run(self) -> Optimization:
         """Evaluate the baseline, screen designs, run the local searches and verify the best design.
 
+        If the baseline's profile is from a file, also evaluate the fitted design that begins the
+        search.
+
         Return the outcome. If `stop` is set, the outcome is the best design so far. It is then
         verified unless the objective is an average over an ensemble.
 
         Raises `InputError` if the objective is not defined for the baseline."""
+        return dataclasses.replace(self._run(), beginning=self.beginning)
+
+    def _run(self) -> Optimization:
         exact = self.exact.prepare(design_vector(self.config))
         Space.of(self.config, exact.scene, 0.0).prepare()
-        exact, baseline = exact.fit()
+        exact, first = exact.fit()
+        baseline = first
+        if self.beginning is not None:
+            self.beginning = dataclasses.replace(self.beginning, evaluation=first)
+            baseline = evaluator_for(self.given)()
         if not baseline.usable:
             return Optimization(None, baseline, None, [], {}, self.stop.is_set())
         # Forces of coexisting motions are compared relative to the baseline's.
@@ -241,8 +264,8 @@ class Search:
         self.sharp = self.exact.surveying()
         self._baseline = baseline
         if self.problem.cornered and self.method == "slsqp":
-            self._warm(baseline)
-        start = self.problem.point(list(baseline.design.values()))
+            self._warm(first)
+        start = self.problem.point(list(first.design.values()))
         points = self._feasible(start)
         if not points:
             reason = explain(self.problem, self._sample[:_EXPLAINED])
@@ -294,6 +317,9 @@ class Search:
         during the search."""
         if self._baseline is None:
             return None
+        return dataclasses.replace(self._so_far(self._baseline), beginning=self.beginning)
+
+    def _so_far(self, baseline: Evaluation) -> Optimization:
         trials = self._in_order()
         rows = _history(trials)
         better = [
@@ -309,13 +335,13 @@ class Search:
             best = noise.most_promising(self.problem, trials)
         verification: dict[str, Any] = {"holds_up": None, "rejected": []}
         if best is None:
-            return Optimization(self.problem, self._baseline, None, rows, verification, True)
+            return Optimization(self.problem, baseline, None, rows, verification, True)
         verification |= {
             "searched_objective": best.objective,
             "verified_objective": None,
             "status": best.evaluation.status.label,
         }
-        return Optimization(self.problem, self._baseline, best.evaluation, rows, verification, True)
+        return Optimization(self.problem, baseline, best.evaluation, rows, verification, True)
 
     def _in_order(self) -> list[Trial]:
         """Return all trials so far: those of the screening, then those of each local search."""
@@ -571,7 +597,7 @@ class Search:
     def _named(self, point) -> dict[str, float]:
         """Return the design at a `point` (d,), in config units by key."""
         values = map(float, self.problem.design(point))
-        return dict(zip(self.problem.baseline.design, values, strict=True))
+        return dict(zip(self.problem.config.design_keys, values, strict=True))
 
 
 def sensitivity_rows(
@@ -607,11 +633,8 @@ def method_of(config: Config) -> str:
     Raises `InputError` if the search needs exact gradients but there are none: the objective is an
     average over an ensemble, or the contact is not smooth."""
     method, noisy = config.optimizer.method, config.objective.motion == "ensemble"
-    if config.solver.fidelity == "nodes" and not noisy:
-        raise InputError(
-            "`solver.fidelity` must be search, map, linear or auto for an optimisation, but is "
-            "nodes: polylines give forces without a gradient"
-        )
+    if not noisy:
+        check_gradient(config)
     if method == "auto":
         return "adam" if noisy else "slsqp"
     if method == "slsqp" and noisy:
@@ -620,6 +643,15 @@ def method_of(config: Config) -> str:
             "is slsqp: gradients of averages have noise; set it to auto"
         )
     return method
+
+
+def check_gradient(config: Config) -> None:
+    """Raise `InputError` if the contact of `config` gives forces without a gradient."""
+    if config.solver.fidelity == "nodes":
+        raise InputError(
+            "`solver.fidelity` must be search, map, linear or auto for an optimisation, but is "
+            "nodes: polylines give forces without a gradient"
+        )
 
 
 def until_stopped(work: Callable[[], T], stop: threading.Event, patience: float) -> T | None:

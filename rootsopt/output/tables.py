@@ -354,15 +354,27 @@ def _notes(record: Mapping[str, Any]) -> list[str]:
     return [*notes, f"dropped: {dropped}"] if dropped else notes
 
 
-def likeness_table(rows: list[dict[str, Any]]) -> RenderableType:
-    """Return a table of the classical designs that are nearest to the optimised profile.
+def likeness_table(
+    rows: list[dict[str, Any]], title: str = "The optimised profile resembles"
+) -> RenderableType:
+    """Return a table of the designs of several families that are nearest to a profile.
 
     `rows`: one per profile family, as in the entry `resembles` of the result file."""
-    table = _table("The optimised profile resembles", "largest distance, um", "nearest member")
+    distances = "largest distance, um", "RMS distance, um"
+    table = _table(title, *distances, "nearest member")
     for row in rows:
         design = ", ".join(f"{key} {_number(value)}" for key, value in row["design"].items())
-        table.add_row(row["family"], _number(row["departure_um"]), design)
+        away = _number(row["departure_um"]), _number(row["departure_rms_um"])
+        table.add_row(row["family"], *away, design)
     return table
+
+
+def beginning_table(record: Mapping[str, Any]) -> RenderableType:
+    """Return a table of the fitted profiles from which a search could begin, and where it began.
+
+    `record`: entry `beginning` of the result file."""
+    table = likeness_table(record["considered"], "Nearest to the outline of the baseline")
+    return Group(table, Text(record["message"]))
 
 
 def _table(title: str, *columns: str) -> Table:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from rootsopt.config import Config
 from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.errors import InputError
+from rootsopt.optimize.search import check_gradient
 from rootsopt.response.evaluation import RESPONSES
 from rootsopt.response.terms import needs_forces, terms_of
 from rootsopt.scene import Scene
@@ -67,7 +68,8 @@ def aims_of(config: Config) -> tuple[Aim, ...]:
 def simulated(config: Config, scene: Scene) -> bool:
     """Return whether a term of `config.pareto` depends on forces.
 
-    Raises `InputError` if so and the forces are not those of one motion at one speed."""
+    Raises `InputError` if so and the forces have no gradient, or are not those of one motion at one
+    speed in one scene."""
     names = config.pareto.terms
     design = jnp.asarray(config.design)
     forced = [
@@ -88,6 +90,12 @@ def simulated(config: Config, scene: Scene) -> bool:
             f"but is {[*config.objective.speeds_rpm]}: a front is that of one speed; set it to [] "
             "and `scene.speed_rpm` to that speed"
         )
+    if config.tolerances is not None:
+        raise InputError(
+            f"`tolerances` must be absent for `pareto.terms` with forces ({forced[0]}): a front is "
+            "that of the nominal scene; remove them"
+        )
+    check_gradient(config)
     return True
 
 

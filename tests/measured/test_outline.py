@@ -20,7 +20,6 @@ from rootsopt.measured.curves import _jumps
 from rootsopt.measured.fit import imported
 from rootsopt.measured.reading import Loop, read, signed_area
 from rootsopt.measured.source import note, outline_of
-from rootsopt.optimize.search import Search
 from rootsopt.profiles import CIC, EE, geometry, outline
 from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.scene.families import free_form_of
@@ -286,8 +285,8 @@ def test_config_keys(tmp_path):
         check_geometry(load(tmp_path / "scene.yaml", ["profile.outline_file=none.csv"]))
     with pytest.raises(InputError, match=r"must not be read from a file for a projection"):
         free_form_of(config.profile, 12)
-    with pytest.raises(InputError, match=r"to be optimised, but is outline"):
-        Search(config)
+    with pytest.raises(InputError, match=r"`optimizer.family` must be one of"):
+        load(tmp_path / "scene.yaml", ["optimizer.family=ee"])
 
 
 def test_profile_command_reads_its_own_files(tmp_path):

@@ -1,0 +1,195 @@
+"""Estimates of scatter, centre and unit from the points of a file, and what messages make of them.
+
+The files are made from known rotors with known errors, so that the estimates can be compared."""
+
+import functools
+import re
+
+import ezdxf
+import numpy as np
+import pytest
+from ezdxf import units
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rootsopt.config import parse
+from rootsopt.errors import InputError
+from rootsopt.measured.estimates import center, estimates, scatter, unit_of_size
+from rootsopt.measured.source import advice, outline_of
+from rootsopt.profiles import CIC, EE, outline
+
+R = 0.033
+CONFIG = """
+profile: {{family: outline, lobes: 3, pitch_radius_mm: 33.0, outline_file: "{}"{}}}
+rotor: {{length_mm: 100.0, density_kg_m3: 7800.0}}
+contact: {{stiffness_N_per_mm_e: 2.0e5, exponent: 2.2, max_damping_N_s_per_mm: 0.25,
+  full_damping_depth_mm: 0.01}}
+scene: {{speed_rpm: 3000.0, load: {{torque_N_m: 4.775}}}}
+"""
+
+
+@functools.cache
+def rotor(name="cic", count=240):
+    """Points of a rotor (mm), the first not repeated."""
+    profile = CIC(3, R, np.deg2rad(36.43), 8.5e-3, np.deg2rad(4.0)) if name == "cic" else EE(3, R)
+    return np.asarray(outline(profile, count))[:-1] @ [1, 1j] * 1e3
+
+
+def scattered(points, size, seed=0):
+    """Points with normal scatter of standard deviation `size` (mm) in x and in y."""
+    chance = np.random.default_rng(seed)
+    return points + size * (chance.normal(size=(len(points), 2)) @ [1, 1j])
+
+
+def write(path, points):
+    np.savetxt(path, np.stack([points.real, points.imag], axis=1), fmt="%.10g", delimiter=",")
+    return path
+
+
+def read(path, **keys):
+    """Config, profile and checks of an outline file, with further `keys` of the profile."""
+    more = "".join(f", outline_{key}: {value}" for key, value in keys.items())
+    config = parse(CONFIG.format(path, more)).profile
+    return config, *outline_of(config)
+
+
+@pytest.mark.parametrize("name", ["cic", "ee"])
+@pytest.mark.parametrize("size", [0.0, 1e-3, 5e-3, 20e-3])
+def test_scatter_and_centre_are_those_put_in(name, size):
+    """Scatter to 15 %, centre to four times the scatter over √n, of shifted and turned points."""
+    points = scattered(rotor(name) * np.exp(0.4j), size) + (12 - 7j)
+    found = estimates(points, 3)
+    if size:
+        assert found.scatter == pytest.approx(size, rel=0.15)
+    else:
+        assert found.scatter < 1e-6
+    off = found.center - (12 - 7j)
+    assert max(abs(off.real), abs(off.imag)) < 4 * size / np.sqrt(len(points)) + 1e-6
+    assert found.off_center
+    assert found.middle == pytest.approx(33, abs=5 * size + 1e-6)
+
+
+def test_standard_error_of_the_centre_is_that_of_repetitions():
+    points = rotor()[::3]
+    found = [center(scattered(points, 5e-3, seed), 3) for seed in range(60)]
+    places = np.array([place for place, _ in found])
+    spread = np.sqrt((np.var(places.real) + np.var(places.imag)) / 2)
+    assert np.mean([error for _, error in found]) == pytest.approx(spread, rel=0.25)
+
+
+@pytest.mark.parametrize("size", [5e-3, 20e-3])
+def test_scatter_of_points_closer_than_they_scatter(size):
+    """Points a few micrometres apart: their order along the outline is lost."""
+    t = np.linspace(0, 2 * np.pi, 60_000, endpoint=False)
+    dense = (33 + 10 * np.cos(3 * t)) * np.exp(1j * t)
+    assert scatter(scattered(dense, size)) == pytest.approx(size, rel=0.15)
+
+
+def test_few_points_have_no_known_scatter():
+    """20 points a flank: what a polynomial misses is no scatter."""
+    found = estimates(rotor()[::24], 3)
+    assert np.isnan(found.scatter)
+    assert "too few" in found.remedy(0.0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    turn=st.floats(-3.1, 3.1),
+    start=st.integers(0, 2891),
+    backwards=st.booleans(),
+    shift=st.complex_numbers(max_magnitude=100, allow_nan=False),
+)
+def test_estimates_do_not_depend_on_how_the_points_are_given(turn, start, backwards, shift):
+    """Turned, moved, in the other direction and from another first point."""
+    points = scattered(rotor(), 5e-3)
+    moved = np.roll(points, start)[:: -1 if backwards else 1] * np.exp(1j * turn) + shift
+    one, other = estimates(points, 3), estimates(moved, 3)
+    assert other.scatter == pytest.approx(one.scatter, rel=1e-6)
+    assert abs(other.center - (one.center * np.exp(1j * turn) + shift)) < 1e-7
+    assert other.center_error == pytest.approx(one.center_error, rel=1e-6)
+    assert other.middle == pytest.approx(one.middle, rel=1e-7)
+
+
+def test_fitted_centre_replaces_the_origin(tmp_path, capsys):
+    """The flanks of a shifted file are then equal, and the centre is reported in mm."""
+    path = write(tmp_path / "shifted.csv", rotor() + (0.1 - 0.05j))
+    config, _, checks = read(path)
+    assert checks.lobe_deviation_um > 100
+    (text,) = advice(config, checks)
+    assert "(0.1, -0.05) mm" in text
+    assert "`profile.outline_center` = fit" in text
+    for place in ("fit", "[0.1, -0.05]"):
+        config, profile, checks = read(path, center=place)
+        assert checks.lobe_deviation_um < 1e-3
+        assert checks.axis_offset_um < 1e-3
+        assert complex(checks.center_x_mm, checks.center_y_mm) == pytest.approx(0.1 - 0.05j)
+        assert float(profile.outer_radius) == pytest.approx(np.max(np.abs(rotor())) * 1e-3)
+    assert advice(*read(path, center="fit")[::2])[0].startswith("outline: the axis is the fitted")
+    with pytest.raises(InputError, match=r"centre of symmetry is at \(60, 0\) mm"):
+        read(write(tmp_path / "far.csv", rotor() + 60))
+    for wrong in ("middle", "[1.0]", "[1, x]", "[1, 1e9]"):
+        with pytest.raises(InputError, match=r"must be fit, or x and y"):
+            read(path, center=wrong)
+
+
+@pytest.mark.parametrize(("unit", "size"), [("inch", 25.4), ("m", 1e3), ("cm", 10.0), ("um", 1e-3)])
+def test_units_are_offered_and_not_taken(tmp_path, unit, size):
+    path = write(tmp_path / "points.csv", rotor() / size)
+    with pytest.raises(InputError, match=f"`profile.outline_unit` = {unit}"):
+        read(path)
+    _, profile, checks = read(path, unit=unit)
+    assert float(profile.outer_radius) == pytest.approx(np.max(np.abs(rotor())) * 1e-3, rel=1e-8)
+    assert checks.lobe_deviation_um < 1e-2
+    assert unit_of_size(33 / size, 33.0) == unit
+
+
+def test_unit_of_a_drawing_can_be_replaced(tmp_path):
+    """A drawing in inches that states millimetres; scatter and centre of its polyline."""
+    points = scattered(rotor() + 0.2, 5e-3) / 25.4
+    document = ezdxf.new("R2010", units=units.MM)
+    corners = np.stack([points.real, points.imag], axis=1)
+    document.modelspace().add_lwpolyline(corners, close=True)
+    document.saveas(tmp_path / "points.dxf")
+    with pytest.raises(InputError, match=r"`profile.outline_unit` = inch"):
+        read(tmp_path / "points.dxf")
+    keys = {"unit": "inch", "center": "fit", "smoothing_mm": 0.005}
+    _, _, checks = read(tmp_path / "points.dxf", **keys)
+    assert checks.scatter_um == pytest.approx(5, rel=0.15)
+    assert checks.center_x_mm == pytest.approx(0.2, abs=4 * 5e-3 / np.sqrt(len(points)))
+
+
+def test_a_wrong_pitch_radius_is_told_from_a_wrong_unit(tmp_path):
+    path = write(tmp_path / "points.csv", rotor() * 1.5)
+    with pytest.raises(InputError, match=r"outer and root radius is 49.5 mm"):
+        read(path)
+
+
+@pytest.mark.parametrize("size", [1, 5, 20])
+def test_refused_points_are_said_to_be_scattered(tmp_path, size):
+    """Without smoothing; with too little; and what the message advises is accepted in the end."""
+    path = write(tmp_path / "points.csv", scattered(rotor(), size * 1e-3, seed=2))
+    for keys in ({}, {"smoothing_mm": 0.1e-3 * size}):
+        with pytest.raises(InputError) as refused:
+            read(path, **keys)
+        said = re.search(r"the points are scattered by about ([0-9.]+) um", str(refused.value))
+        assert said is not None
+        assert float(said[1]) == pytest.approx(size, rel=0.15)
+    smoothing = size * 1e-3
+    if size == 20:
+        with pytest.raises(InputError, match=r"raise `profile.outline_smoothing_mm` from 0.02 to"):
+            read(path, smoothing_mm=smoothing)
+        smoothing *= 1.25
+    config, _, checks = read(path, smoothing_mm=smoothing)
+    assert checks.scatter_um == pytest.approx(size, rel=0.15)
+    assert not any("scattered" in text for text in advice(config, checks))
+
+
+def test_points_closer_than_they_scatter_are_to_be_thinned(tmp_path):
+    t = np.linspace(0, len(rotor()), 30_000, endpoint=False)
+    closed = np.append(rotor(), rotor()[0])
+    dense = scattered(np.interp(t, np.arange(len(closed)), closed), 5e-3)
+    path = write(tmp_path / "points.csv", dense)
+    with pytest.raises(InputError, match=r"um apart: keep one in 3"):
+        read(path, smoothing_mm=0.005)
+    path = write(tmp_path / "thin.csv", dense[::3])
+    assert read(path, smoothing_mm=0.006)[2].scatter_um == pytest.approx(5, rel=0.15)

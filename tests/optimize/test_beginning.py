@@ -1,0 +1,142 @@
+"""A rotor from a file as baseline: where the search begins, what it finds, what is said of it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from rootsopt.commands import optimize
+from rootsopt.config import load, parse
+from rootsopt.design.bounds import bounds_of, widened
+from rootsopt.design.resemblance import Likeness
+from rootsopt.errors import InputError
+from rootsopt.optimize import beginning as module
+from rootsopt.optimize.beginning import beginning
+from rootsopt.optimize.search import Search
+from rootsopt.scene import outline_mm
+
+CIC = "configs/cic.yaml"
+BASE = load(CIC)
+
+
+def measured(folder: Path, scatter: float, **optimizer) -> Path:
+    """A config in `folder` whose baseline is the rotor of `CIC`, with `scatter` (mm) of its points,
+    clockwise, turned and from another first point."""
+    points = outline_mm(BASE)[:-1] @ [1, 1j]
+    chance = np.random.default_rng(5)
+    off = chance.normal(size=(len(points), 2)) @ [1, 1j]
+    points = np.roll((points + scatter * off)[::-1] * np.exp(0.3j), 321)
+    table = np.stack([points.real, points.imag], axis=1)
+    np.savetxt(folder / "rotor.csv", table, fmt="%.10g", delimiter=",")
+    data = yaml.safe_load(Path(CIC).read_text())
+    data["profile"] = {"family": "outline", "lobes": 3, "pitch_radius_mm": 33.0}
+    data["profile"]["outline_file"] = "rotor.csv"
+    if scatter:
+        data["profile"]["outline_smoothing_mm"] = scatter
+    data["optimizer"] |= optimizer
+    path = folder / "measured.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+def test_fit_finds_the_design_that_was_drawn(tmp_path):
+    """Five micrometres of scatter leave the parameters within 2 %, and a small departure."""
+    config = load(measured(tmp_path, 5e-3, family="cic"))
+    found = beginning(config)
+    assert found is not None
+    assert found.config.profile.family == "cic"
+    for key, value in BASE.profile.parameters.items():
+        assert getattr(found.config.profile, key) == pytest.approx(value, rel=0.02)
+    assert found.likeness.rms < 3e-6 < found.likeness.departure * 3 < 30e-6
+    assert "rotor.csv as it is" in found.message
+    assert f"{found.likeness.departure * 1e6:.3g} um" in found.message
+    assert found.record()["departure_rms_um"] == found.likeness.rms * 1e6
+    assert found.widened == ()
+
+
+def test_a_config_without_a_file_has_no_beginning():
+    assert beginning(BASE) is None
+    with pytest.raises(InputError, match=r"`optimizer.family` must be cic"):
+        load(CIC, ["optimizer.family=arc"])
+    assert load(CIC, ["optimizer.family=cic"]).optimizer.family == "cic"
+    with pytest.raises(InputError, match="nearest"):
+        load(CIC, ["optimizer.family=ee"])
+
+
+def test_the_nearest_family_begins(tmp_path, monkeypatch):
+    config = load(measured(tmp_path, 0.0))
+    away = {"arc": 3e-5, "cic": 1e-6, "ellipse": 2e-6}
+
+    def fitted(given, name):
+        del given
+        return Likeness(name, {"arc_center_mm": 29.0}, away[name], 0.0) if name != "cic" else None
+
+    monkeypatch.setattr(module, "classical", lambda: ("ee", "arc", "cic"))
+    monkeypatch.setattr(module, "likeness", fitted)
+    found = beginning(config)
+    assert found is not None
+    assert found.likeness.family == "arc"
+    assert "optimizer.family=free_form" in found.message
+    with pytest.raises(InputError, match=r"`optimizer.family` must be a family with a sound"):
+        beginning(load(tmp_path / "measured.yaml", ["optimizer.family=cic"]))
+
+
+def test_an_ensemble_is_refused(tmp_path, monkeypatch):
+    config = load(measured(tmp_path, 0.0), ["objective.motion=ensemble"])
+    given = module.Beginning(BASE.model_copy(update={"objective": config.objective}),
+                             Likeness("cic", {}, 0.0, 0.0), [], (), "rotor.csv")  # fmt: skip
+    monkeypatch.setattr("rootsopt.optimize.search.beginning", lambda config: given)
+    with pytest.raises(InputError, match=r"`objective.motion` must not be ensemble"):
+        Search(config)
+
+
+def test_default_bounds_are_widened_and_given_ones_are_kept():
+    text = Path(CIC).read_text().replace("36.43", "21.0").replace("9.00 ", "2.0 ")
+    config = parse(text)
+    other, keys = widened(config)
+    assert keys == ("pressure_angle_deg",)
+    assert bounds_of(other)[0] == (19.0, 45.0)
+    assert bounds_of(other)[1:] == bounds_of(config)[1:]
+    given = parse(text, ["optimizer.bounds.pressure_angle_deg=[22,45]"])
+    assert widened(given) == (given, ())
+    assert widened(BASE) == (BASE, ())
+
+
+@pytest.mark.long
+def test_a_measured_rotor_leads_to_the_optimum_of_its_family(tmp_path, capsys):
+    """The optimum of the noisy file is that of the family, for the same weights per newton."""
+    path = measured(tmp_path, 1e-3, family="cic")
+    out = tmp_path / "out"
+    assert optimize.main([str(path), "-o", str(out), "--no-figures"]) == 0
+    said = capsys.readouterr().out
+    result = json.loads((out / "result.json").read_text())
+    assert "rotor.csv as it is" in said
+    assert result["beginning"]["message"] in " ".join(said.split())
+    assert result["baseline"]["design"] == {}
+    assert result["optimality"]["residual"] < 1e-4
+    before, after = (result[name]["response"] for name in ("baseline", "optimized"))
+    expected = 0.5 * sum(after[k] / before[k] for k in ("mean_force_N", "peak_force_N"))
+    assert 1 - result["improvement"]["objective"] == pytest.approx(expected, rel=1e-9)
+    floor = result["baseline"]["geometry"]["area_efficiency"]
+    (row,) = (row for row in result["constraints"] if row["name"] == "area efficiency")
+    assert row["limit"] == pytest.approx(floor, rel=1e-12)
+    # The same problem, posed from the family's own config.
+    base = Search(BASE).exact()
+    weights = {
+        f"objective.{name}_weight": 0.5
+        * base.response[f"{name}_force_N"]
+        / before[f"{name}_force_N"]
+        for name in ("mean", "peak")
+    }
+    same = BASE.replaced(weights | {"constraints.area_efficiency_min": floor})
+    found = Search(same).run()
+    assert found.optimized is not None
+    for key in ("mean_force_N", "peak_force_N"):
+        assert after[key] == pytest.approx(found.optimized.response[key], rel=1e-4)
+    for key, value in found.optimized.design.items():
+        assert result["optimized"]["design"][key] == pytest.approx(value, rel=1e-2)
+    best = load(out / "optimized.yaml")
+    assert best.profile.family == "cic"
+    assert load(out / "config.yaml").profile.outline_file == str(out / "outline.csv")
