@@ -68,16 +68,20 @@ class LinearContact(Contact):
         # φ̄ = -x: ∂G/∂φ1 = -∂G/∂x / 2 - ∂G/∂ε = -lever1, ∂G/∂φ2 = lever2.
         by_roll = mirror * slope * relative
         zero = jnp.zeros_like(lever)
-        # The gap may jump at the ends of segments and, slightly, at the pitch crossing.
-        ends = [end for segment in profile.segments() for end in (segment.start, segment.stop)]
-        places = profile.roll_angle(jnp.stack(ends)).at[-1].set(profile.half_pitch)
-        apart = folded - places
+        # The gap may jump at the ends of segments and, slightly, at the pitch crossing. Where the
+        # roll angle turns back, a flank's own end is passed over together with the next one.
+        ends = jnp.stack([end for one in profile.segments() for end in (one.start, one.stop)])
+        places = profile.roll_angle(ends).at[-1].set(profile.half_pitch)
+        places = lax.cummin(places, reverse=True)
+        # The sides follow from the normal angle, as gap and levers do: roll angles of the ends have
+        # another rounding error.
+        sides = jnp.where(normal > ends, 1, -1).at[-1].set(-1).astype(folded.dtype)
         return Approach(
             gap=jnp.where(touching, lever * relative, lax.stop_gradient(profile.pitch_radius)),
             lever1=jnp.where(touching, lever + by_roll / 2, zero),
             lever2=jnp.where(touching, lever - by_roll / 2, zero),
             place=normal,
-            edges=Edges(jnp.sum(jnp.abs(apart)), mirror * jnp.sum(jnp.sign(apart))),
+            edges=Edges(jnp.sum(sides * (folded - places)), mirror * jnp.sum(sides)),
         )
 
     def switches(self, roll, approach: Approach):

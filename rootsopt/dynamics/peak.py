@@ -277,11 +277,13 @@ def _with_jump(forces: Float[Array, "7"], marks: Float[Array, "7"]) -> Float[Arr
 
     `forces`, `marks`: contact force and first mark at the times `BESIDE`. The change is F dt*/dp,
     where F is the rate of the force on the greater side and t* the instant of the jump. For t*, see
-    `rootsopt.dynamics.saltation`. Rates are differences, taken on one side of the jump each."""
+    `rootsopt.dynamics.saltation`. Rates are differences, taken on one side of the jump each. In
+    single precision, the outermost times are too far away for them."""
+    near = forces.dtype.itemsize < 8
 
     def rates(values):
-        _, _, earlier, _, later, left, right = values
-        return earlier - left, right - later
+        _, before, earlier, after, later, left, right = values
+        return (before - earlier, later - after) if near else (earlier - left, right - later)
 
     before, after = rates(marks)
     closing = before - after

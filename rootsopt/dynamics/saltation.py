@@ -21,7 +21,10 @@ from rootsopt.dynamics.pair import FlankForce
 
 LONGEST = 4e-6
 """Length of a step (mesh periods) above which the step is not checked for a jump. The short steps
-around switches (`rootsopt.dynamics.switches`) are all shorter."""
+around switches (`rootsopt.dynamics.switches`) are all shorter in double precision."""
+_LONGEST_ROUNDINGS = 320
+"""The same limit in rounding errors of one mesh period. It exceeds `LONGEST` only in single
+precision, where the short steps of an orbit of eight mesh periods have 256 rounding errors."""
 _FASTER = 20.0
 """Rate of change of a lever (pitch radii per mesh period) above which the change counts as a jump.
 Along a flank of the EE family the rate is at most 2π, for any number of lobes."""
@@ -72,6 +75,7 @@ def saltation(
     most = most * lax.stop_gradient(length)
     apart = jnp.abs(frozen[:, None, -2:] - frozen[jnp.array([0, -1]), -2:])
     between = jnp.max(jnp.min(jnp.max(apart, axis=-1), axis=-1))
-    jumps = (jnp.abs(step) < LONGEST) & (jump > most) & (between < _ALIKE * jump) & (closing != 0)
+    longest = max(LONGEST, _LONGEST_ROUNDINGS * float(jnp.finfo(step.dtype).eps))
+    jumps = (jnp.abs(step) < longest) & (jump > most) & (between < _ALIKE * jump) & (closing != 0)
     moved = (lax.stop_gradient(depth) - depth) / jnp.where(jumps, closing, jnp.inf)
     return fall * moved
