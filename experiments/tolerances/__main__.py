@@ -20,7 +20,7 @@ def body(run: Run) -> int:
 
     found: list[study.Found] = []
     for name in run.options.cases or study.USUAL:
-        found.append(study.solve(name, run.quick, run.say))
+        found.append(study.run(run.quick, name, run.say))
         run.csv("tolerances.csv", [row for one in found for row in study.rows_of(one)])
         run.csv("tolerances_scenes.csv", [row for one in found for row in study.scenes_of(one)])
         run.json("tolerances.json", {one.name: study.record_of(one) for one in found})

@@ -87,7 +87,7 @@ class Found(NamedTuple):
         return self.result.robustness
 
 
-def solve(name: str, quick: bool, say: Say) -> Found:
+def run(quick: bool, name: str, say: Say = lambda text: None) -> Found:
     """Find both optima of the case `name` and compare them in fresh scenes."""
     config = shipped("cic", *((_PLAY, *QUICK) if quick else CASES[name].overrides))
     told = [0]

@@ -28,6 +28,7 @@ this unit."""
 
 _FARTHEST = 1e5
 """Absolute value (mm) above which a coordinate of a rotor's axis is rejected."""
+_Coordinate = Annotated[float, between(-_FARTHEST, _FARTHEST)]
 
 
 def _is_bool(value: Any) -> bool:
@@ -52,7 +53,7 @@ class ProfileConfig(Section):
         "through them",
     )
 
-    outline_center: Literal["fit"] | tuple[float, float] | None = Field(
+    outline_center: Literal["fit"] | tuple[_Coordinate, _Coordinate] | None = Field(
         None,
         description="outline: x and y (mm) of the rotor's axis in the file, or fit: the centre of "
         "the lobes' rotational symmetry; absent: the origin",

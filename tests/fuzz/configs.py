@@ -393,9 +393,13 @@ DESIGNS: dict[str, dict[str, Any]] = {
     "free_form": {"tip_arc_angle_deg": 4.0, "coefficients": [0.2, 0.1, 0.0, 0.1, 0.3, 0.5]},
 }
 """A sound design of each family at 33 mm and three lobes."""
-TIED = ("solver.fidelity", "objective.motion", "objective.over_speeds")
+UNDRAWN = ("profile.", "scene.", "sweep.", "pareto.", "tolerances.")
+"""Sections whose choices are not drawn at random."""
+TIED = ("optimizer.family", "solver.fidelity", "objective.motion", "objective.over_speeds")
 """Choices that other keys must go with."""
 OPTIONAL = ("rotor.bore_mm", "contact.friction", "scene.timing_gear", "scene.supports")
+SCATTER = {"rotor.length_mm": {"relative_uniform": 0.01}}
+"""Distributions of a config with `tolerances`."""
 
 
 def _inside(draw: random.Random, low: float, high: float) -> float:
@@ -449,6 +453,10 @@ def _valid(draw: random.Random) -> Case:
         profile[key] = value * size * turn * 10 ** draw.gauss(0, spread)
     data: dict[str, Any] = {"profile": profile}
     gone = [part for part in OPTIONAL if draw.random() < 0.5]
+    if draw.random() < 0.2:
+        data["tolerances"] = {"over": SCATTER}
+    else:
+        gone.append("tolerances.")
     load = draw.choice(("torque_N_m", "pressure_difference_Pa"))
     motor = draw.random() < 0.3
     data["scene"] = {"drive": "torque" if motor else "prescribed"}
@@ -479,7 +487,7 @@ def _valid(draw: random.Random) -> Case:
         _set(data, part, data.get(part.split(".")[0], {}).get(part.split(".")[1], {}))
     for key in _keys():
         words = choices(field_of(Config, key.split(".")).annotation)  # type: ignore[union-attr]
-        free = not key.startswith(("profile.", "scene.", "sweep.", "pareto.")) and key not in TIED
+        free = not key.startswith(UNDRAWN) and key not in TIED
         if words and free and draw.random() < 0.2:
             word = draw.choice(words)
             _set(data, key, draw.choice((word, word.upper(), word.replace("_", "-").title())))

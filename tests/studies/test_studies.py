@@ -15,7 +15,7 @@ STUDIES = sorted(path.name for path in EXPERIMENTS.glob("[!_.]*") if path.is_dir
 FILES = {"study.py", "figures.py", "__main__.py"}
 LONGEST = 400
 """Lines of study.py and its further modules up to which they are one file."""
-FROM_COMMANDS = {"basins", "families", "force"}
+FROM_COMMANDS = {"basins", "families", "force", "pareto"}
 """Figures of the docs pages that commands make, and no study."""
 
 
