@@ -30,7 +30,8 @@ def main() -> int:
     tasks = [] if options.only_chosen else [("by hand", one) for one in by_hand(ROOT)]
     if not options.only_by_hand:
         # Its operators are those of a package that mistakes by hand do without.
-        from tests.mutants.candidates import chosen, equivalents
+        from tests.mutants.candidates import chosen
+        from tests.mutants.equivalent import equivalents
 
         left_out = len(equivalents())
         tasks += [("chosen", one) for one in chosen(ROOT, options.seed, options.count)]

@@ -7,15 +7,14 @@ import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
-import yaml
 from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 
+from tests.mutants.equivalent import equivalents
 from tests.mutants.names import key_of
 from tests.mutants.operators import operators
 from tests.mutants.rooms import ROOMS, modules
 
-EQUIVALENT = Path(__file__).with_name("equivalent.yaml")
 _SMALL = 40
 """Lines of a module below which it has no mutant of its own in a choice."""
 
@@ -84,11 +83,6 @@ def chosen(root: Path, seed: int, count: int) -> list[Mutant]:
 
 
 _KEYS = "file", "function", "was", "becomes"
-
-
-def equivalents() -> list[dict[str, str]]:
-    """Mutants known to change nothing, each with its reason."""
-    return yaml.safe_load(EQUIVALENT.read_text()) or []
 
 
 def _quotas(sizes: dict[str, int], count: int) -> dict[str, int]:

@@ -13,15 +13,29 @@ _OF = {
     "contact/law": "conformance extending_parts",
     "contact/linear": "fidelities",
     "contact/map": "contact accuracy",
+    "contact/near": "near",
     "contact/nodes": "closed_forms contact accuracy conjugacy",
     "contact/point": "scene",
     "contact/search": "closed_forms conformance",
     "contact/segments": "fidelities",
     "contact/size": "closed_forms evaluation accuracy",
+    "dynamics/collocation/blocks": "system mesh",
+    "dynamics/collocation/closing": "motion",
+    "dynamics/collocation/elements": "mesh system",
+    "dynamics/collocation/equation": "system motion",
+    "dynamics/collocation/events": "system motion",
+    "dynamics/collocation/forces": "motion",
+    "dynamics/collocation/gauss": "mesh system",
+    "dynamics/collocation/mesh": "mesh motion",
+    "dynamics/collocation/motion": "motion",
+    "dynamics/collocation/newton": "system motion",
+    "dynamics/collocation/seed": "motion",
+    "dynamics/collocation/system": "system motion",
     "dynamics/flow": "flow dynamics steady measures gradients scene extremes",
     "dynamics/integrator": "dynamics extremes",
     "dynamics/landing": "landing",
     "dynamics/linear": "steady measures",
+    "dynamics/maxima": "maxima",
     "dynamics/measures": "measures extremes",
     "dynamics/orbit": "orbit measures steady gradients extremes",
     "dynamics/timescales": "extremes dynamics",
@@ -42,10 +56,22 @@ _OF = {
     "dynamics/parts/supports": "scene",
     "config/families": "extending families config",
     "design/bounds": "bounds families optimize freeform beginning",
+    "design/resemblance": "resemblance",
+    "design/space": "search optimize freeform",
     "optimize/beginning": "beginning",
+    "optimize/certificate": "sqp robust tradeoffs",
+    "optimize/checkpoint": "checkpoint",
+    "optimize/design": "optimize pareto",
+    "optimize/infeasible": "optimize",
+    "optimize/local": "sqp robust tradeoffs",
     "optimize/noise": "search noise ensemble",
     "optimize/problem": "search optimize speeds families freeform",
+    "optimize/optimality": "optimality",
+    "optimize/risk": "risk robust",
+    "optimize/robust": "robust",
+    "optimize/robust_problem": "robust",
     "optimize/search": "search optimize speeds",
+    "optimize/sqp": "sqp robust",
     "profiles/arc_families": "families conjugacy",
     "profiles/arcs": "families conjugacy",
     "profiles/base": "profiles extending contact conjugacy families",
@@ -65,8 +91,20 @@ _OF = {
     "response/batch": "threads accuracy",
     "response/ensemble": "members ensemble",
     "response/members": "members ensemble",
+    "response/scatter": "tolerances",
+    "response/sensitivity": "robust",
     "response/speeds": "speeds",
     "response/steady": "steady gradients",
+    "response/terms": "terms",
+    "response/tolerances": "tolerances",
+    "tradeoffs/aims": "tradeoffs",
+    "tradeoffs/assembly": "tradeoffs",
+    "tradeoffs/front": "tradeoffs",
+    "tradeoffs/gaps": "tradeoffs",
+    "tradeoffs/lattice": "tradeoffs",
+    "tradeoffs/scalar": "tradeoffs",
+    "tradeoffs/study": "tradeoffs",
+    "tradeoffs/trace": "tradeoffs",
 }
 """Modules, and the WORDs in their tests' names `test_WORD.py`."""
 
@@ -77,6 +115,20 @@ ROOMS = {
     f"rootsopt/{module}.py": tuple(_FILES[f"test_{word}"] for word in words.split())
     for module, words in _OF.items()
 }
+
+
+_FOLDERS = ("contact", "continuation", "design", "dynamics", "optimize", "profiles", "tradeoffs")
+_RESPONSE = (
+    "batch",
+    "ensemble",
+    "members",
+    "scatter",
+    "sensitivity",
+    "speeds",
+    "steady",
+    "terms",
+    "tolerances",
+)
 
 
 def modules(root: Path) -> list[str]:
@@ -91,9 +143,9 @@ def modules(root: Path) -> list[str]:
 def _numerical(root: Path):
     package = root / "rootsopt"
     yield package / "config" / "families.py"
-    for name in ("batch", "ensemble", "members", "speeds", "steady"):
+    for name in _RESPONSE:
         yield package / "response" / f"{name}.py"
-    for folder in ("contact", "continuation", "dynamics", "optimize", "profiles"):
+    for folder in _FOLDERS:
         for path in (package / folder).rglob("*.py"):
             if path.name not in ("__init__.py", "__main__.py"):
                 yield path
