@@ -43,8 +43,7 @@ def start_process(cache: bool = False, gpu: bool = False) -> None:
     `InputError` where the environment prevents JAX from starting.
     """
     use_float64()
-    if cache:
-        use_cache()
+    use_cache(wanted=cache)
     if gpu:
         import jax
 

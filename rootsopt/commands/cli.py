@@ -148,8 +148,7 @@ def run(
             options.output = os.path.join("results", f"{options.config.stem}-{command}")
         config = load(options.config, options.overrides)
         use_float64()
-        if not options.no_cache:
-            use_cache()
+        use_cache(wanted=not options.no_cache)
         with environment.explained():
             return _in_folder(command, body, config, options)
     except InputError as error:
@@ -195,18 +194,13 @@ def waiting(console: "Console", what: str) -> Iterator[None]:
         yield
 
 
-def use_cache() -> None:
-    """Cache compiled programs between processes, in the user's cache folder.
+def use_cache(wanted: bool = True) -> None:
+    """Cache compiled programs between processes in the user's cache folder, unless not `wanted`.
 
     The environment variable ROOTSOPT_CACHE may name another folder, or turn the cache off. If the
     folder cannot be used, the cache is off. If other users could change the folder's content, the
     cache is off too, and one line on stderr says why."""
-    import platformdirs
-
     from rootsopt.runtime import programs
 
-    choice = os.environ.get("ROOTSOPT_CACHE", "")
-    if choice.lower() not in ("off", "0", "no"):
-        folder = choice or platformdirs.user_cache_dir("rootsopt", appauthor=False)
-        if refused := programs.keep_in(Path(folder)):
-            environment.say(f"compiled programs are not kept between runs: {refused}")
+    if refused := programs.keep_by_default() if wanted else programs.keep_in(None):
+        environment.say(f"compiled programs are not kept between runs: {refused}")

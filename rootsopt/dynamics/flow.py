@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.integrator import Integrator, StepGrid, first_step
+from rootsopt.dynamics.integrator import Integrator, StepGrid
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, Steps, locate_peak, one_sided
@@ -110,7 +110,7 @@ def strobe(
     above the tolerance, which could hide that the motion repeats.
     """
     number = state.dtype.type
-    first, control = first_step(pair, state.dtype), integrator.controller(state.dtype, pair=pair)
+    control = integrator.controller(state.dtype, pair=pair)
 
     def one_period(state, _):
         solution = diffrax.diffeqsolve(
@@ -118,7 +118,7 @@ def strobe(
             integrator.solver(state.dtype),
             t0=number(0.0),
             t1=number(1.0),
-            dt0=first,
+            dt0=None,
             y0=state,
             args=pair,
             saveat=diffrax.SaveAt(t1=True),
@@ -363,18 +363,15 @@ def _solved(
         equation.solver,
         t0=dtype.type(0.0),
         t1=dtype.type(1.0),
-        dt0=first_step(eqx.combine(dynamic, equation.static), dtype) / periods,
+        dt0=None,
         y0=start,
         args=dynamic,
         saveat=diffrax.SaveAt(
             subs=[
-                diffrax.SubSaveAt(
-                    ts=(jnp.arange(samples) / samples).astype(dtype),
-                    fn=lambda share, y, args: y[:count],
-                ),
                 diffrax.SubSaveAt(steps=True, fn=lambda share, y, args: (share, y)),
                 diffrax.SubSaveAt(t1=True),
             ],
+            dense=True,
             controller_state=True,
         ),
         stepsize_controller=control,
@@ -384,7 +381,8 @@ def _solved(
     )
     assert solution.ys is not None
     assert solution.controller_state is not None
-    states, (ends, after), (end,) = solution.ys
+    (ends, after), (end,) = solution.ys
+    states = jax.vmap(solution.evaluate)((jnp.arange(samples) / samples).astype(dtype))[:, :count]
     states, grid = lax.stop_gradient((states, ends * periods))
     return _Recorded(
         grid=grid,

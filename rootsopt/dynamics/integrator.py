@@ -28,10 +28,6 @@ _STAGES = 1e5
 gap is a difference between lengths that are ten thousand times a penetration, so rounding errors
 are large. With a finer tolerance, the iterations would not end, and a repeated step cannot be
 shortened. The actual error is smaller, because every iteration is a full Newton step."""
-_FIRST_STEP = 1e-3, 0.05
-"""Two lengths for the first step: an absolute length (mesh periods), and a multiple of
-`Timescales.swing`. The smaller one is used. The error control rejects a first step that is too
-long."""
 _LONGEST = 1 / 32, 1 / 8, 4.0
 """Upper limits on the step length: an absolute length (mesh periods), and a multiple of
 `Timescales.fall`. The smaller limit applies. In free flight, the error control alone would let a
@@ -93,15 +89,6 @@ class Integrator(eqx.Module):
         if pair is None or pair.timescales is None:
             return base
         return LandingControl.of(base, pair, periods)
-
-
-def first_step(pair: RotorPair, dtype: Any) -> Float[Array, ""]:
-    """Return the length (mesh periods) of the first step that the solver tries for `pair`."""
-    longest, share = _FIRST_STEP
-    if pair.timescales is None:
-        return jnp.asarray(longest, dtype)
-    swing = lax.stop_gradient(pair.timescales.swing / pair.mesh_period)
-    return jnp.minimum(longest, share * swing).astype(dtype)
 
 
 class StepGrid(diffrax.AbstractAdaptiveStepSizeController):

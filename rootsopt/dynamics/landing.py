@@ -30,18 +30,24 @@ no later than at the vertex."""
 _INSIDE = 1 / 128
 """Maximum step (mesh periods) where ε alone does not determine whether the flanks touch: beyond the
 clearance, or with displaced axes."""
+_FIRST = 1e-3, 0.05
+"""Two lengths for the first step: an absolute length (mesh periods), and a multiple of
+`Timescales.swing`. The smaller one is used. The error control rejects a first step that is too
+long."""
 
 
 class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
     """The step size control `base`, extended so that steps end where free flight may end.
 
     `edges`: scaled ε at which a flank or the gear may begin to touch; `inside`: scaled |ε| above
-    which a flank may touch at any time; `unit`: mesh periods per unit of the independent variable.
+    which a flank may touch at any time; `first`: length of the first step (mesh periods);
+    `unit`: mesh periods per unit of the independent variable.
     """
 
     base: diffrax.PIDController
     edges: Float[Array, " edges"]
     inside: Float[Array, ""]
+    first: Float[Array, ""]
     unit: Float[Array, ""]
 
     @classmethod
@@ -60,10 +66,10 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         if pair.two_sided:
             inside = jnp.zeros_like(play)
         dtype = scale.dtype
-        edge, inside = lax.stop_gradient((jnp.stack(edges), inside))
-        return cls(  # pyright: ignore[reportCallIssue]
-            base, edge.astype(dtype), inside.astype(dtype), jnp.asarray(unit, dtype)
-        )
+        swing = _FIRST[1] * pair.timescales.swing / pair.mesh_period
+        swing = jnp.minimum(_FIRST[0], swing)
+        numbers = lax.stop_gradient((jnp.stack(edges), inside, swing))
+        return cls(base, *(x.astype(dtype) for x in numbers), jnp.asarray(unit, dtype))  # pyright: ignore[reportCallIssue]
 
     @property
     def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -81,7 +87,10 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         return self
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        return self.base.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        # Without `dt0`, diffrax adds no check of it. The check would be a callback to Python, and
+        # programs with callbacks cannot be cached.
+        first = self.first / self.unit if dt0 is None else dt0
+        return self.base.init(terms, t0, t1, y0, first, args, func, error_order)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state):
         keep, start, stop, jump, new, result = self.base.adapt_step_size(

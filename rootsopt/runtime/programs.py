@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+import platformdirs
 from jax.core import Tracer
 from jax.experimental import serialize_executable
 
@@ -60,6 +61,8 @@ passes over loops. XLA repeats these passes many times, because one pass moves a
 only one of several nested loops."""
 _PACKAGE = Path(__file__).parents[1]
 _store: Store | None = None
+_chosen = False
+"""Whether a cache, or none, has been chosen. If not, the first program chooses the default."""
 # Tracing runs in Python, so it is done one function at a time, in the order of requests. The
 # compiler then works in parallel.
 _tracing = threading.RLock()
@@ -71,17 +74,28 @@ def keep_in(folder: Path | None) -> str | None:
     If other users could replace the programs in the folder, turn the cache off and return the
     reason. Otherwise return `None`. If the folder cannot be used for another reason, the cache is
     off as well."""
-    global _store
-    _store = None
-    if folder is None:
-        return None
-    try:
-        _store = Store(folder)
-    except UnsafeFolderError as error:
-        return str(error)
-    except OSError:
-        return None
-    return None
+    global _store, _chosen
+    found, reason = None, None
+    if folder is not None:
+        try:
+            found = Store(folder)
+        except UnsafeFolderError as error:
+            reason = str(error)
+        except OSError:
+            pass
+    _store, _chosen = found, True
+    return reason
+
+
+def keep_by_default() -> str | None:
+    """Cache programs in the user's cache folder from now on; return as `keep_in`.
+
+    The environment variable ROOTSOPT_CACHE may name another folder, or turn the cache off ("off",
+    "0" or "no")."""
+    choice = os.environ.get("ROOTSOPT_CACHE", "")
+    if choice.lower() in ("off", "0", "no"):
+        return keep_in(None)
+    return keep_in(Path(choice or platformdirs.user_cache_dir("rootsopt", appauthor=False)))
 
 
 class _Kind(NamedTuple):
@@ -190,6 +204,8 @@ class Program:
 
     def _place(self, kind: _Kind) -> "_Place | None":
         """Return the cache entry for a program of this `kind`, or `None` if it cannot be cached."""
+        if not _chosen:
+            keep_by_default()
         if _store is None or jax.default_backend() != "cpu":
             return None
         if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,11 +1,41 @@
 """What is seen of a motion between samples and within steps, against closed forms."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from rootsopt.dynamics import peak
 from tests.standins import oscillator
+
+_COUNT = """
+import jax, jax.numpy as jnp, rootsopt
+from rootsopt.dynamics.flow import flow, strobe
+from rootsopt.dynamics.integrator import Integrator
+
+jax.config.update("jax_enable_x64", True)
+config = rootsopt.load_config("configs/ee.yaml", ["solver.fidelity=linear"])
+pair = rootsopt.Scene.from_config(config).pair(config.design)
+how = Integrator("tsit5", jnp.asarray(1e-8), 1024)
+state = jnp.zeros(2)
+programs = (
+    lambda state: strobe(pair, state, 4, how),
+    lambda state: flow(pair, state, jnp.asarray(2.0), how, 32),
+)
+print([str(jax.make_jaxpr(program)(state)).count("callback") for program in programs])
+"""
+
+
+def test_no_callback_to_python_in_an_integration():
+    """Programs with callbacks cannot be cached. Equinox's checks of what diffrax is given would be
+    such callbacks; a command turns them off, a caller from Python does not."""
+    variables = {name: x for name, x in os.environ.items() if name != "EQX_ON_ERROR"}
+    command = [sys.executable, "-c", _COUNT]
+    done = subprocess.run(command, env=variables, check=True, capture_output=True, text=True)
+    assert done.stdout == "[0, 0]\n"
 
 
 def test_motion_between_samples_and_within_steps():

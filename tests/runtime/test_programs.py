@@ -223,6 +223,16 @@ def test_a_cache_that_cannot_be_used_is_not_spoken_of(traced, monkeypatch, capsy
     assert capsys.readouterr().err == ""
 
 
+def test_programs_called_from_python_are_kept_without_being_asked(traced, monkeypatch, tmp_path):
+    """In the folder that a command would use, unless the environment says otherwise."""
+    for choice, kept in ((str(tmp_path / "cache"), 1), ("off", 0)):
+        monkeypatch.setattr(programs, "_chosen", False)
+        monkeypatch.setenv("ROOTSOPT_CACHE", choice)
+        ask(Program(scaled), size=3 + kept)
+    assert len(traced) == 2
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+
+
 def test_the_cache_may_be_named_from_the_current_folder(traced, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ROOTSOPT_CACHE", "cache")

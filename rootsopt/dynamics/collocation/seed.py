@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.gauss import GAUSS
-from rootsopt.dynamics.integrator import Integrator, first_step
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 
 
@@ -38,7 +38,7 @@ def seeded(
         integrator.solver(dtype),
         t0=jnp.zeros((), dtype),
         t1=length,
-        dt0=first_step(pair, dtype),
+        dt0=None,
         y0=state,
         args=pair,
         saveat=diffrax.SaveAt(
