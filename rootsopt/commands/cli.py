@@ -17,6 +17,7 @@ from rootsopt.commands.door import BAD_INPUT, NO_RESULT
 from rootsopt.commands.door import OK as OK
 from rootsopt.config import Config, describe_families, describe_keys, load, sources
 from rootsopt.config.families import import_named
+from rootsopt.config.shipped import shipped
 from rootsopt.errors import InputError
 from rootsopt.runtime import environment
 from rootsopt.runtime.environment import use_float64
@@ -64,7 +65,11 @@ def parser(command: str, purpose: str) -> argparse.ArgumentParser:
         f"config keys (for --set and the file), units in the name:\n{describe_keys()}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    result.add_argument("config", type=Path, help="YAML file, for example configs/cic.yaml")
+    result.add_argument(
+        "config",
+        type=Path,
+        help=f"YAML file, or the name of a shipped config ({', '.join(shipped())})",
+    )
     result.add_argument(
         "-o",
         "--output",

@@ -26,6 +26,7 @@ from rootsopt.config.scene import (
     SceneConfig,
 )
 from rootsopt.config.section import Section, bare
+from rootsopt.config.shipped import advice, located
 from rootsopt.config.smoothing import following_mm
 from rootsopt.config.sources import regular_file
 from rootsopt.config.study import (
@@ -259,9 +260,11 @@ def _with(config: Any, key: str, value: Any) -> Any:
 def load(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Config:
     """Read a config file from `path`, apply `overrides`, and return the config.
 
-    `overrides`: texts of the form `dotted.key=value`, as for `--set`. Raises `InputError` if the
-    file, a key or a value is wrong."""
-    return parse(_read(Path(path)), overrides, source=str(path), folder=Path(path).parent)
+    `path`: a YAML file, or the name of a shipped config, such as "cic"; `overrides`: texts of the
+    form `dotted.key=value`, as for `--set`. Raises `InputError` if the file, a key or a value is
+    wrong."""
+    path = located(Path(path))
+    return parse(_read(path), overrides, source=str(path), folder=path.parent)
 
 
 def parse(
@@ -323,7 +326,7 @@ def _read(path: Path) -> str:
         with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)
     except FileNotFoundError:
-        raise InputError(f"{name}: there is no such file; give the path of a config") from None
+        raise InputError(f"{name}: there is no such file; {advice(path)}") from None
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError(f"{name}: cannot be read: {reason}") from None

@@ -1,0 +1,66 @@
+"""Shipped configs are found by name, in the source tree and in an installed package."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from rootsopt.config import load_config
+from rootsopt.config.shipped import shipped
+from rootsopt.errors import InputError
+
+ROOT = Path(__file__).parents[2]
+_NAMES = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("name", _NAMES)
+def test_a_shipped_config_is_found_by_its_name(name, monkeypatch, tmp_path):
+    """From any folder, even where a folder has that name."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cic").mkdir()
+    expected = load_config(ROOT / "configs" / f"{name}.yaml")
+    assert load_config(name) == load_config(f"{name}.yaml") == expected
+
+
+def test_a_file_comes_before_a_shipped_config(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "configs" / "ee.yaml").read_text()
+    (tmp_path / "cic.yaml").write_text(text)
+    assert load_config("cic.yaml").profile.family == "ee"
+    assert load_config("cic").profile.family == "cic"
+
+
+@pytest.mark.parametrize("path", ["folder/cic", "cic.yml", "cics", "./other/ee.yaml"])
+def test_other_names_are_refused_with_those_that_exist(path):
+    with pytest.raises(InputError, match=r"no such file; give the path .*\(cic, ee, ") as caught:
+        load_config(path)
+    if path == "cics":
+        assert "did you mean 'cic'?" in str(caught.value)
+
+
+def test_an_installed_package_has_its_configs_and_types(tmp_path):
+    """A wheel, unpacked, is used from an empty folder."""
+    builders = pytest.importorskip("hatchling.builders.wheel")
+    (wheel,) = builders.WheelBuilder(str(ROOT)).build(
+        directory=str(tmp_path), versions=["standard"]
+    )
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path / "site")
+    assert (tmp_path / "site" / "rootsopt" / "py.typed").exists()
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    program = "import rootsopt; print(rootsopt.__file__, rootsopt.load_config('cic').design_keys)"
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=empty,
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "site")},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert str(tmp_path / "site") in done.stdout
+    assert "pressure_angle_deg" in done.stdout
+    assert sorted(shipped()) == _NAMES
