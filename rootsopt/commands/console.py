@@ -1,5 +1,7 @@
 """The command `rootsopt COMMAND ...`, which runs the command of this name."""
 
+import difflib
+import importlib
 import sys
 from collections.abc import Sequence
 
@@ -38,14 +40,10 @@ def _called(arguments: list[str]) -> int:
         print(f"rootsopt {__version__}")
         return door.OK
     if name not in COMMANDS:
-        import difflib
-
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"; did you mean `{near[0]}`?" if near else f"; valid: {', '.join(COMMANDS)}"
         print(f"rootsopt: `{name}` is not a command{hint}", file=sys.stderr)
         return door.BAD_INPUT
-    import importlib
-
     return importlib.import_module(f"rootsopt.commands.{name}").main(rest)
 
 

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import importlib
 import importlib.machinery
+import importlib.metadata
 import importlib.util
 import inspect
 import re
@@ -320,9 +321,7 @@ def find_installed(name: str) -> None:
     """Load the installed packages that offer a family with this `name`, if there are any.
 
     Raises `InputError` if loading fails."""
-    from importlib.metadata import entry_points  # Slow: scans all installed packages.
-
-    for point in entry_points(group=ENTRY_POINTS):
+    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
         if bare(point.name) == bare(name):
             with _explained(f"profile family {point.name} of {point.value}"):
                 point.load()

@@ -1,6 +1,7 @@
 """The option `--export` of the commands: choose formats and write the files."""
 
 import argparse
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -126,8 +127,6 @@ def _solids(drawing, formats, place) -> dict[str, bytes]:
     """Return the contents of the STEP and STL files, keyed by file name.
 
     `place`: folder for temporary files. The solid of each shape is made only once."""
-    import math
-
     from rootsopt.export import solid
 
     body = drawing.length, drawing.bore, math.radians(drawing.helix_deg)

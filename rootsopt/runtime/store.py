@@ -15,6 +15,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import platformdirs
+
 try:
     import fcntl
 except ImportError:  # Windows
@@ -245,8 +247,6 @@ class Store:
 
 def key_folder() -> Path:
     """Return the path of the folder of the signing key, in the user's state folder."""
-    import platformdirs
-
     return Path(platformdirs.user_state_dir("rootsopt", appauthor=False))
 
 
