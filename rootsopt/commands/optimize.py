@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rootsopt.commands import door
 
@@ -334,7 +334,7 @@ def _write_robustness(folder, config, options, robustness) -> None:
 
 
 def _progress(console) -> "AbstractContextManager[Callable[..., None] | None]":
-    """Return a context manager for a function (done, expected, best objective), as `progress_bar`."""
+    """Return a context manager for a function (done, expected, best objective): `progress_bar`."""
     from rootsopt.commands.searching import progress_bar
 
     texts = "baseline, compiling", "optimising", "designs"
