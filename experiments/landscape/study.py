@@ -44,6 +44,8 @@ LEVELS, QUICK_LEVELS = 5, 1
 """Number of finer grids around each of them. Each has half the spacing of the one before."""
 AGREES = 1e-3
 """Relative difference of the objective up to which optimum and grid agree."""
+SAME = 1e-5
+"""Relative range of the objective up to which runs with different seeds agree."""
 
 
 class Case(NamedTuple):
@@ -209,6 +211,32 @@ def compared(config: str, case: Case, quick: bool, designs: int) -> Results:
         optima=0 if optimality is None else len(optimality.optima),
         seconds=time.perf_counter() - began,
     )
+
+
+def by_seed(config: str, seeds: int, quick: bool) -> list[Row]:
+    """Optimise a config once for each seed of its screening; return a row per run."""
+    rows = []
+    for seed in range(seeds):
+        search = Search(load(config, [*(QUICK if quick else ()), f"optimizer.seed={seed}"]))
+        result = search.run()
+        known = result.optimality
+        rows.append(
+            {
+                "seed": seed,
+                "objective": 1 - result.improvement.get("objective", np.nan),
+                "residual": np.nan if known is None else known.certificate.residual,
+                "optima": 0 if known is None else len(known.optima),
+                "designs": len(result.history),
+                "status": result.status.label,
+            }
+        )
+    return rows
+
+
+def spread(rows: list[Row]) -> float:
+    """Return the range of the objectives of `by_seed`, relative to the least one."""
+    values = [row["objective"] for row in rows]
+    return float(np.ptp(values) / np.min(values))
 
 
 def run(

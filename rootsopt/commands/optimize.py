@@ -292,8 +292,8 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
             given = None if result.beginning is None else config
             runs.optimization_figures(folder, *pair, rows, searching, given)
             if result.optimality is not None:
-                required = data["optimality"]["required_residual"]
-                runs.certificate_figure(folder, rows, data["constraints"], required)
+                limits = data["constraints"]
+                runs.certificate_figure(folder, rows, limits, data["optimality"])
         else:
             runs.simulation_figures(folder, result.baseline, config)
         if config.objective.speeds_rpm:

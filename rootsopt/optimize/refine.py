@@ -26,7 +26,7 @@ _SAME = 0.1
 """Difference between phases above which branches at two points count as different."""
 _ROUNDS = 25
 """Maximum number of steps."""
-_FALL = 1e-10
+_FALL = 1e-9
 """Predicted decrease of the merit function below which the search ends."""
 _PRICE = 2.0, 5.0
 """Weight of the violation in the merit function: the sum of a constant and a multiple of the

@@ -36,6 +36,9 @@ _RESTARTS = 6
 `refine`."""
 _GAIN = 1e-9
 """Decrease of the objective in a round below which the search does not start another round."""
+_TIE = 3e-8
+"""Difference of two objectives below which the smaller residual decides. Objectives of the same
+design differ by so much, if they come from orbits closed from different first guesses."""
 _SLOW = 12, 2e-5
 """Number of successive points, and decrease of the objective over them, below which SLSQP crawls.
 The round then goes on with `refine`."""
@@ -44,11 +47,13 @@ The round then goes on with `refine`."""
 class Stops(NamedTuple):
     """When a local search ends.
 
-    `residual`: first-order residual below which the search has converged; `feasibility`: scaled
-    violation below which a point is feasible; `evaluations`: maximum number of evaluated points;
-    `asked`: function that returns whether to end at once."""
+    `residual`: first-order residual below which the search ends at once; `enough`: residual below
+    which it does not begin another round, because gradients are hardly more accurate;
+    `feasibility`: scaled violation below which a point is feasible; `evaluations`: maximum number
+    of evaluated points; `asked`: function that returns whether to end at once."""
 
     residual: float = 1e-6
+    enough: float = 5e-5
     feasibility: float = 1e-6
     evaluations: int = 200
     asked: Callable[[], bool] = lambda: False
@@ -153,12 +158,14 @@ class Epigraph:
         Raises `EndError` if the best point satisfies the first-order conditions."""
         best = self.best[1]
         limit = self.stops.feasibility
+        certificate = certify(found, point)
+        residual = certificate.residual
         if max(found.violation, limit) < max(best.violation, limit):
             better = True
         else:
             feasible = found.violation <= max(best.violation, limit)
-            better = feasible and found.objective < best.objective
-        certificate = certify(found, point)
+            gain, flatter = best.objective - found.objective, residual < self.certificate.residual
+            better = feasible and (gain > _TIE or (gain > -_TIE and flatter))
         done = certificate.holds(self.stops.residual, limit)
         if better or (done and found.objective <= best.objective + limit):
             self.best, self.certificate = (point, found), certificate
@@ -256,7 +263,7 @@ def descend(look: Look, start: NDArray[np.float64], stops: Stops | None = None) 
             refine(problem.at, *problem.best, greatest)
         except EndError:
             reason = "interrupted" if stops.asked() else "evaluations"
-        if problem.certificate.holds(stops.residual, stops.feasibility):
+        if problem.certificate.holds(stops.enough, stops.feasibility):
             reason = "converged"
         after = problem.best[1]
         gained = before.objective - after.objective > _GAIN or before.violation > after.violation
