@@ -75,7 +75,8 @@ def plot_starts(
             face = "black" if one["reason"] == "converged" else "none"
             ax.plot(one["start"], one["objective"], "o", mfc=face, mec="black")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.margins(0.15, 0.15)
+    ax.margins(y=0.15)
+    ax.set_xlim(-0.5, max((one["start"] for one in starts), default=0) + 0.5)
     ax.set(xlabel="local search", ylabel="objective at its end (baseline = 1)")
     ax.ticklabel_format(axis="y", useOffset=False)
     ax.grid(visible=True, alpha=0.3)

@@ -259,8 +259,9 @@ def descend(look: Look, start: NDArray[np.float64], stops: Stops | None = None) 
         before = problem.best[1]
         try:
             _slsqp(problem)
-            greatest = float(np.max(problem.certificate.multipliers, initial=0.0))
-            refine(problem.at, *problem.best, greatest)
+            if not problem.certificate.holds(stops.enough, stops.feasibility):
+                greatest = float(np.max(problem.certificate.multipliers, initial=0.0))
+                refine(problem.at, *problem.best, greatest)
         except EndError:
             reason = "interrupted" if stops.asked() else "evaluations"
         if problem.certificate.holds(stops.enough, stops.feasibility):
