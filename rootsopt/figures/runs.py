@@ -121,7 +121,7 @@ def _profiles(outlines, config):
 def _comparison(designs, outlines, config):
     lobes, radius = config.profile.lobes, config.profile.pitch_radius_mm
     series = {name: one.series for name, one in designs.items() if one.series is not None}
-    made, axes = figure(12, 4.4, 1, 1 + bool(series))
+    made, axes = figure(12, 4.8, 1, 1 + bool(series))
     plot_departure(axes[0, -1], *outlines.values(), lobes, radius)
     if series:
         periods = [one.steady_state.get("period") or lobes for one in designs.values()]
