@@ -99,8 +99,8 @@ def progress_bar(
         task = bar.add_task(first, total=None, shown="-")
 
         def update(done: int, expected: int, *shown: float) -> None:
-            fields = {"shown": f"{shown[0]:.4f}"} if shown else {}
-            bar.update(task, description=then, completed=done, total=expected, **fields)
+            text = f"{shown[0]:.4f}" if shown else "-"
+            bar.update(task, description=then, completed=done, total=expected, shown=text)
 
         yield update
 

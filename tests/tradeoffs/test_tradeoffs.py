@@ -24,6 +24,7 @@ from rootsopt.response import terms
 from rootsopt.response.terms import needs_forces
 from rootsopt.scene import Scene
 from rootsopt.status import Status
+from rootsopt.tradeoffs import trace
 from rootsopt.tradeoffs.aims import aims_of, freed
 from rootsopt.tradeoffs.front import Standing, dominated
 from rootsopt.tradeoffs.scalar import RHO, Scalar, Scale
@@ -86,6 +87,15 @@ MADE_UP = {
     "stepped": _stepped,
     "wells": _two_wells,
 }
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few():
+    """Fewer starts and screened designs than a user gets."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trace, "_CHEAP_STARTS", 3)
+        patch.setattr(trace, "_CHEAP_SCREENING", 24)
+        yield
 
 
 @pytest.fixture
@@ -327,7 +337,7 @@ def test_interrupted_front_keeps_its_points():
 
     def progress(done, expected):
         assert done <= expected
-        if done >= 15:
+        if done >= 9:
             stop.set()
 
     tracer = Tracer(config(RADIUS), progress, stop)
