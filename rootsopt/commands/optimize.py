@@ -1,11 +1,11 @@
 """`rootsopt optimize CONFIG`: optimise a design and compare it with the baseline."""
 
-import contextlib
 import hashlib
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING
 
 from rootsopt.commands import door
 
@@ -19,12 +19,6 @@ if TYPE_CHECKING:
 PURPOSE = "Optimise the design parameters for low contact force and compare with the baseline."
 
 
-_PATIENCE = 5.0
-"""Time (s) after an interrupt above which the command no longer waits for the search to end.
-
-In this time, the search may simulate its best design again from rest."""
-
-
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
     """Run `rootsopt optimize`: search for the best design, and write files into `folder`.
 
@@ -33,7 +27,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     from rich.console import Console
 
     from rootsopt import export
-    from rootsopt.commands import cli
+    from rootsopt.commands import cli, searching
     from rootsopt.measured import report as outline_report
     from rootsopt.optimize.checkpoint import aside
     from rootsopt.output import tables
@@ -60,7 +54,8 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
         for file in (checkpoint.path, aside(checkpoint.path)):
             folder.remove_afterwards(file)
     if result is None:
-        return _nothing_known(config, folder)
+        empty = {"baseline": None, "optimized": None}
+        return searching.nothing_known(config, folder, "simulated", empty)
     if result.infeasible is not None:
         return _contradiction(config, folder, result)
     ran = time.perf_counter() - began
@@ -141,39 +136,10 @@ def _searched(config: "Config", progress, stop: threading.Event, checkpoint):
     In the returned config, the chosen settings replace `auto`. The result is `None` if the search
     was stopped before the baseline was simulated. `progress`: function as from `_progress`, or
     `None`; `stop`: event that stops the search; `checkpoint`: file for the evaluations."""
+    from rootsopt.commands.searching import searched
     from rootsopt.optimize.robust import search_of
-    from rootsopt.optimize.search import until_stopped
-    from rootsopt.response.choice import resolve
 
-    state: dict[str, Any] = {"config": config, "choice": {}}
-
-    def work():
-        state["config"], state["choice"] = resolve(config)
-        state["search"] = search_of(state["config"], progress, stop, checkpoint)
-        return state["search"].run()
-
-    result = until_stopped(work, stop, _PATIENCE)
-    if result is None and "search" in state:
-        result = state["search"].so_far()
-    return state["config"], state["choice"], result
-
-
-def _nothing_known(config: "Config", folder: "RunFolder") -> "Outcome":
-    """Write the files of a run that was stopped before the baseline was simulated.
-
-    Return the `Outcome`, with exit code 3."""
-    from rootsopt.commands import cli
-    from rootsopt.output import files
-    from rootsopt.status import Status
-
-    status = Status.INTERRUPTED
-    message = "The run was stopped before the baseline had been simulated: there is no result."
-    files.write_config(folder, config)
-    data = {"baseline": None, "optimized": None, "status": status.label, "message": message}
-    folder.write_json("result.json", data | {"versions": files.versions()})
-    folder.overwrite = False  # An earlier result is more valuable than this one.
-    text = f"{status.label}: {message}"
-    return cli.Outcome(cli.NO_RESULT, lambda out: out.print(text, soft_wrap=True))
+    return searched(config, lambda given: search_of(given, progress, stop, checkpoint), stop)
 
 
 def _contradiction(config: "Config", folder: "RunFolder", result) -> "Outcome":
@@ -326,8 +292,8 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
             given = None if result.beginning is None else config
             runs.optimization_figures(folder, *pair, rows, searching, given)
             if result.optimality is not None:
-                required = data["optimality"]["required_residual"]
-                runs.certificate_figure(folder, rows, data["constraints"], required)
+                limits = data["constraints"]
+                runs.certificate_figure(folder, rows, limits, data["optimality"])
         else:
             runs.simulation_figures(folder, result.baseline, config)
         if config.objective.speeds_rpm:
@@ -367,32 +333,12 @@ def _write_robustness(folder, config, options, robustness) -> None:
         folder.write_figure("figures/tolerances.png", made)
 
 
-@contextlib.contextmanager
-def _progress(console) -> Iterator:
-    """Yield a function (done, expected, best objective) that updates a progress bar.
+def _progress(console) -> "AbstractContextManager[Callable[..., None] | None]":
+    """Return a context manager for a function (done, expected, best objective): `progress_bar`."""
+    from rootsopt.commands.searching import progress_bar
 
-    Yield `None` if the console is not a terminal, where no progress bar is shown."""
-    if not console.is_terminal:
-        yield None
-        return
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total} designs"),
-        TextColumn("best objective {task.fields[best]}"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("baseline, compiling", total=None, best="-")
-
-        def update(done: int, expected: int, best: float) -> None:
-            bar.update(
-                task, description="optimising", completed=done, total=expected, best=f"{best:.4f}"
-            )
-
-        yield update
+    texts = "baseline, compiling", "optimising", "designs"
+    return progress_bar(console, *texts, field="best objective")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,8 +1,8 @@
 """`rootsopt pareto CONFIG`: trace the best compromises between two or three terms."""
 
-import contextlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 from rootsopt.commands import door
@@ -19,10 +19,6 @@ PURPOSE = (
     "Trace the best compromises between two or three terms, such as peak force and area "
     "efficiency (pareto.terms)."
 )
-_PATIENCE = 5.0
-"""Time (s) after an interrupt above which the command no longer waits for the search to end.
-
-In this time, the simulation in progress may end."""
 
 
 def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
@@ -32,7 +28,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     began = time.perf_counter()
     from rich.console import Console
 
-    from rootsopt.commands import cli
+    from rootsopt.commands import cli, searching
     from rootsopt.output import files, fronts, tables
     from rootsopt.runtime.environment import say
     from rootsopt.runtime.timing import CompileClock
@@ -44,7 +40,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     with clock, door.patience(promise) as stop, _progress(Console(stderr=True)) as progress:
         config, choice, front = _traced(config, progress, stop)
     if front is None:
-        return _nothing_known(config, folder)
+        return searching.nothing_known(config, folder, "evaluated", {"points": []})
     ran = time.perf_counter() - began
     record = front.record()
     seconds = {"compile_seconds": clock.seconds, "run_seconds": ran - clock.seconds}
@@ -85,64 +81,18 @@ def _traced(config: "Config", progress, stop) -> "tuple[Config, dict[str, Any], 
 
     In the returned config, the chosen settings replace `auto`. The front is `None` if the search
     was stopped before the baseline was evaluated."""
-    from rootsopt.optimize.search import until_stopped
-    from rootsopt.response.choice import resolve
+    from rootsopt.commands.searching import searched
     from rootsopt.tradeoffs.trace import Tracer
 
-    state: dict[str, Any] = {"config": config, "choice": {}}
-
-    def work():
-        state["config"], state["choice"] = resolve(config)
-        state["tracer"] = Tracer(state["config"], progress, stop)
-        return state["tracer"].run()
-
-    front = until_stopped(work, stop, _PATIENCE)
-    if front is None and "tracer" in state:
-        front = state["tracer"].so_far()
-    return state["config"], state["choice"], front
+    return searched(config, lambda given: Tracer(given, progress, stop), stop)
 
 
-def _nothing_known(config: "Config", folder: "RunFolder") -> "Outcome":
-    """Write the files of a run that was stopped before the baseline was evaluated.
+def _progress(console) -> "AbstractContextManager[Callable[..., None] | None]":
+    """Return a context manager for a function (searches done, searches expected), as
+    `progress_bar`."""
+    from rootsopt.commands.searching import progress_bar
 
-    Return the `Outcome`, with exit code 3."""
-    from rootsopt.commands import cli
-    from rootsopt.output import files
-    from rootsopt.status import Status
-
-    status = Status.INTERRUPTED
-    message = "The run was stopped before the baseline had been evaluated: there is no result."
-    files.write_config(folder, config)
-    data = {"points": [], "status": status.label, "message": message}
-    folder.write_json("result.json", data | {"versions": files.versions()})
-    folder.overwrite = False  # An earlier result is more valuable than this one.
-    text = f"{status.label}: {message}"
-    return cli.Outcome(cli.NO_RESULT, lambda out: out.print(text, soft_wrap=True))
-
-
-@contextlib.contextmanager
-def _progress(console) -> Iterator:
-    """Yield a function (searches done, searches expected) that updates a progress bar.
-
-    Yield `None` if the console is not a terminal, where no progress bar is shown."""
-    if not console.is_terminal:
-        yield None
-        return
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total} searches"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("baseline and screening", total=None)
-
-        def update(done: int, expected: int) -> None:
-            bar.update(task, description="tracing the front", completed=done, total=expected)
-
-        yield update
+    return progress_bar(console, "baseline and screening", "tracing the front", "searches")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -48,7 +48,11 @@ _CONVERGED = {8: 1e-8, 4: 1e-3}
 # Greatest number of steps inside a bracket; halving alone needs about fifty.
 _GUARDED_STEPS = 60
 # Marks a finished search: this is added to the number of attempts.
-_DONE = 8
+_DONE = 16
+# Greatest number of minima of the gap that are compared on a wavy flank, and of the jumps between
+# neighbouring minima that have a flag of their own.
+_MINIMA = 8
+_FLAGS = 3
 # ε (rad) below which a converged Newton search from perfect rolling is not trusted. Down to this ε,
 # and at the nominal centre distance, tests show that Newton finds the closest approach and no other
 # common normal. The exception is a fraction of the flank, about √|ε|, next to a cusp at the pitch
@@ -79,6 +83,8 @@ class ClosestApproach(NamedTuple):
     `found`: whether a common normal was found. Otherwise, the gap is the pitch radius and the
     levers are zero. The search is skipped at poses at which the flanks cannot touch yet (see
     `contact_begins`).
+    `rank`: on a wavy flank (`Profile.wavy`), number of minima of the gap at a smaller ν2; otherwise
+    0. Where it changes, the contact may jump from one minimum to another.
     """
 
     gap: Float[Array, ""]
@@ -87,6 +93,7 @@ class ClosestApproach(NamedTuple):
     normal1: Float[Array, ""]
     normal2: Float[Array, ""]
     found: Bool[Array, ""]
+    rank: Float[Array, ""] | float = 0.0
 
 
 class FlankNodes(NamedTuple):
@@ -218,6 +225,8 @@ class FlankPair(eqx.Module):
         if self.profile.cusp:
             # The second minimum lies beyond the cusp or close before it.
             pieces.append(found.normal2 > self.frozen.pitch_normal - _NEAR_CUSP)
+        if self.frozen.wavy:
+            pieces += [found.rank > 0.5 + number for number in range(_FLAGS)]
         return jnp.concatenate([jnp.stack(pieces), beyond])
 
     def margins(
@@ -278,6 +287,7 @@ class FlankPair(eqx.Module):
                 normal1=normal1_dot,
                 normal2=normal2_dot,
                 found=np.zeros(here.shape, jax.dtypes.float0),  # pyright: ignore[reportArgumentType]
+                rank=still,
             )
 
         return closest(dynamic, roll, relative)
@@ -320,7 +330,9 @@ class FlankPair(eqx.Module):
         intervals contain the two minima that the gap may have next to a cusp, or if the centre
         distance is not nominal. The deeper minimum is returned. If the flanks are not conjugate,
         the gap may have more minima. The attempts then search the two intervals with the least gap.
-        All attempts share one loop, which is compiled once.
+        On a wavy flank, Newton's method may find a minimum that is not the deepest. Attempts 1 to
+        `_MINIMA` then search all intervals, one each. All attempts share one loop, which is
+        compiled once.
         """
         nothing = jnp.zeros_like(roll)
         none = ClosestApproach(
@@ -330,6 +342,7 @@ class FlankPair(eqx.Module):
             normal1=nothing,
             normal2=nothing,
             found=jnp.zeros(roll.shape, bool),
+            rank=nothing,
         )
         low, high = self.nodes.normal[0], self.nodes.normal[-1]
         absent = roll < contact_begins(relative)
@@ -346,7 +359,10 @@ class FlankPair(eqx.Module):
             )
             normal2, converged = self._root(bracket, guess, ~direct, roll, relative)
             _, gap, normal1, lever1, lever2 = self._mesh(normal2, roll, relative)
-            new = ClosestApproach(gap, lever1, lever2, normal1, normal2, present)
+            if self.frozen.wavy:  # A pair this deep belongs to the other flank of the lobe.
+                present &= gap > -_DEEPEST * self.profile.pitch_radius
+            rank = jnp.maximum(attempt - 1.0, 0.0) if self.frozen.wavy else nothing
+            new = ClosestApproach(gap, lever1, lever2, normal1, normal2, present, rank)
             better = present & ((gap < best.gap) | (attempt < 2))
             best = jax.tree.map(lambda x, y: jnp.where(better, x, y), new, best)
             certain = usual & (converged | absent)
@@ -354,16 +370,19 @@ class FlankPair(eqx.Module):
             best = jax.tree.map(lambda x, y: jnp.where(direct & ~done, x, y), none, best)
             return jnp.where(done, _DONE, 0) + attempt + 1, best
 
-        start = jnp.asarray(attempt if self.rolling else max(attempt, 1)), none
-        attempts, best = lax.while_loop(lambda carry: carry[0] < 3, look, start)
+        trusted = self.rolling and not self.frozen.wavy
+        start = jnp.asarray(attempt if trusted else max(attempt, 1)), none
+        limit = 1 + _MINIMA if self.frozen.wavy else 3
+        attempts, best = lax.while_loop(lambda carry: carry[0] < limit, look, start)
         return attempts % _DONE, best
 
     def _bracket(self, attempt, roll, relative):
         """Return an interval between two nodes where T falls through zero.
 
         `roll`, `relative`: as in `_mesh`. For conjugate flanks, attempt 1 takes the last such
-        interval and attempt 2 the first. For other flanks, attempt 1 takes the interval with the
-        least gap and attempt 2 that with the second least gap. The result is ((low, high), first
+        interval and attempt 2 the first; on a wavy flank, attempt k takes the k-th. For other
+        flanks, attempt 1 takes the interval with the least gap and attempt 2 that with the second
+        least gap. The result is ((low, high), first
         guess, whether such an interval exists, whether there is at most one)."""
         profile, nodes = self.profile, self.nodes
         turned = _rotate(nodes.turned, 2 * profile.turn_ratio * roll)
@@ -375,7 +394,11 @@ class FlankPair(eqx.Module):
         # end of one interval and as the start of the next.
         slack = _SLACK[offset.dtype.itemsize] * profile.pitch_radius
         falling = (offset[:-1] >= -slack) & (offset[1:] < slack)
-        if nodes.support is None:
+        if profile.wavy:
+            number = jnp.cumsum(falling)
+            index = jnp.argmax(falling & (number == attempt))
+            present, single = number[-1] >= attempt, number[-1] <= attempt
+        elif nodes.support is None:
             # The maximum of integers is vectorised, an arg-minimum is not.
             place = jnp.arange(falling.shape[0])
             last = jnp.max(jnp.where(falling, place, -1))

@@ -1,4 +1,5 @@
-"""Figures of an optimum: convergence of the local searches, and what relaxing each limit gains."""
+"""Figures of an optimum: convergence of the local searches, the optima that they found, and what
+relaxing each limit gains."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -55,4 +56,30 @@ def plot_prices(ax: Axes, constraints: Sequence[Mapping[str, Any]]) -> Axes:
         ax.text(0.5, 0.5, "no limit holds the optimum", ha="center", transform=ax.transAxes)
         ax.set_yticks([])
     ax.set_xlabel("decrease of the objective (%)")
+    return ax
+
+
+def plot_starts(
+    ax: Axes, starts: Sequence[Mapping[str, Any]], optima: Sequence[Mapping[str, Any]]
+) -> Axes:
+    """Draw the objective at the end of each local search, and the distinct optima as lines.
+
+    `starts`, `optima`: entries of the result file. Searches without a certificate are drawn hollow.
+    The result is `ax`."""
+    for number, one in enumerate(optima):
+        label = f"optimum {number + 1}: {one['objective']:.5f}, found {one['found']}×"
+        color = COLORS[number % len(COLORS)]
+        ax.axhline(one["objective"], color=color, linewidth=1.2, label=label)
+    for one in starts:
+        if one["objective"] is not None:
+            face = "black" if one["reason"] == "converged" else "none"
+            ax.plot(one["start"], one["objective"], "o", mfc=face, mec="black")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.margins(y=0.15)
+    ax.set_xlim(-0.5, max((one["start"] for one in starts), default=0) + 0.5)
+    ax.set(xlabel="local search", ylabel="objective at its end (baseline = 1)")
+    ax.ticklabel_format(axis="y", useOffset=False)
+    ax.grid(visible=True, alpha=0.3)
+    if optima:
+        ax.legend(frameon=False, fontsize=8)
     return ax

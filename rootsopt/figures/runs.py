@@ -8,9 +8,10 @@ import numpy as np
 
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.config.families import is_list
+from rootsopt.figures.comparison import plot_departure, plot_forces_together
 from rootsopt.figures.force import plot_force, plot_spectrum
 from rootsopt.figures.history import plot_history
-from rootsopt.figures.optimum import plot_prices, plot_residual
+from rootsopt.figures.optimum import plot_prices, plot_residual, plot_starts
 from rootsopt.figures.profiles import plot_conjugacy, plot_flank, plot_meshing, plot_profiles
 from rootsopt.figures.style import (
     figure,
@@ -71,6 +72,7 @@ def optimization_figures(
         _write(folder, "meshing", _meshing(outlines["optimised"], config, "optimised rotors")),
     ]
     names += _force_figures(folder, designs, config)
+    names.append(_write(folder, "comparison", _comparison(designs, outlines, config)))
     if history:
         keys = FAMILY_KEYS[config.profile.family]
         names.append(_write(folder, "history", _history(history, keys)))
@@ -81,14 +83,16 @@ def certificate_figure(
     folder: ResultFolder,
     history: Sequence[Mapping[str, Any]],
     constraints: Sequence[Mapping[str, Any]],
-    required: float,
+    optimality: Mapping[str, Any],
 ) -> str:
     """Write optimum.png, the figures of `rootsopt.figures.optimum`; return its name.
 
-    `history`, `required`: as in `plot_residual`; `constraints`: as in `plot_prices`."""
-    made, axes = figure(11, 4.2, 1, 2)
-    plot_residual(axes[0, 0], history, required)
+    `history`: as in `plot_residual`; `constraints`: as in `plot_prices`; `optimality`: entry of the
+    result file."""
+    made, axes = figure(14, 4.4, 1, 3, gridspec_kw={"width_ratios": [1, 1, 0.8]})
+    plot_residual(axes[0, 0], history, optimality["required_residual"])
     plot_prices(axes[0, 1], constraints)
+    plot_starts(axes[0, 2], optimality["starts"], optimality["optima"])
     made.suptitle("Certificate of the optimum")
     return _write(folder, "optimum", made)
 
@@ -111,6 +115,19 @@ def _profiles(outlines, config):
     lines, names = axes[0, 0].get_legend_handles_labels()
     made.legend(lines, names, loc="outside lower center", ncols=len(names), frameon=False)
     made.suptitle(f"Rotor profile{'s' if len(outlines) > 1 else ''}: {' and '.join(outlines)}")
+    return made
+
+
+def _comparison(designs, outlines, config):
+    lobes, radius = config.profile.lobes, config.profile.pitch_radius_mm
+    series = {name: one.series for name, one in designs.items() if one.series is not None}
+    made, axes = figure(12, 4.8, 1, 1 + bool(series))
+    before, after = outlines.values()
+    plot_departure(axes[0, -1], before, after, lobes, radius)
+    if series:
+        periods = [one.steady_state.get("period") or lobes for one in designs.values()]
+        plot_forces_together(axes[0, 0], series, 2 * np.pi / lobes * min(max(periods), lobes))
+    made.suptitle("Optimised design and baseline")
     return made
 
 

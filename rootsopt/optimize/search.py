@@ -61,6 +61,9 @@ _STATIONARY = 1e-3
 _HOLDS_UP = 0.01
 """Relative difference between a design's objectives in search and verification above which the
 design is rejected."""
+_SHARPER = 0.01
+"""Factor on `solver.rtol` for the gradients of a certificate that does not hold at `solver.rtol`.
+"""
 _EXPLAINED = 8
 """Maximum number of points from which the least violation of the constraints is searched for."""
 _POLL = 0.05
@@ -537,6 +540,13 @@ class Search:
         if local is None:
             return None
         certificate = certify(local, point)
+        if not certificate.holds(RESIDUAL, FEASIBLE) and not self.stop.is_set():
+            # The gradients may be less accurate than the residual requires.
+            sharper = self.exact.at_tolerance(_SHARPER * self.config.solver.rtol)
+            again = sharper(self.problem.design(point), start=optimized.state, series=False)
+            found = self.problem.local(again, point)
+            if found is not None and (other := certify(found, point)).residual < RESIDUAL:
+                certificate, optimized = other, again
         reason = "converged"
         ends = sorted(self._found.items())
         if not certificate.holds(RESIDUAL, FEASIBLE):

@@ -3,12 +3,14 @@
 The corners come from maxima over smooth branches b_i. In the epigraph form, each maximum becomes a
 variable t with one constraint b_i(x) ≤ t per branch, so all functions are smooth. SciPy's SLSQP
 solves this problem with exact gradients. See Kraft, A software package for sequential quadratic
-programming, DFVLR-FB 88-28, 1988.
+programming, DFVLR-FB 88-28, 1988. Where it stops or crawls before the first-order conditions hold,
+`rootsopt.optimize.refine` goes on with a second-order model of every function.
 
 A point without an objective gets a value far above all others, and is never the result. The line
 search then shortens its step until it finds a usable point."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +19,7 @@ from scipy.optimize import linear_sum_assignment, minimize
 
 from rootsopt.optimize.certificate import Certificate, certify
 from rootsopt.optimize.local import Group, Local, Look
+from rootsopt.optimize.refine import refine
 
 SCALE = 0.1
 """Factor from SLSQP's variables z to the point x of the unit box: x = `SCALE` · z. It shortens the
@@ -29,19 +32,28 @@ _SAME = 0.1
 _UNUSABLE = 1e3
 """Amount by which the value of a point without an objective exceeds the best objective."""
 _RESTARTS = 6
-"""Maximum number of runs of SLSQP. Each starts at the best point, with a unit Hessian."""
+"""Maximum number of rounds. Each runs SLSQP from the best point, with a unit Hessian, and then
+`refine`."""
 _GAIN = 1e-9
-"""Decrease of the objective in a run of SLSQP below which the search does not start another run."""
+"""Decrease of the objective in a round below which the search does not start another round."""
+_TIE = 3e-8
+"""Difference of two objectives below which the smaller residual decides. Objectives of the same
+design differ by so much, if they come from orbits closed from different first guesses."""
+_SLOW = 12, 2e-5
+"""Number of successive points, and decrease of the objective over them, below which SLSQP crawls.
+The round then goes on with `refine`."""
 
 
 class Stops(NamedTuple):
     """When a local search ends.
 
-    `residual`: first-order residual below which the search has converged; `feasibility`: scaled
-    violation below which a point is feasible; `evaluations`: maximum number of evaluated points;
-    `asked`: function that returns whether to end at once."""
+    `residual`: first-order residual below which the search ends at once; `enough`: residual below
+    which it does not begin another round, because gradients are hardly more accurate;
+    `feasibility`: scaled violation below which a point is feasible; `evaluations`: maximum number
+    of evaluated points; `asked`: function that returns whether to end at once."""
 
     residual: float = 1e-6
+    enough: float = 5e-5
     feasibility: float = 1e-6
     evaluations: int = 200
     asked: Callable[[], bool] = lambda: False
@@ -88,6 +100,10 @@ class EndError(Exception):
     """Raised inside SLSQP's callbacks to end a search."""
 
 
+class SlowError(Exception):
+    """Raised inside SLSQP's callbacks if the search crawls."""
+
+
 class Epigraph:
     """The smooth problem that SLSQP solves, with all points evaluated so far.
 
@@ -100,6 +116,7 @@ class Epigraph:
         self.evaluations = 1
         self.known: dict[bytes, Local | None] = {start.tobytes(): first}
         self.good, self.best = first, (start, first)
+        self.crawling: list[float] | None = None
         self.certificate = certify(first, start)
         slots = [2 * len(group.values) + _SLOTS for group in first.groups]
         self.slots = [np.full((count, 2), np.nan) for count in slots]
@@ -117,7 +134,23 @@ class Epigraph:
             self.known[key] = found = self.look(point)
             if found is not None:
                 self._judge(point, found)
+            self._watch(found)
         return self.known[key]
+
+    def _watch(self, found: Local | None) -> None:
+        """Raise `SlowError` if the last points have hardly improved the best merit.
+
+        `found`: the problem at the new point. The merit is the objective plus the violation with a
+        weight above its price. Only while `crawling` is a list: the best merit after each point."""
+        if self.crawling is None:
+            return
+        count, least = _SLOW
+        before = self.crawling[-1] if self.crawling else np.inf
+        price = 2.0 + 5.0 * float(np.max(self.certificate.multipliers, initial=0.0))
+        merit = np.inf if found is None else found.objective + price * found.violation
+        self.crawling.append(min(before, merit))
+        if len(self.crawling) > count and self.crawling[-1 - count] - self.crawling[-1] < least:
+            raise SlowError
 
     def _judge(self, point, found: Local) -> None:
         """Keep a new `point` if it is the best one; `found` is the problem there.
@@ -125,12 +158,14 @@ class Epigraph:
         Raises `EndError` if the best point satisfies the first-order conditions."""
         best = self.best[1]
         limit = self.stops.feasibility
+        certificate = certify(found, point)
+        residual = certificate.residual
         if max(found.violation, limit) < max(best.violation, limit):
             better = True
         else:
             feasible = found.violation <= max(best.violation, limit)
-            better = feasible and found.objective < best.objective
-        certificate = certify(found, point)
+            gain, flatter = best.objective - found.objective, residual < self.certificate.residual
+            better = feasible and (gain > _TIE or (gain > -_TIE and flatter))
         done = certificate.holds(self.stops.residual, limit)
         if better or (done and found.objective <= best.objective + limit):
             self.best, self.certificate = (point, found), certificate
@@ -224,9 +259,12 @@ def descend(look: Look, start: NDArray[np.float64], stops: Stops | None = None) 
         before = problem.best[1]
         try:
             _slsqp(problem)
+            if not problem.certificate.holds(stops.enough, stops.feasibility):
+                greatest = float(np.max(problem.certificate.multipliers, initial=0.0))
+                refine(problem.at, *problem.best, greatest)
         except EndError:
             reason = "interrupted" if stops.asked() else "evaluations"
-        if problem.certificate.holds(stops.residual, stops.feasibility):
+        if problem.certificate.holds(stops.enough, stops.feasibility):
             reason = "converged"
         after = problem.best[1]
         gained = before.objective - after.objective > _GAIN or before.violation > after.violation
@@ -239,14 +277,22 @@ def descend(look: Look, start: NDArray[np.float64], stops: Stops | None = None) 
 
 
 def _slsqp(problem: Epigraph) -> None:
+    """Run SLSQP from the best point until it ends, or crawls."""
     start, size = problem.start(), problem.size
     free = [(None, None)] * (len(start) - size)
+    problem.crawling = []
+    with contextlib.suppress(SlowError):
+        _minimize(problem, start, [(0.0, 1.0 / SCALE)] * size + free)
+    problem.crawling = None
+
+
+def _minimize(problem: Epigraph, start: NDArray[np.float64], bounds: Sequence) -> None:
     minimize(
         problem.value,
         start,
         jac=True,
         method="SLSQP",
-        bounds=[(0.0, 1.0 / SCALE)] * size + free,
+        bounds=bounds,
         constraints={
             "type": "ineq",
             "fun": lambda z: problem.constraints(z)[0],

@@ -221,6 +221,14 @@ class Profile(eqx.Module):
         Two minima of the gap may then be almost equally deep there."""
         return True
 
+    @property
+    def wavy(self) -> bool:
+        """Whether the gap may have any number of minima, because the curvature may rise and fall.
+
+        The contact search then compares all minima at every pose. Otherwise, it relies on at most
+        two: one near the point of perfect rolling, and one beside a cusp or a land."""
+        return False
+
     def lever_from(
         self, nu: Float[Array, "*n"], cos: Float[Array, "*n"], sin: Float[Array, "*n"]
     ) -> Float[Array, "*n"]:

@@ -22,6 +22,8 @@ step that leaves the bracket is replaced by a bisection."""
 _POLISH = 3
 """Number of plain Newton steps after the safeguarded ones. Derivatives of the result are correct up
 to this order."""
+_NODES_PER_SPAN = 6
+"""Number of nodes per knot span on which the contact search brackets the minima of the gap."""
 _SAMPLES = 40
 """Number of points per knot span in the least-squares fit of a free form."""
 _FIRMLY = 1e3
@@ -94,6 +96,14 @@ class FreeForm(Profile):
     @property
     def _spans(self) -> int:
         return self.turn.shape[0]
+
+    @property
+    def wavy(self) -> bool:
+        return True
+
+    @property
+    def search_nodes(self) -> int:
+        return max(32, _NODES_PER_SPAN * self._spans)
 
     def segments(self) -> tuple[Segment, ...]:
         zero, start = jnp.zeros_like(self.tip_arc_angle), self.tip_arc_angle

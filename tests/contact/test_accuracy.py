@@ -17,7 +17,7 @@ from rootsopt.contact.map import MapContact
 from rootsopt.contact.nodes import pair_gap
 from rootsopt.contact.size import RELATIVES, ROLLS, size_map
 from rootsopt.errors import InputError
-from rootsopt.profiles import CIC, EE
+from rootsopt.profiles import CIC, EE, FreeForm
 from rootsopt.response import choice
 from rootsopt.response.batch import coarse, respond_many
 from rootsopt.response.evaluation import Evaluator
@@ -134,6 +134,44 @@ def test_newton_finds_what_the_nodes_find(lobes, above, share, tip, cycloid, see
     touching = of_nodes.found & (of_nodes.gap < 0)
     assert not np.any(touching & certain & ~best.found)
     assert not np.any(certain & best.found & ~of_nodes.found & (best.gap < 0))
+
+
+WAVY = (1.0, 0.9463, 0.666, 0.8701, 1.0, 0.7063, 0.503, 0.5937, 0.7152, 0.847, 0.9257, 0.2332)
+"""Coefficients of a free form whose gap has two minima of nearly equal depth, and a third one."""
+
+
+@eqx.filter_jit
+def _sampled(pair, roll, relative):
+    """The deepest of all common normals on 4000 nodes (m), how many there are, and the search."""
+    normal = jnp.linspace(pair.nodes.normal[0], pair.nodes.normal[-1], 4001)
+
+    def one(at):
+        folded, _ = pair.folded(at[0])
+        offset, gap, *_ = jax.vmap(lambda nu: pair._mesh(nu, folded, at[1]))(normal)
+        falls = (offset[:-1] >= 0) & (offset[1:] < 0)
+        return jnp.min(jnp.where(falls, gap[1:], jnp.inf)), jnp.sum(falls), pair(*at)
+
+    return jax.lax.map(one, (roll, relative))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_deepest_of_several_minima_is_found_on_a_wavy_flank(seed):
+    """Newton's method from perfect rolling ends at either minimum, and an interval of nodes at the
+    first or last one; the rank tells which of them is the deepest."""
+    rng = np.random.default_rng(seed)
+    moved = np.clip(np.array(WAVY) + rng.uniform(-0.2, 0.2, len(WAVY)) * (seed > 0), -1, 1)
+    pair = FlankPair.of(FreeForm(3, R, 1.2658 * DEG, moved))
+    roll = jnp.asarray(np.append(rng.uniform(-0.1, 0.4, 200), np.linspace(0.1, 0.11, 100)))
+    relative = jnp.asarray(-np.append(10 ** rng.uniform(-4, -2.4, 200), np.full(100, 1.7437e-3)))
+    deepest, count, found = jax.tree.map(np.asarray, _sampled(pair, roll, relative))
+    touching = found.found & (deepest < -1e-7) & (deepest > -1e-3)
+    assert touching.sum() > 100
+    np.testing.assert_allclose(found.gap[touching], deepest[touching], rtol=0, atol=5e-8)
+    if seed == 0:
+        assert np.sum(count[-100:] > 1) > 50
+        # The contact jumps once, from the first minimum to the second.
+        assert np.abs(np.diff(found.normal2[-100:])).max() > 0.15
+        assert np.sum(np.diff(found.rank[-100:]) != 0) >= 1
 
 
 @pytest.mark.parametrize("name", ["paper", "short", "epicycloid"])

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -102,6 +103,19 @@ def test_default_bounds_are_widened_and_given_ones_are_kept():
     given = parse(text, ["optimizer.bounds.pressure_angle_deg=[22,45]"])
     assert widened(given) == (given, ())
     assert widened(BASE) == (BASE, ())
+
+
+def test_a_search_is_not_resumed_with_other_points(tmp_path):
+    """The checkpoint knows the content of the file, and not only its name."""
+    config = load(measured(tmp_path, 0.0))
+    folder, options = SimpleNamespace(checkpoint=tmp_path / "c"), SimpleNamespace(resume=False)
+    optimize._checkpoint(config, options, folder).close(remove=False)
+    options.resume = True
+    optimize._checkpoint(config, options, folder).close(remove=False)
+    rotor = tmp_path / "rotor.csv"
+    rotor.write_text(rotor.read_text().replace("0", "1", 1))
+    with pytest.raises(InputError, match=r"outline \(then .*, now "):
+        optimize._checkpoint(config, options, folder)
 
 
 @pytest.mark.long

@@ -329,10 +329,10 @@ def _refuse():
 
 INTERRUPTED = """
 import os, signal, sys
-from rootsopt.commands import optimize as command
+from rootsopt.commands import optimize as command, searching
 from rootsopt.optimize.search import Search
 wanted, number = int(sys.argv.pop(1)), signal.Signals[sys.argv.pop(1)]
-command._PATIENCE = 600.0 if wanted else 0.0
+searching.PATIENCE = 600.0 if wanted else 0.0
 evaluate, run = Search._evaluate, Search.run
 def counted(self, *arguments, **options):
     found = evaluate(self, *arguments, **options)

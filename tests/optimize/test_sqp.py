@@ -5,7 +5,8 @@ import pytest
 
 from rootsopt.optimize.certificate import certify
 from rootsopt.optimize.local import Group, Local
-from rootsopt.optimize.sqp import Stops, descend
+from rootsopt.optimize.refine import Models, refine
+from rootsopt.optimize.sqp import EndError, Epigraph, Stops, descend
 
 
 def group(values, slopes):
@@ -124,7 +125,8 @@ def test_contradicting_constraints_are_infeasible():
         return Local(x[1], np.array([0.0, 1.0]), (), slack, normals)
 
     found = descend(look, np.array([0.1, 0.9]))
-    assert found.reason in ("infeasible", "evaluations")
+    assert found.reason == "infeasible"
+    assert found.evaluations < 200
     assert found.local.violation >= 0.3 - 1e-9
 
 
@@ -156,3 +158,76 @@ def test_constraint_that_cannot_move_has_no_multiplier():
 def test_search_is_reproducible():
     first, second = (descend(corner, np.array([0.1, 0.9])) for _ in range(2))
     assert first.point.tobytes() == second.point.tobytes()
+
+
+def curved(seed, count=6, branches=3):
+    """Convex quadratic functions of `count` variables: one smooth, branches, and two constraints.
+
+    Returns a function of a point and of an order of the branches, and the Hessians."""
+    rng = np.random.default_rng(seed)
+    roots = rng.normal(size=(branches + 3, count, count)) * np.sqrt(3.0 / count)
+    bends = roots @ np.swapaxes(roots, 1, 2)
+    bends[-2:] *= -1
+    centers, slopes = rng.uniform(0.3, 0.7, (2, branches + 3, count))
+    lift = np.append(np.zeros(branches + 1), [1.2, 1.2])
+
+    def look(x, order=None):
+        away = x - centers
+        bent = np.einsum("kij,kj->ki", bends, away)
+        values = np.einsum("ki,ki->k", slopes + bent / 2, away) + lift
+        rows = slopes + bent
+        order = np.arange(branches) if order is None else order
+        tags = np.stack([np.zeros(branches), 0.1 + 0.3 * np.arange(branches)], axis=1)[order]
+        maxima = Group(tags, values[1 : branches + 1][order], rows[1 : branches + 1][order])
+        first, last = slice(0, 1), slice(branches + 1, None)
+        return Local(values[0], rows[first][0], (maxima,), values[last], rows[last])
+
+    return look, bends
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_models_of_quadratic_functions_are_exact(seed):
+    """Whatever the order in which the branches are listed at each point."""
+    look, bends = curved(seed)
+    rng = np.random.default_rng(seed)
+    point = rng.uniform(0.2, 0.8, 6)
+    models = Models(point, look(point))
+    models.measure(lambda x: look(x, rng.permutation(3)))
+    np.testing.assert_allclose(models.bends, bends, atol=1e-8)
+    step = rng.uniform(-0.1, 0.1, 6)
+    expected = look(point + step)
+    value, slope = models.values(step)
+    np.testing.assert_allclose(value[1:4], expected.groups[0].values, atol=1e-9)
+    np.testing.assert_allclose(slope[4:], expected.normals, atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_refining_with_exact_models_takes_a_few_steps(seed):
+    """SLSQP needs several times as many points for the same optimum."""
+    look, _ = curved(seed)
+    start = np.full(6, 0.5)
+    problem = Epigraph(look, start, look(start), Stops())
+    with pytest.raises(EndError):
+        refine(problem.at, start, look(start), 1.0)
+    assert problem.certificate.residual < 1e-6
+    assert problem.evaluations <= 1 + 6 + 12
+    found = descend(look, start)
+    assert found.converged
+    assert found.local.objective == pytest.approx(problem.best[1].objective, abs=1e-9)
+
+
+def test_refining_follows_branches_of_higher_order():
+    """Rank-one updates keep the models true where the curvature changes along the way."""
+
+    def look(x):
+        values = [np.exp(2 * x[0]) + x[1] ** 4, np.exp(-3 * (x[0] - 0.5)) + (1 - x[1]) ** 2]
+        slopes = [[2 * np.exp(2 * x[0]), 4 * x[1] ** 3],
+                  [-3 * np.exp(-3 * (x[0] - 0.5)), -2 * (1 - x[1])]]  # fmt: skip
+        return Local(0.0, np.zeros(2), (group(values, slopes),), np.zeros(0), np.zeros((0, 2)))
+
+    start = np.array([0.9, 0.1])
+    problem = Epigraph(look, start, look(start), Stops())
+    with pytest.raises(EndError):
+        refine(problem.at, start, look(start), 0.0)
+    found = descend(look, np.array([0.2, 0.9]))
+    np.testing.assert_allclose(problem.best[0], found.point, atol=1e-4)

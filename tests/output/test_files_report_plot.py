@@ -356,7 +356,8 @@ def test_optimization_figures(tmp_path):
     better = _evaluation(design=DESIGN | {"involute_length_mm": 8.0})
     names = optimization_figures(folder, _evaluation(), better, _history(), parse(CONFIG))
     assert names == [
-        f"figures/{name}.png" for name in ("profiles", "meshing", "force", "spectrum", "history")
+        f"figures/{name}.png"
+        for name in ("profiles", "meshing", "force", "spectrum", "comparison", "history")
     ]
     assert sorted(os.listdir(tmp_path / "figures")) == sorted(n.split("/")[1] for n in names)
     for name in names:

@@ -24,6 +24,7 @@ from rootsopt.response import terms
 from rootsopt.response.terms import needs_forces
 from rootsopt.scene import Scene
 from rootsopt.status import Status
+from rootsopt.tradeoffs import trace
 from rootsopt.tradeoffs.aims import aims_of, freed
 from rootsopt.tradeoffs.front import Standing, dominated
 from rootsopt.tradeoffs.scalar import RHO, Scalar, Scale
@@ -88,6 +89,15 @@ MADE_UP = {
 }
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few():
+    """Fewer starts and screened designs than a user gets."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trace, "_CHEAP_STARTS", 3)
+        patch.setattr(trace, "_CHEAP_SCREENING", 24)
+        yield
+
+
 @pytest.fixture
 def registered():
     """A function that registers the terms `first` and `second` for one test."""
@@ -108,7 +118,7 @@ def config(*overrides):
 @pytest.fixture(scope="module")
 def front():
     """A front of geometry alone: nothing is simulated."""
-    return pareto_front(config(RADIUS, "pareto.points=7"))
+    return pareto_front(config(RADIUS, "pareto.points=5"))
 
 
 def _signed(front, points):
@@ -150,7 +160,7 @@ def test_front_of_geometry_is_that_of_another_search(front):
         return at(*map(float, z))
 
     assert front.status is Status.GEOMETRY_ONLY
-    assert [point.standing for point in front.points] == [Standing.CERTIFIED] * 7
+    assert [point.standing for point in front.points] == [Standing.CERTIFIED] * 5
     for point in front.points[1:-1:2]:
         wanted, best = point.terms["area_efficiency"], np.inf
         limits = [
@@ -209,10 +219,10 @@ def test_floor_of_a_term_is_dropped_only_if_it_is_the_baselines(front):
 def test_concave_front_is_reached_evenly(registered):
     """A weighted sum finds nothing but the ends of a concave front."""
     registered("concave")
-    front = pareto_front(config(*ANGLES, "pareto.points=9"))
+    front = pareto_front(config(*ANGLES, "pareto.points=7"))
     values = np.array([[*point.terms.values()] for point in front.points])
-    assert len(values) == 9
-    assert front.certified == 9
+    assert len(values) == 7
+    assert front.certified == 7
     assert front.gaps == ()
     np.testing.assert_allclose(values[:, 1], np.sqrt(4 - 3 * (values[:, 0] - 1) ** 2), atol=2e-6)
     np.testing.assert_allclose(values[[0, -1]], [[1, 2], [2, 1]], atol=2e-6)
@@ -247,7 +257,7 @@ def test_gap_is_that_of_a_dense_grid(registered):
 def test_jump_of_the_designs_is_recognised(registered):
     """The terms go on where the better one of two wells changes, but the designs do not."""
     registered("wells")
-    front = pareto_front(config(*ANGLES, "pareto.points=9"))
+    front = pareto_front(config(*ANGLES, "pareto.points=7"))
     (gap,) = front.gaps
     assert gap.kind == "design"
     sides = [front.points[k - 1] for k in (gap.first, gap.second)]
@@ -313,8 +323,8 @@ def test_senses():
 def test_displaced_volume_is_that_of_its_pockets():
     """Per revolution, a pair displaces what both sections leave of their circles."""
     scene, design = Scene.from_config(config()), jnp.asarray(config().design)
-    profile = scene.profile(design)
-    shape = geometry(profile)
+    profile = eqx.filter_jit(Scene.profile)(scene, design)
+    shape = eqx.filter_jit(geometry)(profile)
     (term,) = terms.terms_of(["displaced_volume_cm3"])
     nothing = terms.Forces(*jnp.zeros(3))
     pockets = np.pi * float(shape.outer_radius) ** 2 - float(shape.area)
@@ -327,7 +337,7 @@ def test_interrupted_front_keeps_its_points():
 
     def progress(done, expected):
         assert done <= expected
-        if done >= 15:
+        if done >= 9:
             stop.set()
 
     tracer = Tracer(config(RADIUS), progress, stop)

@@ -99,8 +99,8 @@ class _Loop(NamedTuple):
 def supported(pair: RotorPair) -> bool:
     """Return whether collocation can close orbits of `pair`.
 
-    The contact must be a `SearchContact`, and every flag of contact law and parts needs a margin
-    (see `Margins`)."""
+    The contact must be a `SearchContact` of flanks that are not wavy (`Profile.wavy`), and every
+    flag of contact law and parts needs a margin (see `Margins`)."""
     owners = [pair.law, *pair.all_parts]
     names = [("margins", "switches"), ("drag_margins", "drag_switches")]
     known = all(
@@ -109,7 +109,8 @@ def supported(pair: RotorPair) -> bool:
         for margin, flag in names
         if hasattr(owner, flag)
     )
-    return known and isinstance(pair.contact, SearchContact)
+    searched = isinstance(pair.contact, SearchContact) and not pair.contact.pair.profile.wavy
+    return known and searched
 
 
 def _newer(kind: type, margin: str, flag: str) -> bool:

@@ -1,0 +1,108 @@
+"""Shared parts of the commands that search: `optimize` and `pareto`."""
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from rootsopt.commands.cli import Outcome
+    from rootsopt.config import Config
+    from rootsopt.output.runs import RunFolder
+
+Found = TypeVar("Found", covariant=True)
+PATIENCE = 5.0
+"""Time (s) after an interrupt above which a command no longer waits for its search to end.
+
+In this time, the simulation in progress may end, and the best design may be simulated again."""
+
+
+class Searches(Protocol[Found]):
+    """A search: `run` returns its outcome.
+
+    `so_far` returns what is known before its end, or `None` before the baseline is known."""
+
+    def run(self) -> Found: ...
+
+    def so_far(self) -> Found | None: ...
+
+
+def searched(
+    config: "Config", make: "Callable[[Config], Searches[Found]]", stop: threading.Event
+) -> "tuple[Config, dict[str, Any], Found | None]":
+    """Run the search that `make` returns for a config; return (config, chosen settings, outcome).
+
+    In the config that `make` gets and that is returned, the chosen settings replace `auto`. The
+    outcome is `None` if `stop`, an event that stops the search, came before the baseline was known.
+    """
+    from rootsopt.optimize.search import until_stopped
+    from rootsopt.response.choice import resolve
+
+    state: dict[str, Any] = {"config": config, "choice": {}}
+
+    def work():
+        state["config"], state["choice"] = resolve(config)
+        state["search"] = make(state["config"])
+        return state["search"].run()
+
+    found = until_stopped(work, stop, PATIENCE)
+    if found is None and "search" in state:
+        found = state["search"].so_far()
+    return state["config"], state["choice"], found
+
+
+def nothing_known(
+    config: "Config", folder: "RunFolder", done: str, empty: Mapping[str, Any]
+) -> "Outcome":
+    """Write the files of a run that was stopped before the baseline was known.
+
+    `done`: past participle for what had to be done with the baseline; `empty`: entries of the
+    result file that have no value. Return the `Outcome`, with exit code 3."""
+    from rootsopt.commands import cli
+    from rootsopt.output import files
+    from rootsopt.status import Status
+
+    status = Status.INTERRUPTED
+    message = f"The run was stopped before the baseline had been {done}: there is no result."
+    files.write_config(folder, config)
+    data = {**empty, "status": status.label, "message": message}
+    folder.write_json("result.json", data | {"versions": files.versions()})
+    folder.overwrite = False  # An earlier result is more valuable than this one.
+    text = f"{status.label}: {message}"
+    return cli.Outcome(cli.NO_RESULT, lambda out: out.print(text, soft_wrap=True))
+
+
+@contextlib.contextmanager
+def progress_bar(
+    console: "Console", first: str, then: str, counted: str, field: str = ""
+) -> Iterator[Callable[..., None] | None]:
+    """Yield a function (done, expected, …) that updates a progress bar.
+
+    Yield `None` if the console is not a terminal, where no progress bar is shown. `first`: text
+    until the first update, `then`: text from there on; `counted`: what the bar counts; `field`:
+    name of the number that is the function's third argument ("": the function has none)."""
+    if not console.is_terminal:
+        yield None
+        return
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = [
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn(f"{{task.completed}}/{{task.total}} {counted}"),
+        *([TextColumn(field + " {task.fields[shown]}")] if field else []),
+        TimeElapsedColumn(),
+    ]
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task(first, total=None, shown="-")
+
+        def update(done: int, expected: int, *shown: float) -> None:
+            text = f"{shown[0]:.4f}" if shown else "-"
+            bar.update(task, description=then, completed=done, total=expected, shown=text)
+
+        yield update
+
+
+__all__ = ["PATIENCE", "Searches", "nothing_known", "progress_bar", "searched"]

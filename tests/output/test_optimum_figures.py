@@ -1,0 +1,65 @@
+"""Figures of an optimum: departure and forces against the baseline, and ends of the searches."""
+
+import numpy as np
+import pytest
+
+from rootsopt.config import load
+from rootsopt.figures.comparison import plot_departure, plot_forces_together
+from rootsopt.figures.optimum import plot_starts
+from rootsopt.figures.style import figure
+from rootsopt.response.evaluation import Series
+from rootsopt.scene import outline_mm
+
+CIC = load("configs/cic.yaml")
+
+
+def drawn(ax, number):
+    """The points (n, 2) of a line on an axis."""
+    return np.asarray(ax.lines[number].get_xydata())
+
+
+def test_departure_of_a_scaled_rotor_is_that_of_its_supporting_lines():
+    """Scaling by 1.001 moves the tip by 45.1 µm outwards, and every point by its support."""
+    outline = outline_mm(CIC)
+    _, axes = figure(6, 4)
+    ax = plot_departure(axes[0, 0], outline, 1.001 * outline, 3, 33.0)
+    along, away = drawn(ax, 1).T
+    radius = np.hypot(*outline.T)
+    assert away[0] == pytest.approx(radius.max(), rel=1e-3)
+    assert away[-1] == pytest.approx(radius.min(), rel=1e-3)
+    assert along[-1] > radius.max() - radius.min()
+    assert "outwards" in ax.get_title()
+    _, axes = figure(6, 4)
+    same = plot_departure(axes[0, 0], outline, outline, 3, 33.0)
+    np.testing.assert_allclose(drawn(same, 1)[:, 1], 0.0, atol=1e-6)
+
+
+def test_forces_begin_at_the_same_rotation():
+    """A force of the rotor's angle alone is drawn on top of itself, wherever its series begins."""
+    turn = 2 * np.pi / 3
+
+    def run(first):
+        rotation = first + np.linspace(0, 2 * np.pi, 601)
+        force = 1 + np.sin(3 * rotation)
+        zero = np.zeros_like(force)
+        return Series(rotation / 314, rotation, zero, zero, force, zero, zero)
+
+    _, axes = figure(6, 4)
+    ax = plot_forces_together(axes[0, 0], {"a": run(0.0), "b": run(5.0)}, turn)
+    first, second = (drawn(ax, k) for k in (0, 1))
+    assert ax.get_xlim() == pytest.approx((0, 120))
+    there = np.interp(second[:, 0], *first.T)
+    np.testing.assert_allclose(there, second[:, 1], atol=1e-3)
+
+
+def test_ends_of_searches_are_drawn_with_their_optima():
+    starts = [
+        {"start": 0, "objective": 0.8, "reason": "converged"},
+        {"start": 1, "objective": 0.9, "reason": "evaluations"},
+        {"start": 2, "objective": None, "reason": "unusable"},
+    ]
+    _, axes = figure(6, 4)
+    ax = plot_starts(axes[0, 0], starts, [{"objective": 0.8, "found": 1}])
+    assert [drawn(ax, k)[0, 1] for k in (0, 1, 2)] == [0.8, 0.8, 0.9]
+    assert ax.lines[2].get_markerfacecolor() == "none"
+    assert "found 1" in ax.get_legend().get_texts()[0].get_text()
