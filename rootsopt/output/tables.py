@@ -19,6 +19,7 @@ from rootsopt.status import Status
 DASH = "-"
 _UNITS = {
     "_kg_m2": "kg m^2",
+    "_l_min": "l/min",
     "_N_m": "N m",
     "_cm3": "cm^3",
     "_mm2": "mm^2",
@@ -287,6 +288,8 @@ def geometry_table(record: Mapping[str, Any]) -> RenderableType:
         _group(table, "margins of the flank", _singles(record["margins"]))
     if "outline" in record:
         _group(table, "outline", _singles(record["outline"]))
+    if "pump" in record:
+        _group(table, "pump", _singles(record["pump"]))
     if record.get("status"):
         _group(table, "status", [("status", str(record["status"]))])
     return Group(table, Text(record.get("message") or ""))

@@ -1,0 +1,24 @@
+"""What a pump designer weighs beside the contact force: flow, play, leakage.
+
+All functions are pure, take SI units and can be differentiated by JAX with respect to profile and
+scene. Nothing here enters the simulation."""
+
+from rootsopt.pump.flow import (
+    displaced_volume,
+    flow_lines,
+    greatest_radius_ratio,
+    relative_flow,
+    ripple,
+    theoretical_flow,
+    tip_height_share,
+)
+
+__all__ = [
+    "displaced_volume",
+    "flow_lines",
+    "greatest_radius_ratio",
+    "relative_flow",
+    "ripple",
+    "theoretical_flow",
+    "tip_height_share",
+]
