@@ -23,6 +23,7 @@ _UNITS = {
     "_N_m": "N m",
     "_cm3": "cm^3",
     "_mm2": "mm^2",
+    "_mrad": "mrad",
     "_um": "um",
     "_mm": "mm",
     "_deg": "deg",

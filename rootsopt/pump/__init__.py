@@ -12,11 +12,14 @@ from rootsopt.pump.flow import (
     theoretical_flow,
     tip_height_share,
 )
+from rootsopt.pump.play import Play, play
 
 __all__ = [
+    "Play",
     "displaced_volume",
     "flow_lines",
     "greatest_radius_ratio",
+    "play",
     "relative_flow",
     "ripple",
     "theoretical_flow",

@@ -18,6 +18,8 @@ from rootsopt.config.units import MM
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
+from rootsopt.pump.play import play
+from rootsopt.pump.sheet import center_distance
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 
@@ -99,6 +101,18 @@ class RippleTerm(Term):
     def value(self, scene, profile, shape, forces):
         del scene, forces
         return flow.ripple(profile, shape)
+
+
+class BacklashTerm(Term):
+    """A term whose value is the backlash (mm) up to which a timing gear keeps the flanks apart.
+
+    It is 0 without clearance, and negative where the rotors overlap."""
+
+    sense: ClassVar[Literal["min", "max"]] = "max"
+
+    def value(self, scene, profile, shape, forces):
+        del shape, forces
+        return play(profile, scene.clearance, center_distance(scene)).gear_backlash / MM
 
 
 class InertiaTerm(Term):
@@ -226,6 +240,7 @@ def _own() -> dict[str, Any]:
         "displaced_volume_cm3": DisplacementTerm(),
         "theoretical_flow_l_min": FlowTerm(),
         "flow_ripple": RippleTerm(),
+        "gear_backlash_max_mm": BacklashTerm(),
     }
 
 
