@@ -15,7 +15,7 @@ class ParetoConfig(Section):
         ("peak_force_N", "area_efficiency"),
         description="two or three quantities: forces and lines as in `response`, geometry as in "
         "`geometry`, displaced_volume_cm3, theoretical_flow_l_min, flow_ripple, "
-        "gear_backlash_max_mm, or registered terms",
+        "gear_backlash_max_mm, leakage_fraction, or registered terms",
     )
     senses: dict[str, Literal["min", "max"]] = Field(
         default_factory=dict,

@@ -19,6 +19,7 @@ from rootsopt.config.families import (
     replace_fields,
 )
 from rootsopt.config.pareto import ParetoConfig
+from rootsopt.config.pump import PumpConfig
 from rootsopt.config.scene import (
     ContactConfig,
     ProfileConfig,
@@ -69,6 +70,7 @@ class Config(Section):
     sweep: SweepConfig = Field(default_factory=lambda: SweepConfig.model_validate({}))
     pareto: ParetoConfig = Field(default_factory=lambda: ParetoConfig.model_validate({}))
     optimizer: OptimizerConfig = Field(default_factory=lambda: OptimizerConfig.model_validate({}))
+    pump: PumpConfig | None = Field(None, description="absent: no leakage is reported")
     tolerances: TolerancesConfig | None = Field(None, description="absent: nothing scatters")
 
     @property

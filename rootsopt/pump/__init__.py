@@ -12,14 +12,22 @@ from rootsopt.pump.flow import (
     theoretical_flow,
     tip_height_share,
 )
+from rootsopt.pump.gap import Allowances, MeshGap, mesh_gap, relative_curvature
+from rootsopt.pump.leakage import Leakage, leakage
 from rootsopt.pump.play import Play, play
 
 __all__ = [
+    "Allowances",
+    "Leakage",
+    "MeshGap",
     "Play",
     "displaced_volume",
     "flow_lines",
     "greatest_radius_ratio",
+    "leakage",
+    "mesh_gap",
     "play",
+    "relative_curvature",
     "relative_flow",
     "ripple",
     "theoretical_flow",

@@ -37,6 +37,15 @@ def both_flanks(flank: Flank) -> Flank:
     return Flank(*(jnp.append(a, b) for a, b in zip(mirrored, flank, strict=True)))
 
 
+def whole_valley(flank: Flank, lobes: int) -> Flank:
+    """Return the points from a lobe's tip through the root to the next lobe's tip.
+
+    `lobes`: N."""
+    turn = jnp.exp(2j * jnp.pi / lobes)
+    mirrored = Flank(*(turn * jnp.conj(one[-2::-1]) for one in flank))
+    return Flank(*(jnp.append(a, b) for a, b in zip(flank, mirrored, strict=True)))
+
+
 def half_valley(flank: Flank, lobes: int, radius: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Return half the angle (rad) of the space between two lobes at a `radius` (m) from the axis.
 

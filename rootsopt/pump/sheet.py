@@ -6,11 +6,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rootsopt.config.units import MM
+from rootsopt.errors import InputError
 from rootsopt.profiles import geometry
 from rootsopt.pump import flow
+from rootsopt.pump.leakage import leakage
 from rootsopt.pump.play import play
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
+from rootsopt.scene.medium import Medium
 
 CM3 = 1e-6
 """One cubic centimetre (m³)."""
@@ -18,6 +21,10 @@ L_MIN = 1e-3 / 60
 """One litre per minute (m³/s)."""
 MRAD = 1e-3
 """One milliradian (rad)."""
+UM = 1e-6
+"""One micrometre (m)."""
+_ROUNDING = 1e-8
+"""Overlap (m) of the flanks up to which it may be the rounding of a measured outline."""
 LINES = 4
 """Number of lines of the flow in the sheet."""
 NOTE = (
@@ -38,10 +45,17 @@ def sheet(scene: Scene, design: Float[Array, " d"]) -> dict[str, Any]:
     With a clearance, a centre distance error or a measured outline, there is also the play.
     `angular_play_…_mrad`: least and greatest play of rotor 2 over the rotation.
     `gear_backlash_max_mm`: greatest backlash of a timing gear that keeps the flanks apart, negative
-    where the rotors overlap."""
+    where the rotors overlap.
+
+    With a section `pump`, there is the leakage too: least and mean gap of the flanks over the mesh
+    (µm), leakage through mesh, tips and end faces, volumetric efficiency and, for a gas, the
+    Knudsen number. Raises `InputError` if the rotors overlap somewhere, or no pressure difference
+    is given."""
     found = {key: value.tolist() for key, value in _flow(scene, design).items()}
     if _has_play(scene):
         found |= {key: value.tolist() for key, value in _play(scene, design).items()}
+    if scene.medium is not None:
+        found |= _leaking(scene, scene.medium, design)
     hidden = () if scene.straight else _STRAIGHT
     return {key: found[key] for key in KEYS if key in found and key not in hidden}
 
@@ -55,6 +69,13 @@ KEYS = (
     "angular_play_min_mrad",
     "angular_play_max_mrad",
     "gear_backlash_max_mm",
+    "flank_gap_min_um",
+    "flank_gap_mean_um",
+    "mesh_leakage_l_min",
+    "tip_leakage_l_min",
+    "end_leakage_l_min",
+    "volumetric_efficiency",
+    "knudsen_number",
 )
 """Keys of the sheet, in the order of its rows."""
 _STRAIGHT = "flow_ripple", "flow_lines"
@@ -95,3 +116,44 @@ def center_distance(scene: Scene) -> Float[Array, ""]:
     """Return the distance between the rotors' axes (m)."""
     error = scene.center_distance_error
     return 2 * scene.pitch_radius + (0.0 if error is None else error)
+
+
+def _leaking(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[str, Any]:
+    """Return the rows of leakage. Raises `InputError` as `sheet` does."""
+    if medium.pressure_difference is None:
+        raise InputError(
+            "`pump.pressure_difference_Pa` must be given if `scene.load` has no "
+            "`pressure_difference_Pa`; add it, or remove the section `pump`"
+        )
+    found, rows = _leaks(scene, design)
+    least = float(found)
+    if least < -_ROUNDING:
+        raise InputError(
+            f"the flanks must not overlap in perfect rolling, but overlap by {-least / UM:.3g} um; "
+            "raise `contact.clearance_mm`, `scene.center_distance_error_mm` or "
+            "`pump.radial_allowance_mm` by more than that"
+        )
+    absent = {
+        "tip_leakage_l_min": medium.tip_clearance is None,
+        "end_leakage_l_min": medium.end_clearance is None,
+        "knudsen_number": medium.gas is None,
+    }
+    return {key: value.tolist() for key, value in rows.items() if not absent.get(key)}
+
+
+@Program
+def _leaks(scene: Scene, design: Float[Array, " d"]) -> tuple[Array, dict[str, Array]]:
+    """Return (least gap of the flanks (m), rows of the sheet)."""
+    assert scene.medium is not None
+    profile = scene.profile(design)
+    found = leakage(scene, scene.medium, profile, geometry(profile))
+    least = jnp.min(found.gap.least)
+    return least, {
+        "flank_gap_min_um": least / UM,
+        "flank_gap_mean_um": jnp.mean(found.gap.least) / UM,
+        "mesh_leakage_l_min": found.mesh / L_MIN,
+        "tip_leakage_l_min": found.tips / L_MIN,
+        "end_leakage_l_min": found.ends / L_MIN,
+        "volumetric_efficiency": found.efficiency,
+        "knudsen_number": found.knudsen,
+    }

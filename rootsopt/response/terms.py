@@ -18,6 +18,7 @@ from rootsopt.config.units import MM
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
+from rootsopt.pump.leakage import leakage
 from rootsopt.pump.play import play
 from rootsopt.pump.sheet import center_distance
 from rootsopt.runtime.programs import Program
@@ -113,6 +114,22 @@ class BacklashTerm(Term):
     def value(self, scene, profile, shape, forces):
         del shape, forces
         return play(profile, scene.clearance, center_distance(scene)).gear_backlash / MM
+
+
+class LossTerm(Term):
+    """A term whose value is the leakage as a fraction of the theoretical flow.
+
+    It is 1 minus the volumetric efficiency. The scene must have a section `pump`."""
+
+    def value(self, scene, profile, shape, forces):
+        del forces
+        medium = scene.medium
+        if medium is None or medium.pressure_difference is None:
+            raise InputError(
+                "the term `leakage_fraction` needs the section `pump` with "
+                "`pump.pressure_difference_Pa`; add both"
+            )
+        return 1 - leakage(scene, medium, profile, shape).efficiency
 
 
 class InertiaTerm(Term):
@@ -241,6 +258,7 @@ def _own() -> dict[str, Any]:
         "theoretical_flow_l_min": FlowTerm(),
         "flow_ripple": RippleTerm(),
         "gear_backlash_max_mm": BacklashTerm(),
+        "leakage_fraction": LossTerm(),
     }
 
 
