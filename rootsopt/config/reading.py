@@ -173,6 +173,19 @@ class Config(Section):
         )
 
     @model_validator(mode="after")
+    def _pressed(self):
+        pump, load = self.pump, self.scene.load
+        if pump is not None and pump.pressure_difference_Pa is None:
+            if load.pressure_difference_Pa is None:
+                raise ValueError(
+                    "`pump.pressure_difference_Pa` must be given if `scene.load` has no "
+                    "`pressure_difference_Pa`; add it, or remove the section `pump`"
+                )
+            across = {"pressure_difference_Pa": load.pressure_difference_Pa}
+            return self.model_copy(update={"pump": pump.model_copy(update=across)})
+        return self
+
+    @model_validator(mode="after")
     def _searched(self):
         fidelity = self.solver.fidelity
         if self.needs_search and fidelity not in ("search", "auto"):

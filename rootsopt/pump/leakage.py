@@ -65,9 +65,8 @@ def end_shape(shape: Geometry) -> Float[Array, ""]:
 def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> Leakage:
     """Return the leakage of a pair.
 
-    `medium`: its `pressure_difference` must be given. `profile`, `shape`: of the design. Where the
-    rotors overlap (`gap.least` < 0), the flows mean nothing."""
-    assert medium.pressure_difference is not None
+    `profile`, `shape`: of the design. Where the rotors overlap (`gap.least` < 0), the flows mean
+    nothing."""
     zero = jnp.zeros_like(scene.clearance)
     error = scene.center_distance_error
     center = zero if error is None else error

@@ -1,10 +1,13 @@
 """The pump sheet: what a designer weighs beside the contact force, at one glance."""
 
+import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rootsopt.config import Config
 from rootsopt.config.units import MM
 from rootsopt.errors import InputError
 from rootsopt.profiles import geometry
@@ -12,7 +15,7 @@ from rootsopt.pump import flow
 from rootsopt.pump.leakage import leakage
 from rootsopt.pump.play import play
 from rootsopt.runtime.programs import Program
-from rootsopt.scene import Scene
+from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.medium import Medium
 
 CM3 = 1e-6
@@ -49,8 +52,7 @@ def sheet(scene: Scene, design: Float[Array, " d"]) -> dict[str, Any]:
 
     With a section `pump`, there is the leakage too: least and mean gap of the flanks over the mesh
     (µm), leakage through mesh, tips and end faces, volumetric efficiency and, for a gas, the
-    Knudsen number. Raises `InputError` if the rotors overlap somewhere, or no pressure difference
-    is given."""
+    Knudsen number. Raises `InputError` if the rotors overlap somewhere."""
     found = {key: value.tolist() for key, value in _flow(scene, design).items()}
     if _has_play(scene):
         found |= {key: value.tolist() for key, value in _play(scene, design).items()}
@@ -58,6 +60,23 @@ def sheet(scene: Scene, design: Float[Array, " d"]) -> dict[str, Any]:
         found |= _leaking(scene, scene.medium, design)
     hidden = () if scene.straight else _STRAIGHT
     return {key: found[key] for key in KEYS if key in found and key not in hidden}
+
+
+def check_clearances(config: Config) -> None:
+    """Raise `InputError` if a config has a section `pump` and its flanks overlap."""
+    if config.pump is not None:
+        sheet(Scene.from_config(config), design_vector(config))
+
+
+def record_of(config: Config, design: Sequence[float]) -> dict[str, Any]:
+    """Return the pump sheet of a `design` in config units; where flanks overlap, without leakage.
+
+    For the end of a search, which an error would leave without its files."""
+    scene, values = Scene.from_config(config), jnp.asarray(design, float)
+    try:
+        return sheet(scene, values)
+    except InputError:
+        return sheet(dataclasses.replace(scene, medium=None), values)
 
 
 KEYS = (
@@ -120,11 +139,6 @@ def center_distance(scene: Scene) -> Float[Array, ""]:
 
 def _leaking(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[str, Any]:
     """Return the rows of leakage. Raises `InputError` as `sheet` does."""
-    if medium.pressure_difference is None:
-        raise InputError(
-            "`pump.pressure_difference_Pa` must be given if `scene.load` has no "
-            "`pressure_difference_Pa`; add it, or remove the section `pump`"
-        )
     found, rows = _leaks(scene, design)
     least = float(found)
     if least < -_ROUNDING:

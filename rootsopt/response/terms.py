@@ -123,13 +123,12 @@ class LossTerm(Term):
 
     def value(self, scene, profile, shape, forces):
         del forces
-        medium = scene.medium
-        if medium is None or medium.pressure_difference is None:
+        if scene.medium is None:
             raise InputError(
-                "the term `leakage_fraction` needs the section `pump` with "
-                "`pump.pressure_difference_Pa`; add both"
+                "the term `leakage_fraction` needs the section `pump`; add it with "
+                "`pump.viscosity_mPa_s` and `pump.pressure_difference_Pa`"
             )
-        return 1 - leakage(scene, medium, profile, shape).efficiency
+        return 1 - leakage(scene, scene.medium, profile, shape).efficiency
 
 
 class InertiaTerm(Term):

@@ -24,13 +24,13 @@ class Gas(eqx.Module):
 class Medium(eqx.Module):
     """What leakage needs beyond a simulation, in SI units.
 
-    `viscosity` (Pa·s); `pressure_difference` (Pa), `None`: not known. `tip_clearance`,
+    `viscosity` (Pa·s); `pressure_difference` (Pa), discharge minus suction. `tip_clearance`,
     `end_clearance` (m), `None`: no leakage there; `tips`: tips that seal in series.
     `radial_allowance` (m): radius by which both rotors are smaller everywhere. `gas`: `None` for a
     liquid."""
 
     viscosity: Float[Array, ""]
-    pressure_difference: Float[Array, ""] | None
+    pressure_difference: Float[Array, ""]
     tip_clearance: Float[Array, ""] | None
     end_clearance: Float[Array, ""] | None
     radial_allowance: Float[Array, ""]
@@ -43,13 +43,11 @@ def medium_of(config: Config) -> Medium | None:
     pump = config.pump
     if pump is None:
         return None
-    across = pump.pressure_difference_Pa
-    if across is None:
-        across = config.scene.load.pressure_difference_Pa
-    gas = pump.gas
+    gas, across = pump.gas, pump.pressure_difference_Pa
+    assert across is not None
     return Medium(
         viscosity=jnp.asarray(pump.viscosity_mPa_s * _MPA_S),
-        pressure_difference=_optional(across),
+        pressure_difference=jnp.asarray(across),
         tip_clearance=_optional(pump.tip_clearance_mm, MM),
         end_clearance=_optional(pump.end_clearance_mm, MM),
         radial_allowance=jnp.asarray(pump.radial_allowance_mm * MM),

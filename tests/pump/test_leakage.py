@@ -242,6 +242,8 @@ def test_interference_is_an_error(change):
 
 
 def test_pressure_is_asked_for():
-    design = design_vector(load_config("configs/cic.yaml"))
     with pytest.raises(InputError, match=r"`pump.pressure_difference_Pa` must be given"):
-        sheet(scene_of("pump.viscosity_mPa_s=50"), design)
+        load_config("configs/cic.yaml", ["pump.viscosity_mPa_s=50"])
+    gas_load = "scene.load={pressure_difference_Pa: 3.0e4}"
+    config = load_config("configs/cic.yaml", ["pump.viscosity_mPa_s=50", gas_load])
+    assert config.pump.pressure_difference_Pa == 3e4
