@@ -31,11 +31,13 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     from rootsopt.measured import report as outline_report
     from rootsopt.optimize.checkpoint import aside
     from rootsopt.output import tables
+    from rootsopt.pump.sheet import check_clearances
     from rootsopt.runtime.timing import CompileClock
     from rootsopt.scene import check_geometry
 
     formats = export.chosen(options.export)
     check_geometry(config)
+    check_clearances(config)
     clock = CompileClock()
     promise = "keeping the best design so far and writing the files"
     with (
@@ -60,7 +62,8 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
         return _contradiction(config, folder, result)
     ran = time.perf_counter() - began
     alike = {} if result.interrupted else _alike(config, result)
-    _write(folder, config, options, result, choice | alike, clock.seconds, ran)
+    sheets = _sheets(config, result)
+    _write(folder, config, options, result, choice | alike, sheets, clock.seconds, ran)
     if result.optimized is not None:
         searching = _searching(config, result)
         export.write_simulated(folder, searching, formats, result.optimized)
@@ -75,6 +78,8 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
         else:
             numbers = result.constraints, result.improvement
             out.print(tables.comparison_table(result.baseline, result.optimized, *numbers))
+            named = zip(("baseline", "optimised"), sheets.values(), strict=True)
+            out.print(tables.pump_table(dict(named)))
             if baseline:
                 optimized = result.optimized.record()["speeds"]
                 out.print(tables.speeds_table(baseline, optimized, result.objective_by_speed))
@@ -187,6 +192,19 @@ def _alike(config: "Config", result) -> dict:
     return {"resembles": [one.record() for one in found]}
 
 
+def _sheets(config: "Config", result) -> dict[str, dict]:
+    """Return the records of baseline and optimised design, with their pump sheets under `pump`."""
+    from rootsopt.pump.sheet import record_of
+
+    designs = {"baseline": (config, result.baseline)}
+    if result.optimized is not None:
+        designs["optimized"] = _searching(config, result), result.optimized
+    return {
+        name: one.record() | {"pump": record_of(own, [*one.design.values()])}
+        for name, (own, one) in designs.items()
+    }
+
+
 def _searching(config: "Config", result) -> "Config":
     """Return the config of the designs that the search varied.
 
@@ -236,7 +254,7 @@ def _interrupted(result) -> str:
     )
 
 
-def _write(folder, config, options, result, choice, compiled, ran) -> None:
+def _write(folder, config, options, result, choice, sheets, compiled, ran) -> None:
     from rootsopt.measured import report as outline_report
     from rootsopt.output import files
     from rootsopt.response.speeds import at_speeds
@@ -251,7 +269,7 @@ def _write(folder, config, options, result, choice, compiled, ran) -> None:
         folder.write_text("optimized.yaml", _designed(searching, result.optimized).to_yaml())
     if result.robustness is not None:
         _write_robustness(folder, config, options, result.robustness)
-    data: dict = {name: e.record() if e is not None else None for name, e in records.items()}
+    data: dict = {name: sheets.get(name) for name in records}
     for name, evaluation in records.items():
         if evaluation is None:
             continue

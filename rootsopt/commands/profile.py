@@ -32,6 +32,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     from rootsopt.measured import report as outline_report
     from rootsopt.output import files, tables
     from rootsopt.profiles import geometry
+    from rootsopt.pump.sheet import NOTE, sheet
     from rootsopt.response.evaluation import geometry_record
     from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, outline_mm
     from rootsopt.scene.families import margins_of
@@ -55,6 +56,7 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
     if margins := margins_of(config.profile):
         record["margins"] = margins
     record |= outline_report.record(config)
+    record["pump"] = sheet(scene, design)
     files.write_config(folder, config)
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     export.write(folder, config, formats, record["design"])
@@ -70,6 +72,8 @@ def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -
 
     def show(out: "Console") -> None:
         out.print(tables.geometry_table(record))
+        if "flow_ripple" in record["pump"]:
+            out.print(NOTE, soft_wrap=True, highlight=False)
         outline_report.say(config, out)
         if alike:
             out.print(tables.likeness_table(alike, "This profile resembles"))

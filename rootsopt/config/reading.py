@@ -19,6 +19,7 @@ from rootsopt.config.families import (
     replace_fields,
 )
 from rootsopt.config.pareto import ParetoConfig
+from rootsopt.config.pump import PumpConfig
 from rootsopt.config.scene import (
     ContactConfig,
     ProfileConfig,
@@ -70,6 +71,7 @@ class Config(Section):
     sweep: SweepConfig = Field(default_factory=lambda: SweepConfig.model_validate({}))
     pareto: ParetoConfig = Field(default_factory=lambda: ParetoConfig.model_validate({}))
     optimizer: OptimizerConfig = Field(default_factory=lambda: OptimizerConfig.model_validate({}))
+    pump: PumpConfig | None = Field(None, description="absent: no leakage is reported")
     tolerances: TolerancesConfig | None = Field(None, description="absent: nothing scatters")
 
     @property
@@ -170,6 +172,19 @@ class Config(Section):
         return self.model_copy(
             update={"contact": contact.model_copy(update={"smoothing_mm": length})}
         )
+
+    @model_validator(mode="after")
+    def _pressed(self):
+        pump, load = self.pump, self.scene.load
+        if pump is not None and pump.pressure_difference_Pa is None:
+            if load.pressure_difference_Pa is None:
+                raise ValueError(
+                    "`pump.pressure_difference_Pa` must be given if `scene.load` has no "
+                    "`pressure_difference_Pa`; add it, or remove the section `pump`"
+                )
+            across = {"pressure_difference_Pa": load.pressure_difference_Pa}
+            return self.model_copy(update={"pump": pump.model_copy(update=across)})
+        return self
 
     @model_validator(mode="after")
     def _searched(self):

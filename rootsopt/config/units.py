@@ -17,6 +17,8 @@ _UNITS: dict[str, tuple[str, dict[str, float]]] = {
     "_N_per_mm": ("N/mm", {"N/m": 1e-3}),
     "_N_m_s_per_rad": ("N·m·s/rad", {"N·mm·s/rad": 1e-3}),
     "_N_m_per_rad": ("N·m/rad", {"N·mm/rad": 1e-3}),
+    "_mPa_s": ("mPa·s", {"Pa·s": 1e3, "µPa·s": 1e-3}),
+    "_J_per_kg_K": ("J/(kg·K)", {"kJ/(kg·K)": 1e3}),
     "_kg_m3": ("kg/m³", {"g/cm³": 1e3, "kg/mm³": 1e9, "t/mm³": 1e12}),
     "_kg_m2": ("kg·m²", {"kg·mm²": 1e-6}),
     "_mm_s": ("mm/s", {"m/s": 1e3}),
@@ -27,6 +29,7 @@ _UNITS: dict[str, tuple[str, dict[str, float]]] = {
     "_mm": ("mm", {"metres": 1e3, "micrometres": 1e-3}),
     "_deg": ("°", {"radians": 180 / math.pi}),
     "_Pa": ("Pa", {}),
+    "_K": ("K", {}),
 }
 
 

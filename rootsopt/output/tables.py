@@ -19,9 +19,11 @@ from rootsopt.status import Status
 DASH = "-"
 _UNITS = {
     "_kg_m2": "kg m^2",
+    "_l_min": "l/min",
     "_N_m": "N m",
     "_cm3": "cm^3",
     "_mm2": "mm^2",
+    "_mrad": "mrad",
     "_um": "um",
     "_mm": "mm",
     "_deg": "deg",
@@ -39,6 +41,8 @@ _NAMES = {
     "rms_force_N": ("RMS force", "N"),
     "peak_norm_force_N": ("p-norm of the force", "N"),
 }
+_SHEET_FORCES = "mean_force_N", "peak_force_N"
+"""Forces in the pump sheet."""
 _STATISTICS = {
     "mean": "mean",
     "sigma": "standard deviation",
@@ -84,6 +88,22 @@ def comparison_table(
     if baseline.message == optimized.message:
         notes = [("both", baseline.message)]
     return Group(table, *(Text(f"{name}: {message}") for name, message in notes))
+
+
+def pump_table(records: Mapping[str, Mapping[str, Any]]) -> RenderableType:
+    """Return the pump sheet of several designs side by side.
+
+    `records`: their records in the result file, by the name of the column. A pump sheet shows the
+    entry `pump` and the forces. With two designs, a last column shows the change in % of the
+    first."""
+    sheets = []
+    for record in records.values():
+        forces = ((key, record.get("response", {}).get(key)) for key in _SHEET_FORCES)
+        sheets.append(record.get("pump", {}) | {key: x for key, x in forces if x is not None})
+    compared = len(sheets) == 2
+    table = _table("Pump sheet", *records, *(["change"] if compared else []))
+    _group(table, "pump", _pairs(*sheets) if compared else _singles(sheets[0]))
+    return table
 
 
 def optimality_table(
@@ -287,6 +307,8 @@ def geometry_table(record: Mapping[str, Any]) -> RenderableType:
         _group(table, "margins of the flank", _singles(record["margins"]))
     if "outline" in record:
         _group(table, "outline", _singles(record["outline"]))
+    if "pump" in record:
+        _group(table, "pump", _singles(record["pump"]))
     if record.get("status"):
         _group(table, "status", [("status", str(record["status"]))])
     return Group(table, Text(record.get("message") or ""))

@@ -9,7 +9,14 @@ from rootsopt.profiles.ee import EE
 from rootsopt.profiles.ellipse import ellipse
 from rootsopt.profiles.epicycloid import TippedEpicycloid, circle_epicycloid, hypo_epicycloid
 from rootsopt.profiles.freeform import FreeForm, project
-from rootsopt.profiles.geometry import Geometry, flank, flank_nodes, geometry, outline
+from rootsopt.profiles.geometry import (
+    Geometry,
+    flank,
+    flank_nodes,
+    geometry,
+    outline,
+    quadrature_nodes,
+)
 from rootsopt.profiles.outline import Outline, Table
 from rootsopt.profiles.trochoid import extended_cycloid
 
@@ -41,4 +48,5 @@ __all__ = [
     "hypo_epicycloid",
     "outline",
     "project",
+    "quadrature_nodes",
 ]

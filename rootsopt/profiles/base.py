@@ -39,6 +39,9 @@ given roll angle starts in one of these intervals."""
 _STEPS = 10
 """Number of safeguarded Newton steps in the search for the normal angle at a given roll angle. A
 step that leaves the bracket is replaced by a bisection."""
+_SLACK = 1e-9
+"""Distance (rad) from the bracket above which a Newton step counts as leaving it. Without slack,
+rounding at the root could send the search back to the middle of a wide bracket."""
 _POLISH = 3
 """Number of plain Newton steps after the safeguarded ones. Derivatives of the result are correct up
 to this order."""
@@ -332,7 +335,8 @@ def _inverse(profile: Profile, roll_angle: Float[Array, "*n"]) -> Float[Array, "
         beta, rate = rolled(fixed, nu)
         low, high = jnp.where(beta <= want, nu, low), jnp.where(beta > want, nu, high)
         step = nu - (beta - want) / rate
-        nu = jnp.where((step >= low) & (step <= high), step, (low + high) / 2)
+        inside = (step >= low - _SLACK) & (step <= high + _SLACK)
+        nu = jnp.where(inside, step, (low + high) / 2)
     nu = lax.stop_gradient(nu)
     for _ in range(_POLISH):
         beta, rate = rolled(profile, nu)

@@ -19,6 +19,9 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _STEPS = 8
 """Number of safeguarded Newton steps in the search for the normal angle at a given roll angle. A
 step that leaves the bracket is replaced by a bisection."""
+_SLACK = 1e-9
+"""Distance (fractions of a span) from the bracket above which a Newton step counts as leaving it.
+Without slack, rounding at the root could send the search back to the middle of a wide bracket."""
 _POLISH = 3
 """Number of plain Newton steps after the safeguarded ones. Derivatives of the result are correct up
 to this order."""
@@ -189,7 +192,8 @@ class FreeForm(Profile):
             error, slope = short(*fixed, share)
             low, high = jnp.where(error < 0, share, low), jnp.where(error < 0, high, share)
             step = share - error / slope
-            share = jnp.where((step >= low) & (step <= high), step, (low + high) / 2)
+            inside = (step >= low - _SLACK) & (step <= high + _SLACK)
+            share = jnp.where(inside, step, (low + high) / 2)
         share = lax.stop_gradient(share)
         for _ in range(_POLISH):
             error, slope = short(c, width, want, share)

@@ -51,11 +51,7 @@ def geometry(profile: Profile) -> Geometry:
         return _given(profile)
     r = profile.pitch_radius
     segments = profile.stretches()
-    start = jnp.stack([s.start for s in segments])[:, None]
-    length = jnp.stack([s.stop for s in segments])[:, None] - start
-    shares, weights = map(jnp.asarray, _rule(profile.quadrature))
-    weights = weights * length
-    nu = start + length * shares
+    nu, weights, length = quadrature_nodes(profile)
     (_, psi, s), addendum, dedendum = profile.speeds(nu)
     sliding = r * jnp.sin(psi)
     sides = ((s, addendum), (-s, dedendum))
@@ -84,6 +80,21 @@ def geometry(profile: Profile) -> Geometry:
         undercut_margin=margin,
         seal_width=outer_radius * seal_angle,
     )
+
+
+def quadrature_nodes(
+    profile: Profile,
+) -> tuple[Float[Array, "k n"], Float[Array, "k n"], Float[Array, "k 1"]]:
+    """Return (nodes, weights, lengths) of a rule for integrals over the addendum's normal angle.
+
+    All are in rad, with one row per part in `Profile.stretches`. Nodes at which only undercut is
+    checked have weight 0."""
+    segments = profile.stretches()
+    start = jnp.stack([s.start for s in segments])[:, None]
+    length = jnp.stack([s.stop for s in segments])[:, None] - start
+    shares, weights = map(jnp.asarray, _rule(profile.quadrature))
+    weights = weights * length
+    return start + length * shares, weights, length
 
 
 @functools.cache

@@ -17,11 +17,17 @@ from jaxtyping import Array, Float
 from rootsopt.config.units import MM
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
+from rootsopt.pump import flow
+from rootsopt.pump.leakage import leakage
+from rootsopt.pump.play import play
+from rootsopt.pump.sheet import center_distance
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 
 _CM = 1e-2
 """Length of a centimetre (m)."""
+_LITRE_PER_MINUTE = 1e-3 / 60
+"""One litre per minute (m³/s)."""
 
 
 class Forces(NamedTuple):
@@ -71,18 +77,58 @@ class LargeTerm(GeometryTerm):
 
 
 class DisplacementTerm(Term):
-    """A term whose value is the volume (cm³) that a pair displaces per revolution.
-
-    Each rotor carries one pocket per lobe and revolution: all pockets of both rotors together have
-    the volume 2 π r_a² L η, with the outer radius r_a, the rotor length L and the area efficiency
-    η."""
+    """A term whose value is the volume (cm³) that a pair displaces per revolution."""
 
     sense: ClassVar[Literal["min", "max"]] = "max"
 
     def value(self, scene, profile, shape, forces):
         del profile, forces
-        swept = 2 * jnp.pi * shape.outer_radius**2 * shape.area_efficiency
-        return swept * scene.length / _CM**3
+        return flow.displaced_volume(shape, scene.length) / _CM**3
+
+
+class FlowTerm(Term):
+    """A term whose value is the flow without leakage (l/min) at the scene's speed."""
+
+    sense: ClassVar[Literal["min", "max"]] = "max"
+
+    def value(self, scene, profile, shape, forces):
+        del profile, forces
+        return flow.theoretical_flow(shape, scene.length, scene.speed) / _LITRE_PER_MINUTE
+
+
+class RippleTerm(Term):
+    """A term whose value is the peak-to-peak ripple of the flow, as a fraction of the mean flow."""
+
+    def value(self, scene, profile, shape, forces):
+        del scene, forces
+        return flow.ripple(profile, shape)
+
+
+class BacklashTerm(Term):
+    """A term whose value is the backlash (mm) up to which a timing gear keeps the flanks apart.
+
+    It is 0 without clearance, and negative where the rotors overlap."""
+
+    sense: ClassVar[Literal["min", "max"]] = "max"
+
+    def value(self, scene, profile, shape, forces):
+        del shape, forces
+        return play(profile, scene.clearance, center_distance(scene)).gear_backlash / MM
+
+
+class LossTerm(Term):
+    """A term whose value is the leakage as a fraction of the theoretical flow.
+
+    It is 1 minus the volumetric efficiency. The scene must have a section `pump`."""
+
+    def value(self, scene, profile, shape, forces):
+        del forces
+        if scene.medium is None:
+            raise InputError(
+                "the term `leakage_fraction` needs the section `pump`; add it with "
+                "`pump.viscosity_mPa_s` and `pump.pressure_difference_Pa`"
+            )
+        return 1 - leakage(scene, scene.medium, profile, shape).efficiency
 
 
 class InertiaTerm(Term):
@@ -208,6 +254,10 @@ def _own() -> dict[str, Any]:
         "undercut_margin_mm": LargeTerm("undercut_margin", MM),
         "seal_width_mm": LargeTerm("seal_width", MM),
         "displaced_volume_cm3": DisplacementTerm(),
+        "theoretical_flow_l_min": FlowTerm(),
+        "flow_ripple": RippleTerm(),
+        "gear_backlash_max_mm": BacklashTerm(),
+        "leakage_fraction": LossTerm(),
     }
 
 

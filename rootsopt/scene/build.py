@@ -42,6 +42,7 @@ from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Outline, Profile, geometry
 from rootsopt.runtime.precision import check_precision
 from rootsopt.scene import families, reading
+from rootsopt.scene.medium import Medium, medium_of
 
 
 class Scene(eqx.Module):
@@ -61,7 +62,8 @@ class Scene(eqx.Module):
     gear as a share of critical damping, which `Scene` adds to `gear.damping` (0 from a config).
     `deepest`: relative rotation (rad, negative) down to which a contact map must extend.
     `center_distance_error`: centre distance minus twice the pitch radius (m), or `None`. `outline`:
-    profile read from a file, or `None`; `extra`: further parts.
+    profile read from a file, or `None`; `medium`: fluid and clearances for leakage, or `None`;
+    `extra`: further parts.
     """
 
     family: str = eqx.field(static=True)
@@ -90,6 +92,7 @@ class Scene(eqx.Module):
     supports: Supports | None = None
     center_distance_error: Float[Array, ""] | None = None
     outline: Outline | None = None
+    medium: Medium | None = None
     extra: tuple[Part, ...] = ()
 
     @classmethod
@@ -117,6 +120,7 @@ class Scene(eqx.Module):
             deepest=jnp.asarray(deepest),
             solver=reading.solver_of(config),
             outline=families.outline(config.profile),
+            medium=medium_of(config),
             law=reading.law_of(config),
             gear=reading.gear_of(config),
             **reading.quantities(config),
@@ -130,6 +134,7 @@ class Scene(eqx.Module):
         the contact map stay the same."""
         return dataclasses.replace(
             self,
+            medium=medium_of(config),
             law=reading.law_of(config),
             gear=reading.gear_of(config),
             **reading.quantities(config),

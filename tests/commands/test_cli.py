@@ -59,7 +59,15 @@ def test_optimize_writes_the_contract(tmp_path):
     done = command("optimize", CIC, "-o", tmp_path, *SMALL, "--export", "dxf")
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    for word in ("baseline", "optimised", "pressure angle", "mean force", "periodic", "compile"):
+    for word in (
+        "baseline",
+        "optimised",
+        "pressure angle",
+        "mean force",
+        "periodic",
+        "compile",
+        "Pump sheet",
+    ):
         assert word in done.stdout
     result = json.loads((tmp_path / "result.json").read_text())
     for record in (result["baseline"], result["optimized"]):
@@ -69,6 +77,9 @@ def test_optimize_writes_the_contract(tmp_path):
             assert record["geometry"][key] > 0
         assert record["steady_state"]["kind"] == "periodic"
         assert record["steady_state"]["floquet_multiplier"] < 1
+        ripple = record["geometry"]["outer_radius_mm"] - 33
+        mean = record["geometry"]["area_efficiency"] * record["geometry"]["outer_radius_mm"] ** 2
+        assert record["pump"]["flow_ripple"] == pytest.approx(ripple**2 / mean, rel=1e-9)
     assert {"improvement", "constraints", "versions"} <= set(result)
     assert result["baseline"]["design"]["pressure_angle_deg"] == 36.43
     assert result["optimized"]["geometry"]["area_efficiency"] >= (

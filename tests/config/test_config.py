@@ -365,6 +365,9 @@ def test_every_number_has_two_ends(key):
     text = PUMP if any(part in key for part in parts) else MINIMAL
     if key.startswith("tolerances."):
         text += "\ntolerances: {over: {rotor.length_mm: {normal: 0.01}}}\n"
+    if key.startswith("pump."):
+        own = "viscosity_mPa_s: 1.0, pressure_difference_Pa: 1.0e5, gas: {inlet_pressure_Pa: 1.0e5}"
+        text += f"\npump: {{{own}}}\n"
     for number in ("1.0e300", "-1.0e300", 10**390, ".inf", ".nan"):
         assert f"`{key}" in refusal(text, f"{key}={number}")
     for value in ("[1.0e300, 2.0e300]", "{1: 1.0e300, from: 1.0e300}"):

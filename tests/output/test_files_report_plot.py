@@ -293,6 +293,17 @@ def test_evaluation_table():
     assert "passed through each other" in empty
 
 
+def test_pump_table():
+    """Baseline beside optimum: rows that both or one of them have, with the forces."""
+    first = {"pump": {"flow_ripple": 0.2, "flow_lines": [0.1]}, "response": {"mean_force_N": 10.0}}
+    second = {"pump": {"flow_ripple": 0.1, "tip_leakage_l_min": 2.5}, "response": {}}
+    text = _render(tables.pump_table({"baseline": first, "optimised": second}))
+    assert _row(text, "flow ripple") == ["0.20000", "0.10000", "-50.00 %"]
+    assert _row(text, "tip leakage, l/min") == ["-", "2.5000", "-"]
+    assert _row(text, "mean force, N") == ["10.000", "-", "-"]
+    assert "flow lines" not in text
+
+
 def test_geometry_table():
     record = {"design": {}, "geometry": {"outer_radius_mm": 44.0, "area_efficiency": 0.40625}}
     text = _render(tables.geometry_table(record))

@@ -40,7 +40,15 @@ def scene() -> Scene:
 
 @pytest.mark.parametrize(
     "name",
-    ["mean_force_N", "rms_force_N", "polar_inertia_kg_m2", "outer_radius_mm", "area_mm2", OUTSIDE],
+    [
+        "mean_force_N",
+        "rms_force_N",
+        "polar_inertia_kg_m2",
+        "outer_radius_mm",
+        "area_mm2",
+        "flow_ripple",
+        OUTSIDE,
+    ],
 )
 def test_gradients_of_terms_are_those_of_differences(outside, scene, name):
     """Of every term, the one from outside among them: forces move with the design as their slopes

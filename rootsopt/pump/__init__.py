@@ -1,0 +1,35 @@
+"""What a pump designer weighs beside the contact force: flow, play, leakage.
+
+All functions are pure, take SI units and can be differentiated by JAX with respect to profile and
+scene. Nothing here enters the simulation."""
+
+from rootsopt.pump.flow import (
+    displaced_volume,
+    flow_lines,
+    greatest_radius_ratio,
+    relative_flow,
+    ripple,
+    theoretical_flow,
+    tip_height_share,
+)
+from rootsopt.pump.gap import Allowances, MeshGap, mesh_gap, relative_curvature
+from rootsopt.pump.leakage import Leakage, leakage
+from rootsopt.pump.play import Play, play
+
+__all__ = [
+    "Allowances",
+    "Leakage",
+    "MeshGap",
+    "Play",
+    "displaced_volume",
+    "flow_lines",
+    "greatest_radius_ratio",
+    "leakage",
+    "mesh_gap",
+    "play",
+    "relative_curvature",
+    "relative_flow",
+    "ripple",
+    "theoretical_flow",
+    "tip_height_share",
+]

@@ -1,0 +1,115 @@
+"""The gap between the rotors over the mesh, and the shape of its narrowest place."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from rootsopt.contact.closest import FlankPair
+from rootsopt.profiles import Outline, Profile, RollPoint
+from rootsopt.pump.section import Flank, both_flanks, flank_points, whole_valley
+
+POSES = 48
+"""Number of roll angles, evenly over the quarter of the mesh in which one addendum touches; the
+other quarters are equal to it."""
+_POINTS = 400
+"""Number of points per segment of a flank for the film thickness beside the narrowest place."""
+_TURNED = 0.2
+"""Cosine of the angle between a flank's normal and that of the narrowest place below which points
+of the flank no longer count as part of the gap."""
+
+_NARROWEST = 1e-9
+"""Gap (m) below which the shape of the gap is that of a gap of this height."""
+
+
+class Allowances(NamedTuple):
+    """Distances by which a pair is apart (m).
+
+    `normal`: distance added to every flank gap, along the normal. `center`: centre distance minus
+    twice the pitch radius. `radial`: radius by which both rotors are smaller everywhere."""
+
+    normal: Float[Array, ""]
+    center: Float[Array, ""]
+    radial: Float[Array, ""]
+
+
+class MeshGap(NamedTuple):
+    """The gap between the rotors over the mesh.
+
+    `roll` (n,): roll angle β (rad). `least` (n,): least distance (m), negative where they overlap.
+    `curvature` (n,): relative curvature (1/m), 0 where the flanks conform. `length` (n,): length
+    (m) of a gap of constant height `least` with the same laminar flow."""
+
+    roll: Float[Array, " n"]
+    least: Float[Array, " n"]
+    curvature: Float[Array, " n"]
+    length: Float[Array, " n"]
+
+
+def relative_curvature(profile: Profile, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Return the relative curvature 1/R1 + 1/R2 (1/m) of conjugate flanks at their contact.
+
+    `nu`: normal angle (rad) of the addendum point. With the arc lengths v1 and v2 per normal angle,
+    it is 2 r sin ψ β′² / (v1 v2). It is 0 where a whole arc touches at once."""
+    point, addendum, dedendum = profile.speeds(nu)
+    turned = 2 * profile.pitch_radius * jnp.sin(point.psi) * profile.roll_rate(nu) ** 2
+    return turned / (addendum * dedendum)
+
+
+def mesh_gap(profile: Profile, allowances: Allowances) -> MeshGap:
+    """Return the gap over the mesh.
+
+    To first order in the allowances, a gap opens by c + Δ sin ψ + a (h1/ρ1 + h2/ρ2): c, Δ and a
+    are the allowances, h the support functions and ρ the radii of the two points. For a measured
+    outline, whose flanks are not conjugate, c is in addition to the gap in perfect rolling."""
+    roll = profile.half_pitch * (jnp.arange(POSES) + 0.5) / POSES
+    nu, gap = profile.normal_at(roll), jnp.zeros_like(roll)
+    if isinstance(profile, Outline):
+        pair = FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True)
+        found = lax.map(lambda x: pair(x, jnp.zeros_like(x)), roll)
+        nu, gap = found.normal2, found.gap
+    r = profile.pitch_radius
+    _, psi, s = profile.addendum(nu)
+    shares = jnp.zeros_like(s)
+    for side in (s, -s):
+        away = jnp.sqrt(r**2 + 2 * r * side * jnp.sin(psi) + side**2)
+        shares += (r * jnp.sin(psi) + side) / away
+    gap = gap + allowances.normal + allowances.center * jnp.sin(psi) + allowances.radial * shares
+    length = _lengths(profile, nu, gap)
+    return MeshGap(roll, gap, relative_curvature(profile, nu), length)
+
+
+def _lengths(profile: Profile, nu: Float[Array, " n"], gap: Float[Array, " n"]):
+    """Return h³ ∫ dl / d³ (n,) in m across gaps of least height h = `gap` (n,) in m.
+
+    `nu` (n,): normal angles (rad) of the addendum points there. l is the arc length on rotor 1, and
+    d the thickness along its normal: h, plus the distance that the flanks have without clearance.
+    """
+    flank = flank_points(profile, _POINTS)
+    lobe, valley = both_flanks(flank), whole_valley(flank, profile.lobes)
+    step = jnp.abs(jnp.diff(lobe.point))
+
+    def seen(curve: Flank, point: RollPoint):
+        """Return tangential place and depth behind the tangent (m), and the cosine of the turn."""
+        beta, psi, s = point
+        turn = jnp.exp(1j * beta)
+        place = turn * (profile.pitch_radius + s * (jnp.sin(psi) + 1j * jnp.cos(psi)))
+        back = jnp.conj(turn * jnp.exp(1j * (jnp.pi / 2 - psi)))
+        local = (curve.point - place) * back
+        return jnp.imag(local), -jnp.real(local), jnp.real(curve.normal * back)
+
+    def length(pose):
+        nu, gap = pose
+        x1, depth1, cosine = seen(lobe, profile.addendum(nu))
+        # Seen from rotor 1, the flank of rotor 2 runs the other way.
+        x2, depth2, facing = (one[::-1] for one in seen(valley, profile.dedendum(nu)))
+        x2 = jnp.where(facing > _TURNED, -x2, jnp.nan)
+        first, last = jnp.nanmin(x2), jnp.nanmax(x2)
+        x2 = lax.cummax(jnp.where(jnp.isnan(x2), first, x2))
+        height = gap + cosine * (depth1 + jnp.interp(x1, x2, depth2))
+        inside = (cosine > _TURNED) & (x1 > first) & (x1 < last)
+        inverse = jnp.where(inside, (gap / jnp.where(inside, height, 1.0)) ** 3, 0.0)
+        return jnp.sum((inverse[1:] + inverse[:-1]) / 2 * step)
+
+    return lax.map(length, (nu, jnp.maximum(gap, _NARROWEST)))

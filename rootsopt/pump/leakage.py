@@ -1,0 +1,111 @@
+"""Leakage of a pump: mesh, tips, end faces, and the volumetric efficiency.
+
+The mesh leaks along the rotor's whole length, its gap changing over the rotation; both tips leak
+along it, too; the four end faces leak across the rotors. A liquid flows by Reynolds' equation. A
+gas flows at the lesser of two limits, friction (compressible laminar flow) and inertia (an ideal
+nozzle of the gap's height).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rootsopt.profiles import Geometry, Profile
+from rootsopt.pump import flow, gas
+from rootsopt.pump.gap import Allowances, MeshGap, mesh_gap
+from rootsopt.pump.laminar import parabolic_length, slot_flow
+from rootsopt.scene import Scene
+from rootsopt.scene.medium import Medium
+
+FACES = 4
+"""End faces of the two rotors."""
+
+
+class Leakage(NamedTuple):
+    """Leakage flows (m³/s) of a pair; of a gas, at suction pressure.
+
+    `mesh`: between the rotors, mean over the rotation; `tips`: between both rotors and the housing;
+    `ends`: across the end faces. `gap`: the gap over the mesh. `efficiency`: volumetric efficiency,
+    1 minus leakage over theoretical flow. `knudsen`: mean free path at suction pressure divided by
+    the least gap; 0 for a liquid."""
+
+    mesh: Float[Array, ""]
+    tips: Float[Array, ""]
+    ends: Float[Array, ""]
+    gap: MeshGap
+    efficiency: Float[Array, ""]
+    knudsen: Float[Array, ""]
+
+    @property
+    def total(self) -> Float[Array, ""]:
+        """Leakage of all gaps (m³/s)."""
+        return self.mesh + self.tips + self.ends
+
+
+def tip_length(profile: Profile, shape: Geometry, height: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the length (m) of a slot with the same laminar flow as the gap at a tip.
+
+    It is the width of the land, and on its sides the two halves of a parabolic gap between the tip
+    arc and the housing's bore. `height`: clearance (m)."""
+    first = next(one for one in profile.segments() if not one.land)
+    radius = profile.addendum_speed(first.start)
+    bore = shape.outer_radius + height
+    return shape.seal_width + parabolic_length(height, 1 / radius - 1 / bore)
+
+
+def end_shape(shape: Geometry) -> Float[Array, ""]:
+    """Return width over length of the strip that stands for an end face, 4 r_a² / A.
+
+    The strip is as wide as the rotor, 2 r_a, and as long as its mean chord, A / 2r_a. By Jensen's
+    inequality, parallel strips of unequal chords leak more."""
+    return 4 * shape.outer_radius**2 / shape.area
+
+
+def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> Leakage:
+    """Return the leakage of a pair.
+
+    `profile`, `shape`: of the design. Where the rotors overlap (`gap.least` < 0), the flows mean
+    nothing."""
+    zero = jnp.zeros_like(scene.clearance)
+    error = scene.center_distance_error
+    center = zero if error is None else error
+    found = mesh_gap(profile, Allowances(scene.clearance, center, medium.radial_allowance))
+    mesh = jnp.mean(_per_width(medium, found.least, found.length, 1))
+    tips, ends = zero, zero
+    heights = [jnp.min(found.least)]
+    if medium.tip_clearance is not None:
+        height = medium.tip_clearance + medium.radial_allowance
+        length = tip_length(profile, shape, jnp.maximum(height, 1e-9))
+        tips = 2 * _per_width(medium, height, length, medium.tips)
+        heights.append(height)
+    if medium.end_clearance is not None:
+        height, width = medium.end_clearance, 2 * shape.outer_radius
+        ends = FACES * width * _per_width(medium, height, width / end_shape(shape), 1)
+        heights.append(height)
+    mesh, tips = scene.length * mesh, scene.length * tips
+    ideal = flow.theoretical_flow(shape, scene.length, scene.speed)
+    knudsen = zero
+    if medium.gas is not None:
+        path = gas.mean_free_path(medium.gas.inlet_pressure, medium.viscosity, medium.gas)
+        knudsen = path / jnp.min(jnp.stack(heights))
+    return Leakage(mesh, tips, ends, found, 1 - (mesh + tips + ends) / ideal, knudsen)
+
+
+def _per_width(medium: Medium, height, length, series: int):
+    """Return the flow (m²/s) per width through `series` equal gaps one behind the other.
+
+    `height`, `length` (m): of one of them. The flow of a gas is that at suction pressure."""
+    across = medium.pressure_difference
+    length = series * jnp.where(height > 0, length, 1.0)
+    height = jnp.maximum(height, 0.0)
+    if medium.gas is None:
+        return slot_flow(height, length, across, medium.viscosity)
+    down = medium.gas.inlet_pressure
+    up = down + across
+    slow = gas.laminar_mass_flow(height, length, up, down, medium.viscosity, medium.gas)
+    # Nozzles in series share the pressure ratio.
+    stage = up * (down / up) ** (1 / series)
+    fast = height * gas.nozzle_flux(up, stage, medium.gas)
+    density = down / (medium.gas.gas_constant * medium.gas.temperature)
+    return jnp.minimum(slow, fast) / density

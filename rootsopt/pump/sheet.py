@@ -1,0 +1,173 @@
+"""The pump sheet: what a designer weighs beside the contact force, at one glance."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rootsopt.config import Config
+from rootsopt.config.units import MM
+from rootsopt.errors import InputError
+from rootsopt.profiles import geometry
+from rootsopt.pump import flow
+from rootsopt.pump.leakage import leakage
+from rootsopt.pump.play import play
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene, design_vector
+from rootsopt.scene.medium import Medium
+
+CM3 = 1e-6
+"""One cubic centimetre (m³)."""
+L_MIN = 1e-3 / 60
+"""One litre per minute (m³/s)."""
+MRAD = 1e-3
+"""One milliradian (rad)."""
+UM = 1e-6
+"""One micrometre (m)."""
+_ROUNDING = 1e-8
+"""Overlap (m) of the flanks up to which it may be the rounding of a measured outline."""
+LINES = 4
+"""Number of lines of the flow in the sheet."""
+NOTE = (
+    "The flow ripple is (r_a - r_p)^2 / (eta r_a^2): with the outer radius r_a and the area "
+    "efficiency eta given, no other shape of the flank changes it."
+)
+"""What limits the ripple, for the user."""
+
+
+def sheet(scene: Scene, design: Float[Array, " d"]) -> dict[str, Any]:
+    """Return the pump sheet of a `design` (d,) in config units, as in the result file.
+
+    Every key ends with its unit; quantities without a unit are fractions. `flow_lines`: amplitudes
+    of the flow's lines as fractions of the mean flow; the k-th has 2Nk periods per revolution.
+    `tip_height_of_limit`: tip height over the pitch circle as a fraction of its limit. Ripple and
+    lines are left out for twisted rotors.
+
+    With a clearance, a centre distance error or a measured outline, there is also the play.
+    `angular_play_…_mrad`: least and greatest play of rotor 2 over the rotation.
+    `gear_backlash_max_mm`: greatest backlash of a timing gear that keeps the flanks apart, negative
+    where the rotors overlap.
+
+    With a section `pump`, there is the leakage too: least and mean gap of the flanks over the mesh
+    (µm), leakage through mesh, tips and end faces, volumetric efficiency and, for a gas, the
+    Knudsen number. Raises `InputError` if the rotors overlap somewhere."""
+    found = {key: value.tolist() for key, value in _flow(scene, design).items()}
+    if _has_play(scene):
+        found |= {key: value.tolist() for key, value in _play(scene, design).items()}
+    if scene.medium is not None:
+        found |= _leaking(scene, scene.medium, design)
+    hidden = () if scene.straight else _STRAIGHT
+    return {key: found[key] for key in KEYS if key in found and key not in hidden}
+
+
+def check_clearances(config: Config) -> None:
+    """Raise `InputError` if a config has a section `pump` and its flanks overlap."""
+    if config.pump is not None:
+        sheet(Scene.from_config(config), design_vector(config))
+
+
+def record_of(config: Config, design: Sequence[float]) -> dict[str, Any]:
+    """Return the pump sheet of a `design` in config units; where flanks overlap, without leakage.
+
+    For the end of a search, which an error would leave without its files."""
+    scene, values = Scene.from_config(config), jnp.asarray(design, float)
+    try:
+        return sheet(scene, values)
+    except InputError:
+        return sheet(dataclasses.replace(scene, medium=None), values)
+
+
+KEYS = (
+    "displaced_volume_cm3",
+    "theoretical_flow_l_min",
+    "flow_ripple",
+    "flow_lines",
+    "tip_height_of_limit",
+    "angular_play_min_mrad",
+    "angular_play_max_mrad",
+    "gear_backlash_max_mm",
+    "flank_gap_min_um",
+    "flank_gap_mean_um",
+    "mesh_leakage_l_min",
+    "tip_leakage_l_min",
+    "end_leakage_l_min",
+    "volumetric_efficiency",
+    "knudsen_number",
+)
+"""Keys of the sheet, in the order of its rows."""
+_STRAIGHT = "flow_ripple", "flow_lines"
+"""Keys that hold for straight rotors only."""
+
+
+@Program
+def _flow(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
+    profile = scene.profile(design)
+    shape = geometry(profile)
+    return {
+        "displaced_volume_cm3": flow.displaced_volume(shape, scene.length) / CM3,
+        "theoretical_flow_l_min": flow.theoretical_flow(shape, scene.length, scene.speed) / L_MIN,
+        "flow_ripple": flow.ripple(profile, shape),
+        "flow_lines": jnp.abs(flow.flow_lines(profile, shape, LINES)),
+        "tip_height_of_limit": flow.tip_height_share(profile, shape),
+    }
+
+
+def _has_play(scene: Scene) -> bool:
+    """Return whether rotor 2 has play between its flanks, or the rotors may overlap."""
+    odd = scene.outline is not None or scene.center_distance_error is not None
+    return odd or float(scene.clearance) > 0
+
+
+@Program
+def _play(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
+    profile = scene.profile(design)
+    found = play(profile, scene.clearance, center_distance(scene))
+    return {
+        "angular_play_min_mrad": jnp.min(found.total) / MRAD,
+        "angular_play_max_mrad": jnp.max(found.total) / MRAD,
+        "gear_backlash_max_mm": found.gear_backlash / MM,
+    }
+
+
+def center_distance(scene: Scene) -> Float[Array, ""]:
+    """Return the distance between the rotors' axes (m)."""
+    error = scene.center_distance_error
+    return 2 * scene.pitch_radius + (0.0 if error is None else error)
+
+
+def _leaking(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[str, Any]:
+    """Return the rows of leakage. Raises `InputError` as `sheet` does."""
+    found, rows = _leaks(scene, design)
+    least = float(found)
+    if least < -_ROUNDING:
+        raise InputError(
+            f"the flanks must not overlap in perfect rolling, but overlap by {-least / UM:.3g} um; "
+            "raise `contact.clearance_mm`, `scene.center_distance_error_mm` or "
+            "`pump.radial_allowance_mm` by more than that"
+        )
+    absent = {
+        "tip_leakage_l_min": medium.tip_clearance is None,
+        "end_leakage_l_min": medium.end_clearance is None,
+        "knudsen_number": medium.gas is None,
+    }
+    return {key: value.tolist() for key, value in rows.items() if not absent.get(key)}
+
+
+@Program
+def _leaks(scene: Scene, design: Float[Array, " d"]) -> tuple[Array, dict[str, Array]]:
+    """Return (least gap of the flanks (m), rows of the sheet)."""
+    assert scene.medium is not None
+    profile = scene.profile(design)
+    found = leakage(scene, scene.medium, profile, geometry(profile))
+    least = jnp.min(found.gap.least)
+    return least, {
+        "flank_gap_min_um": least / UM,
+        "flank_gap_mean_um": jnp.mean(found.gap.least) / UM,
+        "mesh_leakage_l_min": found.mesh / L_MIN,
+        "tip_leakage_l_min": found.tips / L_MIN,
+        "end_leakage_l_min": found.ends / L_MIN,
+        "volumetric_efficiency": found.efficiency,
+        "knudsen_number": found.knudsen,
+    }

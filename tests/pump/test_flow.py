@@ -1,0 +1,170 @@
+"""Flow against polygons of the chambers, closed forms and differences."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import KDTree
+
+from rootsopt import load_config
+from rootsopt.config.families import families
+from rootsopt.contact.nodes import place_pair
+from rootsopt.profiles import CIC, EE, geometry
+from rootsopt.pump import flow
+from rootsopt.scene import Scene, design_vector
+from rootsopt.scene.families import margins_of
+from tests.conformance.families import LOBES, R, config_of, made, outline_of
+
+ROLLING = [
+    name for name, row in families().items() if row.example is not None and row.maker is not None
+]
+
+
+def described(profile):
+    shape = geometry(profile)
+    lines = flow.flow_lines(profile, shape, 6)
+    return shape, flow.ripple(profile, shape), lines, flow.tip_height_share(profile, shape)
+
+
+describe = jax.jit(described)
+over = jax.jit(flow.relative_flow)
+
+
+def shoelace(points):
+    here, there = points @ [1, 1j], np.roll(points @ [1, 1j], -1)
+    return float(np.sum((np.conj(here) * there).imag)) / 2
+
+
+def arc(radius, start, stop):
+    turn = np.linspace(start, stop, 20001)
+    return radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+
+
+def suction(outline, lobes, phi):
+    """Area of the upper chamber, up to a constant.
+
+    From the contact along rotor 1 to the tip that seals it at the housing, back along the housing
+    to fixed points above both axes, and likewise along rotor 2."""
+    first, second = place_pair(outline, lobes, 2 * R, phi, phi)
+    outer = np.max(np.hypot(*outline.T))
+    sides = []
+    distance, partner = KDTree(second[:-1]).query(first[:-1])
+    start = int(np.argmin(distance)), int(partner[np.argmin(distance)])
+    for points, begin, axis, sign in (
+        (first[:-1], start[0], 0.0, 1),
+        # Rotor 2 seen in a mirror: it is passed through the other way.
+        (second[:-1][::-1], len(second) - 2 - start[1], 2 * R, -1),
+    ):
+        centred = (points - [axis, 0.0]) * [sign, 1.0]
+        centred = np.roll(centred, -begin, axis=0)
+        angle = np.unwrap(np.arctan2(*centred.T[::-1]))
+        radius = np.hypot(*centred.T)
+        tips = np.flatnonzero(radius > outer - 1e-12)
+        tip = tips[np.argmin(abs(angle[tips] - np.pi / 2 - TIP[sign](phi, lobes)))]
+        side = np.concatenate([centred[: tip + 1], arc(outer, angle[tip], np.pi / 2)])
+        sides.append(side * [sign, 1.0] + [axis, 0.0])
+    return -shoelace(np.concatenate([sides[0], sides[1][::-1]]))
+
+
+TIP = {
+    1: lambda phi, lobes: phi + 2 * np.pi / lobes - np.pi / 2,
+    -1: lambda phi, lobes: phi + 3 * np.pi / lobes - np.pi / 2,
+}
+"""Angle from the vertical of the tip that seals each rotor's side of the chamber."""
+
+
+@pytest.mark.parametrize("lobes", [2, 3, 4])
+def test_ee_has_one_line(lobes):
+    shape, ripple, lines, _ = describe(EE(lobes, R))
+    assert float(shape.area_efficiency) == pytest.approx((4 * lobes + 1) / (2 * (lobes + 1) ** 2))
+    assert float(ripple) == pytest.approx(2 / (4 * lobes + 1), rel=1e-13)
+    # Fractions of the mean: 22.222, 15.385, 11.765 %.
+    assert 100 * float(ripple) == pytest.approx({2: 22.222, 3: 15.385, 4: 11.765}[lobes], abs=5e-4)
+    assert 2 * abs(float(lines[0])) == pytest.approx(2 / (4 * lobes + 1), rel=1e-12)
+    np.testing.assert_allclose(lines[1:4], 0.0, atol=1e-10)
+
+
+def test_ripple_of_the_paper():
+    """CIC as printed: 16.6 %."""
+    config = load_config("configs/cic.yaml")
+    scene = Scene.from_config(config)
+    _, ripple, _, share = describe(scene.profile(design_vector(config)))
+    assert 100 * float(ripple) == pytest.approx(16.6, abs=0.05)
+    assert 0.7 < float(share) < 0.72
+
+
+@pytest.mark.parametrize("family", ROLLING)
+def test_ripple_and_mean_of_every_family(family):
+    """Greatest minus least flow of many samples; the mean of the samples is 1; the lines are those
+    of a discrete Fourier transform of them."""
+    profile = made(family)
+    shape, ripple, lines, share = describe(profile)
+    count = 4096
+    phi = (np.arange(count) + 0.5) * np.pi / LOBES / count
+    found = np.asarray(over(profile, shape, jnp.asarray(phi)))
+    ends = np.asarray(over(profile, shape, jnp.asarray([0.0, np.pi / LOBES / 2])))
+    if min(margins_of(config_of(family)).get("rolling", 0.0), 0.0) < -1e-6:
+        return
+    assert ends[1] - ends[0] == pytest.approx(float(ripple), rel=1e-9)
+    assert np.max(found) - np.min(found) <= float(ripple) * (1 + 1e-9)
+    assert np.mean(found) == pytest.approx(1.0, abs=2e-5)
+    order = 2 * LOBES * np.arange(1, 7)
+    sampled = [2 * np.mean(found * np.cos(k * phi)) for k in order]
+    np.testing.assert_allclose(lines, sampled, atol=1e-4)
+    assert 0 < float(share) < 1
+
+
+@pytest.mark.parametrize("family", ["ee", "cic", "five_arcs"])
+def test_flow_is_the_growth_of_the_chamber(family):
+    """Growth of the suction chamber's polygon against the flow over the mesh, and the pockets
+    against the volume per revolution."""
+    profile = made(family)
+    outline = outline_of(family) / 1e3
+    shape, _, _, _ = describe(profile)
+    ends = np.linspace(0.03, 0.03 + np.pi / LOBES, 4)
+    areas = [suction(outline, LOBES, phi) for phi in ends]
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    mean = float(shape.area_efficiency * shape.outer_radius**2)
+    for (start, stop), grown in zip(itertools.pairwise(ends), np.diff(areas), strict=True):
+        phi = (start + stop) / 2 + (stop - start) / 2 * nodes
+        flow_here = np.asarray(over(profile, shape, jnp.asarray(phi)))
+        expected = mean * np.sum(weights * flow_here) * (stop - start) / 2
+        assert grown == pytest.approx(expected, rel=1e-6)
+    lobe = outline[: (len(outline) - 1) // LOBES + 1]
+    outer = float(shape.outer_radius)
+    pocket = shoelace(np.concatenate([arc(outer, 0, 2 * np.pi / LOBES), lobe[::-1]]))
+    volume = flow.displaced_volume(shape, jnp.asarray(0.1))
+    assert 2 * LOBES * pocket * 0.1 == pytest.approx(float(volume), rel=1e-6)
+    per_second = flow.theoretical_flow(shape, jnp.asarray(0.1), jnp.asarray(100 * np.pi))
+    assert float(per_second) == pytest.approx(50 * float(volume), rel=1e-12)
+
+
+@pytest.mark.parametrize(("lobes", "centre"), [(2, 0.92882), (3, 0.96693), (4, 0.98111)])
+def test_radius_ratio_stays_below_its_limit(lobes, centre):
+    """The single arc on the verge of undercut; and the limiting flank, s = 2 r sin(θ/2), traced
+    backwards from the pitch crossing by the law of gearing."""
+    height = np.sqrt(1 + centre**2 - 2 * centre * np.cos(np.pi / (2 * lobes)))
+    limit = flow.greatest_radius_ratio(lobes)
+    assert 0.85 < (centre + height - 1) / (limit - 1) < 1
+    turned = np.linspace(0, np.pi / (2 * lobes), 20001)
+    s = 0.0
+    for step in np.diff(turned):
+        half = s + step / 2 * np.sqrt(1 - s**2 / 4)
+        s += step * np.sqrt(1 - half**2 / 4)
+    assert 1 + s == pytest.approx(limit, rel=1e-9)
+
+
+@given(st.floats(25, 45), st.floats(0, 1), st.floats(0.5, 8))
+def test_no_cic_comes_near_the_limit(angle, share, land):
+    alpha, land = np.radians([angle, land])
+    longest = R * np.sin(alpha) * (np.pi / (2 * LOBES) - land)
+    profile = CIC(
+        LOBES, R, pressure_angle=alpha, involute_length=share * longest, tip_arc_angle=land
+    )
+    _, ripple, _, height = describe(profile)
+    assert 0 < float(height) < 1
+    assert 0 < float(ripple) < 0.35

@@ -1,0 +1,249 @@
+"""Leakage against closed forms, SciPy's quadrature and polygons of the rotors."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import integrate, optimize
+
+from rootsopt import load_config
+from rootsopt.contact.nodes import pair_gap, place_pair, signed_distance
+from rootsopt.errors import InputError
+from rootsopt.profiles import geometry
+from rootsopt.pump import gas
+from rootsopt.pump.gap import Allowances, mesh_gap, relative_curvature
+from rootsopt.pump.laminar import parabolic_length, slot_flow
+from rootsopt.pump.leakage import leakage
+from rootsopt.pump.sheet import sheet
+from rootsopt.scene import Scene, design_vector
+from rootsopt.scene.medium import Gas
+from tests.conformance.families import LOBES, R, made, outline_of
+
+AIR = Gas(*map(jnp.asarray, (1e5, 293.15, 287.05, 1.4)))
+
+
+@jax.jit
+def gapped(profile, allowances):
+    return mesh_gap(profile, allowances)
+
+
+@functools.cache
+def gaps(family, normal=0.0, center=0.0, radial=0.0):
+    return gapped(made(family), Allowances(*map(jnp.asarray, (normal, center, radial))))
+
+
+def test_parabolic_gap_by_quadrature():
+    """0.1 mm, relative radius 20 mm, 1 mPa·s, 1 bar: 3.5368e-3 m²/s per metre."""
+    h, curvature = 1e-4, 1 / 0.02
+    length = parabolic_length(jnp.asarray(h), jnp.asarray(curvature))
+    found = slot_flow(jnp.asarray(h), length, jnp.asarray(1e5), jnp.asarray(1e-3))
+    assert float(found) == pytest.approx(3.5368e-3, rel=2e-5)
+    resistance, _ = integrate.quad(
+        lambda x: 1 / (h + x**2 * curvature / 2) ** 3, -np.inf, np.inf, points=None
+    )
+    assert float(found) == pytest.approx(1e5 / (12e-3 * resistance), rel=1e-6)
+
+
+def test_nozzle_of_air():
+    """150 → 100 kPa at 293.15 K: 338.706 kg/(s·m²); choked below 0.52828, where the flow is the
+    greatest over all pressures in the throat."""
+    flux = functools.partial(gas.nozzle_flux, gas=AIR)
+    up = jnp.asarray(1.5e5)
+    assert float(flux(up, jnp.asarray(1e5))) == pytest.approx(338.706, abs=1e-3)
+    assert float(gas.critical_ratio(AIR.heat_ratio)) == pytest.approx(0.52828, abs=5e-6)
+
+    def by_energy(throat):
+        """Density times speed, from enthalpy and isentrope."""
+        cp = 287.05 * 1.4 / 0.4
+        temperature = 293.15 * (throat / 1.5e5) ** (0.4 / 1.4)
+        return throat / (287.05 * temperature) * np.sqrt(2 * cp * (293.15 - temperature))
+
+    assert float(flux(up, jnp.asarray(1e5))) == pytest.approx(by_energy(1e5), rel=1e-12)
+    best = optimize.minimize_scalar(lambda p: -by_energy(p), bounds=(5e4, 1.4e5), method="bounded")
+    assert float(flux(up, jnp.asarray(1e3))) == pytest.approx(-best.fun, rel=1e-9)
+    assert float(jax.grad(flux, 1)(up, jnp.asarray(1e3))) == 0
+    assert float(flux(up, up)) == 0
+
+
+def test_laminar_gas_by_quadrature_of_its_pressure():
+    """Mass flow per width through a slot, from dp/dx with the density of each place; for a small
+    pressure difference it is the liquid's."""
+    up, down, h, length, mu = 3e5, 1e5, 5e-5, 4e-3, 1.8e-5
+    values = map(jnp.asarray, (h, length, up, down, mu))
+    found = float(gas.laminar_mass_flow(*values, AIR))
+    driven, _ = integrate.quad(lambda p: p / (287.05 * 293.15), down, up)
+    assert found == pytest.approx(h**3 * driven / (12 * mu * length), rel=1e-12)
+    # Air at 1 bar and 20 °C: 0.066 µm.
+    path = gas.mean_free_path(jnp.asarray(1e5), jnp.asarray(1.82e-5), AIR)
+    assert float(path) == pytest.approx(0.0662e-6, rel=0.01)
+
+
+@pytest.mark.parametrize("family", ["ee", "cic", "five_arcs", "ellipse"])
+def test_gaps_are_those_of_polygons(family):
+    """At another centre distance, and of rotors of smaller radius."""
+    outline = outline_of(family) / 1e3
+    size = 2e-5
+    moved, smaller = gaps(family, center=size), gaps(family, radial=size)
+    away = np.hypot(*outline.T)[:, None]
+    shrunk = outline * (1 - size / away)
+    for k in (2, 11, 23, 37):
+        phi = -float(moved.roll[k])
+        assert pair_gap(outline, LOBES, 2 * R + size, phi, phi) == pytest.approx(
+            float(moved.least[k]), abs=0.02 * size
+        )
+        assert pair_gap(shrunk, LOBES, 2 * R, phi, phi) == pytest.approx(
+            float(smaller.least[k]), abs=0.02 * size
+        )
+
+
+@pytest.mark.parametrize("family", ["ee", "cic", "circle_epicycloid"])
+def test_film_is_that_of_polygons(family):
+    """h³ ∫ dl / d³ over the polygon of rotor 1, with its distance d from that of rotor 2; and the
+    parabola of the same curvature where that is short."""
+    h = 2e-5
+    found = gaps(family, normal=h)
+    outline = outline_of(family) / 1e3
+    parabola = parabolic_length(found.least, found.curvature)
+    for k in (8, 20, 33, 44):
+        beta = float(found.roll[k])
+        first, second = place_pair(outline, LOBES, 2 * R, -beta, -beta)
+        distance = h + signed_distance(first[:-1], second)
+        step = np.hypot(*np.diff(first, axis=0).T)
+        inverse = (h / np.append(distance, distance[0])) ** 3
+        film = np.sum((inverse[1:] + inverse[:-1]) / 2 * step)
+        assert float(found.length[k]) == pytest.approx(film, rel=0.01)
+        if k in (20, 33):
+            assert float(found.length[k]) == pytest.approx(float(parabola[k]), rel=0.02)
+
+
+@functools.cache
+def scene_of(*changes):
+    return Scene.from_config(load_config("configs/cic.yaml", changes))
+
+
+LIQUID = (
+    "pump={viscosity_mPa_s: 50, pressure_difference_Pa: 2.0e5, tip_clearance_mm: 0.08, "
+    "end_clearance_mm: 0.05}",
+    "contact.clearance_mm=0.06",
+)
+BLOWER = (*LIQUID, "pump.viscosity_mPa_s=0.0182", "pump.gas.inlet_pressure_Pa=1.0e5")
+
+
+@eqx.filter_jit
+def leaks(scene, design):
+    profile = scene.profile(design)
+    return leakage(scene, scene.medium, profile, geometry(profile))
+
+
+def test_liquid_leaks_like_slots():
+    scene = scene_of(*LIQUID)
+    design = design_vector(load_config("configs/cic.yaml"))
+    found = leaks(scene, design)
+    shape = jax.jit(geometry)(scene.profile(design))
+    tips = 2 * 0.1 * 8e-5**3 * 2e5 / (12 * 0.05)
+    assert 0.2 < float(found.tips) / (tips / float(shape.seal_width)) < 1
+    strip = 4 * float(shape.outer_radius) ** 2 / float(shape.area)
+    assert float(found.ends) == pytest.approx(4 * strip * 5e-5**3 * 2e5 / (12 * 0.05), rel=1e-12)
+    np.testing.assert_allclose(found.gap.least, 6e-5, rtol=1e-12)
+    volume = 2 * 0.1 * (np.pi * float(shape.outer_radius) ** 2 - float(shape.area))
+    assert float(1 - found.efficiency) == pytest.approx(float(found.total) / (50 * volume))
+    thicker = scene_of(*LIQUID, "pump.viscosity_mPa_s=100")
+    assert float(leaks(thicker, design).total) == pytest.approx(float(found.total) / 2, rel=1e-12)
+
+
+def test_gas_leaks_less_than_friction_or_inertia_alone():
+    scene = scene_of(*BLOWER)
+    design = design_vector(load_config("configs/cic.yaml"))
+    found = leaks(scene, design)
+    flux = gas.nozzle_flux(jnp.asarray(3e5), jnp.asarray(1e5), AIR)
+    density = 1e5 / (287.05 * 293.15)
+    fastest = float(flux) / density
+    assert 0 < float(found.mesh) <= 0.1 * 6e-5 * fastest * (1 + 1e-12)
+    assert 0 < float(found.tips) <= 2 * 0.1 * 8e-5 * fastest * (1 + 1e-12)
+    assert float(found.knudsen) == pytest.approx(0.0662e-6 / 5e-5, rel=0.01)
+    assert 0 < float(found.efficiency) < 1
+
+
+@pytest.mark.long
+def test_slopes_are_those_of_differences():
+    """Of the efficiency, with respect to the design and the clearance."""
+    scene = scene_of(*LIQUID)
+    design = jnp.asarray([36.0, 8.0, 4.0])
+
+    @eqx.filter_jit
+    def efficiency(design, clearance):
+        moved = eqx.tree_at(lambda s: s.clearance, scene, clearance)
+        return leaks(moved, design).efficiency
+
+    here = design, scene.clearance
+    slopes = jax.jit(jax.jacfwd(efficiency, (0, 1)))(*here)
+    for k, step in enumerate(np.diag([1e-4, 1e-4, 1e-4])):
+        expected = (efficiency(design + step, here[1]) - efficiency(design - step, here[1])) / 2e-4
+        assert float(slopes[0][k]) == pytest.approx(float(expected), rel=2e-3, abs=1e-9)
+    expected = (efficiency(design, here[1] + 1e-8) - efficiency(design, here[1] - 1e-8)) / 2e-8
+    assert float(slopes[1]) == pytest.approx(float(expected), rel=1e-4)
+
+
+def test_curvature_of_circles():
+    """On the land, two circles about their axes touch: radii r_a and 2r - r_a."""
+    profile = made("five_arcs")
+    outer = float(jax.jit(geometry)(profile).outer_radius)
+    found = float(relative_curvature(profile, jnp.asarray(0.02)))
+    assert found == pytest.approx(1 / outer + 1 / (2 * R - outer), rel=1e-9)
+
+
+def test_section_adds_nothing_to_the_simulation():
+    """The program of the equations of motion is the same with it."""
+    design = design_vector(load_config("configs/cic.yaml"))
+
+    def forces(scene, design):
+        return scene.pair(design).contact_force(*jnp.zeros(3)).total
+
+    texts = []
+    for changes in ((), LIQUID[:1]):
+        dynamic, static = eqx.partition(scene_of(*changes), eqx.is_array)
+        program = jax.make_jaxpr(lambda d, x, s=static: forces(eqx.combine(d, s), x))
+        texts.append([str(one.primitive) for one in program(dynamic, design).eqns])
+    assert len(texts[0]) > 20
+    assert texts[0] == texts[1]
+
+
+def test_sheet_has_the_rows_of_its_inputs():
+    config = load_config("configs/cic.yaml")
+    design = design_vector(config)
+    small = sheet(scene_of(), design)
+    assert len(small) == 5
+    assert "mesh_leakage_l_min" not in small
+    whole = sheet(scene_of(*LIQUID), design)
+    assert whole["volumetric_efficiency"] == pytest.approx(
+        1
+        - sum(whole[f"{place}_leakage_l_min"] for place in ("mesh", "tip", "end"))
+        / whole["theoretical_flow_l_min"],
+        rel=1e-12,
+    )
+    assert whole["flank_gap_min_um"] == pytest.approx(60)
+    assert "knudsen_number" not in whole
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "pump.radial_allowance_mm=-0.1",
+        pytest.param("scene.center_distance_error_mm=-0.2", marks=pytest.mark.long),
+    ],
+)
+def test_interference_is_an_error(change):
+    design = design_vector(load_config("configs/cic.yaml"))
+    with pytest.raises(InputError, match=r"overlap by .*raise `contact.clearance_mm`"):
+        sheet(scene_of(*LIQUID, change), design)
+
+
+def test_pressure_is_asked_for():
+    with pytest.raises(InputError, match=r"`pump.pressure_difference_Pa` must be given"):
+        load_config("configs/cic.yaml", ["pump.viscosity_mPa_s=50"])
+    gas_load = "scene.load={pressure_difference_Pa: 3.0e4}"
+    config = load_config("configs/cic.yaml", ["pump.viscosity_mPa_s=50", gas_load])
+    assert config.pump.pressure_difference_Pa == 3e4

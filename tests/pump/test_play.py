@@ -1,0 +1,115 @@
+"""Play against polygons that are pushed into each other, and closed forms."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.path import Path
+
+from rootsopt.contact.nodes import pair_gap, place_pair
+from rootsopt.profiles import CIC, EE
+from rootsopt.pump.play import play
+from tests.conformance.families import LOBES, R, made, outline_of
+from tests.measured.test_outline import bulged, points_of, profile_of
+
+C = 5e-5
+
+
+@jax.jit
+def played(profile, clearance, distance):
+    return play(profile, clearance, distance)
+
+
+@functools.cache
+def of(family, error=0.0):
+    return played(made(family), jnp.asarray(C), jnp.asarray(2 * R + error))
+
+
+def test_ee_and_involute():
+    """At the pitch crossing of EE the lever is r; on an involute it is r cos α, and stays so."""
+    found = of("ee")
+    assert float(found.gear_backlash) == pytest.approx(2 * C, rel=1e-4)
+    assert np.min(found.total) > 2 * C / R
+    found = of("cic")
+    angle = C / (R * np.cos(np.radians(36.43)))
+    assert float(found.gear_backlash) == pytest.approx(2 * R * angle, rel=1e-6)
+    # Rotor 1's drive flank touches on the involute where 0 ≤ -φ1 - π/2N, as far as it reaches.
+    near = np.abs(np.asarray(found.phi) - 2 * np.pi / LOBES + np.pi / 6) < 0.2
+    assert np.sum(near) > 5
+    np.testing.assert_allclose(np.asarray(found.behind)[near], -angle, rtol=1e-5)
+
+
+@pytest.mark.parametrize("family", ["ee", "cic", "five_arcs", "ellipse", "extended_cycloid"])
+def test_polygons_touch_where_the_play_ends(family):
+    """The rotors' polygons, with nominal flanks, overlap there by the clearance; half the way they
+    do by less."""
+    found = of(family)
+    outline = outline_of(family) / 1e3
+    for k in (3, 20, 41, 70, 88):
+        phi, behind, ahead = (float(x[k]) for x in (found.phi, found.behind, found.ahead))
+        for end in (behind, ahead):
+            gap = pair_gap(outline, LOBES, 2 * R, phi, phi + end)
+            assert gap == pytest.approx(-C, rel=2e-3)
+            assert pair_gap(outline, LOBES, 2 * R, phi, phi + end / 2) > -0.99 * C
+
+
+def shrunk(outline, clearance):
+    """A polygon inside of another by a distance, from the directions of its sides."""
+    z = outline[:-1] @ [1, 1j]
+    side = np.roll(z, -1) - np.roll(z, 1)
+    return z + 1j * clearance * side / abs(side)
+
+
+@pytest.mark.parametrize("error", [0.0, 3e-5])
+def test_rotors_intersect_beyond_their_play(error):
+    """Points of one polygon lie inside of the other just beyond the play, and none just within;
+    also at another centre distance, where the flanks are not conjugate."""
+    found = of("cic", error)
+    z = shrunk(outline_of("cic") / 1e3, C / 2)
+    polygon = np.stack([z.real, z.imag], axis=1)
+    polygon = np.concatenate([polygon, polygon[:1]])
+    for k in (5, 44, 83):
+        phi = float(found.phi[k])
+        for end in (found.behind[k], found.ahead[k]):
+            for share, expected in ((0.97, False), (1.03, True)):
+                pair = place_pair(polygon, LOBES, 2 * R + error, phi, phi + share * float(end))
+                assert intersect(*pair, 2 * R) == expected
+
+
+def intersect(first, second, distance):
+    """Whether a vertex of one of two polygons lies inside of the other."""
+    near = [z[abs(z[:, 0] - distance / 2) < 0.45 * distance / 2] for z in (first, second)]
+    return any(Path(a).contains_points(b).any() for a, b in ((first, near[1]), (second, near[0])))
+
+
+def test_overlap_is_negative():
+    """A centre distance that is too small."""
+    found = of("cic", -2e-4)
+    assert float(found.gear_backlash) < 0
+
+
+def test_slope_is_that_of_differences():
+    def backlash(clearance):
+        poses = jnp.asarray([-np.pi / 6, 0.3])
+        return play(EE(LOBES, R), clearance, jnp.asarray(2 * R), poses).gear_backlash
+
+    value, slope = jax.jit(jax.value_and_grad(backlash))(jnp.asarray(C))
+    assert float(slope) == pytest.approx(2.0, rel=1e-2)
+    assert float(value) == pytest.approx(2 * C, rel=1e-4)
+
+
+def test_measured_outline():
+    """Points of a CIC rotor whose addenda are 20 µm too thin: not conjugate, no clearance."""
+    points = bulged(
+        points_of(CIC(LOBES, R, *np.deg2rad([36.43]), 8.5e-3, np.deg2rad(4.0)), 240), -0.02
+    )
+    found = played(profile_of(points)[0], jnp.asarray(0.0), jnp.asarray(2 * R))
+    outline = np.stack([points.real, points.imag], axis=1) / 1e3
+    outline = np.concatenate([outline, outline[:1]])
+    assert float(found.gear_backlash) == pytest.approx(0.0, abs=1e-7)
+    for k in (3, 41, 75):
+        phi = float(found.phi[k])
+        for end in (float(found.behind[k]), float(found.ahead[k])):
+            assert abs(pair_gap(outline, LOBES, 2 * R, phi, phi + end)) < 2e-7
