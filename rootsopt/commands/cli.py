@@ -6,6 +6,7 @@ the status says why.
 
 import argparse
 import contextlib
+import importlib
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -128,18 +129,18 @@ def _import_extensions(command: str, argv: Sequence[str] | None) -> None:
 def run(
     command: str,
     purpose: str,
-    body: Body,
     argv: Sequence[str] | None,
     add_options: Callable[[argparse.ArgumentParser], None] = lambda _: None,
 ) -> int:
     """Run a command and return its exit code.
 
-    `command`: name of the command; `purpose`: description in its help; `body`: function that does
-    the work; `argv`: arguments (`None`: those of the process); `add_options`: function that adds
-    the command's own arguments to the parser.
+    `command`: name of the command; `purpose`: description in its help; `argv`: arguments (`None`:
+    those of the process); `add_options`: function that adds the command's own arguments to the
+    parser.
 
-    Parse the arguments, load the config and select double precision. Then call `body` with a new
-    result folder, move the folder to its final path and print the result. `InputError` and
+    Parse the arguments, load the config and select double precision. Then call the function `body`
+    of the module `rootsopt.commands.work.COMMAND` with a new result folder, move the folder to its
+    final path and print the result. `InputError` and
     `OSError` give exit code 2."""
     environment.own_process()
     try:
@@ -155,7 +156,7 @@ def run(
         use_float64()
         use_cache(wanted=not options.no_cache)
         with environment.explained():
-            return _in_folder(command, body, config, options)
+            return _in_folder(command, config, options)
     except InputError as error:
         message = " ".join(str(error).split())
         print(f"rootsopt {command}: {message}", file=sys.stderr)
@@ -169,9 +170,10 @@ def run(
         return NO_RESULT
 
 
-def _in_folder(command: str, body: Body, config: Config, options: argparse.Namespace) -> int:
+def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int:
     from rootsopt.output.runs import RunFolder
 
+    body: Body = importlib.import_module(f"rootsopt.commands.work.{command}").body
     with (
         RunFolder(options.output, command, options.overwrite) as folder,
         door.leaving(folder.abandon),

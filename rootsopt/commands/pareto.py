@@ -1,98 +1,13 @@
 """`rootsopt pareto CONFIG`: trace the best compromises between two or three terms."""
 
-import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
 
 from rootsopt.commands import door
-
-if TYPE_CHECKING:
-    import argparse
-
-    from rootsopt.commands.cli import Outcome
-    from rootsopt.config import Config
-    from rootsopt.output.runs import RunFolder
-    from rootsopt.tradeoffs.front import Front
 
 PURPOSE = (
     "Trace the best compromises between two or three terms, such as peak force and area "
     "efficiency (pareto.terms)."
 )
-
-
-def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Run `rootsopt pareto`: trace the front, and write files into `folder`.
-
-    Return the `Outcome`. Raises `InputError` if the config is invalid."""
-    began = time.perf_counter()
-    from rich.console import Console
-
-    from rootsopt.commands import cli, searching
-    from rootsopt.output import files, fronts, tables
-    from rootsopt.runtime.environment import say
-    from rootsopt.runtime.timing import CompileClock
-    from rootsopt.scene import check_geometry
-
-    check_geometry(config)
-    clock = CompileClock()
-    promise = "keeping the points found so far and writing the files"
-    with clock, door.patience(promise) as stop, _progress(Console(stderr=True)) as progress:
-        config, choice, front = _traced(config, progress, stop)
-    if front is None:
-        return searching.nothing_known(config, folder, "evaluated", {"points": []})
-    ran = time.perf_counter() - began
-    record = front.record()
-    seconds = {"compile_seconds": clock.seconds, "run_seconds": ran - clock.seconds}
-    record["statistics"] |= seconds
-    files.write_config(folder, config)
-    fronts.write_front(folder, front)
-    folder.write_json("result.json", choice | record | {"versions": files.versions()})
-    if front.points and not options.no_figures:
-        from rootsopt.figures import page
-        from rootsopt.figures.front import front_figure
-
-        front_figure(folder, front)
-        if page.available():
-            page.write_page(folder, front)
-        else:
-            say(page.MISSING)
-    if front.interrupted and not front.points:
-        folder.overwrite = False  # An earlier result is more valuable than this one.
-
-    def show(out: Console) -> None:
-        if front.infeasible is not None:
-            out.print(tables.conflict_table(record["infeasible"]["conflicts"]))
-        elif front.baseline_terms:
-            out.print(tables.front_table(record))
-        out.print(f"{front.status.label}: {front.message}", soft_wrap=True)
-        out.print(
-            f"{front.searches} searches, {front.evaluations} designs, compile "
-            f"{clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s",
-            soft_wrap=True,
-        )
-
-    found = front.certified > 0 and not front.interrupted
-    return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
-
-
-def _traced(config: "Config", progress, stop) -> "tuple[Config, dict[str, Any], Front | None]":
-    """Trace the front; return (config, settings chosen for `auto`, front).
-
-    In the returned config, the chosen settings replace `auto`. The front is `None` if the search
-    was stopped before the baseline was evaluated."""
-    from rootsopt.commands.searching import searched
-    from rootsopt.tradeoffs.trace import Tracer
-
-    return searched(config, lambda given: Tracer(given, progress, stop), stop)
-
-
-def _progress(console) -> "AbstractContextManager[Callable[..., None] | None]":
-    """Return a context manager for a function (searches done, searches expected), as
-    `progress_bar`."""
-    from rootsopt.commands.searching import progress_bar
-
-    return progress_bar(console, "baseline and screening", "tracing the front", "searches")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -105,4 +20,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     from rootsopt.commands import cli
 
-    return cli.run("pareto", PURPOSE, body, argv)
+    return cli.run("pareto", PURPOSE, argv)

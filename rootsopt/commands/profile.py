@@ -1,19 +1,12 @@
 """`rootsopt profile CONFIG`: compute the geometry of one design."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rootsopt.commands import door
 
 if TYPE_CHECKING:
     import argparse
-
-    from rich.console import Console
-
-    from rootsopt.commands.cli import Outcome
-    from rootsopt.config import Config
-    from rootsopt.output.runs import RunFolder
-    from rootsopt.profiles import Profile
 
 PURPOSE = (
     "Compute the geometry of one design (radii, area, inertia, margins) and export drawings, "
@@ -21,107 +14,6 @@ PURPOSE = (
 )
 EXPORT = "dxf,svg"
 """Default value of `--export` for this command. Drawings take less than 1 s, a solid takes 10 s."""
-
-
-def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Run `rootsopt profile`: compute the geometry, and write files into `folder`.
-
-    Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
-    from rootsopt import export
-    from rootsopt.commands import cli
-    from rootsopt.measured import report as outline_report
-    from rootsopt.output import files, tables
-    from rootsopt.profiles import geometry
-    from rootsopt.pump.sheet import NOTE, sheet
-    from rootsopt.response.evaluation import geometry_record
-    from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, outline_mm
-    from rootsopt.scene.families import margins_of
-    from rootsopt.status import Status
-
-    formats = export.chosen(options.export)
-    check_geometry(config)
-    coefficients = _coefficients(options.project)
-    scene, design = Scene.from_config(config), design_vector(config)
-    shape = geometry(scene.profile(design))
-    record = {
-        "design": dict(zip(design_keys(config), map(float, design), strict=True)),
-        "geometry": geometry_record(scene, shape),
-        "response": {},
-        "gradient": {},
-        "steady_state": {},
-        "status": Status.GEOMETRY_ONLY.label,
-        "message": Status.GEOMETRY_ONLY.value,
-        "statistics": {},
-    }
-    if margins := margins_of(config.profile):
-        record["margins"] = margins
-    record |= outline_report.record(config)
-    record["pump"] = sheet(scene, design)
-    files.write_config(folder, config)
-    folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
-    export.write(folder, config, formats, record["design"])
-    if not options.no_figures:
-        from rootsopt.figures import runs
-
-        runs.profile_figures(folder, config, record)
-    alike = resembles(scene.profile(design)) if options.resembles else []
-    if alike:
-        record["resembles"] = alike
-    folder.write_json("result.json", record | {"versions": files.versions()})
-    projected = None if coefficients is None else _projected(folder, config, coefficients)
-
-    def show(out: "Console") -> None:
-        out.print(tables.geometry_table(record))
-        if "flow_ripple" in record["pump"]:
-            out.print(NOTE, soft_wrap=True, highlight=False)
-        outline_report.say(config, out)
-        if alike:
-            out.print(tables.likeness_table(alike, "This profile resembles"))
-        if projected is not None:
-            out.print(projected, soft_wrap=True)
-
-    return cli.Outcome(cli.OK, show)
-
-
-def resembles(profile: "Profile") -> list[dict[str, Any]]:
-    """Return the records of the member of each family that is nearest to a profile, nearest first.
-
-    The families are the classical ones and, last, the free form."""
-    from rootsopt.design.resemblance import free_likeness, likenesses
-
-    named = likenesses(profile)
-    free = free_likeness(profile, *named[:2])
-    return [one.record() for one in (*named, *([] if free is None else [free]))]
-
-
-def _coefficients(given: str | None) -> int | None:
-    """Return the value of `--project` as a number, or `None` if the option is absent.
-
-    Raises `InputError` unless the value is a whole number from 3 to 64."""
-    from rootsopt.errors import InputError
-
-    if given is None:
-        return None
-    if not (given.isdecimal() and 3 <= int(given) <= 64):
-        raise InputError(
-            f"`--project` must be a number of coefficients from 3 to 64, but is {given}; "
-            "12 come within some micrometres of most profiles"
-        )
-    return int(given)
-
-
-def _projected(folder: "RunFolder", config: "Config", count: int) -> str:
-    """Write free_form.yaml: the config with its profile approximated by a free form.
-
-    `count`: number of coefficients of the free form. Return a message for the user."""
-    from rootsopt.scene.families import free_form_of
-
-    profile, away = free_form_of(config.profile, count)
-    folder.write_text("free_form.yaml", config.model_copy(update={"profile": profile}).to_yaml())
-    return (
-        f"as a free form of {count} coefficients, at most {away * 1e6:.3g} µm away from this "
-        f"outline: {folder.path / 'free_form.yaml'}"
-    )
 
 
 def _options(parser: "argparse.ArgumentParser") -> None:
@@ -152,4 +44,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     from rootsopt.commands import cli
 
-    return cli.run("profile", PURPOSE, body, argv, _options)
+    return cli.run("profile", PURPOSE, argv, _options)

@@ -1,80 +1,10 @@
 """`rootsopt sweep CONFIG`: simulate one design at many speeds."""
 
-import contextlib
-from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from rootsopt.commands import door
 
-if TYPE_CHECKING:
-    import argparse
-
-    from rootsopt.commands.cli import Outcome
-    from rootsopt.config import Config
-    from rootsopt.output.runs import RunFolder
-
 PURPOSE = "Simulate one design at many speeds, each from rest: contact force and kind of motion."
-
-
-def body(config: "Config", options: "argparse.Namespace", folder: "RunFolder") -> "Outcome":
-    """Run `rootsopt sweep`: simulate the design at all speeds, and write files into `folder`.
-
-    Return the `Outcome`. Raises `InputError` if the config is invalid."""
-    from rich.console import Console
-
-    from rootsopt.commands import cli
-    from rootsopt.output import files, tables
-    from rootsopt.response import speeds
-    from rootsopt.response.choice import resolve
-    from rootsopt.response.evaluators import evaluator_for
-    from rootsopt.scene import check_geometry, design_keys, design_vector
-
-    check_geometry(config)
-    with _progress(Console(stderr=True)) as progress:
-        config, choice = resolve(config)
-        evaluator = evaluator_for(speeds.alone(config)).without_gradient()
-        parts = speeds.sweep(evaluator, speeds.swept_speeds(config), progress=progress)
-    rows = [part.row() for part in parts]
-    status, message = speeds.overall(parts)
-    files.write_config(folder, config)
-    folder.write_csv("sweep.csv", files.row_columns(rows))
-    data = {
-        "design": dict(zip(design_keys(config), map(float, design_vector(config)), strict=True)),
-        "geometry": parts[0].evaluation.geometry,
-        "speeds": rows,
-        "status": status.label,
-        "message": message,
-        "versions": files.versions(),
-    }
-    folder.write_json("result.json", choice | data)
-    if not options.no_figures:
-        from rootsopt.figures.speeds import speed_figure
-
-        name = config.profile.family.upper()
-        speed_figure(folder, {name: parts}, f"Contact force of the {name} pair over speed")
-
-    def show(out: Console) -> None:
-        out.print(tables.sweep_table(rows))
-        if not status.usable:
-            out.print(f"{status.label}: {message}", soft_wrap=True)
-
-    usable = any(part.evaluation.usable for part in parts)
-    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)
-
-
-@contextlib.contextmanager
-def _progress(console) -> Iterator[Callable[[int, int], None]]:
-    """Yield a function (done, expected) that updates a progress bar.
-
-    If the console is not a terminal, there is no progress bar and the function does nothing."""
-    if not console.is_terminal:
-        yield lambda done, expected: None
-        return
-    from rich.progress import Progress
-
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task("compiling and simulating", total=None)
-        yield lambda done, expected: bar.update(task, completed=done, total=expected)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -87,4 +17,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     from rootsopt.commands import cli
 
-    return cli.run("sweep", PURPOSE, body, argv)
+    return cli.run("sweep", PURPOSE, argv)

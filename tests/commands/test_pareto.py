@@ -110,12 +110,13 @@ def test_contradicting_constraints_end_with_advice(tmp_path, capsys):
 _STOPPED = """
 import contextlib, os, signal, sys
 from rootsopt.commands import door, pareto
+from rootsopt.commands.work import pareto as work
 
 @contextlib.contextmanager
 def progress(console):
     yield lambda done, expected: done == 20 and os.kill(os.getpid(), signal.SIGINT)
 
-pareto._progress = progress
+work._progress = progress
 door.leave(pareto.main())
 """
 """A command that gets Ctrl-C after 20 searches."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rootsopt.commands import optimize as command
+from rootsopt.commands.work import optimize as work
 from rootsopt.config import parse
 from rootsopt.errors import InputError
 from rootsopt.optimize.checkpoint import Checkpoint, set_aside
@@ -87,7 +88,7 @@ def test_the_command_keeps_its_checkpoint_until_the_run_is_in_place(tmp_path, mo
         raise InputError("no space")
 
     put = RunFolder.put_in_place
-    monkeypatch.setattr(command, "_searched", searched)
+    monkeypatch.setattr(work, "_searched", searched)
     monkeypatch.setattr(RunFolder, "put_in_place", given_up)
     arguments = ["configs/cic.yaml", "-o", str(tmp_path / "run")]
     assert command.main(arguments) == 2

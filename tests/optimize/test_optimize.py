@@ -329,7 +329,8 @@ def _refuse():
 
 INTERRUPTED = """
 import os, signal, sys
-from rootsopt.commands import optimize as command, searching
+from rootsopt.commands import optimize as command
+from rootsopt.commands.work import searching
 from rootsopt.optimize.search import Search
 wanted, number = int(sys.argv.pop(1)), signal.Signals[sys.argv.pop(1)]
 searching.PATIENCE = 600.0 if wanted else 0.0

@@ -297,7 +297,7 @@ def test_what_a_command_leaves_when_it_fails(tmp_path, capsys, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("rootsopt.export.write", interrupted)
+    monkeypatch.setattr("rootsopt.commands.work.profile.write", interrupted)
     capsys.readouterr()
     assert _profile(target) == 3
     assert capsys.readouterr().err == "rootsopt profile: stopped by the user\n"
@@ -321,7 +321,7 @@ def test_all_commands_write_through_one_layer():
     removes files, but for the cache's folder and the checkpoint beside a folder."""
     for command in COMMANDS:
         source = (ROOT / "rootsopt" / "commands" / f"{command}.py").read_text()
-        assert f'cli.run("{command}", PURPOSE, body, argv' in source
+        assert f'cli.run("{command}", PURPOSE, argv' in source
         assert f'door.through("{command}", ' in source
         assert "ResultFolder" not in source
     allowed = {"disk.py", "lock.py", "door.py", "programs.py", "store.py", "checkpoint.py"}

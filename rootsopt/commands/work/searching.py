@@ -3,14 +3,18 @@
 import contextlib
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
-if TYPE_CHECKING:
-    from rich.console import Console
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from rootsopt.commands.cli import Outcome
-    from rootsopt.config import Config
-    from rootsopt.output.runs import RunFolder
+from rootsopt.commands import cli
+from rootsopt.config import Config
+from rootsopt.optimize.search import until_stopped
+from rootsopt.output import files
+from rootsopt.output.runs import RunFolder
+from rootsopt.response.choice import resolve
+from rootsopt.status import Status
 
 Found = TypeVar("Found", covariant=True)
 PATIENCE = 5.0
@@ -30,16 +34,13 @@ class Searches(Protocol[Found]):
 
 
 def searched(
-    config: "Config", make: "Callable[[Config], Searches[Found]]", stop: threading.Event
+    config: Config, make: "Callable[[Config], Searches[Found]]", stop: threading.Event
 ) -> "tuple[Config, dict[str, Any], Found | None]":
     """Run the search that `make` returns for a config; return (config, chosen settings, outcome).
 
     In the config that `make` gets and that is returned, the chosen settings replace `auto`. The
     outcome is `None` if `stop`, an event that stops the search, came before the baseline was known.
     """
-    from rootsopt.optimize.search import until_stopped
-    from rootsopt.response.choice import resolve
-
     state: dict[str, Any] = {"config": config, "choice": {}}
 
     def work():
@@ -54,16 +55,12 @@ def searched(
 
 
 def nothing_known(
-    config: "Config", folder: "RunFolder", done: str, empty: Mapping[str, Any]
-) -> "Outcome":
+    config: Config, folder: RunFolder, done: str, empty: Mapping[str, Any]
+) -> cli.Outcome:
     """Write the files of a run that was stopped before the baseline was known.
 
     `done`: past participle for what had to be done with the baseline; `empty`: entries of the
     result file that have no value. Return the `Outcome`, with exit code 3."""
-    from rootsopt.commands import cli
-    from rootsopt.output import files
-    from rootsopt.status import Status
-
     status = Status.INTERRUPTED
     message = f"The run was stopped before the baseline had been {done}: there is no result."
     files.write_config(folder, config)
@@ -76,7 +73,7 @@ def nothing_known(
 
 @contextlib.contextmanager
 def progress_bar(
-    console: "Console", first: str, then: str, counted: str, field: str = ""
+    console: Console, first: str, then: str, counted: str, field: str = ""
 ) -> Iterator[Callable[..., None] | None]:
     """Yield a function (done, expected, …) that updates a progress bar.
 
@@ -86,7 +83,6 @@ def progress_bar(
     if not console.is_terminal:
         yield None
         return
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = [
         TextColumn("{task.description}"),
@@ -103,6 +99,3 @@ def progress_bar(
             bar.update(task, description=then, completed=done, total=expected, shown=text)
 
         yield update
-
-
-__all__ = ["PATIENCE", "Searches", "nothing_known", "progress_bar", "searched"]

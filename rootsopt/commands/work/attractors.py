@@ -1,0 +1,59 @@
+"""The work of `rootsopt attractors`."""
+
+import argparse
+
+import numpy as np
+from rich.console import Console
+
+from rootsopt.commands import cli
+from rootsopt.config import Config
+from rootsopt.figures.basins import basin_figures
+from rootsopt.output import files, tables
+from rootsopt.output.runs import RunFolder
+from rootsopt.response.attractors import find
+from rootsopt.response.choice import resolve
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.scene import check_geometry
+
+
+def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
+    """Run `rootsopt attractors`: find the coexisting motions, and write files into `folder`.
+
+    Return the `Outcome`. Raises `InputError` if the config is invalid."""
+    check_geometry(config)
+    with cli.waiting(Console(stderr=True), "compiling and simulating"):
+        config, choice = resolve(config)
+        found = find(Evaluator.of(config), series=True)
+    files.write_config(folder, config)
+    data = {
+        "attractors": found.records(),
+        "lost": found.lost,
+        "status": found.status.label,
+        "message": found.status.value,
+        "versions": files.versions(),
+    }
+    folder.write_json("result.json", choice | data)
+    rows = [{"attractor": number} | row for number, row in enumerate(found.summary(), 1)]
+    folder.write_csv("attractors.csv", files.row_columns(rows))
+    relative, rate = np.meshgrid(1e3 * found.relative, found.rate)
+    columns = {
+        "relative_rotation_mrad": relative.ravel(),
+        "relative_speed_rad_s": rate.ravel(),
+        # 0: the initial state leads to no reported motion.
+        "attractor": found.leads_to.ravel() + 1,
+    }
+    folder.write_csv("basins.csv", columns)
+    for number, one in enumerate(found.attractors, 1):
+        if one.evaluation.series is not None:
+            response = files.response_columns(one.evaluation.series)
+            folder.write_csv(f"response_{number}.csv", response)
+    if not options.no_figures:
+        basin_figures(folder, found, config)
+
+    def show(out: Console) -> None:
+        out.print(tables.attractor_table(rows, found.lost))
+        if not found.status.usable:
+            out.print(f"{found.status.label}: {found.status.value}", soft_wrap=True)
+
+    usable = any(one.evaluation.usable for one in found.attractors)
+    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)

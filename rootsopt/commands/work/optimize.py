@@ -1,0 +1,327 @@
+"""The work of `rootsopt optimize`."""
+
+import argparse
+import hashlib
+import threading
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+
+import jax.numpy as jnp
+from rich.console import Console
+
+from rootsopt.commands import cli, door
+from rootsopt.commands.work.searching import nothing_known, progress_bar, searched
+from rootsopt.config import Config, sources
+from rootsopt.config.families import family_of
+from rootsopt.design.resemblance import likenesses
+from rootsopt.export import chosen
+from rootsopt.export.writing import write_simulated
+from rootsopt.figures import runs
+from rootsopt.figures.speeds import speed_figure
+from rootsopt.figures.tolerances import distributions
+from rootsopt.measured import report as outline_report
+from rootsopt.optimize import noise
+from rootsopt.optimize.checkpoint import Checkpoint, aside, set_aside
+from rootsopt.optimize.robust import search_of
+from rootsopt.output import files, tables
+from rootsopt.output.runs import RunFolder
+from rootsopt.pump.sheet import check_clearances, record_of
+from rootsopt.response.speeds import at_speeds
+from rootsopt.response.tolerances import nominal_of
+from rootsopt.runtime.environment import say
+from rootsopt.runtime.timing import CompileClock
+from rootsopt.scene import Scene, check_geometry, outline_mm
+from rootsopt.scene.families import with_design
+
+
+def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
+    """Run `rootsopt optimize`: search for the best design, and write files into `folder`.
+
+    Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
+    began = time.perf_counter()
+    formats = chosen(options.export)
+    check_geometry(config)
+    check_clearances(config)
+    clock = CompileClock()
+    promise = "keeping the best design so far and writing the files"
+    with (
+        clock,
+        door.patience(promise) as stop,
+        _progress(Console(stderr=True)) as progress,
+    ):
+        checkpoint = _checkpoint(config, options, folder)
+        try:
+            config, choice, result = _searched(config, progress, stop, checkpoint)
+        except BaseException:
+            checkpoint.close(remove=checkpoint.empty)
+            raise
+    checkpoint.close(remove=checkpoint.empty)
+    if not stop.is_set():  # A stopped search can go on later.
+        for file in (checkpoint.path, aside(checkpoint.path)):
+            folder.remove_afterwards(file)
+    if result is None:
+        empty = {"baseline": None, "optimized": None}
+        return nothing_known(config, folder, "simulated", empty)
+    if result.infeasible is not None:
+        return _contradiction(config, folder, result)
+    ran = time.perf_counter() - began
+    alike = {} if result.interrupted else _alike(config, result)
+    sheets = _sheets(config, result)
+    _write(folder, config, options, result, choice | alike, sheets, clock.seconds, ran)
+    if result.optimized is not None:
+        write_simulated(folder, _searching(config, result), formats, result.optimized)
+    total = time.perf_counter() - began
+
+    def show(out: Console) -> None:
+        baseline = result.baseline.record().get("speeds")
+        if result.optimized is None:
+            out.print(tables.evaluation_table(result.baseline))
+            if baseline:
+                out.print(tables.speeds_table(baseline))
+        else:
+            numbers = result.constraints, result.improvement
+            out.print(tables.comparison_table(result.baseline, result.optimized, *numbers))
+            named = zip(("baseline", "optimised"), sheets.values(), strict=True)
+            out.print(tables.pump_table(dict(named)))
+            if baseline:
+                optimized = result.optimized.record()["speeds"]
+                out.print(tables.speeds_table(baseline, optimized, result.objective_by_speed))
+            if result.optimality is not None:
+                out.print(tables.optimality_table(result.optimality.record(), numbers[0]))
+                if result.optimality.sensitivities:
+                    out.print(tables.sensitivity_table([*result.optimality.sensitivities]))
+            if result.robustness is not None and result.robustness.fresh:
+                record = result.robustness.record()
+                designs = {"baseline": result.baseline, "robust": result.optimized}
+                shown = {name: one.design for name, one in designs.items()}
+                out.print(tables.robustness_table(record, shown))
+            if alike:
+                out.print(tables.likeness_table(alike["resembles"]))
+        if result.beginning is not None:
+            outline_report.say(config, out)
+            out.print(tables.beginning_table(result.beginning.record()))
+        if result.interrupted or result.optimized is None:
+            out.print(_message(result))
+        out.print(
+            f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
+            f"reports {total - ran:.1f} s",
+            soft_wrap=True,
+        )
+
+    found = result.optimized is not None and not result.interrupted
+    return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
+
+
+def _checkpoint(config: Config, options: argparse.Namespace, folder: RunFolder):
+    """Return the checkpoint file of this run, beside the result folder.
+
+    With the option `--resume`, it contains the evaluations of the interrupted run. Without it, an
+    existing checkpoint is moved aside until a run has ended."""
+    path = folder.checkpoint
+    older = None if options.resume else set_aside(path)
+    if older is not None:
+        say(
+            f"an interrupted run has left a checkpoint, which is now {str(older)!r} and goes when "
+            f"this run has ended; to go on with the interrupted run, stop this one, move the file "
+            f"back to {path.name!r}, and add `--resume`"
+        )
+    header = {"config": config.model_dump(mode="json"), "versions": files.versions()}
+    if config.profile.from_file:
+        source = sources.regular_file(config.profile.outline_file or "", "an outline")
+        header["outline"] = hashlib.sha256(source.read_bytes()).hexdigest()
+    return Checkpoint(path, header, options.resume)
+
+
+def _searched(config: Config, progress, stop: threading.Event, checkpoint):
+    """Run the search; return (config, settings chosen for `auto`, result).
+
+    In the returned config, the chosen settings replace `auto`. The result is `None` if the search
+    was stopped before the baseline was simulated. `progress`: function as from `_progress`, or
+    `None`; `stop`: event that stops the search; `checkpoint`: file for the evaluations."""
+    return searched(config, lambda given: search_of(given, progress, stop, checkpoint), stop)
+
+
+def _contradiction(config: Config, folder: RunFolder, result) -> cli.Outcome:
+    """Write the files of a run that found no design because its constraints are in conflict.
+
+    Return the `Outcome`, with exit code 3."""
+    found = result.infeasible
+    files.write_config(folder, config)
+    data = {"baseline": result.baseline.record(), "optimized": None}
+    data |= {"status": result.status.label, "message": found.message}
+    data |= {"infeasible": found.record(), "versions": files.versions()}
+    if result.beginning is not None:
+        data["beginning"] = result.beginning.record()
+    folder.write_json("result.json", data)
+    rows = found.record()["conflicts"]
+
+    def show(out):
+        out.print(tables.conflict_table(rows))
+        if result.beginning is not None:
+            out.print(tables.beginning_table(data["beginning"]))
+        out.print(f"{result.status.label}: {found.message}", soft_wrap=True)
+
+    return cli.Outcome(cli.NO_RESULT, show)
+
+
+def _alike(config: Config, result) -> dict:
+    """Return {"resembles": classical profiles nearest to the optimised one, one row per family}.
+
+    Return {} if the optimised family is itself classical, or if there is no optimised design."""
+    config = _searching(config, result)
+    if family_of(config.profile.family).classical or result.optimized is None:
+        return {}
+
+    design = list(result.optimized.design.values())
+    found = likenesses(Scene.from_config(config).profile(jnp.asarray(design)))
+    return {"resembles": [one.record() for one in found]}
+
+
+def _sheets(config: Config, result) -> dict[str, dict]:
+    """Return the records of baseline and optimised design, with their pump sheets under `pump`."""
+    designs = {"baseline": (config, result.baseline)}
+    if result.optimized is not None:
+        designs["optimized"] = _searching(config, result), result.optimized
+    return {
+        name: one.record() | {"pump": record_of(own, [*one.design.values()])}
+        for name, (own, one) in designs.items()
+    }
+
+
+def _searching(config: Config, result) -> Config:
+    """Return the config of the designs that the search varied.
+
+    It is `config` itself, unless the baseline's profile is from a file."""
+    return config if result.beginning is None else result.beginning.config
+
+
+def _message(result) -> str:
+    """Return the status and advice for a search that was interrupted or found no better design."""
+    return f"{result.status.label}: {_advice(result)}"
+
+
+def _advice(result) -> str:
+
+    if result.interrupted:
+        return _interrupted(result)
+    if not result.baseline.usable:
+        return f"baseline: {result.baseline.message}"
+    if result.optimality is not None and not result.optimality.converged:
+        return result.optimality.message
+    if result.optimized is not None:
+        return result.optimized.message
+    if message := noise.message(result.verification):
+        return message
+    if result.verification.get("rejected"):
+        return (
+            "No better design held up when simulated again from rest at the tight tolerance. "
+            "Raise optimizer.iterations or optimizer.screening, or tighten solver.rtol."
+        )
+    return result.status.value
+
+
+def _interrupted(result) -> str:
+    """Return one or two sentences on what an interrupted search has achieved."""
+    count = len(result.history)
+    begin = f"The search was stopped after {count} design{'s' if count != 1 else ''}"
+    if not result.baseline.usable:
+        return f"{begin}, and the baseline cannot be used: {result.baseline.message}"
+    if result.optimized is None:
+        return f"{begin}; none of them is known to be feasible and better than the baseline."
+    if result.verification["holds_up"]:
+        return f"{begin}. The best of them, simulated again from rest, is reported."
+    return (
+        f"{begin}. The best of them is reported as the search found it: it was not simulated again "
+        "from rest at the config's tolerance."
+    )
+
+
+def _write(folder, config, options, result, choice, sheets, compiled, ran) -> None:
+
+    records = {"baseline": result.baseline, "optimized": result.optimized}
+    searching = _searching(config, result)
+    configs = {"baseline": config, "optimized": searching}
+    files.write_config(folder, config)
+    if result.optimized is not None:
+        folder.write_text("optimized.yaml", _designed(searching, result.optimized).to_yaml())
+    if result.robustness is not None:
+        _write_robustness(folder, config, options, result.robustness)
+    data: dict = {name: sheets.get(name) for name in records}
+    for name, evaluation in records.items():
+        if evaluation is None:
+            continue
+        design = list(evaluation.design.values())
+        points = outline_mm(configs[name], design)
+        folder.write_csv(f"profile_{name}.csv", files.profile_columns(points))
+        if evaluation.series is not None:
+            folder.write_csv(f"response_{name}.csv", files.response_columns(evaluation.series))
+    rows = result.history
+    if rows:
+        folder.write_csv("history.csv", {key: [row[key] for row in rows] for key in rows[0]})
+    data |= choice
+    if result.beginning is not None:
+        data["beginning"] = result.beginning.record()
+        data |= outline_report.record(config)
+    data["improvement"] = result.improvement
+    data["constraints"] = result.constraints
+    if config.objective.speeds_rpm and result.optimized is not None:
+        data["objective_by_speed"] = result.objective_by_speed
+    if result.optimality is not None:
+        data["optimality"] = result.optimality.record()
+    if result.robustness is not None:
+        data["robustness"] = result.robustness.record()
+    data["verification"] = result.verification
+    data["status"], data["message"] = result.status.label, _advice(result)
+    data["statistics"] = {
+        "evaluations": len(rows),
+        "compile_seconds": compiled,
+        "run_seconds": ran - compiled,
+    }
+    data["versions"] = files.versions()
+    folder.write_json("result.json", data)
+    if not options.no_figures:
+        if result.optimized is not None:
+            pair = result.baseline, result.optimized
+            given = None if result.beginning is None else config
+            runs.optimization_figures(folder, *pair, rows, searching, given)
+            if result.optimality is not None:
+                limits = data["constraints"]
+                runs.certificate_figure(folder, rows, limits, data["optimality"])
+        else:
+            runs.simulation_figures(folder, result.baseline, config)
+        if config.objective.speeds_rpm:
+            names = {"baseline": result.baseline, "optimised": result.optimized}
+            known = {name: nominal_of(one) for name, one in names.items() if one is not None}
+            designs = {name: at_speeds(one) for name, one in known.items()}
+            speed_figure(folder, designs, "Contact force over the speeds of the objective")
+
+
+def _designed(config: Config, evaluation) -> Config:
+    """Return `config` with the design of an `evaluation`."""
+    profile = with_design(config.profile, list(evaluation.design.values()))
+    return config.model_copy(update={"profile": profile})
+
+
+def _write_robustness(folder, config, options, robustness) -> None:
+    """Write the nominal optimum, and the files of the comparison over fresh scenes."""
+    nominal = robustness.nominal.optimized
+    if nominal is not None:
+        folder.write_text("nominal.yaml", _designed(config, nominal).to_yaml())
+    if not robustness.fresh:
+        return
+    columns = dict(robustness.scenes)
+    for name, one in robustness.fresh.items():
+        columns |= {f"{name}_{key}": values for key, values in one.values.items()}
+    folder.write_csv("tolerances.csv", columns)
+    if not options.no_figures:
+        designs = {name: one.values for name, one in robustness.fresh.items()}
+        count = len(next(iter(robustness.scenes.values())))
+        made = distributions(designs, f"Contact force in {count} fresh scenes")
+        folder.write_figure("figures/tolerances.png", made)
+
+
+def _progress(console) -> "AbstractContextManager[Callable[..., None] | None]":
+    """Return a context manager for a function (done, expected, best objective): `progress_bar`."""
+    texts = "baseline, compiling", "optimising", "designs"
+    return progress_bar(console, *texts, field="best objective")

@@ -1,0 +1,44 @@
+"""The work of `rootsopt simulate`."""
+
+import argparse
+
+from rich.console import Console
+
+from rootsopt.commands import cli
+from rootsopt.config import Config
+from rootsopt.export import chosen
+from rootsopt.export.writing import write_simulated
+from rootsopt.figures import runs
+from rootsopt.measured import report as outline_report
+from rootsopt.output import files, tables
+from rootsopt.output.runs import RunFolder
+from rootsopt.response.choice import resolve
+from rootsopt.response.evaluators import evaluator_for
+from rootsopt.response.speeds import alone
+from rootsopt.scene import check_geometry, outline_mm
+
+
+def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
+    """Run `rootsopt simulate`: simulate the design, and write files into `folder`.
+
+    Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
+    formats = chosen(options.export)
+    check_geometry(config)
+    with cli.waiting(Console(stderr=True), "compiling and simulating"):
+        config, choice = resolve(config)
+        evaluation = evaluator_for(alone(config))()
+    files.write_config(folder, config)
+    folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
+    if evaluation.series is not None:
+        folder.write_csv("response_design.csv", files.response_columns(evaluation.series))
+    data = evaluation.record() | choice | outline_report.record(config)
+    folder.write_json("result.json", data | {"versions": files.versions()})
+    write_simulated(folder, config, formats, evaluation)
+    if not options.no_figures:
+        runs.simulation_figures(folder, evaluation, config)
+
+    def show(out: Console) -> None:
+        out.print(tables.evaluation_table(evaluation))
+        outline_report.say(config, out)
+
+    return cli.Outcome(cli.OK if evaluation.usable else cli.NO_RESULT, show)

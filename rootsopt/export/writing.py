@@ -1,0 +1,89 @@
+"""Writes the files of the option `--export`."""
+
+import math
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from rootsopt.config import Config
+from rootsopt.export import solid
+from rootsopt.export.animation import rolling_gif, simulation_gif
+from rootsopt.export.command import SOLID
+from rootsopt.export.drawing import Drawing
+from rootsopt.export.dxf import dxf_bytes
+from rootsopt.export.svg import svg_text
+from rootsopt.output.files import ResultFolder
+from rootsopt.response.evaluation import Evaluation, Series
+from rootsopt.scene import Scene
+
+
+def write(
+    folder: ResultFolder,
+    config: Config,
+    formats: Sequence[str],
+    design: dict[str, float],
+    series: Series | None = None,
+    periods: int = 1,
+) -> list[str]:
+    """Write drawings of a `design` into `folder`; return the names of the files.
+
+    `config`: config of the rotor; `formats`: keys of `FORMATS`; `design`: values of the design
+    parameters (config units), keyed by config key. If `series` holds a simulated motion, the GIF
+    shows `periods` mesh periods of it. Otherwise the GIF shows perfect rolling.
+    """
+    if not formats:
+        return []
+    values = jnp.asarray(np.array(list(design.values()), dtype=float))
+    profile = Scene.from_config(config).profile(values)
+    drawing = Drawing.of(config, profile, design)
+    files: dict[str, bytes] = {}
+    if "dxf" in formats:
+        files["rotor.dxf"] = dxf_bytes(drawing)
+    if "svg" in formats:
+        files["rotor.svg"] = svg_text(drawing).encode()
+    if set(formats) & set(SOLID):
+        files |= _solids(drawing, formats, folder.place)
+    if "gif" in formats:
+        if series is None:
+            files["figures/meshing.gif"] = rolling_gif(drawing, profile)
+        else:
+            files["figures/meshing.gif"] = simulation_gif(drawing, profile, series, periods)
+    for name, data in files.items():
+        folder.write_bytes(name, data)
+    return list(files)
+
+
+def write_simulated(
+    folder: ResultFolder, config: Config, formats: Sequence[str], evaluation: Evaluation
+) -> list[str]:
+    """Write drawings of a simulated design and return the names of the files.
+
+    `folder`, `config`, `formats`: as in `write`; `evaluation`: result of the simulation. The GIF
+    shows the simulated motion. If `evaluation` has no motion, no GIF is written."""
+    series = evaluation.series
+    if series is None:
+        formats = tuple(name for name in formats if name != "gif")
+    periods = evaluation.steady_state.get("period") or config.profile.lobes
+    return write(folder, config, formats, evaluation.design, series, periods)
+
+
+def _solids(drawing, formats, place) -> dict[str, bytes]:
+    """Return the contents of the STEP and STL files, keyed by file name.
+
+    `place`: folder for temporary files. The solid of each shape is made only once."""
+    body = drawing.length, drawing.bore, math.radians(drawing.helix_deg)
+    shapes = {
+        "rotor": solid.rotor(drawing.pieces, *body),
+        "pair": solid.pair(drawing.pieces, drawing.lobes, 2 * drawing.pitch_radius, *body),
+    }
+    make = {
+        "step": solid.step_bytes,
+        "stl": lambda shape: solid.stl_bytes(shape, place),
+    }
+    return {
+        f"{name}.{suffix}": make[suffix](shape)
+        for suffix in SOLID
+        if suffix in formats
+        for name, shape in shapes.items()
+    }
