@@ -18,6 +18,7 @@ from rootsopt.pump.gap import Allowances, mesh_gap, relative_curvature
 from rootsopt.pump.laminar import parabolic_length, slot_flow
 from rootsopt.pump.leakage import leakage
 from rootsopt.pump.sheet import sheet
+from rootsopt.response.terms import terms_of
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.medium import Gas
 from tests.conformance.families import LOBES, R, made, outline_of
@@ -247,3 +248,20 @@ def test_pressure_is_asked_for():
     gas_load = "scene.load={pressure_difference_Pa: 3.0e4}"
     config = load_config("configs/cic.yaml", ["pump.viscosity_mPa_s=50", gas_load])
     assert config.pump.pressure_difference_Pa == 3e4
+
+
+def test_terms_are_those_of_the_sheet():
+    """The share that leaks needs a section `pump`; the backlash does not."""
+    design = design_vector(load_config("configs/cic.yaml"))
+    loss, backlash = terms_of(["leakage_fraction", "gear_backlash_max_mm"])
+
+    def value(term, scene):
+        profile = scene.profile(design)
+        return float(eqx.filter_jit(term.value)(scene, profile, geometry(profile), None))
+
+    scene = scene_of(*LIQUID)
+    rows = sheet(scene, design)
+    assert value(loss, scene) == pytest.approx(1 - rows["volumetric_efficiency"], rel=1e-9)
+    assert value(backlash, scene) == pytest.approx(rows["gear_backlash_max_mm"], rel=1e-9)
+    with pytest.raises(InputError, match="needs the section `pump`"):
+        value(loss, scene_of())
