@@ -174,7 +174,7 @@ def response(equation: Equation, elements: Elements, force: Any, tangents: Any) 
     values = jnp.concatenate([averages[:2], height[None], averages[2:]])
     slopes = jnp.concatenate([by_averages[:2], by_height[None], by_averages[2:]])
     values = values + slopes[:, 0]
-    origin = _origin(elements)
+    first = origin(elements)
     corrected = Elements(
         mesh._replace(times=mesh.times + step.times[:, 0]),
         elements.state + step.state[..., 0],
@@ -186,8 +186,8 @@ def response(equation: Equation, elements: Elements, force: Any, tangents: Any) 
         elements=corrected,
         response=values,
         sensitivity=slopes[:, 1:],
-        state=corrected.state[origin],
-        moved=step.state[origin, :, 1:],
+        state=corrected.state[first],
+        moved=step.state[first, :, 1:],
         monodromy=step.monodromy,
         depth=jnp.max(jnp.where(used, points.depth, -jnp.inf)),
         peak=peak,
@@ -249,7 +249,7 @@ def _height(equation: Equation, elements: Elements, step: Step, peak: Peak, eval
     return unit * force, unit * (change[0] - force * change[-1]) / value[-1]
 
 
-def _origin(elements: Elements) -> Int[Array, ""]:
+def origin(elements: Elements) -> Int[Array, ""]:
     """Return the index of the element that begins at φ1 = 0."""
     mesh = elements.mesh
     begin = mesh.ends[0]
