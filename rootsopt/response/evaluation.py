@@ -15,14 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 from rootsopt.config import Config
 from rootsopt.config.units import MM, RPM
 from rootsopt.contact.size import size_map
+from rootsopt.dynamics.collocation.closing import sizes
+from rootsopt.dynamics.collocation.nearby import Known
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.maxima import Maxima, local_maxima
 from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
 from rootsopt.dynamics.orbit import Orbit, reverse_sensitivity
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import BLOCK
-from rootsopt.dynamics.collocation.nearby import Known
-from rootsopt.dynamics.collocation.closing import sizes
 from rootsopt.dynamics.steady import (
     CLOSED,
     Steady,

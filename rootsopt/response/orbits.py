@@ -30,7 +30,7 @@ class Orbits:
         return len(self._known)
 
     def near(self, state: NDArray[np.float64] | None) -> Known | None:
-        """Return the orbit with this scaled `state` (n,) at φ1 = 0, or `None` if it is not known."""
+        """Return the orbit with this scaled `state` (n,) at φ1 = 0, or `None` if not known."""
         if state is None:
             return None
         with self._lock:
