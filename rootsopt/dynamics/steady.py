@@ -394,13 +394,13 @@ class _Attempts(eqx.Module):
         coarse = jnp.maximum(now.coarse / 10, solver.orbit.rtol)
         return _Collocation(found, settled.state, coarse, now.within / 10, now.tries + 1, ~again)
 
-    def near(self, known: Known) -> Steady:
-        """Return the motion whose orbit is near the `known` one of a similar pair.
+    def near(self, known: Known, begun: RotorPair) -> Steady:
+        """Return the motion whose orbit is near the `known` one of the similar pair `begun`.
 
         The status is NOT_SETTLED if the orbit is not accepted."""
         solver = self.solver
         made = near_orbit(
-            self.pair, self.tangents, known, solver.orbit, solver.measures, solver.samples
+            self.pair, self.tangents, (known, begun), solver.orbit, solver.measures, solver.samples
         )
         period = jnp.round(known.elements.mesh.period).astype(int)
         state, within = made.orbit.state, settled_within(solver.transient.rtol)
@@ -513,11 +513,13 @@ def collocates(pair: RotorPair, solver: Solver) -> bool:
 def near_motion(
     pair: RotorPair,
     tangents: RotorPair,
-    known: Known,
+    start: tuple[Known, RotorPair],
     radius: Float[Array, ""],
     solver: Solver,
 ) -> Steady:
-    """Find the steady motion of `pair` near the orbit `known` of a similar pair.
+    """Find the steady motion of `pair` near the orbit of a similar pair.
+
+    `start`: this orbit, and its pair.
 
     There is no transient: the result is the same motion as that of the other pair, continued. It
     has to be stable. The status is NOT_SETTLED if the orbit is not accepted (see
@@ -525,4 +527,4 @@ def near_motion(
     there. The pair must be one that collocation supports.
     """
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
-    return _Attempts(pair, tangents, solver, radius).near(known)
+    return _Attempts(pair, tangents, solver, radius).near(*start)

@@ -259,7 +259,7 @@ class Evaluator:
                 break
             if float(other.scene.deepest) < float(now.scene.deepest):
                 other = other._sized(design)
-        self.orbits.keep(found)
+        self.orbits.keep(found, pair)
         report = now._report(design, (pair, shape), found, began, series)
         if self.maxima and report.usable:
             integrator = now.scene.solver.orbit
@@ -278,6 +278,8 @@ class Evaluator:
         The result is None if there is no such orbit, or if the motion is not accepted."""
         known = self.orbits.near(start)
         if known is None or not collocates(pair, self.scene.solver):
+            return None
+        if jax.tree.structure(known[1]) != jax.tree.structure(pair):
             return None
         scene = self.scene
         found = _near(pair, tangents, known, scene.pitch_radius, scene.solver)
@@ -303,7 +305,7 @@ class Evaluator:
         _build.prepare(now.scene, design)
         if not series and collocates(pair, now.scene.solver):
             known = Known.empty(sizes(1), pair.states, 1 + pair.two_sided)
-            _near.prepare(pair, tangents, known, now.scene.pitch_radius, now.scene.solver)
+            _near.prepare(pair, tangents, (known, pair), now.scene.pitch_radius, now.scene.solver)
         if series:
             count = pair.lobes * now.scene.solver.samples
             times = jax.ShapeDtypeStruct((count,), float)

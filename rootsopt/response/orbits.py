@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.dynamics.collocation.nearby import Known, trimmed
+from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import Steady
 from rootsopt.status import Status
 
@@ -23,14 +24,16 @@ class Orbits:
     """
 
     def __init__(self) -> None:
-        self._known: OrderedDict[bytes, Known] = OrderedDict()
+        self._known: OrderedDict[bytes, tuple[Known, RotorPair]] = OrderedDict()
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
         return len(self._known)
 
-    def near(self, state: NDArray[np.float64] | None) -> Known | None:
-        """Return the orbit with this scaled `state` (n,) at φ1 = 0, or `None` if not known."""
+    def near(self, state: NDArray[np.float64] | None) -> tuple[Known, RotorPair] | None:
+        """Return the orbit with this scaled `state` (n,) at φ1 = 0, and its pair.
+
+        The result is `None` if no such orbit is known."""
         if state is None:
             return None
         with self._lock:
@@ -39,17 +42,22 @@ class Orbits:
                 self._known.move_to_end(_key(state))
         return found
 
-    def keep(self, found: Steady) -> None:
-        """Remember the orbit of the motion `found`, if it was closed by collocation."""
+    def keep(self, found: Steady, pair: RotorPair) -> None:
+        """Remember the orbit of the motion `found` of `pair`, if it was closed by collocation."""
         if found.known is None or Status.of(found.status) is not Status.PERIODIC:
             return
-        if not (bool(found.collocated) and bool(found.known.sound)):
-            return
-        known = trimmed(found.known, int(found.period))
-        if known is None:
+        if bool(found.collocated):
+            self.store(found.orbit.state, found.known, int(found.period), pair)
+
+    def store(self, state: NDArray[np.float64], known: Known, period: int, pair: RotorPair) -> None:
+        """Remember the orbit `known` of a `pair`, with `period` mesh periods, if it is sound.
+
+        `state` (n,): its scaled state at φ1 = 0."""
+        cut = trimmed(known, period) if bool(known.sound) else None
+        if cut is None:
             return
         with self._lock:
-            self._known[_key(found.orbit.state)] = known
+            self._known[_key(state)] = cut, pair
             while len(self._known) > _MOST:
                 self._known.popitem(last=False)
 

@@ -112,16 +112,17 @@ def collocated(
 def near_orbit(
     pair: RotorPair,
     tangents: Any,
-    known: Known,
+    start: tuple[Known, RotorPair],
     integrator: Integrator,
     measures: Measures,
     samples: int,
 ) -> Collocated:
-    """Close the orbit near the `known` one of a similar pair, without a transient or integration.
+    """Close the orbit near that of a similar pair, without a transient or integration.
 
-    `integrator`: sets accuracy and room for steps; for the other arguments, see `collocated`."""
+    `start`: the known orbit, and its pair; `integrator`: sets accuracy and room for steps; for the
+    other arguments, see `collocated`."""
     unit = lax.stop_gradient(pair.force_scale)
-    near = close_near(Equation(pair, measures, unit), tangents, known)
+    near = close_near(Equation(pair, measures, unit), tangents, *start)
     found, drift, sound = near.found, near.known.drift, near.known.sound
     tolerance = integrator.tolerance(found.state.dtype)
     verified = sound & (near.known.error <= _UNREFINED * _ACCURACY * tolerance)

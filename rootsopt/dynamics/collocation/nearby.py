@@ -1,7 +1,8 @@
 """Close an orbit from the known orbit of a similar pair, without a transient.
 
 The orbit of a neighbouring design or scene has nearly the same motion, and its events in the same
-order. Newton's method therefore starts on its mesh. Afterwards the flags are evaluated along the
+order. A step along the tangent of the family of orbits leads from one to the other, and Newton's
+method corrects it, on the same mesh. Afterwards the flags are evaluated along the
 new orbit, with a search for the contact. If they do not change exactly at the events of the mesh,
 or if another check fails, the orbit is not accepted.
 
@@ -25,6 +26,7 @@ from rootsopt.dynamics.collocation.forces import Found, response
 from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.collocation.mesh import roughness
 from rootsopt.dynamics.collocation.newton import newton
+from rootsopt.dynamics.pair import RotorPair
 
 _STEP = 1e-6
 """Newton step (scaled) below which Newton's method stops. The last correction, made together with
@@ -86,14 +88,14 @@ class Near(NamedTuple):
     steps: Int[Array, ""]
 
 
-def close_near(equation: Equation, tangents: Any, known: Known) -> Near:
-    """Close the orbit near a known one of a similar pair.
+def close_near(equation: Equation, tangents: Any, known: Known, begun: RotorPair) -> Near:
+    """Close the orbit near the `known` one of a similar pair.
 
     `equation` of the new pair; `tangents`: directions of its parameters along which to
-    differentiate, stacked along a leading axis."""
-    got = newton(equation, known.elements, jnp.asarray(_STEP))
-    found = response(equation, got.elements, got.force, tangents)
+    differentiate, stacked along a leading axis; `begun`: pair of the known orbit."""
     frozen = lax.stop_gradient(equation.pair)
+    got = newton(equation, known.elements, jnp.asarray(_STEP), begun)
+    found = response(equation, got.elements, got.force, tangents)
     seen = look(frozen, found.elements)
     events = found_events(frozen, found.elements, seen, found.elements.mesh.times.shape[0])
     growth = jnp.maximum(roughness(found.elements) / known.roughness, 1.0) ** 2
