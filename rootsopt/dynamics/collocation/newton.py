@@ -82,8 +82,9 @@ def newton(
     """Solve for the orbit near `elements`, until the last step is at most `tolerance` (scaled).
 
     `begun`: pair of which `elements` is an orbit, if it is a similar pair. The first step is then
-    along the tangent of the family of orbits that leads to the equation's pair (predictor). Newton's
-    first step would be evaluated at penetrations of the wrong size, since the flanks have moved."""
+    along the tangent of the family of orbits that leads to the equation's pair (predictor).
+    Newton's first step would be evaluated at penetrations of the wrong size, since the flanks have
+    moved."""
 
     def go_on(now):
         return (now.turns < _TURNS) & (now.size > tolerance)  # Ends at NaN.
