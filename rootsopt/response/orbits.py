@@ -47,7 +47,8 @@ class Orbits:
         if found.known is None or Status.of(found.status) is not Status.PERIODIC:
             return
         if bool(found.collocated):
-            self.store(found.orbit.state, found.known, int(found.period), pair)
+            state = np.asarray(found.orbit.state)
+            self.store(state, found.known, int(found.period), pair)
 
     def store(self, state: NDArray[np.float64], known: Known, period: int, pair: RotorPair) -> None:
         """Remember the orbit `known` of a `pair`, with `period` mesh periods, if it is sound.

@@ -13,6 +13,7 @@ the fourth power of the elements' length, the error of the forces with the eight
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -113,21 +114,14 @@ def trimmed(known: Known, period: int) -> Known | None:
     All such orbits then share one program. The result is `None` if they have no room for the orbit.
     The arrays are those of NumPy."""
     room, times = sizes(period)
-    mesh = known.elements.mesh
-    anchors = np.asarray(mesh.times)
-    if int(mesh.used) + 1 > room or np.any(anchors[times - 2 :] < anchors[-1]):
+    mesh, *parts = jax.tree.map(np.asarray, known.elements)
+    anchors, interval = mesh.times[:times], np.minimum(mesh.interval[:room], times - 2)
+    if mesh.used + 1 > room or np.any(mesh.times[times - 2 :] < mesh.times[-1]):
         return None
-    cut = Mesh(
-        times=anchors[:times],
-        which=np.asarray(mesh.which)[:times],
-        interval=np.minimum(np.asarray(mesh.interval)[:room], times - 2),
-        left=np.asarray(mesh.left)[:room],
-        right=np.asarray(mesh.right)[:room],
-        used=np.asarray(mesh.used),
-    )
-    state, slopes, roots = (np.asarray(x)[:room] for x in known.elements[1:])
-    rest = map(np.asarray, known[1:])
-    return Known(Elements(cut, state, slopes, roots), *rest)
+    shares = mesh.left[:room], mesh.right[:room], mesh.used
+    arrays: Any = anchors, mesh.which[:times], interval, *shares
+    rest: Any = map(np.asarray, known[1:])
+    return Known(Elements(Mesh(*arrays), *(part[:room] for part in parts)), *rest)
 
 
 def _apart(elements: Elements, seen: Look) -> Float[Array, ""]:
