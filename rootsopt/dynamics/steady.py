@@ -399,9 +399,9 @@ class _Attempts(eqx.Module):
 
         The status is NOT_SETTLED if the orbit is not accepted."""
         solver = self.solver
-        made = near_orbit(
-            self.pair, self.tangents, (known, begun), solver.orbit, solver.measures, solver.samples
-        )
+        sizes_of = solver.samples, solver.max_orbit
+        start = known, begun
+        made = near_orbit(self.pair, self.tangents, start, solver.orbit, solver.measures, sizes_of)
         period = jnp.round(known.elements.mesh.period).astype(int)
         state, within = made.orbit.state, settled_within(solver.transient.rtol)
         settled = self.start(state).found.settled._replace(period=period, nearest=period)

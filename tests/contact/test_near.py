@@ -113,3 +113,21 @@ def test_root_at_the_end_of_a_segment_has_one_slope():
     assert bool(there.place[0].found)
     np.testing.assert_allclose(there.gap, beside.gap, rtol=0, atol=1e-15)
     np.testing.assert_allclose(there.lever1, beside.lever1, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["cic", "pump"])
+def test_force_and_margins_from_one_contact_are_those_of_two(name):
+    pair = _pair(name)
+    tau, state = (x[0] for x in _states(pair, 1))
+
+    @eqx.filter_jit
+    def both(pair):
+        apart = *pair.derivative(tau, state), pair.margins(tau, state)
+        contact, margins = pair.contact_and_margins(tau, state)
+        shared = pair.derivative_and_margins(tau, state)
+        return apart, shared, (pair.contact_at(tau, state), margins), (contact, apart[2])
+
+    apart, shared, third, fourth = both(pair)
+    for one, other in ((apart, shared), (third, fourth)):
+        for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-12)

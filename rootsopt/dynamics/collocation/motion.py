@@ -99,14 +99,21 @@ def collocated(
     verified = closed.sound & out.solved & (miss <= far * size * gain) & (apart <= unequal)
     verified &= closed.error <= _UNREFINED * _ACCURACY * tolerance
     # The transient may have taken a whole number of periods for one.
-    shorter = jnp.arange(1, max(longest // 2, 1) + 1)
-    states = jax.vmap(found.elements.motion)(shorter.astype(state.dtype))
-    repeats = jnp.max(jnp.abs(states - found.state), axis=1) < _REPEATS
-    verified &= ~jnp.any(repeats & (shorter < period) & (period % shorter == 0))
+    verified &= ~_repeats(found, period, longest)
     residual = jnp.where(closed.sound, found.correction, jnp.inf)
     orbit = _as_orbit(found, _with_forces(out, found), residual, closed.drift, closed.steps)
     known = Known(found.elements, roughness(found.elements), closed.error, closed.drift, verified)
     return Collocated(orbit, closed.sound, verified, known)
+
+
+def _repeats(found: Found, period: Int[Array, ""], longest: int) -> Bool[Array, ""]:
+    """Return whether the orbit repeats after a fraction of its `period` (mesh periods).
+
+    `longest`: longest period of an orbit (mesh periods)."""
+    shorter = jnp.arange(1, max(longest // 2, 1) + 1)
+    states = jax.vmap(found.elements.motion)(shorter.astype(found.state.dtype))
+    same = jnp.max(jnp.abs(states - found.state), axis=1) < _REPEATS
+    return jnp.any(same & (shorter < period) & (period % shorter == 0))
 
 
 def near_orbit(
@@ -115,7 +122,7 @@ def near_orbit(
     start: tuple[Known, RotorPair],
     integrator: Integrator,
     measures: Measures,
-    samples: int,
+    sizes_of: tuple[int, int],
 ) -> Collocated:
     """Close the orbit near that of a similar pair, without a transient or integration.
 
@@ -126,9 +133,11 @@ def near_orbit(
     found, drift, sound = near.found, near.known.drift, near.known.sound
     tolerance = integrator.tolerance(found.state.dtype)
     verified = sound & (near.known.error <= _UNREFINED * _ACCURACY * tolerance)
+    period = jnp.round(found.elements.mesh.period).astype(int)
+    verified &= ~_repeats(found, period, sizes_of[1])
     # Newton's method converges quadratically: what is left is far below the last correction.
     residual = jnp.where(sound, found.correction**2, jnp.inf)
-    out = as_flow(found, samples, integrator.max_steps)
+    out = as_flow(found, sizes_of[0], integrator.max_steps)
     orbit = _as_orbit(found, out, residual, drift, near.steps)
     return Collocated(orbit, sound, verified & out.solved, near.known)
 

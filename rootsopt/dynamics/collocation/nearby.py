@@ -22,16 +22,17 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.collocation.closing import sizes
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.equation import Equation
-from rootsopt.dynamics.collocation.events import Look, found_events, look
+from rootsopt.dynamics.collocation.events import Look, agrees, look
 from rootsopt.dynamics.collocation.forces import Found, response
 from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.collocation.mesh import roughness
 from rootsopt.dynamics.collocation.newton import newton
 from rootsopt.dynamics.pair import RotorPair
 
-_STEP = 1e-6
-"""Newton step (scaled) below which Newton's method stops. The last correction, made together with
-the derivatives, is smaller by orders of magnitude."""
+_STEP, _LAST = 1e-5, 1e-6
+"""Newton step (scaled) below which Newton's method stops, and last correction (scaled) above which
+an orbit is rejected. This correction is made together with the derivatives. It is usually smaller
+by orders of magnitude, since convergence is quadratic."""
 _FAR = 1e-6
 """Distance (rad) between the contact's root carried along and that found by a search, where the
 flanks push, above which an orbit is rejected."""
@@ -98,11 +99,9 @@ def close_near(equation: Equation, tangents: Any, known: Known, begun: RotorPair
     got = newton(equation, known.elements, jnp.asarray(_STEP), begun)
     found = response(equation, got.elements, got.force, tangents)
     seen = look(frozen, found.elements)
-    events = found_events(frozen, found.elements, seen, found.elements.mesh.times.shape[0])
     growth = jnp.maximum(roughness(found.elements) / known.roughness, 1.0) ** 2
-    sound = known.sound & (got.size <= _STEP) & (found.correction <= _STEP)
-    sound &= (events.new == 0) & (events.gone == 0) & events.fits
-    sound &= _apart(found.elements, seen) <= _FAR
+    sound = known.sound & (got.size <= _STEP) & (found.correction <= _LAST)
+    sound &= agrees(frozen, found.elements, seen) & (_apart(found.elements, seen) <= _FAR)
     near = Known(found.elements, known.roughness, known.error, known.drift, sound)
     near = near._replace(error=known.error * growth, drift=known.drift * growth)
     return Near(found, near, got.turns)
