@@ -404,12 +404,11 @@ class _Attempts(eqx.Module):
         made = near_orbit(self.pair, self.tangents, start, solver.orbit, solver.measures, sizes_of)
         period = jnp.round(known.elements.mesh.period).astype(int)
         state, within = made.orbit.state, settled_within(solver.transient.rtol)
-        settled = self.start(state).found.settled._replace(period=period, nearest=period)
-        return self.final(
-            self._taken(
-                self.start(state).found._replace(settled=settled), made, state, period, within
-            )
-        )
+        empty = self.start(state).found
+        settled = empty.settled._replace(period=period, nearest=period)
+        # No window, which would only be copied.
+        empty = empty._replace(settled=settled, window=Window.empty(state, 0))
+        return self.final(self._taken(empty, made, state, period, within))
 
     def _taken(self, found: Steady, made: Collocated, start, period, within) -> Steady:
         """Return `found` with the orbit `made`, and with its status.

@@ -48,7 +48,7 @@ def _steps(elements: Elements, room: int) -> tuple[Float[Array, " steps"], Float
 
     `room`: size of the returned arrays; unused ends are inf."""
     mesh = elements.mesh
-    number = jnp.arange(room)
+    number = jnp.arange(min(room, _PARTS * mesh.left.shape[0]))
     place, part = number // _PARTS, number % _PARTS + 1
     first = origin(elements)
     used = jnp.maximum(mesh.used, 1)
@@ -59,8 +59,10 @@ def _steps(elements: Elements, room: int) -> tuple[Float[Array, " steps"], Float
     turns = jnp.where(first + place >= used, mesh.period, 0.0)
     last = _PARTS * mesh.used - 1
     ends = jnp.where(number == last, mesh.period, tau + turns - begin[first])
-    states = jax.vmap(elements.inside)(k, tau)
-    return jnp.where(number <= last, ends, jnp.inf), jnp.where((number <= last)[:, None], states, 0)
+    ends = jnp.where(number <= last, ends, jnp.inf)
+    states = jnp.where((number <= last)[:, None], jax.vmap(elements.inside)(k, tau), 0.0)
+    spare = (0, room - number.size)
+    return jnp.pad(ends, spare, constant_values=jnp.inf), jnp.pad(states, (spare, (0, 0)))
 
 
 __all__ = ["as_flow"]
