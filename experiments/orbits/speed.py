@@ -31,6 +31,9 @@ LIVELY = [
     "scene.timing_gear.backlash_mm=0.25",
     "scene.timing_gear.damping_ratio=0.3",
     "scene.timing_gear.stiffness_N_m_per_rad=9000",
+    "profile.pressure_angle_deg=30.7",
+    "profile.involute_length_mm=4",
+    "profile.tip_arc_angle_deg=1.5",
 ]
 SCENES: dict[str, tuple[str, list[str]]] = {
     "cic": (CIC, []),
