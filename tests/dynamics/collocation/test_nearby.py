@@ -90,6 +90,7 @@ def test_known_orbit_is_cut_to_the_size_of_its_period():
         np.testing.assert_array_equal(
             cut.elements.motion(jnp.asarray(tau)), known.elements.motion(jnp.asarray(tau))
         )
+    assert int(jnp.max(cut.elements.mesh.interval)) == sizes(PERIOD)[1] - 2
     np.testing.assert_array_equal(
         cut.elements.mesh.lengths[:USED], known.elements.mesh.lengths[:USED]
     )
