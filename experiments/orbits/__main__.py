@@ -2,6 +2,9 @@
 
 Writes orbits.csv (updated after each pair) and orbits.png. The exit code is 3 if an orbit has
 another period or its forces differ by more than 1e-4.
+
+With `--speed`, times value and gradient from a neighbour's orbit instead, against the other ways,
+SciPy and Numba. Writes speed.csv.
 """
 
 import argparse
@@ -26,6 +29,8 @@ def body(run: Run) -> int:
         run.csv("orbits.csv", rows)
 
     options = run.options
+    if options.speed:
+        return _timed(run)
     if not options.draw:
         study.run(run.quick, options.count, options.seed, run.say, keep)
     rows = study.read(run.folder.path)
@@ -37,10 +42,29 @@ def body(run: Run) -> int:
     return verdict(worst <= _AGREE and not found.other_period)
 
 
+def _timed(run: Run) -> int:
+    """Time the scenes named, and print the table."""
+    from experiments.orbits import speed
+
+    rows: list[speed.Row] = []
+    for scene in run.options.speed:
+        rows += speed.rows_of(scene, 3 if run.quick else 20, run.say)
+        run.csv("speed.csv", rows)
+    for line in speed.lines(rows):
+        print(line)
+    return verdict(all("ms" in row for row in rows))
+
+
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add options for size and seed of the draw, and for drawing alone."""
     parser.add_argument("--count", type=int, default=72, help="pairs (default: 72)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the draw (default: 0)")
+    parser.add_argument(
+        "--speed",
+        nargs="+",
+        choices=("cic", "lively", "free form", "pump"),
+        help="scenes in which to time orbits from a neighbour; no comparison of random pairs",
+    )
     parser.add_argument(
         "--draw", action="store_true", help="measure nothing: table and figure of a former run"
     )

@@ -86,9 +86,9 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
 
 
 @functools.lru_cache(maxsize=4)
-def _solver(method: str, kind: str):
-    """Return the compiled response with derivatives. One for each kind of pair and method."""
-    del method, kind
+def _solver(method: str, pair: tuple[Any, ...]):
+    """Return the compiled response with derivatives. One for each method and kind of `pair`."""
+    del method, pair
 
     @eqx.filter_jit
     def solve(scene: Scene, design):
@@ -112,7 +112,8 @@ def solved(config: Config, kind: str, method: str) -> tuple[np.ndarray, Any, flo
     scene = Scene.from_config(config)
     scene = dataclasses.replace(scene, solver=dataclasses.replace(scene.solver, closing=method))
     design = design_vector(config)
-    solve = _solver(method, kind)
+    family, lobes, fixed = KINDS[kind]
+    solve = _solver(method, (family, lobes, *fixed))
     jax.block_until_ready(solve(scene, design))
     begun = time.perf_counter()
     slopes, found = jax.block_until_ready(solve(scene, design))
@@ -185,7 +186,7 @@ class Judgement:
     `pairs`: number of pairs with a periodic orbit by shooting; `closed`: how many collocation
     closed too; `only`: orbits that only collocation closed; `other_period`: pairs with different
     periods; `differences`: the greatest and the median of each difference; `faster`: median and
-    least ratio of the times.
+    least ratio of the times; `left`: a line for each pair that collocation leaves to shooting.
     """
 
     pairs: int
@@ -194,6 +195,7 @@ class Judgement:
     other_period: int
     differences: dict[str, tuple[float, float]]
     faster: tuple[float, float]
+    left: tuple[str, ...]
 
     def lines(self) -> list[str]:
         """Return the table."""
@@ -204,7 +206,8 @@ class Judgement:
             f"{self.faster[1]:.2f})",
             f"{'difference':32s} {'median':>9s} {'greatest':>9s}",
         ]
-        return [*head, *(f"{k:32s} {v[1]:9.1e} {v[0]:9.1e}" for k, v in self.differences.items())]
+        spread = (f"{k:32s} {v[1]:9.1e} {v[0]:9.1e}" for k, v in self.differences.items())
+        return [*head, *spread, *self.left]
 
 
 def judge(rows: list[Row]) -> Judgement:
@@ -228,4 +231,10 @@ def judge(rows: list[Row]) -> Judgement:
             if values.size
         },
         faster=(float(np.median(ratio)), float(np.min(ratio))) if ratio.size else (0.0, 0.0),
+        left=tuple(
+            f"left to shooting ({row['collocation_status']}, period {row['shooting_period']}): "
+            f"{row['kind']}, {row['scene']}"
+            for row in shot
+            if row not in closed
+        ),
     )

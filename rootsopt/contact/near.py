@@ -12,6 +12,9 @@ from rootsopt.contact.point import ContactPoint, contact_point
 
 _FARTHEST = 0.06
 """Magnitude of the Newton step (rad) above which the flanks count as having no common normal."""
+_ASIDE = 1e-12
+"""Distance (rad) from a given root at which the offset is linearised. An event may lie exactly
+where a segment ends. Automatic differentiation would give a mixture of both slopes there."""
 _BEYOND = 0.05
 """Distance (rad) from the range of the search's nodes above which a root outside it is rejected.
 The flanks then count as having no common normal."""
@@ -81,7 +84,7 @@ class NearContact(Contact):
 
         `roll`, `relative`: x and ε (rad)."""
         pair = self.pair
-        root = lax.stop_gradient(self.roots[0, which])
+        root = lax.stop_gradient(self.roots[0, which]) + _ASIDE
         folded, mirrored = pair.folded(roll)
         here, turned = jax.jvp(
             lambda normal: pair._mesh(normal, folded, relative), (root,), (jnp.ones_like(root),)

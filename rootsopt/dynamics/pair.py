@@ -317,16 +317,27 @@ class RotorPair(eqx.Module):
         """Return the flank contact at rotation `tau` (mesh periods) and scaled `state`."""
         return self._force(self.motion(tau, state))
 
-    def _force(self, motion: Motion) -> FlankForce:
-        """Return the contact of the flanks at the position and velocity `motion`.
+    def _touches(self, motion: Motion) -> tuple[Float[Array, "*sides"], _Touch]:
+        """Return the side of each flank that can touch at a `motion` (1 drive, -1 coast), and its
+        `_Touch`.
 
         A pair that is not two-sided has the nominal centre distance and no negative clearance. Then
         only the drive flank can touch when ε < 0, and only the coast flank when ε > 0. One search
-        for the gap is therefore enough.
+        for the gap is therefore enough. Otherwise, both results have a leading axis for the sides.
         """
         if self.two_sided:
             sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)
-            flanks = jax.vmap(self._flank_force, (0, None))(sides, motion)
+            return sides, jax.vmap(self._touch, (0, None))(sides, motion)
+        side = jnp.where(motion.relative < 0, jnp.ones_like(motion.relative), -1.0)
+        return side, self._touch(side, motion)
+
+    def _force(self, motion: Motion, touches: Any = None) -> FlankForce:
+        """Return the contact of the flanks at the position and velocity `motion`.
+
+        `touches`: result of `_touches` at this motion, if known."""
+        side, touch = self._touches(motion) if touches is None else touches
+        if self.two_sided:
+            flanks = jax.vmap(self._flank_force, (0, None, 0))(side, motion, touch)
             drive, coast = flanks.drive
             summed = jax.tree.map(lambda x: jnp.sum(x, axis=0), flanks)
             deeper = jnp.argmax(flanks.depth)
@@ -339,16 +350,16 @@ class RotorPair(eqx.Module):
                 lever2=flanks.lever2[deeper],
             )
         drives = motion.relative < 0
-        flank = self._flank_force(jnp.where(drives, 1.0, -1.0), motion)
+        flank = self._flank_force(side, motion, touch)
         return flank._replace(
             drive=jnp.where(drives, flank.drive, 0.0), coast=jnp.where(drives, 0.0, flank.drive)
         )
 
-    def _flank_force(self, side: Float[Array, ""], motion: Motion) -> FlankForce:
+    def _flank_force(self, side: Float[Array, ""], motion: Motion, touch: _Touch) -> FlankForce:
         """Return the contact on one side (1 drive, -1 coast) at the position and velocity `motion`.
 
-        The field `drive` holds the normal force on either side; `coast` is zero."""
-        touch = self._touch(side, motion)
+        `touch`: the flanks of this side. The field `drive` of the result holds the normal force on
+        either side; `coast` is zero."""
         force = self.law(touch.depth, touch.closing)
         lever1, lever2 = touch.approach.lever1, touch.approach.lever2
         forward, sliding = side * force, touch.sliding
@@ -457,9 +468,12 @@ class RotorPair(eqx.Module):
     def margins(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> Margins:
         """Return the `Margins` at rotation `tau` (mesh periods) and scaled `state`."""
         motion, acting = self._moving(tau, state)
+        return self._margins(motion, acting, self._touches(motion))
 
-        def of_flank(side):
-            touch = self._touch(side, motion)
+    def _margins(self, motion: Motion, acting, touches: Any) -> Margins:
+        """Return the `Margins` at a `motion`; `acting`, `touches`: as in `_slope`."""
+
+        def of_flank(side, touch):
             found = [
                 self.law.margins(touch.depth, touch.closing),
                 self.contact.on_side(side).margins(touch.roll, touch.approach),
@@ -472,13 +486,11 @@ class RotorPair(eqx.Module):
             return values, jnp.full(values.shape, pushes), touch.approach.place, pushes
 
         if self.two_sided:
-            sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)
-            values, counts, both, pushes = jax.vmap(of_flank)(sides)
+            values, counts, both, pushes = jax.vmap(of_flank)(*touches)
             places = [jax.tree.map(lambda x, k=k: x[k], both) for k in range(2)]
             values, counts = [values.ravel()], [counts.ravel()]
         else:
-            one = jnp.ones((), self.angle_scale.dtype)
-            values, counts, place, push = of_flank(jnp.where(motion.relative < 0, one, -one))
+            values, counts, place, push = of_flank(*touches)
             values, counts = [values, -motion.relative[None]], [counts, counts[:1]]
             places, pushes = [place], push[None]
         values += [part.margins(motion, own) for part, own in acting]
@@ -493,7 +505,32 @@ class RotorPair(eqx.Module):
         """Return d(state)/dτ and the flank contact, at rotation `tau` (mesh periods) and scaled
         `state`."""
         motion, acting = self._moving(tau, state)
-        contact = self._force(motion)
+        return self._slope(state, motion, acting, self._touches(motion))
+
+    @eqx.filter_jit
+    def derivative_and_margins(
+        self, tau: Float[Array, ""], state: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], FlankForce, Margins]:
+        """Return the results of `derivative` and `margins`, with one evaluation of the contact."""
+        motion, acting = self._moving(tau, state)
+        touches = self._touches(motion)
+        slope, contact = self._slope(state, motion, acting, touches)
+        return slope, contact, self._margins(motion, acting, touches)
+
+    @eqx.filter_jit
+    def contact_and_margins(
+        self, tau: Float[Array, ""], state: Float[Array, " n"]
+    ) -> tuple[FlankForce, Margins]:
+        """Return the results of `contact_at` and `margins`, with one evaluation of the contact."""
+        motion, acting = self._moving(tau, state)
+        touches = self._touches(motion)
+        return self._force(motion, touches), self._margins(motion, acting, touches)
+
+    def _slope(self, state, motion: Motion, acting, touches: Any):
+        """Return d(state)/dτ and the flank contact at the scaled `state`.
+
+        `motion`, `acting`: result of `_moving`; `touches`: result of `_touches`."""
+        contact = self._force(motion, touches)
         loads = self._loads(motion, acting, contact)
         unit = self.mesh_period**2 / self.angle_scale
         acceleration = loads.torque2 / self.inertia

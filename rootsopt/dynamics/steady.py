@@ -15,8 +15,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.closing import supported
-from rootsopt.dynamics.collocation.motion import collocated
+from rootsopt.dynamics.collocation.closing import sizes, supported
+from rootsopt.dynamics.collocation.motion import Collocated, collocated, near_orbit
+from rootsopt.dynamics.collocation.nearby import Known
 from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
@@ -36,6 +37,9 @@ repeat to rounding."""
 _TRUSTED = 1e-8
 """Finest tolerance to which an orbit is refined, unless the config requests a finer tolerance. An
 orbit is refined if it does not close or its derivatives are uncertain."""
+_COLLOCATIONS, _LONGER = 3, 160.0
+"""Maximum number of times that an orbit is collocated, each time from a transient that has settled
+to a tenth of the distance, and the greatest number of mesh periods by which it goes on."""
 
 
 class Solver(eqx.Module):
@@ -80,7 +84,9 @@ class Steady(NamedTuple):
     periods), `rtol` and `verdict`: length and tolerance of this orbit, and the results of its
     checks; `window` of a motion that did not settle; `settled`: end of the transient; `used`: mesh
     periods of all transients; `steps`: number of solver steps of transients and orbits;
-    `collocated`: whether the orbit was closed by collocation.
+    `collocated`: whether the orbit was closed by collocation; `known`: that orbit, from which
+    those of similar pairs can be closed (`near_motion`), `None` if orbits are closed by shooting
+    only.
     """
 
     status: Int[Array, ""]
@@ -93,6 +99,7 @@ class Steady(NamedTuple):
     used: Int[Array, ""]
     steps: Int[Array, ""]
     collocated: Bool[Array, ""]
+    known: Known | None
 
     @property
     def forces(self) -> Float[Array, " r"]:
@@ -146,6 +153,22 @@ class _Search(NamedTuple):
     over: Bool[Array, ""]
 
 
+class _Collocation(NamedTuple):
+    """State of the loop over attempts to close an orbit by collocation.
+
+    `found`: result of the last attempt. The next one continues the transient from `state`, at the
+    tolerance `coarse`, until the states repeat to within the scaled distance `within`. `tries`:
+    number of attempts; `over`: whether the loop has ended.
+    """
+
+    found: Steady
+    state: Float[Array, " n"]
+    coarse: Float[Array, ""]
+    within: Float[Array, ""]
+    tries: Int[Array, ""]
+    over: Bool[Array, ""]
+
+
 class _Attempts(eqx.Module):
     """The loop of `steady_motion`. Its fields hold the arguments of that function.
 
@@ -177,6 +200,7 @@ class _Attempts(eqx.Module):
             used=zero,
             steps=zero,
             collocated=no,
+            known=self._unknown(),
         )
         coarse, fine = solver.transient.rtol, solver.orbit.rtol
         within = settled_within(coarse).astype(dtype)
@@ -238,6 +262,7 @@ class _Attempts(eqx.Module):
             used=used,
             steps=steps + jnp.where(now.windowed, 0, orbit.flow.steps),
             collocated=found.collocated,
+            known=found.known,
         )
         return self._next(now, new, within, lost, taken & shorter)
 
@@ -318,22 +343,41 @@ class _Attempts(eqx.Module):
             return jnp.asarray(Status.NOT_SETTLED.code)
         return window_status(self.pair, window)
 
+    def _unknown(self) -> Known | None:
+        """Return the placeholder for `Steady.known`."""
+        if not collocates(self.pair, self.solver):
+            return None
+        return Known.empty(sizes(self.solver.max_orbit), self.pair.states, 1 + self.pair.two_sided)
+
     def collocated(self, state: Float[Array, " n"]) -> Steady:
         """Return the motion that the scaled `state` leads to, with an orbit closed by collocation.
 
         The status is NOT_SETTLED if the orbit is not stable, is not near the end of the transient,
-        or is not confirmed by an integration."""
-        solver, empty = self.solver, self.start(state).found
-        within = settled_within(solver.transient.rtol).astype(state.dtype)
-        periods = solver.max_periods.astype(int)
-        settled = settle(self.pair, state, solver.transient, within, periods, solver.max_orbit)
+        or is not confirmed by an integration. Before that, the transient is continued and the orbit
+        is tried again."""
+        begun, no = self.start(state), jnp.zeros((), bool)
+        zero = jnp.zeros((), int)
+        start = _Collocation(begun.found, state, begun.coarse, begun.within, zero, no)
+        loop = lax.while_loop(lambda now: ~now.over, lambda now: self._collocate(now), start)
+        return self.final(loop.found)
+
+    def _collocate(self, now: _Collocation) -> _Collocation:
+        """Continue the transient, try to close its orbit, and return the new state of the loop."""
+        solver, used = self.solver, now.found.used
+        room = solver.max_periods - used
+        room = jnp.where(now.tries > 0, jnp.minimum(room, _LONGER), room).astype(int)
+        transient = dataclasses.replace(solver.transient, rtol=now.coarse)
+        settled = settle(self.pair, now.state, transient, now.within, room, solver.max_orbit)
         failure = transient_status(self.pair, settled)
-        period = jnp.maximum(settled.period, 1)
-        lost = empty._replace(
-            status=failure, settled=settled, used=settled.periods, steps=settled.steps
+        lost = now.found._replace(
+            status=failure,
+            settled=settled,
+            used=used + settled.periods,
+            steps=now.found.steps + settled.steps,
         )
 
         def close() -> Steady:
+            period = jnp.maximum(settled.period, 1)
             made = collocated(
                 self.pair,
                 self.tangents,
@@ -342,19 +386,47 @@ class _Attempts(eqx.Module):
                 solver.measures,
                 (solver.samples, solver.max_orbit),
             )
-            judged, status = self._judged(made.orbit, settled.state, solver.orbit.rtol, within)
-            unknown = among(status, (Status.PERIODIC, Status.INACCURATE)) & ~made.verified
-            status = jnp.where(unknown, Status.NOT_SETTLED.code, status)
-            return lost._replace(
-                status=status,
-                orbit=made.orbit,
-                period=period,
-                verdict=judged,
-                steps=settled.steps + made.orbit.flow.steps,
-                collocated=jnp.ones((), bool),
-            )
+            return self._taken(lost, made, settled.state, period, now.within)
 
-        return self.final(lax.cond(failure < 0, close, lambda: lost))
+        found = lax.cond(failure < 0, close, lambda: lost)
+        again = (failure < 0) & (found.status == Status.NOT_SETTLED.code)
+        again &= (now.tries + 1 < _COLLOCATIONS) & (found.used < solver.max_periods)
+        coarse = jnp.maximum(now.coarse / 10, solver.orbit.rtol)
+        return _Collocation(found, settled.state, coarse, now.within / 10, now.tries + 1, ~again)
+
+    def near(self, known: Known, begun: RotorPair) -> Steady:
+        """Return the motion whose orbit is near the `known` one of the similar pair `begun`.
+
+        The status is NOT_SETTLED if the orbit is not accepted."""
+        solver = self.solver
+        sizes_of = solver.samples, solver.max_orbit
+        start = known, begun
+        made = near_orbit(self.pair, self.tangents, start, solver.orbit, solver.measures, sizes_of)
+        period = jnp.round(known.elements.mesh.period).astype(int)
+        state, within = made.orbit.state, settled_within(solver.transient.rtol)
+        empty = self.start(state).found
+        settled = empty.settled._replace(period=period, nearest=period)
+        # No window, which would only be copied.
+        empty = empty._replace(settled=settled, window=Window.empty(state, 0))
+        return self.final(self._taken(empty, made, state, period, within))
+
+    def _taken(self, found: Steady, made: Collocated, start, period, within) -> Steady:
+        """Return `found` with the orbit `made`, and with its status.
+
+        `start`: scaled state near which the orbit has to be; `period` of the orbit (mesh periods);
+        `within`: scaled distance to which the transient's states repeated."""
+        judged, status = self._judged(made.orbit, start, self.solver.orbit.rtol, within)
+        unknown = among(status, (Status.PERIODIC, Status.INACCURATE)) & ~made.verified
+        status = jnp.where(unknown | ~made.sound, Status.NOT_SETTLED.code, status)
+        return found._replace(
+            status=status,
+            orbit=made.orbit,
+            period=period,
+            verdict=judged,
+            steps=found.steps + made.orbit.flow.steps,
+            collocated=jnp.ones((), bool),
+            known=made.known,
+        )
 
     def final(self, found: Steady) -> Steady:
         """Return `found`, with a different status if the forces of its orbit are not valid.
@@ -424,9 +496,34 @@ def steady_motion(
         )
         return attempts.final(search.found)
 
-    if solver.closing == "shooting" or solver.precision != "float64" or not supported(pair):
+    if not collocates(pair, solver):
         return shooting()
     found = attempts.collocated(state)
     if solver.closing == "collocation":
         return found
     return lax.cond(found.status == Status.PERIODIC.code, lambda: found, shooting)
+
+
+def collocates(pair: RotorPair, solver: Solver) -> bool:
+    """Return whether orbits of `pair` are closed by collocation with these settings."""
+    return solver.closing != "shooting" and solver.precision == "float64" and supported(pair)
+
+
+def near_motion(
+    pair: RotorPair,
+    tangents: RotorPair,
+    start: tuple[Known, RotorPair],
+    radius: Float[Array, ""],
+    solver: Solver,
+) -> Steady:
+    """Find the steady motion of `pair` near the orbit of a similar pair.
+
+    `start`: this orbit, and its pair.
+
+    There is no transient: the result is the same motion as that of the other pair, continued. It
+    has to be stable. The status is NOT_SETTLED if the orbit is not accepted (see
+    `collocation.nearby`); `steady_motion` then finds the motion. For the other arguments, see
+    there. The pair must be one that collocation supports.
+    """
+    radius = jnp.asarray(radius, pair.angle_scale.dtype)
+    return _Attempts(pair, tangents, solver, radius).near(*start)

@@ -328,11 +328,16 @@ def _scattered(
 ) -> Scattered:
     """Simulate one design in many scenes. Arguments: see `compare`."""
     design = np.array(list(nominal.design.values()))
+    begun = nominal.state
+    if evaluator.config.solver.orbit != "shooting":
+        # This evaluator then knows the orbit, and closes those of the scenes from it.
+        again = evaluator(design, nominal.state, series=False)
+        begun = again.state if again.usable else begun
 
     def at(shift: Shift) -> tuple[str, list[float]]:
         if tick():
             return "interrupted", [float("nan")] * len(COMPARED)
-        one = in_scene(evaluator, shift, design, nominal.state).evaluation
+        one = in_scene(evaluator, shift, design, begun).evaluation
         forces = [one.response.get(name, float("nan")) for name in RESPONSES]
         values = [problem.objective(one), *forces] if one.usable else [float("nan")] * len(COMPARED)
         return one.status.label, values

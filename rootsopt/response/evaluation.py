@@ -15,15 +15,25 @@ from numpy.typing import ArrayLike, NDArray
 from rootsopt.config import Config
 from rootsopt.config.units import MM, RPM
 from rootsopt.contact.size import size_map
+from rootsopt.dynamics.collocation.closing import sizes
+from rootsopt.dynamics.collocation.nearby import Known
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.maxima import Maxima, local_maxima
 from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
 from rootsopt.dynamics.orbit import Orbit, reverse_sensitivity
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import BLOCK
-from rootsopt.dynamics.steady import CLOSED, Steady, steady_motion, window_status
+from rootsopt.dynamics.steady import (
+    CLOSED,
+    Steady,
+    collocates,
+    near_motion,
+    steady_motion,
+    window_status,
+)
 from rootsopt.dynamics.window import Window, lyapunov
 from rootsopt.profiles import Geometry
+from rootsopt.response.orbits import Orbits
 from rootsopt.response.terms import terms_of, values_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_keys, design_vector
@@ -132,7 +142,8 @@ class Evaluator:
     `reference`: response by which forces are divided when coexisting motions are compared;
     `fitted`: whether the contact map has been fitted to a motion; `map_error`: error of the contact
     map, relative to the static penetration, NaN if unknown; `maxima`: whether to compute all local
-    maxima of the force, with their gradients.
+    maxima of the force, with their gradients; `orbits`: orbits known from former evaluations, which
+    all evaluators made from this one share.
     """
 
     config: Config
@@ -142,6 +153,7 @@ class Evaluator:
     fitted: bool = False
     map_error: float = float("nan")
     maxima: bool = False
+    orbits: Orbits = dataclasses.field(default_factory=Orbits, compare=False, repr=False)
 
     @classmethod
     def of(cls, config: Config, rtol: float | None = None, survey: bool = False) -> "Evaluator":
@@ -238,12 +250,16 @@ class Evaluator:
             pair, tangents, shape = _build(now.scene, design)
             dtype = pair.angle_scale.dtype
             state = np.zeros(pair.states, dtype) if start is None else np.asarray(start, dtype)
-            found = jax.device_get(now.motion(pair, tangents, state))
+            # An orbit that is reported with its series is closed anew, and confirmed.
+            found = None if series else now._near(pair, tangents, start)
+            if found is None:
+                found = jax.device_get(now.motion(pair, tangents, state))
             other = now._refitted(pair, found)
             if other is None:
                 break
             if float(other.scene.deepest) < float(now.scene.deepest):
                 other = other._sized(design)
+        self.orbits.keep(found, pair)
         report = now._report(design, (pair, shape), found, began, series)
         if self.maxima and report.usable:
             integrator = now.scene.solver.orbit
@@ -255,6 +271,20 @@ class Evaluator:
         """Return the steady motion of `pair` that the scaled `state` (n,) leads to, with its
         derivatives along `tangents`."""
         return _motion(pair, tangents, state, self.scene.pitch_radius, self.scene.solver)
+
+    def _near(self, pair: RotorPair, tangents: RotorPair, start) -> Steady | None:
+        """Return the motion of `pair` near the known orbit that begins at `start`.
+
+        The result is None if there is no such orbit, or if the motion is not accepted."""
+        known = self.orbits.near(start)
+        if known is None or not collocates(pair, self.scene.solver):
+            return None
+        if jax.tree.structure(known[1]) != jax.tree.structure(pair):
+            return None
+        scene = self.scene
+        found = _near(pair, tangents, known, scene.pitch_radius, scene.solver)
+        found = jax.device_get(found)
+        return found if Status.of(found.status) is Status.PERIODIC else None
 
     def pair(self, design: ArrayLike) -> RotorPair:
         """Return the rotor pair of `design` (config units)."""
@@ -273,6 +303,9 @@ class Evaluator:
         # The slowest compilation starts first.
         _motion.prepare(pair, tangents, state, now.scene.pitch_radius, now.scene.solver)
         _build.prepare(now.scene, design)
+        if not series and collocates(pair, now.scene.solver):
+            known = Known.empty(sizes(1), pair.states, 1 + pair.two_sided)
+            _near.prepare(pair, tangents, (known, pair), now.scene.pitch_radius, now.scene.solver)
         if series:
             count = pair.lobes * now.scene.solver.samples
             times = jax.ShapeDtypeStruct((count,), float)
@@ -460,6 +493,8 @@ def _orbit_statistics(found: Steady) -> dict[str, int | float]:
     }
     if bool(found.collocated):
         statistics["collocated"] = 1
+        if not int(found.used):
+            statistics["from_neighbour"] = 1
     if np.isfinite(orbit.disagreement):  # Infinite: there was no room for a comparison.
         statistics["gradient_disagreement"] = float(orbit.disagreement)
     return statistics
@@ -511,6 +546,7 @@ def geometry_record(scene: Scene, shape: Geometry) -> dict[str, float]:
 
 _build = Program(Scene.pair_and_tangents)
 _motion = Program(steady_motion)
+_near = Program(near_motion)
 lyapunov_program = Program(lyapunov)
 unsettled_status = Program(window_status)
 

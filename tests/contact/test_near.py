@@ -5,10 +5,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import rootsopt
+from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.near import NearContact
 from rootsopt.contact.search import SearchContact
+from rootsopt.profiles.cic import CIC
 from rootsopt.scene import Scene
 
 GAS = [
@@ -94,3 +97,37 @@ def test_equation_near_a_root_is_that_of_the_search(name):
         for one, other in zip(slopes(pair, tau, state), nearly(pair, tau, state), strict=True):
             size = np.max(np.abs(one))
             np.testing.assert_allclose(other, one, rtol=0, atol=2e-6 * size)
+
+
+def test_root_at_the_end_of_a_segment_has_one_slope():
+    """There, automatic differentiation mixes the slopes of both segments to one of wrong sign."""
+    flanks = FlankPair.of(CIC(3, 0.033, np.radians(34.85), 3.956e-3, np.radians(3.29)))
+    relative = jnp.asarray(-1.135e-3)
+    end = flanks.profile.segments()[1].stop
+    offset = eqx.filter_jit(flanks._offset)
+    roll = brentq(lambda x: float(offset(end, jnp.asarray(x), relative)), 0.2, 0.4, xtol=1e-15)
+    at = eqx.filter_jit(
+        lambda roots: NearContact(flanks, roots).approach(jnp.asarray(roll), relative)
+    )
+    beside, there = (at(jnp.full((1, 2), end + aside)) for aside in (-1e-9, 0.0))
+    assert bool(there.place[0].found)
+    np.testing.assert_allclose(there.gap, beside.gap, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(there.lever1, beside.lever1, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["cic", "pump"])
+def test_force_and_margins_from_one_contact_are_those_of_two(name):
+    pair = _pair(name)
+    tau, state = (x[0] for x in _states(pair, 1))
+
+    @eqx.filter_jit
+    def both(pair):
+        apart = *pair.derivative(tau, state), pair.margins(tau, state)
+        contact, margins = pair.contact_and_margins(tau, state)
+        shared = pair.derivative_and_margins(tau, state)
+        return apart, shared, (pair.contact_at(tau, state), margins), (contact, apart[2])
+
+    apart, shared, third, fourth = both(pair)
+    for one, other in ((apart, shared), (third, fourth)):
+        for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-12)

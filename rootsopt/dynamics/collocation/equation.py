@@ -66,13 +66,12 @@ class Equation(eqx.Module):
         `dynamic`, `static`: the pair's floating-point arrays, and the rest of the pair. For the
         other arguments, see `point`."""
         near = self.near(dynamic, static, roots)
-        slope, contact = near.derivative(tau, state)
+        slope, contact, found = near.derivative_and_margins(tau, state)
         unit = jax.lax.stop_gradient(self.pair.force_scale)
         top = jax.lax.stop_gradient(self.top) / unit
         rates = self.measures.rates(tau, contact.total / unit, top)
         if near.free:
             rates = near.lapse(state) * jnp.append(rates, jnp.ones_like(unit))
-        found = near.margins(tau, state)
         values = jnp.concatenate([slope, rates, found.values[which][None]])
         return values, (_roots(found.places), contact.total, contact.depth)
 
@@ -84,8 +83,8 @@ class Equation(eqx.Module):
         `tau`: time (mesh periods); `state` (n,): scaled; `roots` (sides, 2):
         `NearContact.roots`."""
         near = self.near(*eqx.partition(self.pair, eqx.is_inexact_array), roots)
-        places = near.margins(tau, state).places
-        return near.contact_at(tau, state).total, _roots(places)
+        contact, margins = near.contact_and_margins(tau, state)
+        return contact.total, _roots(margins.places)
 
     def point(
         self,

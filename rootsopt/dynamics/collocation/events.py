@@ -141,10 +141,23 @@ def rooted(elements: Elements, seen: Look) -> Elements:
     return elements._replace(roots=jnp.concatenate([points, ends[:, None]], axis=1))
 
 
-def found_events(pair: RotorPair, elements: Elements, seen: Look, room: int) -> Events:
-    """Return the events of the motion `elements`, whose flags are `seen`.
+class _Compared(NamedTuple):
+    """Flags along a motion, compared with the events of its mesh.
 
-    `room`: size m of the returned arrays."""
+    `fresh` (p, f): whether a flag that matters changes after the instant, but not at an event of
+    the mesh; `later` (p,): next instant (mesh periods); `ends_at` (p,): index of the event at the
+    end of the instant's element; `declared` (p,): whether the instant is the last one before an
+    event of the mesh; `kept` (p,): whether, in addition, the event's flag changes there."""
+
+    fresh: Bool[Array, "p f"]
+    later: Float[Array, " p"]
+    ends_at: Int[Array, " p"]
+    declared: Bool[Array, " p"]
+    kept: Bool[Array, " p"]
+
+
+def _compared(pair: RotorPair, elements: Elements, seen: Look) -> _Compared:
+    """Compare the flags `seen` along the motion `elements` with the events of its mesh."""
     mesh = elements.mesh
     places = seen.tau.shape[0]
     per = len(GAUSS.nodes) + 2
@@ -162,7 +175,21 @@ def found_events(pair: RotorPair, elements: Elements, seen: Look, room: int) -> 
     fixed = mesh.which[ends_at] < 0
     holds = jnp.take_along_axis(differ, jnp.maximum(mesh.which[ends_at], 0)[:, None], 1)[:, 0]
     kept = declared & (fixed | holds)
-    fresh = differ & ~(kept)[:, None]
+    return _Compared(differ & ~kept[:, None], later, ends_at, declared, kept)
+
+
+def agrees(pair: RotorPair, elements: Elements, seen: Look) -> Bool[Array, ""]:
+    """Return whether the flags `seen` along `elements` change exactly at the events of the mesh."""
+    found = _compared(pair, elements, seen)
+    return ~jnp.any(found.fresh) & ~jnp.any(found.declared & ~found.kept)
+
+
+def found_events(pair: RotorPair, elements: Elements, seen: Look, room: int) -> Events:
+    """Return the events of the motion `elements`, whose flags are `seen`.
+
+    `room`: size m of the returned arrays."""
+    mesh, rank = elements.mesh, jnp.asarray(ranks(pair))
+    fresh, later, ends_at, declared, kept = _compared(pair, elements, seen)
     place, flag = jnp.nonzero(fresh, size=_CHANGES, fill_value=0)
     new = jnp.sum(fresh)
     value = seen.flags[place, flag]

@@ -30,14 +30,13 @@ from rootsopt.dynamics.collocation.system import (
 _RIVALS, _PLACES = 4, 9
 """Number of elements in which the peak is searched for, and number of instants per element at which
 the force is evaluated in each round."""
-_ROUNDS, _CLOSER = 14, 0.25
+_ROUNDS, _CLOSER = 8, 0.25
 """Number of rounds of the search for the peak, and factor by which the searched range shrinks from
-one round to the next."""
-
-
-_MENDED = 3
-"""Number of evaluations at each instant in the search for the peak. Each evaluation improves the
-`NearContact.roots` from which the next one starts."""
+one round to the next. Next to a smooth peak, the force falls with the square of the distance."""
+_MENDED, _POOR = 3, 2
+"""Number of evaluations at each instant in the first rounds of the search for the peak, and number
+of these rounds. Each evaluation improves the `NearContact.roots` from which the next one starts. In
+later rounds, one evaluation is enough."""
 
 
 class Peak(NamedTuple):
@@ -114,11 +113,12 @@ def located_peak(equation: Equation, elements: Elements, force: Float[Array, "e 
         reach = 0.5 * _CLOSER ** number.astype(force.dtype)
         tried = jnp.clip(share[:, None] + reach * spread, 0.0, 1.0)
         first = jax.vmap(lambda k, places: jax.vmap(lambda x: _inside(elements, k, x)[2])(places))
-        begun = jnp.where(number < 2, first(rivals, tried), roots[:, None])
+        poor = number < _POOR
+        begun = jnp.where(poor, first(rivals, tried), roots[:, None])
         # Polynomials through the roots are poor near the ends: the first step only mends them.
         forces, new = lax.fori_loop(
             0,
-            _MENDED,
+            jnp.where(poor, _MENDED, 1),
             lambda _, found: each(rivals, tried, found[1]),
             (jnp.zeros_like(tried), begun),
         )
@@ -174,7 +174,7 @@ def response(equation: Equation, elements: Elements, force: Any, tangents: Any) 
     values = jnp.concatenate([averages[:2], height[None], averages[2:]])
     slopes = jnp.concatenate([by_averages[:2], by_height[None], by_averages[2:]])
     values = values + slopes[:, 0]
-    origin = _origin(elements)
+    first = origin(elements)
     corrected = Elements(
         mesh._replace(times=mesh.times + step.times[:, 0]),
         elements.state + step.state[..., 0],
@@ -186,8 +186,8 @@ def response(equation: Equation, elements: Elements, force: Any, tangents: Any) 
         elements=corrected,
         response=values,
         sensitivity=slopes[:, 1:],
-        state=corrected.state[origin],
-        moved=step.state[origin, :, 1:],
+        state=corrected.state[first],
+        moved=step.state[first, :, 1:],
         monodromy=step.monodromy,
         depth=jnp.max(jnp.where(used, points.depth, -jnp.inf)),
         peak=peak,
@@ -249,7 +249,7 @@ def _height(equation: Equation, elements: Elements, step: Step, peak: Peak, eval
     return unit * force, unit * (change[0] - force * change[-1]) / value[-1]
 
 
-def _origin(elements: Elements) -> Int[Array, ""]:
+def origin(elements: Elements) -> Int[Array, ""]:
     """Return the index of the element that begins at φ1 = 0."""
     mesh = elements.mesh
     begin = mesh.ends[0]

@@ -69,14 +69,22 @@ def needed(elements: Elements) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
     The density consists of times (p,) in mesh periods, and of the number of elements up to each
     time (p,), in an arbitrary unit. An element's error is estimated from the highest coefficient of
     the polynomial through its slopes."""
+    share = _highest(elements) ** (1 / (len(GAUSS.nodes) + 1))
+    begin, end = elements.mesh.ends
+    return jnp.append(begin[:1], end), jnp.append(0.0, jnp.cumsum(share))
+
+
+def roughness(elements: Elements) -> Float[Array, ""]:
+    """Return the greatest highest coefficient of all elements (scaled), a measure of the error."""
+    return jnp.max(_highest(elements))
+
+
+def _highest(elements: Elements) -> Float[Array, " e"]:
+    """Return the modulus (e,) of the highest coefficient of each element's motion (scaled)."""
     mesh = elements.mesh
     highest = jnp.sum(jnp.asarray(GAUSS.powers[-1])[:, None] * elements.slopes, axis=1)
     size = jnp.max(jnp.abs(highest), axis=1) * mesh.lengths
-    share = jnp.where(
-        jnp.arange(size.shape[0]) < mesh.used, size ** (1 / (len(GAUSS.nodes) + 1)), 0
-    )
-    begin, end = mesh.ends
-    return jnp.append(begin[:1], end), jnp.append(0.0, jnp.cumsum(share))
+    return jnp.where(jnp.arange(size.shape[0]) < mesh.used, size, 0.0)
 
 
 def moved(elements: Elements, mesh: Mesh) -> Elements:

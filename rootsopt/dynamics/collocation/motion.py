@@ -5,11 +5,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.closing import Closed, close, first_elements, sizes
+from rootsopt.dynamics.collocation.closing import close, first_elements, sizes
 from rootsopt.dynamics.collocation.equation import Equation
 from rootsopt.dynamics.collocation.forces import Found
+from rootsopt.dynamics.collocation.mesh import roughness
+from rootsopt.dynamics.collocation.nearby import Known, close_near
+from rootsopt.dynamics.collocation.sampled import as_flow
 from rootsopt.dynamics.collocation.seed import seeded
 from rootsopt.dynamics.flow import Flow, flow
 from rootsopt.dynamics.integrator import Integrator
@@ -29,10 +33,10 @@ error. The estimate exceeds the request if the mesh has no room for refinement."
 _REPEATS = 1e-6
 """Scaled difference between the states at φ1 = 0 and after a fraction of the period, below which an
 orbit is rejected. Its true period is then shorter."""
-_MISS = 1e3
+_MISS = 1e4, 1e-4
 """Scaled difference between the start and the end of an integration from the orbit's state, above
-which the orbit is rejected. The limit is this number of tolerances, multiplied by the greatest
-entries of the state and of the monodromy matrix, where they exceed 1."""
+which the orbit is rejected. The limit is the first number (tolerances), but at least the second,
+multiplied by the greatest entries of the state and of the monodromy matrix, where they exceed 1."""
 _APART = 1e4, 1e-4
 """Relative difference between the forces of the orbit and of an integration from its state, above
 which the orbit is rejected. The limit is the first number (tolerances), but at least the second."""
@@ -42,14 +46,16 @@ class Collocated(NamedTuple):
     """An orbit closed by collocation, with the results of its checks.
 
     `orbit`: its `flow` is an integration over one period, with the forces from collocation; its
-    `residual` is the last correction, inf if the orbit is not sound. `closed`: result of
-    collocation; `verified`: whether the orbit is sound and accurate, and the integration confirms
-    it.
+    `residual` is the last correction, inf if the orbit is not sound. `sound`: whether Newton's
+    method has converged on a mesh that ends at the orbit's events; otherwise the orbit has no
+    meaning. `verified`: whether the orbit is sound and accurate, and the integration confirms it.
+    `known`: the orbit as a start for those of similar pairs.
     """
 
     orbit: Orbit
-    closed: Closed
+    sound: Bool[Array, ""]
     verified: Bool[Array, ""]
+    known: Known
 
 
 def collocated(
@@ -87,35 +93,78 @@ def collocated(
     miss = jnp.max(jnp.abs(out.end - found.state))
     size = jnp.maximum(1.0, jnp.max(jnp.abs(found.state)))
     gain = jnp.maximum(1.0, jnp.max(jnp.abs(found.monodromy)))
-    factor, least = _APART
     scale = jnp.maximum(jnp.abs(found.response[:3]), 1e-30)
     apart = jnp.max(jnp.abs(out.response[:3] - found.response[:3]) / scale)
-    verified = closed.sound & (miss <= _MISS * tolerance * size * gain)
-    verified &= apart <= jnp.maximum(factor * tolerance, least)
+    far, unequal = (jnp.maximum(factor * tolerance, least) for factor, least in (_MISS, _APART))
+    verified = closed.sound & out.solved & (miss <= far * size * gain) & (apart <= unequal)
     verified &= closed.error <= _UNREFINED * _ACCURACY * tolerance
     # The transient may have taken a whole number of periods for one.
+    verified &= ~_repeats(found, period, longest)
+    residual = jnp.where(closed.sound, found.correction, jnp.inf)
+    orbit = _as_orbit(found, _with_forces(out, found), residual, closed.drift, closed.steps)
+    known = Known(found.elements, roughness(found.elements), closed.error, closed.drift, verified)
+    return Collocated(orbit, closed.sound, verified, known)
+
+
+def _repeats(found: Found, period: Int[Array, ""], longest: int) -> Bool[Array, ""]:
+    """Return whether the orbit repeats after a fraction of its `period` (mesh periods).
+
+    `longest`: longest period of an orbit (mesh periods)."""
     shorter = jnp.arange(1, max(longest // 2, 1) + 1)
-    states = jax.vmap(found.elements.motion)(shorter.astype(state.dtype))
-    repeats = jnp.max(jnp.abs(states - found.state), axis=1) < _REPEATS
-    verified &= ~jnp.any(repeats & (shorter < period) & (period % shorter == 0))
-    orbit = Orbit(
+    states = jax.vmap(found.elements.motion)(shorter.astype(found.state.dtype))
+    same = jnp.max(jnp.abs(states - found.state), axis=1) < _REPEATS
+    return jnp.any(same & (shorter < period) & (period % shorter == 0))
+
+
+def near_orbit(
+    pair: RotorPair,
+    tangents: Any,
+    start: tuple[Known, RotorPair],
+    integrator: Integrator,
+    measures: Measures,
+    sizes_of: tuple[int, int],
+) -> Collocated:
+    """Close the orbit near that of a similar pair, without a transient or integration.
+
+    `start`: the known orbit, and its pair; `integrator`: sets accuracy and room for steps; for the
+    other arguments, see `collocated`."""
+    unit = lax.stop_gradient(pair.force_scale)
+    near = close_near(Equation(pair, measures, unit), tangents, *start)
+    found, drift, sound = near.found, near.known.drift, near.known.sound
+    tolerance = integrator.tolerance(found.state.dtype)
+    verified = sound & (near.known.error <= _UNREFINED * _ACCURACY * tolerance)
+    period = jnp.round(found.elements.mesh.period).astype(int)
+    verified &= ~_repeats(found, period, sizes_of[1])
+    # Newton's method converges quadratically: what is left is far below the last correction.
+    residual = jnp.where(sound, found.correction**2, jnp.inf)
+    out = as_flow(found, sizes_of[0], integrator.max_steps)
+    orbit = _as_orbit(found, out, residual, drift, near.steps)
+    return Collocated(orbit, sound, verified & out.solved, near.known)
+
+
+def _as_orbit(found: Found, out: Flow, residual, drift, steps) -> Orbit:
+    """Return an orbit found by collocation.
+
+    `out`: its flow over one period; `residual`: its residual; `drift`: estimated error of its
+    derivatives; `steps`: number of Newton steps."""
+    nothing = jnp.zeros_like(found.depth)
+    return Orbit(
         state=found.state,
-        flow=_as_flow(out, found),
-        residual=jnp.where(closed.sound, found.correction, jnp.inf),
+        flow=out,
+        residual=residual,
         monodromy=found.monodromy,
         multiplier=spectral_radius(found.monodromy),
         response=found.response,
         sensitivity=found.sensitivity,
         moved=found.moved,
-        newton_steps=closed.steps,
-        drift=jnp.zeros_like(peak),
-        defect=jnp.zeros_like(peak),
-        disagreement=closed.drift,
+        newton_steps=steps,
+        drift=nothing,
+        defect=nothing,
+        disagreement=drift,
     )
-    return Collocated(orbit, closed, verified)
 
 
-def _as_flow(out: Flow, found: Found) -> Flow:
+def _with_forces(out: Flow, found: Found) -> Flow:
     """Return the flow `out` with the forces of the orbit `found`, and with zeros for the
     derivatives."""
     response = found.response

@@ -3,10 +3,11 @@ same."""
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements
@@ -20,6 +21,7 @@ from rootsopt.dynamics.collocation.system import (
     condensed,
     own_column,
 )
+from rootsopt.dynamics.pair import RotorPair
 
 _TURNS = 16
 """Maximum number of Newton steps."""
@@ -71,16 +73,29 @@ def solved_step(elements: Elements, found: Lines, columns: Columns) -> Step:
     return chained(elements, found, columns, condensed(elements, found, columns))
 
 
-def newton(equation: Equation, elements: Elements, tolerance: Float[Array, ""]) -> Converged:
-    """Solve for the orbit near `elements`, until the last step is at most `tolerance` (scaled)."""
+def newton(
+    equation: Equation,
+    elements: Elements,
+    tolerance: Float[Array, ""],
+    begun: RotorPair | None = None,
+) -> Converged:
+    """Solve for the orbit near `elements`, until the last step is at most `tolerance` (scaled).
+
+    `begun`: pair of which `elements` is an orbit, if it is a similar pair. The first step is then
+    along the tangent of the family of orbits that leads to the equation's pair (predictor).
+    Newton's first step would be evaluated at penetrations of the wrong size, since the flanks have
+    moved."""
 
     def go_on(now):
         return (now.turns < _TURNS) & (now.size > tolerance)  # Ends at NaN.
 
     def turn(now):
         at = now.elements
-        points = evaluated(equation, at)
-        found = lines(at, points)
+        if begun is None:
+            points = evaluated(equation, at)
+            found = lines(at, points)
+        else:
+            points, found = _along(equation, at, begun, now.turns == 0)
         step = solved_step(at, found, own_column(at, found))
         moved, size = advanced(at, step, points.roots)
         return Converged(moved, size, now.turns + 1, points.force[:, : len(GAUSS.nodes)])
@@ -89,6 +104,34 @@ def newton(equation: Equation, elements: Elements, tolerance: Float[Array, ""]) 
     infinite = jnp.full_like(elements.state[0, 0], jnp.inf)
     start = Converged(elements, infinite, jnp.zeros((), int), force)
     return lax.while_loop(go_on, turn, start)
+
+
+def _along(
+    equation: Equation, elements: Elements, begun: RotorPair, first: Bool[Array, ""]
+) -> tuple[Point, Lines]:
+    """Return the equation along `elements`, and linearised.
+
+    If this is the `first` step, the equation is that of the pair `begun`, and its change to the
+    equation's pair is added to what the step has to correct."""
+    new, static = eqx.partition(equation.pair, eqx.is_inexact_array)
+    old = eqx.filter(begun, eqx.is_inexact_array)
+    change = jax.tree.map(lambda x, y: jnp.where(first, x - y, 0.0)[None], new, old)
+    here = eqx.combine(jax.tree.map(lambda x, y: jnp.where(first, y, x), new, old), static)
+    own = eqx.tree_at(lambda e: e.pair, equation, here)
+    mesh = elements.mesh
+    tau, state = elements.places
+    which = jnp.maximum(mesh.which[mesh.interval + 1], 0)
+
+    def both(tau, state, roots, which):
+        return own.along(tau, state, roots, which, change)
+
+    each = jax.vmap(jax.vmap(both, (0, 0, 0, None)))
+    points, along = in_blocks(each, mesh.used, tau, state, elements.roots, which)
+    found, (count, inside) = lines(elements, points), (state.shape[-1], len(GAUSS.nodes))
+    return points, found._replace(
+        miss=found.miss + along[:, :inside, :count, 0],
+        margin=found.margin + along[:, inside, -1, 0],
+    )
 
 
 def advanced(

@@ -1,0 +1,174 @@
+"""Times value and gradient from a neighbour's orbit against other ways to the same numbers.
+
+All tools run in one process, one after the other in turns. Times are processor times, so that other
+processes on the machine hardly change them. The neighbour is a design whose parameters differ by a
+small fraction.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments._common.engines import FD_STEPS
+from experiments._common.engines import Scene as PlainScene
+from experiments._common.engines.scipy_nodes import NODES_1E3, ScipyNodes
+from experiments._common.scenes import CIC
+from rootsopt.config import load
+from rootsopt.response.evaluation import Evaluator, _build, _near
+from rootsopt.response.orbits import Orbits
+
+Row = dict[str, Any]
+AWAY = 2e-3
+"""Relative difference between the parameters of a design and those of its neighbour."""
+LIVELY = [
+    "scene.speed_rpm=1700",
+    "scene.load.torque_N_m=3",
+    "scene.timing_gear.backlash_mm=0.25",
+    "scene.timing_gear.damping_ratio=0.3",
+    "scene.timing_gear.stiffness_N_m_per_rad=9000",
+    "profile.pressure_angle_deg=30.7",
+    "profile.involute_length_mm=4",
+    "profile.tip_arc_angle_deg=1.5",
+]
+SCENES: dict[str, tuple[str, list[str]]] = {
+    "cic": (CIC, []),
+    "lively": (CIC, LIVELY),
+    "free form": ("configs/free.yaml", []),
+    "pump": ("configs/pump.yaml", []),
+}
+"""Config and overrides of each scene."""
+EXACT = 1e-10
+"""Orbit tolerance of the reference, which is closed by shooting."""
+
+
+def processor_time(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:
+    """Return the median processor time (s) of a warm call, and its result."""
+    found = call()
+    times = []
+    for _ in range(repeats):
+        begun = time.process_time()
+        found = call()
+        times.append(time.process_time() - begun)
+    return float(np.median(times)), found
+
+
+def _numbers(evaluation) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and peak force (N), and their gradients (2, d)."""
+    names = "mean_force_N", "peak_force_N"
+    forces = np.array([evaluation.response[name] for name in names])
+    return forces, np.array([list(evaluation.gradient[name].values()) for name in names])
+
+
+def _row(scene: str, tool: str, seconds: float, found: Any, truth: Any) -> Row:
+    forces, slopes = (np.asarray(x)[:2] for x in found)
+    apart = np.max(np.abs(slopes - truth[1]), axis=1) / np.max(np.abs(truth[1]), axis=1)
+    return {
+        "scene": scene,
+        "tool": tool,
+        "ms": 1e3 * seconds,
+        "force_error": float(np.max(np.abs(forces / truth[0] - 1))),
+        "gradient_error": float(np.max(apart)),
+    }
+
+
+def rows_of(scene: str, repeats: int, say: Callable[[str], None] = lambda text: None) -> list[Row]:
+    """Measure one of `SCENES`; return a row for each tool."""
+    path, overrides = SCENES[scene]
+    config = load(path, [*overrides, "solver.orbit=collocation"])
+    own = Evaluator.of(config)
+    shooting = Evaluator.of(load(path, overrides))
+    base = np.asarray(config.design, float)
+    draw = np.random.default_rng(0)
+    design = base * (1 + AWAY * draw.uniform(-1, 1, base.shape))
+    say(f"{scene}: compiling")
+    neighbour = own(base, series=False)
+    exact = shooting.at_tolerance(EXACT)(design, start=neighbour.state, series=False)
+    if not (neighbour.usable and exact.usable):
+        return [{"scene": scene, "tool": f"{neighbour.status.label}, {exact.status.label}"}]
+    truth = _numbers(exact)
+    alone = dataclasses.replace(own, orbits=Orbits())
+    known = own.orbits.near(neighbour.state)
+    pair, tangents, _ = _build(own.scene, jnp.asarray(design))
+    settings = own.scene.pitch_radius, own.scene.solver
+
+    def program():
+        return jax.block_until_ready(_near(pair, tangents, known, *settings))
+
+    def afresh(tool: Evaluator, start: Any):
+        return lambda: dataclasses.replace(tool, orbits=Orbits())(design, start, series=False)
+
+    near = own(design, start=neighbour.state, series=False)
+    used = near.statistics.get("from_neighbour", 0)
+    name = "neighbour" if used else "neighbour refused, usual way"
+    calls = {
+        name: lambda: own(design, start=neighbour.state, series=False),
+        "collocation from the neighbour's state": afresh(alone, neighbour.state),
+        "collocation from rest": afresh(alone, None),
+        "shooting from the neighbour's state": afresh(shooting, neighbour.state),
+        "shooting from rest": afresh(shooting, None),
+    }
+    rows = []
+    if used:
+        seconds, _ = processor_time(program, repeats)
+        rows.append(_row(scene, "neighbour, program alone", seconds, _numbers(near), truth))
+    for tool, call in calls.items():
+        say(f"{scene}: {tool}")
+        seconds, found = processor_time(call, repeats)
+        if not found.usable:
+            rows.append({"scene": scene, "tool": f"{tool}: {found.status.label}"})
+            continue
+        rows.append(_row(scene, tool, seconds, _numbers(found), truth))
+    if scene == "cic":
+        rows += _competitors(config, design, truth, repeats, say)
+    return rows
+
+
+def _competitors(config: Any, design, truth, repeats: int, say: Callable[[str], None]) -> list[Row]:
+    """Measure SciPy and Numba with central differences."""
+    from experiments._common.engines import numba_pair as numba
+
+    scene = PlainScene.of(config)
+    tools = {
+        "SciPy, differences": ScipyNodes(scene, **NODES_1E3),
+        "Numba, differences": numba.NumbaPair(scene, **numba.SEARCH_1E3),
+        "Numba, gradient to 1e-3": numba.NumbaPair(scene, **numba.SEARCH_GRADIENT_1E3),
+    }
+    rows = []
+    for name, tool in tools.items():
+        say(f"cic: {name}")
+        best: Row | None = None
+        for factor in (1.0, 3.0):
+            steps = [factor * step for step in FD_STEPS]
+            count = max(1, repeats // 10) if "SciPy" in name else repeats
+            seconds, (_, slopes) = processor_time(
+                lambda tool=tool, steps=steps: tool.gradient(tuple(design), steps), count
+            )
+            forces = tool.simulate(tuple(design)).response
+            row = _row("cic", name, seconds, (forces, slopes), truth)
+            if best is None or row["gradient_error"] < best["gradient_error"]:
+                best = row
+        assert best is not None
+        rows.append(best)
+    return rows
+
+
+def lines(rows: list[Row]) -> list[str]:
+    """Return the table. The last column is the time relative to that from the neighbour."""
+    head = f"{'scene':10s} {'tool':40s} {'ms':>9s} {'forces':>8s} {'gradient':>8s} {'ratio':>7s}"
+    found = [head]
+    for row in rows:
+        if "ms" not in row:
+            found.append(f"{row['scene']:10s} {row['tool']}")
+            continue
+        same = [one for one in rows if one["scene"] == row["scene"] and one["tool"] == "neighbour"]
+        ratio = f"{float(row['ms']) / float(same[0]['ms']):7.1f}" if same else " " * 7
+        errors = " ".join(f"{float(row[key]):8.0e}" for key in ("force_error", "gradient_error"))
+        found.append(
+            f"{row['scene']:10s} {row['tool']:40s} {float(row['ms']):9.2f} {errors} {ratio}"
+        )
+    return found

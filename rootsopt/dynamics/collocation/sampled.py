@@ -1,0 +1,68 @@
+"""A motion on elements, sampled like an integrated one."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.forces import Found, origin
+from rootsopt.dynamics.flow import Flow
+
+_PARTS = 4
+"""Number of steps into which an element is divided. A step of an explicit method of the order of
+the elements is then at least as accurate as the element."""
+
+
+def as_flow(found: Found, samples: int, steps: int) -> Flow:
+    """Return the orbit `found` as a `Flow` over its period, with zeros for the derivatives.
+
+    `samples`: number of uniform samples of the state; `steps`: room for steps. Each element is
+    divided into `_PARTS` steps. `Flow.solved` is False if there is no room for them."""
+    elements, response = found.elements, found.response
+    mesh, dtype = elements.mesh, found.state.dtype
+    grid, corners = _steps(elements, steps)
+    uniform = mesh.period * jnp.arange(samples) / samples
+    begin, length = mesh.ends[0][found.peak.element], mesh.lengths[found.peak.element]
+    rows = found.state.shape[0] + response.shape[0]
+    columns = found.state.shape[0] + found.moved.shape[1]
+    return Flow(
+        end=found.state,
+        mean=response[0],
+        mean_square=response[1],
+        peak=response[2],
+        peak_time=jnp.mod(begin + found.peak.share * length, mesh.period),
+        depth=found.depth,
+        states=jax.vmap(elements.motion)(uniform),
+        grid=grid,
+        corners=corners,
+        steps=jnp.zeros((), int),
+        solved=_PARTS * mesh.used <= steps,
+        strain=jnp.zeros((), dtype),
+        others=response[3:],
+        slope=jnp.zeros((rows, columns), dtype),
+    )
+
+
+def _steps(elements: Elements, room: int) -> tuple[Float[Array, " steps"], Float[Array, "steps n"]]:
+    """Return the ends of steps from φ1 = 0 over one period (mesh periods), and the states there.
+
+    `room`: size of the returned arrays; unused ends are inf."""
+    mesh = elements.mesh
+    number = jnp.arange(min(room, _PARTS * mesh.left.shape[0]))
+    place, part = number // _PARTS, number % _PARTS + 1
+    first = origin(elements)
+    used = jnp.maximum(mesh.used, 1)
+    k = jnp.mod(first + place, used)
+    begin, length = mesh.ends[0], mesh.lengths
+    tau = begin[k] + length[k] * part / _PARTS
+    # Elements before φ1 = 0 come last. The last step ends after exactly one period.
+    turns = jnp.where(first + place >= used, mesh.period, 0.0)
+    last = _PARTS * mesh.used - 1
+    ends = jnp.where(number == last, mesh.period, tau + turns - begin[first])
+    ends = jnp.where(number <= last, ends, jnp.inf)
+    states = jnp.where((number <= last)[:, None], jax.vmap(elements.inside)(k, tau), 0.0)
+    spare = (0, room - number.size)
+    return jnp.pad(ends, spare, constant_values=jnp.inf), jnp.pad(states, (spare, (0, 0)))
+
+
+__all__ = ["as_flow"]

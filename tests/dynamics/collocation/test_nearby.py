@@ -1,0 +1,146 @@
+"""Orbits closed from those of neighbouring pairs."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rootsopt
+from rootsopt.dynamics.collocation.closing import sizes
+from rootsopt.dynamics.collocation.elements import Elements, Mesh
+from rootsopt.dynamics.collocation.forces import Found, Peak
+from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
+from rootsopt.dynamics.collocation.mesh import roughness
+from rootsopt.dynamics.collocation.nearby import Known, trimmed
+from rootsopt.dynamics.collocation.sampled import as_flow
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.orbits import Orbits
+from rootsopt.scene import Scene
+from rootsopt.status import Status
+
+PERIOD, BEGIN, USED = 2, 0.3, 10
+TURN = 2 * np.pi / PERIOD
+
+
+def _known(room=(48, 51)):
+    """A sine over two mesh periods on equal elements, from τ = 0.3, with an end at τ = 2."""
+    elements, times = room
+    edges = np.concatenate([np.linspace(BEGIN, 2.0, 8), [2.1, 2.2, BEGIN + PERIOD]])
+    filled = np.arange(elements) < USED
+    anchors = np.full(times, BEGIN + PERIOD)
+    anchors[0] = BEGIN
+    share = np.append((edges - BEGIN) / PERIOD, np.ones(elements))
+    mesh = Mesh(
+        times=jnp.asarray(anchors),
+        which=jnp.full(times, -1),
+        interval=jnp.where(filled, 0, times - 2),
+        left=jnp.where(filled, share[:elements], 1.0),
+        right=jnp.where(filled, share[1 : elements + 1], 1.0),
+        used=jnp.asarray(USED),
+    )
+    begin, _ = mesh.ends
+    inside = begin[:, None] + mesh.lengths[:, None] * GAUSS.nodes
+    motion = Elements(
+        mesh,
+        jnp.sin(TURN * begin)[:, None],
+        (TURN * jnp.cos(TURN * inside))[..., None],
+        jnp.zeros((elements, POINTS + 1, 1, 2)),
+    )
+    one = jnp.ones(())
+    return Known(motion, one, one, one, jnp.ones((), bool))
+
+
+def test_orbit_sampled_as_steps_is_the_motion_over_one_period():
+    """Steps begin at φ1 = 0, although the mesh does not, and end after exactly one period."""
+    elements = _known().elements
+    nothing = jnp.zeros(())
+    found = Found(
+        elements=elements,
+        response=jnp.arange(3.0),
+        sensitivity=jnp.zeros((3, 2)),
+        state=jnp.zeros(1),
+        moved=jnp.zeros((1, 2)),
+        monodromy=jnp.zeros((1, 1)),
+        depth=nothing,
+        peak=Peak(jnp.asarray(8), jnp.asarray(0.5), jnp.zeros((1, 2)), nothing),
+        correction=nothing,
+    )
+    flow = as_flow(found, samples=16, steps=64)
+    assert bool(flow.solved)
+    ends = np.asarray(flow.grid)[: 4 * USED]
+    assert np.all(np.diff(ends) > 0)
+    np.testing.assert_allclose(ends[-1], PERIOD, rtol=1e-15)
+    assert np.all(np.isinf(flow.grid[40:]))
+    np.testing.assert_allclose(flow.corners[:40, 0], np.sin(TURN * ends), atol=1e-5)
+    np.testing.assert_allclose(flow.states[:, 0], np.sin(TURN * np.arange(16) / 8), atol=1e-5)
+    np.testing.assert_allclose(float(flow.peak_time), 0.15)
+    assert not bool(as_flow(found, samples=16, steps=39).solved)
+
+
+def test_known_orbit_is_cut_to_the_size_of_its_period():
+    known = _known((sizes(8)[0], sizes(8)[1]))
+    cut = trimmed(known, PERIOD)
+    assert cut is not None
+    cut = jax.tree.map(jnp.asarray, cut)
+    assert (cut.elements.state.shape[0], cut.elements.mesh.times.shape[0]) == sizes(PERIOD)
+    for tau in (0.0, 0.7, 2.25):
+        np.testing.assert_array_equal(
+            cut.elements.motion(jnp.asarray(tau)), known.elements.motion(jnp.asarray(tau))
+        )
+    assert int(jnp.max(cut.elements.mesh.interval)) == sizes(PERIOD)[1] - 2
+    np.testing.assert_array_equal(
+        cut.elements.mesh.lengths[:USED], known.elements.mesh.lengths[:USED]
+    )
+    np.testing.assert_allclose(roughness(cut.elements), roughness(known.elements), rtol=0)
+    many = known._replace(elements=known.elements._replace(
+        mesh=known.elements.mesh._replace(used=jnp.asarray(sizes(1)[0]))))  # fmt: skip
+    assert trimmed(many, 1) is None
+
+
+def test_memory_finds_an_orbit_by_its_state_and_forgets_the_oldest(monkeypatch):
+    monkeypatch.setattr("rootsopt.response.orbits._MOST", 2)
+    memory, known = Orbits(), _known(sizes(8))
+    config = rootsopt.load_config("configs/cic.yaml")
+    design = jnp.asarray(config.design, float)
+    pair = eqx.filter_eval_shape(Scene.pair, Scene.from_config(config), design)
+    memory.store(np.array([0.25]), known, PERIOD, pair)
+    memory.store(np.array([0.5]), known._replace(sound=jnp.zeros((), bool)), PERIOD, pair)
+    assert len(memory) == 1
+    assert memory.near(np.array([0.25])) is not None
+    assert memory.near(np.array([0.26])) is None
+    assert memory.near(None) is None
+    memory.store(np.array([0.5]), known, PERIOD, pair)
+    memory.near(np.array([0.25]))
+    memory.store(np.array([0.75]), known, PERIOD, pair)
+    assert memory.near(np.array([0.5])) is None
+    assert memory.near(np.array([0.25])) is not None
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["cic", "ee"])
+def test_orbit_from_a_neighbour_is_that_from_rest(name):
+    """Close by, both ways agree; farther away, where events come and go, the usual way is taken."""
+    config = rootsopt.load_config(f"configs/{name}.yaml", ["solver.orbit=collocation"])
+    evaluator = Evaluator.of(config).with_maxima()
+    fresh = dataclasses.replace(evaluator, orbits=Orbits())
+    base = evaluator(series=False)
+    assert "from_neighbour" not in base.statistics
+    moved = evaluator.at_speed(config.scene.speed_rpm * 1.003)
+    near = moved(start=base.state, series=False)
+    usual = fresh.at_speed(config.scene.speed_rpm * 1.003)(start=base.state, series=False)
+    assert near.statistics["from_neighbour"] == 1
+    assert "from_neighbour" not in usual.statistics
+    assert near.status is usual.status is Status.PERIODIC
+    for force, value in usual.response.items():
+        np.testing.assert_allclose(near.response[force], value, rtol=2e-6)
+        slopes = np.array([list(one.gradient[force].values()) for one in (near, usual)])
+        most = np.max(np.abs(slopes))
+        np.testing.assert_allclose(slopes[0], slopes[1], rtol=0, atol=1e-3 * most)
+    assert near.maxima is not None
+    assert usual.maxima is not None
+    np.testing.assert_allclose(near.maxima.forces[:2], usual.maxima.forces[:2], rtol=1e-5)
+    far = evaluator.at_speed(config.scene.speed_rpm * 0.5)(start=base.state, series=False)
+    assert "from_neighbour" not in far.statistics
