@@ -28,7 +28,9 @@ _OF = {
     "dynamics/collocation/gauss": "mesh system",
     "dynamics/collocation/mesh": "mesh motion",
     "dynamics/collocation/motion": "motion",
+    "dynamics/collocation/nearby": "nearby",
     "dynamics/collocation/newton": "system motion",
+    "dynamics/collocation/sampled": "nearby",
     "dynamics/collocation/seed": "motion",
     "dynamics/collocation/system": "system motion",
     "dynamics/flow": "flow dynamics steady measures gradients scene extremes",
@@ -89,9 +91,19 @@ _OF = {
     "profiles/outline": "outline",
     "profiles/trochoid": "families conjugacy",
     "profiles/validity": "families",
+    "pump/bearings": "bearings",
+    "pump/flow": "pump_flow",
+    "pump/gap": "leakage",
+    "pump/gas": "leakage",
+    "pump/laminar": "leakage",
+    "pump/leakage": "leakage",
+    "pump/play": "play",
+    "pump/section": "play leakage",
+    "pump/sheet": "pump_flow play leakage",
     "response/batch": "threads accuracy",
     "response/ensemble": "members ensemble",
     "response/members": "members ensemble",
+    "response/orbits": "nearby",
     "response/scatter": "tolerances",
     "response/sensitivity": "robust",
     "response/speeds": "speeds",
@@ -118,11 +130,21 @@ ROOMS = {
 }
 
 
-_FOLDERS = ("contact", "continuation", "design", "dynamics", "optimize", "profiles", "tradeoffs")
+_FOLDERS = (
+    "contact",
+    "continuation",
+    "design",
+    "dynamics",
+    "optimize",
+    "profiles",
+    "pump",
+    "tradeoffs",
+)
 _RESPONSE = (
     "batch",
     "ensemble",
     "members",
+    "orbits",
     "scatter",
     "sensitivity",
     "speeds",
