@@ -13,6 +13,9 @@ from rootsopt.figures.style import BLUE, COLORS, GREY
 _WIDEST = 40
 """Number of characters above which the name of a limit is shortened."""
 
+_RANGE = 0.01
+"""Minimum range of the axis of objectives."""
+
 
 def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: float) -> Axes:
     """Draw the first-order residual over the iterations of each local search.
@@ -78,6 +81,10 @@ def plot_starts(
     ax.margins(y=0.15)
     ax.set_xlim(-0.5, max((one["start"] for one in starts), default=0) + 0.5)
     ax.set(xlabel="local search", ylabel="objective at its end (baseline = 1)")
+    # Searches that agree must look alike, whatever their rounding.
+    low, high = ax.get_ylim()
+    spare = max(0.0, _RANGE - (high - low)) / 2
+    ax.set_ylim(low - spare, high + spare)
     ax.ticklabel_format(axis="y", useOffset=False)
     ax.grid(visible=True, alpha=0.3)
     if optima:
