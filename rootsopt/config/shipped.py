@@ -2,6 +2,7 @@
 
 import difflib
 import functools
+import os
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parents[1]
@@ -23,7 +24,7 @@ def located(path: Path) -> Path:
     """Return the path of the config that a user calls `path`.
 
     A file has precedence. Otherwise "cic" and "cic.yaml" name the shipped config."""
-    if len(path.parts) != 1 or path.suffix not in ("", _SUFFIX) or path.is_file():
+    if len(path.parts) != 1 or path.suffix not in ("", _SUFFIX) or os.path.isfile(path):
         return path
     return shipped().get(path.stem, path)
 

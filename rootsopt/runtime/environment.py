@@ -7,6 +7,7 @@ before anything is computed. This matters because XLA ends the whole process if 
 flag."""
 
 import contextlib
+import logging
 import os
 import re
 import subprocess
@@ -124,6 +125,8 @@ def own_process() -> None:
         os.environ.pop("COLUMNS", None)
     if "matplotlib" not in sys.modules:
         os.environ["MPLBACKEND"] = "agg"
+    # Without a folder for its settings, matplotlib uses a temporary one and says so in two lines.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     if "equinox" not in sys.modules:
         chosen = os.environ.get("EQX_ON_ERROR", "off")
         os.environ["EQX_ON_ERROR"] = "off"

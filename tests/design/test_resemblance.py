@@ -7,6 +7,7 @@ from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
 from rootsopt.commands import profile as command
+from rootsopt.commands.work import profile as work
 from rootsopt.design import resemblance
 from rootsopt.design.resemblance import free_likeness, likeness
 from rootsopt.profiles import CIC, EE, arc, ellipse, five_arcs, outline, project
@@ -128,7 +129,7 @@ def test_profile_command_names_the_family(tmp_path, monkeypatch, capsys):
     import json
 
     monkeypatch.setattr(resemblance, "classical", lambda: ("arc",))
-    monkeypatch.setattr(resemblance, "free_likeness", lambda profile, *near: None)
+    monkeypatch.setattr(work, "free_likeness", lambda profile, *near: None)
     where = ["-o", str(tmp_path / "out"), "--no-figures", "--export", "none"]
     assert command.main(["configs/cic.yaml", *where, "--resembles"]) == 0
     (row,) = json.loads((tmp_path / "out" / "result.json").read_text())["resembles"]

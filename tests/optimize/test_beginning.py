@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from rootsopt.commands import optimize
+from rootsopt.commands.work import optimize as work
 from rootsopt.config import load, parse
 from rootsopt.design.bounds import bounds_of, widened
 from rootsopt.design.resemblance import Likeness
@@ -109,13 +110,13 @@ def test_a_search_is_not_resumed_with_other_points(tmp_path):
     """The checkpoint knows the content of the file, and not only its name."""
     config = load(measured(tmp_path, 0.0))
     folder, options = SimpleNamespace(checkpoint=tmp_path / "c"), SimpleNamespace(resume=False)
-    optimize._checkpoint(config, options, folder).close(remove=False)
+    work._checkpoint(config, options, folder).close(remove=False)
     options.resume = True
-    optimize._checkpoint(config, options, folder).close(remove=False)
+    work._checkpoint(config, options, folder).close(remove=False)
     rotor = tmp_path / "rotor.csv"
     rotor.write_text(rotor.read_text().replace("0", "1", 1))
     with pytest.raises(InputError, match=r"outline \(then .*, now "):
-        optimize._checkpoint(config, options, folder)
+        work._checkpoint(config, options, folder)
 
 
 @pytest.mark.long
