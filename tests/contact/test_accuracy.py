@@ -68,7 +68,7 @@ gap_of = eqx.filter_jit(lambda pair, roll, relative: pair(roll, relative).gap)
 
 
 @pytest.mark.parametrize(
-    "name", ["paper", pytest.param("short", marks=pytest.mark.long), "epicycloid"]
+    "name", ["paper", *(pytest.param(n, marks=pytest.mark.long) for n in ("short", "epicycloid"))]
 )
 @pytest.mark.parametrize("error_mm", [0.0, pytest.param(0.3, marks=pytest.mark.long)])
 def test_gap_is_that_of_nodes_far_out(graded_outline, name, error_mm):
@@ -107,6 +107,7 @@ def both_searches(pair, roll, relative):
     return jax.vmap(one)(roll, relative)
 
 
+@pytest.mark.long
 @given(
     lobes=st.integers(2, 4),
     above=st.floats(0.1, 20.0),
@@ -252,6 +253,7 @@ def default():
     return evaluator, evaluator(series=False)
 
 
+@pytest.mark.long
 def test_single_precision(default):
     """float32 reaches forces to 1e-4 and the gradient of the mean to 1 %, in float32.
 

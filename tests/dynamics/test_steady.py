@@ -304,6 +304,7 @@ def test_both_modes_differentiate_the_same_motion(sharp, orbits, monkeypatch):
         )
 
 
+@pytest.mark.long
 def test_recorded_steps_give_the_same_motion(sharp, orbits):
     """Repeating the recorded steps changes nothing, and on them central differences of the
     flow are its slope down to small steps, which adaptive steps would drown in noise."""

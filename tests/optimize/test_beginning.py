@@ -1,8 +1,8 @@
 """A rotor from a file as baseline: where the search begins, what it finds, what is said of it."""
 
+import argparse
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from rootsopt.errors import InputError
 from rootsopt.optimize import beginning as module
 from rootsopt.optimize.beginning import beginning
 from rootsopt.optimize.search import Search
+from rootsopt.output.runs import RunFolder
 from rootsopt.scene import outline_mm
 
 CIC = "configs/cic.yaml"
@@ -109,7 +110,8 @@ def test_default_bounds_are_widened_and_given_ones_are_kept():
 def test_a_search_is_not_resumed_with_other_points(tmp_path):
     """The checkpoint knows the content of the file, and not only its name."""
     config = load(measured(tmp_path, 0.0))
-    folder, options = SimpleNamespace(checkpoint=tmp_path / "c"), SimpleNamespace(resume=False)
+    folder = RunFolder(tmp_path / "run", "optimize", overwrite=False)
+    options = argparse.Namespace(resume=False)
     work._checkpoint(config, options, folder).close(remove=False)
     options.resume = True
     work._checkpoint(config, options, folder).close(remove=False)

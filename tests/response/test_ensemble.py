@@ -370,6 +370,7 @@ def test_optimize_a_chaotic_scene(tmp_path, capsys):
         assert result["optimized"] is None
 
 
+@pytest.mark.long
 def test_reached_refuses_chaos_and_names_the_option(tmp_path):
     """A single chaotic motion is refused, with the way out."""
     options = itertools.chain.from_iterable(
