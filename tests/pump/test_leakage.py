@@ -1,5 +1,6 @@
 """Leakage against closed forms, SciPy's quadrature and polygons of the rotors."""
 
+import dataclasses
 import functools
 
 import equinox as eqx
@@ -153,6 +154,14 @@ def test_liquid_leaks_like_slots():
     assert float(1 - found.efficiency) == pytest.approx(float(found.total) / (50 * volume))
     thicker = scene_of(*LIQUID, "pump.viscosity_mPa_s=100")
     assert float(leaks(thicker, design).total) == pytest.approx(float(found.total) / 2, rel=1e-12)
+
+
+def test_overlapping_flanks_let_nothing_through():
+    """A search may pass through such designs. A negative flow would draw it there."""
+    scene = dataclasses.replace(scene_of(*LIQUID), clearance=jnp.asarray(-1e-4))
+    found = leaks(scene, design_vector(load_config("configs/cic.yaml")))
+    assert float(jnp.max(found.gap.least)) < 0
+    assert float(found.mesh) == 0
 
 
 def test_gas_leaks_less_than_friction_or_inertia_alone():
