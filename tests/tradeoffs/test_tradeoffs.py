@@ -24,7 +24,7 @@ from rootsopt.response import terms
 from rootsopt.response.terms import needs_forces
 from rootsopt.scene import Scene
 from rootsopt.status import Status
-from rootsopt.tradeoffs import trace
+from rootsopt.tradeoffs import gaps, trace
 from rootsopt.tradeoffs.aims import aims_of, freed
 from rootsopt.tradeoffs.front import Standing, dominated
 from rootsopt.tradeoffs.scalar import RHO, Scalar, Scale
@@ -422,3 +422,14 @@ def test_peaks_are_branches_of_one_group():
     assert len(local.groups) == 2
     weights = scalar.weights(sample, certify(local, point))
     assert weights == pytest.approx([2 / 3, 1 / 3], abs=2 * RHO)
+
+
+def test_a_point_divides_neighbours_if_it_lies_between_them():
+    """Not at an end, and not farther from one of them than they are apart."""
+    one, other = np.array([0.0, 1.0]), np.array([1.0, 0.0])
+    edge = gaps.measured((0, 1), np.stack([one, other]), np.zeros((2, 3)))
+    assert edge.distance == pytest.approx(2**0.5)
+    assert gaps.divides(edge, np.array([0.5, 0.5]), one, other)
+    assert gaps.divides(edge, np.array([0.2, 0.7]), one, other)
+    for outside in (one, other, [0.001, 0.999], [1.5, -0.5], [2.0, 2.0]):
+        assert not gaps.divides(edge, np.array(outside), one, other)
