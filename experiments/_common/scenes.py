@@ -6,6 +6,17 @@ CIC = "configs/cic.yaml"
 """The shipped CIC pair, relative to the repository root."""
 FORCES = ("mean_force_N", "peak_force_N")
 """Names of the forces that most studies compare."""
+SHAKY = (
+    "scene.speed_rpm=1700",
+    "scene.load.torque_N_m=3",
+    "scene.timing_gear.backlash_mm=0.25",
+    "scene.timing_gear.damping_ratio=0.3",
+    "scene.timing_gear.stiffness_N_m_per_rad=9000",
+    "profile.pressure_angle_deg=30.7",
+    "profile.involute_length_mm=4",
+    "profile.tip_arc_angle_deg=1.5",
+)
+"""Overrides that give a stable orbit of two mesh periods which is sensitive to changes."""
 
 
 def shipped(name: str, *overrides: str) -> Config:

@@ -17,7 +17,7 @@ import numpy as np
 from experiments._common.engines import FD_STEPS
 from experiments._common.engines import Scene as PlainScene
 from experiments._common.engines.scipy_nodes import NODES_1E3, ScipyNodes
-from experiments._common.scenes import CIC
+from experiments._common.scenes import CIC, SHAKY
 from rootsopt.config import load
 from rootsopt.response.evaluation import Evaluator, _build, _near
 from rootsopt.response.orbits import Orbits
@@ -25,19 +25,9 @@ from rootsopt.response.orbits import Orbits
 Row = dict[str, Any]
 AWAY = 2e-3
 """Relative difference between the parameters of a design and those of its neighbour."""
-LIVELY = [
-    "scene.speed_rpm=1700",
-    "scene.load.torque_N_m=3",
-    "scene.timing_gear.backlash_mm=0.25",
-    "scene.timing_gear.damping_ratio=0.3",
-    "scene.timing_gear.stiffness_N_m_per_rad=9000",
-    "profile.pressure_angle_deg=30.7",
-    "profile.involute_length_mm=4",
-    "profile.tip_arc_angle_deg=1.5",
-]
 SCENES: dict[str, tuple[str, list[str]]] = {
     "cic": (CIC, []),
-    "lively": (CIC, LIVELY),
+    "lively": (CIC, [*SHAKY]),
     "free form": ("configs/free.yaml", []),
     "pump": ("configs/pump.yaml", []),
 }
@@ -51,9 +41,9 @@ def processor_time(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:
     found = call()
     times = []
     for _ in range(repeats):
-        begun = time.process_time()
+        began = time.process_time()
         found = call()
-        times.append(time.process_time() - begun)
+        times.append(time.process_time() - began)
     return float(np.median(times)), found
 
 

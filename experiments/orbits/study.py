@@ -115,9 +115,9 @@ def solved(config: Config, kind: str, method: str) -> tuple[np.ndarray, Any, flo
     family, lobes, fixed = KINDS[kind]
     solve = _solver(method, (family, lobes, *fixed))
     jax.block_until_ready(solve(scene, design))
-    begun = time.perf_counter()
+    began = time.perf_counter()
     slopes, found = jax.block_until_ready(solve(scene, design))
-    return np.asarray(slopes), jax.tree.map(np.asarray, found), time.perf_counter() - begun
+    return np.asarray(slopes), jax.tree.map(np.asarray, found), time.perf_counter() - began
 
 
 def row_of(kind: str, overrides: list[str]) -> Row:

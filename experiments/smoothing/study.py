@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments._common.engines import FD_STEPS
-from experiments._common.scenes import shipped
+from experiments._common.scenes import SHAKY, shipped
 from experiments._common.simulation import stacked
 from rootsopt.config import Config
 from rootsopt.config.units import MM
@@ -48,17 +48,6 @@ SAME = 0.02
 """Scaled distance at φ1 = 0 above which two orbits count as different motions."""
 FD_SHARE = 0.05
 """Size of the steps of central differences, as a fraction of `FD_STEPS`."""
-SHAKY = (
-    "scene.speed_rpm=1700",
-    "scene.load.torque_N_m=3",
-    "scene.timing_gear.backlash_mm=0.25",
-    "scene.timing_gear.damping_ratio=0.3",
-    "scene.timing_gear.stiffness_N_m_per_rad=9000",
-    "profile.pressure_angle_deg=30.7",
-    "profile.involute_length_mm=4",
-    "profile.tip_arc_angle_deg=1.5",
-)
-"""Overrides that give a stable orbit of two mesh periods which is sensitive to changes."""
 KNOWN: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
     "cic": (("cic", ()), ("cic", SHAKY), ("paper_cic", ())),
     "ee": (("ee", ()), ("paper_ee", ())),

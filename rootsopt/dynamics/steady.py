@@ -394,13 +394,13 @@ class _Attempts(eqx.Module):
         coarse = jnp.maximum(now.coarse / 10, solver.orbit.rtol)
         return _Collocation(found, settled.state, coarse, now.within / 10, now.tries + 1, ~again)
 
-    def near(self, known: Known, begun: RotorPair) -> Steady:
-        """Return the motion whose orbit is near the `known` one of the similar pair `begun`.
+    def near(self, known: Known, neighbour: RotorPair) -> Steady:
+        """Return the motion whose orbit is near the `known` one of the similar pair `neighbour`.
 
         The status is NOT_SETTLED if the orbit is not accepted."""
         solver = self.solver
         sizes_of = solver.samples, solver.max_orbit
-        start = known, begun
+        start = known, neighbour
         made = near_orbit(self.pair, self.tangents, start, solver.orbit, solver.measures, sizes_of)
         period = jnp.round(known.elements.mesh.period).astype(int)
         state, within = made.orbit.state, settled_within(solver.transient.rtol)

@@ -90,13 +90,13 @@ class Near(NamedTuple):
     steps: Int[Array, ""]
 
 
-def close_near(equation: Equation, tangents: Any, known: Known, begun: RotorPair) -> Near:
+def close_near(equation: Equation, tangents: Any, known: Known, neighbour: RotorPair) -> Near:
     """Close the orbit near the `known` one of a similar pair.
 
     `equation` of the new pair; `tangents`: directions of its parameters along which to
-    differentiate, stacked along a leading axis; `begun`: pair of the known orbit."""
+    differentiate, stacked along a leading axis; `neighbour`: pair of the known orbit."""
     frozen = lax.stop_gradient(equation.pair)
-    got = newton(equation, known.elements, jnp.asarray(_STEP), begun)
+    got = newton(equation, known.elements, jnp.asarray(_STEP), neighbour)
     found = response(equation, got.elements, got.force, tangents)
     seen = look(frozen, found.elements)
     growth = jnp.maximum(roughness(found.elements) / known.roughness, 1.0) ** 2

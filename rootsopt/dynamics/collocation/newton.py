@@ -77,25 +77,25 @@ def newton(
     equation: Equation,
     elements: Elements,
     tolerance: Float[Array, ""],
-    begun: RotorPair | None = None,
+    neighbour: RotorPair | None = None,
 ) -> Converged:
     """Solve for the orbit near `elements`, until the last step is at most `tolerance` (scaled).
 
-    `begun`: pair of which `elements` is an orbit, if it is a similar pair. The first step is then
-    along the tangent of the family of orbits that leads to the equation's pair (predictor).
-    Newton's first step would be evaluated at penetrations of the wrong size, since the flanks have
-    moved."""
+    `neighbour`: pair of which `elements` is an orbit, if it is a similar pair. The first step
+    is then along the tangent of the family of orbits that leads to the equation's pair
+    (predictor). Newton's first step would be evaluated at penetrations of the wrong size, since
+    the flanks have moved."""
 
     def go_on(now):
         return (now.turns < _TURNS) & (now.size > tolerance)  # Ends at NaN.
 
     def turn(now):
         at = now.elements
-        if begun is None:
+        if neighbour is None:
             points = evaluated(equation, at)
             found = lines(at, points)
         else:
-            points, found = _along(equation, at, begun, now.turns == 0)
+            points, found = _along(equation, at, neighbour, now.turns == 0)
         step = solved_step(at, found, own_column(at, found))
         moved, size = advanced(at, step, points.roots)
         return Converged(moved, size, now.turns + 1, points.force[:, : len(GAUSS.nodes)])
@@ -107,14 +107,14 @@ def newton(
 
 
 def _along(
-    equation: Equation, elements: Elements, begun: RotorPair, first: Bool[Array, ""]
+    equation: Equation, elements: Elements, neighbour: RotorPair, first: Bool[Array, ""]
 ) -> tuple[Point, Lines]:
     """Return the equation along `elements`, and linearised.
 
-    If this is the `first` step, the equation is that of the pair `begun`, and its change to the
+    If this is the `first` step, the equation is that of the pair `neighbour`, and its change to the
     equation's pair is added to what the step has to correct."""
     new, static = eqx.partition(equation.pair, eqx.is_inexact_array)
-    old = eqx.filter(begun, eqx.is_inexact_array)
+    old = eqx.filter(neighbour, eqx.is_inexact_array)
     change = jax.tree.map(lambda x, y: jnp.where(first, x - y, 0.0)[None], new, old)
     here = eqx.combine(jax.tree.map(lambda x, y: jnp.where(first, y, x), new, old), static)
     own = eqx.tree_at(lambda e: e.pair, equation, here)
