@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: optimize test test-all fuzz mutants lint clean
+.PHONY: optimize test test-all docs fuzz mutants lint clean
 
 optimize: $(VENV)/.run
 	$(BIN)/python -m rootsopt.optimize configs/cic.yaml -o results/cic
@@ -13,6 +13,10 @@ test: $(VENV)/.dev
 
 test-all: $(VENV)/.dev
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+# The site, in build/site; notebooks run if they or the code have changed. A warning is an error.
+docs: $(VENV)/.dev
+	$(BIN)/python -m sphinx -E -W --keep-going -b html -d build/trees docs build/site
 
 # Random configs, outline files and kills against the commands (about an hour).
 fuzz: $(VENV)/.dev
@@ -45,4 +49,4 @@ $(VENV)/.mutants: $(VENV)/.dev
 	touch $@
 
 clean:
-	rm -rf $(VENV) results
+	rm -rf $(VENV) results build

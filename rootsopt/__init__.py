@@ -1,7 +1,8 @@
 """Design of Roots rotors by the gradient of their dynamic contact force; see the README.
 
 Public names are imported on first use. Importing the package is therefore fast, loads no solver,
-and changes no global setting.
+and changes no global setting. The first use of a name makes XLA compile loops as
+`rootsopt.runtime.environment.use_compiled_loops` says, if JAX has not computed anything yet.
 """
 
 from importlib import import_module
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from rootsopt.profiles.base import Segment as Segment
     from rootsopt.response.evaluation import Evaluation as Evaluation
     from rootsopt.response.evaluation import evaluate as evaluate
-    from rootsopt.response.scenes import sweep_scenes as sweep_scenes
     from rootsopt.response.steady import Response as Response
     from rootsopt.response.steady import steady_response as steady_response
     from rootsopt.response.terms import Term as Term
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rootsopt.runtime.programs import COMPILER_OPTIONS as COMPILER_OPTIONS
     from rootsopt.scene import Scene as Scene
     from rootsopt.status import Status as Status
+    from rootsopt.sweeps.scenes import sweep_scenes as sweep_scenes
     from rootsopt.tradeoffs.front import Front as Front
     from rootsopt.tradeoffs.trace import pareto_front as pareto_front
 
@@ -61,15 +62,16 @@ _PUBLIC = {
     "register_family": "rootsopt.config.families:register_family",
     "register_term": "rootsopt.response.terms:register_term",
     "steady_response": "rootsopt.response.steady:steady_response",
-    "sweep_scenes": "rootsopt.response.scenes:sweep_scenes",
+    "sweep_scenes": "rootsopt.sweeps.scenes:sweep_scenes",
 }
-"""Public names, each with the module and attribute to which it refers."""
+"""Public names, each with the "module:attribute" from which it is imported."""
 __all__ = ["__version__", *_PUBLIC]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module 'rootsopt' has no attribute {name!r}")
+    import_module("rootsopt.runtime.environment").use_compiled_loops()
     module, _, attribute = _PUBLIC[name].partition(":")
     return getattr(import_module(module), attribute)
 

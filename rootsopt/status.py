@@ -80,6 +80,15 @@ class Status(enum.Enum):
         "No design satisfies all constraints. `infeasible` of result.json lists those that are in "
         "conflict, and the nearest limits that can be met. Relax one of them."
     )
+    INVALID = (
+        "This point of the sweep has no valid config: its values do not fit each other, or the "
+        "profile is not sound."
+    )
+    FAILED = "This point of the sweep ended with an error, or ended the processes that ran it."
+    NOT_SIMULATED = (
+        "The sweep was stopped before this point. Run it again with --resume for the missing "
+        "points."
+    )
 
     @property
     def code(self) -> int:

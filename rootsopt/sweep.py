@@ -1,4 +1,4 @@
-"""`python -m rootsopt.sweep CONFIG`: simulate one design at many speeds."""
+"""`python -m rootsopt.sweep CONFIG`: simulate one design at many speeds, or values of any keys."""
 
 from rootsopt.commands.door import leave
 from rootsopt.commands.sweep import main

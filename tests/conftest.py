@@ -21,7 +21,7 @@ gc.set_threshold(100_000, 50, 100)
 # One folder of compiled programs for all processes of a session, new for every session.
 os.environ.setdefault("ROOTSOPT_TEST_CACHE", tempfile.mkdtemp(prefix="rootsopt-"))
 os.environ["ROOTSOPT_CACHE"] = os.path.join(os.environ["ROOTSOPT_TEST_CACHE"], "programs")
-# The key that they are signed with belongs there too, and not to the user's own.
+# Their signing key is stored there too, apart from the user's own.
 os.environ["XDG_STATE_HOME"] = os.path.join(os.environ["ROOTSOPT_TEST_CACHE"], "state")
 
 from rootsopt.commands.cli import use_cache  # noqa: E402
@@ -54,15 +54,18 @@ _OPTIMISED = (
     "optimize",
     "response",
 )
-"""Files that compute longer than they compile."""
+"""Test files that compute longer than they compile."""
 _PRECISE = ("steady",)
-"""Files whose own functions are optimised too, as they tell the rounding of optimised code."""
+"""Test files whose own functions are optimised too, because they test the rounding of optimised
+code."""
 
 
 @pytest.fixture(autouse=True, scope="module")
 def compiled(request):
-    """Optimise programs, as a user has them, only where that pays: elsewhere the arithmetic is the
-    same except for rounding, and compiling takes half the time."""
+    """Optimise programs, as for a user, only in files where this saves time.
+
+    In the others, the arithmetic is the same except for rounding, and compiling takes half the
+    time."""
     name = request.path.stem.removeprefix("test_")
     options = programs.COMPILER_OPTIONS | {
         "xla_backend_optimization_level": 3 if name in _OPTIMISED else 0
@@ -79,23 +82,23 @@ _LONGEST_FIRST = ("steady", "experiments", "accuracy", "ensemble", "measures", "
 
 
 def pytest_collection_modifyitems(items):
-    """Files that take longest come first, so that no process is left alone with one at the end."""
+    """Sort the files that take longest to the front, so that processes end at about the same
+    time."""
     place = {f"test_{name}.py": number for number, name in enumerate(_LONGEST_FIRST)}
     items.sort(key=lambda item: place.get(item.path.name, len(place)))
 
 
 def pytest_sessionfinish(session):
-    """The first process, which the others inherit the folder from, removes it."""
+    """Remove the cache folder at the end of the first process, from which the others inherit it."""
     if not hasattr(session.config, "workerinput"):
         shutil.rmtree(os.environ["ROOTSOPT_TEST_CACHE"], ignore_errors=True)
 
 
 def _graded_normals(profile, points):
-    """Normal angles with every segment end among them, evenly in arc length + angle.
+    """Return normal angles that include every segment end, evenly spaced in arc length + angle.
 
-    Even arc length alone leaves wide angles between nodes where the radius of curvature
-    vanishes (pitch point of EE), and there polygon and cubic are both poor.
-    """
+    Equal arc lengths alone would leave wide angles between nodes where the radius of curvature
+    vanishes (pitch point of EE). Polygon and cubic are both inaccurate there."""
     pieces = []
     for segment in profile.segments():
         if not float(segment.stop) > float(segment.start):
@@ -116,7 +119,8 @@ def _graded_normals(profile, points):
 
 @pytest.fixture(scope="session")
 def graded_outline():
-    """Function (profile, points) → closed outline (m) with nodes crowded at high curvature."""
+    """Return a function (profile, points) → closed outline (m) with dense nodes at high
+    curvature."""
 
     def build(profile, points):
         nu = jnp.asarray(_graded_normals(profile, points))

@@ -1,7 +1,6 @@
-"""Runs that fail or die at a chosen file operation; `python -m tests.deaths` tries them all.
+"""Runs that fail or end at a chosen file operation; `python -m tests.deaths` tries them all.
 
-Used by the tests and by the fuzzing campaign `kills`. Needs no JAX, so that it may fork.
-"""
+The tests and the fuzzing campaign `kills` use this module. It needs no JAX, so that it can fork."""
 
 import argparse
 import errno
@@ -24,11 +23,12 @@ WRITING = ("open", "write", "fsync", "mkdir", "rename", "replace", "ftruncate", 
 """Operations that a full disk makes fail."""
 REMOVING = ("unlink", "rmdir")
 BEFORE = ("absent", "empty", "run", "overwritten")
-"""What is in the target: nothing, an empty folder, a run to be moved aside or replaced."""
+"""Content of the target: nothing, an empty folder, a run to be moved aside, or one to be
+replaced."""
 
 
 class _System:
-    """The `os` of a module, of which the operation number `at` is given to `fail`."""
+    """The `os` of a module, in which operation number `at` is passed to `fail`."""
 
     def __init__(self, operations: tuple[str, ...], at: int, fail: Callable[[str, Any], Any]):
         self.operations, self.at, self.fail, self.count = operations, at, fail, 0
@@ -48,7 +48,7 @@ class _System:
 
 
 class faulty:  # noqa: N801
-    """While it lasts, operation number `at` of the file layer goes to `fail(name, do it)`."""
+    """Pass operation number `at` of the file layer to `fail(name, operation)` in a `with` block."""
 
     def __init__(self, operations, at: int, fail, exchanges: bool = True):
         self.system = _System(operations, at, fail)
@@ -83,7 +83,7 @@ def _in_halves(path, ignore_errors=True) -> None:
 
 
 def full_disk(name: str, do: Callable[[], Any]) -> None:
-    """Fail as on a full disk, a write after having written nothing."""
+    """Fail as on a full disk; a write fails after writing nothing."""
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
@@ -93,13 +93,13 @@ def die_before(name: str, do: Callable[[], Any]) -> None:
 
 
 def die_after(name: str, do: Callable[[], Any]) -> None:
-    """The same once the operation is done."""
+    """Do the operation, then end the process without any clean-up."""
     do()
     os._exit(9)
 
 
 def write_run(target: Path, text: str, overwrite: bool = False) -> list[str]:
-    """A small run of which every file says `text`."""
+    """Write a small run in which every file contains `text`."""
     with RunFolder(target, "simulate", overwrite) as folder:
         folder.write_text("config.yaml", text)
         folder.write_csv("response_design.csv", {"a": [1.0], "text": [text]})
@@ -109,7 +109,7 @@ def write_run(target: Path, text: str, overwrite: bool = False) -> list[str]:
 
 
 def digest(folder: Path) -> str | None:
-    """Names and contents of all files in a folder; None if there is none."""
+    """Return a digest of the names and contents of all files in a folder; None without a folder."""
     if not folder.is_dir():
         return None
     found = hashlib.sha256()
@@ -121,7 +121,7 @@ def digest(folder: Path) -> str | None:
 
 
 def prepared(parent: Path, before: str) -> Path:
-    """A target in an empty folder `parent`, in the state asked for."""
+    """Return a target with the state `before` in an empty folder `parent`."""
     target = parent / "run"
     if before == "empty":
         target.mkdir()
@@ -131,15 +131,16 @@ def prepared(parent: Path, before: str) -> Path:
 
 
 def scratch() -> Path:
-    """A new folder, in memory where that is possible: thousands of files are synchronised."""
+    """Return a new folder, in memory if possible, because thousands of files are synchronised."""
     memory = "/dev/shm"
     usable = os.path.isdir(memory) and os.access(memory, os.W_OK)
     return Path(tempfile.mkdtemp(prefix="deaths-", dir=memory if usable else None))
 
 
 def failures(kind: str, before: str, exchanges: bool, at: int) -> tuple[bool, list[str]]:
-    """Let operation number `at` of a run fail (`full`) or the process end before or after it;
-    whether there was such an operation, and what is wrong afterwards."""
+    """Let operation number `at` of a run fail (`full`), or the process end before or after it.
+
+    Return whether there was such an operation, and what is wrong afterwards."""
     place = scratch()
     try:
         return _failures(place, kind, before, exchanges, at)
@@ -185,7 +186,7 @@ def _failures(place: Path, kind: str, before: str, exchanges: bool, at: int):
 
 
 def _tried(target: Path, kind: str, before: str, exchanges: bool, at: int):
-    """Whether the operation was met, and the message of the run that failed."""
+    """Return whether the operation was reached, and the message of the run that failed."""
     overwrite = before == "overwritten"
     if kind == "full":
         with faulty(WRITING, at, full_disk, exchanges) as system:
@@ -207,7 +208,7 @@ def _tried(target: Path, kind: str, before: str, exchanges: bool, at: int):
 
 
 def digest_of(text: str) -> str | None:
-    """The digest of a whole run."""
+    """Return the digest of a complete run."""
     place = scratch()
     try:
         write_run(place / "run", text)
@@ -217,7 +218,7 @@ def digest_of(text: str) -> str | None:
 
 
 def every_operation(kind: str) -> tuple[int, list[str]]:
-    """Try each operation of each kind of run; how many were tried, and what went wrong."""
+    """Try each operation of each kind of run; return the number of tries, and what went wrong."""
     tried, wrong = 0, []
     for before, exchanges in itertools.product(BEFORE, (True, False)):
         for at in itertools.count(1):
@@ -231,7 +232,7 @@ def every_operation(kind: str) -> tuple[int, list[str]]:
 
 
 def main() -> int:
-    """Try every operation; one line for each thing that is wrong."""
+    """Try every operation; print one line for each failure."""
     parser = argparse.ArgumentParser(prog="python -m tests.deaths", description=__doc__)
     parser.add_argument("kinds", nargs="*", default=["full", "before", "after"])
     bad = False

@@ -1,16 +1,15 @@
-"""Two rotors in the plane, written from Newton's laws with NumPy; nothing of the package.
+"""Two rotors in the plane, written from Newton's laws with NumPy and without the package.
 
-Every body has three coordinates; contact is a pair of points on two curves, forces are vectors
+Every body has three coordinates. Contact is a pair of points on two curves, and forces are vectors
 that act there. State: φ1, φ2 (rad, each in its own sense of rotation), the displacements x1, y1,
-x2, y2 of the axes (m), then the six rates; time in seconds. Laws as DESIGN.md words them.
-"""
+x2, y2 of the axes (m), then the six rates; time in seconds. The laws are those of DESIGN.md."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 NODES = 72
-"""Points at which a flank's distances are looked at first."""
+"""Number of points of a flank at which the distances are first computed."""
 STEPS = 1e-6 * np.eye(2)
 BESIDE = np.array(np.meshgrid([0, -1, 1], [0, -1, 1])).reshape(2, 9).T
 
@@ -24,11 +23,11 @@ def dot(a, b):
 
 
 class Flank:
-    """Half a lobe of a CIC or EE rotor, tip on the real axis, by a parameter p from 0 (tip) to
-    `end` (root) that runs through one smooth piece from each whole number to the next.
+    """Describe half a lobe of a CIC or EE rotor, with its tip on the real axis.
 
-    A point is exp(iβ) (r + s sin ψ + i s cos ψ), its outward normal exp(i (β + π/2 - ψ)).
-    """
+    The parameter p runs from 0 (tip) to `end` (root), through one smooth piece from each whole
+    number to the next. A point is exp(iβ) (r + s sin ψ + i s cos ψ), its outward normal exp(i (β +
+    π/2 - ψ))."""
 
     def __init__(self, profile):
         n, r = profile.lobes, profile.pitch_radius_mm * 1e-3
@@ -71,7 +70,7 @@ class Flank:
         self.nodes = places, *np.array([self(p, int(p)) for p in places]).T
 
     def __call__(self, p, number):
-        """Point and outward normal at p, on the piece of that number or its continuation."""
+        """Return the point and the outward normal at p, on piece `number` or its continuation."""
         count = len(self.pieces)
         if number < count:
             beta, psi, s = self.pieces[number](p - number)
@@ -86,7 +85,8 @@ class Flank:
 
 
 class Touch(NamedTuple):
-    """A closest approach: a point on each rotor, normal from rotor 1 to rotor 2, gap."""
+    """Hold a closest approach: a point on each rotor, the normal from rotor 1 to rotor 2, the
+    gap."""
 
     first: complex
     second: complex
@@ -122,7 +122,7 @@ class Planar:
             self.middle = 1e-3 * (scene.phase_error_mrad or 0.0)
 
     def ramp(self, x, width):
-        """max(0, x), rounded over `width`."""
+        """Return max(0, x), rounded over `width`."""
         if x <= 0:
             return 0.0
         return x if x >= width else 2 * x**2 / width - x**3 / width**2
@@ -151,13 +151,16 @@ class Planar:
         return np.sign(sliding) * step(abs(sliding), low, law.static, high, law.kinetic)
 
     def touches(self, angles, axes):
-        """Closest approach of the drive flanks and of the coast flanks, where there is one."""
+        """Return the closest approach of the drive flanks and of the coast flanks, where they
+        exist."""
         found = [self.touch(side, angles, axes) for side in (1, -1)]
         return [touch for touch in found if touch is not None]
 
     def touch(self, side, angles, axes):
-        """The flanks nearest to the pitch point: the leading ones of rotor 1 (`side` 1) with the
-        trailing ones of rotor 2, or the other way round."""
+        """Return the closest approach of the flanks nearest to the pitch point.
+
+        They are the leading flanks of rotor 1 (`side` 1) and the trailing ones of rotor 2, or the
+        other way round."""
         lobes = np.exp(2j * np.pi * np.arange(self.lobes) / self.lobes)
         crossing = np.exp(0.5j * np.pi / self.lobes) * self.radius
         # In the rotors' own frames a leading flank lies ahead of the lobe's axis.
@@ -184,7 +187,7 @@ class Planar:
         apart = apart[np.arange(len(z1)), nearest]
         signed = dot(n2[nearest], apart)
         signed[abs(cross(n2[nearest], apart)) > 0.05 * self.radius] = np.inf
-        # Every dip of the distance along rotor 1 may hold the least; far ones do not touch.
+        # Each local minimum along rotor 1 may be the least distance; far ones do not touch.
         reach = self.clearance + 5e-4 * self.radius
         around = np.pad(signed, 1, constant_values=np.inf)
         dips = (signed <= around[:-2]) & (signed <= around[2:]) & (signed < reach)
@@ -222,7 +225,7 @@ class Planar:
         return min(found, key=lambda touch: touch.gap, default=None)
 
     def forces(self, state):
-        """Torques on the rotors and forces on their axes, contact force, and the greatest depth."""
+        """Return torques on the rotors, forces on their axes, contact force and greatest depth."""
         (phi1, phi2), shifts = state[:2], state[2:6]
         (speed1, speed2), drifts = state[6:8], state[8:12]
         axes = np.array([0, self.distance]) + shifts[::2] + 1j * shifts[1::2]
@@ -243,7 +246,7 @@ class Planar:
         return torques, pushes, total, deepest
 
     def __call__(self, time, state):
-        """d(state)/dt."""
+        """Return d(state)/dt."""
         torques, pushes, _, _ = self.forces(state)
         torques = torques - np.array(self.load(state[0]))
         relative, rate = state[1] - state[0], state[7] - state[6]

@@ -1,7 +1,6 @@
-"""Stand-ins for a pair, its flow and an evaluation, whose numbers are given by hand.
+"""Stand-ins for a pair, its flow and an evaluation, with numbers made up for a test.
 
-A pair whose flanks are never in reach is a damped oscillator.
-"""
+A pair whose flanks never touch is a damped oscillator."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,14 +19,14 @@ HALF_BACKLASH, SCALE = 1e-3, 5e-3
 
 
 class Far(Contact):
-    """Flanks a metre apart in every position."""
+    """Stand in for a contact whose flanks are a metre apart in every position."""
 
     def __call__(self, roll, relative):
         return jnp.ones_like(roll), jnp.zeros_like(roll), jnp.zeros_like(roll)
 
 
 def oscillator(**changes) -> RotorPair:
-    """A pair held by its gear alone."""
+    """Return a pair whose rotors are coupled by the gear alone."""
     gear = TimingGear(*(jnp.asarray(x) for x in (STIFFNESS, DAMPING, HALF_BACKLASH, 1e-6)))
     parts = {
         "lobes": LOBES,
@@ -45,8 +44,10 @@ def oscillator(**changes) -> RotorPair:
 
 
 def told_flow(pair, state, means, growth=None):
-    """A mesh period whose force has the mean `means[k]`, k being the first state; the next state
-    counts one up. `growth`: what the derivative by the state is, times the unit matrix."""
+    """Return a mesh period whose force has the mean `means[k]`.
+
+    k is the first state, which grows by one in each period. `growth`: the derivative with respect
+    to the state, as a multiple of the unit matrix."""
     at = jnp.round(state[0]).astype(int)
     mean = jnp.asarray(means)[at]
     blank = Flow.empty(state.shape[0], 0, 2, 1, Measures(), state.dtype)
@@ -67,14 +68,14 @@ def told_flow(pair, state, means, growth=None):
 
 
 class Near(Contact):
-    """Flanks that overlap by the radius of 0.03 m times the turn towards them."""
+    """Stand in for a contact that overlaps by 0.03 m times the relative rotation."""
 
     def __call__(self, roll, relative):
         return 0.03 * relative, 0.03 * jnp.ones_like(roll), 0.03 * jnp.ones_like(roll)
 
 
 def evaluation_of(force=1.0, status=Status.PERIODIC, design=(), state=None) -> Evaluation:
-    """An evaluation whose forces are all `force`."""
+    """Return an evaluation whose forces are all `force`."""
     return Evaluation(
         design={f"x{k}": float(x) for k, x in enumerate(design)},
         geometry={"area_efficiency": 0.5},

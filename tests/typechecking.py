@@ -1,4 +1,4 @@
-"""Run-time type checking of the package while the tests run; an int passes for a float."""
+"""Run-time type checks of the package while the tests run; an int passes for a float."""
 
 from beartype import BeartypeConf, beartype
 

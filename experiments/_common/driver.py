@@ -142,7 +142,7 @@ def verdict(kept: bool) -> int:
 
 
 def _parser(name: str, purpose: str | None, quick: str, publishes: bool) -> argparse.ArgumentParser:
-    """Make a parser with the common options of all studies."""
+    """Return a parser with the common options of all studies."""
     parser = argparse.ArgumentParser(
         prog=f"python -m experiments.{name}",
         description=purpose,

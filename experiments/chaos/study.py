@@ -73,7 +73,7 @@ class Size:
 
 
 def _slopes(designs: int, members: int, count: int) -> tuple[tuple[int, int], ...]:
-    """List sizes (designs, members) of gradients, starting from the given size.
+    """Return sizes (designs, members) of gradients, starting from the given size.
 
     First come `count` sizes with doubling members, then `count` - 1 with doubling designs."""
     more = [(designs, members * 2**k) for k in range(count)]

@@ -1,7 +1,7 @@
 """Which profile family has the least contact force in the same housing?
 
 Writes families.csv (a row per design), families.json, families.md (the tables), families.png (the
-ranking) and families_profiles.png.
+ranking) and families_profiles.png; with --overview only overview.png, an example of every family.
 """
 
 import argparse
@@ -11,7 +11,11 @@ from pathlib import Path
 
 from experiments._common.driver import OK, Run, drive
 
-FIGURES = {"families.png": "ranking.png", "families_profiles.png": "ranking_profiles.png"}
+FIGURES = {
+    "families.png": "ranking.png",
+    "families_profiles.png": "ranking_profiles.png",
+    "overview.png": "families.png",
+}
 LONG = ("design", "outline_mm", "config")
 """Entries of a row that the table omits."""
 
@@ -21,6 +25,9 @@ def body(run: Run) -> int:
     from experiments.families import figures, study, tables
 
     options = run.options
+    if options.overview:
+        run.figure("overview.png", figures.overview())
+        return OK
     if options.show:
         data = json.loads(options.show.read_text())
     else:
@@ -38,7 +45,7 @@ def body(run: Run) -> int:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add options for reference configs, families, number of processes, and an earlier run."""
+    """Add options: reference configs, families, number of processes, overview, earlier run."""
     parser.add_argument(
         "configs",
         nargs="*",
@@ -47,6 +54,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--families", help="comma-separated (default: all but the free form)")
     parser.add_argument("--jobs", type=int, default=2, help="families in parallel (default: 2)")
+    parser.add_argument(
+        "--overview", action="store_true", help="only draw an example of every family"
+    )
     parser.add_argument("--show", type=Path, help="families.json of an earlier run to show")
 
 

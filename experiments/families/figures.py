@@ -2,15 +2,38 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from experiments._common.style import BLUE, GREY, VERMILION, grid_below, sheet
+from experiments._common.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    grid_below,
+    sheet,
+)
 from experiments.families.tables import Row, by_study, is_missing, title
+from rootsopt.config.families import families
+from rootsopt.config.units import MM, si_unit
 from rootsopt.figures.profiles import plot_flank
+from rootsopt.profiles import Profile, geometry
+from rootsopt.profiles.geometry import outline
 
 _COLUMNS = 4
+LOBES, RADIUS_MM = 3, 33.0
+"""Number of lobes and pitch radius of the families' examples."""
+_PANELS = 4
+"""Panels in a row of the overview."""
+_COLORS = BLUE, ORANGE, PURPLE, GREEN, SKY, VERMILION, "#7a5c00", "#888888"
+_POINTS = 60
+"""Points drawn on a piece of an addendum."""
 
 
 def ranking_figure(data: dict[str, Any]) -> Figure:
@@ -80,3 +103,55 @@ def profiles_figure(data: dict[str, Any]) -> Figure:
     handles.append(Line2D([], [], color=GREY, ls="--", lw=0.9, label="pitch circle"))
     made.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return made
+
+
+def overview() -> Figure:
+    """Draw one rotor per family, its example, with the pieces of the addendum in colours."""
+    shown = {name: family for name, family in families().items() if family.classical}
+    made, axes = sheet(12.2, 9.4, -(-(len(shown) + 1) // _PANELS), _PANELS)
+    panels = axes.ravel()
+    colors: dict[str, str] = {}
+    for place, (ax, (name, family)) in enumerate(zip(panels, shown.items(), strict=False)):
+        units = {key: si_unit(key) for key in family.keys}
+        values = [family.example[key] * unit for key, unit in units.items()]
+        names = [parameter.argument for parameter in family.parameters]
+        profile = family.make(LOBES, RADIUS_MM * MM, **dict(zip(names, values, strict=True)))
+        _rotor(ax, profile, colors)
+        shape = geometry(profile)
+        radius, share = float(shape.outer_radius) / MM, float(shape.area_efficiency)
+        ax.set_title(f"{name}\nr_a {radius:.2f} mm, area efficiency {share:.3f}", fontsize=9)
+        ax.set(xlabel="x (mm)" if place + _PANELS >= len(shown) else "")
+        ax.set(ylabel="" if place % _PANELS else "y (mm)")
+    for ax in panels[len(shown) :]:
+        ax.axis("off")
+    handles = [Line2D([], [], color=color, lw=2.5, label=kind) for kind, color in colors.items()]
+    handles.append(Line2D([], [], color=BLACK, lw=0.8, label="conjugate dedendum"))
+    handles.append(Line2D([], [], color=GREY, ls="--", lw=0.9, label="pitch circle, 33 mm"))
+    panels[-1].legend(handles=handles, loc="center", frameon=False)
+    return made
+
+
+def _rotor(ax, profile: Profile, colors: dict[str, str]) -> None:
+    """Draw a rotor with a lobe tip upwards; `colors` gets an entry for each new kind of piece."""
+    upwards = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    points = np.asarray(outline(profile)) / MM @ upwards
+    ax.fill(*points.T, facecolor="0.9", edgecolor=BLACK, linewidth=0.8)
+    for piece in profile.segments():
+        if not piece.stop > piece.start:
+            continue
+        color = BLACK if piece.land else _COLORS[len(colors) % len(_COLORS)]
+        color = colors.setdefault("land about the axis" if piece.land else piece.name, color)
+        nu = jnp.linspace(piece.start, piece.stop, _POINTS)
+        arc = np.asarray(profile.position(profile.addendum(nu))) / MM
+        dot = np.ptp(arc, axis=0).max() < 1.0
+        for turn in 2 * np.pi * np.arange(LOBES) / LOBES:
+            spin = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+            for side in (1, -1):
+                line = (arc * [1, side]) @ spin @ upwards
+                ax.plot(
+                    *line.T, color=color, linewidth=2.5, marker="o" if dot else "", markersize=4
+                )
+    angle = np.linspace(0, 2 * np.pi, 181)
+    ax.plot(RADIUS_MM * np.cos(angle), RADIUS_MM * np.sin(angle), "--", color=GREY, linewidth=0.9)
+    ax.plot(0, 0, "+", color=BLACK)
+    ax.set_aspect("equal")

@@ -156,7 +156,7 @@ def errors(found: Evaluation, truth: np.ndarray) -> list[float]:
 def rows_of(
     config: Config, kind: str, overrides: list[str], found: dict[float, Evaluation]
 ) -> list[dict[str, Any]]:
-    """List the evaluations and their errors, one row per tolerance."""
+    """Return the evaluations and their errors, one row per tolerance."""
     truth = None
     rows = []
     for rtol, one in found.items():

@@ -1,12 +1,11 @@
-"""Compares the optimum with an exhaustive grid of designs, in scenes of different character.
+"""Compares the optimum with an exhaustive grid of designs, in different scenes.
 
 The study lays a regular grid over pressure angle, involute share and tip arc angle within the
-config's bounds, fine enough for the requested number of feasible designs, and simulates each at the
-tolerance of a screening, without gradients. Around the best of them that lie apart, finer and finer
-grids follow. Points outside the constraints are moved onto their boundary. Nothing of this uses the
-gradient of the objective. The best design of all grids is simulated at the full tolerance, and
-compared with the result of `rootsopt optimize`.
-"""
+config's bounds. The grid is fine enough for the requested number of feasible designs. Each design
+is simulated at the tolerance of a screening, without gradients. Finer and finer grids follow around
+the best designs that lie apart. Points outside the constraints are moved onto their boundary. No
+step uses the gradient of the objective. The best design of all grids is simulated at the full
+tolerance, and compared with the result of `rootsopt optimize`."""
 
 import dataclasses
 import itertools
@@ -43,9 +42,9 @@ APART, CENTERS = 0.15, 3
 LEVELS, QUICK_LEVELS = 5, 1
 """Number of finer grids around each of them. Each has half the spacing of the one before."""
 AGREES = 1e-3
-"""Relative difference of the objective up to which optimum and grid agree."""
+"""Relative difference of the objectives below which optimum and grid agree."""
 SAME = 1e-5
-"""Relative range of the objective up to which runs with different seeds agree."""
+"""Relative range of the objectives below which runs with different seeds agree."""
 
 
 class Case(NamedTuple):

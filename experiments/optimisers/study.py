@@ -11,7 +11,10 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 from numpy.typing import NDArray
 from scipy.optimize import BFGS, NonlinearConstraint, minimize
 
@@ -23,15 +26,21 @@ from rootsopt.optimize.sqp import SCALE, EndError, Epigraph, Stops, descend
 from rootsopt.response.evaluators import evaluator_for
 
 REACHED = 1e-6
-"""Distance of the objective from the optimum at which a method has reached it."""
+"""Distance of the objective from the optimum below which a method has reached the optimum."""
 EVALUATIONS, QUICK = 150, 15
-"""Designs that each method may simulate, in a full and in a reduced run."""
+"""Number of designs that each method may simulate: in a full run, and in a reduced run."""
 _PEAK = "objective.mean_weight=0"
 Method = Callable[[Look, NDArray[np.float64], Stops], None]
 _OUTER, _INNER = 30, 25
-"""Rounds of the augmented Lagrangian, and iterations of L-BFGS in each."""
+"""Number of rounds of the augmented Lagrangian, and of iterations of L-BFGS in each round."""
 _PENALTY, _GROWTH, _MOST = 10.0, 4.0, 1e6
-"""First weight of the penalty, its growth where the violation does not fall by half, its limit."""
+"""Weight of the penalty: first value, factor where the violation does not fall by half, and
+maximum."""
+_ARMIJO, _SHORTEST, _FLAT = 1e-4, 1e-6, 1e-11
+"""Share of the predicted decrease that a step must reach, share of a step that is tried last, and
+decrease below which L-BFGS ends."""
+_INSIDE = 0.98
+"""Greatest sine at the start of L-BFGS: at 1, on a bound, its gradient would be zero."""
 
 
 class Task(NamedTuple):
@@ -80,26 +89,37 @@ def _bounds(problem: Epigraph, count: int) -> list[tuple[float | None, float | N
 
 
 def augmented_lagrangian(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
-    """Run an augmented Lagrangian with SciPy's L-BFGS-B (Nocedal and Wright, algorithm 17.4)."""
+    """Run an augmented Lagrangian with optax's L-BFGS (Nocedal and Wright, algorithm 17.4).
+
+    L-BFGS knows no bounds: each bounded variable is a sine of a free one. The step length is found
+    by halving (Armijo)."""
     problem = _problem(look, start, stops)
     if problem is None:
         return
+    size = problem.size
     z = problem.start()
+    z[:size] = np.arcsin(np.clip(2 * SCALE * z[:size] - 1, -_INSIDE, _INSIDE))
     weights = np.zeros(len(problem.constraints(z)[0]))
     penalty, before = _PENALTY, np.inf
 
-    def merit(z):
+    def bounded(w):
+        z, slope = np.array(w), np.ones(len(w))
+        z[:size] = (1 + np.sin(w[:size])) / (2 * SCALE)
+        slope[:size] = np.cos(w[:size]) / (2 * SCALE)
+        return z, slope
+
+    def merit(w) -> tuple[float, NDArray[np.float64]]:
+        z, by_free = bounded(w)
         value, slope = problem.value(z)
         slack, normals = problem.constraints(z)
         short = np.maximum(weights / penalty - slack, 0.0)
-        return value + penalty / 2 * short @ short, slope - penalty * short @ normals
+        slope = slope - penalty * short @ normals
+        return float(value + penalty / 2 * short @ short), slope * by_free
 
     try:
         for _ in range(_OUTER):
-            options = {"maxiter": _INNER}
-            bounds = _bounds(problem, len(z))
-            z = minimize(merit, z, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
-            slack = problem.constraints(z)[0]
+            z = _lbfgs(merit, z)
+            slack = problem.constraints(bounded(z)[0])[0]
             violation = np.max(np.maximum(-slack, 0.0))
             weights = np.maximum(weights - penalty * slack, 0.0)
             if violation > before / 2:
@@ -107,6 +127,35 @@ def augmented_lagrangian(look: Look, start: NDArray[np.float64], stops: Stops) -
             before = violation
     except EndError:
         return
+
+
+def _lbfgs(
+    merit: Callable[[NDArray[np.float64]], tuple[float, NDArray[np.float64]]],
+    z: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the variables after some iterations of optax's L-BFGS from `z`."""
+    rule = optax.scale_by_lbfgs()
+    state = rule.init(jnp.asarray(z))
+    update = jax.jit(rule.update)
+    value, slope = merit(z)
+    for _ in range(_INNER):
+        direction, state = update(jnp.asarray(slope), state, jnp.asarray(z))
+        step = -np.asarray(direction)
+        if step @ slope >= 0:
+            step = -slope
+        share = 1.0
+        while share > _SHORTEST:
+            found, gradient = merit(z + share * step)
+            if found <= value + _ARMIJO * share * (step @ slope):
+                break
+            share /= 2
+        else:
+            return z
+        gained = value - found
+        z, value, slope = z + share * step, found, gradient
+        if gained < _FLAT:
+            break
+    return z
 
 
 def interior_point(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
@@ -184,7 +233,7 @@ METHODS: dict[str, Method] = {
 
 
 class Recorder:
-    """A problem as methods see it, with a record of every evaluation."""
+    """A problem as the methods see it. It records every evaluation."""
 
     def __init__(self, task: Task):
         self.config = load(task.config, list(task.overrides))
@@ -252,7 +301,7 @@ class Results:
         return found
 
     def reached(self) -> dict[str, int]:
-        """Return on how many problems each method has reached the optimum."""
+        """Return the number of problems on which each method has reached the optimum."""
         counts: dict[str, int] = {}
         for row in self.summary():
             counts[row["method"]] = counts.get(row["method"], 0) + (row["evaluations"] is not None)
@@ -261,6 +310,11 @@ class Results:
 
 def _met(row: dict[str, Any]) -> bool:
     return bool(np.isfinite(row["objective"]) and row["violation"] <= FEASIBLE)
+
+
+def _stops(evaluations: int) -> Stops:
+    """Return stops so tight that a method ends at its own criterion, or at `evaluations`."""
+    return Stops(residual=1e-9, enough=1e-9, feasibility=FEASIBLE, evaluations=evaluations)
 
 
 def run(
@@ -279,7 +333,7 @@ def run(
         look(look.start)  # Compiles.
         for name, method in methods.items():
             look.reset()
-            method(look, look.start, Stops(1e-9, 1e-9, QUICK if quick else EVALUATIONS))
+            method(look, look.start, _stops(QUICK if quick else EVALUATIONS))
             rows += [{"problem": task.name, "method": name, **row} for row in look.rows]
             say(f"{task.name}: {name}, {len(look.rows)} designs")
     return Results(rows, tuple(METHODS.keys() - methods.keys()))

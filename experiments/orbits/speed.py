@@ -1,9 +1,7 @@
-"""Times value and gradient from a neighbour's orbit against other ways to the same numbers.
+"""Times value and gradient from a neighbour's orbit against other methods for the same numbers.
 
-All tools run in one process, one after the other in turns. Times are processor times, so that other
-processes on the machine hardly change them. The neighbour is a design whose parameters differ by a
-small fraction.
-"""
+All tools run in one process, in turns. Times are processor times, which other processes on the
+machine hardly change. The neighbour is a design whose parameters differ by a small fraction."""
 
 import dataclasses
 import time
@@ -20,7 +18,7 @@ from experiments._common.engines.scipy_nodes import NODES_1E3, ScipyNodes
 from experiments._common.scenes import CIC, SHAKY
 from rootsopt.config import load
 from rootsopt.response.evaluation import Evaluator, _build, _near
-from rootsopt.response.orbits import Orbits
+from rootsopt.response.orbits import OrbitStore
 
 Row = dict[str, Any]
 AWAY = 2e-3
@@ -81,7 +79,7 @@ def rows_of(scene: str, repeats: int, say: Callable[[str], None] = lambda text: 
     if not (neighbour.usable and exact.usable):
         return [{"scene": scene, "tool": f"{neighbour.status.label}, {exact.status.label}"}]
     truth = _numbers(exact)
-    alone = dataclasses.replace(own, orbits=Orbits())
+    alone = dataclasses.replace(own, orbits=OrbitStore())
     known = own.orbits.near(neighbour.state)
     pair, tangents, _ = _build(own.scene, jnp.asarray(design))
     settings = own.scene.pitch_radius, own.scene.solver
@@ -90,7 +88,7 @@ def rows_of(scene: str, repeats: int, say: Callable[[str], None] = lambda text: 
         return jax.block_until_ready(_near(pair, tangents, known, *settings))
 
     def afresh(tool: Evaluator, start: Any):
-        return lambda: dataclasses.replace(tool, orbits=Orbits())(design, start, series=False)
+        return lambda: dataclasses.replace(tool, orbits=OrbitStore())(design, start, series=False)
 
     near = own(design, start=neighbour.state, series=False)
     used = near.statistics.get("from_neighbour", 0)

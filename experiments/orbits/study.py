@@ -87,7 +87,9 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
 
 @functools.lru_cache(maxsize=4)
 def _solver(method: str, pair: tuple[Any, ...]):
-    """Return the compiled response with derivatives. One for each method and kind of `pair`."""
+    """Return the compiled response with derivatives.
+
+    There is one program for each method and kind of `pair`."""
     del method, pair
 
     @eqx.filter_jit
@@ -154,7 +156,7 @@ def run(
 ) -> list[Row]:
     """Compare `count` pairs, evenly distributed over the kinds; return a row for each.
 
-    Counted are pairs with a periodic orbit by shooting. `keep` is called with all rows so far after
+    Only pairs with a periodic orbit by shooting count. `keep` is called with all rows so far after
     each pair. A reduced run compares a few pairs of one kind."""
     kinds = list(KINDS)[: 1 if quick else None]
     each = QUICK_COUNT if quick else -(-count // len(kinds))
@@ -181,13 +183,13 @@ def read(folder: Path) -> list[Row]:
 
 @dataclasses.dataclass(frozen=True)
 class Judgement:
-    """What the rows show.
+    """Summary of all rows.
 
-    `pairs`: number of pairs with a periodic orbit by shooting; `closed`: how many collocation
-    closed too; `only`: orbits that only collocation closed; `other_period`: pairs with different
-    periods; `differences`: the greatest and the median of each difference; `faster`: median and
-    least ratio of the times; `left`: a line for each pair that collocation leaves to shooting.
-    """
+    `pairs`: number of pairs with a periodic orbit by shooting; `closed`: number of these that
+    collocation has closed; `only`: number of orbits that only collocation has closed;
+    `other_period`: number of pairs with different periods; `differences`: greatest and median value
+    of each difference; `faster`: median and least ratio of the times; `left`: a line for each pair
+    that collocation leaves to shooting."""
 
     pairs: int
     closed: int

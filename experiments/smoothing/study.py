@@ -235,7 +235,7 @@ def measure(kind: str, size: Size, seed: int, say: Say) -> Measured:
 
 
 def rows_of(measured: Measured) -> list[dict[str, Any]]:
-    """List a row for every scene at every smoothing length."""
+    """Return a row for every scene at every smoothing length."""
     rows = []
     for width, orbit in measured.orbits.items():
         for k, config in enumerate(measured.configs):

@@ -27,7 +27,8 @@ STATISTICS = ("mean", "sigma", "quantile_95", "worst")
 
 
 class Case(NamedTuple):
-    """A scene that scatters: words for tables and figures, and overrides of configs/cic.yaml."""
+    """A scene with scattered values: name in tables and figures, and overrides of
+    configs/cic.yaml."""
 
     title: str
     overrides: tuple[str, ...]
@@ -103,7 +104,7 @@ def run(quick: bool, name: str, say: Say = lambda text: None) -> Found:
 
 
 def rows_of(found: Found) -> list[dict[str, Any]]:
-    """List a row for each design: its parameters, and statistics over the fresh scenes."""
+    """Return a row for each design: its parameters, and statistics over the fresh scenes."""
     known = {
         "baseline": found.result.baseline,
         "nominal": found.robustness.nominal.optimized,
@@ -123,7 +124,7 @@ def rows_of(found: Found) -> list[dict[str, Any]]:
 
 
 def scenes_of(found: Found) -> list[dict[str, Any]]:
-    """List a row for each fresh scene: its numbers, and the forces of each design."""
+    """Return a row for each fresh scene: its values, and the forces of each design."""
     columns = dict(found.robustness.scenes)
     for name, one in found.robustness.fresh.items():
         columns |= {f"{name}_{force}": one.values[force] for force in FORCES}
@@ -135,7 +136,7 @@ def scenes_of(found: Found) -> list[dict[str, Any]]:
 
 
 def deviation(scatter: Scatter) -> float:
-    """Return the standard deviation of a key. That of a normal distribution is not cut off."""
+    """Return the standard deviation of a key; for a normal distribution, before it is cut off."""
     return (
         scatter.width
         / {"normal": 1.0, "uniform": math.sqrt(3), "triangular": math.sqrt(6)}[scatter.kind]
@@ -143,10 +144,11 @@ def deviation(scatter: Scatter) -> float:
 
 
 def linear_of(found: Found) -> list[dict[str, Any]]:
-    """List the standard deviation of each force of the nominal optimum, by key and in total.
+    """Return the standard deviation of each force of the nominal optimum, by key and in total.
 
-    First order: |derivative| times the standard deviation of the key; the total is their root sum
-    of squares. `sampled`: over the fresh scenes. The list is empty without sensitivities."""
+    To first order, it is |derivative| times the standard deviation of the key. The total is the
+    root of the sum of squares. `sampled`: standard deviation over the fresh scenes. The list is
+    empty without sensitivities."""
     optimality = found.robustness.nominal.optimality
     if optimality is None or not found.robustness.fresh:
         return []

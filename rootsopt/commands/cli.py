@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
+from rootsopt import report
 from rootsopt.commands import door
 from rootsopt.commands.door import BAD_INPUT, NO_RESULT
 from rootsopt.commands.door import OK as OK
@@ -20,6 +21,7 @@ from rootsopt.config import Config, describe_families, describe_keys, load, sour
 from rootsopt.config.families import import_named
 from rootsopt.config.shipped import shipped
 from rootsopt.errors import InputError
+from rootsopt.report import REPORT
 from rootsopt.runtime import environment
 from rootsopt.runtime.environment import use_float64
 
@@ -94,6 +96,12 @@ def parser(command: str, purpose: str) -> argparse.ArgumentParser:
     _add_import(result)
     result.add_argument("--no-figures", action="store_true", help="write no figures")
     result.add_argument(
+        "--report",
+        action="store_true",
+        help=f"write {REPORT}: summary, tables, charts and an animation in one file that opens "
+        "without a network (needs the [pages] extra)",
+    )
+    result.add_argument(
         "--no-cache",
         action="store_true",
         help="compile again, and keep no compiled programs in the user's cache folder "
@@ -140,8 +148,7 @@ def run(
 
     Parse the arguments, load the config and select double precision. Then call the function `body`
     of the module `rootsopt.commands.work.COMMAND` with a new result folder, move the folder to its
-    final path and print the result. `InputError` and
-    `OSError` give exit code 2."""
+    final path and print the result. `InputError` and `OSError` give exit code 2."""
     environment.own_process()
     try:
         _import_extensions(command, argv)
@@ -173,12 +180,16 @@ def run(
 def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int:
     from rootsopt.output.runs import RunFolder
 
+    if options.report:
+        report.require()
     body: Body = importlib.import_module(f"rootsopt.commands.work.{command}").body
     with (
         RunFolder(options.output, command, options.overwrite) as folder,
         door.leaving(folder.abandon),
     ):
         outcome = body(config, options, folder)
+        if options.report:
+            _report(folder, options, outcome)
         notes = folder.put_in_place()
         # Write files first: importing the console takes half of the time, and stdout may fail.
         from rich.console import Console
@@ -189,6 +200,23 @@ def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int
             out.print(note, soft_wrap=True, markup=False, highlight=False)
         out.print(f"results in {folder.path}", soft_wrap=True, markup=False, highlight=False)
     return outcome.code
+
+
+def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) -> None:
+    """Write the report of a run that has written all its other files.
+
+    If it cannot be made, say so on stderr: the result of a long run must not be lost with it."""
+    from rootsopt.report.gather import Run
+    from rootsopt.report.html import report_text
+
+    try:
+        run = Run.of(folder, folder.result, str(options.config), outcome.code == door.OK)
+        text = report_text(run)
+    except Exception as error:
+        words = f"{type(error).__name__}: {error}"
+        environment.say(f"{REPORT} is not written, because it could not be made: {words}")
+        return
+    folder.write_text(REPORT, text)
 
 
 @contextlib.contextmanager

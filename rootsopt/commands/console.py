@@ -11,10 +11,16 @@ COMMANDS = {
     "optimize": "optimise a design and compare it with the baseline",
     "simulate": "simulate one design in one scene",
     "pareto": "trace the best compromises between two or three terms",
-    "sweep": "simulate one design at many speeds",
+    "sweep": "simulate one design at many speeds, or at values of any keys",
     "attractors": "find the coexisting motions of one scene",
     "profile": "compute the geometry of one design",
 }
+
+_COMPLETION = """
+
+The Tab key completes commands, options and config keys after one of
+  rootsopt --completion bash > ~/.local/share/bash-completion/completions/rootsopt
+  rootsopt --completion zsh > ~/.zfunc/_rootsopt"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -30,6 +36,7 @@ def _called(arguments: list[str]) -> int:
     usage = "usage: rootsopt COMMAND CONFIG [options]\n\n" + "\n".join(
         f"  {name:<10} {what}" for name, what in COMMANDS.items()
     )
+    usage += "\n\nrootsopt COMMAND --help lists the options and all config keys." + _COMPLETION
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage)
         return door.OK if arguments else door.BAD_INPUT
@@ -39,12 +46,27 @@ def _called(arguments: list[str]) -> int:
 
         print(f"rootsopt {__version__}")
         return door.OK
+    if name == "--completion":
+        return _completed(rest)
     if name not in COMMANDS:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"; did you mean `{near[0]}`?" if near else f"; valid: {', '.join(COMMANDS)}"
         print(f"rootsopt: `{name}` is not a command{hint}", file=sys.stderr)
         return door.BAD_INPUT
     return importlib.import_module(f"rootsopt.commands.{name}").main(rest)
+
+
+def _completed(arguments: list[str]) -> int:
+    """Print the completion script for the shell that `arguments` name; return the exit code."""
+    from rootsopt.commands import completion
+    from rootsopt.errors import InputError
+
+    try:
+        print(completion.script(arguments[0] if arguments else "", COMMANDS))
+    except InputError as error:
+        print(f"rootsopt: {error}", file=sys.stderr)
+        return door.BAD_INPUT
+    return door.OK
 
 
 def console() -> None:

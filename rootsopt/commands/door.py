@@ -17,7 +17,7 @@ from typing import Any
 OK, BAD_INPUT, NO_RESULT = 0, 2, 3
 _NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 _GONE = (errno.EPIPE, errno.EBADF, errno.ESHUTDOWN)
-"""Numbers of the errors that occur if nobody reads a stream. They do not change the exit code."""
+"""Numbers of the errors that mean that nobody reads a stream. They do not change the exit code."""
 _WAITING = "rootsopt signals"
 _SHOW_CURSOR = "\x1b[?25h"
 

@@ -18,17 +18,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     return door.through("optimize", lambda: _run(argv), own=argv is None)
 
 
-def _run(argv: Sequence[str] | None) -> int:
+def options(parser: "argparse.ArgumentParser") -> None:
+    """Add the command's own options to a `parser`."""
     from rootsopt import export
+
+    export.add_option(parser, "none")
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on with a run into the same folder that was stopped or killed, from its "
+        "checkpoint; the result is that of an uninterrupted run",
+    )
+
+
+def _run(argv: Sequence[str] | None) -> int:
     from rootsopt.commands import cli
 
-    def add(parser: "argparse.ArgumentParser") -> None:
-        export.add_option(parser, "none")
-        parser.add_argument(
-            "--resume",
-            action="store_true",
-            help="go on with a run into the same folder that was stopped or killed, from its "
-            "checkpoint; the result is that of an uninterrupted run",
-        )
-
-    return cli.run("optimize", PURPOSE, argv, add)
+    return cli.run("optimize", PURPOSE, argv, options)

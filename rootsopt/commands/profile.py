@@ -16,7 +16,8 @@ EXPORT = "dxf,svg"
 """Default value of `--export` for this command. Drawings take less than 1 s, a solid takes 10 s."""
 
 
-def _options(parser: "argparse.ArgumentParser") -> None:
+def options(parser: "argparse.ArgumentParser") -> None:
+    """Add the command's own options to a `parser`."""
     from rootsopt import export
 
     export.add_option(parser, EXPORT)
@@ -44,4 +45,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     from rootsopt.commands import cli
 
-    return cli.run("profile", PURPOSE, argv, _options)
+    return cli.run("profile", PURPOSE, argv, options)

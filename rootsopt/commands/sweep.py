@@ -1,10 +1,15 @@
-"""`rootsopt sweep CONFIG`: simulate one design at many speeds."""
+"""`rootsopt sweep CONFIG`: simulate one design at many speeds, or at values of any keys."""
 
+import argparse
 from collections.abc import Sequence
 
 from rootsopt.commands import door
 
-PURPOSE = "Simulate one design at many speeds, each from rest: contact force and kind of motion."
+PURPOSE = (
+    "Simulate one config at many values of any of its keys (--over), each from rest: contact "
+    "force, gradient, kind of motion, as a netCDF or Zarr dataset. Without --over: one design at "
+    "many speeds (sweep.speed_rpm)."
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -14,7 +19,73 @@ def main(argv: Sequence[str] | None = None) -> int:
     return door.through("sweep", lambda: _run(argv), own=argv is None)
 
 
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the command's own options to a `parser`."""
+    group = parser.add_argument_group("points of the sweep")
+    group.add_argument(
+        "--over",
+        action="append",
+        default=[],
+        metavar="KEY=VALUES",
+        help="values of a config key: a list (0.05,0.1,0.2; cic,ee; null,10), a range "
+        "(300:6000:39 for 39 values, 1:100:9:log), or both; for samples an interval (300:6000, "
+        "1:100:log) or a list; repeatable: all combinations are simulated",
+    )
+    group.add_argument(
+        "--zip", action="store_true", help="advance all keys together instead of combining them"
+    )
+    group.add_argument(
+        "--zip-keys",
+        action="append",
+        default=[],
+        metavar="KEY,KEY...",
+        help="advance these keys together, and combine them with the others; repeatable",
+    )
+    group.add_argument("--sample", type=int, metavar="N", help="draw N pseudo-random points")
+    group.add_argument(
+        "--sobol",
+        type=int,
+        metavar="N",
+        help="draw N points of a scrambled Sobol sequence, which fill the space more evenly (best "
+        "with a power of 2)",
+    )
+    group.add_argument(
+        "--tolerances",
+        type=int,
+        metavar="N",
+        help="simulate N fresh scenes of the config's `tolerances`, instead of --over",
+    )
+    group.add_argument(
+        "--seed", type=int, metavar="N", help="seed of the samples (default: 0), kept in the files"
+    )
+    group = parser.add_argument_group("how a sweep runs (with --over or --tolerances)")
+    group.add_argument(
+        "--data",
+        metavar="NAME",
+        help="name of the dataset in the result folder; its suffix chooses the format: .nc "
+        "(netCDF) or .zarr (Zarr, needs rootsopt[zarr]); default: sweep.nc",
+    )
+    group.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="start N processes on this machine (needs rootsopt[cluster]); default: this process, "
+        "with one thread per core",
+    )
+    group.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="use the workers of a running Dask scheduler, for example tcp://10.0.0.1:8786 (needs "
+        "rootsopt[cluster])",
+    )
+    group.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on with a sweep into the same folder that was stopped or killed",
+    )
+
+
 def _run(argv: Sequence[str] | None) -> int:
     from rootsopt.commands import cli
 
-    return cli.run("sweep", PURPOSE, argv)
+    return cli.run("sweep", PURPOSE, argv, options)

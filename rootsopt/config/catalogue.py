@@ -11,13 +11,11 @@ if TYPE_CHECKING:
     from rootsopt.config.scene import ProfileConfig
 
 _LONGEST = 5e4
-"""Length (mm) of a profile above which a config is rejected, whatever its pitch radius."""
+"""Length (mm) in a profile above which a config is rejected, whatever the pitch radius."""
 _SHARES = 0.002, 10.0
-"""Range (pitch radii) outside which a length of a profile is rejected."""
+"""Range (pitch radii) outside which a length in a profile is rejected."""
 _NO_FLOOR = 0.0, 10.0
-"""Range (pitch radii) outside which a length with a lower limit of its own is rejected.
-
-It replaces `_SHARES` where the key or the family sets the lower limit."""
+"""Range (pitch radii) that replaces `_SHARES` where the key or the family sets the lower limit."""
 
 
 @dataclasses.dataclass(frozen=True)

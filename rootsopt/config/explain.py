@@ -2,6 +2,7 @@
 
 import difflib
 import types
+from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt
@@ -16,12 +17,19 @@ _MOST_NAMES = 12
 """Maximum number of valid keys that a message lists."""
 
 
-def explain(error: ValidationError, model: type[BaseModel]) -> str:
+def explain(
+    error: ValidationError, model: type[BaseModel], keys: Sequence[Sequence[str]] | None = None
+) -> str:
     """Return one sentence on the problem that pydantic's `error` reports in a config.
 
     `model`: type of the config. If there are several problems, report the first unknown key. If no
-    key is unknown, report the first problem."""
+    key is unknown, report the first problem. `keys`: keys, each as a list of its parts, inside
+    which problems count; the result is "" if there are none. By default, all problems count."""
     problems = error.errors(include_url=False)
+    if keys is not None:
+        problems = [p for p in problems if _inside(p, keys)]
+        if not problems:
+            return ""
     first = next((p for p in problems if p["type"] in _UNKNOWN), problems[0])
     place, rest = _split(model, first["loc"])
     if first["type"] in _UNKNOWN and not rest:
@@ -47,6 +55,18 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
 
 
 _UNKNOWN = ("extra_forbidden", "invalid_key")
+
+
+def _inside(problem: Any, keys: Sequence[Sequence[str]]) -> bool:
+    """Return whether a pydantic `problem` is located at one of the `keys` or inside it.
+
+    An unknown section above a key counts as well."""
+    place, unknown = problem["loc"], problem["type"] in _UNKNOWN
+    return any(
+        (unknown or len(place) >= len(key))
+        and all(x == y for x, y in zip(place, key, strict=False))
+        for key in keys
+    )
 
 
 def _split(model: type[BaseModel], location: tuple) -> tuple[list[Any], list[Any]]:
@@ -243,21 +263,52 @@ def _range(field: FieldInfo) -> str:
     return " ".join(words)
 
 
+class Key(NamedTuple):
+    """A config key as `--help` and the site describe it.
+
+    `name`: dotted name; `meaning`: its description; `unit`, `choices` (the words it accepts),
+    `range` (of its numbers), `default`: texts, "" where there is none; `required`: whether a config
+    must have it, if it has the section."""
+
+    name: str
+    meaning: str
+    unit: str
+    choices: str
+    range: str
+    default: str
+    required: bool
+
+
+def keys_of(model: type[BaseModel]) -> list[Key]:
+    """Return all keys of a `model`, without its sections, in their order."""
+    found = []
+    for name in all_keys(model):
+        field = field_of(model, name.split("."))
+        if field is None or _model_of(field.annotation) is not None:
+            continue
+        default = ""
+        if field.default_factory is None and not field.is_required():
+            value = list(field.default) if isinstance(field.default, tuple) else field.default
+            default = "" if value in (None, []) else str(value)
+        found.append(
+            Key(
+                name,
+                field.description or "",
+                unit_of(name.split(".")[-1]),
+                " | ".join(choices(field.annotation)),
+                _range(field),
+                default,
+                field.is_required(),
+            )
+        )
+    return found
+
+
 def describe(model: type[BaseModel]) -> str:
     """Return one line per key for `--help`: meaning, unit, choices or range, and default."""
     lines = []
-    for key in all_keys(model):
-        field = field_of(model, key.split("."))
-        if field is None or _model_of(field.annotation) is not None:
-            continue
-        notes = [unit_of(key.split(".")[-1]), " | ".join(choices(field.annotation)), _range(field)]
-        if field.is_required():
-            notes.append("required")
-        elif field.default_factory is None and field.default not in (None, ()):
-            default = field.default
-            notes.append(f"default {list(default) if isinstance(default, tuple) else default}")
-        note = ", ".join(note for note in notes if note)
-        lines.append(
-            f"  {key:<42} {field.description or ''}{f' [{note}]' if note else ''}".rstrip()
-        )
+    for key in keys_of(model):
+        last = "required" if key.required else f"default {key.default}" if key.default else ""
+        note = ", ".join(note for note in (key.unit, key.choices, key.range, last) if note)
+        lines.append(f"  {key.name:<42} {key.meaning}{f' [{note}]' if note else ''}".rstrip())
     return "\n".join(lines)

@@ -37,7 +37,7 @@ MARGINS = (
 )
 """Names of the margins that are ≥ 0 in a sound profile (see `rootsopt.profiles.validity`)."""
 FREE_FORM = "free_form"
-"""Name of the family whose members come closest to any profile."""
+"""Name of the family whose members can approximate any profile."""
 ENTRY_POINTS = "rootsopt.families"
 """Name of the entry-point group in which installed packages offer families.
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
 from rootsopt.config.document import MOST_BYTES, read_document
+from rootsopt.config.drawing import DrawingConfig
 from rootsopt.config.explain import all_keys, describe, explain
 from rootsopt.config.families import (
     families,
@@ -41,7 +42,7 @@ from rootsopt.config.study import (
     SolverConfig,
     SweepConfig,
 )
-from rootsopt.config.tolerances import Scatter, TolerancesConfig, scatterable, unknown_key
+from rootsopt.config.tolerances import Scatter, TolerancesConfig, mounted, scatterable, unknown_key
 from rootsopt.config.units import hint
 from rootsopt.config.words import named, placed, sentence, shown
 from rootsopt.errors import InputError
@@ -73,6 +74,14 @@ class Config(Section):
     optimizer: OptimizerConfig = Field(default_factory=lambda: OptimizerConfig.model_validate({}))
     pump: PumpConfig | None = Field(None, description="absent: no leakage is reported")
     tolerances: TolerancesConfig | None = Field(None, description="absent: nothing scatters")
+    drawing: DrawingConfig | None = Field(
+        None, description="absent: the title block states what follows from the rest"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _mounted(cls, data):
+        return mounted(data)
 
     @property
     def design(self) -> NDArray[np.float64]:
@@ -87,19 +96,66 @@ class Config(Section):
     def replaced(self, values: Mapping[str, Any]) -> "Config":
         """Return a copy of the config in which some `values` are replaced.
 
-        `values`: new values by dotted key. They are checked in the same way as a file. Raises
-        `InputError` for an unknown key or a value that is not allowed."""
-        data = self.model_dump(mode="json", exclude_none=True)
-        for key, value in values.items():
-            *path, last = key.split(".")
-            target = data
-            for part in path:
-                target = target.setdefault(part, {})
-            target[last] = value
+        `values`: new values by dotted key; `None`: as if the key were absent. They are checked in
+        the same way as a file. Defaults that follow other keys, such as the smoothing length,
+        follow the new values. Raises `InputError` for an unknown key or a value that is not
+        allowed."""
         try:
-            return Config.model_validate(data)
+            return Config.model_validate(self.plain(values))
         except ValidationError as error:
             raise InputError(sentence(f"{explain(error, Config)}")) from None
+
+    def check_values(self, values: Mapping[str, Any]) -> None:
+        """Raise `InputError` for an unknown key, or a value that its key cannot have by itself.
+
+        `values`: new values by dotted key. A value that merely does not fit the other values is
+        accepted: `replaced` rejects it."""
+        try:
+            Config.model_validate(self.plain(values))
+        except ValidationError as error:
+            keys = [
+                ["profile", self._entry(k)[0]] if self._entry(k)[0] else k.split(".")
+                for k in values
+            ]
+            if message := explain(error, Config, keys):
+                raise InputError(sentence(message)) from None
+
+    def plain(self, values: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """Return the config as plain values, from which `Config.model_validate` makes it again.
+
+        `values`: new values by dotted key; `profile.coefficients_3` is the third entry of a list of
+        design parameters. Defaults that follow other keys are left out. Raises `InputError` if a
+        key is inside one that holds no keys."""
+        data = self.model_dump(mode="json", exclude_none=True)
+        for name, key in _FOLLOWING:
+            section = getattr(self, name)
+            if section is not None and key not in section.model_fields_set:
+                data[name].pop(key, None)
+        for key, value in (values or {}).items():
+            parts = key.split(".")
+            name, entry = self._entry(key)
+            if name:
+                data["profile"][name][entry] = value
+                continue
+            target = data
+            for i, part in enumerate(parts[:-1]):
+                inner = target.setdefault(part, {})
+                if not isinstance(inner, dict):
+                    place = ".".join(map(named, parts[: i + 1]))
+                    raise InputError(f"`{named(key)}` is not a known key: `{place}` holds no keys")
+                target = inner
+            target[parts[-1]] = value
+        return data
+
+    def _entry(self, key: str) -> tuple[str, int]:
+        """Return (name, place) of the entry of a list that a `key` such as
+        `profile.coefficients_3` names; ("", 0) for any other key."""
+        section, _, entry = key.partition(".")
+        name, _, number = entry.rpartition("_")
+        single = entry in self.profile.parameters
+        if section != "profile" or entry not in self.design_keys or single:
+            return "", 0
+        return name, int(number) - 1
 
     @property
     def scatters(self) -> tuple[Scatter, ...]:
@@ -132,12 +188,17 @@ class Config(Section):
     def needs_search(self) -> tuple[str, ...]:
         """Keys set in this config that require `solver.fidelity: search`.
 
-        Friction and supports need the point of contact. An outline file or a centre distance error
-        needs the gap between flanks that do not roll perfectly. Only this fidelity provides them.
+        Friction, supports and bearings need the point of contact. An outline file or a centre
+        distance error needs the gap between flanks that do not roll perfectly. Only this fidelity
+        provides them. Twisted rotors are checked with this one.
         """
         parts = {
             "contact.friction": self.contact.friction,
             "scene.supports": self.scene.supports,
+            "scene.bearings": self.scene.bearings,
+            "scene.heat": self.scene.heat,
+            "contact.wear": self.contact.wear,
+            "rotor.helix_deg": self.rotor.helix_deg or None,
             "scene.center_distance_error_mm": self.scene.center_distance_error_mm,
             "profile.outline_file": self.profile.outline_file,
         }
@@ -169,9 +230,7 @@ class Config(Section):
             law,
             self.solver.precision,
         )
-        return self.model_copy(
-            update={"contact": contact.model_copy(update={"smoothing_mm": length})}
-        )
+        return self.model_copy(update={"contact": _followed(contact, "smoothing_mm", length)})
 
     @model_validator(mode="after")
     def _pressed(self):
@@ -182,8 +241,9 @@ class Config(Section):
                     "`pump.pressure_difference_Pa` must be given if `scene.load` has no "
                     "`pressure_difference_Pa`; add it, or remove the section `pump`"
                 )
-            across = {"pressure_difference_Pa": load.pressure_difference_Pa}
-            return self.model_copy(update={"pump": pump.model_copy(update=across)})
+            across = load.pressure_difference_Pa
+            filled = _followed(pump, "pressure_difference_Pa", across)
+            return self.model_copy(update={"pump": filled})
         return self
 
     @model_validator(mode="after")
@@ -228,7 +288,7 @@ class Config(Section):
         if tolerances is None:
             return self
         valid, known = scatterable(self), dict.fromkeys(all_keys(Config))
-        for key in tolerances.over:
+        for key in (*tolerances.over, *tolerances.changed):
             if key not in valid:
                 raise ValueError(unknown_key(key, valid, known))
         if self.objective.motion == "ensemble":
@@ -243,6 +303,17 @@ class Config(Section):
                 "the speeds; remove one of them"
             )
         alone = self.model_copy(update={"tolerances": None})
+        for name, values in tolerances.conditions.items():
+            data = alone.moved(values).model_dump(mode="json", exclude_none=True)
+            try:
+                Config.model_validate(data)
+            except ValidationError as error:
+                raise ValueError(
+                    f"the scene `{name}` of `tolerances.conditions` must be a valid one, but "
+                    f"{explain(error, Config)}; correct its values"
+                ) from None
+        if tolerances.conditions:
+            return self
         for one in tolerances.scatters(valid):
             for end in (one.nominal - one.half, one.nominal + one.half):
                 data = alone.moved({one.key: end}).model_dump(mode="json", exclude_none=True)
@@ -263,6 +334,19 @@ class Config(Section):
 
 
 follow(lambda: replace_fields(Config, dict(Config.model_fields)))
+
+
+_FOLLOWING = (("contact", "smoothing_mm"), ("pump", "pressure_difference_Pa"))
+"""Keys whose default follows other keys, each as (section, key)."""
+
+
+def _followed(section: Any, key: str, value: Any) -> Any:
+    """Return a copy of a section with the default `value` of a key that follows other keys.
+
+    The key is not in `model_fields_set`, so that it can be told from one that the user gave."""
+    copy = section.model_copy(update={key: value})
+    copy.model_fields_set.discard(key)
+    return copy
 
 
 def _with(config: Any, key: str, value: Any) -> Any:

@@ -188,7 +188,8 @@ class RotorConfig(Section):
         None, description="diameter of the bore; absent: none"
     )
     helix_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
-        0.0, description="twist over the length, for CAD only: the simulated rotors are straight"
+        0.0,
+        description="twist over the length, positive in the rotor's own sense of rotation",
     )
 
 
@@ -220,6 +221,17 @@ def _none_for_auto(value: Any) -> Any:
     return None if value == "auto" else value
 
 
+class WearConfig(Section):
+    """Metal that the flanks have lost, or gained by a coating, since they were drawn."""
+
+    offset_mm: Annotated[float, Field(ge=-1, le=1)] = Field(
+        0.0, description="normal offset that each rotor has lost everywhere; negative: gained"
+    )
+    depth_mm: Annotated[float, between(0, 1)] = Field(
+        0.0, description="greatest wear of both flanks together, distributed after Archard"
+    )
+
+
 class ContactConfig(Section):
     """The IMPACT contact law, clearance and friction of the flanks."""
 
@@ -243,6 +255,7 @@ class ContactConfig(Section):
         "load",
     )
     friction: FrictionConfig | None = Field(None, description="absent: frictionless flanks")
+    wear: WearConfig | None = Field(None, description="absent: flanks as drawn")
 
     @property
     def rounding_mm(self) -> float:
@@ -294,6 +307,52 @@ class SupportsConfig(Section):
     )
 
 
+class BearingsConfig(Section):
+    """The rotors' bearings and what loads them beside the flanks: gas, gear teeth, weight.
+
+    With `scene.supports`, these forces also move the axes."""
+
+    gear_pressure_angle_deg: Annotated[float, Field(ge=0, le=45)] = Field(
+        20.0, description="pressure angle of the timing gear's teeth"
+    )
+    weight: bool = Field(False, description="whether the rotors' weight counts, downwards")
+    port_deg: Annotated[float, Field(ge=-90, le=90)] = Field(
+        0.0, description="angle before the bore's lowest point at which a pocket opens"
+    )
+    bearing_distance_mm: Annotated[float, Field(ge=0, le=1e4)] = Field(
+        20.0, description="axial distance of each bearing from the nearer end face of the rotor"
+    )
+    gear_distance_mm: Annotated[float, Field(ge=0, le=1e4)] = Field(
+        50.0, description="axial distance of the timing gear from the nearer end face"
+    )
+    kind: Literal["ball", "roller"] = Field(
+        "roller", description="kind of bearing; sets the exponent of the equivalent load"
+    )
+
+
+class HeatConfig(Section):
+    """Thermal growth of rotors and housing, each at one temperature, since they were measured."""
+
+    rotor_warming_K: Annotated[float, Field(ge=-200, le=500)] = Field(
+        0.0, description="rise of the rotors' temperature"
+    )
+    housing_warming_K: Annotated[float, Field(ge=-200, le=500)] = Field(
+        0.0, description="rise of the housing's temperature"
+    )
+    rotor_expansion_per_K: Annotated[float, between(0, 1e-4)] = Field(
+        1.1e-5, description="thermal expansion of the rotors; default: cast iron, steel"
+    )
+    housing_expansion_per_K: Annotated[float, between(0, 1e-4)] = Field(
+        1.1e-5, description="thermal expansion of the housing"
+    )
+
+    @property
+    def strain(self) -> float:
+        """Growth of the housing over that of the rotors, as a fraction of every length."""
+        housing = self.housing_expansion_per_K * self.housing_warming_K
+        return housing - self.rotor_expansion_per_K * self.rotor_warming_K
+
+
 class TimingGearConfig(Section):
     """The timing gear between the rotors: torsional stiffness, damping and backlash."""
 
@@ -321,6 +380,8 @@ class SceneConfig(Section):
     load: LoadConfig
     timing_gear: TimingGearConfig | None = Field(None, description="absent: no timing gear")
     supports: SupportsConfig | None = Field(None, description="absent: rigid bearings")
+    bearings: BearingsConfig | None = Field(None, description="absent: no bearing loads")
+    heat: HeatConfig | None = Field(None, description="absent: all at the same temperature")
     center_distance_error_mm: Annotated[float, Field(ge=-1, le=1)] | None = Field(
         None, description="centre distance minus twice the pitch radius"
     )

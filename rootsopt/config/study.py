@@ -7,12 +7,12 @@ from pydantic import Field, model_validator
 from rootsopt.config.families import families, follow, parameters, replace_fields
 from rootsopt.config.section import Order, Section, Speed, Weight, between, number, tuples
 from rootsopt.config.units import hint
-from rootsopt.config.words import shown
+from rootsopt.config.words import named, shown
 
 _Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 _NODES_RTOL = 3e-5
-"""Default tolerance for fidelity `nodes`. Its force has a step at every node, which needs many
-solver steps at finer tolerances, and limits the accuracy of forces to about 1e-3."""
+"""Default tolerance for fidelity `nodes`, whose force has a step at every node. These steps limit
+the accuracy of forces to about 1e-3, and a finer tolerance would need many solver steps."""
 NEAREST = "nearest"
 """Word in `optimizer.family` for the named family that is nearest to an outline."""
 _LEAST_WEIGHT = 1e-6
@@ -45,6 +45,15 @@ class SolverConfig(Section):
     map_relatives: Annotated[int, Field(ge=12, le=1024)] | None = Field(
         None,
         description="map points over the relative rotation; absent: as many as map_error needs",
+    )
+    slices: Annotated[int, Field(ge=1, le=64)] | None = Field(
+        None,
+        description="slices (Gauss points) along twisted rotors; absent: as many as slice_error "
+        "needs",
+    )
+    slice_error: Annotated[float, Field(ge=1e-6, le=0.1)] = Field(
+        1e-2,
+        description="mean error of the contact torque of twisted rotors, relative to its maximum",
     )
     method: Literal["tsit5", "dopri5", "dopri8", "kvaerno3", "kvaerno5"] = Field(
         "tsit5", description="explicit: tsit5, dopri5, dopri8; implicit: kvaerno3, kvaerno5"
@@ -304,6 +313,7 @@ class SweepConfig(Section):
 
 _Floor = Annotated[float, between(0, 5000)]
 _Outer = Annotated[float, between(1, 1e4)]
+_Finite = Annotated[float, between(-1e12, 1e12)]
 
 
 class ConstraintsConfig(Section):
@@ -318,6 +328,12 @@ class ConstraintsConfig(Section):
     outer_radius_max_mm: _Outer | None = Field(
         None, description="ceiling of the outer radius: radius of the housing's bore"
     )
+    terms: dict[str, dict[Literal["min", "max"], _Finite]] = Field(
+        default_factory=dict,
+        description="limits of further quantities by name, as {peak_force_N: {max: 200}, "
+        "displaced_volume_cm3: {min: 900}}: mean_force_N, peak_force_N, rms_force_N, "
+        "line_ORDER_force_N, built-in or registered terms; forces at every speed of the objective",
+    )
 
     @model_validator(mode="after")
     def _ordered(self):
@@ -327,6 +343,17 @@ class ConstraintsConfig(Section):
                 "`constraints.outer_radius_max_mm` must be greater than "
                 f"`constraints.outer_radius_min_mm` = {low:g}, but is {high:g}"
             )
+        for name, sides in self.terms.items():
+            if not sides:
+                raise ValueError(
+                    f"`constraints.terms.{named(name)}` must have `min`, `max` or both, as in "
+                    "{max: 200}, but is empty"
+                )
+            if len(sides) == 2 and not sides["min"] < sides["max"]:
+                raise ValueError(
+                    f"`constraints.terms.{named(name)}.max` must be greater than its `min` = "
+                    f"{sides['min']:g}, but is {sides['max']:g}"
+                )
         return self
 
 

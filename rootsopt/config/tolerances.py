@@ -1,4 +1,4 @@
-"""Config section `tolerances`: how far the numbers of scene and design scatter in manufacture."""
+"""Config section `tolerances`: how far values of scene and design scatter in manufacture."""
 
 import difflib
 from collections.abc import Mapping
@@ -15,7 +15,23 @@ DISTRIBUTIONS = (*_KINDS, *(_RELATIVE + kind for kind in _KINDS))
 """Names of the distributions. The width of a `relative_` one is a fraction of the key's value."""
 _SECTIONS = ("rotor", "contact", "scene")
 _NOT_PHYSICAL = ("rotor.helix_deg", "contact.smoothing_mm")
-"""Numbers of these sections that cannot scatter: settings, not quantities of the simulated pair."""
+"""Keys in `_SECTIONS` that cannot scatter: they are not quantities of the simulated pair."""
+_LISTED = "listed"
+"""Kind of a key that `conditions` give."""
+_MOUNTING = "center_distance_error_mm", "phase_error_mrad"
+"""Errors of mounting in the section `scene`: their nominal value is 0 unless a config gives it."""
+_PLAIN = {
+    "profile_offset": "contact.clearance_mm",
+    "clearance": "contact.clearance_mm",
+    "center_distance": "scene.center_distance_error_mm",
+    "center_distance_mm": "scene.center_distance_error_mm",
+    "backlash": "scene.timing_gear.backlash_mm",
+    "phase": "scene.phase_error_mrad",
+    "load": "scene.load.torque_N_m",
+    "speed": "scene.speed_rpm",
+    "friction": "contact.friction.kinetic",
+}
+"""Words for quantities, each with the key that is probably meant."""
 _DEEPEST = 4
 """Number of nested sections above which the keys of `tolerances.over` are rejected."""
 
@@ -40,9 +56,15 @@ class TolerancesConfig(Section):
     """Scatter of scene and design, for a robust optimum. Without this section, nothing scatters."""
 
     over: dict[str, dict[str, Annotated[float, Field(gt=0, le=1e9)]]] = Field(
+        default_factory=dict,
         description="distribution by key, as {contact.clearance_mm: {normal: 0.002}}; normal: "
         "standard deviation; uniform, triangular: half width; relative_normal, relative_uniform, "
-        "relative_triangular: the same as a fraction of the key's value"
+        "relative_triangular: the same as a fraction of the key's value",
+    )
+    conditions: dict[str, dict[str, Annotated[float, between(-1e9, 1e9)]]] = Field(
+        default_factory=dict,
+        description="scenes by name, instead of `over` and a sample: values of keys, as "
+        "{new: {}, worn: {contact.wear.depth_mm: 0.03}}",
     )
     normal_limit: Annotated[float, between(0.5, 8)] = Field(
         4.0, description="standard deviations at which normal distributions are cut off"
@@ -71,12 +93,34 @@ class TolerancesConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _flat(cls, data):
-        if not isinstance(data, dict) or not isinstance(data.get("over"), dict):
+        if not isinstance(data, dict):
             return data
-        return data | {"over": _flattened(data["over"])}
+        if isinstance(data.get("over"), dict):
+            data = data | {"over": _flattened(data["over"])}
+        named_scenes = data.get("conditions")
+        if not isinstance(named_scenes, dict) or not named_scenes:
+            return data
+        flat = {
+            name: _dotted(values) if isinstance(values, dict) else values
+            for name, values in named_scenes.items()
+        }
+        # These scenes are all there are: nothing is drawn.
+        return data | {"conditions": flat, "samples": max(2, len(flat)), "check_samples": 0}
 
     @model_validator(mode="after")
     def _one_each(self):
+        if self.conditions:
+            if self.over:
+                raise ValueError(
+                    "`tolerances` must hold either `over` or `conditions`, but holds both; remove "
+                    "one"
+                )
+            if len(self.conditions) < 2:
+                raise ValueError(
+                    "`tolerances.conditions` must name two or more scenes, but names "
+                    f"{len(self.conditions)}; add one, as new: {{}}"
+                )
+            return self
         if not self.over:
             raise ValueError(
                 "`tolerances.over` must name at least one key, as in {contact.clearance_mm: "
@@ -97,12 +141,21 @@ class TolerancesConfig(Section):
                 )
         return self
 
+    @property
+    def changed(self) -> tuple[str, ...]:
+        """Keys that some of the `conditions` change."""
+        return tuple(dict.fromkeys(key for one in self.conditions.values() for key in one))
+
     def scatters(self, values: Mapping[str, float]) -> tuple[Scatter, ...]:
         """Return the distributions, in the order of the config.
 
         `values`: the config's own value of each key. Raises ValueError for a relative distribution
         of a key whose value is 0."""
         found = []
+        for key in self.changed:
+            nominal = values[key]
+            half = max(abs(one.get(key, nominal) - nominal) for one in self.conditions.values())
+            found.append(Scatter(key, _LISTED, nominal, half, half))
         for key, given in self.over.items():
             ((name, width),) = given.items()
             kind = name.removeprefix(_RELATIVE)
@@ -119,9 +172,9 @@ class TolerancesConfig(Section):
 
 
 def scatterable(config: Any) -> dict[str, float]:
-    """Return the numbers of a config that may scatter, by dotted key.
+    """Return the values of a config that may scatter, by dotted key.
 
-    They are the numbers of `rotor`, `contact` and `scene` that this config has, and its design
+    They are the numerical values in its sections `rotor`, `contact` and `scene`, and its design
     parameters. An entry of a list is numbered from 1, as in `profile.coefficients_2`."""
     found: dict[str, float] = {}
 
@@ -140,6 +193,19 @@ def scatterable(config: Any) -> dict[str, float]:
     return found | {f"profile.{key}": float(value) for key, value in designs}
 
 
+def mounted(data: Any) -> Any:
+    """Return the plain values of a config with the mounting errors that scatter, 0 where absent.
+
+    Return `data` unchanged if it has another form than a config, or if no such error scatters."""
+    parts = [data.get(key) for key in ("scene", "tolerances")] if isinstance(data, dict) else []
+    over = parts[1].get("over") if parts and isinstance(parts[1], dict) else None
+    if not isinstance(over, dict) or not isinstance(parts[0], dict):
+        return data
+    scatter = [name for name in _MOUNTING if f"scene.{name}" in _flattened(over)]
+    absent = {name: 0.0 for name in scatter if parts[0].get(name) is None}
+    return data | {"scene": parts[0] | absent} if absent else data
+
+
 def unknown_key(key: str, valid: Mapping[str, float], known: Mapping[str, Any]) -> str:
     """Return a message for a key of `tolerances.over` that cannot scatter.
 
@@ -148,7 +214,7 @@ def unknown_key(key: str, valid: Mapping[str, float], known: Mapping[str, Any]) 
     if key in known and key.split(".")[0] in _SECTIONS and key not in _NOT_PHYSICAL:
         return (
             f"{text}, which the config does not have as a number; give `{key}` its nominal value "
-            "first, as 0 for an error of mounting"
+            "first"
         )
     if key in known:
         return (
@@ -160,11 +226,26 @@ def unknown_key(key: str, valid: Mapping[str, float], known: Mapping[str, Any]) 
 
 def _near(word: str, words: Any) -> str:
     """Return a guess at which of the `words` was meant, as the end of a message, or ""."""
+    meant = _PLAIN.get(word.replace("centre", "center"))
+    if meant is not None:
+        return f"; did you mean `{meant}`?"
     last = {one.split(".")[-1]: one for one in words}
     if word.split(".")[-1] in last and word not in words:
         return f"; did you mean `{last[word.split('.')[-1]]}`?"
     found = difflib.get_close_matches(word[:80], [*words], n=1, cutoff=0.5)
     return f"; did you mean `{found[0]}`?" if found else ""
+
+
+def _dotted(data: dict, prefix: str = "") -> dict[str, Any]:
+    """Return {dotted key: value} from nested sections."""
+    found: dict[str, Any] = {}
+    for key, value in data.items():
+        found |= (
+            _dotted(value, f"{prefix}{key}.")
+            if isinstance(value, dict)
+            else {f"{prefix}{key}": value}
+        )
+    return found
 
 
 def _flattened(data: dict, prefix: str = "", depth: int = 0) -> dict[str, Any]:
@@ -185,4 +266,4 @@ def _flattened(data: dict, prefix: str = "", depth: int = 0) -> dict[str, Any]:
     return found
 
 
-__all__ = ["DISTRIBUTIONS", "Scatter", "TolerancesConfig", "scatterable", "unknown_key"]
+__all__ = ["DISTRIBUTIONS", "Scatter", "TolerancesConfig", "mounted", "scatterable", "unknown_key"]

@@ -1,6 +1,8 @@
 """Turns values, names and whole messages into one line of limited length."""
 
+import difflib
 import reprlib
+from collections.abc import Sequence
 from typing import Any
 
 LONGEST = 500
@@ -56,3 +58,8 @@ def clipped(text: str, longest: int = LONGEST) -> str:
 def sentence(text: str) -> str:
     """Return a message as one line of at most `LONGEST` characters."""
     return clipped(" ".join(text[: 100 * LONGEST].split()))
+
+
+def near(word: str, known: Sequence[str]) -> str:
+    """Return the one of the `known` words that is most like `word`, or "" if none is like it."""
+    return next(iter(difflib.get_close_matches(word[:_NAME], known, n=1)), "")

@@ -40,17 +40,20 @@ from jaxtyping import Array, Bool, Float
 
 from rootsopt.profiles.base import Profile
 
-# Greatest number of Newton steps from the point of perfect rolling; two or three are usual.
+# Maximum number of Newton steps from the point of perfect rolling; two or three are usual.
 _NEWTON_STEPS = 5
-# Length (rad) of the last step below which Newton's method has converged, by bytes of a number.
-# The next step would then be less than rounding, even across a kink of T.
+# Length (rad) of the last step below which Newton's method has converged, keyed by bytes per
+# number. The next step would then be smaller than the rounding error, even across a kink of T.
 _CONVERGED = {8: 1e-8, 4: 1e-3}
-# Greatest number of steps inside a bracket; halving alone needs about fifty.
+# Length (rad) of a step below which no further step is tried, keyed by bytes per number. Beside a
+# kink of T, the normal angles of the result err by this length.
+_FINISHED = {8: 1e-11, 4: 1e-5}
+# Maximum number of steps inside a bracket; bisection alone needs about fifty.
 _GUARDED_STEPS = 60
 # Marks a finished search: this is added to the number of attempts.
 _DONE = 16
-# Greatest number of minima of the gap that are compared on a wavy flank, and of the jumps between
-# neighbouring minima that have a flag of their own.
+# On a wavy flank: maximum number of minima of the gap that are compared, and number of jumps
+# between neighbouring minima that have a flag of their own.
 _MINIMA = 8
 _FLAGS = 3
 # ε (rad) below which a converged Newton search from perfect rolling is not trusted. Down to this ε,
@@ -65,8 +68,8 @@ _NEAR_CUSP = 1e-3
 # Penetration (pitch radii) above which a pair of points on flanks that are not conjugate is
 # ignored.
 _DEEPEST = 0.1
-# Magnitude of T (pitch radii) below which T at a node may be zero except for rounding, by bytes of
-# a number.
+# Magnitude of T (pitch radii) below which T at a node counts as zero, because it may be a rounding
+# error. Keyed by bytes per number.
 _SLACK = {8: 1e-13, 4: 1e-6}
 # Number of extra nodes between the edge of a land and the next node. Their distances from the edge
 # double from one to the next.
@@ -315,12 +318,6 @@ class FlankPair(eqx.Module):
         offset = self.center_distance * jnp.sin(direction) - lever1 - mate.lever
         return offset, gap, normal1, lever1, mate.lever
 
-    def _offset(self, normal2, roll, relative):
-        """Return the tangential offset T (m) for the arguments of `_mesh`."""
-        mate = self.profile.mate(normal2, support=False)
-        reach = self.center_distance * jnp.sin(mate.facing + roll - relative / 2)
-        return reach - self.profile.lever(mate.facing + 2 * roll) - mate.lever
-
     def _search(self, roll, relative, attempt=0):
         """Return (number of attempts, closest approach) for a `roll` from `folded`.
 
@@ -357,8 +354,8 @@ class FlankPair(eqx.Module):
             bracket, guess, present, single = lax.cond(
                 direct, lambda: rolling, lambda: self._bracket(attempt, roll, relative)
             )
-            normal2, converged = self._root(bracket, guess, ~direct, roll, relative)
-            _, gap, normal1, lever1, lever2 = self._mesh(normal2, roll, relative)
+            found, converged = self._root(bracket, guess, ~direct, roll, relative)
+            gap, normal1, lever1, lever2, normal2 = found
             if self.frozen.wavy:  # A pair this deep belongs to the other flank of the lobe.
                 present &= gap > -_DEEPEST * self.profile.pitch_radius
             rank = jnp.maximum(attempt - 1.0, 0.0) if self.frozen.wavy else nothing
@@ -382,8 +379,8 @@ class FlankPair(eqx.Module):
         `roll`, `relative`: as in `_mesh`. For conjugate flanks, attempt 1 takes the last such
         interval and attempt 2 the first; on a wavy flank, attempt k takes the k-th. For other
         flanks, attempt 1 takes the interval with the least gap and attempt 2 that with the second
-        least gap. The result is ((low, high), first
-        guess, whether such an interval exists, whether there is at most one)."""
+        least gap. The result is ((low, high), first guess, whether such an interval exists, whether
+        there is at most one)."""
         profile, nodes = self.profile, self.nodes
         turned = _rotate(nodes.turned, 2 * profile.turn_ratio * roll)
         normal1 = nodes.facing + 2 * roll
@@ -421,24 +418,27 @@ class FlankPair(eqx.Module):
         return (low, high), low + (high - low) * share, present, single
 
     def _root(self, bracket, guess, guarded, roll, relative):
-        """Return (root ν2 (rad) of T, whether Newton's method from `guess` has converged to it).
+        """Return ((G, ν1, q1, q2, ν2) at a root of T, whether Newton's method from `guess` has
+        converged to it).
 
         `bracket`: (low, high) (rad); `roll`, `relative`: as in `_mesh`. `guarded`: whether T falls
         through zero in the bracket. The bracket then shrinks around the root, and is halved if
         Newton's step leaves it or is longer than half the previous step. Halving is needed because
-        T has a kink where ν1 crosses a segment's end.
+        T has a kink where ν1 crosses a segment's end. G, ν1 and the levers follow from values and
+        slopes before the last step; the error is of second order in this step.
         """
-        tolerance = _CONVERGED[guess.dtype.itemsize]
+        size = guess.dtype.itemsize
         limit = jnp.where(guarded, _GUARDED_STEPS, _NEWTON_STEPS)
 
         def go_on(carry):
-            count, _, step, _, _ = carry
-            return (count < limit) & (jnp.abs(step) >= tolerance)
+            count, step = carry[:2]
+            return (count < limit) & (jnp.abs(step) >= _FINISHED[size])
 
         def newton(carry):
-            count, normal2, before, _, (low, high) = carry
-            value, slope = jax.jvp(
-                lambda nu: self._offset(nu, roll, relative), (normal2,), (jnp.ones_like(normal2),)
+            count, before, _, (low, high), found = carry
+            normal2 = found[-1]
+            (value, *here), (slope, *turned) = jax.jvp(
+                lambda nu: self._mesh(nu, roll, relative), (normal2,), (jnp.ones_like(normal2),)
             )
             step = value / jnp.where(slope < 0, slope, -jnp.inf)
             left = guarded & (value >= 0)
@@ -448,12 +448,17 @@ class FlankPair(eqx.Module):
             halve = guarded & (slow | (new < low) | (new > high))
             new = jnp.where(halve, (low + high) / 2, jnp.clip(new, low, high))
             step = jnp.where(halve, (high - low) / 2, step)
-            return count + 1, new, step, slope, (low, high)
+            # The gap is stationary at the root: its mean slope is half of that before the step.
+            moves = (new - normal2) * jnp.array([0.5, 1, 1, 1], new.dtype)
+            after = [x + move * by for x, move, by in zip(here, moves, turned, strict=True)]
+            return count + 1, step, slope, (low, high), (*after, new)
 
-        start = 0, guess, jnp.full_like(guess, jnp.inf), jnp.zeros_like(guess), bracket
-        _, normal2, step, slope, (low, high) = lax.while_loop(go_on, newton, start)
-        inside = (normal2 > low) & (normal2 < high) & (slope < 0)
-        return normal2, inside & (jnp.abs(step) < tolerance)
+        nothing = jnp.zeros_like(guess)
+        found = *[nothing] * 4, guess
+        start = 0, jnp.full_like(guess, jnp.inf), nothing, bracket, found
+        _, step, slope, (low, high), found = lax.while_loop(go_on, newton, start)
+        inside = (found[-1] > low) & (found[-1] < high) & (slope < 0)
+        return found, inside & (jnp.abs(step) < _CONVERGED[size])
 
 
 def _search_one_by_one(pair: FlankPair, roll, relative):

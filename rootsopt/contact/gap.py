@@ -14,8 +14,8 @@ from rootsopt.errors import InputError
 class Edges(NamedTuple):
     """Distance of a pose from the roll coordinates at which a gap jumps.
 
-    `distance` (rad): continuous, with a kink at every jump of the gap, for example the sum of the
-    distances from all of them; `by_roll`: its derivative with respect to x."""
+    `distance` (rad): continuous function of x, with a kink at every jump of the gap, for example
+    the sum of the distances from all jumps; `by_roll`: its derivative with respect to x."""
 
     distance: Float[Array, ""]
     by_roll: Float[Array, ""]
@@ -35,11 +35,25 @@ class Approach(NamedTuple):
     edges: Edges | None = None
 
 
+class Slices(NamedTuple):
+    """Gauss points along the axis of twisted rotors.
+
+    `places` (n,): distance of each slice from the middle, as a share of the rotor's length.
+    `weights` (n,): share of the length that each slice stands for; their sum is 1. `offsets` (n,):
+    angle (rad) that is added to the angles of both rotors, each in its own sense of rotation.
+    `twist` (rad): over the whole length."""
+
+    places: Float[Array, " n"]
+    weights: Float[Array, " n"]
+    offsets: Float[Array, " n"]
+    twist: Float[Array, ""]
+
+
 class Contact(eqx.Module):
     """Gap and levers of the drive flanks of two rotors.
 
-    A pose is the roll coordinate x = -(φ1 + φ2)/2 and the relative rotation ε = φ2 - φ1 (rad), with
-    the rotations φ1 and φ2 of the rotors. A contact returns the gap and its levers. The gap and the
+    φ1 and φ2 (rad) are the rotations of the rotors. A pose is the roll coordinate x = -(φ1 + φ2)/2
+    and the relative rotation ε = φ2 - φ1. A contact returns the gap and its levers. The gap and the
     levers satisfy d gap = -lever1 dφ1 + lever2 dφ2, so that forces come from a potential. The gap's
     period in x is 2π/N. The coast flanks follow by x → -x, ε → -ε.
 
@@ -76,6 +90,12 @@ class Contact(eqx.Module):
 
         Such flanks can touch if the axes are displaced or the flanks are not conjugate."""
         return False
+
+    @property
+    def slices(self) -> Slices | None:
+        """Slices of twisted rotors, for each of which the pair evaluates the contact; `None`: the
+        rotors are straight."""
+        return None
 
     @property
     def length_scale(self) -> Float[Array, ""] | None:

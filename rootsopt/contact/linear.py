@@ -1,7 +1,7 @@
 """Contact to first order in the relative rotation, in closed form: the cheapest fidelity.
 
-In perfect rolling (ε = 0) the pair touches at roll angle β = x, where the common normal
-has the moment arm r cos ψ(x) about both axes. To first order in ε the gap is therefore
+In perfect rolling (ε = 0) the pair touches at roll angle β = x. There the common normal has the
+moment arm r cos ψ(x) about both axes. To first order in ε the gap is therefore
 
     G = r cos ψ(x) · ε,
 
@@ -69,12 +69,12 @@ class LinearContact(Contact):
         by_roll = mirror * slope * relative
         zero = jnp.zeros_like(lever)
         # The gap may jump at the ends of segments and, slightly, at the pitch crossing. Where the
-        # roll angle turns back, a flank's own end is passed over together with the next one.
+        # roll angle turns back, the contact skips an end together with the next one.
         ends = jnp.stack([end for one in profile.segments() for end in (one.start, one.stop)])
         places = profile.roll_angle(ends).at[-1].set(profile.half_pitch)
         places = lax.cummin(places, reverse=True)
-        # The sides follow from the normal angle, as gap and levers do: roll angles of the ends have
-        # another rounding error.
+        # Compare normal angles, from which gap and levers follow as well: the roll angles of the
+        # ends have a different rounding error.
         sides = jnp.where(normal > ends, 1, -1).at[-1].set(-1).astype(folded.dtype)
         return Approach(
             gap=jnp.where(touching, lever * relative, lax.stop_gradient(profile.pitch_radius)),
@@ -91,8 +91,9 @@ class LinearContact(Contact):
 
 
 def _folded(profile: Profile, roll: Float[Array, ""]):
-    """Return (x (rad) in the half of the mesh before the pitch crossing, whether the rotors are
-    exchanged), from any x = `roll` (rad)."""
+    """Return (x (rad) before the pitch crossing, whether the rotors are exchanged).
+
+    `roll`: any x (rad). Symmetry maps it to the half of the mesh before the pitch crossing."""
     half = profile.half_pitch
     centered = roll - half
     centered = centered - 4 * half * jnp.round(centered / (4 * half))

@@ -2,8 +2,8 @@
 
 Each flank is a polyline from tip to root. The gap is the least (p - q) · n over the nodes p of one
 flank and the segments (q, n) of the other that face them. The paper tests the nodes of rotor 2
-only. Here, the nodes of each flank are tested against the segments of the other, so that the result
-does not change when the rotors are exchanged.
+only. Here, the nodes of each flank are tested against the segments of the other. The result
+therefore does not change when the rotors are exchanged.
 
 A segment faces the nodes between the bisectors at its two ends. On a bisector, the distances to
 both segments agree, so the gap is continuous over the pose. Its derivatives with respect to the
@@ -11,11 +11,11 @@ rotations are the levers of the contact force, so elastic forces come from a pot
 jump from segment to segment: their error is of first order in the node spacing, that of the gap of
 second order.
 
-Let N be the number of lobes, x the roll coordinate and ε the relative rotation (see `Contact`), E
-the vector between the axes, and R(a) the rotation by a. The angle a is x + ε/2 for rotor 1 and
+Let N be the number of lobes, x the roll coordinate and ε the relative rotation (see `Contact`). Let
+E be the vector between the axes, and R(a) the rotation by a. The angle a is x + ε/2 for rotor 1 and
 π/N - x + ε/2 for rotor 2. Let z be a point of a flank in the frame of its own rotor, with a tip on
-+x. In the frame of the other rotor, it lies at R(a) (E - R(-a′) z), with the angle a of the other
-rotor and a′ of its own. Exchanging the rotors only exchanges a and a′.
++x. In the frame of the other rotor, it lies at R(a) (E - R(-a′) z). Here, a is the angle of the
+other rotor and a′ that of its own. Exchanging the rotors only exchanges a and a′.
 """
 
 import equinox as eqx
@@ -160,8 +160,8 @@ def _facing(
     `nodes`, `tangent`, `normal`: as in `NodeContact`, for one rotor. Where no segment faces a
     point, the distance is inf. The segment is found by bisection over the nodes. Bisection works
     because a point near the flank is ahead of all bisectors on the tip's side of its segment, and
-    behind all others. The reason is that the chord between any two nodes of a flank stays within a
-    right angle of the tangents at both.
+    behind all others. This holds if the chord between any two nodes of a flank makes an angle below
+    90° with the tangents at both.
     """
     x, y = points[:, 0], points[:, 1]
     offset = jnp.sum(nodes * tangent, axis=1)

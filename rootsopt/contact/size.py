@@ -21,10 +21,10 @@ from rootsopt.runtime.programs import Program
 ROLLS = (96, 128, 192, 256, 384, 512, 768, 1024, 1536)
 RELATIVES = (16, 24, 32, 48)
 _FINE = 3073, 193
-"""Number of points on each fine line along the roll, and on each fine line along ε."""
+"""Number of poses on each line over the roll, and on each line over ε, in `_probe`."""
 _LINES = 5, 33
-"""Number of fine lines along the roll, at geometrically spaced ε, and along ε, at evenly spaced
-rolls."""
+"""Number of lines over the roll, each at half the ε of the line before; number of lines over ε, at
+evenly spaced rolls."""
 
 
 class MapSize(NamedTuple):
@@ -58,9 +58,9 @@ def size_map(profile: Profile, deepest: float, error: float) -> MapSize:
 
 @Program
 def _probe(profile, deepest):
-    """Return (points, gap (lines, points)) on fine lines along the roll, and the same along ε.
+    """Return (rolls, gap (lines, rolls)) on lines of poses over the roll, and the same over ε.
 
-    The points are rolls or ε (rad); the gap is in m."""
+    Rolls and ε are in rad; the gap is in m."""
     pair = FlankPair.of(profile)
     half = profile.half_pitch
     first = first_roll(deepest, half)

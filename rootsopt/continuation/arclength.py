@@ -22,7 +22,7 @@ _TOLERANCE = 2e-11
 """Residual (greatest entry) above which Newton's method continues."""
 _NEAR = 1e-6
 """Newton step (greatest entry) below which each evaluation of the equations repeats the computation
-of the previous one, with the same solver steps (`Look.memory`)."""
+of the previous one, with the same solver steps (`Linearization.memory`)."""
 _FARTHEST = 0.05
 """Newton step (greatest entry) above which the step is shortened to this size."""
 _PATIENCE = 4
@@ -77,7 +77,7 @@ class StoppedError(Exception):
         self.end = end
 
 
-class Look(NamedTuple):
+class Linearization(NamedTuple):
     """One evaluation of the equations and their Jacobian.
 
     `residual` (n,) and `jacobian` (n, n + 1) of the equations; `memory`: pass this to the
@@ -92,11 +92,11 @@ class Look(NamedTuple):
     data: Any = None
 
 
-SolutionCurve = Callable[[NDArray[np.float64], Any, bool], Look]
+SolutionCurve = Callable[[NDArray[np.float64], Any, bool], Linearization]
 """Type of the function that evaluates the equations of a curve. Arguments: the unknowns (n + 1,);
-`Look.memory` of an earlier evaluation whose solver steps are repeated, or None for new steps; and
-whether the steps are to be refined, because Newton's method converges slowly. It returns a `Look`,
-or raises `StoppedError` if there is no result."""
+`Linearization.memory` of an earlier evaluation whose solver steps are repeated, or None for new
+steps; and whether the steps are to be refined, because Newton's method converges slowly. It returns
+a `Linearization`, or raises `StoppedError` if there is no result."""
 
 
 class Spot(NamedTuple):
@@ -108,7 +108,7 @@ class Spot(NamedTuple):
 
     place: NDArray[np.float64]
     tangent: NDArray[np.float64]
-    look: Look
+    look: Linearization
     looks: int
 
 
@@ -189,7 +189,7 @@ def corrected(
         if grown > 2:
             break
         last = size
-        if memory is not None and size > _NEAR:  # The repeated steps have missed something.
+        if memory is not None and size > _NEAR:  # The repeated steps have skipped a contact.
             memory, careful = None, True
         elif memory is None and size <= _NEAR:
             memory = look.memory
@@ -249,8 +249,9 @@ def follow_curve(
 
 
 def _leaves(spot: Spot, steps: StepSizes) -> bool:
-    """Return whether `spot` is at an end of the parameter's range, with a tangent pointing
-    outwards.
+    """Return whether the curve leaves the parameter's range at `spot`.
+
+    It does if `spot` is at an end of the range and its tangent points outwards.
     """
     value, way = float(spot.place[-1]), float(spot.tangent[-1])
     return (value <= steps.low and way < 0) or (value >= steps.high and way > 0)

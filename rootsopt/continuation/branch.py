@@ -27,7 +27,7 @@ from rootsopt.continuation.orbits import (
     LONGEST,
     PLACES,
     BranchPoint,
-    Orbits,
+    OrbitFamily,
     parameters,
     place_of,
     value_of,
@@ -95,7 +95,7 @@ class Branch:
 
         Each orbit is closed again at exactly this value, and left out if that fails. The branch's
         last point is returned as it is. The list is empty if the branch does not pass the value."""
-        orbits = Orbits(self.config, self.parameter, self.period, self.limits)
+        orbits = OrbitFamily(self.config, self.parameter, self.period, self.limits)
         found = []
         for old, new in zip(self.points[:-1], self.points[1:], strict=True):
             ends = sorted((old.value, new.value))
@@ -144,7 +144,7 @@ def follow(
         )
     for bound in (limits.low, limits.high):
         with_value(config, parameter, bound)
-    orbits = Orbits(config, parameter, period, limits)
+    orbits = OrbitFamily(config, parameter, period, limits)
     place = orbits.place(state, value)
     fixed = np.eye(len(place))[-1]
     try:
@@ -183,8 +183,8 @@ def follow_doubled(
     if 2 * branch.period > LONGEST:
         return None
     limits = limits or branch.limits
-    simple = Orbits(branch.config, branch.parameter, branch.period, limits)
-    orbits = Orbits(branch.config, branch.parameter, 2 * branch.period, limits)
+    simple = OrbitFamily(branch.config, branch.parameter, branch.period, limits)
+    orbits = OrbitFamily(branch.config, branch.parameter, 2 * branch.period, limits)
     place = simple.place(bifurcation.point.state, bifurcation.value)
     fixed = np.eye(len(place))[-1]
     try:
@@ -207,7 +207,7 @@ def follow_doubled(
     return None
 
 
-def _branch(orbits: Orbits, path: Path) -> Branch:
+def _branch(orbits: OrbitFamily, path: Path) -> Branch:
     """Return the branch that consists of the points of `path`, with its bifurcations."""
     end = path.end
     if end is End.STEP_TOO_SMALL and orbits.period % 2 == 0:

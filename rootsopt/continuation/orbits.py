@@ -19,7 +19,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config, parse
 from rootsopt.config.units import MM, RPM
-from rootsopt.continuation.arclength import End, Look, Spot, StepSizes, StoppedError, corrected
+from rootsopt.continuation.arclength import (
+    End,
+    Linearization,
+    Spot,
+    StepSizes,
+    StoppedError,
+    corrected,
+)
 from rootsopt.dynamics.flow import Flow, flow
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
@@ -48,10 +55,10 @@ PLACES = {
 can also be followed along design parameters, whose keys are in the section `profile`."""
 _GEAR = ("backlash_mm", "damping_ratio")
 SPAN = 20.0
-"""Change of the scaled state that counts as much as the whole range of the parameter when step
-lengths are measured."""
+"""Change of the scaled state that has the same length as the whole range of the parameter, when
+step lengths are measured."""
 _LOOKS = 504
-"""Number of uniform times on an orbit at which it is checked whether flanks or gear touch."""
+"""Number of uniform instants on an orbit at which contact of flanks and gear is checked."""
 LONGEST = 8
 """Longest orbit that can be followed (mesh periods)."""
 _STEP = 1 / 256
@@ -104,8 +111,9 @@ def parameters(config: Config) -> tuple[str, ...]:
 
 
 def value_of(config: Config, parameter: str) -> float:
-    """Return the value of a parameter, in the config's unit. Raises `InputError` for an unknown
-    parameter."""
+    """Return the value of a parameter, in the config's unit.
+
+    Raises `InputError` for an unknown parameter."""
     _check(config, parameter)
     keys = design_keys(config)
     if parameter in keys:
@@ -168,7 +176,7 @@ class _Shot(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """Data of an orbit in `Look.data`, in addition to residual and Jacobian.
+    """Data of an orbit in `Linearization.data`, in addition to residual and Jacobian.
 
     `statistics`: mean, peak and RMS force (N); `half_way`: distance (unit of `StepSizes`) between
     the states at the start and the middle of the orbit. For the other fields, see `BranchPoint`.
@@ -184,7 +192,7 @@ class _Seen(NamedTuple):
     gap_time: float
 
 
-class Orbits:
+class OrbitFamily:
     """Equations for orbits of k mesh periods, as a `SolutionCurve`.
 
     The unknowns (n + 1,), called a *place*, are the scaled state divided by `SPAN`, then the
@@ -240,7 +248,7 @@ class Orbits:
         fixed = np.eye(len(guess))[-1]
         return self.point(corrected(self, guess, fixed, fixed))
 
-    def __call__(self, place: NDArray[np.float64], memory: Any, careful: bool) -> Look:
+    def __call__(self, place: NDArray[np.float64], memory: Any, careful: bool) -> Linearization:
         self._check_design(self.value(place))
         shot = self._shot(place, memory, refine=memory is None)
         if careful and memory is None:
@@ -276,7 +284,7 @@ class Orbits:
         if self.period % 2 == 0 and seen.half_way < _SAME and seen.residual < RESIDUAL["float64"]:
             raise StoppedError(End.HALVED)
         jacobian = np.column_stack([monodromy - np.eye(count), by_share])
-        return Look(miss / SPAN, jacobian, shot.grid, seen)
+        return Linearization(miss / SPAN, jacobian, shot.grid, seen)
 
     def _shot(self, place: NDArray[np.float64], grid: Any, refine: bool) -> "_Shot":
         return jax.device_get(
@@ -376,8 +384,7 @@ def _shoot(  # Eleven parameters, since a compiled program takes its arrays one 
     repeat: Bool[Array, ""],
     refine: Bool[Array, ""],
 ) -> _Shot:
-    """Integrate `period` mesh periods from the scaled `state` (n,), with ε in the fixed `unit`
-    (rad).
+    """Integrate `period` mesh periods from the scaled `state` (n,); `unit`: fixed unit of ε (rad).
 
     `names`, `values` (p,): names of the parameters, as from `parameters`, and their values
     (config's units), which replace those of `scene`. Derivatives are with respect to the state, and

@@ -5,7 +5,7 @@ from rootsopt.config.families import Parameter, family_of
 from rootsopt.errors import InputError
 
 _ROOM = 0.1
-"""Room (fraction of the width of the bounds) beyond a design for which bounds are widened."""
+"""Distance beyond a design (fraction of the width of the bounds) to which bounds are widened."""
 
 
 def bounds_of(config: Config) -> list[tuple[float, float]]:

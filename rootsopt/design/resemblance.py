@@ -4,9 +4,9 @@ A *member* of a family is a profile with some values of the family's parameters.
 *classical* if its profiles are made from single numbers, not from a list or a file.
 
 The distance is that of the closed outlines (Hausdorff): the greatest distance of a point of either
-outline from the other outline. A search minimises it by linear programs. By the envelope theorem,
-the derivative of a distance from a point to its nearest point needs no derivative of the latter's
-place.
+outline from the other outline. A search minimises it by linear programs. Let d be the distance from
+a point to the nearest point of an outline. By the envelope theorem, the derivative of d does not
+depend on how the nearest point moves along the outline.
 """
 
 import functools
@@ -34,7 +34,8 @@ from rootsopt.scene.families import check, classical, profile_of
 COEFFICIENTS = 12
 """Number of coefficients of a free form that is fitted to a profile."""
 _NODES = 128
-"""Number of nodes on each side of the pitch circle at which a search compares two flanks."""
+"""Number of nodes per flank, on each side of the pitch circle, at which a search compares two
+outlines."""
 _SAMPLE = 128
 """Number of sampled members of a family. The searches start from the best of them."""
 _STARTS = 3
@@ -45,8 +46,8 @@ below which the search ends. Steps are fractions of the parameters' usual ranges
 _GAIN = 1e-7
 """Relative decrease of the distance in one step below which a search ends."""
 _UNSOUND_WEIGHT = 10.0
-"""Factor of the penalty for a negative margin. The penalty is this factor times the margin's
-magnitude (relative to its scale), and is added to the distance (pitch radii)."""
+"""Weight of a negative margin in the function that a search minimises. The weight times the
+margin's magnitude (relative to its scale) is added to the distance (pitch radii)."""
 _UNSOUND = 1e-6
 """Magnitude of a negative margin (relative to its scale) above which a member counts as unsound."""
 
@@ -75,7 +76,7 @@ class Likeness(NamedTuple):
     def config(self, profile: ProfileConfig) -> ProfileConfig:
         """Return the config of the member, with lobes and pitch radius of `profile`.
 
-        Raises `InputError` or `ValueError` if the member is no valid design."""
+        Raises `InputError` or `ValueError` if the member is not a valid design."""
         family, values = family_of(self.family), list(self.design.values())
         parts = zip(family.parameters, family.split(values), strict=True)
         named = {one.key: v if one.count is None else tuple(v) for one, v in parts}
@@ -139,7 +140,9 @@ def free_likeness(profile: Profile, *near: Likeness) -> Likeness | None:
 
 
 def _best(look: "_Look", profile: Profile, designs) -> Likeness | None:
-    """Return the nearest of several members with the given `designs`, `None` if none is sound."""
+    """Return the nearest sound member among those with the given `designs`.
+
+    Return `None` if all of them are unsound."""
     keys = family_of(look.family).keys
     size = {"lobes": profile.lobes, "pitch_radius_mm": float(profile.pitch_radius) / MM}
     blank = ProfileConfig.model_construct(**size)

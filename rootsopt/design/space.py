@@ -20,8 +20,8 @@ from rootsopt.config import Config
 from rootsopt.config.families import Family, family_of
 from rootsopt.config.units import DEG, MM
 from rootsopt.design.bounds import bounds_of
-from rootsopt.profiles import Geometry, geometry
-from rootsopt.profiles.validity import Margins, margins
+from rootsopt.profiles import Geometry, Profile, geometry
+from rootsopt.profiles.validity import ProfileMargins, margins
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 
@@ -43,9 +43,10 @@ columns are name, margin, unit, limit, scale and factor (see `Constraint`)."""
 class Constraint(eqx.Module):
     """A constraint: value ≥ limit, or value ≤ limit for a `ceiling`.
 
-    `name`: name in reports; `quantity`: name of the limited field of `Geometry`, or of `Margins` if
-    `margin` is true; `limit`: limit in SI units; `scale`: divisor (SI) that brings the slack to the
-    order of one; `unit`: unit in reports; `factor`: SI value of one such unit.
+    `name`: name in reports; `quantity`: name of the limited field of `Geometry`, or of
+    `ProfileMargins` if `margin` is true; `limit`: limit in SI units; `scale`: divisor (SI) that
+    brings the slack to the order of one; `unit`: unit in reports; `factor`: SI value of one
+    such unit.
     """
 
     name: str = eqx.field(static=True)
@@ -62,13 +63,23 @@ class Constraint(eqx.Module):
         """+1 if `limit` is a least value, -1 if it is a greatest value."""
         return -1.0 if self.ceiling else 1.0
 
-    def slack(self, shape: Geometry, found: Margins | None = None) -> Float[Array, ""]:
+    def slack(self, shape: Geometry, found: ProfileMargins | None = None) -> Float[Array, ""]:
         """Return the distance from the limit, divided by `scale`; ≥ 0 if the constraint holds.
 
         `shape`, `found`: geometry and margins of the design. `found` is needed only if `margin` is
         true."""
-        value = getattr(found if self.margin else shape, self.quantity)
+        return self.scaled(getattr(found if self.margin else shape, self.quantity))
+
+    def scaled(self, value: Float[Array, ""] | float) -> Float[Array, ""]:
+        """Return the slack of a `value` of the limited quantity."""
         return self.sign * (value - self.limit) / self.scale
+
+    def slack_of(
+        self, scene: Scene, profile: Profile, shape: Geometry, found: ProfileMargins | None
+    ) -> Float[Array, ""]:
+        """Return the slack of a design in a `scene`, given its `profile`; see `slack`."""
+        del scene, profile
+        return self.slack(shape, found)
 
 
 class Space(eqx.Module):
@@ -84,12 +95,19 @@ class Space(eqx.Module):
     constraints: tuple[Constraint, ...]
 
     @classmethod
-    def of(cls, config: Config, scene: Scene, area_efficiency: float) -> "Space":
+    def of(
+        cls,
+        config: Config,
+        scene: Scene,
+        area_efficiency: float,
+        further: tuple[Constraint, ...] = (),
+    ) -> "Space":
         """Return the design space of a config.
 
         `scene`: scene of the config; `area_efficiency`: area efficiency of the baseline design,
-        used if the config's limit is `baseline`. Raises `InputError` if the config's bounds are
-        impossible."""
+        used if the config's limit is `baseline`; `further`: constraints in addition to those of
+        the family and of the fixed keys of `constraints`. Raises `InputError` if the config's
+        bounds are impossible."""
         limits, family = config.constraints, family_of(config.profile.family)
         rows = bounds_of(config)
         floor = limits.area_efficiency_min
@@ -116,7 +134,7 @@ class Space(eqx.Module):
             rows_of = [row for row in _SOUND if row[1] not in family.inherent]
             constraints += tuple(_constraint(*row, margin=True) for row in rows_of)
         lower, upper = np.array(rows, dtype=float).T
-        return cls(scene, jnp.asarray(lower), jnp.asarray(upper), constraints)
+        return cls(scene, jnp.asarray(lower), jnp.asarray(upper), constraints + further)
 
     @property
     def family(self) -> Family:
@@ -173,7 +191,8 @@ class Space(eqx.Module):
         profile = self.scene.profile(design)
         shape = geometry(profile)
         found = margins(profile) if any(c.margin for c in self.constraints) else None
-        return jnp.stack([c.slack(shape, found) for c in self.constraints])
+        every = (c.slack_of(self.scene, profile, shape, found) for c in self.constraints)
+        return jnp.stack([*every])
 
     def prepare(self) -> None:
         """Start compiling, in the background, the program that a search in this space needs."""

@@ -1,4 +1,4 @@
-"""Integration of a rotor pair over whole mesh periods with diffrax."""
+"""Integration of a rotor pair over whole mesh periods."""
 
 import functools
 from typing import Any, NamedTuple
@@ -12,9 +12,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.integrator import Integrator, StepGrid
 from rootsopt.dynamics.measures import Measures
-from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.pair import FlankForce, RotorPair
 from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, Steps, locate_peak, one_sided
 from rootsopt.dynamics.saltation import MARKS, marks, saltation
+from rootsopt.dynamics.stepping import integrated
 from rootsopt.dynamics.tangent import Linear, linearized, one_step, propagated
 
 _SHORTEST = 1e-9
@@ -109,31 +110,13 @@ def strobe(
     A step ends exactly at the end of each mesh period. Interpolated states would have an error far
     above the tolerance, which could hide that the motion repeats.
     """
-    number = state.dtype.type
     control = integrator.controller(state.dtype, pair=pair)
+    solver = integrator.solver(state.dtype)
+    term = diffrax.ODETerm(lambda tau, y, pair: pair.derivative(tau, y)[0])
 
     def one_period(state, _):
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda tau, y, pair: pair.derivative(tau, y)[0]),
-            integrator.solver(state.dtype),
-            t0=number(0.0),
-            t1=number(1.0),
-            dt0=None,
-            y0=state,
-            args=pair,
-            saveat=diffrax.SaveAt(t1=True),
-            stepsize_controller=control,
-            adjoint=diffrax.ForwardMode(),
-            max_steps=integrator.max_steps,
-            throw=False,
-        )
-        assert solution.ys is not None
-        end = solution.ys[0]
-        return end, (
-            end,
-            solution.stats["num_steps"],
-            solution.result == diffrax.RESULTS.successful,
-        )
+        out = integrated(term, solver, control, state, pair, integrator.max_steps, recorded=False)
+        return out.end, (out.end, out.steps, out.solved)
 
     _, (states, steps, solved) = lax.scan(one_period, state, length=periods)
     return Strobe(states, jnp.sum(steps), jnp.all(solved))
@@ -158,6 +141,17 @@ class Equation(eqx.Module):
     states: int = eqx.field(static=True)
     solver: diffrax.AbstractSolver
 
+    def pair(self, dynamic) -> RotorPair:
+        """Return the pair whose floating-point arrays are `dynamic`."""
+        return eqx.combine(dynamic, self.static)
+
+    def rates(self, tau, state, contact: FlankForce, dynamic) -> Float[Array, " q"]:
+        """Return the integrands at the time `tau` (mesh periods), per mesh period.
+
+        `state`: scaled; `contact`: the flanks there."""
+        del state, dynamic
+        return self.measures.rates(tau, contact.total / self.force_unit, self.top)
+
     def start(self, state: Float[Array, " n"], free: bool) -> Float[Array, " m"]:
         """Return y at the start: the scaled `state`, then zeros for the integrals and, if `free`,
         the time."""
@@ -166,9 +160,9 @@ class Equation(eqx.Module):
     def derivative(self, tau, y, dynamic, marked: bool = False) -> Float[Array, " m"]:
         """Return dy/dτ at the time `tau` (mesh periods), followed by the `marks` of the contact if
         `marked`."""
-        pair = eqx.combine(dynamic, self.static)
+        pair = self.pair(dynamic)
         slope, contact = pair.derivative(tau, y[: self.states])
-        rates = self.measures.rates(tau, contact.total / self.force_unit, self.top)
+        rates = self.rates(tau, y[: self.states], contact, dynamic)
         if pair.free:
             # Averages are over time, which is not proportional to rotation here.
             rates = pair.lapse(y[: self.states]) * jnp.append(rates, jnp.ones_like(self.force_unit))
@@ -179,7 +173,7 @@ class Equation(eqx.Module):
 
         The derivative is followed by the `marks` if the contact may jump. The derivatives of y with
         respect to state and parameters account for the moving instants of jumps."""
-        pair = eqx.combine(dynamic, self.static)
+        pair = self.pair(dynamic)
         term = diffrax.ODETerm(functools.partial(self.derivative, marked=pair.jumps))
         if not pair.jumps:
             after, slopes = one_step(self.solver, term, begin, end, y, dynamic)
@@ -191,10 +185,12 @@ class Equation(eqx.Module):
         return after[:-MARKS] + moved, slopes[-1]
 
     def with_force(self, begin, end, y, dynamic) -> Float[Array, " rows"]:
-        """Return y after one step from `begin` to `end` (mesh periods), then the first of the
-        `marks` if the contact may jump, then the contact force (`force_unit`)."""
+        """Return y after one step from `begin` to `end` (mesh periods), and the contact force.
+
+        If the contact may jump, the first of the `marks` stands between them. The force is in
+        `force_unit`."""
         after, slope = self.advanced(begin, end, y, dynamic)
-        pair = eqx.combine(dynamic, self.static)
+        pair = self.pair(dynamic)
         force = slope[self.states]
         last = y.shape[0]
         force = force / slope[last - 1] if pair.free else force
@@ -282,11 +278,14 @@ def flow(  # Eleven parameters: adaptive steps, repeated steps and reverse mode 
         ends=ends,
         repeat=jnp.asarray(False if grid is None else repeat),
     )
-    # The solver's adjoint ignores jumps. Where the contact may jump, differentiate the steps.
+    how = periods, control, integrator.max_steps, samples
+    # An adjoint of diffrax ignores jumps. Where the contact may jump, differentiate the steps.
     retraced = pair.jumps and adjoint is not None
-    mode = diffrax.ForwardMode() if adjoint is None or retraced else adjoint
-    given = lax.stop_gradient((dynamic, start)) if retraced else (dynamic, start)
-    taken = _solved(equation, *given, periods, control, integrator.max_steps, samples, mode)
+    if adjoint is None or retraced:
+        given = lax.stop_gradient((dynamic, start)) if retraced else (dynamic, start)
+        taken = _solved(equation, *given, *how)
+    else:
+        taken = _solved_by_diffrax(equation, dynamic, start, *how, adjoint)
     if retraced:
         taken = _retraced(equation, taken, start, dynamic)
     # The step that contains the peak is repeated up to the peak. Short steps from there give the
@@ -349,17 +348,51 @@ def _solved(
     control: StepGrid,
     max_steps: int,
     samples: int,
-    adjoint: diffrax.AbstractAdjoint,
 ) -> _Recorded:
     """Integrate from y = `start` over `periods` mesh periods, and return all accepted steps."""
-    dtype, count = start.dtype, equation.states
+    dtype, solver = start.dtype, equation.solver
+    out = integrated(
+        _over_unit(equation, periods), solver, control, start, dynamic, max_steps, recorded=True
+    )
+    assert out.records is not None
+    ends, after, dense = out.records
+    last = jnp.maximum(out.accepted - 1, 0)
+    begins = jnp.concatenate([jnp.zeros_like(ends[:1]), ends[:-1]])
 
-    def whole(share, y, dynamic):
-        return periods * equation.derivative(share * periods, y, dynamic)
+    def sample(share):
+        k = jnp.minimum(jnp.searchsorted(ends, share), last)
+        within = jax.tree.map(lambda x: x[k], dense)
+        return solver.interpolation_cls(t0=begins[k], t1=ends[k], **within).evaluate(share)
 
-    # Over the unit interval, since limits known at tracing give a smaller program.
+    states = jax.vmap(sample)((jnp.arange(samples) / samples).astype(dtype))
+    states, grid, strain = lax.stop_gradient((states, ends * periods, out.control[-1]))
+    return _Recorded(
+        grid=grid,
+        before=jnp.concatenate([start[None], after[:-1]]),
+        after=after,
+        end=out.end,
+        last=last,
+        states=states[:, : equation.states],
+        strain=strain,
+        steps=out.steps,
+        solved=out.solved,
+    )
+
+
+def _solved_by_diffrax(
+    equation: Equation,
+    dynamic: Any,
+    start: Float[Array, " m"],
+    periods: Float[Array, ""],
+    control: StepGrid,
+    max_steps: int,
+    samples: int,
+    adjoint: diffrax.AbstractAdjoint,
+) -> _Recorded:
+    """Return the same as `_solved`, differentiable in reverse mode by the diffrax `adjoint`."""
+    dtype = start.dtype
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(whole),
+        _over_unit(equation, periods),
         equation.solver,
         t0=dtype.type(0.0),
         t1=dtype.type(1.0),
@@ -382,8 +415,8 @@ def _solved(
     assert solution.ys is not None
     assert solution.controller_state is not None
     (ends, after), (end,) = solution.ys
-    states = jax.vmap(solution.evaluate)((jnp.arange(samples) / samples).astype(dtype))[:, :count]
-    states, grid = lax.stop_gradient((states, ends * periods))
+    states = jax.vmap(solution.evaluate)((jnp.arange(samples) / samples).astype(dtype))
+    states, grid = lax.stop_gradient((states[:, : equation.states], ends * periods))
     return _Recorded(
         grid=grid,
         before=jnp.concatenate([start[None], after[:-1]]),
@@ -395,6 +428,15 @@ def _solved(
         steps=solution.stats["num_steps"],
         solved=solution.result == diffrax.RESULTS.successful,
     )
+
+
+def _over_unit(equation: Equation, periods: Float[Array, ""]) -> diffrax.ODETerm:
+    """Return the equation with time in units of `periods` mesh periods, so that it ends at 1."""
+
+    def whole(share, y, dynamic):
+        return periods * equation.derivative(share * periods, y, dynamic)
+
+    return diffrax.ODETerm(whole)
 
 
 def _retraced(
@@ -436,8 +478,7 @@ def _peak_force(
 def _linearized(
     equation: Equation, taken: _Recorded, peak: _Peak, dynamic: Any, moved: Any
 ) -> tuple[Float[Array, "m columns"], Float[Array, ""], Float[Array, " columns"]]:
-    """Return three results: the derivatives of y at the end, the peak force, and the derivatives of
-    the peak force.
+    """Return the derivatives of y at the end, the peak force, and its derivatives.
 
     Forces are in `force_unit`. The columns of derivatives are the n entries of the initial state,
     then the directions `moved` of the parameters.

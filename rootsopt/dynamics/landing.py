@@ -121,11 +121,10 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         return jnp.any(passed), jnp.max(jnp.where(passed, ago, 0.0))
 
     def _ahead(self, before, after, step):
-        """Return the maximum length (mesh periods) of the next step. Such a step ends where ε next
-        reaches an edge.
+        """Return the maximum length (mesh periods) of the next step.
 
-        `before`, `after`: scaled ε and dε/dτ at both ends of the last step; `step`: its length
-        (mesh periods)."""
+        A step of this length ends where ε next reaches an edge. `before`, `after`: scaled ε and
+        dε/dτ at both ends of the last step; `step`: its length (mesh periods)."""
         place, rate = after
         bend = (rate - before[1]) / step
         away = place - self.edges

@@ -42,8 +42,7 @@ _CLOSER, _ROUNDS = 16, 10
 _CHUNK = 32
 """Number of steps linearised together, as arrays."""
 _DIP = 1e-6
-"""Fall of the force between two maxima, relative to the lower one, below which they count as
-one."""
+"""Fall of the force between two maxima (fraction of the lower one) below which they are one."""
 _LEAST = 1e-3
 """Fraction of the greatest force below which a maximum is left out."""
 _SHOULDER = 0.02
@@ -104,10 +103,9 @@ def _steps(orbit: Orbit) -> Steps:
 def _located(
     pair: RotorPair, orbit: Orbit, steps: Steps, length: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return times (mesh periods) and forces (N) of the local maxima in order of time, then of the
-    shoulders.
+    """Return the times (mesh periods) and forces (N) of local maxima, then of shoulders.
 
-    `length` of the orbit (mesh periods)."""
+    The maxima are in order of time. `length` of the orbit (mesh periods)."""
     states = np.asarray(orbit.flow.states)
     width = length / states.shape[0]
     ends = np.asarray(steps.ends)[: int(steps.count)]
@@ -145,9 +143,9 @@ def candidates(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the indices (k,) of local maxima among samples, and the intervals (2, k) around them.
 
-    `places`, `forces` (m,): times and forces over one cycle. The last sample repeats the first. At
-    most `MOST` maxima are returned, in order of time. If this repeated sample is a maximum, it
-    counts once, on the side of its higher neighbour."""
+    `places`, `forces` (m,): times and forces over one cycle, in which the last sample repeats the
+    first. If this repeated sample is a maximum, it counts once, on the side of its higher
+    neighbour. At most `MOST` maxima are returned, in order of time."""
     last = len(places) - 1
     before, after = np.roll(forces, 1), np.roll(forces, -1)
     before[0], after[-1] = forces[-2], forces[1]
@@ -167,11 +165,11 @@ def candidates(
 
 
 def shoulders(forces: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the indices (k,) of shoulders among uniform samples (m,) of one cycle, greatest force
-    first.
+    """Return the indices (k,) of shoulders among uniform samples (m,) of one cycle.
 
     A shoulder is a sample at which the slope of the force comes closest to 0, without a change of
-    sign. Only shoulders close to the greatest force count (`_SHOULDER`)."""
+    sign. Only shoulders close to the greatest force count (`_SHOULDER`). The shoulder with the
+    greatest force comes first."""
     slope = np.roll(forces, -1) - np.roll(forces, 1)
     before, after, steep = np.roll(slope, 1), np.roll(slope, -1), np.abs(slope)
     same = (np.sign(before) == np.sign(slope)) & (np.sign(after) == np.sign(slope))
@@ -182,9 +180,9 @@ def shoulders(forces: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _dip(forces: NDArray[np.float64], one: int, other: int) -> float:
-    """Return the least force on the way between samples `one` and `other` of a cycle.
+    """Return the least force between the samples `one` and `other` of a cycle.
 
-    The direction around the cycle is that in which this least force is greater."""
+    There are two ways around the cycle. The one with the greater least force counts."""
     low, high = sorted((one, other))
     inner, outer = forces[low : high + 1], np.concatenate([forces[high:], forces[: low + 1]])
     return float(max(inner.min(), outer.min()))

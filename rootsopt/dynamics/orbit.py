@@ -33,14 +33,14 @@ sample falls on the end of each mesh period."""
 _NEWTON_STEPS = 24
 """Default maximum number of integrations to close one orbit."""
 _CLOSED = 4000, 1e-3, 1e-10
-"""Limits of the residual at which Newton's method stops. The limit is the second number
-(tolerances), at most the third (scaled). In any case it is at least the first number (rounding
-errors; about 1e-12 in float64)."""
+"""Residual (scaled) below which Newton's method stops. It is the second number times the tolerance,
+but at most the third number. In any case it is at least the first number times the rounding error
+(about 1e-12 in float64)."""
 _KEPT = 4
-"""Number of integrations after which the solver steps are kept, however large the Newton step. If a
-third of `Shots.count` is less, that number is used instead."""
+"""Number of integrations after which the solver steps are kept, whatever the size of the Newton
+step. If a third of `Shots.count` is less, that number is used instead."""
 _LOOKS = 6
-"""Maximum number of searches for kinks in the course of closing one orbit."""
+"""Maximum number of searches for kinks while one orbit is closed."""
 _DRIFT = 30.0, 1e-9, 1e-6
 """Change of the orbit's start (scaled) above which the search for kinks is repeated. The limit is
 the first number (tolerances), at least the second and at most the third (scaled). After a smaller
@@ -55,8 +55,8 @@ _AGREE = 10.0, 1e-3, 3e-2
 derivatives are reported. The limit is the first number times the square root of the tolerance, at
 least the second number and at most the third."""
 _SMALL = 1e-9, 1e-3
-"""Bounds (scaled) of a limit: the Newton step below which the solver steps are kept. The limit is a
-thousand tolerances, but at least the first and at most the second number."""
+"""Least and greatest value (scaled) of the Newton step below which the solver steps are kept. In
+between, this limit is a thousand tolerances."""
 
 
 class Orbit(NamedTuple):
@@ -285,12 +285,12 @@ class _Closer(eqx.Module):
         )
 
     def _kept(self, now: _Closing, start, out: Flow, size, residual, improving):
-        """Return whether to keep the steps of `out`, whether to search for kinks along `out`, and
-        whether to discard the steps kept so far.
+        """Return three decisions about the solver steps after the flow `out`.
 
-        `start`: scaled initial state of `out`; `size`: greatest entry of the Newton step (scaled);
-        `residual`: residual (scaled) of `out`; `improving`: whether it is less than half the least
-        one before on the same grid."""
+        They are: whether to keep the steps of `out`; whether to search for kinks along `out`;
+        whether to discard the steps kept so far. `start`: scaled initial state of `out`; `size`:
+        greatest entry of the Newton step (scaled); `residual`: residual (scaled) of `out`;
+        `improving`: whether it is below half the least residual so far on the same grid."""
         done, smooth = now.orbit.newton_steps + 1, self.pair.smooth
         known = size < jnp.clip(1000 * self.tolerance, *_SMALL)
         following = now.repeat | known | (done >= jnp.minimum(self.shots // 3, _KEPT))
@@ -367,8 +367,10 @@ def orbit_or_window(
     windowed: Bool[Array, ""] | bool = False,
     periods: int = 0,
 ) -> tuple[Orbit, Window]:
-    """Close and differentiate an orbit or, if `windowed`, integrate a window of `periods` mesh
-    periods from `state`. Return both; the one that was not computed is a placeholder.
+    """Close and differentiate an orbit or, if `windowed`, integrate a window from `state`.
+
+    Return both; the one that was not computed is a placeholder. `periods`: length of the window
+    (mesh periods).
 
     The orbit is the solution of Φ(z) = z near the scaled `state` (n,), where Φ is the flow over
     `period` mesh periods. Newton shooting finds it, and the implicit function theorem gives its
@@ -414,7 +416,7 @@ def orbit_or_window(
     slope = orbit.flow.slope
     moved = solved(jnp.eye(count, dtype=dtype) - orbit.monodromy, slope[:count, count:])
     if not pair.smooth:
-        moved = jnp.full_like(moved, jnp.nan)  # All derivatives by parameters become NaN.
+        moved = jnp.full_like(moved, jnp.nan)  # Parameter derivatives become NaN.
     return orbit._replace(
         multiplier=spectral_radius(orbit.monodromy),
         response=orbit.flow.response,

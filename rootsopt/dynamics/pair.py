@@ -49,6 +49,10 @@ class FlankForce(NamedTuple):
     rotation; `push`: contact force (N) on rotor 2 in x and y, None if no part lets the axes move.
     The force on rotor 1 is equal and opposite. `edges`: distance (rad) of the pose from the jumps
     of the gap (see `Edges`) and its rate (rad/s), None for a contact whose gap is continuous.
+
+    For twisted rotors, forces, torques and `push` are sums over the slices, and the levers are
+    means. `edges` then holds the mean of what each slice has, or of its penetration (m) and rate
+    (m/s): a jump in one slice is a kink of this mean.
     """
 
     drive: Float[Array, "*n"]
@@ -95,6 +99,19 @@ class _Touch(NamedTuple):
     roll: Float[Array, ""]
     approach: Approach
     sliding: _Sliding | None
+
+
+class Pushes(NamedTuple):
+    """Contact forces of every slice (one for straight rotors) and side that can touch.
+
+    `force` (slices, sides, x and y): on rotor 2 (N), friction included; on rotor 1 it is the
+    opposite. `place` (slices, sides, x and y): of the contact, from the axis of rotor 1 (m).
+    `torque` (slices, sides, rotor): of the normal force, in the rotor's sense of rotation (N·m).
+    """
+
+    force: Float[Array, "slices sides xy"]
+    place: Float[Array, "slices sides xy"]
+    torque: Float[Array, "slices sides rotor"]
 
 
 class Margins(NamedTuple):
@@ -317,6 +334,37 @@ class RotorPair(eqx.Module):
         """Return the flank contact at rotation `tau` (mesh periods) and scaled `state`."""
         return self._force(self.motion(tau, state))
 
+    def pushes(self, motion: Motion) -> Pushes:
+        """Return the `Pushes` of the flanks at the position and velocity `motion`.
+
+        Raises `InputError` if the contact does not give the point of contact."""
+
+        def of_flank(side, motion):
+            touch = self._touch(side, motion, located=True)
+            found = self._flank_force(side, motion, touch)
+            sliding = touch.sliding
+            assert sliding is not None
+            assert sliding.normal is not None
+            assert found.push is not None
+            x, y = sliding.normal
+            aside = side * touch.approach.lever1 * jnp.stack([-y, x])
+            place = sliding.point.support1 * sliding.normal - aside
+            levers = jnp.stack([-touch.approach.lever1, touch.approach.lever2])
+            return Pushes(found.push, place, side * found.drive * levers)
+
+        def of_section(motion):
+            sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)
+            if not self.two_sided:
+                sides = jnp.where(motion.relative < 0, sides[:1], sides[1:])
+            return jax.vmap(of_flank, (0, None))(sides, motion)
+
+        slices = self.contact.slices
+        if slices is None:
+            return jax.tree.map(lambda x: x[None], of_section(motion))
+        found = jax.vmap(lambda by: of_section(_turned(motion, by)))(slices.offsets)
+        weights = slices.weights[:, None, None]
+        return Pushes(weights * found.force, found.place, weights * found.torque)
+
     def _touches(self, motion: Motion) -> tuple[Float[Array, "*sides"], _Touch]:
         """Return the side of each flank that can touch at a `motion` (1 drive, -1 coast), and its
         `_Touch`.
@@ -324,7 +372,15 @@ class RotorPair(eqx.Module):
         A pair that is not two-sided has the nominal centre distance and no negative clearance. Then
         only the drive flank can touch when ε < 0, and only the coast flank when ε > 0. One search
         for the gap is therefore enough. Otherwise, both results have a leading axis for the sides.
+        With twisted rotors, an axis for the slices stands before it.
         """
+        slices = self.contact.slices
+        if slices is None:
+            return self._section_touches(motion)
+        return jax.vmap(lambda by: self._section_touches(_turned(motion, by)))(slices.offsets)
+
+    def _section_touches(self, motion: Motion) -> tuple[Float[Array, "*sides"], _Touch]:
+        """Return the result of `_touches` for one section of the rotors."""
         if self.two_sided:
             sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)
             return sides, jax.vmap(self._touch, (0, None))(sides, motion)
@@ -335,7 +391,21 @@ class RotorPair(eqx.Module):
         """Return the contact of the flanks at the position and velocity `motion`.
 
         `touches`: result of `_touches` at this motion, if known."""
-        side, touch = self._touches(motion) if touches is None else touches
+        touches = self._touches(motion) if touches is None else touches
+        slices = self.contact.slices
+        if slices is None:
+            return self._section_force(motion, *touches)
+        found = jax.vmap(self._section_force, (None, 0, 0))(motion, *touches)
+        whole = jax.tree.map(lambda x: jnp.tensordot(slices.weights, x, 1), found)
+        if whole.edges is None and self.jumps:
+            whole = whole._replace(edges=jnp.stack([whole.depth, whole.closing]))
+        deepest = jnp.argmax(found.depth)
+        return whole._replace(depth=found.depth[deepest], closing=found.closing[deepest])
+
+    def _section_force(self, motion: Motion, side: Float[Array, "*sides"], touch: _Touch):
+        """Return the `FlankForce` of rotors that are this section over their whole length.
+
+        `side`, `touch`: result of `_section_touches`."""
         if self.two_sided:
             flanks = jax.vmap(self._flank_force, (0, None, 0))(side, motion, touch)
             drive, coast = flanks.drive
@@ -392,8 +462,10 @@ class RotorPair(eqx.Module):
             edges=edges,
         )
 
-    def _touch(self, side: Float[Array, ""], motion: Motion) -> _Touch:
+    def _touch(self, side: Float[Array, ""], motion: Motion, located: bool = False) -> _Touch:
         """Return the geometry of the flanks of one side (1 drive, -1 coast) at a `motion`.
+
+        `located`: whether to give the direction of the force even if no part needs it.
 
         Let n be the drive side's normal from rotor 1 to rotor 2, and t the tangent: n turned by
         +90°. Rotor 1 slides along rotor 2 at the speed ω1 h1 - ω2 h2 + (v1 - v2)·t. The coast side
@@ -407,6 +479,8 @@ class RotorPair(eqx.Module):
             line = jnp.stack([contact.center_distance + x, y])
             relative = relative + 2 * jnp.arctan2(y, line[0])
             contact = contact.at_distance(jnp.hypot(*line))
+        elif located:
+            line = jnp.stack([contact.center_distance, jnp.zeros_like(contact.center_distance)])
         roll, turned = -side * (motion.phi + motion.relative / 2), side * relative
         approach = contact.approach(roll, turned)
         gap, lever1, lever2 = approach[:3]
@@ -418,15 +492,15 @@ class RotorPair(eqx.Module):
             speed = side * (motion.speed * point.support1 - other * point.support2)
             sliding = _Sliding(point, speed)
             if line is not None:
-                assert motion.drift is not None
                 distance = contact.center_distance
                 cos, sin = line / distance
                 along, across = point.radial, side * (lever1 + lever2) / distance
                 normal = jnp.stack([cos * along - sin * across, sin * along + cos * across])
                 tangent = side * jnp.stack([-normal[1], normal[0]])
-                approaching = motion.drift[0] - motion.drift[1]
-                closing += jnp.dot(approaching, normal)
-                speed += jnp.dot(approaching, tangent)
+                if motion.drift is not None:
+                    approaching = motion.drift[0] - motion.drift[1]
+                    closing += jnp.dot(approaching, normal)
+                    speed += jnp.dot(approaching, tangent)
                 sliding = _Sliding(point, speed, normal, tangent)
         return _Touch(-gap - self.clearance, closing, roll, approach, sliding)
 
@@ -442,7 +516,7 @@ class RotorPair(eqx.Module):
         """
         motion, acting = self._moving(tau, state)
 
-        def of_flank(side):
+        def of_flank(side, motion):
             touch = self._touch(side, motion)
             flags = [
                 self.law.switches(touch.depth, touch.closing),
@@ -454,13 +528,20 @@ class RotorPair(eqx.Module):
             found = jnp.concatenate(flags)
             return found, jnp.full_like(found, touch.depth > 0)
 
-        drives = motion.relative < 0
-        if self.two_sided:
+        def of_section(motion):
+            if not self.two_sided:
+                return of_flank(jnp.where(motion.relative < 0, 1.0, -1.0), motion)
             sides = jnp.asarray([1.0, -1.0], self.angle_scale.dtype)
-            flags, counts = (x.ravel() for x in jax.vmap(of_flank)(sides))
+            return tuple(x.ravel() for x in jax.vmap(of_flank, (0, None))(sides, motion))
+
+        slices = self.contact.slices
+        if slices is None:
+            flags, counts = of_section(motion)
         else:
-            flags, counts = of_flank(jnp.where(drives, 1.0, -1.0))
-            flags, counts = jnp.append(flags, drives), jnp.append(counts, True)
+            each = jax.vmap(lambda by: of_section(_turned(motion, by)))(slices.offsets)
+            flags, counts = (x.ravel() for x in each)
+        if not self.two_sided:
+            flags, counts = jnp.append(flags, motion.relative < 0), jnp.append(counts, True)
         flags = jnp.concatenate([flags, *(part.switches(motion, own) for part, own in acting)])
         return flags, jnp.pad(counts, (0, flags.size - counts.size), constant_values=True)
 
@@ -471,7 +552,11 @@ class RotorPair(eqx.Module):
         return self._margins(motion, acting, self._touches(motion))
 
     def _margins(self, motion: Motion, acting, touches: Any) -> Margins:
-        """Return the `Margins` at a `motion`; `acting`, `touches`: as in `_slope`."""
+        """Return the `Margins` at a `motion`; `acting`, `touches`: as in `_slope`.
+
+        Raises NotImplementedError for twisted rotors, whose orbits collocation does not close."""
+        if self.contact.slices is not None:
+            raise NotImplementedError("Margins are for straight rotors; these are twisted.")
 
         def of_flank(side, touch):
             found = [
@@ -588,6 +673,11 @@ class RotorPair(eqx.Module):
         if not self.free:
             return jnp.zeros((), bool)
         return self.speed(state) < STALLED * self.drive.speed
+
+
+def _turned(motion: Motion, by: Float[Array, ""]) -> Motion:
+    """Return the `motion` of a section that is turned by the angle `by` (rad) from the middle."""
+    return motion._replace(phi=motion.phi + by)
 
 
 def _sum(terms: Iterable[Array | None]) -> Array | None:

@@ -125,8 +125,9 @@ class Steps(NamedTuple):
         return x * (1 - x) * step**2 < width**2
 
     def _place(self, tau):
-        """Return the index and length of the step that contains `tau`, and the fraction of the step
-        completed at `tau`."""
+        """Return (index of the step that contains `tau`, its length, fraction of it before `tau`).
+
+        `tau` and the length are in mesh periods."""
         k = jnp.clip(jnp.searchsorted(self.ends, tau), 0, self.count - 1)
         step = self.ends[k] - self.begins[k]
         return k, step, (tau - self.begins[k]) / step
@@ -220,8 +221,9 @@ def locate_peak(
 def one_sided(
     found: Float[Array, "7 values"], noise: Float[Array, ""] | float = 0.0
 ) -> tuple[Float[Array, ""], Float[Array, "7 values"]]:
-    """Return the peak force, and weights (7, values). The derivative of the peak is the weighted
-    sum of the derivatives of `found`.
+    """Return the peak force, and the weights (7, values) of its derivative.
+
+    The derivative of the peak is the weighted sum of the derivatives of `found`.
 
     `found`: at the times `BESIDE` around the located peak, the contact force in any unit (last
     column). If the contact may jump, the first of its `rootsopt.dynamics.saltation.marks` stands
@@ -240,7 +242,7 @@ def one_sided(
     forces = found[:, -1]
     here, before, earlier, after, later, left, right = forces
     none, one = jnp.zeros_like(here), jnp.ones_like(here)
-    # Each slope is taken on one side only: the place of the corner is not known well enough.
+    # Compute each slope on one side only: the instant of the corner is not known well enough.
     rise, fall = before - earlier, after - later
     drop = rise + fall
     # Next to a corner the force falls as fast as farther away; on a parabola, a third as fast.
@@ -272,12 +274,12 @@ def one_sided(
 
 
 def _with_jump(forces: Float[Array, "7"], marks: Float[Array, "7"]) -> Float[Array, "7"]:
-    """Return weights (7,) for the derivatives of `marks`: their sum is the change of a peak at a
-    jump due to the motion of the jump.
+    """Return the weights (7,) of the derivatives of `marks` in the derivative of a peak at a jump.
 
-    `forces`, `marks`: contact force and first mark at the times `BESIDE`. The change is F dt*/dp,
-    where F is the rate of the force on the greater side and t* the instant of the jump. For t*, see
-    `rootsopt.dynamics.saltation`. Rates are differences, taken on one side of the jump each. In
+    The weighted sum is the part of the derivative that comes from the motion of the jump:
+    F dt*/dp. F is the time derivative of the force on the greater side, and t* the instant of the
+    jump (see `rootsopt.dynamics.saltation`). `forces`, `marks`: contact force and first mark at the
+    times `BESIDE`. Time derivatives are difference quotients, each on one side of the jump. In
     single precision, the outermost times are too far away for them."""
     near = forces.dtype.itemsize < 8
 

@@ -8,9 +8,9 @@ P. C. Müller, Chaos, Solitons & Fractals 5 (1995) 1671-1681):
     dy = (f₋ - f₊) dt*,        dt* = -d(δ₋ - δ₊) / (dδ₋/dτ - dδ₊/dτ).
 
 f is the right-hand side of the equation of motion and δ the penetration, before (₋) and after (₊)
-the jump. Where the gap itself jumps, at given poses, δ is the distance of the pose from them
-(`rootsopt.contact.gap.Edges`), which is continuous and has a kink there. Besides the states, y also
-contains the integrals over the motion.
+the jump. If the gap itself jumps at given poses, δ is the distance from these poses
+(`rootsopt.contact.gap.Edges`). This distance is continuous and has a kink at the jump. Besides the
+states, y also contains the integrals over the motion.
 """
 
 import jax.numpy as jnp
@@ -23,8 +23,8 @@ LONGEST = 4e-6
 """Length of a step (mesh periods) above which the step is not checked for a jump. The short steps
 around switches (`rootsopt.dynamics.switches`) are all shorter in double precision."""
 _LONGEST_ROUNDINGS = 320
-"""The same limit in rounding errors of one mesh period. It exceeds `LONGEST` only in single
-precision, where the short steps of an orbit of eight mesh periods have 256 rounding errors."""
+"""The same length in rounding errors of one mesh period. It exceeds `LONGEST` only in single
+precision. There, the short steps of an orbit of eight mesh periods have 256 rounding errors."""
 _FASTER = 20.0
 """Rate of change of a lever (pitch radii per mesh period) above which the change counts as a jump.
 Along a flank of the EE family the rate is at most 2π, for any number of lobes."""
@@ -32,8 +32,8 @@ _ROUNDINGS = 300
 """Change of a lever (rounding errors) below which the change does not count as a jump."""
 _ALIKE = 0.05
 """Distance from the levers at a stage to those at the nearer end of the step (fraction of the
-change over the step). Above this distance, the change does not count as a jump: if a lever changes
-fast but continuously, some stages lie in between."""
+change over the step) above which the change does not count as a jump. If a lever changes fast but
+continuously, some stages lie in between."""
 MARKS = 4
 """Number of `marks`: further numbers stored with the time derivative of a motion (penetration, its
 rate, both levers). A jump of the levers shows in them."""

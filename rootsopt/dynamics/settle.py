@@ -24,8 +24,7 @@ _PATIENCE = 32, 1e-5
 """Number of mesh periods after which a transient continues with a finer tolerance, and the greatest
 value of that tolerance. The noise of coarser steps can hide that the motion repeats."""
 NOISE = 100.0
-"""Noise of the stroboscopic states that adaptive steps cause (tolerances, relative to the
-states)."""
+"""Relative noise (tolerances) that adaptive steps cause in the stroboscopic states."""
 
 
 class Transient(NamedTuple):

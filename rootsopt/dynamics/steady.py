@@ -38,8 +38,9 @@ _TRUSTED = 1e-8
 """Finest tolerance to which an orbit is refined, unless the config requests a finer tolerance. An
 orbit is refined if it does not close or its derivatives are uncertain."""
 _COLLOCATIONS, _LONGER = 3, 160.0
-"""Maximum number of times that an orbit is collocated, each time from a transient that has settled
-to a tenth of the distance, and the greatest number of mesh periods by which it goes on."""
+"""Maximum number of attempts to close an orbit by collocation, and maximum number of mesh periods
+by which the transient continues before each further attempt. The states of the transient must then
+repeat ten times more closely."""
 
 
 class Solver(eqx.Module):
@@ -310,13 +311,13 @@ class _Attempts(eqx.Module):
         scales = pair.law.exponent, self.radius, pair.force_scale
         found = verdict(orbit, start, within, rtols, open_by.astype(dtype), scales)
         numbers = jnp.concatenate([orbit.response, orbit.state])
-        # A pair that is not smooth never has derivatives: that is no failure.
+        # A pair that is not smooth never has derivatives. Their absence is not a failure.
         unknown = ~jnp.all(jnp.isfinite(orbit.sensitivity)) & pair.smooth
         status = _first(
             (~orbit.flow.solved, Status.SOLVER_FAILED),
             (found.idle, Status.IDLE),
             (~jnp.all(jnp.isfinite(numbers)), Status.NON_FINITE),
-            # Before the derivatives: an orbit that amplifies errors has no known derivative.
+            # Checked before the derivatives, which are unknown if the orbit amplifies errors.
             (~found.steady, Status.NOT_SETTLED),
             (unknown, Status.NON_FINITE),
             (~found.certain, Status.INACCURATE),
@@ -352,9 +353,9 @@ class _Attempts(eqx.Module):
     def collocated(self, state: Float[Array, " n"]) -> Steady:
         """Return the motion that the scaled `state` leads to, with an orbit closed by collocation.
 
-        The status is NOT_SETTLED if the orbit is not stable, is not near the end of the transient,
-        or is not confirmed by an integration. Before that, the transient is continued and the orbit
-        is tried again."""
+        An orbit is rejected if it is not stable, is not near the end of the transient, or is not
+        confirmed by an integration. The transient then continues, followed by another attempt
+        (`_COLLOCATIONS`). If the last attempt fails, the status is NOT_SETTLED."""
         begun, no = self.start(state), jnp.zeros((), bool)
         zero = jnp.zeros((), int)
         start = _Collocation(begun.found, state, begun.coarse, begun.within, zero, no)
@@ -406,7 +407,7 @@ class _Attempts(eqx.Module):
         state, within = made.orbit.state, settled_within(solver.transient.rtol)
         empty = self.start(state).found
         settled = empty.settled._replace(period=period, nearest=period)
-        # No window, which would only be copied.
+        # Use an empty window: a full one would be copied, but never used.
         empty = empty._replace(settled=settled, window=Window.empty(state, 0))
         return self.final(self._taken(empty, made, state, period, within))
 
@@ -520,10 +521,10 @@ def near_motion(
 
     `start`: this orbit, and its pair.
 
-    There is no transient: the result is the same motion as that of the other pair, continued. It
-    has to be stable. The status is NOT_SETTLED if the orbit is not accepted (see
-    `collocation.nearby`); `steady_motion` then finds the motion. For the other arguments, see
-    there. The pair must be one that collocation supports.
+    The result continues the motion of the similar pair without a transient, and must be stable. The
+    status is NOT_SETTLED if the orbit is not accepted (see `collocation.nearby`); call
+    `steady_motion` in that case. Collocation must support the pair. For the other arguments, see
+    `steady_motion`.
     """
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     return _Attempts(pair, tangents, solver, radius).near(*start)

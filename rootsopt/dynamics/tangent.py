@@ -117,8 +117,7 @@ def propagated(
     branch: Int[Array, ""],
     aside: int,
 ) -> tuple[Float[Array, "m columns"], Float[Array, "n columns"], Linear]:
-    """Return derivatives after a sequence of linearised steps, and after side steps from one of
-    them.
+    """Return derivatives after a sequence of linearised steps, and after side steps.
 
     `linear_step(k, there)` linearises step k. Its rows are y, then any further values. y holds the
     n entries of the state, then integrals. No row depends on the integrals. `start` (m, n + d):

@@ -23,7 +23,7 @@ count as unresolved."""
 _UNKNOWN = 0.1
 """Estimated error of an orbit (scaled) above which the orbit is rejected."""
 _FREE = 1e-6
-"""Distance from 1 below which a Floquet multiplier counts as 1. So does a multiplier above 1."""
+"""Distance from 1 below which a Floquet multiplier counts as 1. A multiplier above 1 also does."""
 _DEFECT = 1e3
 """Residual on halved steps (tolerances) above which an orbit's derivatives are uncertain. This
 limit is multiplied by the greatest entries of the state and of the monodromy matrix, where they

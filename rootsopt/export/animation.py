@@ -22,7 +22,7 @@ from rootsopt.response.evaluation import Series
 from rootsopt.runtime.programs import Program
 
 _MM = 1e3
-_FRAMES = 40  # per mesh period
+_FRAMES = 40  # frames per mesh period
 _MOST_PERIODS = 4
 _MILLISECONDS = 60  # per frame
 _DPI = 80
@@ -78,6 +78,51 @@ def rolling_contacts(
     return Contacts(point, normal, (roll >= 0) & (roll <= 2 * half))
 
 
+@dataclasses.dataclass(frozen=True)
+class Frames:
+    """Frames of a simulated motion, evenly spaced.
+
+    `time` (n,): time (s); `rotation`, `relative` (n,): rotation of rotor 1 and ε (rad); `forces`:
+    largest force (N) on drive and coast flank in the time interval of each frame, (n,) each;
+    `samples`: number of samples of the motion that the frames cover.
+    """
+
+    time: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    relative: NDArray[np.float64]
+    forces: tuple[NDArray[np.float64], NDArray[np.float64]]
+    samples: int
+
+
+def frames_of(series: Series, lobes: int, periods: int) -> Frames:
+    """Return the frames of a motion over `periods` mesh periods.
+
+    `periods` is limited to 4 and to the length of `series`; `lobes`: number of lobes."""
+    pitch = 2 * np.pi / lobes
+    whole = max(1, round(float(np.ptp(series.rotation)) / pitch))
+    periods = max(1, min(periods, whole, _MOST_PERIODS))
+    samples = len(series.time) * periods // whole
+    edges = np.linspace(0, samples, periods * _FRAMES + 1).astype(int)
+    middle = (edges[1:] + edges[:-1]) // 2
+    drive, coast = (
+        np.array([np.max(force[a : max(b, a + 1)]) for a, b in itertools.pairwise(edges)])
+        for force in (series.drive_force, series.coast_force)
+    )
+    time, rotation = series.time[middle], series.rotation[middle]
+    return Frames(time, rotation, series.relative[middle], (drive, coast), samples)
+
+
+def rolling_frames(profile: Profile) -> tuple[NDArray[np.float64], list[Contacts]]:
+    """Return frames of perfect rolling over one lobe pitch: rotations (n,) (rad), and the contacts
+    of drive and coast flanks.
+
+    Where one flank takes over from the other, both ends touch. Only one of them is present."""
+    rotation = 2 * np.pi / profile.lobes * np.arange(_FRAMES) / _FRAMES
+    flanks = [rolling_contacts(profile, rotation, coast) for coast in (False, True)]
+    flanks[1] = dataclasses.replace(flanks[1], present=flanks[1].present & ~flanks[0].present)
+    return rotation, flanks
+
+
 def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
     """Return the content of a GIF of the pair in perfect rolling over one lobe pitch.
 
@@ -85,10 +130,7 @@ def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
     direction of its force. The size of the force is not shown, because only a simulation can give
     it.
     """
-    rotation = 2 * np.pi / profile.lobes * np.arange(_FRAMES) / _FRAMES
-    flanks = [rolling_contacts(profile, rotation, coast) for coast in (False, True)]
-    # Where one flank takes over from the other, both ends touch. Show one arrow only.
-    flanks[1] = dataclasses.replace(flanks[1], present=flanks[1].present & ~flanks[0].present)
+    rotation, flanks = rolling_frames(profile)
     made, axes = figure(9, 5.4)
     scene = _Scene(axes[0, 0], drawing)
     axes[0, 0].set_title("Perfect rolling: contact and direction of its force on rotor 2")
@@ -109,24 +151,14 @@ def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: 
     of the force over the rotation. An arrow's length is proportional to the largest force in the
     time interval of its frame.
     """
-    pitch = 2 * np.pi / profile.lobes
-    whole = max(1, round(float(np.ptp(series.rotation)) / pitch))
-    periods = max(1, min(periods, whole, _MOST_PERIODS))
-    samples = len(series.time) * periods // whole
-    count = periods * _FRAMES
-    edges = np.linspace(0, samples, count + 1).astype(int)
-    middle = (edges[1:] + edges[:-1]) // 2
-    rotation, relative = series.rotation[middle], series.relative[middle]
-    forces = [
-        np.array([np.max(force[a:b]) for a, b in itertools.pairwise(edges)])
-        for force in (series.drive_force, series.coast_force)
-    ]
+    frames = frames_of(series, profile.lobes, periods)
+    rotation, relative, forces = frames.rotation, frames.relative, frames.forces
     longest = max(1e-30, *map(np.max, forces))
     flanks = [rolling_contacts(profile, rotation, coast) for coast in (False, True)]
     made, axes = figure(9, 7.4, 2, 1, gridspec_kw={"height_ratios": [2.6, 1]})
     scene = _Scene(axes[0, 0], drawing)
     axes[0, 0].set_title("Contact force on rotor 2; the arrow's length shows the force below")
-    cursor = _force_panel(axes[1, 0], series, samples)
+    cursor = _force_panel(axes[1, 0], series, frames.samples)
     degrees = np.degrees(rotation - series.rotation[0])
 
     def draw(i: int) -> None:
@@ -135,7 +167,7 @@ def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: 
             arrow.show(flank.point[i], flank.normal[i], float(force[i] / longest))
         cursor.set_xdata([degrees[i], degrees[i]])
 
-    return _gif(made, draw, count)
+    return _gif(made, draw, len(rotation))
 
 
 def _force_panel(ax: Axes, series: Series, samples: int):

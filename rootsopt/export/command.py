@@ -5,7 +5,8 @@ import argparse
 from rootsopt.errors import InputError
 
 FORMATS = {
-    "dxf": "rotor.dxf, true arcs and splines on layers",
+    "dxf": "rotor.dxf, true arcs and splines on layers, dimensions and title block; "
+    "rotor_points.csv, coordinates of a lobe",
     "svg": "rotor.svg, true size",
     "step": "rotor.step and pair.step, solids (needs the [cad] extra)",
     "stl": "rotor.stl and pair.stl, triangles (needs the [cad] extra)",

@@ -2,12 +2,16 @@
 
 import dataclasses
 
+import rootsopt
 from rootsopt.config import Config
+from rootsopt.config.drawing import DrawingConfig
 from rootsopt.export.pieces import DrawnPiece, outline_pieces
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.runtime.programs import Program
 
 _MM = 1e3
+_LINE = 72
+"""Length (characters) above which a line of design parameters is broken."""
 _shape = Program(geometry)
 
 
@@ -18,6 +22,8 @@ class Drawing:
     `pieces`: closed outline (mm); `pitch_radius`, `outer_radius`: radii (mm); `lobes`: number of
     lobes; `length`: axial length (mm); `helix_deg`: twist over the length (°); `bore`: bore
     diameter (mm), `None` for a rotor without a bore; `notes`: lines of text with the dimensions.
+    `root_radius`: radius (mm); `block`: (heading, text) of each field of the title block; `points`:
+    number of points over a lobe in the table of coordinates.
     """
 
     pieces: list[DrawnPiece]
@@ -28,6 +34,9 @@ class Drawing:
     helix_deg: float
     bore: float | None
     notes: tuple[str, ...]
+    root_radius: float
+    block: tuple[tuple[str, str], ...]
+    points: int
 
     @classmethod
     def of(cls, config: Config, profile: Profile, design: dict[str, float]) -> "Drawing":
@@ -45,7 +54,7 @@ class Drawing:
             body += f", twist {rotor.helix_deg:g} deg over the length (rotor 2: the other way)"
         notes = [
             f"Roots rotor, family {config.profile.family}, {config.profile.lobes} lobes",
-            ", ".join(f"{key} = {value:.8g}" for key, value in design.items()),
+            *_wrapped([f"{key} = {value:.8g}" for key, value in design.items()]),
             f"centre distance {2 * radius:g} mm, pitch radius {radius:g} mm",
             f"outer radius {outer:.6f} mm, root radius {root:.6f} mm, "
             f"area {float(shape.area) * _MM**2:.6f} mm2",
@@ -61,9 +70,59 @@ class Drawing:
             helix_deg=rotor.helix_deg,
             bore=rotor.bore_mm,
             notes=tuple(note for note in notes if note),
+            root_radius=root,
+            block=_block(config),
+            points=(config.drawing or DrawingConfig.model_validate({})).points,
         )
 
     @property
     def reach(self) -> float:
         """Distance (mm) from the rotor's axis to the ends of the centre lines."""
         return 1.08 * self.outer_radius
+
+
+def _wrapped(words: list[str]) -> list[str]:
+    """Return lines with all `words`, separated by commas, of about `_LINE` characters."""
+    lines: list[str] = []
+    for word in words:
+        if lines and len(lines[-1]) + len(word) < _LINE:
+            lines[-1] += f", {word}"
+        else:
+            lines.append(word)
+    return lines
+
+
+def _block(config: Config) -> tuple[tuple[str, str], ...]:
+    """Return (heading, text) of each field of the title block; a dash where nothing is stated."""
+    stated, profile = config.drawing or DrawingConfig.model_validate({}), config.profile
+    tolerance = stated.tolerance_mm
+    texts = {
+        "Title": stated.title,
+        "Drawing number": stated.number,
+        "Revision": stated.revision,
+        "Material": stated.material or f"density {config.rotor.density_kg_m3:g} kg/m3",
+        "Flank, profile of a line": None if tolerance is None else f"{tolerance:g} mm (ISO 1101)",
+        "General tolerances": stated.general_tolerance,
+        "Rotor": f"{profile.family}, {profile.lobes} lobes, length {config.rotor.length_mm:g} mm",
+        "Centre distance": f"{2 * profile.pitch_radius_mm:g} mm",
+        "Designed for": _scene(config),
+        "Drawn by": stated.drawn_by,
+        "Date": stated.date,
+        "Scale, unit": "1:1, mm",
+        "Program": f"rootsopt {rootsopt.__version__}",
+    }
+    return tuple((name, text or "-") for name, text in texts.items())
+
+
+def _scene(config: Config) -> str:
+    """Return the scene that the rotor was designed for, in a few words."""
+    scene, load = config.scene, config.scene.load
+    words = [f"{scene.speed_rpm:g} rpm"]
+    if load.torque_N_m is not None:
+        words.append(f"{load.torque_N_m:g} N m")
+    else:
+        words.append(f"{load.pressure_difference_Pa:g} Pa")
+    if scene.timing_gear is not None:
+        words.append(f"backlash {scene.timing_gear.backlash_mm:g} mm")
+    words.append(f"clearance {config.contact.clearance_mm:g} mm")
+    return ", ".join(words)

@@ -2,9 +2,11 @@
 
 import io
 import logging
+from typing import Any
 
 import numpy as np
 
+from rootsopt.export import frame
 from rootsopt.export.drawing import Drawing
 from rootsopt.export.pieces import Arc
 
@@ -18,7 +20,7 @@ _STYLES = {
     PITCH: (5, "DASHDOT", 18),
     CENTER: (1, "CENTER", 18),
     TEXT: (8, "CONTINUOUS", 18),
-}
+} | frame.STYLES
 
 
 def dxf_bytes(drawing: Drawing) -> bytes:
@@ -54,10 +56,20 @@ def dxf_bytes(drawing: Drawing) -> bytes:
     for end in ((reach, 0), (0, reach)):
         start = -end[0], -end[1]
         space.add_line(start, end, dxfattribs={"layer": CENTER})
-    height = drawing.outer_radius / 24
-    for row, note in enumerate(drawing.notes):
-        place = -reach, -reach - 1.8 * height * (row + 1)
-        space.add_text(note, height=height, dxfattribs={"layer": TEXT}).set_placement(place)
+    frame.add_style(document, drawing)
+    frame.add_dimensions(space, drawing)
+    frame.add_title_block(space, drawing)
+    frame.add_table(space, drawing)
+    _add_notes(space, drawing)
     text = io.StringIO()
     document.write(text)
     return document.encode(text.getvalue())
+
+
+def _add_notes(space: Any, drawing: Drawing) -> None:
+    """Add the lines of text beside the title block."""
+    height, left = frame.letter(drawing), frame.edges(drawing)[0]
+    for row, note in enumerate(drawing.notes):
+        place = left + height, -1.3 * drawing.outer_radius - 1.9 * height * (row + 1)
+        text = space.add_text(frame.plain(note), height=height, dxfattribs={"layer": TEXT})
+        text.set_placement(place)

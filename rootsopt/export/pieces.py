@@ -63,6 +63,11 @@ class Arc:
         angle = self.begin + np.asarray(share) * self.sweep
         return np.asarray(self.center + self.radius * np.exp(1j * angle))
 
+    def heading(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
+        """Return the unit tangents at fractions `share` of the arc."""
+        angle = self.begin + np.asarray(share) * self.sweep
+        return np.asarray(1j * np.sign(self.sweep) * np.exp(1j * angle))
+
     @property
     def start(self) -> complex:
         return complex(self.at(0.0))
@@ -103,6 +108,13 @@ class Spline:
         The parameter is close to the arc length."""
         first, last = self.knots[0], self.knots[-1]
         return np.asarray(BSpline(self.knots, self.controls, 3)(first + share * (last - first)))
+
+    def heading(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
+        """Return the unit tangents at fractions `share` of the parameter."""
+        first, last = self.knots[0], self.knots[-1]
+        slope = BSpline(self.knots, self.controls, 3).derivative()
+        tangent = slope(first + np.asarray(share) * (last - first))
+        return np.asarray(tangent / np.abs(tangent))
 
     @property
     def start(self) -> complex:

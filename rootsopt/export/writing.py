@@ -10,12 +10,16 @@ from rootsopt.config import Config
 from rootsopt.export import solid
 from rootsopt.export.animation import rolling_gif, simulation_gif
 from rootsopt.export.command import SOLID
+from rootsopt.export.coordinates import coordinates
 from rootsopt.export.drawing import Drawing
 from rootsopt.export.dxf import dxf_bytes
 from rootsopt.export.svg import svg_text
 from rootsopt.output.files import ResultFolder
 from rootsopt.response.evaluation import Evaluation, Series
 from rootsopt.scene import Scene
+
+POINTS = "rotor_points.csv"
+"""Name of the table of coordinates, which is written beside the DXF drawing."""
 
 
 def write(
@@ -40,6 +44,8 @@ def write(
     files: dict[str, bytes] = {}
     if "dxf" in formats:
         files["rotor.dxf"] = dxf_bytes(drawing)
+        found = coordinates(drawing.pieces, drawing.lobes, drawing.points)
+        folder.write_csv(POINTS, found.columns())
     if "svg" in formats:
         files["rotor.svg"] = svg_text(drawing).encode()
     if set(formats) & set(SOLID):
@@ -51,7 +57,7 @@ def write(
             files["figures/meshing.gif"] = simulation_gif(drawing, profile, series, periods)
     for name, data in files.items():
         folder.write_bytes(name, data)
-    return list(files)
+    return [*files, *([POINTS] if "dxf" in formats else [])]
 
 
 def write_simulated(

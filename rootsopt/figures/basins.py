@@ -26,7 +26,7 @@ _PANELS = 6
 def plot_basins(ax: Axes, basins: Basins) -> Axes:
     """Draw a map of the initial states, coloured by the motion to which each leads.
 
-    Points mark the state of each motion at the start of every mesh period. The result is `ax`."""
+    Points mark the state of each motion at the start of every mesh period. Return `ax`."""
     colors = [_LOST, *_colors(basins)]
     bounds = np.arange(len(colors) + 1) - 1.5
     pale = [_pale(color) for color in colors]

@@ -14,8 +14,8 @@ from rootsopt.response.evaluation import Series
 def plot_forces_together(ax: Axes, series: Mapping[str, Series], turn: float) -> Axes:
     """Draw the contact force of several designs over the same rotation of rotor 1.
 
-    `series`: simulated motions, keyed by the design's name; `turn`: rotation (rad) to show. The
-    result is `ax`."""
+    `series`: simulated motions, keyed by the design's name; `turn`: rotation (rad) to show. Return
+    `ax`."""
     for (name, run), color, dashes in zip(series.items(), COLORS, DASHES * 2, strict=False):
         first = turn * np.ceil(run.rotation[0] / turn - 1e-9)
         if run.rotation[-1] < first + turn:
@@ -42,7 +42,7 @@ def plot_departure(
 
     `baseline`, `optimized`: points (n, 2) in mm of the closed outlines, counter-clockwise from a
     tip on the +x axis; `lobes`: number of lobes; `pitch_radius_mm`: pitch radius. The departure is
-    measured along the normal, positive outwards. The result is `ax`."""
+    measured along the normal, positive outwards. Return `ax`."""
     line, points = (_flank(one, lobes) for one in (baseline, optimized))
     away = 1e3 * feet(points, beyond(line, lobes), smooth=True).away
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])

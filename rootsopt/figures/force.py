@@ -30,7 +30,7 @@ def plot_force(
     design, keyed by its name. Mean and peak are taken from the response (`mean_force_N`,
     `peak_force_N`), which is more accurate than the samples. All panels cover the same number of
     revolutions, at most a few, and each includes the largest force of its design. Time is 0 at the
-    start of each panel. The result is `axes`.
+    start of each panel. Return `axes`.
     """
     turns = min(_MOST_TURNS, *(np.ptp(run.rotation) / (2 * np.pi) for run in series.values()))
     for ax, (name, run) in zip(axes, series.items(), strict=True):
@@ -106,7 +106,7 @@ def plot_spectrum(
 
     `axes`: one for each design; `series`: simulated motion of each design, keyed by its name;
     `mesh_frequency_Hz`: mesh frequency (Hz); `harmonics`: number of multiples of the mesh frequency
-    on the frequency axis. The mean (0 Hz) is omitted. The result is `axes`.
+    on the frequency axis. The mean (0 Hz) is omitted. Return `axes`.
     """
     limit = (harmonics + 0.5) * mesh_frequency_Hz
     top = 0.0

@@ -11,7 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 
-from rootsopt.figures.style import BLUE, GREY, ORANGE, VERMILION, figure
+from rootsopt.figures.style import BLUE, COLORS, DASHES, GREY, ORANGE, VERMILION, figure
 from rootsopt.output.files import ResultFolder
 from rootsopt.tradeoffs.front import Front, Standing
 
@@ -21,8 +21,8 @@ _DROPPED = (Standing.DOMINATED,)
 def plot_front(ax: Axes, front: Front, x: str, y: str) -> Axes:
     """Draw the points of a front with the term `x` across and the term `y` up.
 
-    Lines connect neighbours, but not across a gap. For three terms, colours show the third. The
-    result is `ax`."""
+    Lines connect neighbours, but not across a gap. For three terms, colours show the third. Return
+    `ax`."""
     aims = {aim.name: aim for aim in front.aims}
     third = next((name for name in aims if name not in (x, y)), None)
     for one, other in front.edges:
@@ -118,9 +118,7 @@ def front_figure(folder: ResultFolder, front: Front) -> list[str]:
 def plot_designs(ax: Axes, front: Front, x: str) -> Axes:
     """Draw the design parameters along a front over the term `x`, each in units of its bounds.
 
-    Lines are interrupted at gaps. The result is `ax`."""
-    from rootsopt.figures.style import COLORS, DASHES
-
+    Lines are interrupted at gaps. Return `ax`."""
     keys = [*front.points[0].design]
     points = np.array([point.point for point in front.points])
     aim = next(aim for aim in front.aims if aim.name == x)

@@ -29,8 +29,8 @@ def plot_history(
     `keys`: names of the design parameters; `axes`: a panel for the objective, followed by one for
     each key. `history`: one row per evaluation. A row whose `start` is absent or negative belongs
     to the screening. The entries of a list-valued parameter share one panel, which omits the
-    screening. Crosses at the top mark unusable designs, whose objective is not finite. The result
-    is `axes`.
+    screening. Crosses at the top mark unusable designs, whose objective is not finite. Return
+    `axes`.
     """
     keys = ("objective", *keys)
     for ax, key in zip(axes, keys, strict=True):

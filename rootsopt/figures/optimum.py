@@ -22,7 +22,7 @@ def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: floa
 
     `history`: rows with `start`, `iteration` and `residual`; `required`: residual up to which a
     design counts as an optimum. Trials of the screening, and trials without a residual, are left
-    out. The result is `ax`."""
+    out. Return `ax`."""
     starts = sorted({int(row["start"]) for row in history if int(row["start"]) >= 0})
     for start in starts:
         rows = [row for row in history if int(row["start"]) == start]
@@ -45,7 +45,7 @@ def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: floa
 def plot_prices(ax: Axes, constraints: Sequence[Mapping[str, Any]]) -> Axes:
     """Draw bars of the gain in the objective (%) from relaxing each limit by one step.
 
-    `constraints`: rows of the result file; those without a multiplier are left out. The result is
+    `constraints`: rows of the result file; those without a multiplier are left out. Return
     `ax`."""
     rows = [row for row in constraints if abs(row.get("multiplier") or 0.0) > 0]
     rows.sort(key=lambda row: row["relaxed_objective_percent"], reverse=True)
@@ -68,7 +68,7 @@ def plot_starts(
     """Draw the objective at the end of each local search, and the distinct optima as lines.
 
     `starts`, `optima`: entries of the result file. Searches without a certificate are drawn hollow.
-    The result is `ax`."""
+    Return `ax`."""
     for number, one in enumerate(optima):
         label = f"optimum {number + 1}: {one['objective']:.5f}, found {one['found']}×"
         color = COLORS[number % len(COLORS)]

@@ -16,7 +16,7 @@ def plot_profiles(
     """Draw closed outlines on top of each other, with the pitch circle.
 
     `outlines`: points (n, 2) in mm of each outline, keyed by its name; `pitch_radius_mm`: pitch
-    radius. The result is `ax`."""
+    radius. Return `ax`."""
     _overlay(ax, outlines, pitch_radius_mm)
     reach = 1.06 * max(np.max(np.hypot(*points.T)) for points in outlines.values())
     ax.plot(0, 0, "+", color="black", markersize=9)
@@ -30,8 +30,8 @@ def plot_flank(
     """Draw one flank of each outline from the tip (on the +x axis) to the root, enlarged.
 
     `outlines`: points (n, 2) in mm of each closed outline, keyed by its name; `lobes`: number of
-    lobes; `pitch_radius_mm`: pitch radius. The rest of an outline follows by symmetry. The result
-    is `ax`.
+    lobes; `pitch_radius_mm`: pitch radius. The rest of an outline follows by symmetry. Return
+    `ax`.
     """
     _overlay(ax, outlines, pitch_radius_mm)
     flanks = []
@@ -71,7 +71,7 @@ def plot_meshing(
     """Draw the meshing pair at several angles of rotor 1, one panel per angle.
 
     `axes`: one for each of `angles_deg`; `outline_mm` (n, 2): closed outline, equal for both
-    rotors; `lobes`: number of lobes; `pitch_radius_mm`: pitch radius. The result is `axes`."""
+    rotors; `lobes`: number of lobes; `pitch_radius_mm`: pitch radius. Return `axes`."""
     center = 2 * pitch_radius_mm
     for ax, angle in zip(axes, angles_deg, strict=True):
         turn = np.radians(angle)
@@ -92,7 +92,7 @@ def plot_conjugacy(ax: Axes, gaps: Mapping[str, tuple[NDArray, NDArray]]) -> Axe
     """Draw the gap of one or more pairs in perfect rolling over the angle of rotor 1.
 
     `gaps`: (angles (n,) in degrees, gaps (n,) in µm) of each pair, keyed by its name. The angle is
-    0 when a tip of rotor 1 is on the line of centres. The result is `ax`."""
+    0 when a tip of rotor 1 is on the line of centres. Return `ax`."""
     for (name, (angle, gap)), color, dashes in zip(gaps.items(), COLORS, DASHES * 2, strict=False):
         ax.plot(angle, gap, color=color, linestyle=dashes, linewidth=1.6, label=name)
     ax.axhline(0, color="black", linewidth=0.8)

@@ -16,6 +16,8 @@ from rootsopt.figures.profiles import plot_conjugacy, plot_flank, plot_meshing, 
 from rootsopt.figures.style import (
     figure,
 )
+from rootsopt.measured.conjugacy import conjugacy, gaps_um
+from rootsopt.measured.source import outline_of
 from rootsopt.output.files import ResultFolder
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.scene import design_keys, outline_mm
@@ -32,9 +34,6 @@ def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, A
         _write(folder, "meshing", _meshing(points, config)),
     ]
     if config.profile.from_file:
-        from rootsopt.measured.conjugacy import conjugacy, gaps_um
-        from rootsopt.measured.source import outline_of
-
         made, axes = figure(8, 4.2)
         gaps = gaps_um(conjugacy(outline_of(config.profile)[0]))
         plot_conjugacy(axes[0, 0], {Path(config.profile.outline_file or "").name: gaps})

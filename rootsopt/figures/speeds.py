@@ -27,7 +27,7 @@ def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[AtSpeed]], force: str) 
 
     `designs`: evaluations of each design at all speeds, keyed by its name; `force`: key of the
     force in `Evaluation.response`. Lines connect steady motions. Other motions are drawn as single
-    markers, at the bottom of the panel if their force is not known. The result is `ax`.
+    markers, at the bottom of the panel if their force is not known. Return `ax`.
     """
     for (name, parts), color, dashes in zip(designs.items(), COLORS, DASHES * 2, strict=False):
         speeds = np.array([part.speed_rpm for part in parts])

@@ -1,4 +1,4 @@
-"""Figures of designs in many scenes that scatter: distributions of the contact force."""
+"""Figures of designs in many scenes with scattered values: distributions of the contact force."""
 
 from collections.abc import Mapping
 
@@ -26,7 +26,7 @@ def plot_distribution(ax: Axes, designs: Mapping[str, ArrayLike], label: str) ->
     """Draw a histogram of each design's force, and a vertical line at its 95 % quantile.
 
     `designs`: force in each scene (n,) by name of the design (keys of `NAMES`); scenes without a
-    usable motion are NaN and left out. `label`: that of the horizontal axis. The result is `ax`.
+    usable motion are NaN and left out. `label`: that of the horizontal axis. Return `ax`.
     """
     known = {name: np.asarray(values, float) for name, values in designs.items()}
     known = {name: values[np.isfinite(values)] for name, values in known.items()}

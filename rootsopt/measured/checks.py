@@ -13,7 +13,7 @@ class Checks:
     `axis_offset_um`: distance (µm) of the outline's centroid from the rotor's axis.
     `scatter_um`: estimated standard deviation (µm) of the points across the outline.
     `center_x_mm`, `center_y_mm`: estimated centre (mm) of the lobes' rotational symmetry, in the
-    coordinates of the file. `center_error_um`: standard error (µm) of each of both.
+    coordinates of the file. `center_error_um`: standard error (µm) of each coordinate.
     `lobe_deviation_um`: greatest normal distance between a flank and the mean of the same flank of
     all lobes (µm).
     `flank_deviation_um`: greatest normal distance between the mean leading flank and the mirrored

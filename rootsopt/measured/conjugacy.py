@@ -59,13 +59,13 @@ class Conjugacy:
         }
 
 
-def conjugacy(profile: Profile, error: float = 0.0) -> Conjugacy:
+def conjugacy(profile: Profile) -> Conjugacy:
     """Return the gap between the flanks of two equal rotors in pure rolling.
 
-    `profile`: profile of both rotors; `error`: centre distance minus twice the pitch radius (m).
-    Raises `InputError` if the flanks never face each other."""
+    `profile`: profile of both rotors, at the centre distance of twice its pitch radius. Raises
+    `InputError` if the flanks never face each other."""
     roll = float(profile.half_pitch) * (np.arange(_POSES) + 0.5) / _POSES
-    gap, found = map(np.asarray, _gaps(profile, jnp.asarray(roll), jnp.asarray(error)))
+    gap, found = map(np.asarray, _gaps(profile, jnp.asarray(roll)))
     found = found & np.isfinite(gap)
     if not np.any(found):
         raise InputError(
@@ -76,8 +76,8 @@ def conjugacy(profile: Profile, error: float = 0.0) -> Conjugacy:
 
 
 @Program
-def _gaps(profile, roll, error):
-    pair = FlankPair.of(profile, 2 * profile.pitch_radius + error, two_sided=True)
+def _gaps(profile, roll):
+    pair = FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True)
     sides = jnp.stack([roll, -roll])
     contact = lax.map(lambda x: pair(x, jnp.zeros_like(x)), sides.ravel())
     gap = jnp.where(contact.found, contact.gap, jnp.inf).reshape(sides.shape)

@@ -15,41 +15,42 @@ from rootsopt.measured.loop import signed_area
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "inch": 25.4}
 """Length (mm) of each unit that the points of a file may have."""
 _NEIGHBOURS = 2, 3, 4
-"""Numbers of neighbours on each side from which a point is predicted, by a polynomial through all
-of them. The least of these predictions' errors counts: where points are few, errors of a
-polynomial depend on its degree, and scatter does not."""
+"""Numbers of neighbours on each side from which the scatter is estimated (see `scatter`). The least
+of the three estimates counts. The others may be larger, because the error of a polynomial through
+few points depends on its degree."""
 _AGREED = 1.5
-"""Ratio of the greatest to the least of these errors above which the scatter is not known."""
+"""Ratio of the greatest to the least of these estimates above which the scatter is unknown."""
 _CLEAR = 8.0
-"""Ratio of the distance between neighbours to the scatter below which farther neighbours are taken.
-Closer ones are out of order."""
+"""Ratio of the distance between neighbours to the scatter below which farther neighbours are used.
+Points that are closer together do not lie in order along the curve."""
 _FEWEST = 48
-"""Number of neighbours' distances in an outline below which no farther neighbours are taken."""
+"""Number of distances between neighbours around the outline below which the distance is not
+doubled again."""
 _MOST = 20_000
 """Number of points above which estimates use only every second, third ... point."""
 _MEDIAN = 1.4826
 """Ratio of the standard deviation to the median of the absolute values, for a normal
 distribution."""
 _HARMONICS = 48
-"""Greatest number of harmonics of the lobes in the outline that is fitted to find the centre."""
+"""Maximum number of harmonics of the lobes in the outline that is fitted to find the centre."""
 _PASSES, _STILL = 12, 1e-12
-"""Greatest number of Gauss-Newton steps to the centre; step (fraction of the outline's greatest
-radius) below which they end."""
+"""Maximum number of Gauss-Newton steps in the search for the centre, and step (fraction of the
+outline's greatest radius) below which the search ends."""
 _SUM = 0.06
-"""Relative difference of a pitch radius from the mean of outer and root radius up to which both fit
-together. They are equal for conjugate rotors."""
+"""Relative difference between the pitch radius and the mean of outer and root radius above which an
+outline counts as the wrong size. Both are equal for conjugate rotors."""
 _SEEN = 1e-4
-"""Scatter (mm) below which no message mentions it."""
+"""Scatter (mm) below which messages do not mention it."""
 _ENOUGH = 0.7
-"""Smoothing (in units of the scatter) above which the scatter counts as smoothed."""
+"""Ratio of the smoothing to the scatter below which the points count as not smoothed enough."""
 _APART = 6.0
-"""Ratio of the distance between points to the scatter below which smoothing fails: the length along
-the points is then mostly scatter."""
+"""Ratio of the distance between points to the scatter below which smoothing fails. Most of the
+length along the points is then scatter."""
 _MORE = 1.25
 """Factor by which a message raises a smoothing that did not suffice."""
 _SURE, _LEAST = 5.0, 1e-3
-"""Distance of the centre from the origin above which it is offered: in standard errors, and in
-mm."""
+"""Distances of the centre from the origin (standard errors; mm) above which a message proposes to
+move it there. Both must be exceeded."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,14 +75,14 @@ class Estimates:
 
     @property
     def excess(self) -> str:
-        """Advice if the scatter is so large that no smoothing removes it."""
+        """Advice for points whose scatter is too large for smoothing."""
         return (
             f"the points are scattered by about {_two(self.scatter)} um (RMS), too much to be "
             "smoothed: thin them out, or measure again"
         )
 
     def thinning(self, spacing: float) -> str:
-        """Return advice if points scatter more than they are apart; otherwise an empty text.
+        """Return advice if the scatter is large compared with the spacing; otherwise "".
 
         `spacing`: distance (mm) between successive points."""
         if not spacing < _APART * self.scatter:
@@ -119,7 +120,7 @@ class Estimates:
         )
 
     def centering(self) -> str:
-        """Return advice to move the centre to the origin; empty if it is there already."""
+        """Return advice to move the centre to the origin; "" if it is there already."""
         if not self.off_center:
             return ""
         return (
@@ -129,7 +130,7 @@ class Estimates:
         )
 
     def sizing(self, pitch_radius: float, unit: float) -> str:
-        """Return advice on units or pitch radius; empty if the size fits the `pitch_radius` (mm).
+        """Return advice on units or pitch radius; "" if the size fits the `pitch_radius` (mm).
 
         `unit`: length (mm) of the unit in which the file was read."""
         if not math.isfinite(self.middle) or abs(self.middle / pitch_radius - 1) < _SUM:
@@ -165,7 +166,7 @@ def unit_of_size(middle: float, pitch_radius: float) -> str | None:
 
 
 def estimates(points: Complex128[np.ndarray, " n"], lobes: int) -> Estimates:
-    """Return what the `points` (mm) of a closed outline with this number of `lobes` reveal."""
+    """Return estimates from the `points` (mm) of a closed outline with this number of `lobes`."""
     with np.errstate(all="ignore"):
         try:
             spread = scatter(points)
@@ -182,8 +183,8 @@ def scatter(points: Complex128[np.ndarray, " n"]) -> float:
     The unit is that of the points. Each point is predicted by the polynomial through some
     neighbours on both sides. Its deviation across the curve is divided by the standard deviation
     that unit scatter of all these points would cause. Corners and joints of the curve disturb few
-    deviations, so the median is used. If the scatter is not small compared with the distances
-    between neighbours, the neighbours are taken further apart."""
+    deviations, so the median is used. If the scatter is large compared with the distance between
+    neighbours, neighbours farther apart are used."""
     spacing = float(np.median(np.abs(np.diff(points))))
     stride, found = 1, _least(points, 1)
     while found > stride * spacing / _CLEAR and len(points) / (2 * stride) >= _FEWEST:
@@ -245,7 +246,7 @@ def center(points: Complex128[np.ndarray, " n"], lobes: int) -> tuple[complex, f
         a, b = np.split(shape[1:], 2)
         slope = (cos * b - sin * a) @ orders
         across = radius / np.hypot(radius, slope)
-        # A move of the centre changes radius and angle of every point.
+        # The derivatives include the change of radius and angle of every point.
         east, north = np.cos(angle), np.sin(angle)
         by_x = -east - slope * north / radius
         by_y = -north + slope * east / radius

@@ -23,8 +23,8 @@ so that one compiled program serves all outlines."""
 _PIECES = NODES // 4
 """Number of smooth pieces of an addendum or dedendum above which an outline is rejected."""
 _BEYOND = 0.3
-"""Polar angle (fraction of the angle from tip to root) by which the points used to fit a flank
-extend beyond its tip and beyond its root."""
+"""Polar angle (fraction of the angle from tip to root) by which the fitted points extend beyond a
+flank's tip and root."""
 _SHARES = 400
 """Number of points at which two flanks are compared."""
 _FOLD = 1e-3
@@ -48,7 +48,8 @@ _FAR = 1e3
 """Ratio of an outline's greatest radius to the pitch radius, or its inverse, above which an outline
 is rejected because its units must be wrong."""
 _WANDER = 8.0
-"""Distance (in units of the scatter) that smoothed points may lie beside their curve."""
+"""Backward run of the outline (multiples of the scatter) above which an outline to be smoothed is
+rejected, in addition to `_FOLD`."""
 _MANY = 20.0
 """Ratio of the flanks' deviation to the scatter below which a message blames the scatter."""
 _ESTIMATED = "scatter_um", "center_x_mm", "center_y_mm", "center_error_um"

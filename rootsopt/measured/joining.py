@@ -100,7 +100,7 @@ def _extent(points: NDArray[np.complex128]) -> float:
 
 
 def _clusters(points: NDArray[np.complex128], name: str) -> NDArray[np.intp]:
-    """Return the cluster number of each point. Points closer than `TOGETHER` share a cluster.
+    """Return the index of the cluster of each point. Points closer than `TOGETHER` share a cluster.
 
     Raises `InputError` if too many points are close together."""
     unique, which = np.unique(points, return_inverse=True)
@@ -123,7 +123,7 @@ def _components(pairs: NDArray[np.intp], count: int) -> NDArray[np.intp]:
 def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> NDArray[np.intp]:
     """Return the indices of the chains that do not repeat an earlier chain.
 
-    `vertex` (n, 2): numbers of the vertices at each chain's ends; `name`: name of the drawing in
+    `vertex` (n, 2): indices of the vertices at each chain's ends; `name`: name of the drawing in
     messages. A chain repeats another if the ends and the points of `_quarters` of both coincide."""
     if not chains:
         return np.zeros(0, np.intp)
@@ -152,7 +152,7 @@ def _quarters(points: NDArray[np.complex128], backwards: bool) -> NDArray[np.com
 def _in_loops(vertex: NDArray[np.intp]) -> NDArray[np.intp]:
     """Return the indices of the links that remain after repeatedly removing links at dead ends.
 
-    `vertex` (n, 2): numbers of the vertices at each link's ends."""
+    `vertex` (n, 2): indices of the vertices at each link's ends."""
     at: dict[int, set[int]] = {}
     for link, (a, b) in enumerate(vertex.tolist()):
         at.setdefault(a, set()).add(link)
@@ -173,7 +173,7 @@ def _in_loops(vertex: NDArray[np.intp]) -> NDArray[np.intp]:
 def _groups(vertex: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     """Return the indices of the links in each connected group.
 
-    `vertex` (n, 2): numbers of the vertices at each link's ends. Groups are ordered by the first
+    `vertex` (n, 2): indices of the vertices at each link's ends. Groups are ordered by the first
     index in each."""
     if not len(vertex):
         return []
@@ -190,7 +190,7 @@ def _walked(
 ) -> tuple[NDArray[np.complex128], NDArray[np.bool_]]:
     """Return (points, mask of joints) along the links of one loop or one open path in `chains`.
 
-    `members`: indices of the links, in any order; `vertex` (n, 2): numbers of the vertices at each
+    `members`: indices of the links, in any order; `vertex` (n, 2): indices of the vertices at each
     chain's ends."""
     at: dict[int, list[int]] = {}
     for link in members.tolist():
@@ -218,8 +218,7 @@ def _walked(
 def _widest_gap(
     ends: NDArray[np.complex128], vertex: NDArray[np.intp], links: NDArray[np.intp]
 ) -> tuple[float, complex]:
-    """Return (gap (mm), point (mm)): the widest gap between dead ends, and the dead end from which
-    it is measured.
+    """Return the widest gap (mm) between dead ends, and the dead end (mm) where it begins.
 
     `ends`, `vertex` (n, 2): points (mm) and vertices at each chain's ends; `links`: indices of the
     chains that count. A dead end is an end of these chains that shares its vertex with no other.

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from rootsopt.config import Config
 from rootsopt.measured.conjugacy import conjugacy
+from rootsopt.measured.source import advice, note, outline_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -15,8 +16,6 @@ def record(config: Config) -> dict[str, Any]:
     Return {} if the config names no outline file."""
     if not config.profile.from_file:
         return {}
-    from rootsopt.measured.source import outline_of
-
     profile, checks = outline_of(config.profile)
     return {"outline": checks.record() | conjugacy(profile).record()}
 
@@ -28,8 +27,6 @@ def say(config: Config, out: "Console") -> None:
     centre is not the rotor's axis."""
     if not config.profile.from_file:
         return
-    from rootsopt.measured.source import advice, note, outline_of
-
     checks = outline_of(config.profile)[1]
     for message in (note(checks), *advice(config.profile, checks)):
         if message:

@@ -43,8 +43,7 @@ def _kept(path: Path, stamp, lobes: int, radius: float, smoothing: float, place)
 
 
 def advice(config: "ProfileConfig", checks: Checks) -> list[str]:
-    """Return notes for the user on scatter and centre of a file's points, if the config ignores
-    them.
+    """Return notes on a file's scatter and centre, for a config that ignores them.
 
     `config`: the profile's config; `checks`: those of its outline."""
     found = []

@@ -38,7 +38,8 @@ class Certificate(NamedTuple):
 
     `violation`: greatest scaled violation of a constraint. `multipliers` (m,): those of the
     constraints. `lower`, `upper` (d,): multipliers of the bounds. `shares`: one array (k,) for each
-    maximum over k branches, whose entries add up to 1."""
+    maximum over k branches, whose entries add up to 1. `walls`: one array (k,) for each wall, with
+    a multiplier for each of its k branches."""
 
     residual: float
     violation: float
@@ -46,6 +47,12 @@ class Certificate(NamedTuple):
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     shares: tuple[NDArray[np.float64], ...]
+    walls: tuple[NDArray[np.float64], ...] = ()
+
+    @property
+    def greatest(self) -> float:
+        """Greatest multiplier of a constraint, or of a wall over all its branches."""
+        return float(np.max([0.0, *self.multipliers, *map(np.sum, self.walls)]))
 
     def holds(self, tolerance: float, feasibility: float) -> bool:
         """Return whether the conditions hold within tolerances.
@@ -68,11 +75,14 @@ def certify(local: Local, point: NDArray[np.float64], near: float = NEAR) -> Cer
         rows.append(group.slopes[chosen[-1]])
         gaps.append(gap[chosen[-1]])
     long = np.linalg.norm(local.normals, axis=1) > _NEGLIGIBLE
-    limits = (
+    limits = [
         ((local.slack <= near) & long, -local.normals, np.maximum(local.slack, 0.0)),
         (point <= near, -np.eye(size), point),
         (1 - point <= near, np.eye(size), 1 - point),
-    )
+    ]
+    for wall in local.walls:
+        steep = np.linalg.norm(wall.slopes, axis=1) > _NEGLIGIBLE
+        limits.append(((-wall.values <= near) & steep, wall.slopes, np.maximum(-wall.values, 0.0)))
     for active, normals, gap in limits:
         rows.append(normals[active])
         gaps.append(gap[active])
@@ -99,12 +109,15 @@ def certify(local: Local, point: NDArray[np.float64], near: float = NEAR) -> Cer
         values = np.zeros(len(active))
         values[active], found = found[:count], found[count:]
         numbers.append(values)
-    multipliers, lower, upper = numbers
+    multipliers, lower, upper, *walls = numbers
     left = local.combined(tuple(shares)) - multipliers @ local.normals - lower + upper
+    for wall, held in zip(local.walls, walls, strict=True):
+        left = left + held @ wall.slopes
     apart = [s * (g.top - g.values) for s, g in zip(shares, local.groups, strict=True)]
-    apart += [multipliers * np.maximum(local.slack, 0.0), lower * point, upper * (1 - point)]
+    apart += [value * gap for value, (_, _, gap) in zip(numbers, limits, strict=True)]
     residual = float(np.linalg.norm(np.concatenate([left, *apart])))
-    return Certificate(residual, local.violation, multipliers, lower, upper, tuple(shares))
+    held = multipliers, lower, upper, tuple(shares), tuple(walls)
+    return Certificate(residual, local.violation, *held)
 
 
 __all__ = ["NEAR", "Certificate", "certify"]

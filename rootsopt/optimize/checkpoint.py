@@ -30,7 +30,7 @@ from rootsopt.status import Status
 _SHOWN = 5
 """Maximum number of differences that an error message lists."""
 Key = tuple[int, int]
-"""Key of an evaluation: (number of the local search, number of the evaluation in it). The screening
+"""Key of an evaluation: (index of the local search, index of the evaluation in it). The screening
 is search -1."""
 
 
@@ -127,7 +127,7 @@ class Checkpoint:
             # A search that was stopped may still finish an evaluation.
             if self._file.closed:
                 return
-            # A full disk costs the checkpoint, not the run.
+            # If the disk is full, the run continues without a checkpoint.
             with contextlib.suppress(OSError):
                 self._file.write(line)
                 self._file.flush()

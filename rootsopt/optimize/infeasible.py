@@ -2,20 +2,25 @@
 
 A search minimises the greatest scaled violation of all constraints (elastic mode). See Nocedal and
 Wright, Numerical Optimization (2006), section 18.5. The constraints that keep this minimum above
-zero are in conflict. Only the geometry is needed, so no design is simulated."""
+zero are in conflict. If the geometry alone rules out all designs, none is simulated."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.design.space import Constraint
-from rootsopt.optimize.local import Group, Local
+from rootsopt.optimize.limits import ForceLimit
+from rootsopt.optimize.local import Group, Local, Look
 from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.optimize.sqp import Found, Stops, descend
 
 _STOPS = Stops(residual=1e-7, feasibility=1e-9, evaluations=300)
+_SIMULATED = Stops(residual=1e-5, feasibility=FEASIBLE, evaluations=60)
+"""The same, if each point must be simulated."""
+_GOLDEN = 0.6180339887
+"""Difference between the phases of branches at successive speeds, in `_groups`."""
 _PART = 1e-3
 """Share of a constraint in the least violation above which the constraint counts as in conflict.
 The shares of all constraints add up to 1."""
@@ -57,10 +62,16 @@ class Infeasible(NamedTuple):
             if one.alone is not None:
                 line += f" (possible with the others: {one.alone:.5g}{unit})"
             lines.append(line)
+        if any(one.alone is not None for one in self.conflicts):
+            advice = "Relax one of these to the value in brackets, or widen optimizer.bounds."
+        else:
+            advice = (
+                "Relaxing one of them is not enough. Relax all of them to their values in the "
+                "design of least violation, or widen optimizer.bounds."
+            )
         return (
             "No design within optimizer.bounds satisfies all constraints. In conflict: "
-            f"{'; '.join(lines)}. Relax one of these to the value in brackets, or widen "
-            "optimizer.bounds."
+            f"{'; '.join(lines)}. {advice}"
         )
 
     def record(self) -> dict[str, Any]:
@@ -69,68 +80,109 @@ class Infeasible(NamedTuple):
         return {"violation": self.violation, "conflicts": conflicts, "design": self.design}
 
 
-def explain(problem: Problem, starts: Sequence[NDArray[np.float64]]) -> Infeasible:
+def explain(
+    problem: Problem, starts: Sequence[NDArray[np.float64]], look: Look | None = None
+) -> Infeasible:
     """Return why no design satisfies all constraints of a `problem`.
 
-    `starts`: points (d,) of the unit box from which to search for the least violation."""
-    constraints = problem.space.constraints
-    nothing = np.zeros(0), np.zeros((0, len(problem.space.lower)))
+    `starts`: points (d,) of the unit box from which to search for the least violation. `look`:
+    function that returns constraints and walls at a point, from a simulation. By default, only the
+    constraints of the geometry count."""
+    limits = () if look is None else problem.limits
+    stops = _STOPS if look is None else _SIMULATED
+
+    def parts(point: NDArray[np.float64]) -> tuple[Group, ...] | None:
+        found = _geometry(problem, point) if look is None else look(point)
+        return None if found is None else _groups(found)
 
     def greatest(point: NDArray[np.float64]) -> Local | None:
-        slack, normals = problem.look(point)[2:]
-        if not np.all(np.isfinite(slack)) or not np.all(np.isfinite(normals)):
+        groups = parts(point)
+        if groups is None:
             return None
-        tags = np.stack([np.arange(len(slack)), np.zeros(len(slack))], axis=1).astype(float)
-        return Local(0.0, np.zeros(len(point)), (Group(tags, -slack, -normals),), *nothing)
+        every = [np.concatenate(arrays) for arrays in zip(*groups, strict=True)]
+        nothing = np.zeros(0), np.zeros((0, len(point)))
+        return Local(0.0, np.zeros(len(point)), (Group(*every),), *nothing)
 
-    best = _best([descend(greatest, start, _STOPS) for start in starts])
+    best = _best([descend(greatest, start, stops) for start in starts])
     if best is None or best.certificate is None or best.local is None:
         return Infeasible(float("nan"), (), {})
-    (shares,) = best.certificate.shares
-    slack = -best.local.groups[0].values
+    kinds = best.local.groups[0].tags[:, 0].astype(int)
+    shares = np.bincount(kinds, best.certificate.shares[0])
     conflicts = []
     for k in np.flatnonzero(shares > _PART):
-        one = constraints[k]
-        alone = _alone(problem, int(k), [best.point, *starts])
-        reached = _in_units(one, slack[k])
-        sense = "<=" if one.ceiling else ">="
-        limit = float(one.limit) / one.factor
-        conflicts.append(Conflict(one.name, sense, limit, one.unit, reached, alone))
+        excess = float(np.max(best.local.groups[0].values[kinds == k]))
+        alone = _alone(parts, int(k), [best.point, *starts], stops)
+        conflicts.append(_conflict((*problem.space.constraints, *limits)[k], excess, alone))
     names = problem.config.design_keys
     design = dict(zip(names, map(float, problem.design(best.point)), strict=True))
     return Infeasible(best.local.objective, tuple(conflicts), design)
 
 
-def _alone(problem: Problem, k: int, starts: Sequence[NDArray[np.float64]]) -> float | None:
-    """Return the nearest limit of constraint `k`, in its unit, that can be met if all others hold.
+def _geometry(problem: Problem, point: NDArray[np.float64]) -> Local | None:
+    """Return the constraints of the geometry at a `point` (d,), without an objective."""
+    slack, normals = problem.look(point)[2:]
+    if not np.all(np.isfinite(slack)) or not np.all(np.isfinite(normals)):
+        return None
+    return Local(0.0, np.zeros(len(point)), (), slack, normals)
 
-    `starts`: points (d,) of the unit box from which to search. Return `None` if the searches find
-    no point that satisfies the other constraints."""
+
+def _groups(local: Local) -> tuple[Group, ...]:
+    """Return each constraint and wall as a group that must be at most 0; its number is its kind."""
+    found = [
+        Group(np.array([[float(k), 0.0]]), np.array([-value]), -row[None, :])
+        for k, (value, row) in enumerate(zip(local.slack, local.normals, strict=True))
+    ]
+    for wall in local.walls:
+        # Speeds and scenes are told apart by their phase.
+        phases = (wall.tags[:, 1] + wall.tags[:, 0] * _GOLDEN) % 1.0
+        kinds = np.full(len(phases), float(len(found)))
+        found.append(wall._replace(tags=np.stack([kinds, phases], axis=1)))
+    return tuple(found)
+
+
+def _alone(
+    parts: Callable[[NDArray[np.float64]], tuple[Group, ...] | None],
+    k: int,
+    starts: Sequence[NDArray[np.float64]],
+    stops: Stops,
+) -> float | None:
+    """Return the least excess over constraint `k`, scaled, if all others hold.
+
+    `parts`: function that returns all constraints at a point; `starts`: points (d,) of the unit
+    box from which to search. Return `None` if the searches find no point that satisfies the other
+    constraints."""
 
     def look(point: NDArray[np.float64]) -> Local | None:
-        slack, normals = problem.look(point)[2:]
-        if not np.all(np.isfinite(slack)) or not np.all(np.isfinite(normals)):
+        groups = parts(point)
+        if groups is None:
             return None
-        others = np.delete(slack, k), np.delete(normals, k, axis=0)
-        return Local(-float(slack[k]), -normals[k], (), *others)
+        others = groups[:k] + groups[k + 1 :]
+        nothing = np.zeros(0), np.zeros((0, len(point)))
+        return Local(0.0, np.zeros(len(point)), (groups[k],), *nothing, others)
 
-    found = [descend(look, start, _STOPS) for start in starts]
+    found = [descend(look, start, stops) for start in starts]
     found = [one for one in found if one.local is not None and one.local.violation <= FEASIBLE]
     best = _best(found)
-    if best is None or best.local is None:
-        return None
-    return _in_units(problem.space.constraints[k], -best.local.objective)
+    return None if best is None or best.local is None else best.local.objective
+
+
+def _conflict(one: Constraint | ForceLimit, excess: float, alone: float | None) -> Conflict:
+    """Return a conflict in reported units, given the scaled excess over its limit.
+
+    `excess`: in the design of least violation; `alone`: if all others hold."""
+    if isinstance(one, ForceLimit):
+        sign, sense, limit, size = one.sign, one.sense, one.limit, one.scale
+    else:
+        sign, sense = -one.sign, "<=" if one.ceiling else ">="
+        limit, size = float(one.limit) / one.factor, one.scale / one.factor
+    reached = limit + sign * size * excess
+    nearest = None if alone is None else limit + sign * size * alone
+    return Conflict(one.name, sense, limit, one.unit, reached, nearest)
 
 
 def _best(found: Sequence[Found]) -> Found | None:
     usable = [(one.local.objective, one) for one in found if one.local is not None]
     return min(usable, key=lambda pair: pair[0], default=(0.0, None))[1]
-
-
-def _in_units(constraint: Constraint, slack: float) -> float:
-    """Return a constraint's value in its reported unit, given its scaled `slack`."""
-    limit = float(constraint.limit)
-    return (limit + constraint.sign * float(slack) * constraint.scale) / constraint.factor
 
 
 __all__ = ["Conflict", "Infeasible", "explain"]

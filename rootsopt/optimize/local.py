@@ -2,11 +2,12 @@
 
 The objective is a smooth function s plus a sum of maxima over groups g of smooth *branches* b:
 
-    f(x) = s(x) + Σ_g max_i b_gi(x),    subject to c_j(x) ≥ 0 and 0 ≤ x ≤ 1.
+    f(x) = s(x) + Σ_g max_i b_gi(x),    subject to c_j(x) ≥ 0, max_i w_ki(x) ≤ 0 and 0 ≤ x ≤ 1.
 
 For example, the local maxima of the contact force over time are the branches of its peak. If only
 the worst of several speeds counts, the objectives at these speeds are branches. Each branch is
-smooth, even where the maximum has a corner."""
+smooth, even where the maximum has a corner. The same holds for the *walls* w_k: limits of a
+quantity that is a maximum over branches."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -38,13 +39,14 @@ class Local(NamedTuple):
 
     `smooth`: smooth part of the objective; `slope` (d,): its gradient; `groups`: the maxima that
     are added to it. `slack` (m,): values of the constraints c ≥ 0; `normals` (m, d): their
-    gradients."""
+    gradients. `walls`: limits of maxima over branches; each branch must be at most 0."""
 
     smooth: float
     slope: NDArray[np.float64]
     groups: tuple[Group, ...]
     slack: NDArray[np.float64]
     normals: NDArray[np.float64]
+    walls: tuple[Group, ...] = ()
 
     @property
     def objective(self) -> float:
@@ -53,8 +55,9 @@ class Local(NamedTuple):
 
     @property
     def violation(self) -> float:
-        """Greatest violation of a constraint; 0 if all constraints are satisfied."""
-        return max(0.0, -float(np.min(self.slack, initial=0.0)))
+        """Greatest violation of a constraint or wall; 0 if all are satisfied."""
+        beyond = max((wall.top for wall in self.walls), default=0.0)
+        return max(0.0, -float(np.min(self.slack, initial=0.0)), beyond)
 
     def combined(self, shares: tuple[NDArray[np.float64], ...]) -> NDArray[np.float64]:
         """Return the gradient (d,) of the smooth part plus the weighted branches.

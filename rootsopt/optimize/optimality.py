@@ -1,4 +1,4 @@
-"""What is known about an optimum: certificate, active branches, outcomes of the local searches."""
+"""Facts about an optimum: certificate, active branches, outcomes of the local searches."""
 
 import dataclasses
 import math
@@ -32,7 +32,8 @@ _REASONS = REASONS | {
 class StartOutcome(NamedTuple):
     """Outcome of one local search.
 
-    `start`: number of the search; `objective`: best objective, NaN if no design was usable;
+    `start`: index of the search; `objective`: best objective, NaN if no usable design satisfied
+    all constraints;
     `residual`: first-order residual, NaN if not known; `reason`: word for why the search ended;
     `evaluations`: number of evaluated designs; `design`: best design, in config units by key;
     `point` (d,): this design in the unit box."""
@@ -53,8 +54,8 @@ class Holder(NamedTuple):
     branch. `share`: its weight in the gradient of the objective.
 
     `rotation_deg`, `force_N`: rotation of rotor 1 (degrees from φ1 = 0) and contact force (N), if
-    the branch is a local maximum of the force over time. Otherwise, both are NaN. `scene`: number
-    of the scene in the sample of `tolerances`, from 0; `None` if nothing scatters."""
+    the branch is a local maximum of the force over time. Otherwise, both are NaN. `scene`: index
+    of the scene in the sample of `tolerances`; `None` if nothing scatters."""
 
     speed_rpm: float
     rotation_deg: float

@@ -18,6 +18,13 @@ from rootsopt.design.space import Space, slacks_and_slopes
 from rootsopt.dynamics.measures import line_name
 from rootsopt.errors import InputError
 from rootsopt.optimize.certificate import NEAR, Certificate
+from rootsopt.optimize.limits import (
+    PEAK,
+    ForceLimit,
+    TermConstraint,
+    force_limits,
+    term_constraints,
+)
 from rootsopt.optimize.local import Group, Local
 from rootsopt.optimize.optimality import Holder
 from rootsopt.response.evaluation import Evaluation, objective_weights
@@ -26,8 +33,6 @@ from rootsopt.response.terms import sense_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 
-PEAK = "peak_force_N"
-"""Key of the peak force in a response: the greatest of several local maxima of the force."""
 _NO_LINE = 1e-9
 """Amplitude of the baseline's spectral line (relative to its mean force) below which an objective
 that contains this line is rejected."""
@@ -37,9 +42,11 @@ equality by every design."""
 _HELD = 1e-6
 """Multiplier of a bound, or share of a branch, below which the bound or branch counts as inactive.
 """
-_STEPS = {"mm": 0.1, "deg": 1.0, "": 0.01}
+_STEPS = {"mm": 0.1, "deg": 1.0, "°": 1.0, "": 0.01}
 """Change of a limit, by the unit of the limit, for which the report states the effect on the
-objective."""
+objective. In other units, it is the power of ten nearest to 1 % of the limit."""
+SCENE_KINDS = 64
+"""Kinds of branches per scene. There are at most 33 speeds, and each is a kind."""
 _DRAWN = 5
 """Maximum number of times that an infeasible point is moved halfway towards a feasible point."""
 FEASIBLE = 1e-6
@@ -69,12 +76,14 @@ class Problem:
     """The design problem of a config, relative to its evaluated baseline.
 
     `config`: the config; `baseline`: evaluation of the config's own design, or of the outline that
-    the search is to improve; `space`: unit box of the d design parameters, with m constraints. In
-    all methods, a *point* (d,) is a point of this box."""
+    the search is to improve; `space`: unit box of the d design parameters, with m constraints;
+    `limits`: limits that depend on forces. In all methods, a *point* (d,) is a point of this box.
+    """
 
     config: Config
     baseline: Evaluation
     space: Space
+    limits: tuple[ForceLimit, ...] = ()
 
     @classmethod
     def of(cls, config: Config, scene: Scene, baseline: Evaluation) -> "Problem":
@@ -104,7 +113,9 @@ class Problem:
                 f"{name} is {one.response[name]:g}{at}; raise the load, lower "
                 "`contact.clearance_mm`, or set the weight to 0"
             )
-        return cls(config, baseline, Space.of(config, scene, baseline.geometry["area_efficiency"]))
+        floor = baseline.geometry["area_efficiency"]
+        space = Space.of(config, scene, floor, term_constraints(config, scene))
+        return cls(config, baseline, space, force_limits(config, scene))
 
     def objective(self, evaluation: Evaluation) -> float:
         """Return the objective of an `evaluation`, which is 1 for the baseline.
@@ -188,7 +199,79 @@ class Problem:
             together = [np.concatenate(arrays) for arrays in zip(*groups, strict=True)]
             groups = [Group(*together)]
         scaled = tuple(g._replace(slopes=g.slopes @ jacobian) for g in groups)
-        return Local(smooth, slope @ jacobian, scaled, slack, normals)
+        walls = self.walls(evaluation, jacobian)
+        return Local(smooth, slope @ jacobian, scaled, slack, normals, walls)
+
+    def walls(self, evaluation: Evaluation, jacobian: NDArray[np.float64]) -> tuple[Group, ...]:
+        """Return one wall for each of `limits`: by how much an evaluated design exceeds it.
+
+        `evaluation`: usable, with gradients; `jacobian` (d, d): that of the design with respect to
+        the point. Each speed that counts, each coexisting motion and each scene of a sample is a
+        branch. If the peak force has a ceiling, each local maximum of the force is one."""
+        found = []
+        for limit in self.limits:
+            tags, values, slopes = [], [], []
+            for kind, one in self._limited(evaluation):
+                maxima = one.maxima if limit.cornered else None
+                if maxima is None or not maxima.times.size:
+                    tags.append((kind, 0.0))
+                    values.append(one.response[limit.key])
+                    slopes.append(np.array(list(one.gradient[limit.key].values())))
+                    continue
+                period = one.steady_state["period"]
+                tags += [(kind, time / period) for time in maxima.times]
+                values += [*maxima.forces]
+                slopes += [*maxima.slopes]
+            rows = limit.sign * np.array(slopes) / limit.scale
+            found.append(
+                Group(np.array(tags, float), limit.excess(np.array(values)), rows @ jacobian)
+            )
+        return tuple(found)
+
+    def worst(self, evaluation: Evaluation, limit: ForceLimit) -> float:
+        """Return the value of a limited quantity that is nearest to its `limit`, or beyond it most.
+
+        `evaluation`: usable. Speeds, motions and scenes are those of `walls`."""
+        values = [one.response[limit.key] for _, one in self._limited(evaluation)]
+        return float(max(values, key=limit.excess))
+
+    def excess(self, evaluation: Evaluation) -> float:
+        """Return by how much an evaluated design exceeds the worst of `limits`; ≤ 0 if by none.
+
+        The excess is scaled. It is 0 if there are no limits, NaN without a usable steady state."""
+        if not self.limits:
+            return 0.0
+        if not evaluation.usable:
+            return math.nan
+        return max(float(one.excess(self.worst(evaluation, one))) for one in self.limits)
+
+    @property
+    def with_maxima(self) -> bool:
+        """Whether an evaluation needs all local maxima of the force."""
+        motions = self.config.objective.motion in ("reached", "worst")
+        return self.cornered or (motions and any(one.cornered for one in self.limits))
+
+    def keeps_limits(self, evaluation: Evaluation) -> bool:
+        """Return whether an evaluated design satisfies all of `constraints.terms`."""
+        if self.excess(evaluation) > FEASIBLE:
+            return False
+        terms = (c for c in self.space.constraints if isinstance(c, TermConstraint))
+        return all(float(c.scaled(evaluation.response[c.quantity])) >= -FEASIBLE for c in terms)
+
+    def _limited(self, evaluation: Evaluation) -> list[tuple[int, Evaluation]]:
+        """Return (kind, evaluation) of each scene, speed and motion in which `limits` must hold."""
+        found = []
+        for scene, whole in enumerate(self._scenes(evaluation)):
+            for number, part in enumerate(at_speeds(whole)):
+                if part.share <= 0:
+                    continue
+                kind = SCENE_KINDS * scene + number
+                found += [(kind, one) for one in (part.evaluation, *part.evaluation.rivals)]
+        return found
+
+    def _scenes(self, evaluation: Evaluation) -> list[Evaluation]:
+        """Return the evaluations in all scenes in which `limits` must hold."""
+        return [evaluation]
 
     def along_scene(self, moved: Evaluation, certificate: Certificate) -> dict[str, float]:
         """Return the derivatives of the optimal objective with respect to scene quantities, by key.
@@ -344,6 +427,8 @@ class Problem:
             limit = float(c.limit) / c.factor
             if c.margin:
                 before, after = (self._margin(one, k) for one in (self.baseline, optimized))
+            elif isinstance(c, TermConstraint):
+                before, after = (one.response[c.quantity] for one in (self.baseline, optimized))
             else:
                 before = self.baseline.geometry[keys[c.quantity]]
                 after = optimized.geometry[keys[c.quantity]]
@@ -356,7 +441,23 @@ class Problem:
                 per_unit = certificate.multipliers[k] * c.factor / c.scale
                 row |= self._multiplier(row, per_unit, optimized)
             rows.append(row)
+        rows += self._limit_rows(optimized, certificate)
         return rows + self._range_rows(optimized, certificate)
+
+    def _limit_rows(
+        self, optimized: Evaluation, certificate: Certificate | None = None
+    ) -> list[dict]:
+        """Return one row for each of `limits`, with its value at the worst speed."""
+        rows = []
+        for k, one in enumerate(self.limits):
+            before, after = (self.worst(every, one) for every in (self.baseline, optimized))
+            slack = -float(one.excess(after))
+            row = _row(one.name, before, after, one.limit, one.unit, slack, one.sense)
+            if certificate is not None:
+                per_unit = float(np.sum(certificate.walls[k])) / one.scale
+                row |= self._multiplier(row, per_unit, optimized)
+            rows.append(row)
+        return rows
 
     def _margin(self, evaluation: Evaluation, k: int) -> float:
         """Return the value that constraint `k` limits, in its unit, for an evaluated design.
@@ -383,7 +484,7 @@ class Problem:
         """Return entries for a `row` that state how its limit affects the objective.
 
         `per_unit`: decrease of the objective per unit by which the limit is relaxed."""
-        step = _STEPS.get(row["unit"], 1.0)
+        step = _step(row["unit"], row["limit"])
         relax = step if row["sense"] == "<=" else -step
         toward = -1.0 if row["sense"] == "<=" else 1.0
         gain = -100 * per_unit * step / self.objective(optimized)
@@ -480,6 +581,13 @@ def check_senses(config: Config) -> None:
                 f"`objective.terms` must name terms of which less is better, but names {name}; "
                 "limit it under `constraints`, or trade it against others with `rootsopt pareto`"
             )
+
+
+def _step(unit: str, limit: float) -> float:
+    """Return the change of a `limit` for which the report states the effect on the objective."""
+    if unit in _STEPS or limit == 0:
+        return _STEPS.get(unit, 1.0)
+    return 10.0 ** (round(math.log10(abs(limit))) - 2)
 
 
 def words(key: str) -> str:

@@ -1,16 +1,17 @@
 """Local search with a second-order model of every branch and constraint.
 
-Sequential quadratic programming has one curvature for all functions together. Where many branches
-and constraints with curvatures of their own hold an optimum, its steps run out of the feasible set,
-the line search cuts them short (Maratos effect), and it crawls. Here, each function has a model of
-its own: value and gradient at the best point, and a Hessian from differences of gradients. A step
-minimises the models within a trust region. This is sequential quadratically constrained quadratic
-programming: Anitescu, A superlinearly convergent sequential quadratically constrained quadratic
-programming algorithm for degenerate nonlinear programming, SIAM Journal on Optimization 12 (2002)
-949-978. The Hessians follow the motion by symmetric rank-one updates (Nocedal and Wright, Numerical
-Optimization, 2006, section 6.2)."""
+Sequential quadratic programming has one Hessian for all functions together. If many branches and
+constraints of different curvature are active at an optimum, its steps leave the feasible set. The
+line search then shortens every step, and progress is slow (Maratos effect). Here, each function has
+its own model: value and gradient at the best point, and a Hessian from differences of gradients. A
+step minimises the models within a trust region. After each step, symmetric rank-one updates correct
+the Hessians (Nocedal and Wright, Numerical Optimization, 2006, section 6.2).
 
-from collections.abc import Callable
+The method is sequential quadratically constrained quadratic programming. Source: Anitescu, A
+superlinearly convergent sequential quadratically constrained quadratic programming algorithm for
+degenerate nonlinear programming, SIAM Journal on Optimization 12 (2002) 949-978."""
+
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +20,9 @@ from scipy.optimize import linear_sum_assignment, minimize
 from rootsopt.optimize.local import Group, Local
 
 _STEP = 1e-3
-"""Distance in the unit box over which gradients are compared."""
+"""Step (unit box) of the difference quotients that give the first Hessians."""
 _FIRST, _LEAST = 0.05, 1e-6
-"""Half width of the trust region at the start, and at which the search ends (unit box)."""
+"""Half width of the trust region (unit box): at the start, and that below which the search ends."""
 _SAME = 0.1
 """Difference between phases above which branches at two points count as different."""
 _ROUNDS = 25
@@ -39,9 +40,10 @@ Rows = tuple[NDArray[np.float64], NDArray[np.float64]]
 class Models:
     """Quadratic models of all functions of a problem near a point.
 
-    The n functions are the smooth part of the objective, the branches of each maximum, and the
-    constraints, in this order. `point` (d,): centre; `local`: the problem there, with the n values
-    and gradients in `rows`; `bends` (n, d, d): Hessians."""
+    The n functions are the smooth part of the objective, the branches of each maximum, the
+    constraints, and the branches of each wall with the opposite sign, in this order. `point` (d,):
+    centre; `local`: the problem there, with the n values and gradients in `rows`; `bends` (n, d,
+    d): Hessians."""
 
     def __init__(self, point: NDArray[np.float64], local: Local):
         self.point, self.local, self.rows = point, local, _rows(local)
@@ -49,7 +51,9 @@ class Models:
         self.bends = np.zeros((count, size, size))
 
     def measure(self, at: Callable[[NDArray[np.float64]], Local | None]) -> None:
-        """Set the Hessians by differences of gradients. `at` evaluates the problem at a point."""
+        """Compute the Hessians from differences of gradients.
+
+        `at`: function that evaluates the problem at a point."""
         size = len(self.point)
         columns = np.zeros_like(self.bends)
         for axis in range(size):
@@ -66,8 +70,8 @@ class Models:
     def moved(self, point: NDArray[np.float64], local: Local) -> "Models":
         """Return the models at a new `point` (d,), where the problem is `local`.
 
-        The Hessians are updated with the change of the gradients. A branch that was not known
-        before has none."""
+        The Hessians are updated with the change of the gradients. The Hessian of a new branch is
+        zero."""
         slopes, known = _matched(self.local, local)
         step = point - self.point
         for k in np.flatnonzero(known):
@@ -141,10 +145,11 @@ def refine(
     local: Local,
     greatest: float,
 ) -> None:
-    """Search from a `point` (d,), where the problem is `local`, by steps of `Models`.
+    """Search from a `point` (d,), where the problem is `local`, with steps from `Models`.
 
-    `at` evaluates the problem at a point; it keeps the best one, and ends the search by an
-    exception. `greatest`: greatest multiplier of a constraint at the point."""
+    `at`: function that evaluates the problem at a point. It also stores the best point, so that
+    nothing is returned here, and raises an exception to end the search. `greatest`: greatest
+    multiplier of a constraint at the point."""
     price = _PRICE[0] + _PRICE[1] * greatest
     models, reach = Models(point, local), _FIRST
     models.measure(at)
@@ -171,29 +176,45 @@ def refine(
 
 
 def _rows(local: Local) -> Rows:
-    """Return values (n,) and gradients (n, d) of the n functions of a problem, as in `Models`."""
+    """Return the values (n,) and gradients (n, d) of the n functions listed in `Models`."""
     values = [np.array([local.smooth]), *(g.values for g in local.groups), local.slack]
     slopes = [local.slope[None], *(g.slopes for g in local.groups), local.normals]
+    values += [-wall.values for wall in local.walls]
+    slopes += [-wall.slopes for wall in local.walls]
     return np.concatenate(values), np.concatenate(slopes)
 
 
 def _places(one: Local, other: Local) -> NDArray[np.int64]:
-    """Return the numbers (n,) at point `other` of the functions at point `one`; -1 for none."""
+    """Return the index (n,) of each function of the problem `one` among those of `other`.
+
+    The index of a branch that `other` does not have is -1."""
     places, start = [np.zeros(1, int)], 1
-    for group, new in zip(one.groups, other.groups, strict=True):
-        places.append(np.where((found := _alike(group, new)) >= 0, found + start, -1))
-        start += len(new.values)
-    return np.concatenate([*places, start + np.arange(len(other.slack))])
+
+    def add(groups: Sequence[Group], others: Sequence[Group]) -> None:
+        nonlocal start
+        for group, new in zip(groups, others, strict=True):
+            places.append(np.where((found := _alike(group, new)) >= 0, found + start, -1))
+            start += len(new.values)
+
+    add(one.groups, other.groups)
+    places.append(start + np.arange(len(other.slack)))
+    start += len(other.slack)
+    add(one.walls, other.walls)
+    return np.concatenate(places)
 
 
 def _matched(one: Local, other: Local) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the gradients (n, d) at `other` of the functions at `one`, and which of them exist."""
+    """Return the gradients (n, d) in the problem `other` of the functions of the problem `one`.
+
+    Also return a mask (n,) of the functions that `other` has."""
     places = _places(one, other)
     return _rows(other)[1][places], places >= 0
 
 
 def _alike(group: Group, other: Group) -> NDArray[np.int64]:
-    """Return the index in `other` of each branch of `group` (k,), by kind and phase; -1: none."""
+    """Return the index (k,) in `other` of each branch of `group`; -1 if there is no such branch.
+
+    Two branches are the same if their kinds are equal and their phases are close (`_SAME`)."""
     apart = np.abs(group.tags[:, None, 1] - other.tags[None, :, 1])
     apart = np.minimum(apart % 1.0, -apart % 1.0)
     differ = group.tags[:, None, 0] != other.tags[None, :, 0]

@@ -3,17 +3,17 @@
 The combinations are R = Σ w_k(J) J_k, where J_k is the objective in scene k of n, and the weights w
 add up to 1:
 
-- mean plus k standard deviations: R = m + k s with m = Σ J_k / n and s² = Σ (J_k - m)² / n, so that
-  w_k = (1 + k (J_k - m) / s) / n;
-- quantile q: the estimator of Harrell and Davis, a weighted mean of all ordered values. The weight
-  of the i-th smallest is B(i/n) - B((i-1)/n), where B is the distribution function of the beta
-  distribution with parameters (n + 1) q and (n + 1) (1 - q). It changes less from sample to sample
-  than a single ordered value, and every scene contributes to its gradient. Source: Harrell and
-  Davis, A new distribution-free quantile estimator, Biometrika 69 (1982) 635-640;
-- worst: the greatest value, w_k = 1 there.
+- Mean plus c = `tolerances.k` standard deviations: R = m + c s, with m = Σ J_k / n and
+  s² = Σ (J_k - m)² / n. Hence w_k = (1 + c (J_k - m) / s) / n.
+- Quantile q: the estimator of Harrell and Davis, a weighted mean of all ordered values. The weight
+  of the i-th smallest is B(i/n) - B((i-1)/n). B is the distribution function of the beta
+  distribution with parameters (n + 1) q and (n + 1) (1 - q). This estimator varies less between
+  samples than a single ordered value, and every scene contributes to its gradient. Source: Harrell
+  and Davis, A new distribution-free quantile estimator, Biometrika 69 (1982) 635-640.
+- Worst: the greatest value. Its weight is 1.
 
-Each R grows in proportion to J. Therefore dR/dJ_k = w_k (Euler's theorem), wherever R is
-differentiable."""
+Each R is a homogeneous function of J of degree 1. Therefore dR/dJ_k = w_k (Euler's theorem),
+wherever R is differentiable."""
 
 from typing import NamedTuple
 
@@ -28,7 +28,9 @@ _EQUAL = 1e-14
 
 
 class Combined(NamedTuple):
-    """A combination R of n values: `value`, and `weights` (n,), its derivatives by the values."""
+    """A combination R of n values.
+
+    `value`: R; `weights` (n,): derivatives of R with respect to the values."""
 
     value: float
     weights: NDArray[np.float64]
@@ -58,7 +60,7 @@ def order_weights(count: int, quantile: float) -> NDArray[np.float64]:
 def _mean_and_deviation(values: NDArray[np.float64], k: float) -> NDArray[np.float64]:
     away = values - np.mean(values)
     deviation = float(np.sqrt(np.mean(away**2)))
-    # Equal values: the standard deviation has a corner here, and 0 is one of its subgradients.
+    # For equal values, the standard deviation has a corner, and 0 is one of its subgradients.
     if deviation <= _EQUAL * abs(float(np.mean(values))):
         return np.full(len(values), 1 / len(values))
     return (1 + k * away / deviation) / len(values)

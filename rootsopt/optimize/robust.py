@@ -1,4 +1,4 @@
-"""The robust optimum: the best design if numbers of scene and design scatter (`tolerances`).
+"""The robust optimum: the best design if values of scene and design scatter (`tolerances`).
 
 The search has two stages. The first one finds the nominal optimum, as without `tolerances`. In the
 second one, local searches begin at the optima of the first stage. Each of their designs is
@@ -43,7 +43,7 @@ scene), and mean, peak and RMS force (N)."""
 _LEVEL = 0.95
 """Level of the quantile that the comparison reports."""
 _APART = 1e-6
-"""Distance of two designs in the unit box below which they count as the same."""
+"""Distance in the unit box below which two designs count as the same."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,12 +95,12 @@ class Scattered:
 
 @dataclasses.dataclass(frozen=True)
 class Robustness:
-    """What the search found besides the robust optimum.
+    """Results of the search other than the robust optimum.
 
     `nominal`: outcome of the first stage; `begun`: robust objective of the nominal optimum over the
     sample of the search, NaN if it is not usable; `fresh`: designs in fresh scenes by name
     (`baseline`, `nominal`, `robust`), empty without `tolerances.check_samples`; `scenes`: sampled
-    numbers of these scenes, arrays (n,) by key."""
+    values of these scenes, arrays (n,) by key."""
 
     nominal: Optimization
     begun: float
@@ -167,7 +167,7 @@ class RobustSearch(Search):
         return [point for point in self._sample if self.problem.feasible(point)]
 
     def _starts(self, trials) -> list[NDArray[np.float64]]:
-        """Return those optima of the first stage that lie apart in the unit box."""
+        """Return the optima of the first stage, without those close to another in the unit box."""
         del trials
         chosen: list[NDArray[np.float64]] = []
         for point in self._sample:
@@ -256,7 +256,7 @@ class TolerantSearch:
         self.progress(self._done + done, self._expected + expected, best)
 
     def _compared(self, stage: RobustSearch, found: Optimization) -> tuple[dict, dict]:
-        """Return baseline and both optima in fresh scenes, and the numbers of these scenes."""
+        """Return the fields `fresh` and `scenes` of `Robustness`."""
         tolerances = self.config.tolerances
         assert tolerances is not None
         assert self._nominal is not None
@@ -277,7 +277,7 @@ class TolerantSearch:
         expected, lock, ended = before + total // per, threading.Lock(), [0]
 
         def tick() -> bool:
-            # As many scenes as a design of the search has count as one design.
+            # A design of the search needs `per` simulations: count so many as one evaluation.
             with lock:
                 ended[0] += 1
                 if ended[0] % per == 0:
@@ -330,7 +330,7 @@ def _scattered(
     design = np.array(list(nominal.design.values()))
     begun = nominal.state
     if evaluator.config.solver.orbit != "shooting":
-        # This evaluator then knows the orbit, and closes those of the scenes from it.
+        # The evaluator then remembers this orbit, and starts from it in every scene.
         again = evaluator(design, nominal.state, series=False)
         begun = again.state if again.usable else begun
 
@@ -375,7 +375,8 @@ def search_of(
 
     Arguments: see `Search`.
 
-    Raises `InputError` for `tolerances` with a profile from a file: it has no design to move."""
+    Raises `InputError` for `tolerances` with a profile from a file, which has no design
+    parameters."""
     if config.tolerances is not None and config.profile.family == "outline":
         raise InputError(
             "`tolerances` must be absent for `profile.family` outline; optimise it without them, "

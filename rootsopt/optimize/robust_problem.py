@@ -1,4 +1,4 @@
-"""The design problem over a sample of scenes that scatter.
+"""The design problem over a sample of scenes with scattered values.
 
 The objective in each scene is that of `Problem`, relative to the baseline in the nominal scene. A
 rule (`rootsopt.optimize.risk`) combines the scenes to one number, which is divided by its value for
@@ -13,16 +13,14 @@ from rootsopt.config import Config
 from rootsopt.optimize.certificate import Certificate
 from rootsopt.optimize.local import Group, Local
 from rootsopt.optimize.optimality import Holder
-from rootsopt.optimize.problem import Problem
+from rootsopt.optimize.problem import SCENE_KINDS, Problem
 from rootsopt.optimize.risk import Combined, combine
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.tolerances import ToleranceEvaluation, nominal_of
 from rootsopt.scene import Scene
 
 _HELD = 1e-6
-"""Share of a scene below which it does not hold the optimum."""
-_KINDS = 64
-"""Kinds of branches per scene. There are at most 33 speeds, and each is a kind."""
+"""Share of a scene below which the scene does not count as active at the optimum."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +40,7 @@ class RobustProblem(Problem):
         `baseline`: a usable `ToleranceEvaluation` of the config's own design."""
         assert isinstance(baseline, ToleranceEvaluation)
         problem = Problem.of(config, scene, baseline.nominal)
-        found = cls(config, problem.baseline, problem.space)
+        found = cls(config, problem.baseline, problem.space, problem.limits)
         return dataclasses.replace(found, reference=found.combined(baseline).value)
 
     def values(self, evaluation: ToleranceEvaluation) -> NDArray[np.float64]:
@@ -81,11 +79,12 @@ class RobustProblem(Problem):
     ) -> Local | None:
         """Return the robust objective and the constraints at a `point`, with gradients.
 
-        If the worst scene counts, its scenes are branches of one maximum. Otherwise the maxima of
-        each scene (local maxima of the force, for example) are groups, weighted by `shares` (n,):
-        numbers ≥ 0 that must be the same throughout a local search. By default they are the
-        weights at this point, without those below 0. What the groups leave of the objective is
-        described by the gradient of the greatest branch in each scene."""
+        If the worst scene counts, the scenes are branches of one maximum. Otherwise the maxima of
+        each scene (for example, over the local maxima of the force) become groups, multiplied by
+        `shares` (n,) ≥ 0. The shares must not change during a local search. By default, they are
+        the weights of the scenes at this point, with negative ones set to 0. The rest of the
+        objective becomes its smooth part, with the gradient of the greatest branch in each
+        scene."""
         if not isinstance(evaluation, ToleranceEvaluation):
             return super().local(evaluation, point)
         if not evaluation.usable:
@@ -93,8 +92,9 @@ class RobustProblem(Problem):
         assert self.config.tolerances is not None
         every = [super(RobustProblem, self).local(p.evaluation, point) for p in _of(evaluation)]
         parts = [part for part in every if part is not None]
+        walls = self.walls(evaluation, self.look(point)[1]) if self.limits else ()
         if self.config.tolerances.combine == "worst":
-            return self._worst(parts)
+            return self._worst(parts)._replace(walls=walls)
         value, weights = combine(self.config.tolerances, [part.objective for part in parts])
         shares = self.shares(weights) if shares is None else shares
         smooth, slope = value, np.zeros_like(parts[0].slope)
@@ -108,8 +108,14 @@ class RobustProblem(Problem):
                 slope = slope - share * one.slopes[np.argmax(one.values)]
                 groups.append(Group(one.tags, share * one.values, share * one.slopes))
         scaled = tuple(self._scaled(group) for group in groups)
-        limits = parts[0].slack, parts[0].normals
+        limits = parts[0].slack, parts[0].normals, walls
         return Local(smooth / self.reference, slope / self.reference, scaled, *limits)
+
+    def _scenes(self, evaluation: Evaluation) -> list[Evaluation]:
+        """Return the evaluations in the nominal scene and in all scenes of the sample."""
+        if not isinstance(evaluation, ToleranceEvaluation):
+            return [evaluation]
+        return [part.evaluation for part in evaluation.parts]
 
     def by_speed(self, evaluation: Evaluation) -> list[dict[str, float]]:
         """Return one row per speed in the nominal scene, as `Problem.by_speed` does."""
@@ -120,7 +126,7 @@ class RobustProblem(Problem):
         return np.maximum(weights, 0.0)
 
     def _worst(self, parts: list[Local]) -> Local:
-        branches = [self._scaled(_branches(part, _KINDS * k)) for k, part in enumerate(parts)]
+        branches = [self._scaled(_branches(part, SCENE_KINDS * k)) for k, part in enumerate(parts)]
         group = Group(*(np.concatenate(arrays) for arrays in zip(*branches, strict=True)))
         zero = np.zeros_like(parts[0].slope)
         return Local(0.0, zero, (group,), parts[0].slack, parts[0].normals)
@@ -130,10 +136,10 @@ class RobustProblem(Problem):
         return group._replace(values=group.values / size, slopes=group.slopes / size)
 
     def held_by(self, evaluation: Evaluation, certificate: Certificate) -> list[Holder]:
-        """Return the worst scenes that are active at an evaluated optimum, if the worst counts.
+        """Return the scenes that are active at an evaluated optimum, if the worst scene counts.
 
-        If another rule combines the scenes, all scenes hold the optimum, and the list is empty.
-        `evaluation`, `certificate`: those of the optimum."""
+        With any other rule, all scenes influence the optimum, and the list is empty. `evaluation`,
+        `certificate`: those of the optimum."""
         if not isinstance(evaluation, ToleranceEvaluation):
             return super().held_by(evaluation, certificate)
         assert self.config.tolerances is not None
@@ -143,7 +149,7 @@ class RobustProblem(Problem):
         local = self.local(evaluation, point)
         assert local is not None
         (group,), (shares,) = local.groups, certificate.shares
-        scenes = (group.tags[:, 0] // _KINDS).astype(int)
+        scenes = (group.tags[:, 0] // SCENE_KINDS).astype(int)
         held = []
         for scene in np.unique(scenes[shares > _HELD]):
             mine = scenes == scene
@@ -158,15 +164,16 @@ def _of(evaluation: ToleranceEvaluation):
 
 
 def top_slope(local: Local) -> NDArray[np.float64]:
-    """Return the gradient (d,) of an objective by the greatest branch of each of its maxima."""
+    """Return the gradient (d,) of an objective, with the greatest branch of each maximum."""
     rows = (group.slopes[np.argmax(group.values)] for group in local.groups)
     return local.slope + sum(rows, np.zeros_like(local.slope))
 
 
 def _branches(local: Local, kind: int) -> Group:
-    """Return an objective as the branches of one maximum, with kinds from `kind` on.
+    """Return an objective as the branches of one maximum.
 
-    An objective that is a sum of several maxima has one branch, its greatest one."""
+    `kind`: number added to the kinds of the branches. If the objective is a sum of several maxima,
+    the result has one branch: the sum of their greatest branches."""
     if len(local.groups) == 1:
         (group,) = local.groups
         tags = group.tags + np.array([kind, 0.0])

@@ -30,6 +30,7 @@ from rootsopt.optimize.beginning import Beginning, beginning
 from rootsopt.optimize.certificate import Certificate, certify
 from rootsopt.optimize.checkpoint import Checkpoint
 from rootsopt.optimize.infeasible import Infeasible, explain
+from rootsopt.optimize.limits import limited
 from rootsopt.optimize.local import Local, Look
 from rootsopt.optimize.optimality import RESIDUAL, Optimality, StartOutcome
 from rootsopt.optimize.problem import FEASIBLE, Problem
@@ -62,10 +63,14 @@ _HOLDS_UP = 0.01
 """Relative difference between a design's objectives in search and verification above which the
 design is rejected."""
 _SHARPER = 0.01
-"""Factor on `solver.rtol` for the gradients of a certificate that does not hold at `solver.rtol`.
+"""Factor on `solver.rtol` for a second evaluation, if the first-order conditions do not hold.
 """
+_MEETS = 1e-4
+"""Scaled excess over a limit of a force in the verification above which the design is rejected."""
 _EXPLAINED = 8
 """Maximum number of points from which the least violation of the constraints is searched for."""
+_SIMULATED = 3
+"""The same, if each point must be simulated."""
 _POLL = 0.05
 """Interval (s) at which a waiting thread checks whether it should stop."""
 
@@ -78,11 +83,12 @@ objective)."""
 class Trial:
     """One evaluated design of a search.
 
-    `point` (d,): the design in the unit box. `start`: number of the local search, -1 for the
-    screening. `iteration`: number of the evaluation in the local search, from 0. `evaluation`:
+    `point` (d,): the design in the unit box. `start`: index of the local search, -1 for the
+    screening. `iteration`: index of the evaluation in the local search. `evaluation`:
     result of the simulation. `objective`: its objective, NaN without a usable steady state.
-    `feasible`: whether all constraints are satisfied. `local`: objective and constraints with
-    gradients, `None` if not known."""
+    `feasible`: whether all constraints of the geometry are satisfied. `local`: objective and
+    constraints with gradients, `None` if not known. `excess`: scaled amount by which limits of
+    forces are exceeded, at most 0 if they hold."""
 
     point: NDArray[np.float64]
     start: int
@@ -91,6 +97,7 @@ class Trial:
     objective: float
     feasible: bool
     local: Local | None = None
+    excess: float = 0.0
 
     @property
     def residual(self) -> float:
@@ -100,6 +107,11 @@ class Trial:
     @property
     def candidate(self) -> bool:
         """Whether the design may become the result: it is feasible and has an objective."""
+        return self.begins and self.excess <= FEASIBLE
+
+    @property
+    def begins(self) -> bool:
+        """Whether a local search may begin at the design: only limits of forces may be violated."""
         return self.feasible and not np.isnan(self.objective)
 
 
@@ -191,7 +203,7 @@ class Search:
     method does not suit the objective."""
 
     first = 0
-    """Number of the first local search."""
+    """Index of the first local search."""
 
     def __init__(
         self,
@@ -201,9 +213,9 @@ class Search:
         checkpoint: Checkpoint | None = None,
     ):
         self.beginning = beginning(config)
-        self.given = config
+        self.given = config = limited(config)
         if self.beginning is not None:
-            config = self.beginning.config
+            config = limited(self.beginning.config)
             if config.objective.motion == "ensemble":
                 raise InputError(
                     "`objective.motion` must not be ensemble for a rotor from a file, because it "
@@ -233,6 +245,8 @@ class Search:
         self._refuted: list[NDArray[np.float64]] = []
         self._found: dict[int, Found] = {}
         self._baseline: Evaluation | None = None
+        # A baseline that violates a limit may be better than every design that does not.
+        self._bar = 1.0
 
     def run(self) -> Optimization:
         """Evaluate the baseline, screen designs, run the local searches and verify the best design.
@@ -258,15 +272,16 @@ class Search:
             return Optimization(None, baseline, None, [], {}, self.stop.is_set())
         # Forces of coexisting motions are compared relative to the baseline's.
         self.exact = exact = exact.relative_to(baseline)
-        # The search needs gradients and a ranking of designs, not the last digits.
+        # Screening and descent need a ranking of designs and gradients, but only a few digits.
         self.fast = exact.at_tolerance(max(1e-6, self.config.solver.rtol)).surveying()
         self.problem = self._problem(exact.scene, baseline)
-        if self.problem.cornered:
+        self._bar = 1.0 if self.problem.keeps_limits(baseline) else np.inf
+        if self.problem.with_maxima:
             self.exact = exact.with_maxima()
-        # Second-order convergence needs more digits than a descent.
+        # Sequential quadratic programming needs more accurate gradients than a descent.
         self.sharp = self.exact.surveying()
         self._baseline = baseline
-        if self.problem.cornered and self.method == "slsqp":
+        if self.problem.with_maxima and self.method == "slsqp":
             self._warm(first)
         start = self.problem.point(list(first.design.values()))
         points = self._feasible(start)
@@ -294,13 +309,18 @@ class Search:
             found = noise.verify(self.problem, self.exact, trials)
             settled = found.problem, found.baseline, found.optimized, rows, found.record
             return Optimization(*settled, self.stop.is_set())
+        if self.problem.limits and not any(trial.candidate for trial in trials):
+            reason = None if self.stop.is_set() else self._unmet(points)
+            return Optimization(
+                self.problem, baseline, None, rows, {}, self.stop.is_set(), None, reason
+            )
         optimized, verification = self._verify(trials)
         settled = self.problem, baseline, optimized, rows, verification
         optimality = None if optimized is None else self._optimality(optimized, trials)
         return Optimization(*settled, self.stop.is_set(), optimality)
 
     def _warm(self, baseline: Evaluation) -> None:
-        """Compile what the maxima need, in the background during the screening."""
+        """Compile the programs for local maxima of the force, in the background."""
         again = list(baseline.design.values()), baseline.state, False
         threading.Thread(target=self.sharp, args=again, daemon=True).start()
 
@@ -328,7 +348,9 @@ class Search:
         better = [
             trial
             for trial in trials
-            if trial.candidate and trial.objective < 1 and not _near(trial.point, self._refuted)
+            if trial.candidate
+            and trial.objective < self._bar
+            and not _near(trial.point, self._refuted)
         ]
         best = min(better, key=_objective, default=None)
         if self.noisy:
@@ -388,18 +410,39 @@ class Search:
     def _starts(self, trials: list[Trial]) -> list[NDArray[np.float64]]:
         """Return the best screened points as starts of the local searches.
 
+        Designs that meet the limits of forces come first, then those that exceed them least.
         The starts are more than 0.15 apart in the unit box."""
         chosen: list[NDArray[np.float64]] = []
-        for trial in sorted(filter(_candidate, trials), key=_objective):
+        able = [trial for trial in trials if trial.begins]
+        for trial in sorted(able, key=lambda one: (max(one.excess, FEASIBLE), one.objective)):
             apart = all(np.linalg.norm(trial.point - p) > 0.15 for p in chosen)
             if apart and len(chosen) < self.settings.starts:
                 chosen.append(trial.point)
         return chosen
 
+    def _unmet(self, points: list[NDArray[np.float64]]) -> Infeasible:
+        """Return why no design satisfies the limits of forces.
+
+        `points`: feasible points (d,), used if the local searches found none."""
+        orbits: list[NDArray[np.float64] | None] = [None]
+
+        def look(point: NDArray[np.float64]) -> Local | None:
+            if self.stop.is_set():
+                return None
+            evaluation = self.sharp(self.problem.design(point), start=orbits[-1], series=False)
+            if evaluation.usable:
+                orbits.append(evaluation.state)
+            return self.problem.local(evaluation, point)
+
+        usable = [found for found in self._found.values() if found.local is not None]
+        usable.sort(key=lambda found: found.local.violation if found.local else np.inf)
+        starts = [found.point for found in usable[: _SIMULATED - 1]] + points[:1]
+        return explain(self.problem, starts, look)
+
     def _solve(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
         """Search from `point` (d,) by sequential quadratic programming, and return the trials.
 
-        `number`: number of the local search."""
+        `number`: index of the local search."""
         trials: list[Trial] = []
         last: list[Trial] = []
 
@@ -430,7 +473,7 @@ class Search:
             return found
         point = self.problem.toward(best.point, found.point)
         local = look(point)
-        if local is None or not self.problem.feasible(point):
+        if local is None or local.violation > FEASIBLE:
             return found
         if found.local.violation <= FEASIBLE and local.objective >= found.local.objective:
             return found
@@ -440,7 +483,7 @@ class Search:
     def _descend(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
         """Descend from `point` (d,) by an update rule, and return the trials.
 
-        `number`: number of the local search."""
+        `number`: index of the local search."""
         settings = self.settings
         rule = self.method, settings.learning_rate, settings.iterations
         state = _init(*rule, point)
@@ -488,11 +531,11 @@ class Search:
         else:
             evaluation = kept
         objective = self.problem.objective(evaluation)
-        feasible = self.problem.feasible(point)
+        feasible, excess = self.problem.feasible(point), self.problem.excess(evaluation)
         local = None
         if start >= 0 and not self.noisy:
             local = self._local(start, evaluation, point)
-        trial = Trial(point, start, iteration, evaluation, objective, feasible, local)
+        trial = Trial(point, start, iteration, evaluation, objective, feasible, local, excess)
         with self._lock:
             self._trials.append(trial)
             if trial.candidate:
@@ -506,12 +549,12 @@ class Search:
         Return (evaluation of this design, or `None`; record for the result file)."""
         ends = {found.point.tobytes() for found in self._found.values()}
         ranked = sorted(filter(_candidate, trials), key=_objective)
-        # The ends of local searches come first: points beside them are no better.
+        # Try the results of the local searches first. Points next to them are hardly different.
         ranked.sort(key=lambda trial: trial.point.tobytes() not in ends)
         tried: list[np.ndarray] = []
         failures = []
         for candidate in ranked:
-            if candidate.objective >= 1 or len(tried) >= 5:
+            if candidate.objective >= self._bar or len(tried) >= 5:
                 break
             if _near(candidate.point, tried):
                 continue
@@ -523,9 +566,9 @@ class Search:
                 "searched_objective": candidate.objective,
                 "verified_objective": None if np.isnan(objective) else objective,
                 "status": evaluation.status.label,
-                "holds_up": bool(change <= _HOLDS_UP),
+                "holds_up": bool(change <= _HOLDS_UP and self.problem.excess(evaluation) <= _MEETS),
             }
-            if change <= _HOLDS_UP and objective < 1:
+            if record["holds_up"] and objective < self._bar:
                 return evaluation, record | {"rejected": failures}
             failures.append(record | {"design": evaluation.design})
             self._refuted.append(candidate.point)
@@ -576,14 +619,17 @@ class Search:
     def _outcome(self, number: int, found: Found) -> StartOutcome:
         """Return the outcome of a local search by sequential quadratic programming.
 
-        `number`: number of the search; `found`: what it found."""
+        `number`: index of the search; `found`: what it found."""
         certificate, local = found.certificate, found.local
         reason = found.reason
         if certificate is not None and certificate.holds(RESIDUAL, FEASIBLE):
             reason = "converged"
+        met = local is not None and local.violation <= FEASIBLE
+        if local is not None and not met and reason != "interrupted":
+            reason = "infeasible"
         return StartOutcome(
             start=number,
-            objective=float("nan") if local is None else local.objective,
+            objective=local.objective if local is not None and met else float("nan"),
             residual=float("nan") if certificate is None else certificate.residual,
             reason=reason,
             evaluations=found.evaluations,
@@ -619,7 +665,7 @@ def sensitivity_rows(
 
     `evaluator`, `optimized`: of one motion at one speed; `percent`: function that returns the
     derivatives of the objective (% per unit, by key) from an evaluation with gradients with respect
-    to the quantities; {}: not known. Return an empty list if there are no such gradients."""
+    to the quantities, or {} if they are not known. Return an empty list without such gradients."""
     design = np.array(list(optimized.design.values()))
     fitted = evaluator.fit(design, optimized.state, series=False)[0]
     moved = by_scene(fitted, optimized)
@@ -738,7 +784,7 @@ def _history(trials: list[Trial]) -> list[dict[str, Any]]:
                 "peak_force_N": evaluation.response.get("peak_force_N", float("nan")),
                 **evaluation.design,
                 "area_efficiency": evaluation.geometry["area_efficiency"],
-                "feasible": trial.feasible,
+                "feasible": trial.feasible and trial.excess <= FEASIBLE,
                 "residual": trial.residual,
                 "status": evaluation.status.label,
             }

@@ -3,8 +3,8 @@
 The corners come from maxima over smooth branches b_i. In the epigraph form, each maximum becomes a
 variable t with one constraint b_i(x) ≤ t per branch, so all functions are smooth. SciPy's SLSQP
 solves this problem with exact gradients. See Kraft, A software package for sequential quadratic
-programming, DFVLR-FB 88-28, 1988. Where it stops or crawls before the first-order conditions hold,
-`rootsopt.optimize.refine` goes on with a second-order model of every function.
+programming, DFVLR-FB 88-28, 1988. If it stops or becomes too slow (`_SLOW`) before the first-order
+conditions hold, `rootsopt.optimize.refine` continues with a second-order model of every function.
 
 A point without an objective gets a value far above all others, and is never the result. The line
 search then shortens its step until it finds a usable point."""
@@ -37,15 +37,16 @@ _RESTARTS = 6
 _GAIN = 1e-9
 """Decrease of the objective in a round below which the search does not start another round."""
 _TIE = 3e-8
-"""Difference of two objectives below which the smaller residual decides. Objectives of the same
-design differ by so much, if they come from orbits closed from different first guesses."""
+"""Difference of two objectives below which the smaller residual decides which point is better.
+Evaluations of the same design differ by up to this amount if their first guesses of the orbit
+differ."""
 _SLOW = 12, 2e-5
-"""Number of successive points, and decrease of the objective over them, below which SLSQP crawls.
-The round then goes on with `refine`."""
+"""Number of successive points, and decrease of the merit over them below which SLSQP is too slow.
+The round then continues with `refine`."""
 
 
 class Stops(NamedTuple):
-    """When a local search ends.
+    """Criteria for the end of a local search.
 
     `residual`: first-order residual below which the search ends at once; `enough`: residual below
     which it does not begin another round, because gradients are hardly more accurate;
@@ -101,7 +102,7 @@ class EndError(Exception):
 
 
 class SlowError(Exception):
-    """Raised inside SLSQP's callbacks if the search crawls."""
+    """Raised inside SLSQP's callbacks if the search is too slow (`_SLOW`)."""
 
 
 class Epigraph:
@@ -109,7 +110,7 @@ class Epigraph:
 
     The variables z are x / `SCALE`, followed by one variable t per maximum, its upper bound.
     `look`: function that evaluates the problem at a point; `start` (d,): first point; `first`: the
-    problem there; `stops`: when to end."""
+    problem there; `stops`: criteria for the end."""
 
     def __init__(self, look: Look, start: NDArray[np.float64], first: Local, stops: Stops):
         self.look, self.stops, self.size = look, stops, len(start)
@@ -118,7 +119,7 @@ class Epigraph:
         self.good, self.best = first, (start, first)
         self.crawling: list[float] | None = None
         self.certificate = certify(first, start)
-        slots = [2 * len(group.values) + _SLOTS for group in first.groups]
+        slots = [2 * len(group.values) + _SLOTS for group in (*first.groups, *first.walls)]
         self.slots = [np.full((count, 2), np.nan) for count in slots]
         self.used = [np.zeros(count) for count in slots]
 
@@ -138,15 +139,16 @@ class Epigraph:
         return self.known[key]
 
     def _watch(self, found: Local | None) -> None:
-        """Raise `SlowError` if the last points have hardly improved the best merit.
+        """Raise `SlowError` if the last points have hardly improved the best merit (`_SLOW`).
 
-        `found`: the problem at the new point. The merit is the objective plus the violation with a
-        weight above its price. Only while `crawling` is a list: the best merit after each point."""
+        `found`: the problem at the new point. The merit is the objective plus the violation times a
+        weight that exceeds all multipliers. The best merit after each point is stored in
+        `crawling`; if this is `None`, nothing is checked."""
         if self.crawling is None:
             return
         count, least = _SLOW
         before = self.crawling[-1] if self.crawling else np.inf
-        price = 2.0 + 5.0 * float(np.max(self.certificate.multipliers, initial=0.0))
+        price = 2.0 + 5.0 * self.certificate.greatest
         merit = np.inf if found is None else found.objective + price * found.violation
         self.crawling.append(min(before, merit))
         if len(self.crawling) > count and self.crawling[-1 - count] - self.crawling[-1] < least:
@@ -198,18 +200,21 @@ class Epigraph:
     def constraints(self, z) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the values (≥ 0 if satisfied) and gradients of all constraints at SLSQP's `z`.
 
-        First come t - b_i for the branches b_i of each maximum t, then the constraints of the
-        problem."""
+        First come t - b_i for the branches b_i of each maximum t, then -w_i for those of each
+        wall, then the constraints of the problem."""
         found = self.at(self.point(z))
         found = self.good if found is None else found
         values, rows = [], []
-        for k, group in enumerate(found.groups):
+        tops = len(found.groups)
+        for k, group in enumerate((*found.groups, *found.walls)):
             places = self._places(k, group)
             value, row = np.ones(len(self.slots[k])), np.zeros((len(self.slots[k]), len(z)))
             for place, b, slope in zip(places, group.values, group.slopes, strict=True):
                 if place >= 0:
-                    value[place] = z[self.size + k] - b
+                    value[place] = -b
                     row[place, : self.size] = -SCALE * slope
+                if place >= 0 and k < tops:
+                    value[place] += z[self.size + k]
                     row[place, self.size + k] = 1.0
             values.append(value)
             rows.append(row)
@@ -244,8 +249,8 @@ class Epigraph:
 def descend(look: Look, start: NDArray[np.float64], stops: Stops | None = None) -> Found:
     """Search for a local minimum from `start` (d,) in the unit box.
 
-    `look`: function that evaluates the problem at a point; `stops`: when to end, by default
-    `Stops()`."""
+    `look`: function that evaluates the problem at a point; `stops`: criteria for the end, by
+    default `Stops()`."""
     stops = Stops() if stops is None else stops
     start = np.clip(np.asarray(start, dtype=np.float64), 0.0, 1.0)
     first = look(start)
@@ -260,8 +265,7 @@ def descend(look: Look, start: NDArray[np.float64], stops: Stops | None = None) 
         try:
             _slsqp(problem)
             if not problem.certificate.holds(stops.enough, stops.feasibility):
-                greatest = float(np.max(problem.certificate.multipliers, initial=0.0))
-                refine(problem.at, *problem.best, greatest)
+                refine(problem.at, *problem.best, problem.certificate.greatest)
         except EndError:
             reason = "interrupted" if stops.asked() else "evaluations"
         if problem.certificate.holds(stops.enough, stops.feasibility):
@@ -277,7 +281,7 @@ def descend(look: Look, start: NDArray[np.float64], stops: Stops | None = None) 
 
 
 def _slsqp(problem: Epigraph) -> None:
-    """Run SLSQP from the best point until it ends, or crawls."""
+    """Run SLSQP from the best point until it ends or becomes too slow."""
     start, size = problem.start(), problem.size
     free = [(None, None)] * (len(start) - size)
     problem.crawling = []

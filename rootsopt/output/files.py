@@ -6,12 +6,10 @@ whole folders in the same way (`rootsopt.output.runs`)."""
 
 import csv
 import enum
-import importlib.metadata
 import io
 import json
 import math
 import os
-import platform
 import secrets
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -20,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-import rootsopt
 from rootsopt.config import sources
 from rootsopt.errors import InputError
 from rootsopt.output import disk
+from rootsopt.runtime.versions import versions as versions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,7 +31,6 @@ if TYPE_CHECKING:
 
 DPI = 150
 """Resolution (dots per inch) of the figures."""
-_LIBRARIES = ("jax", "jaxlib", "diffrax", "optax", "equinox", "numpy")
 
 
 class ResultFolder:
@@ -103,7 +100,7 @@ class ResultFolder:
         """Write `data` as strict JSON to the file `name`; return the file's path.
 
         Non-finite numbers become null. Raises `InputError` if the file cannot be written."""
-        text = json.dumps(_plain(data), indent=2, allow_nan=False, ensure_ascii=False)
+        text = json.dumps(plain(data), indent=2, allow_nan=False, ensure_ascii=False)
         return self.write_text(name, text + "\n")
 
     def write_csv(self, name: str, columns: Mapping[str, ArrayLike]) -> Path:
@@ -128,18 +125,18 @@ def _temporary(name: str) -> str:
     return f".{name[:100]}.{os.getpid()}-{secrets.token_hex(4)}.tmp"
 
 
-def _plain(data: Any) -> Any:
+def plain(data: Any) -> Any:
     """Convert `data` to types that JSON supports; non-finite numbers become `None`."""
     if isinstance(data, Mapping):
-        return {str(key): _plain(value) for key, value in data.items()}
+        return {str(key): plain(value) for key, value in data.items()}
     if isinstance(data, (list, tuple)):
-        return [_plain(value) for value in data]
+        return [plain(value) for value in data]
     if isinstance(data, enum.Enum):
         return data.name.lower()
     if isinstance(data, os.PathLike):
         return os.fspath(data)
     if hasattr(data, "tolist"):  # arrays and array scalars, NumPy or JAX
-        return _plain(data.tolist())
+        return plain(data.tolist())
     if isinstance(data, float) and not math.isfinite(data):
         return None
     return data
@@ -203,7 +200,10 @@ def profile_columns(outline_mm: ArrayLike) -> dict[str, NDArray[np.float64]]:
 def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
     """Return the columns of `response_*.csv`: motion and forces over time, each (n,).
 
-    `series`: time series of a motion, in SI units. Units of the columns are in their names."""
+    `series`: time series of a motion, in SI units. Units of the columns are in their names. Loads
+    on the bearings come last, if there are any."""
+    loads = series.bearing_loads
+    more = {} if loads is None else dict(zip(_BEARINGS, loads.T, strict=True))
     return {
         "time_s": series.time,
         "rotation_deg": np.degrees(series.rotation),
@@ -212,7 +212,11 @@ def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
         "drive_flank_force_N": series.drive_force,
         "coast_flank_force_N": series.coast_force,
         "contact_force_N": series.force,
-    }
+    } | more
+
+
+_BEARINGS = tuple(f"bearing_{rotor}_{end}_end_N" for rotor in (1, 2) for end in ("gear", "far"))
+"""Columns of the loads on the bearings."""
 
 
 def row_columns(
@@ -229,9 +233,3 @@ def row_columns(
         columns[key] = np.empty(len(rows), dtype=object)
         columns[key][:] = [row.get(key) for row in rows]
     return columns
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of Python, this package and the libraries that affect its results."""
-    found = {"python": platform.python_version(), "rootsopt": rootsopt.__version__}
-    return found | {name: importlib.metadata.version(name) for name in _LIBRARIES}

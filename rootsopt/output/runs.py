@@ -34,7 +34,7 @@ from typing import Any, Literal
 from rootsopt.config import sources
 from rootsopt.errors import InputError
 from rootsopt.output import disk
-from rootsopt.output.files import ResultFolder
+from rootsopt.output.files import ResultFolder, plain
 from rootsopt.output.lock import Lock, TakenError
 
 RESULT = "result.json"
@@ -218,6 +218,11 @@ class RunFolder(ResultFolder):
             return super().write_json(name, data)
         self._result = data
         return self.path / name
+
+    @property
+    def result(self) -> dict[str, Any]:
+        """Content of the file `result.json` as it will be written, without the list of files."""
+        return plain({**(self._result or {}), "run": {"command": self.command}})
 
     def remove_afterwards(self, file: Path) -> None:
         """Remove `file`, which is not part of the run, as soon as the run is in place.

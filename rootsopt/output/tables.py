@@ -12,36 +12,25 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from rootsopt.output.labels import DASH
+from rootsopt.output.labels import change as _change
+from rootsopt.output.labels import fitting as _plain
+from rootsopt.output.labels import in_words as _words
+from rootsopt.output.labels import label_of as _label
+from rootsopt.output.labels import name_and_unit as _split
+from rootsopt.output.labels import number as _number
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.sensitivity import MICROMETRE
 from rootsopt.status import Status
 
-DASH = "-"
-_UNITS = {
-    "_kg_m2": "kg m^2",
-    "_l_min": "l/min",
-    "_N_m": "N m",
-    "_cm3": "cm^3",
-    "_mm2": "mm^2",
-    "_mrad": "mrad",
-    "_um": "um",
-    "_mm": "mm",
-    "_deg": "deg",
-    "_N": "N",
-}
-_NAMES = {
-    "seconds": ("time", "s"),
-    "kind": ("steady state", ""),
-    "period": ("period", "mesh periods"),
-    "window_mesh_periods": ("window", "mesh periods"),
-    "lyapunov_exponent_per_mesh_period": ("Lyapunov exponent", "1/mesh period"),
-    "lyapunov_standard_error": ("  its standard error", ""),
-    "floquet_multiplier": ("largest Floquet multiplier", ""),
-    "residual": ("orbit residual", ""),
-    "rms_force_N": ("RMS force", "N"),
-    "peak_norm_force_N": ("p-norm of the force", "N"),
-}
-_SHEET_FORCES = "mean_force_N", "peak_force_N"
+_SHEET_FORCES = (
+    "mean_force_N",
+    "peak_force_N",
+    "bearing_load_max_N",
+    "bearing_load_equivalent_N",
+    "axial_force_max_N",
+    "tilting_moment_max_N_m",
+)
 """Forces in the pump sheet."""
 _STATISTICS = {
     "mean": "mean",
@@ -152,7 +141,7 @@ def sensitivity_table(rows: list[dict[str, Any]]) -> RenderableType:
 def robustness_table(
     robustness: Mapping[str, Any], designs: Mapping[str, Mapping[str, float]]
 ) -> RenderableType:
-    """Return a table of baseline, nominal and robust optimum over fresh scenes that scatter.
+    """Return a table of baseline, nominal and robust optimum over many scattered scenes.
 
     `robustness`: this entry of the result file; `designs`: design of `baseline` and `robust`."""
     fresh = robustness["fresh"]
@@ -430,12 +419,6 @@ def _pairs(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple[st
     return rows
 
 
-def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of `values` that fit into a cell: all except lists and mappings."""
-    tables = Mapping, list, tuple
-    return {key: value for key, value in values.items() if not isinstance(value, tables)}
-
-
 def _objective(improvement: Mapping[str, float]) -> tuple[str, ...]:
     gain = improvement.get("objective")
     label = "objective (baseline = 1)"
@@ -492,54 +475,5 @@ def _per_unit(row: Mapping[str, float], unit: str) -> dict[str, float]:
     }
 
 
-def _split(key: str) -> tuple[str, str]:
-    """Return (name in words, unit) for a key of the result file."""
-    if key in _NAMES:
-        return _NAMES[key]
-    for suffix, unit in _UNITS.items():
-        if key.startswith("line_") and key.endswith(suffix):
-            order = key.removeprefix("line_").removesuffix("_force" + suffix)
-            return f"line at {order} x mesh frequency", unit
-        if key.endswith(suffix):
-            return _words(key.removesuffix(suffix)), unit
-    return _words(key), ""
-
-
-def _label(key: str) -> str:
-    if ", " in key:  # already a label
-        return key
-    name, unit = _split(key)
-    return f"{name}, {unit}" if unit else name
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")
-
-
-def _change(first: Any, second: Any) -> str:
-    numbers = [x for x in (first, second) if isinstance(x, int | float) and math.isfinite(x)]
-    if len(numbers) < 2 or first == 0:
-        return DASH
-    change = 100 * (second - first) / abs(first)
-    return f"{change:+.2f} %" if abs(change) < 1000 else f"{change:+.3g} %"
-
-
-def _number(value: Any) -> str:
-    """Format a number with five significant digits, or as a dash if it is `None` or not finite.
-
-    Whole numbers, truth values and text are not changed."""
-    if value is None:
-        return DASH
-    if isinstance(value, bool | str):
-        return str(value)
-    if isinstance(value, int):
-        return str(value)
-    value = float(value)
-    if not math.isfinite(value):
-        return DASH
-    if value == 0:
-        return "0"
-    size = math.floor(math.log10(abs(value)))
-    if not -4 <= size < 7:
-        return f"{value:.3e}"
-    return f"{value:.{max(0, 4 - size)}f}"
+plain_table, status_text = _table, _word
+"""Empty table and coloured status for tables that other modules make."""

@@ -71,10 +71,12 @@ def arcs_epicycloid(
     `lobes`: number of lobes N; `pitch_radius`: r (m). The single arc is that of `arc`: its centre
     is at the distance `arc_center` b (m) from the axis, and its radius is ρ. The land has the half
     angle `tip_arc_angle` θ1 (rad). The edge between arc and land is an arc of radius `edge_radius`
-    e (m), tangent to both. The edge's centre lies on the ray θ1 at the distance d = b cos θ1 ± √((ρ
-    - e)²
-    - b² sin² θ1) from the axis. The sign is + for e < ρ. For e > ρ it is -, and the outline turns
-      back. The outer radius is d + e.
+    e (m), tangent to both. The edge's centre lies on the ray θ1, at the distance d from the axis:
+
+        d = b cos θ1 ± √((ρ - e)² - b² sin² θ1).
+
+    The sign is + for e < ρ. For e > ρ it is -, and the outline turns back. The outer radius is
+    d + e.
 
     The centre of the edge traces an extended epicycloid on the partner. The edge generates the
     parallel curve at the distance e from this epicycloid. The parallel curve joins the conjugates
@@ -85,7 +87,7 @@ def arcs_epicycloid(
     is not undercut, because its arc length per ν, (r sin ψ - 2 s) dβ/dν + s, stays positive.
     However, edge and arc then mesh at the same time, and carry the gas trapped between them to the
     other side. An edge with d ≤ r has no such carryover. Its radius is at least the tip's height
-    above the pitch circle. (Derivation.)
+    above the pitch circle. These formulas are derived here, not taken from a source.
     """
     r = jnp.asarray(pitch_radius)
     b, theta, e = jnp.asarray(arc_center), jnp.asarray(tip_arc_angle), jnp.asarray(edge_radius)

@@ -190,12 +190,13 @@ class Profile(eqx.Module):
         psi = beta + jnp.pi / 2 - nu
         mate_beta = jnp.where(beyond, jnp.pi / self.lobes - beta, beta)
         facing = jnp.pi / 2 - psi - mate_beta
-        lever = self.pitch_radius * jnp.cos(psi)
+        # On rotor and partner the lever is r cos ψ. `lever` may know it without a roll angle.
+        lever = self.lever(nu)
         if not support:
             return Mate(facing, lever, jnp.zeros_like(lever))
         s = self.contact_distance(nu)
-        arm = self.pitch_radius * jnp.sin(psi)
-        return Mate(facing, lever, arm + jnp.where(beyond, s, -s))
+        reach = self.support(nu)
+        return Mate(facing, lever, jnp.where(beyond, reach, reach - 2 * s))
 
     @property
     def conjugate(self) -> bool:

@@ -1,9 +1,9 @@
 """Distances between the outlines of two profiles.
 
 Two profiles of equal lobes have the same mirror lines: the axes of the lobes and of the valleys. A
-flank from tip to root lies between two neighbouring mirror lines. A point of one flank is not
-farther from a point of the other outline's flank in the same sector than from any mirror image of
-that point. The distances between the flanks are therefore those between the closed outlines.
+flank from tip to root lies in the sector between two neighbouring mirror lines. Mirroring a point
+never brings it closer to a point of the other outline in the same sector. The distances between the
+flanks are therefore those between the closed outlines.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from rootsopt.profiles.base import Profile
 from rootsopt.runtime.programs import Program
 
 _NODES = 400
-"""Least number of nodes on each side of the pitch circle."""
+"""Default of `nodes`, the least number of points of a flank on each side of the pitch circle."""
 _BEYOND = 8
 """Number of points of a neighbouring flank by which a flank is continued beyond its tip or root."""
 _CORNER = 0.1
@@ -116,8 +116,8 @@ def feet(
     """Return the nearest point of a polygonal `line` to each of the `points`.
 
     Points, line and distances have the same unit of length. `smooth`: whether the line's vertices
-    lie on a smooth curve. The distances are then those from this curve, with a relative error up to
-    an eighth of the squared turn (rad) of the curve along a segment."""
+    lie on a smooth curve. The distances are then those from this curve. Their relative error is at
+    most an eighth of the squared turn (rad) of the curve along a segment."""
     start, step = line[:-1], np.diff(line, axis=0)
     squares = np.maximum(np.sum(step**2, axis=1), np.finfo(float).tiny)
     # One coordinate at a time: a third axis of length 2 takes four times as long.

@@ -17,7 +17,8 @@ class TippedEpicycloid(Profile):
     tip arc is tangent to the epicycloid at the joint, and its centre C lies on the lobe's axis.
     With normal ν and pressure angle ψ at the joint, C lies at the distance c = r cos ψ / sin ν from
     the rotor's axis. No epicycloid with r_e < r is undercut: the arc length of its conjugate per ν
-    is 4 r_e (r - r_e) sin ψ / (r + 2 r_e). (Derivation; no source of the formulas was available.)
+    is 4 r_e (r - r_e) sin ψ / (r + 2 r_e). These formulas are derived here, because no source was
+    available.
 
     `rolling_radius`: r_e (m). `joint`: normal angle (rad) at which the tip arc ends.
     `arc_center_radius`: c (m). `arc_radius`: radius of the tip arc (m). `land`: whether the arc is
@@ -122,7 +123,7 @@ def circle_epicycloid(
 
     `lobes`: number of lobes N; `pitch_radius`: r (m); `rolling_radius`: r_e of the epicycloid (m);
     `tip_arc_turn`: normal angle ν (rad) at which the arc ends. For ν = π/2 - π r / (4 N r_e), the
-    arc is centred on the pitch circle (roll angle β = 0 at its end), and the whole arc meshes at
+    arc is centred on the pitch circle (roll angle β = 0 at its end). The whole arc then meshes at
     one instant."""
     return TippedEpicycloid(lobes, pitch_radius, rolling_radius, tip_arc_turn)
 
@@ -136,7 +137,8 @@ def hypo_epicycloid(
 
     `lobes`: number of lobes N; `pitch_radius`: r (m). The land at the tip has the half angle
     `tip_arc_angle` θ1 (rad). Identical rotors need the same rolling circle for both arches. ψ must
-    be π/2 where the land starts: r_e = r (π/2N - θ1) / π. Without a land this is EE. (Derivation.)
+    be π/2 where the land starts: r_e = r (π/2N - θ1) / π. Without a land this is EE. This formula
+    is derived here, not taken from a source.
     """
     rolling = jnp.asarray(pitch_radius) * (1 / (2 * lobes) - jnp.asarray(tip_arc_angle) / jnp.pi)
     return TippedEpicycloid(lobes, pitch_radius, rolling, tip_arc_angle, land=True)

@@ -40,9 +40,9 @@ derivative is 0 on an arc centred on the pitch circle."""
 class FreeForm(Profile):
     """A tip land, followed by a free curve with any number of coefficients.
 
-    A turn of the normal dν changes the roll angle by dβ = (1 - τ) dν and the pressure angle by dψ =
-    -τ dν. The rate τ(ν) is a quadratic B-spline with evenly spaced knots from the end of the land
-    to the pitch crossing. ψ(ν) is a cubic B-spline that starts at π/2.
+    The rate τ(ν) is a quadratic B-spline with evenly spaced knots from the end of the land to the
+    pitch crossing. It determines the roll angle by dβ/dν = 1 - τ, and the pressure angle by
+    dψ/dν = -τ. ψ(ν) is therefore a cubic B-spline; it starts at π/2.
 
     If no coefficient exceeds 1 (the value on an arc centred on the pitch circle), the roll angle
     does not turn back. If no coefficient is below 0 (the value on an involute), ψ never rises.
@@ -52,10 +52,10 @@ class FreeForm(Profile):
 
         (ν_p - θ1) (1 - mean of τ) = π/2N - θ1,
 
-    and the support function from h′ = -lever = -r cos ψ, h(ν_p) = r sin ψ(ν_p), by Gauss-Legendre
-    quadrature inside each knot span, exact to rounding. Thus the law of gearing holds for any
-    coefficients. The spline is a function of ν, not of β, because ψ(β) jumps on an arc centred on
-    the pitch circle.
+    where ν_p is the normal angle there. The support function h is the solution of h′ = -lever =
+    -r cos ψ with h(ν_p) = r sin ψ(ν_p). It is computed by Gauss-Legendre quadrature inside each
+    knot span, exact to rounding. The law of gearing therefore holds for any coefficients. The
+    spline is a function of ν, not of β, because ψ(β) jumps on an arc centred on the pitch circle.
 
     `lobes`: number of lobes N; `pitch_radius`: r (m). `tip_arc_angle`: θ1 (rad), half the angle of
     the land. `coefficients` (n,), n ≥ 3: coefficients of τ, from the land to the pitch crossing.

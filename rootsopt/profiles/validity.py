@@ -14,7 +14,7 @@ _POINTS = 400
 """Number of points per segment at which margins are evaluated."""
 
 
-class Margins(NamedTuple):
+class ProfileMargins(NamedTuple):
     """Margins of a flank: least values of nine quantities, none negative on a sound profile.
 
     `turning`: range of normal angles of a segment (rad), negative where joints are out of order.
@@ -45,7 +45,7 @@ class Margins(NamedTuple):
 
 
 @Program
-def margins(profile: Profile) -> Margins:
+def margins(profile: Profile) -> ProfileMargins:
     """Return the margins of a profile.
 
     Least values along the flank are taken over `_POINTS` points per segment. Both sides of a joint
@@ -69,7 +69,7 @@ def margins(profile: Profile) -> Margins:
         values = values.at[:, 1:-1].add(-jnp.where(low, dip, 0.0))
         return jnp.min(jnp.where(present, values, jnp.inf))
 
-    return Margins(
+    return ProfileMargins(
         turning=jnp.min(length),
         convexity=least(addendum),
         reach=least(r - jnp.abs(lever)),

@@ -11,6 +11,8 @@ from rootsopt.pump.flow import (
     ripple,
     theoretical_flow,
     tip_height_share,
+    twisted_lines,
+    twisted_ripple,
 )
 from rootsopt.pump.gap import Allowances, MeshGap, mesh_gap, relative_curvature
 from rootsopt.pump.leakage import Leakage, leakage
@@ -32,4 +34,6 @@ __all__ = [
     "ripple",
     "theoretical_flow",
     "tip_height_share",
+    "twisted_lines",
+    "twisted_ripple",
 ]

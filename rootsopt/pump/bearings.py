@@ -5,9 +5,11 @@ Rotor 1 turns counter-clockwise. Gas is carried along the housing from suction, 
 below. `docs/bearings.md` derives the formulas.
 """
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Inexact
 
+from rootsopt.dynamics.parts import resultants
 from rootsopt.profiles import Geometry, Profile
 
 PORT = 0.0
@@ -20,15 +22,10 @@ def contact_place(profile: Profile, phi: Float[Array, "*n"]) -> Complex[Array, "
     """Return the place (m) where the rotors touch, x + iy from the axis of rotor 1.
 
     `phi`: φ1 (rad)."""
-    half = profile.half_pitch
-    centred = phi - 4 * half * jnp.round(phi / (4 * half))
-    roll = jnp.abs(centred)
-    addendum = half - jnp.abs(roll - half)
-    _, psi, s = profile.addendum(profile.normal_at(addendum))
-    s = jnp.where(roll < half, s, -s)
-    # At φ1 < 0 the leading flank of rotor 1 touches.
-    side = jnp.where(centred < 0, 1.0, -1.0)
-    return profile.pitch_radius + s * jnp.sin(psi) + 1j * side * s * jnp.cos(psi)
+    x, y = jnp.vectorize(lambda one: resultants.contact_place(profile, one), signature="()->(k)")(
+        phi
+    ).T
+    return x + 1j * y
 
 
 def gas_forces(
@@ -43,18 +40,10 @@ def gas_forces(
     `pressure_length`: Δp L (N/m); `phi` (n,): φ1 (rad); `port`: see `PORT`. Discharge pressure acts
     on a rotor's surface between the contact and the tip at the housing that passes the port next.
     The resultant is Δp L times the chord between the two, turned by a right angle."""
-    contact, pitch = contact_place(profile, phi), 2 * jnp.pi / profile.lobes
-    opening = -jnp.pi / 2 - port
-
-    def on_rotor(place, turned):
-        # The last tip before the port, in the sense of rotation.
-        tip = opening - jnp.mod(opening - turned, pitch)
-        return 1j * pressure_length * (place - shape.outer_radius * jnp.exp(1j * tip))
-
-    # Rotor 2 is seen in a mirror.
-    mirrored = -jnp.conj(contact - 2 * profile.pitch_radius)
-    second = on_rotor(mirrored, phi + pitch / 2)
-    return jnp.stack([on_rotor(contact, phi), -jnp.conj(second)])
+    opening = jnp.asarray(port)
+    gas = resultants.GasResultant(pressure_length, profile, shape.outer_radius, opening)
+    found = jnp.sum(jax.vmap(gas.slice_forces)(phi), axis=1)
+    return (found[..., 0] + 1j * found[..., 1]).T
 
 
 def gas_moments(
@@ -80,7 +69,7 @@ def gear_force(
     return 1j * across + jnp.abs(across) * jnp.tan(pressure_angle)
 
 
-def equivalent_load(force: Complex[Array, "*k n"], exponent: float = ROLLER) -> Float[Array, "*k"]:
+def equivalent_load(force: Inexact[Array, "*k n"], exponent: float = ROLLER) -> Float[Array, "*k"]:
     """Return the constant load (N) with the same bearing life, (mean |F|^p)^(1/p).
 
     `force` (…, n): loads (N) at equal steps of rotation; `exponent`: p."""

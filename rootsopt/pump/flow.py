@@ -12,9 +12,13 @@ what follows from it.
 import math
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from rootsopt.profiles import Geometry, Profile, quadrature_nodes
+
+_PANELS = 64
+"""Number of panels of the quadrature over the length of twisted rotors."""
 
 
 def displaced_volume(shape: Geometry, length: Float[Array, ""]) -> Float[Array, ""]:
@@ -69,6 +73,31 @@ def flow_lines(profile: Profile, shape: Geometry, count: int = 4) -> Float[Array
     turns = jnp.cos(order[:, None, None] * profile.roll_angle(nu))
     # Twice the mean of s² cos over the quarter of the mesh that the addendum covers.
     return -4 * lobes / jnp.pi * jnp.sum(turns * square, axis=(1, 2)) / _mean(shape)
+
+
+def twisted_lines(
+    lines: Float[Array, " count"], lobes: int, twist: Float[Array, ""]
+) -> Float[Array, " count"]:
+    """Return the `lines` (count,) of the flow of twisted rotors, from those of straight ones.
+
+    The mean over the phases φ - Φ/2 … φ + Φ/2 multiplies c_k by sin(kNΦ) / (kNΦ). `lobes`: N;
+    `twist`: Φ (rad)."""
+    order = lobes * jnp.arange(1, lines.shape[0] + 1)
+    return lines * jnp.sinc(order * twist / jnp.pi)
+
+
+def twisted_ripple(profile: Profile, shape: Geometry, twist: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the peak-to-peak ripple of the flow of rotors with the `twist` Φ (rad).
+
+    By its symmetry, the mean flow over the phases φ - Φ/2 … φ + Φ/2 has its extremes where that of
+    straight rotors has them: at the tip, φ = 0, and at the pitch crossing, φ = π/2N. `_PANELS`
+    panels with four Gauss points each give the two means."""
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    places = ((np.arange(_PANELS)[:, None] + (nodes + 1) / 2) / _PANELS - 0.5).ravel()
+    shares = jnp.asarray(np.tile(weights / 2, _PANELS) / _PANELS)
+    middles = jnp.array([[0.0], [profile.half_pitch]])
+    means = relative_flow(profile, shape, middles + twist * places) @ shares
+    return jnp.abs(means[1] - means[0])
 
 
 def greatest_radius_ratio(lobes: int) -> float:

@@ -26,10 +26,11 @@ _NARROWEST = 1e-9
 class Allowances(NamedTuple):
     """Distances by which a pair is apart (m).
 
-    `normal`: distance added to every flank gap, along the normal. `center`: centre distance minus
+    `normal`: distance added to every flank gap, along the normal; one number, or one per roll angle
+    of `rolls`. `center`: centre distance minus
     twice the pitch radius. `radial`: radius by which both rotors are smaller everywhere."""
 
-    normal: Float[Array, ""]
+    normal: Float[Array, "*#n"]
     center: Float[Array, ""]
     radial: Float[Array, ""]
 
@@ -57,13 +58,18 @@ def relative_curvature(profile: Profile, nu: Float[Array, "*n"]) -> Float[Array,
     return turned / (addendum * dedendum)
 
 
+def rolls(profile: Profile) -> Float[Array, " n"]:
+    """Return the roll angles (n,) in rad at which `mesh_gap` gives the gap."""
+    return profile.half_pitch * (jnp.arange(POSES) + 0.5) / POSES
+
+
 def mesh_gap(profile: Profile, allowances: Allowances) -> MeshGap:
     """Return the gap over the mesh.
 
     To first order in the allowances, a gap opens by c + Δ sin ψ + a (h1/ρ1 + h2/ρ2): c, Δ and a
     are the allowances, h the support functions and ρ the radii of the two points. For a measured
     outline, whose flanks are not conjugate, c is in addition to the gap in perfect rolling."""
-    roll = profile.half_pitch * (jnp.arange(POSES) + 0.5) / POSES
+    roll = rolls(profile)
     nu, gap = profile.normal_at(roll), jnp.zeros_like(roll)
     if isinstance(profile, Outline):
         pair = FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True)

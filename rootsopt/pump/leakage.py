@@ -8,18 +8,24 @@ nozzle of the gap's height).
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from rootsopt.contact.worn import series_at, wear_series
 from rootsopt.profiles import Geometry, Profile
 from rootsopt.pump import flow, gas
-from rootsopt.pump.gap import Allowances, MeshGap, mesh_gap
-from rootsopt.pump.laminar import parabolic_length, slot_flow
+from rootsopt.pump.gap import Allowances, MeshGap, mesh_gap, rolls
+from rootsopt.pump.laminar import slot_flow
 from rootsopt.scene import Scene
 from rootsopt.scene.medium import Medium
 
 FACES = 4
 """End faces of the two rotors."""
+_NODES, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(64))
+_SHARES = _NODES + 0.5
+"""Nodes and weights of the rule of Gauss and Legendre on [0, 1], for the gap beside a tip."""
 
 
 class Leakage(NamedTuple):
@@ -46,12 +52,17 @@ class Leakage(NamedTuple):
 def tip_length(profile: Profile, shape: Geometry, height: Float[Array, ""]) -> Float[Array, ""]:
     """Return the length (m) of a slot with the same laminar flow as the gap at a tip.
 
-    It is the width of the land, and on its sides the two halves of a parabolic gap between the tip
-    arc and the housing's bore. `height`: clearance (m)."""
-    first = next(one for one in profile.segments() if not one.land)
-    radius = profile.addendum_speed(first.start)
+    It is the width of the land, plus h³ ∫ dl / d³ along the addendum on both of its sides. d is the
+    distance from the bore of the housing, h its least value, the clearance `height` (m)."""
     bore = shape.outer_radius + height
-    return shape.seal_width + parabolic_length(height, 1 / radius - 1 / bore)
+    sides = [one for one in profile.segments() if not one.land]
+    start, stop = (jnp.stack([getattr(s, end) for s in sides]) for end in ("start", "stop"))
+    turn = (stop - start)[:, None]
+    nu = start[:, None] + turn * _SHARES**2  # denser near the tip, where the gap is narrow
+    point, speed, _ = profile.speeds(nu)
+    depth = bore - jnp.linalg.norm(profile.position(point), axis=-1)
+    film = jnp.sum(2 * turn * _SHARES * _WEIGHTS * speed * (height / depth) ** 3)
+    return shape.seal_width + 2 * film
 
 
 def end_shape(shape: Geometry) -> Float[Array, ""]:
@@ -70,17 +81,22 @@ def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> 
     zero = jnp.zeros_like(scene.clearance)
     error = scene.center_distance_error
     center = zero if error is None else error
-    found = mesh_gap(profile, Allowances(scene.clearance, center, medium.radial_allowance))
+    normal, strain = scene.clearance, zero if medium.strain is None else medium.strain
+    if scene.wear is not None:
+        series, lobes = wear_series(profile, scene.wear), jnp.asarray(float(profile.lobes))
+        normal = normal + jax.vmap(lambda x: series_at(series, lobes, x)[0])(rolls(profile))
+    found = mesh_gap(profile, Allowances(normal, center, medium.radial_allowance))
     mesh = jnp.mean(_per_width(medium, found.least, found.length, 1))
     tips, ends = zero, zero
     heights = [jnp.min(found.least)]
     if medium.tip_clearance is not None:
-        height = medium.tip_clearance + medium.radial_allowance
+        height = medium.tip_clearance + medium.radial_allowance + strain * shape.outer_radius
         length = tip_length(profile, shape, jnp.maximum(height, 1e-9))
         tips = 2 * _per_width(medium, height, length, medium.tips)
         heights.append(height)
     if medium.end_clearance is not None:
-        height, width = medium.end_clearance, 2 * shape.outer_radius
+        height = medium.end_clearance + strain * scene.length / 2
+        width = 2 * shape.outer_radius
         ends = FACES * width * _per_width(medium, height, width / end_shape(shape), 1)
         heights.append(height)
     mesh, tips = scene.length * mesh, scene.length * tips

@@ -10,9 +10,10 @@ from jaxtyping import Array, Float
 from rootsopt.config import Config
 from rootsopt.config.units import MM
 from rootsopt.errors import InputError
-from rootsopt.profiles import geometry
+from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
 from rootsopt.pump.leakage import leakage
+from rootsopt.pump.loads import static_loads
 from rootsopt.pump.play import play
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_vector
@@ -32,7 +33,7 @@ LINES = 4
 """Number of lines of the flow in the sheet."""
 NOTE = (
     "The flow ripple is (r_a - r_p)^2 / (eta r_a^2): with the outer radius r_a and the area "
-    "efficiency eta given, no other shape of the flank changes it."
+    "efficiency eta given, no other shape of the flank changes it; a twist lowers it."
 )
 """What limits the ripple, for the user."""
 
@@ -42,24 +43,29 @@ def sheet(scene: Scene, design: Float[Array, " d"]) -> dict[str, Any]:
 
     Every key ends with its unit; quantities without a unit are fractions. `flow_lines`: amplitudes
     of the flow's lines as fractions of the mean flow; the k-th has 2Nk periods per revolution.
-    `tip_height_of_limit`: tip height over the pitch circle as a fraction of its limit. Ripple and
-    lines are left out for twisted rotors.
+    `tip_height_of_limit`: tip height over the pitch circle as a fraction of its limit.
 
     With a clearance, a centre distance error or a measured outline, there is also the play.
     `angular_play_…_mrad`: least and greatest play of rotor 2 over the rotation.
     `gear_backlash_max_mm`: greatest backlash of a timing gear that keeps the flanks apart, negative
     where the rotors overlap.
 
+    With a section `scene.bearings`, there are the greatest load of a bearing and the greatest
+    equivalent load while the timing gear, not the flanks, carries the load, and nothing oscillates.
+
     With a section `pump`, there is the leakage too: least and mean gap of the flanks over the mesh
     (µm), leakage through mesh, tips and end faces, volumetric efficiency and, for a gas, the
     Knudsen number. Raises `InputError` if the rotors overlap somewhere."""
     found = {key: value.tolist() for key, value in _flow(scene, design).items()}
+    if scene.bearings is not None:
+        equivalent, greatest = static_loads(scene, design)
+        found["static_bearing_load_max_N"] = float(jnp.max(greatest))
+        found["static_bearing_load_equivalent_N"] = float(jnp.max(equivalent))
     if _has_play(scene):
         found |= {key: value.tolist() for key, value in _play(scene, design).items()}
     if scene.medium is not None:
         found |= _leaking(scene, scene.medium, design)
-    hidden = () if scene.straight else _STRAIGHT
-    return {key: found[key] for key in KEYS if key in found and key not in hidden}
+    return {key: found[key] for key in KEYS if key in found}
 
 
 def check_clearances(config: Config) -> None:
@@ -88,6 +94,8 @@ KEYS = (
     "angular_play_min_mrad",
     "angular_play_max_mrad",
     "gear_backlash_max_mm",
+    "static_bearing_load_max_N",
+    "static_bearing_load_equivalent_N",
     "flank_gap_min_um",
     "flank_gap_mean_um",
     "mesh_leakage_l_min",
@@ -97,21 +105,29 @@ KEYS = (
     "knudsen_number",
 )
 """Keys of the sheet, in the order of its rows."""
-_STRAIGHT = "flow_ripple", "flow_lines"
-"""Keys that hold for straight rotors only."""
 
 
 @Program
 def _flow(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
     profile = scene.profile(design)
     shape = geometry(profile)
+    lines = flow.flow_lines(profile, shape, LINES)
+    if scene.helix is not None:
+        lines = flow.twisted_lines(lines, scene.lobes, scene.helix)
     return {
         "displaced_volume_cm3": flow.displaced_volume(shape, scene.length) / CM3,
         "theoretical_flow_l_min": flow.theoretical_flow(shape, scene.length, scene.speed) / L_MIN,
-        "flow_ripple": flow.ripple(profile, shape),
-        "flow_lines": jnp.abs(flow.flow_lines(profile, shape, LINES)),
+        "flow_ripple": ripple_of(scene, profile, shape),
+        "flow_lines": jnp.abs(lines),
         "tip_height_of_limit": flow.tip_height_share(profile, shape),
     }
+
+
+def ripple_of(scene: Scene, profile: Profile, shape: Geometry) -> Float[Array, ""]:
+    """Return the ripple of the flow in a `scene`, with its twist."""
+    if scene.helix is None:
+        return flow.ripple(profile, shape)
+    return flow.twisted_ripple(profile, shape, scene.helix)
 
 
 def _has_play(scene: Scene) -> bool:

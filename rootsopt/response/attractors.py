@@ -191,7 +191,7 @@ class _Sorter:
     """Assigns each transient to the motion that it has led to.
 
     `evaluations` and `cycles`: the known motions and their stroboscopic states; `numbers`: for each
-    transient the number of its motion, or -1 after a failure; `lost`: for each transient the label
+    transient the index of its motion, or -1 after a failure; `lost`: for each transient the label
     of its failure, or "".
     """
 

@@ -33,8 +33,9 @@ from rootsopt.dynamics.steady import (
 )
 from rootsopt.dynamics.window import Window, lyapunov
 from rootsopt.profiles import Geometry
-from rootsopt.response.orbits import Orbits
-from rootsopt.response.terms import terms_of, values_of
+from rootsopt.pump.loads import OrbitLoads, orbit_loads
+from rootsopt.response.orbits import OrbitStore
+from rootsopt.response.terms import EQUIVALENT, terms_of, values_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_keys, design_vector
 from rootsopt.status import Status
@@ -53,7 +54,9 @@ class Series:
 
     `time` (s): uniform unless rotor 1 is free; `rotation` of rotor 1 (rad), uniform; `relative`: ε
     (rad); `rate`: dε/dt (rad/s); `drive_force`, `coast_force`: normal force (N) on each flank;
-    `depth`: greatest penetration (m; negative: gap).
+    `depth`: greatest penetration (m; negative: gap); `bearing_loads` (samples, 4): loads (N) on the
+    bearings, None without `scene.bearings` or without an orbit. The bearings are that of rotor 1 at
+    the timing gear's end, its other one, and those of rotor 2.
     """
 
     time: NDArray[np.float64]
@@ -63,6 +66,7 @@ class Series:
     drive_force: NDArray[np.float64]
     coast_force: NDArray[np.float64]
     depth: NDArray[np.float64]
+    bearing_loads: NDArray[np.float64] | None = None
 
     @property
     def force(self) -> NDArray[np.float64]:
@@ -153,7 +157,7 @@ class Evaluator:
     fitted: bool = False
     map_error: float = float("nan")
     maxima: bool = False
-    orbits: Orbits = dataclasses.field(default_factory=Orbits, compare=False, repr=False)
+    orbits: OrbitStore = dataclasses.field(default_factory=OrbitStore, compare=False, repr=False)
 
     @classmethod
     def of(cls, config: Config, rtol: float | None = None, survey: bool = False) -> "Evaluator":
@@ -312,6 +316,26 @@ class Evaluator:
             _contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, pair.states), dtype))
         return now
 
+    def sized(self) -> "Evaluator":
+        """Return another evaluator, with a contact map sized for the config's own design."""
+        return self._sized(design_vector(self.config))
+
+    def assembled(self) -> tuple[RotorPair, RotorPair, Geometry]:
+        """Return the pair of the config's own design, its derivatives along the design, and its
+        geometry."""
+        return _build(self.scene, design_vector(self.config))
+
+    def evaluation(
+        self, built: tuple[RotorPair, Geometry], found: Steady, began: float
+    ) -> Evaluation | None:
+        """Return the evaluation, without series, of the config's own design with a known motion.
+
+        `built`: its pair and geometry; `found`: its motion; `began`: time at the start (s,
+        `perf_counter`). The result is None if the contact map does not fit the motion."""
+        if self._refitted(built[0], found) is not None:
+            return None
+        return self._report(design_vector(self.config), built, found, began, False)
+
     def _sized(self, design) -> "Evaluator":
         """Return another evaluator whose contact map has enough nodes for `design`.
 
@@ -380,6 +404,16 @@ class Evaluator:
             statistics |= _orbit_statistics(found)
             motion = _orbit_series(pair, orbit, period) if series else None
             state = np.asarray(orbit.state, np.float64)
+            if self.scene.bearings is not None and (series or EQUIVALENT in self._names):
+                loads = jax.device_get(self._bearing_loads(design, found))
+                response |= bearing_record(self.scene, loads)
+                if gradient:
+                    slope = loads.slopes[np.argmax(loads.equivalent)]
+                    gradient[EQUIVALENT] = dict(zip(self.keys, map(float, slope), strict=True))
+                if motion is not None:
+                    turns = len(motion.time) // len(loads.series.sizes), 1
+                    each = np.tile(np.asarray(loads.series.sizes, np.float64), turns)
+                    motion = dataclasses.replace(motion, bearing_loads=each)
             terms, slopes = self._terms(design, response, gradient)
             response |= terms
             gradient |= slopes if gradient else {}
@@ -417,12 +451,23 @@ class Evaluator:
             state=state,
         )
 
+    @property
+    def _names(self) -> tuple[str, ...]:
+        """Names of the further terms of the objective."""
+        return tuple(self.config.objective.terms)
+
+    def _bearing_loads(self, design, found: Steady) -> OrbitLoads:
+        """Return the loads on the bearings over the orbit of the motion `found`."""
+        integrator = dataclasses.replace(self.scene.solver.orbit, rtol=jnp.asarray(found.rtol))
+        period = jnp.asarray(int(found.period))
+        return orbit_loads(self.scene, jnp.asarray(design), found.orbit, period, integrator)
+
     def _terms(self, design, response, gradient):
         """Return the values of the objective's further terms, and their gradients.
 
         The gradient of a term is NaN if it depends on gradients of the forces that are not known.
         """
-        names = [name for name in self.config.objective.terms if name not in response]
+        names = [name for name in self._names if name not in response]
         if not names:
             return {}, {}
         forces = np.array([response[name] for name in RESPONSES])
@@ -450,7 +495,7 @@ class Evaluator:
             return {}
         orbit, solver = found.orbit, self.scene.solver
         sensitivity = orbit.sensitivity
-        # Collocation has them already, and no steps to go back through.
+        # Collocation has computed them already, and records no steps for reverse mode.
         if self.config.solver.gradient == "reverse" and not bool(found.collocated):
             settings = np.asarray(found.period), solver.orbit, solver.measures
             sensitivity = _reverse(self.scene, design, orbit, *settings)
@@ -479,6 +524,21 @@ def _reached(pair: RotorPair, found: Steady) -> float:
     if int(found.window.done):
         return scale * float(np.max(np.abs(found.window.states[..., 0])))
     return scale * abs(float(found.settled.state[0]))
+
+
+def bearing_record(scene: Scene, loads: OrbitLoads) -> dict[str, float]:
+    """Return the result file's entries for the loads on the bearings over an orbit."""
+    record = {
+        EQUIVALENT: float(np.max(loads.equivalent)),
+        "bearing_load_max_N": float(np.max(loads.greatest)),
+    }
+    if scene.straight:
+        return record
+    moment = np.hypot(*np.moveaxis(np.asarray(loads.series.tilting), -1, 0))
+    return record | {
+        "axial_force_max_N": float(np.max(np.abs(loads.series.axial))),
+        "tilting_moment_max_N_m": float(np.max(moment)),
+    }
 
 
 def _orbit_statistics(found: Steady) -> dict[str, int | float]:

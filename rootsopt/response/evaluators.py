@@ -2,7 +2,10 @@
 ensemble; at one speed or over several."""
 
 from rootsopt.config import Config
+from rootsopt.response.attractors import AttractorEvaluator
+from rootsopt.response.ensemble import EnsembleEvaluator
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.speeds import SpeedsEvaluator
 from rootsopt.response.wrapper import Evaluates
 
 
@@ -11,15 +14,9 @@ def evaluator_for(config: Config) -> Evaluates:
     single = Evaluator.of(config)
     found: Evaluates = single
     if config.objective.motion == "ensemble":
-        from rootsopt.response.ensemble import EnsembleEvaluator
-
         found = EnsembleEvaluator(single)
     elif config.objective.motion in ("worst", "weighted"):
-        from rootsopt.response.attractors import AttractorEvaluator
-
         found = AttractorEvaluator(single)
     if config.objective.speeds_rpm:
-        from rootsopt.response.speeds import SpeedsEvaluator
-
         found = SpeedsEvaluator(found)
     return found

@@ -12,15 +12,15 @@ from rootsopt.dynamics.steady import Steady
 from rootsopt.status import Status
 
 _MOST = 512
-"""Number of orbits remembered: those used last."""
+"""Number of orbits above which the least recently used one is forgotten."""
 
 
-class Orbits:
+class OrbitStore:
     """Orbits closed by collocation, found again by their state at φ1 = 0.
 
     An evaluation passes on the state of its orbit as `start` for neighbouring evaluations. With
-    this state, they find the whole orbit here. Threads can share one memory. It only saves time: an
-    orbit that is not in it is closed from its state, as always.
+    this state, they find the whole orbit here. Threads can share an instance. Results do not depend
+    on it: an orbit that is not stored is closed from its state, which takes longer.
     """
 
     def __init__(self) -> None:
@@ -67,4 +67,4 @@ def _key(state) -> bytes:
     return np.ascontiguousarray(state, np.float64).tobytes()
 
 
-__all__ = ["Orbits"]
+__all__ = ["OrbitStore"]

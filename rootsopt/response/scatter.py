@@ -1,4 +1,4 @@
-"""Samples of the numbers of scene and design that scatter (`tolerances` of a config).
+"""Samples of the scattered values of scene and design (`tolerances` of a config).
 
 The search of a robust optimum uses a fixed sample from a scrambled Sobol sequence. Its points cover
 the distributions more evenly than random ones. Fresh samples are pseudo-random and independent, so
@@ -21,13 +21,13 @@ from rootsopt.design.space import sobol
 from rootsopt.scene import Scene
 
 _FRESH = 1
-"""Number of the random stream from which fresh samples are drawn."""
+"""Index of the random stream from which fresh samples are drawn."""
 
 
 class Shift(NamedTuple):
     """One sample: how far scene and design are from their nominal values.
 
-    `values`: sampled number of each key that scatters, in the key's unit; `scene`: change of the
+    `values`: sampled value of each key that scatters, in the key's unit; `scene`: change of the
     scene's arrays in SI units, as a `Scene` (None: no array scatters); `design` (d,): change of the
     design in config units."""
 
@@ -54,10 +54,17 @@ def quantiles(scatter: Scatter, levels: Float[np.ndarray, " n"]) -> Float[np.nda
 def draw(config: Config, count: int, fresh: bool = False) -> Float[np.ndarray, "n q"]:
     """Return `count` samples of the q keys that scatter, in the order of `config.scatters`.
 
-    `fresh`: whether the sample is pseudo-random and independent of the search's, instead of the
-    fixed Sobol sample of the search. Both follow from `tolerances.seed` alone."""
+    With `tolerances.conditions`, these are the rows. `fresh`: whether the sample is pseudo-random
+    and independent of the search's, instead of the fixed Sobol sample of the search. Both follow
+    from `tolerances.seed` alone."""
     scatters, tolerances = config.scatters, config.tolerances
     assert tolerances is not None
+    if tolerances.conditions:
+        rows = [
+            [values.get(one.key, one.nominal) for one in scatters]
+            for values in tolerances.conditions.values()
+        ]
+        return np.array(rows, float).reshape(len(rows), len(scatters))
     if fresh:
         levels = np.random.default_rng([tolerances.seed, _FRESH]).random((count, len(scatters)))
     else:

@@ -140,7 +140,7 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
     gradient: dict[str, dict[str, float]] = {name: {} for name in evaluation.gradient}
     slopes, maxima = [], evaluation.maxima
     for begin in range(0, len(wanted), size):
-        # As many directions as design parameters, so that the compiled program fits.
+        # Pad to as many directions as there are design parameters, to reuse the compiled program.
         some = directions[begin : begin + size]
         stacked = jax.tree.map(lambda *x: np.stack(x), *some, *[blank] * (size - len(some)))
         pair, tangents = _along(evaluator.scene, design, stacked)

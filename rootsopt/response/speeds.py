@@ -54,7 +54,7 @@ class SpeedsEvaluation(Evaluation):
 
     `parts`: one for each speed; `status`: that of the first part that is not usable. In this case,
     there is no gradient. If all parts are usable, it is the status of the first part. `state` (m, 1
-    + n): a row for each known motion, which holds the number of its part, then the scaled state.
+    + n): a row for each known motion, which holds the index of its part, then the scaled state.
     """
 
     parts: tuple[AtSpeed, ...] = ()
@@ -223,8 +223,9 @@ def sweep(
 
 
 def overall(parts: Sequence[AtSpeed]) -> tuple[Status, str]:
-    """Return status and message of the first part that is not usable. If all parts are usable,
-    return those of the first part."""
+    """Return status and message of the first part that is not usable.
+
+    If all parts are usable, return those of the first part."""
     for part in parts:
         if not part.evaluation.usable:
             return part.evaluation.status, f"At {part.speed_rpm:g} rpm: {part.evaluation.message}"

@@ -105,21 +105,29 @@ def _response_jvp(primals, tangents):
     scene, design, start = primals
     moved, without = _moved(*tangents[:2])
     response, slopes = _solved(scene, design, start, tuple(at for at, _ in moved))
-    flat = [jnp.ravel(tangent) for _, tangent in moved]
-    vector = jnp.concatenate(flat) if flat else jnp.zeros(0, design.dtype)
-    # Leaves that cannot be differentiated make every derivative NaN.
-    unknown = jnp.nan * sum((jnp.sum(tangent) for tangent in without), start=jnp.sum(vector))
-    values = slopes @ vector + (unknown if without else 0.0)
+    values = _change(slopes, [tangent for _, tangent in moved], without)
     mean, peak, rms, lines, norm, state = _split(values, response)
     constant: Any = None
     change = Response(mean, peak, rms, lines, norm, constant, constant, constant, constant, state)
     return response, change
 
 
+@jax.jit
+def _change(slopes: Array, moved: list[Array], without: list[Array]) -> Array:
+    """Return `slopes` (rows, m) times the `moved` tangents, which have m entries in total.
+
+    Leaves that cannot be differentiated make every derivative NaN; their tangents are `without`.
+    As one program, it compiles quickly where the caller does not use `jax.jit`."""
+    flat = [jnp.ravel(tangent) for tangent in moved]
+    vector = jnp.concatenate(flat) if flat else jnp.zeros(0, slopes.dtype)
+    unknown = jnp.nan * sum((jnp.sum(tangent) for tangent in without), start=jnp.sum(vector))
+    return slopes @ vector + (unknown if without else 0.0)
+
+
 def _moved(scene: Any, design: Any) -> tuple[list[tuple[int, Array]], list[Array]]:
     """Return the tangents that are not None, in two lists. A tangent of None stands for zero.
 
-    The first list holds (number of the leaf in `_leaves`, tangent) for differentiable leaves. The
+    The first list holds (index of the leaf in `_leaves`, tangent) for differentiable leaves. The
     second list holds the tangents of a measured outline, for which there are no derivatives."""
     numbers, leaves = [], []
     for number, (path, leaf) in enumerate(_leaves((scene, design))):
@@ -156,7 +164,7 @@ def _split(values, response: Response):
 def _solved(scene: Scene, design, start, along: tuple[int, ...]) -> tuple[Response, Array]:
     """Return the response, and the derivatives (rows, m) of its differentiated fields.
 
-    `along`: numbers of the leaves of scene and design with respect to which to differentiate. The
+    `along`: indices of the leaves of scene and design with respect to which to differentiate. The
     leaves have m entries in total."""
     arguments = scene, design, start, along
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):

@@ -20,7 +20,7 @@ from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
 from rootsopt.pump.leakage import leakage
 from rootsopt.pump.play import play
-from rootsopt.pump.sheet import center_distance
+from rootsopt.pump.sheet import center_distance, ripple_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 
@@ -31,11 +31,15 @@ _LITRE_PER_MINUTE = 1e-3 / 60
 
 
 class Forces(NamedTuple):
-    """Mean, peak and RMS of the contact force (N), in the fields `mean`, `peak`, `rms`."""
+    """Mean, peak and RMS of the contact force (N), in the fields `mean`, `peak`, `rms`.
+
+    `bearing` (N): greatest equivalent load of a bearing. An evaluation integrates it along the
+    motion itself, so that it is NaN here."""
 
     mean: Float[Array, ""]
     peak: Float[Array, ""]
     rms: Float[Array, ""]
+    bearing: Float[Array, ""] | float = float("nan")
 
 
 class Term(eqx.Module):
@@ -71,7 +75,7 @@ class GeometryTerm(Term):
 
 
 class LargeTerm(GeometryTerm):
-    """A `GeometryTerm` of which more is better."""
+    """A `GeometryTerm` that is to be maximised."""
 
     sense: ClassVar[Literal["min", "max"]] = "max"
 
@@ -100,8 +104,8 @@ class RippleTerm(Term):
     """A term whose value is the peak-to-peak ripple of the flow, as a fraction of the mean flow."""
 
     def value(self, scene, profile, shape, forces):
-        del scene, forces
-        return flow.ripple(profile, shape)
+        del forces
+        return ripple_of(scene, profile, shape)
 
 
 class BacklashTerm(Term):
@@ -149,6 +153,23 @@ class ForceTerm(Term):
         return getattr(forces, self.field)
 
 
+class BearingTerm(Term):
+    """A term whose value is the greatest equivalent dynamic load (N) of the four bearings.
+
+    The scene must have a section `scene.bearings`."""
+
+    def value(self, scene, profile, shape, forces):
+        del profile, shape
+        if scene.bearings is None:
+            raise InputError(
+                f"the term `{EQUIVALENT}` needs the section `scene.bearings`; add it, as in "
+                "`scene.bearings={}`"
+            )
+        return forces.bearing
+
+
+EQUIVALENT = "bearing_load_equivalent_N"
+"""Name of the greatest equivalent dynamic load of the bearings."""
 _terms: dict[str, Term] = {}
 
 
@@ -258,6 +279,7 @@ def _own() -> dict[str, Any]:
         "flow_ripple": RippleTerm(),
         "gear_backlash_max_mm": BacklashTerm(),
         "leakage_fraction": LossTerm(),
+        EQUIVALENT: BearingTerm(),
     }
 
 

@@ -1,6 +1,6 @@
-"""One design in many scenes that scatter (`tolerances` of a config).
+"""One design in many scenes with scattered values (`tolerances` of a config).
 
-The scenes of a sample differ in numbers only, so all of them share the same compiled programs.
+The scenes of a sample differ only in the values of arrays, so they share compiled programs.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from rootsopt.status import Status
 class AtSample(NamedTuple):
     """The evaluation in one scene.
 
-    `values`: numbers of the keys that scatter, in their units, empty for the nominal scene;
+    `values`: value of each key that scatters, in its unit; empty for the nominal scene;
     `evaluation` in this scene, of the design moved by its own scatter.
     """
 
@@ -46,7 +46,7 @@ class ToleranceEvaluation(Evaluation):
     `parts`: that of the nominal scene, then one for each sample. `status`: that of the first part
     that is not usable. In this case, there is no gradient. If all parts are usable, it is the
     status of the nominal scene. `state` (m, 1 + n): a row for each known motion, which holds the
-    number of its part, then the state as that part has it.
+    index of its part, then the state of that part.
     """
 
     parts: tuple[AtSample, ...] = ()
@@ -142,8 +142,9 @@ def together(parts: Sequence[AtSample]) -> ToleranceEvaluation:
 
 
 def overall(parts: Sequence[AtSample]) -> tuple[Status, str]:
-    """Return status and message of the first part that is not usable. If all parts are usable,
-    return those of the first part."""
+    """Return status and message of the first part that is not usable.
+
+    If all parts are usable, return those of the first part."""
     failed = [part for part in parts if not part.evaluation.usable]
     if not failed or failed[0] is parts[0]:
         return parts[0].evaluation.status, parts[0].evaluation.message
@@ -156,7 +157,9 @@ def overall(parts: Sequence[AtSample]) -> tuple[Status, str]:
 
 
 def nominal_of(evaluation: Evaluation) -> Evaluation:
-    """Return the evaluation in the nominal scene; any other evaluation is returned unchanged."""
+    """Return the part of an evaluation in the nominal scene.
+
+    Return an evaluation without such parts unchanged."""
     return evaluation.nominal if isinstance(evaluation, ToleranceEvaluation) else evaluation
 
 

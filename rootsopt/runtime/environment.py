@@ -169,15 +169,28 @@ def use_float64() -> None:
 def use_compiled_loops() -> None:
     """Make XLA compile each loop into a single function on CPUs.
 
-    Call this before JAX computes anything. If XLA_FLAGS already contains extra options for the
-    backend, leave it unchanged."""
+    This adds an option to XLA_FLAGS, which XLA reads when JAX computes for the first time in a
+    process. If JAX has computed already, or if XLA_FLAGS contains extra options for the backend,
+    leave it unchanged. XLA does not accept the option for a single compilation."""
     flags = os.environ.get(_XLA_FLAGS, "")
-    if "xla_backend_extra_options" not in flags:
+    if "xla_backend_extra_options" not in flags and not _started():
         checked = flags.strip() in ("", os.environ.get(_CHECKED))
         flags = f"{flags} --xla_backend_extra_options={_LOOPS}=1000000000".strip()
         os.environ[_XLA_FLAGS] = flags
         if checked:
             os.environ[_CHECKED] = flags
+
+
+def _started() -> bool:
+    """Return whether JAX has started a backend, and XLA has therefore read XLA_FLAGS."""
+    if "jax" not in sys.modules:
+        return False
+    try:
+        from jax._src import xla_bridge  # JAX has no public function for this.
+
+        return xla_bridge.backends_are_initialized()
+    except (ImportError, AttributeError):
+        return True
 
 
 @contextlib.contextmanager

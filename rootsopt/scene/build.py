@@ -22,19 +22,24 @@ from rootsopt.contact.linear import LinearContact
 from rootsopt.contact.map import MapContact
 from rootsopt.contact.search import SearchContact
 from rootsopt.contact.segments import NodeContact
+from rootsopt.contact.twisted import TwistedContact, slices_of
+from rootsopt.contact.worn import WornContact, wear_series
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import (
+    AxisLoads,
     ConstantLoad,
     Context,
     Drive,
     Friction,
     GasLoad,
+    GasResultant,
     Load,
     MotorDrive,
     Part,
     PrescribedDrive,
     Supports,
     TimingGear,
+    TwistedLoad,
 )
 from rootsopt.dynamics.steady import Solver
 from rootsopt.dynamics.timescales import Timescales
@@ -42,7 +47,9 @@ from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Outline, Profile, geometry
 from rootsopt.runtime.precision import check_precision
 from rootsopt.scene import families, reading
+from rootsopt.scene.bearings import GRAVITY, Bearings, bearings_of
 from rootsopt.scene.medium import Medium, medium_of
+from rootsopt.scene.slicing import slices_needed
 
 
 class Scene(eqx.Module):
@@ -53,17 +60,19 @@ class Scene(eqx.Module):
 
     `family`, `lobes`, `pitch_radius` (m): profile; `design_size`: number d of its parameters.
     `fidelity`, `map_size`, `nodes`: contact model and its resolution.
-    `precision`: number type of the integration; `solver`: solver for the steady motion. `straight`:
-    whether the rotors have no helix.
-    `length` (m), `density` (kg/m³), `bore_radius` (m, `None`: no bore): body of a rotor.
-    `law`, `clearance` (m): contact law, and distance added to every flank gap.
+    `precision`: number type of the integration; `solver`: solver for the steady motion. `slices`:
+    number of slices of twisted rotors, 0 for straight ones.
+    `length` (m), `density` (kg/m³), `bore_radius` (m, `None`: no bore): body of a rotor. `helix`:
+    twist over the length (rad), `None` for straight rotors.
+    `law`, `clearance` (m): contact law, and distance added to every flank gap. `wear` (m, `None`:
+    no wear): greatest depth of wear.
     `speed` (rad/s), `load_torque` (N·m), `pressure` (Pa, `None`: constant torque): operation.
     `gear`, `motor`, `friction`, `supports`: optional parts. `gear_damping_ratio`: damping of the
     gear as a share of critical damping, which `Scene` adds to `gear.damping` (0 from a config).
     `deepest`: relative rotation (rad, negative) down to which a contact map must extend.
     `center_distance_error`: centre distance minus twice the pitch radius (m), or `None`. `outline`:
     profile read from a file, or `None`; `medium`: fluid and clearances for leakage, or `None`;
-    `extra`: further parts.
+    `bearings`: what loads the bearings, or `None`; `extra`: further parts.
     """
 
     family: str = eqx.field(static=True)
@@ -72,7 +81,7 @@ class Scene(eqx.Module):
     precision: str = eqx.field(static=True)
     map_size: tuple[int, int] = eqx.field(static=True)
     nodes: int = eqx.field(static=True)
-    straight: bool = eqx.field(static=True)
+    slices: int = eqx.field(static=True)
     design_size: int = eqx.field(static=True)
     pitch_radius: Float[Array, ""]
     length: Float[Array, ""]
@@ -86,6 +95,8 @@ class Scene(eqx.Module):
     deepest: Float[Array, ""]
     solver: Solver
     bore_radius: Float[Array, ""] | None = None
+    helix: Float[Array, ""] | None = None
+    wear: Float[Array, ""] | None = None
     pressure: Float[Array, ""] | None = None
     motor: MotorDrive | None = None
     friction: Friction | None = None
@@ -93,6 +104,7 @@ class Scene(eqx.Module):
     center_distance_error: Float[Array, ""] | None = None
     outline: Outline | None = None
     medium: Medium | None = None
+    bearings: Bearings | None = None
     extra: tuple[Part, ...] = ()
 
     @classmethod
@@ -108,24 +120,36 @@ class Scene(eqx.Module):
         check_precision(config.solver.precision)
         if deepest is None:
             deepest = reading.expected_rotation(config)
-        return cls(
+        found = cls(
             family=config.profile.family,
             lobes=config.profile.lobes,
             fidelity=config.solver.fidelity,
             precision=config.solver.precision,
             map_size=reading.map_size(config),
             nodes=config.solver.nodes,
-            straight=config.rotor.helix_deg == 0,
+            slices=config.solver.slices or 0,
             design_size=len(reading.design_keys(config)),
             deepest=jnp.asarray(deepest),
             solver=reading.solver_of(config),
             outline=families.outline(config.profile),
             medium=medium_of(config),
+            bearings=bearings_of(config),
             law=reading.law_of(config),
             gear=reading.gear_of(config),
             **reading.quantities(config),
             **reading.parts_of(config),
         )
+        if found.helix is None or found.slices:
+            return found
+        count = slices_needed(
+            found.profile(reading.design_vector(config)),
+            found.law,
+            found.clearance,
+            jnp.asarray(found.static_depth),
+            float(found.helix),
+            config.solver.slice_error,
+        )
+        return dataclasses.replace(found, slices=count)
 
     def renewed(self, config: Config) -> "Scene":
         """Return this scene with the physical quantities of another `config`.
@@ -135,6 +159,7 @@ class Scene(eqx.Module):
         return dataclasses.replace(
             self,
             medium=medium_of(config),
+            bearings=bearings_of(config),
             law=reading.law_of(config),
             gear=reading.gear_of(config),
             **reading.quantities(config),
@@ -146,6 +171,11 @@ class Scene(eqx.Module):
         if self.outline is not None:
             return self.outline
         return families.profile_of(self.family, self.lobes, self.pitch_radius, design)
+
+    @property
+    def straight(self) -> bool:
+        """Whether the rotors have no helix."""
+        return self.helix is None
 
     @property
     def static_depth(self) -> float:
@@ -201,8 +231,17 @@ class Scene(eqx.Module):
     def contact(self, profile: Profile) -> Contact:
         """Return the contact of `profile` at this scene's fidelity.
 
-        Raises `InputError` if the fidelity is `auto`, which must first be replaced by another one.
+        Raises `InputError` if the fidelity is `auto`, which must first be replaced by another one,
+        or does not support twisted rotors.
         """
+        if self.helix is not None:
+            if self.fidelity not in ("search", "auto"):
+                raise InputError(
+                    "`solver.fidelity` must be search for twisted rotors (`rotor.helix_deg`), but "
+                    f"is {self.fidelity}; set it to search"
+                )
+            straight = dataclasses.replace(self, helix=None)
+            return TwistedContact(straight.contact(profile), self.helix, self.slices)
         if self.fidelity == "map":
             return MapContact.of(profile, self.deepest, *self.map_size)
         if self.fidelity == "linear":
@@ -214,11 +253,15 @@ class Scene(eqx.Module):
                 "`solver.fidelity` must be chosen before a pair is built, but is auto; call "
                 "rootsopt.response.choice.choose first"
             )
-        if not self.two_sided:
-            return SearchContact.of(profile)
-        error = self.center_distance_error
-        distance = 2 * profile.pitch_radius + (0.0 if error is None else error)
-        return SearchContact.of(profile, distance, two_sided=True)
+        distance = None
+        if self.two_sided:
+            error = self.center_distance_error
+            distance = 2 * profile.pitch_radius + (0.0 if error is None else error)
+        found = SearchContact.of(profile, distance, self.two_sided)
+        if self.wear is None:
+            return found
+        lobes = jnp.asarray(float(self.lobes))
+        return WornContact(found, wear_series(profile, self.wear), lobes)
 
     def _drive(self, load: Load) -> Drive:
         """Return the drive of a pair under `load`.
@@ -236,14 +279,34 @@ class Scene(eqx.Module):
         across = self.pressure * self.length
         # ρ1² + ρ2² = 2 (r² + s²), and the area is π times the mean of r² + s².
         mean = across * (shape.outer_radius**2 - shape.area / jnp.pi) / 2
-        return GasLoad(
+        load = GasLoad(
             pressure_length=across, profile=profile, outer_radius=shape.outer_radius, torque=mean
         )
+        if self.helix is None:
+            return load
+        slices = slices_of(self.helix, self.slices)
+        return TwistedLoad(section=load, offsets=slices.offsets, weights=slices.weights)  # pyright: ignore[reportCallIssue]
+
+    def axis_loads(
+        self, bearings: Bearings, load: Load, gear: TimingGear | None, mass: Float[Array, ""]
+    ) -> AxisLoads:
+        """Return the forces on the axes beside the flanks' push.
+
+        `load`, `gear`: those of the pair; `mass` (kg) of a rotor."""
+        gas = slices = None
+        if isinstance(load, TwistedLoad):
+            assert self.helix is not None
+            load, slices = load.section, slices_of(self.helix, self.slices)
+        if isinstance(load, GasLoad):
+            across = load.pressure_length
+            gas = GasResultant(across, load.profile, load.outer_radius, bearings.port, slices)
+        weight = GRAVITY * mass if bearings.heavy else None
+        return AxisLoads(gas, gear, bearings.tooth_angle, self.pitch_radius, weight)
 
     def pair(self, design: Float[Array, " d"]) -> RotorPair:
         """Return the rotor pair of a design in config units, differentiable with respect to it.
 
-        Raises `InputError` for twisted rotors."""
+        Raises `InputError` as `pair_and_shape` does."""
         return self.pair_and_shape(design)[0]
 
     def pair_and_tangents(
@@ -262,14 +325,7 @@ class Scene(eqx.Module):
     def pair_and_shape(self, design: Float[Array, " d"]) -> tuple[RotorPair, Geometry]:
         """Return (rotor pair, geometry of one rotor) for a design (d,) in config units.
 
-        Raises `InputError` for twisted rotors. Along the length of such rotors, all phases of the
-        mesh occur at the same time, which this package does not model."""
-        if not self.straight:
-            raise InputError(
-                "`rotor.helix_deg` must be 0, because only straight rotors are simulated; set it "
-                "to 0 to simulate straight rotors of the same section, or draw the twisted ones "
-                "with `rootsopt profile`"
-            )
+        Raises `InputError` if the contact cannot be simulated in this scene."""
         profile = self.profile(design)
         shape = geometry(profile)
         inertia = self.inertia(shape)
@@ -297,6 +353,8 @@ class Scene(eqx.Module):
         )
         supports = None if self.supports is None else self.supports.prepare(context)
         extra = tuple(part.prepare(context) for part in self.extra)
+        if supports is not None and self.bearings is not None:
+            extra = (*extra, self.axis_loads(self.bearings, load, gear, context.mass))
         pair = RotorPair(
             lobes=self.lobes,
             contact=contact,
@@ -324,11 +382,12 @@ class Scene(eqx.Module):
 
 
 def along(
-    build: Callable[[Any], tuple[RotorPair, Geometry]], primal: Any, directions: Any
-) -> tuple[RotorPair, RotorPair, Geometry]:
+    build: Callable[[Any], tuple[Any, Any]], primal: Any, directions: Any
+) -> tuple[Any, Any, Any]:
     """Return (pair, derivatives of the pair along `directions`, geometry) of `build(primal)`.
 
-    `build`: function that returns a rotor pair and the geometry of one rotor. `directions`: tree
+    `build`: function that returns a rotor pair and the geometry of one rotor, or another module and
+    a result without derivatives. `directions`: tree
     with the structure of `primal` and a leading axis, which may have length 0. The derivatives have
     the pair's own structure with the same leading axis."""
 

@@ -26,14 +26,16 @@ class Medium(eqx.Module):
 
     `viscosity` (Pa·s); `pressure_difference` (Pa), discharge minus suction. `tip_clearance`,
     `end_clearance` (m), `None`: no leakage there; `tips`: tips that seal in series.
-    `radial_allowance` (m): radius by which both rotors are smaller everywhere. `gas`: `None` for a
-    liquid."""
+    `radial_allowance` (m): radius by which both rotors are smaller everywhere. `strain`: growth of
+    the housing over that of the rotors, as a fraction of every length, `None`: all at the same
+    temperature. `gas`: `None` for a liquid."""
 
     viscosity: Float[Array, ""]
     pressure_difference: Float[Array, ""]
     tip_clearance: Float[Array, ""] | None
     end_clearance: Float[Array, ""] | None
     radial_allowance: Float[Array, ""]
+    strain: Float[Array, ""] | None
     gas: Gas | None
     tips: int = eqx.field(static=True)
 
@@ -44,13 +46,17 @@ def medium_of(config: Config) -> Medium | None:
     if pump is None:
         return None
     gas, across = pump.gas, pump.pressure_difference_Pa
+    wear, heat, tip = config.contact.wear, config.scene.heat, pump.tip_clearance_mm
+    if wear is not None and tip is not None:
+        tip = tip + wear.offset_mm
     assert across is not None
     return Medium(
         viscosity=jnp.asarray(pump.viscosity_mPa_s * _MPA_S),
         pressure_difference=jnp.asarray(across),
-        tip_clearance=_optional(pump.tip_clearance_mm, MM),
+        tip_clearance=_optional(tip, MM),
         end_clearance=_optional(pump.end_clearance_mm, MM),
         radial_allowance=jnp.asarray(pump.radial_allowance_mm * MM),
+        strain=None if heat is None else jnp.asarray(heat.strain),
         gas=None
         if gas is None
         else Gas(

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rootsopt.config import Config
-from rootsopt.config.units import MM, RPM
+from rootsopt.config.units import DEG, MM, RPM
 from rootsopt.contact.impact import ImpactLaw
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
@@ -36,17 +36,26 @@ def design_keys(config: Config) -> tuple[str, ...]:
 def quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
     """Return the physical quantities of a config in SI units, keyed by `Scene` field names."""
     rotor, scene, gear = config.rotor, config.scene, config.scene.timing_gear
+    wear, heat, error = config.contact.wear, scene.heat, scene.center_distance_error_mm
+    clearance = config.contact.clearance_mm
+    if wear is not None:
+        clearance += 2 * wear.offset_mm
+    if heat is not None:
+        # A pair that has grown as a whole meshes as before, at a centre distance of its own.
+        error = (error or 0.0) + 2 * config.profile.pitch_radius_mm * heat.strain
     return {
         "pitch_radius": jnp.asarray(config.profile.pitch_radius_mm * MM),
         "length": jnp.asarray(rotor.length_mm * MM),
         "density": jnp.asarray(rotor.density_kg_m3),
-        "clearance": jnp.asarray(config.contact.clearance_mm * MM),
+        "clearance": jnp.asarray(clearance * MM),
         "speed": jnp.asarray(scene.speed_rpm * RPM),
         "load_torque": jnp.asarray(config.load_torque),
         "gear_damping_ratio": jnp.asarray(0.0 if gear is None else gear.damping_ratio),
         "bore_radius": _optional(rotor.bore_mm, MM / 2),
+        "helix": _optional(rotor.helix_deg or None, DEG),
+        "wear": None if wear is None else jnp.asarray(wear.depth_mm * MM),
         "pressure": _optional(scene.load.pressure_difference_Pa),
-        "center_distance_error": _optional(scene.center_distance_error_mm, MM),
+        "center_distance_error": _optional(error, MM),
     }
 
 

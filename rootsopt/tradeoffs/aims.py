@@ -1,27 +1,17 @@
-"""The terms of a trade-off: which they are, in which sense, and what a design needs for them."""
+"""The terms of a trade-off: names, senses (`min` or `max`), and whether they need a simulation."""
 
-import re
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
 from rootsopt.config import Config
-from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.errors import InputError
+from rootsopt.optimize.limits import LIMITS, depends_on_forces, limited
 from rootsopt.optimize.search import check_gradient
-from rootsopt.response.evaluation import RESPONSES
-from rootsopt.response.terms import needs_forces, terms_of
+from rootsopt.response.reporting import in_words, is_force, reporting, unit_in
+from rootsopt.response.terms import terms_of
 from rootsopt.scene import Scene
 
-_LINE = re.compile(r"line_(\d+(?:\.\d+)?)_force_N")
-_UNITS = {
-    "_kg_m2": "kg m²",
-    "_cm3": "cm³",
-    "_mm2": "mm²",
-    "_mm": "mm",
-    "_deg": "°",
-    "_N": "N",
-}
+_KEY = "pareto.terms"
+"""Config key that names the terms."""
 
 
 class Aim(NamedTuple):
@@ -34,19 +24,18 @@ class Aim(NamedTuple):
 
     @property
     def sign(self) -> float:
-        """Factor that turns the term into a quantity of which less is better."""
+        """Factor (1 or -1) that turns the term into a quantity to be minimised."""
         return -1.0 if self.sense == "max" else 1.0
 
     @property
     def unit(self) -> str:
-        """Unit of the term; empty if it has none or if its name does not tell it."""
-        return next((unit for end, unit in _UNITS.items() if self.name.endswith(end)), "")
+        """Unit of the term; "" if its name does not contain a unit."""
+        return unit_in(self.name)
 
     @property
     def words(self) -> str:
         """Name in words, without the unit."""
-        end = next((end for end in _UNITS if self.name.endswith(end)), "")
-        return self.name.removesuffix(end).replace("_", " ")
+        return in_words(self.name)
 
     @property
     def label(self) -> str:
@@ -60,7 +49,7 @@ def aims_of(config: Config) -> tuple[Aim, ...]:
     Raises `InputError` for a name that is neither a force nor a registered term."""
     found = []
     for name in config.pareto.terms:
-        sense = "min" if _force(config, name) else terms_of([name], "pareto.terms")[0].sense
+        sense = "min" if is_force(config, name, _KEY) else terms_of([name], "pareto.terms")[0].sense
         found.append(Aim(name, config.pareto.senses.get(name, sense)))
     return tuple(found)
 
@@ -68,14 +57,13 @@ def aims_of(config: Config) -> tuple[Aim, ...]:
 def simulated(config: Config, scene: Scene) -> bool:
     """Return whether a term of `config.pareto` depends on forces.
 
-    Raises `InputError` if so and the forces have no gradient, or are not those of one motion at one
-    speed in one scene."""
-    names = config.pareto.terms
-    design = jnp.asarray(config.design)
+    If one does, the forces must have a gradient and belong to one motion at one speed in one scene.
+    Raises `InputError` if they do not."""
     forced = [
         name
+        for names, key in ((config.pareto.terms, _KEY), (config.constraints.terms, LIMITS))
         for name in names
-        if _force(config, name) or needs_forces(scene, terms_of([name])[0], design)
+        if depends_on_forces(config, scene, name, key)
     ]
     if not forced:
         return False
@@ -99,26 +87,17 @@ def simulated(config: Config, scene: Scene) -> bool:
     return True
 
 
-def reporting(config: Config) -> Config:
+def reported(config: Config) -> Config:
     """Return a copy of a `config` whose evaluations report all terms of `config.pareto`."""
-    lines = [*config.response.lines]
-    terms = dict(config.objective.terms)
-    for name in config.pareto.terms:
-        if found := _LINE.fullmatch(name):
-            order = float(found[1])
-            lines += [order] * (order not in lines)
-        elif not _force(config, name):
-            terms.setdefault(name, 0.0)
-    response = config.response.model_copy(update={"lines": tuple(lines)})
-    objective = config.objective.model_copy(update={"terms": terms})
-    return config.model_copy(update={"response": response, "objective": objective})
+    return reporting(limited(config), config.pareto.terms, _KEY)
 
 
 def freed(config: Config) -> Config:
     """Return a copy of a `config` whose area efficiency may fall below the baseline's.
 
     This applies only if area efficiency is a term of `config.pareto` and its floor is `baseline`,
-    the default: that floor would cut off one side of the front. A floor that is a number stays."""
+    the default. That floor would cut off one side of the front. If the floor is a number, it is
+    kept."""
     limits = config.constraints
     if "area_efficiency" not in config.pareto.terms or limits.area_efficiency_min != "baseline":
         return config
@@ -126,23 +105,4 @@ def freed(config: Config) -> Config:
     return config.model_copy(update={"constraints": limits})
 
 
-def _force(config: Config, name: str) -> bool:
-    """Return whether `name` is a measure of the force; raise `InputError` for a wrong one."""
-    if name == PEAK_NORM and config.objective.peak_norm is None:
-        raise InputError(
-            f"`pareto.terms` names {PEAK_NORM}, which needs `objective.peak_norm`; set it, or name "
-            "peak_force_N"
-        )
-    found = _LINE.fullmatch(name)
-    if found is None:
-        return name in RESPONSES or name == PEAK_NORM
-    order = float(found[1])
-    if not 1e-2 <= order <= 1e3 or line_name(order) != name:
-        raise InputError(
-            f"`pareto.terms` must name a line as line_ORDER_force_N with an order from 0.01 to "
-            f"1000, as in line_2_force_N, but names {name}"
-        )
-    return True
-
-
-__all__ = ["Aim", "aims_of", "freed", "reporting", "simulated"]
+__all__ = ["Aim", "aims_of", "freed", "reported", "simulated"]

@@ -1,4 +1,7 @@
-"""Puts the points of a front together: what stays, who is whose neighbour, what it costs."""
+"""Assembles a front from its nodes: which points stay, which are neighbours, and the rates.
+
+A *node* is an optimum that the tracing has found; a *point* belongs to the finished front. An *end*
+of the front is the optimum of one term alone."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,7 +12,7 @@ from numpy.typing import NDArray
 from rootsopt.optimize.certificate import Certificate
 from rootsopt.optimize.problem import words
 from rootsopt.tradeoffs.front import FrontPoint, Gap, Standing, dominated, ordered, repeated
-from rootsopt.tradeoffs.gaps import Edge, Pair, Search, Spacing, along, among, measured
+from rootsopt.tradeoffs.gaps import Bisections, Edge, Pair, Spacing, along, among, measured
 from rootsopt.tradeoffs.scalar import Scalar, Scale, rates
 from rootsopt.tradeoffs.study import Sample, Study
 
@@ -20,9 +23,10 @@ _HELD = 1e-6
 class Node(NamedTuple):
     """One point of a front while it is traced.
 
-    `scalar`: its objective; `sample`: the best design; `certificate`: first-order conditions there;
-    `reason`: why the search ended; `end`: number of the term that it is the end of, or -1;
-    `standing`: status, `NOT_VERIFIED` until the design has been simulated again."""
+    `scalar`: the objective that was minimised; `sample`: the best design; `certificate`:
+    first-order conditions there; `reason`: why the search ended; `end`: index of the term whose
+    optimum this is, or -1; `standing`: status, `NOT_VERIFIED` until the design has been simulated
+    again."""
 
     scalar: Scalar
     sample: Sample
@@ -43,11 +47,11 @@ class Node(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """Which of n nodes form the front.
+    """The nodes, out of n, that form the front.
 
     `values` (n, k): scaled terms; `points` (n, d): designs in the unit box; `standings`: status of
-    each node; `same`: number of the node that stands for a repeated one, or -1; `kept`: numbers of
-    the nodes on the front, in order."""
+    each node; `same`: for each node that repeats another one, the index of that other node, or -1;
+    `kept`: indices of the nodes on the front, in order."""
 
     values: NDArray[np.float64]
     points: NDArray[np.float64]
@@ -56,9 +60,10 @@ class Selection(NamedTuple):
     kept: list[int]
 
     def edges(self, pairs: Sequence[Pair]) -> list[Edge]:
-        """Return the neighbours on the front.
+        """Return the pairs of neighbours on the front.
 
-        `pairs`: pairs of numbers of neighbours; used for three terms only."""
+        `pairs`: indices of neighbouring nodes; used for three terms only. With two terms,
+        neighbours are nodes that follow each other in `kept`."""
         if self.values.shape[1] == 2:
             found = [(min(pair), max(pair)) for pair in along(self.kept)]
         else:
@@ -67,14 +72,16 @@ class Selection(NamedTuple):
 
 
 def selected(nodes: Sequence[Node], scale: Scale) -> Selection:
-    """Return which of the `nodes` form the front: those not dominated, repeated or refuted."""
+    """Return the `nodes` that form the front.
+
+    Nodes that are dominated, repeat another node, or failed the verification are left out."""
     count = len(scale.width)
     values = scale.of(np.array([node.sample.values for node in nodes]).reshape(-1, count))
     points = np.array([node.sample.point for node in nodes])
     standings = [node.standing for node in nodes]
     same = [-1] * len(nodes)
     alive = [k for k, one in enumerate(standings) if one.kept]
-    # Certified points come first, so that they stand for those which repeat them; ends before all.
+    # Of several equal nodes, keep an end if there is one, otherwise a certified node.
     alive.sort(key=lambda k: (nodes[k].end < 0, standings[k] is not Standing.CERTIFIED))
     beaten = dominated(values[alive]) if alive else []
     for k, one in zip(alive, beaten, strict=True):
@@ -90,9 +97,10 @@ def selected(nodes: Sequence[Node], scale: Scale) -> Selection:
 
 
 def spacing_of(selection: Selection, pairs: Sequence[Pair], ends: int, divisions: int) -> Spacing:
-    """Return the typical distances of neighbours before any bisection.
+    """Return the typical distances between neighbours before any bisection.
 
-    `ends`: number of ends, which are the first nodes; `divisions`: steps between two ends."""
+    `ends`: number of ends, which are the first nodes; `divisions`: number of steps between two
+    ends."""
     corners = selection.values[:ends]
     sides = [np.linalg.norm(a - b) for k, a in enumerate(corners) for b in corners[k + 1 :]]
     moves = [edge.design_distance for edge in selection.edges(pairs)]
@@ -115,9 +123,11 @@ def points_of(
 
 
 def gaps_of(
-    selection: Selection, search: Search, spacing: Spacing
+    selection: Selection, search: Bisections, spacing: Spacing
 ) -> tuple[list[tuple[int, int]], list[Gap]]:
-    """Return (pairs of neighbours without those of gaps, the gaps), in numbers of the front."""
+    """Return (pairs of neighbours without a gap between them, the gaps).
+
+    Both refer to points by their numbers on the front (`FrontPoint.number`)."""
     number = {k: place for place, k in enumerate(selection.kept, start=1)}
     edges, gaps = [], []
     for edge in selection.edges(search.pairs):
@@ -137,7 +147,7 @@ def _point(study: Study, node: Node, number: int, standing: Standing, scale: Sca
     names = [aim.name for aim in study.aims]
     signs = np.array([aim.sign for aim in study.aims])
     weights = node.scalar.weights(node.sample, node.certificate)
-    # Signs turn rates between terms of which less is better into rates between the terms.
+    # The rates are those of terms to be minimised; the signs convert them to the terms themselves.
     traded = rates(weights, scale.width)[0] * signs[0] * signs
     return FrontPoint(
         number=number,

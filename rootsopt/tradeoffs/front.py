@@ -55,17 +55,17 @@ class Standing(enum.Enum):
 class FrontPoint:
     """One design of a front.
 
-    `number`: number of the point, from 1 at the end of the first term; 0 if it was dropped.
-    `end_of`: name of the term that it is the end of, empty if none. `point` (d,): the design in the
-    unit box. `terms`: value of each term, in its unit. `evaluation`: the simulated design, or its
-    geometry.
+    `number`: number of the point, from 1 at the best design in the first term; 0 if it was dropped.
+    `end_of`: name of the term in which this design is the best, or "". `point` (d,): the design in
+    the unit box. `terms`: value of each term, in its unit. `evaluation`: the simulated design, or
+    its geometry if no term needs a simulation.
 
     `standing`: status; `reason`: why the local search ended, as in `rootsopt.optimize.sqp`;
-    `residual`, `violation`: first-order conditions, as in `Certificate`, in ranges of the terms per
-    side of the unit box. `weights`: weight of each term at the optimum; their sum is 1. `rates`:
-    change of the first term per unit of each other term along the front, NaN if the point has none.
-    `limits`: multiplier of each active constraint and bound by name, in ranges of the terms per
-    scaled unit."""
+    `residual`, `violation`: first-order conditions, as in `Certificate`. A *range* of a term is its
+    range along the front; the residual is in ranges per side of the unit box. `weights`: weight of
+    each term at the optimum; their sum is 1. `rates`: change of the first term per unit of each
+    other term along the front, NaN if unknown. `limits`: multiplier of each active constraint and
+    bound by name, in ranges per scaled unit."""
 
     number: int
     end_of: str
@@ -121,14 +121,14 @@ class FrontPoint:
 
 
 class Gap(NamedTuple):
-    """A place where a front, or the designs along it, jump.
+    """A gap between two points of a front, where the terms or the designs jump.
 
     `first`, `second`: numbers of the points on both sides. `kind`: `terms` if there is no best
-    compromise between them, `design` if the terms go on but the designs jump to another kind.
-    `distance`: distance of the points in terms, in ranges along the front; `design_distance`: that
-    in the unit box of the designs. `tried`: number of points that were searched for in between.
-    `confirmed`: whether these searches led back to one of both sides; otherwise the points that may
-    be spent on it (`pareto.refinements`) ran out."""
+    compromise between them, `design` if the terms are continuous but the designs jump.
+    `distance`: distance between the points in terms, in ranges along the front; `design_distance`:
+    greatest difference of a coordinate of the unit box. `tried`: number of searches for a point in
+    between. `confirmed`: whether these searches led back to one of the two sides. Otherwise,
+    `pareto.refinements` was used up before."""
 
     first: int
     second: int
@@ -143,10 +143,10 @@ class Gap(NamedTuple):
 class Front:
     """Outcome of a trade-off.
 
-    `config`: config of the run; `aims`: the terms; `baseline`: the evaluated design of the config,
+    `config`: config of the run; `aims`: the terms; `baseline`: the evaluated design of the config;
     `baseline_terms`: its terms, empty if it has no usable steady state. `points`: the front, from
-    the best in the first term on. `dropped`: points that turned out dominated, repeated or not
-    usable. `edges`: pairs of numbers of neighbours, those of gaps left out; `gaps`: the gaps.
+    the best in the first term on. `dropped`: points that are dominated, repeated or not usable.
+    `edges`: pairs of point numbers of neighbours without a gap between them; `gaps`: the gaps.
 
     `floor_dropped`: whether the floor of the area efficiency, the baseline's, was dropped because
     area efficiency is a term. `searches`, `evaluations`: effort. `interrupted`: whether the search
@@ -249,7 +249,7 @@ def dominated(values: NDArray[np.float64], equal: float = EQUAL) -> NDArray[np.b
     no worse in any term and better in one, by more than `equal`."""
     worse = values[:, None, :] - values[None, :, :]
     beaten = np.all(worse >= -equal, axis=2) & np.any(worse > equal, axis=2)
-    # Two points that each beat the other within `equal` would otherwise both be dropped.
+    # Compare the sums as well: within `equal`, two points could otherwise dominate each other.
     total = values.sum(axis=1)
     return np.any(beaten & (total[None, :] < total[:, None]), axis=1)
 
@@ -260,7 +260,7 @@ def repeated(
     """Return, for each of n points, the number of an earlier point that is the same, or -1.
 
     `values` (n, k): scaled terms; `points` (n, d): designs in the unit box. Two points are the same
-    if no term and no coordinate differ by more than `near`."""
+    if no term differs by more than `near`, and no coordinate by more than 5 times `near`."""
     found: list[int] = []
     for k in range(len(values)):
         same = [
@@ -275,7 +275,9 @@ def repeated(
 
 
 def ordered(values: NDArray[np.float64]) -> Sequence[int]:
-    """Return the order (n,) of points by their scaled terms (n, k), the first term first."""
+    """Return the indices (n,) that sort points by their scaled terms `values` (n, k).
+
+    Points are sorted by the first term, equal ones by the next term."""
     return [int(k) for k in np.lexsort(values.T[::-1])]
 
 

@@ -1,7 +1,10 @@
-"""Recognises gaps: places where a front, or the designs along it, jump.
+"""Detects gaps of a front: jumps of the terms, or of the designs, between two neighbours.
 
-Neighbours that lie far apart are bisected. On a front without a gap, the point found in between
-divides the distance. At a gap, the search leads back to one of both neighbours."""
+If two neighbours lie far apart, a search looks for a point between them (bisection). Without a gap,
+it finds such a point. At a gap, it leads back to one of the two neighbours.
+
+Below, the *spacing* of terms is the distance between neighbouring reference points
+(`rootsopt.tradeoffs.scalar`). Points are identified by their indices."""
 
 import dataclasses
 import itertools
@@ -13,24 +16,23 @@ from numpy.typing import NDArray
 
 Pair = tuple[int, int]
 _WIDE_TERMS = 1.8
-"""Distance of neighbours in terms, in distances of their reference points, above which the place
-between them is searched."""
+"""Distance in terms (multiples of the spacing) above which two neighbours are bisected."""
 _WIDE_DESIGN, _LEAST_DESIGN = 3.0, 0.05
-"""Distance of neighbours in the unit box, in typical distances and absolute, above which the place
-between them is searched."""
+"""Distances in the unit box (multiples of the typical distance; absolute) above which two
+neighbours are bisected. Both must be exceeded."""
 _CLOSE = 0.3
-"""Distance of neighbours in terms, in distances of their reference points, below which their
-designs count as those of two kinds if they are still far apart."""
+"""Distance in terms (multiples of the spacing) below which two neighbours with distant designs are
+a gap of kind `design`, without another bisection."""
 _BACK = 0.1
-"""Share of the distance of two neighbours up to which a point found between them counts as one of
-them."""
+"""Distance from a neighbour (fraction of the distance between both neighbours) below which a point
+found by bisection counts as that neighbour."""
 
 
 class Edge(NamedTuple):
-    """Two neighbours on a front.
+    """Two neighbours on a front, and the distances between them.
 
-    `pair`: their numbers; `distance`: distance in scaled terms; `design_distance`: greatest
-    difference of a coordinate of the unit box."""
+    `pair`: indices of the neighbours; `distance`: Euclidean distance in scaled terms;
+    `design_distance`: greatest difference of a coordinate of the unit box."""
 
     pair: Pair
     distance: float
@@ -38,41 +40,45 @@ class Edge(NamedTuple):
 
 
 class Spacing(NamedTuple):
-    """Typical distances of neighbours: `terms` in scaled terms, `design` in the unit box."""
+    """Typical distances between neighbours: `terms` in scaled terms, `design` in the unit box."""
 
     terms: float
     design: float
 
     def excess(self, edge: Edge) -> float:
-        """Return how far apart two neighbours are, 1 where the place between them is searched."""
+        """Return the distance of two neighbours divided by that above which they are bisected.
+
+        The greater of the quotients in terms and in the unit box counts."""
         jump = edge.design_distance / max(_WIDE_DESIGN * self.design, _LEAST_DESIGN)
         return max(edge.distance / (_WIDE_TERMS * self.terms), jump)
 
     def kind(self, edge: Edge) -> str:
-        """Return whether neighbours are far apart in `terms`, or only in `design`."""
+        """Return "terms" if two neighbours are far apart in terms, otherwise "design"."""
         return "terms" if edge.distance > _WIDE_TERMS * self.terms else "design"
 
     def close(self, edge: Edge) -> bool:
-        """Return whether neighbours are so close in terms that a bisection cannot tell more."""
+        """Return whether two neighbours are too close in terms to be bisected."""
         return edge.distance <= _CLOSE * self.terms
 
 
 def measured(pair: Pair, values: NDArray[np.float64], points: NDArray[np.float64]) -> Edge:
-    """Return the edge of a `pair`, given scaled terms (n, k) and points (n, d) of all numbers."""
+    """Return the `Edge` of a `pair` of points.
+
+    `values` (n, k): scaled terms of all points; `points` (n, d): their designs in the unit box."""
     i, j = pair
     apart = float(np.linalg.norm(values[i] - values[j]))
     return Edge(pair, apart, float(np.max(np.abs(points[i] - points[j]))))
 
 
 def along(kept: Sequence[int]) -> list[Pair]:
-    """Return pairs of successive numbers of an ordered front of two terms."""
+    """Return the pairs of neighbours on a front of two terms: successive indices in `kept`."""
     return list(itertools.pairwise(kept))
 
 
 def among(pairs: Sequence[Pair], kept: Sequence[int], same: Sequence[int]) -> list[Pair]:
-    """Return those `pairs` whose numbers are both in `kept`, each once.
+    """Return those `pairs` whose points are both in `kept`, each once.
 
-    `same`: for each number, that of an earlier one which stands for it, or -1."""
+    `same`: for each point, the index of the point that replaces it, or -1."""
     found: dict[Pair, None] = {}
     for pair in pairs:
         i, j = sorted(same[k] if same[k] >= 0 else k for k in pair)
@@ -86,24 +92,24 @@ def divides(
 ) -> bool:
     """Return whether a point with scaled terms `values` (k,) lies between two neighbours.
 
-    `edge`: the neighbours; `one`, `other` (k,): their scaled terms."""
+    `edge`: edge of the neighbours; `one`, `other` (k,): their scaled terms."""
     apart = [float(np.linalg.norm(values - end)) for end in (one, other)]
     return min(apart) > _BACK * edge.distance and max(apart) < edge.distance * (1 + _BACK)
 
 
 @dataclasses.dataclass
-class Search:
-    """What the bisections have found so far.
+class Bisections:
+    """Results of all bisections so far.
 
-    `pairs`: pairs of neighbours (three terms only); `tried`: number of points searched for between
-    a pair; `closed`: pairs that turned out to be the two sides of a gap, with its kind."""
+    `pairs`: pairs of neighbours (three terms only); `tried`: number of searches between each pair;
+    `closed`: kind of the gap between each pair that is not bisected further."""
 
     pairs: list[Pair]
     tried: dict[Pair, int] = dataclasses.field(default_factory=dict)
     closed: dict[Pair, str] = dataclasses.field(default_factory=dict)
 
     def divided(self, pair: Pair, middle: int) -> None:
-        """Record that the point number `middle` was found between a `pair`."""
+        """Record that the point with the index `middle` was found between the two of a `pair`."""
         count = self.tried.get(pair, 0)
         for end in pair:
             new = (min(end, middle), max(end, middle))
@@ -113,4 +119,4 @@ class Search:
             self.pairs.remove(pair)
 
 
-__all__ = ["Edge", "Pair", "Search", "Spacing", "along", "among", "divides", "measured"]
+__all__ = ["Bisections", "Edge", "Pair", "Spacing", "along", "among", "divides", "measured"]

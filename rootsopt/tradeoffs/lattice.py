@@ -1,7 +1,8 @@
 """Grid of reference points between the ends of a front: a line for two terms, a triangle for three.
 
-A *key* of the grid has one whole number per term; their sum is the number of divisions. The key of
-the end of a term has all of them in the entry of that term."""
+A *key* identifies a grid point by one whole number per term; their sum is the number of divisions.
+At the end of a term (the optimum of this term alone), the number of this term is that sum, and all
+others are 0."""
 
 import itertools
 from collections.abc import Sequence
@@ -10,26 +11,26 @@ Key = tuple[int, ...]
 
 
 def keys(count: int, divisions: int) -> list[Key]:
-    """Return all keys for `count` terms, from the end of the first term on.
+    """Return all keys for `count` terms, beginning with the end of the first term.
 
-    Neighbours of a key that come before it are those at minus one of `directions`."""
+    The neighbours that come before a key differ from it by minus one of the `directions`."""
     every = itertools.product(range(divisions, -1, -1), repeat=count)
     return [key for key in every if sum(key) == divisions]
 
 
 def corners(count: int, divisions: int) -> list[Key]:
-    """Return the keys of the ends, in the order of the terms."""
+    """Return the key of each term's end, in the order of the terms."""
     return [tuple(divisions * (i == k) for i in range(count)) for k in range(count)]
 
 
 def directions(count: int) -> list[Key]:
-    """Return the steps from a key to those neighbours that come after it."""
+    """Return the differences between a key and those neighbours that come after it in `keys`."""
     pairs = itertools.combinations(range(count), 2)
     return [tuple((k == j) - (k == i) for k in range(count)) for i, j in pairs]
 
 
 def links(found: Sequence[Key]) -> list[tuple[int, int]]:
-    """Return pairs of numbers of the keys in `found` that are neighbours on the grid."""
+    """Return the pairs of neighbours on the grid, as indices of the keys in `found`."""
     place = {key: number for number, key in enumerate(found)}
     pairs = []
     for key, number in place.items():

@@ -7,13 +7,14 @@ From a reference point r, the design is sought that goes furthest in all terms a
 
 Every point of a front is the optimum for some r, also where the front is not convex. A weighted sum
 does not reach these points. All d_i are 1, except beside a gap. The small second part excludes
-designs that are worse in one term and better in none. See Pascoletti and Serafini, Scalarizing
-vector optimization problems, Journal of Optimization Theory and Applications 42 (1984) 499-524, and
+designs that are worse in one term and better in none. Sources: Pascoletti and Serafini, Scalarizing
+vector optimization problems, Journal of Optimization Theory and Applications 42 (1984) 499-524.
 Steuer and Choo, An interactive weighted Tchebycheff procedure, Mathematical Programming 26 (1983)
 326-344.
 
-The maximum is one `Group` of branches. The shares of its branches, from the certificate, are the
-weights of the terms at the optimum, and their ratios are the rates at which the terms trade."""
+The maximum is one `Group` of branches. The certificate gives the share of each branch. The shares
+are the weights of the terms at the optimum, and their ratios are the rates at which the terms
+trade."""
 
 from typing import NamedTuple
 
@@ -25,8 +26,8 @@ from rootsopt.optimize.local import Group, Local
 from rootsopt.tradeoffs.study import Sample
 
 RHO = 1e-3
-"""Weight ρ of the sum. Designs that give up more than 1/ρ of one term's range per range of another
-count as worse."""
+"""Weight ρ of the sum. It excludes a design if a small loss in one term would gain more than 1/ρ
+times as much of another term, both in ranges."""
 
 
 class Scale(NamedTuple):
@@ -36,7 +37,7 @@ class Scale(NamedTuple):
     width: NDArray[np.float64]
 
     def of(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the scaled terms (…, k) for their values (…, k), of which less is better."""
+        """Return the scaled terms (…, k) for their values (…, k), all to be minimised."""
         return (values - self.ideal) / self.width
 
 
@@ -44,7 +45,7 @@ class Scalar(NamedTuple):
     """One scalar objective made of k terms.
 
     `scale`: scale of the terms; `reference` (k,): reference point r, in scaled terms; `leading`:
-    numbers of the terms in the maximum; `direction` (k,): d, by default 1 for each term."""
+    indices of the terms in the maximum; `direction` (k,): d, by default 1 for each term."""
 
     scale: Scale
     reference: NDArray[np.float64]
@@ -53,7 +54,7 @@ class Scalar(NamedTuple):
 
     @property
     def steps(self) -> NDArray[np.float64]:
-        """Direction d (k,)."""
+        """Divisor (k,) of each scaled term in the maximum: `direction`, or ones by default."""
         return np.ones(len(self.reference)) if self.direction is None else self.direction
 
     def value(self, values: NDArray[np.float64]) -> float:
@@ -80,7 +81,8 @@ class Scalar(NamedTuple):
                 smooth += RHO * float(values[0])
                 slope = slope + RHO * group.slopes[0] / width
         first = Group(*(np.concatenate(arrays) for arrays in zip(*together, strict=True)))
-        return Local(smooth, slope, (first, *corners), sample.slack, sample.normals)
+        limits = sample.slack, sample.normals, sample.walls
+        return Local(smooth, slope, (first, *corners), *limits)
 
     def weights(self, sample: Sample, certificate: Certificate) -> NDArray[np.float64]:
         """Return the weights (k,) of the scaled terms in the maximum at an optimum; their sum is 1.
@@ -98,10 +100,10 @@ def rates(
 ) -> NDArray[np.float64]:
     """Return the rates (k, k) at which terms trade along the front.
 
-    Entry (i, j) is the change of term i per unit of term j, both in a sense in which less is
-    better: -(w_j / width_j) / (w_i / width_i). `weights` (k,): those of the scaled terms; `width`
-    (k,): their scale. The rate is NaN if a weight is below `least`: one term then does not hold the
-    design, as at an end of the front or beside a gap."""
+    Entry (i, j) is the change of term i per unit of term j, both taken as terms to be minimised:
+    -(w_j / width_j) / (w_i / width_i). `weights` (k,): those of the scaled terms; `width` (k,):
+    their scale. The rate is NaN if one of the two weights is below `least`. That term then does not
+    influence the optimum, as at an end of the front or beside a gap."""
     held = np.where(weights >= least, weights / width, np.nan)
     found = -held[None, :] / held[:, None]
     np.fill_diagonal(found, np.nan)

@@ -9,15 +9,16 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.design.space import Space
+from rootsopt.optimize.limits import force_limits, term_constraints
 from rootsopt.optimize.local import Group
-from rootsopt.optimize.problem import Problem
+from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.profiles import geometry
 from rootsopt.response.evaluation import Evaluation, Evaluator, geometry_record
 from rootsopt.response.terms import terms_of, values_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
-from rootsopt.tradeoffs.aims import Aim, aims_of, freed, reporting, simulated
+from rootsopt.tradeoffs.aims import Aim, aims_of, freed, reported, simulated
 
 PEAK = "peak_force_N"
 """Key of the peak force: the greatest of several local maxima, each a smooth branch."""
@@ -28,9 +29,10 @@ class Sample:
     """The k terms at one point of the unit box.
 
     `point` (d,): the design in the unit box; `evaluation`: evaluation of the design; `terms`: one
-    group of branches per term, in a sense in which less is better, with gradients with respect to
-    the point; `cornered`: for each term, whether it is a maximum over branches; `slack` (m,),
-    `normals` (m, d): constraints, as in `rootsopt.optimize.local`."""
+    group of branches per term, with the sign that makes it a term to be minimised, and with
+    gradients with respect to the point; `cornered`: for each term, whether it is a maximum over
+    branches; `slack` (m,), `normals` (m, d),
+    `walls`: constraints, as in `rootsopt.optimize.local`."""
 
     point: NDArray[np.float64]
     evaluation: Evaluation
@@ -38,20 +40,27 @@ class Sample:
     cornered: tuple[bool, ...]
     slack: NDArray[np.float64]
     normals: NDArray[np.float64]
+    walls: tuple[Group, ...] = ()
+
+    @property
+    def feasible(self) -> bool:
+        """Whether all constraints hold."""
+        beyond = max((wall.top for wall in self.walls), default=0.0)
+        return max(-float(np.min(self.slack, initial=0.0)), beyond) <= FEASIBLE
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Values (k,) of the terms, in a sense in which less is better."""
+        """Values (k,) of the terms, each with the sign that makes it a term to be minimised."""
         return np.array([group.top for group in self.terms])
 
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """Everything that is needed to look at designs of one trade-off.
+    """Everything that is needed to evaluate designs of one trade-off.
 
     `config`: config of the study; `aims`: its k terms; `problem`: unit box and constraints, with
-    the evaluated baseline; `fast`: evaluator for a screening, `sharp`: for a search, `exact`: for
-    reports. All three are `None` if no term depends on forces."""
+    the evaluated baseline; `fast`, `sharp`, `exact`: evaluators for screening, search and report.
+    All three are `None` if no term depends on forces."""
 
     config: Config
     aims: tuple[Aim, ...]
@@ -70,19 +79,22 @@ class Study:
         scene = Scene.from_config(config)
         if not simulated(config, scene):
             baseline = geometry_of(scene, config, design_vector(config))
-            space = Space.of(config, scene, baseline.geometry["area_efficiency"])
+            floor = baseline.geometry["area_efficiency"]
+            space = Space.of(config, scene, floor, term_constraints(config, scene))
             return cls(config, aims, Problem(config, baseline, space), None, None, None)
-        exact, baseline = Evaluator.of(reporting(config)).fit()
-        if any(_is_cornered(aim) for aim in aims):
+        exact, baseline = Evaluator.of(reported(config)).fit()
+        limits = force_limits(config, scene)
+        if any(_is_cornered(aim) for aim in aims) or any(one.cornered for one in limits):
             exact = exact.with_maxima()
         fast = exact.at_tolerance(max(1e-6, config.solver.rtol)).surveying()
-        space = Space.of(config, exact.scene, baseline.geometry["area_efficiency"])
-        problem = Problem(config, baseline, space)
+        floor = baseline.geometry["area_efficiency"]
+        space = Space.of(config, exact.scene, floor, term_constraints(config, exact.scene))
+        problem = Problem(config, baseline, space, limits)
         return cls(config, aims, problem, fast, exact.surveying(), exact)
 
     @property
     def usable(self) -> bool:
-        """Whether the baseline has all terms."""
+        """Whether all terms are known for the baseline."""
         return self.exact is None or self.problem.baseline.usable
 
     def term_values(self, evaluation: Evaluation) -> dict[str, float]:
@@ -138,7 +150,9 @@ class Study:
             slope = np.array([*evaluation.gradient[aim.name].values()])
             groups.append(_single(number, aim, evaluation.response[aim.name], slope @ jacobian))
         cornered = tuple(map(_is_cornered, self.aims))
-        return _finite(Sample(np.array(point), evaluation, tuple(groups), cornered, slack, normals))
+        walls = self.problem.walls(evaluation, jacobian)
+        limits = slack, normals, walls
+        return _finite(Sample(np.array(point), evaluation, tuple(groups), cornered, *limits))
 
     def _still(self, point: NDArray[np.float64]) -> Sample | None:
         design, jacobian, slack, normals = self.problem.look(point)
@@ -171,7 +185,9 @@ def _single(number: int, aim: Aim, value: float, slope: NDArray[np.float64]) -> 
 def _finite(sample: Sample) -> Sample | None:
     """Return `sample`, or `None` if a number in it is not finite."""
     arrays = [sample.slack, sample.normals]
-    arrays += [array for group in sample.terms for array in (group.values, group.slopes)]
+    arrays += [
+        array for group in (*sample.terms, *sample.walls) for array in (group.values, group.slopes)
+    ]
     return sample if all(np.all(np.isfinite(array)) for array in arrays) else None
 
 

@@ -2,15 +2,16 @@
 
 First, each term alone is minimised from several starts. These optima are the ends of the front, and
 reference points are spread evenly between them: on the straight line between two ends, or on a
-triangular grid between three. This is the normal-boundary method of Das and Dennis, Normal-boundary
-intersection, SIAM Journal on Optimization 8 (1998) 631-657, with the objective of
-`rootsopt.tradeoffs.scalar`, which may stay behind the line from a reference point.
+triangular grid between three. The objective of `rootsopt.tradeoffs.scalar` is minimised for each of
+them. The reference points are those of the normal-boundary method: Das and Dennis, Normal-boundary
+intersection, SIAM Journal on Optimization 8 (1998) 631-657. That method requires the solution to
+lie on the normal through the reference point; here, it may lie beside the normal.
 
-The points are then solved in order, each from a prediction by its solved neighbours: the secant
-through two of them, or the nearest one. A second pass goes back from the other ends. Branches of
-optima can exist side by side, so the better result counts. Any design seen before that would be
-better still begins a further search, and so does the best one of another kind. Last, neighbours
-that lie far apart are bisected."""
+The optima are found in order. Each search starts from a prediction: the secant through two
+neighbours already found, or the nearest one. A second pass runs in the opposite order. Several
+local optima can exist side by side, so the better of the two results counts. Two kinds of designs
+evaluated earlier start further searches: one that is better than the result, and the best one that
+lies far from it. Finally, neighbours that lie far apart are bisected."""
 
 import os
 import threading
@@ -34,34 +35,37 @@ from rootsopt.response.choice import resolve
 from rootsopt.scene import check_geometry
 from rootsopt.tradeoffs.assembly import Node, gaps_of, points_of, selected, spacing_of
 from rootsopt.tradeoffs.front import Front, Standing
-from rootsopt.tradeoffs.gaps import Edge, Pair, Search, Spacing, divides
+from rootsopt.tradeoffs.gaps import Bisections, Edge, Pair, Spacing, divides
 from rootsopt.tradeoffs.lattice import Key, corners, directions, keys, links
 from rootsopt.tradeoffs.scalar import Scalar, Scale, end_scale
 from rootsopt.tradeoffs.study import Sample, Study
 
 _BETTER = 1e-4
-"""Gain (range of a term) that a design seen before must promise to begin a further search."""
+"""Gain in the objective (fraction of a term's range) above which a design evaluated earlier starts
+another search."""
 _PROMISING = 0.25
-"""Disadvantage (range of a term) up to which a design of another kind begins a further search."""
+"""Excess over the best objective (fraction of a term's range) below which a design evaluated
+earlier, far from the best one, starts another search."""
 _APART = 0.15
-"""Distance in the unit box above which two starts differ."""
+"""Distance in the unit box above which two designs count as distant from each other."""
 _CHEAP_EVALUATIONS, _CHEAP_STARTS, _CHEAP_SCREENING = 300, 6, 64
-"""Least effort per search, starts per end and screened designs, where nothing is simulated."""
+"""Minimum effort where no term needs a simulation: number of evaluations per search, of starts per
+end, and of screened designs."""
 _SHARP = 0.01
-"""Accuracy (width of the gap) with which the sides of a gap are found."""
+"""Accuracy (fraction of the gap's width) with which the sides of a gap are located."""
 _EXPLAINED = 8
 """Maximum number of points from which the least violation of the constraints is searched for."""
 _HOLDS_UP = 0.01
 """Relative difference of a term between search and verification above which a point is dropped."""
 _SAME_ENDS = 1e-6
-"""Range of a term over the ends, relative to its scale, below which the term is not in conflict."""
+"""Range of a term over the ends (relative to its scale) below which the terms do not conflict."""
 
 Progress = Callable[[int, int], None]
 """Type of a progress callback, with arguments (searches done, searches expected)."""
 
 
 class _Seen(NamedTuple):
-    """A feasible design seen before: `point` (d,), its terms `values` (k,), its `orbit`."""
+    """A feasible design evaluated earlier: `point` (d,), its terms `values` (k,), its `orbit`."""
 
     point: NDArray[np.float64]
     values: NDArray[np.float64]
@@ -71,8 +75,8 @@ class _Seen(NamedTuple):
 class Tracer:
     """Traces the front of one config.
 
-    `progress`: function called after each local search; `stop`: event that another thread can set
-    to end early.
+    `progress`: function called after each local search with (searches done, searches expected);
+    `stop`: event that another thread can set to end the tracing early.
 
     Raises `InputError` if the profile family has no design parameters."""
 
@@ -94,7 +98,7 @@ class Tracer:
         self._study: Study | None = None
         self._nodes: dict[Key, Node] = {}
         self._extra: list[Node] = []
-        self._gaps = Search([])
+        self._gaps = Bisections([])
         self._spacing = Spacing(np.inf, np.inf)
         self._scale: Scale | None = None
         self._seen: list[_Seen] = []
@@ -104,13 +108,13 @@ class Tracer:
 
     @property
     def study(self) -> Study:
-        """The terms at designs; known as soon as the baseline has been evaluated."""
+        """The study that evaluates designs; available once the baseline has been evaluated."""
         assert self._study is not None
         return self._study
 
     @property
     def scale(self) -> Scale:
-        """Scale of the terms; known from the screening on, final once the ends are known."""
+        """Scale of the terms; available after the screening, final once the ends are known."""
         assert self._scale is not None
         return self._scale
 
@@ -163,10 +167,15 @@ class Tracer:
             found = list(pool.map(self._screened, points))
         signs = np.array([aim.sign for aim in self.study.aims])
         names = [aim.name for aim in self.study.aims]
+        # Designs beyond a limit of a force serve as starts only if there are no others.
+        beyond: list[_Seen] = []
         for point, evaluation in zip(points, found, strict=True):
             if evaluation is not None:
                 values = signs * [evaluation.response[name] for name in names]
-                self._seen.append(_Seen(point, values, evaluation.state))
+                seen = _Seen(point, values, evaluation.state)
+                kept = self.study.problem.excess(evaluation) <= FEASIBLE
+                (self._seen if kept else beyond).append(seen)
+        self._seen = self._seen or beyond
         self._evaluations += len(points)
         baseline = signs * [self.study.problem.baseline.response[name] for name in names]
         every = np.array([one.values for one in self._seen]).reshape(-1, len(names))
@@ -203,7 +212,10 @@ class Tracer:
         return conflict and not self.stop.is_set()
 
     def _apart(self, scalar: Scalar, count: int, first: NDArray[np.float64]) -> list[_Seen]:
-        """Return at most `count` designs seen before that lie apart, the best by `scalar` first."""
+        """Return up to `count` designs evaluated earlier that are distant from each other.
+
+        They are in order of the objective `scalar`, the best first. Without such designs, return
+        the point `first` (d,)."""
         chosen: list[_Seen] = []
         for one in sorted(self._seen, key=lambda one: scalar.value(one.values)):
             apart = all(np.linalg.norm(one.point - other.point) > _APART for other in chosen)
@@ -248,9 +260,9 @@ class Tracer:
     def _predictions(self, key: Key, ahead: bool):
         """Yield (start (d,), orbit) for a `key` of the grid, from its solved neighbours.
 
-        `ahead`: whether this is the first pass; the second begins from the other side. The first
-        start is the secant through two neighbours in line, or the nearest neighbour; if it leads
-        nowhere, the neighbour itself follows."""
+        `ahead`: whether this is the first pass; the second runs in the opposite order. The first
+        start is the secant through two neighbours in line. If there is only one neighbour, or if
+        the search from the secant fails at once, the start is the nearest neighbour."""
         steps = directions(len(key))
         for step in steps if ahead else [tuple(-x for x in one) for one in steps]:
             near = self._nodes.get(tuple(a - b for a, b in zip(key, step, strict=True)))
@@ -261,13 +273,15 @@ class Tracer:
             if far is not None and np.max(np.abs(near.point - far.point)) < 2 * _APART:
                 secant = np.clip(2 * near.point - far.point, 0.0, 1.0)
                 yield secant, near.sample.evaluation.state
-                if self._evaluations > before + 1:  # The prediction had a steady state.
+                if self._evaluations > before + 1:  # The start had a steady state.
                     return
             yield near.point, near.sample.evaluation.state
             return
 
     def _again(self, scalar: Scalar, best: Node | None) -> Node | None:
-        """Search from the best design seen before if it is better than `best`; return the best."""
+        """Search from the best design evaluated earlier, if it beats `best`.
+
+        Return the better one of the outcome and `best`."""
         seen = min(self._seen, key=lambda one: scalar.value(one.values), default=None)
         if seen is None or self.stop.is_set():
             return best
@@ -276,10 +290,10 @@ class Tracer:
         return best
 
     def _elsewhere(self, scalar: Scalar, best: Node | None) -> Node | None:
-        """Search from the most promising design seen before that lies apart from `best`.
+        """Search from the best design evaluated earlier that is distant from `best`.
 
         Return the better one of the outcome and `best`. With a single start (`optimizer.starts`),
-        or without a promising design, return `best`."""
+        or if that design is much worse than `best` (`_PROMISING`), return `best`."""
         if best is None or self.config.optimizer.starts < 2:
             return best
         limit = best.objective + _PROMISING
@@ -309,7 +323,7 @@ class Tracer:
                 return None
             last[0] = sample.evaluation.state
             samples[point.tobytes()] = sample
-            if np.min(sample.slack, initial=0.0) >= -FEASIBLE:
+            if sample.feasible:
                 self._seen.append(_Seen(sample.point, sample.values, sample.evaluation.state))
             return scalar.local(sample)
 
@@ -336,7 +350,7 @@ class Tracer:
 
     def _bisect(self) -> None:
         """Search between neighbours that lie far apart, as long as refinements are left."""
-        self._gaps = Search(links([*self._nodes]))
+        self._gaps = Bisections(links([*self._nodes]))
         first = selected(self._all(), self.scale)
         self._spacing = spacing_of(first, self._gaps.pairs, len(self.study.aims), self._divisions)
         for _ in range(self.config.pareto.refinements):
@@ -348,7 +362,9 @@ class Tracer:
             self._divide(wide, nodes)
 
     def _widest(self, edges: Sequence[Edge]) -> Edge | None:
-        """Return the neighbours that lie furthest apart and may still be bisected."""
+        """Return the neighbours that lie farthest apart, out of those that may be bisected.
+
+        Return `None` if no neighbours are left to bisect."""
         spacing, gaps = self._spacing, self._gaps
         open_ones = []
         for edge in edges:
@@ -361,7 +377,7 @@ class Tracer:
         return max(open_ones, key=spacing.excess, default=None)
 
     def _divide(self, edge: Edge, nodes: Sequence[Node]) -> None:
-        """Search for a point between two neighbours, and record what was found."""
+        """Search for a point between two neighbours, and record it, or the gap."""
         ends = [nodes[k] for k in edge.pair]
         values = [self.scale.of(node.sample.values) for node in ends]
         middle = np.mean(values, axis=0)
@@ -387,10 +403,11 @@ class Tracer:
         gaps.divided(edge.pair, len(nodes))
 
     def _sharpened(self, pair: Pair) -> Pair:
-        """Move both sides of a gap between two terms as close together as the front goes on.
+        """Move the two sides of a gap towards each other, as far as the front continues.
 
-        Each side improves its worse term as long as it is better than the other side in the other
-        term. Return the numbers of the sides, which are new where a side has moved."""
+        The front has two terms. Each side improves its worse term, as long as it stays better than
+        the other side in the other term. Return the indices of the sides. A side that has moved has
+        a new index."""
         first, second = sorted(pair, key=lambda k: self._scaled(k)[0])
         for lead in (0, 1):
             moving, fixed = (second, first) if lead == 0 else (first, second)
@@ -418,9 +435,10 @@ class Tracer:
     # The result.
 
     def _verified(self, nodes: list[Node]) -> list[Node]:
-        """Return the nodes with those of the front simulated again from rest, and certified there.
+        """Return the nodes after those on the front have been simulated again from rest.
 
-        Nodes that `stop` leaves no time for keep their standing."""
+        Their first-order conditions are checked with that simulation. If `stop` is set, the
+        remaining nodes keep their standing."""
         if not nodes:
             return nodes
         kept = set(selected(nodes, self.scale).kept)
@@ -459,10 +477,10 @@ class Tracer:
             selection = selected(nodes, self.scale)
             points, dropped = points_of(study, nodes, selection, self.scale)
             spacing = self._spacing
-            if not np.isfinite(spacing.terms):  # Stopped, or the ends are not in conflict.
+            if not np.isfinite(spacing.terms):  # Stopped early, or the terms do not conflict.
                 spacing = spacing_of(selection, [], len(study.aims), self._divisions)
             edges, gaps = gaps_of(selection, self._gaps, spacing)
-            if self.stop.is_set():  # Points that are missing leave no gap.
+            if self.stop.is_set():  # Neighbours may be far apart only because points are missing.
                 gaps = [gap for gap in gaps if gap.confirmed]
             known = {"points": tuple(points), "dropped": tuple(dropped)}
             known |= {"edges": tuple(edges), "gaps": tuple(gaps)}

@@ -1,4 +1,4 @@
-"""The commands from outside: files, exit codes, messages."""
+"""Tests of the commands from outside: files, exit codes, messages."""
 
 import csv
 import json
@@ -49,13 +49,15 @@ def columns(path):
 
 
 def profile_in(folder):
-    """The profile of the optimised config in a result folder."""
+    """Return the profile of the optimised config in a result folder."""
     config = load(folder / "optimized.yaml")
     return Scene.from_config(config).profile(design_vector(config))
 
 
 def test_optimize_writes_the_contract(tmp_path):
-    """Every file of the contract, the table, compile and run time, exit 0, quiet stderr."""
+    """`optimize` writes every promised file, a table and the times of compiling and running.
+
+    The exit code is 0 and stderr is empty."""
     done = command("optimize", CIC, "-o", tmp_path, *SMALL, "--export", "dxf")
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
@@ -117,7 +119,8 @@ def test_optimize_writes_the_contract(tmp_path):
 
 
 def test_simulate_ee_and_profile(tmp_path):
-    """One record at top level; `profile` simulates nothing; EE has an empty design."""
+    """Both commands write one record at top level. `profile` simulates nothing, and EE has an empty
+    design."""
     done = command("simulate", EE, "-o", tmp_path / "ee", "--no-figures")
     assert done.returncode == 0, done.stdout + done.stderr
     record = json.loads((tmp_path / "ee" / "result.json").read_text())
@@ -130,12 +133,13 @@ def test_simulate_ee_and_profile(tmp_path):
     assert record["geometry"]["area_efficiency"] == pytest.approx(0.5, abs=1e-12)
     assert record["response"] == {}
     assert record["margins"]["root_mm"] == pytest.approx(record["geometry"]["root_radius_mm"])
-    # Of the turn of an epicycloid's normal 1 / (1 + N) is the roll angle's.
+    # The roll angle advances by 1 / (1 + N) of the turn of an epicycloid's normal.
     assert record["margins"]["rolling"] == pytest.approx(1 / 3, abs=1e-9)
 
 
 def test_no_usable_result_exits_3(tmp_path):
-    """Lobes passing through each other, with hardly a gear: status, exit 3, no numbers."""
+    """If the lobes pass through each other, the result has a status and no numbers; the exit code
+    is 3."""
     text = yaml.safe_load(Path(CIC).read_text())
     text["scene"]["timing_gear"]["stiffness_N_m_per_rad"] = 1.0
     text["scene"]["load"]["torque_N_m"] = 40.0
@@ -163,7 +167,8 @@ def test_no_usable_result_exits_3(tmp_path):
     ],
 )
 def test_bad_input_exits_2_with_one_message(arguments, words, tmp_path):
-    """Exit 2, one line on stderr that names key and remedy, nothing written."""
+    """Bad input ends with exit code 2 and one line on stderr that names key and remedy. Nothing is
+    written."""
     out = tmp_path / "out"
     done = command("simulate", *arguments, "-o", out)
     assert done.returncode == 2
@@ -186,7 +191,8 @@ def test_unwritable_output_exits_2(tmp_path):
 
 
 def test_console_command_and_help():
-    """`rootsopt COMMAND`; unknown commands get the nearest; help lists keys with units."""
+    """An unknown command gets the nearest name as a suggestion. `--help` lists the keys with
+    units."""
     run = [
         sys.executable,
         "-c",
@@ -202,8 +208,10 @@ def test_console_command_and_help():
 
 
 def test_compiled_programs_are_kept_between_processes(tmp_path):
-    """A second run finds every program in the cache and gives the same numbers. The first one
-    shares the session's cache; the second has a copy of it, which nobody else writes to."""
+    """A second run finds every program in the cache and gives the same numbers.
+
+    The first run shares the cache of the session. The second run has a copy of it, which no other
+    process writes to."""
     answers = []
     for run, cache in (("first", os.environ["ROOTSOPT_CACHE"]), ("second", tmp_path / "cache")):
         if run == "second":
@@ -221,7 +229,7 @@ def test_compiled_programs_are_kept_between_processes(tmp_path):
 
 
 def test_no_programs_are_kept_if_told_so(tmp_path, monkeypatch, capsys):
-    """With --no-cache; without it they are."""
+    """With `--no-cache`, no programs are stored; without it, they are."""
     monkeypatch.setattr(programs, "_store", None)
     monkeypatch.setenv("ROOTSOPT_CACHE", str(tmp_path / "cache"))
     arguments = EE, "-o", str(tmp_path / "p"), "--no-figures", "--export", "none"

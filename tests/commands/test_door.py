@@ -1,4 +1,4 @@
-"""The edges of a command's process: signals, closed and full streams, odd files as config."""
+"""Tests of a command's process: signals, closed and full streams, odd files as config."""
 
 import os
 import signal
@@ -21,9 +21,9 @@ CIC = str(ROOT / "configs" / "cic.yaml")
 
 
 def python(code, *arguments, **options):
-    """A process that runs `code`, its streams as pipes."""
+    """Return a process that runs `code`, with pipes as its streams."""
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
-    # Whoever started the tests in the background has Ctrl-C ignored, in its children too.
+    # If the tests run in the background, Ctrl-C is ignored in their child processes too.
     options |= {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
     return subprocess.Popen([sys.executable, "-c", code, *arguments], cwd=ROOT, **options)
 
@@ -39,12 +39,12 @@ sys.exit(door.through("test", work, own=True))
 """
 
 
-# What is left in a buffer is written at the very end of the process.
+# Buffered output is written at the very end of the process.
 BUFFERED = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
 
 
 def shell(redirection, code, size=10):
-    """Exit code and stderr of work that prints, with a shell's redirection."""
+    """Return exit code and stderr of a process that prints, with a shell's redirection."""
     command = f'"$0" -c "$1" {code} {size} {redirection}'
     done = subprocess.run(
         ["bash", "-c", f"{command}; exit ${{PIPESTATUS[0]}}", sys.executable, WORK],
@@ -57,7 +57,7 @@ def shell(redirection, code, size=10):
 @pytest.mark.parametrize("code", [0, 3])
 @pytest.mark.parametrize("redirection", ["| true", ">&-", "2>&-", ">&- 2>&- <&-", "1</dev/null"])
 def test_the_exit_code_is_the_runs_own(redirection, code, size):
-    """Whoever reads, or has stopped to."""
+    """The exit code does not depend on who reads the output, or on whether it is still read."""
     found, told = shell(redirection, code, size)
     assert found == code
     assert told in ("said\n", "")
@@ -92,7 +92,8 @@ def test_help_into_a_closed_pipe(arguments, code):
 
 @pytest.mark.parametrize("daemon", [True, False])
 def test_threads_that_go_on_do_not_keep_the_process(daemon):
-    """Nor are they waited for, as a compilation that nobody needs any more."""
+    """The process ends without waiting for threads, such as a compilation that is no longer
+    needed."""
     code = (
         "import threading, time; from rootsopt.commands import door;"
         f"go = lambda: threading.Thread(target=time.sleep, args=(60,), daemon={daemon}).start();"
@@ -146,7 +147,7 @@ PATIENT = """
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("wait", [AT_ONCE, COMPILED])
 def test_a_signal_stops_a_run_at_once(tmp_path, wait, number):
-    """In compiled code too, which Python cannot interrupt; nothing is left."""
+    """A signal also stops compiled code, which Python cannot interrupt; nothing is left behind."""
     process = python(WAITING.format(wait=wait), str(tmp_path / "run"))
     assert process.stdout.readline() == "here\n"
     assert len(os.listdir(tmp_path)) == 2
@@ -185,7 +186,7 @@ def test_a_second_signal_stops_a_patient_run(tmp_path):
 
 
 def test_signals_that_are_ignored_stay_so():
-    """As those of a job in the background of a script."""
+    """Signals stay ignored, as for a background job of a script."""
     code = (
         "import os, signal, sys, time; from rootsopt.commands import door;"
         "signal.signal(signal.SIGINT, signal.SIG_IGN);"
@@ -200,7 +201,7 @@ def test_signals_that_are_ignored_stay_so():
 @pytest.mark.parametrize("module", ["argparse", "yaml", "pydantic", "jax"])
 @pytest.mark.parametrize("command", ["rootsopt", "rootsopt.simulate", "rootsopt.optimize"])
 def test_an_interrupt_during_imports(tmp_path, command, module):
-    """A module of that name stands in for the real one, and takes for ever."""
+    """An interrupt is handled while a module is imported; a stand-in of that name never returns."""
     text = "print('here', flush=True)\nimport time\ntime.sleep(60)\n"
     (tmp_path / f"{module}.py").write_text(text)
     arguments = ["simulate", CIC] if command == "rootsopt" else [CIC]
@@ -219,7 +220,7 @@ def test_an_interrupt_during_imports(tmp_path, command, module):
 
 
 def test_called_from_python_nothing_global_changes(tmp_path, capsys, monkeypatch):
-    """Neither signals nor streams, nor file descriptors."""
+    """Signals, streams and file descriptors are unchanged."""
     monkeypatch.chdir(ROOT)
     before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
     streams, threads = (sys.stdout, sys.stderr), threading.active_count()
@@ -235,7 +236,7 @@ def test_called_from_python_nothing_global_changes(tmp_path, capsys, monkeypatch
 
 
 def test_doors_load_little():
-    """What is imported before signals are answered."""
+    """No large module is imported before signals are handled."""
     code = "import sys, rootsopt.simulate, rootsopt.__main__, rootsopt.optimize.__main__;"
     code += "print([n for n in ('numpy', 'yaml', 'pydantic', 'jax', 'rich') if n in sys.modules])"
     process = python(code)
@@ -289,7 +290,7 @@ def test_wrong_arguments_take_one_line(capsys):
 
 
 def test_full_disks_elsewhere_take_one_line(capsys, monkeypatch):
-    """Any failure of the system that nobody has foreseen."""
+    """Any other failure of the operating system ends with one line."""
 
     def full(*_):
         raise OSError(28, "No space left on device", "/tmp/elsewhere")

@@ -1,4 +1,4 @@
-"""The command `pareto` from outside: files, exit codes, messages, and the whole run with forces."""
+"""Tests of `pareto` from outside: files, exit codes, messages, and a whole run with forces."""
 
 import csv
 import json
@@ -25,14 +25,14 @@ FEW = [*RADIUS, "--set", "pareto.points=4"]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A finished run without a simulation."""
+    """Return the folder of a finished run without a simulation."""
     place = tmp_path_factory.mktemp("front") / "run"
     assert main([CIC, "-o", str(place), *FEW]) == 0
     return place
 
 
 def test_files_of_a_run_belong_together(folder):
-    """Every file of the run is listed; table, result and configs hold the same points."""
+    """Every file of the run is listed; table, result and configs contain the same points."""
     result = json.loads((folder / "result.json").read_text())
     files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
     assert set(result["run"]["files"]) == files
@@ -51,7 +51,7 @@ def test_files_of_a_run_belong_together(folder):
 
 
 def test_config_of_a_point_is_its_design(folder):
-    """Each config gives the terms of its point, by a way of its own."""
+    """The config of each point gives the terms of this point, computed in another way."""
     result = json.loads((folder / "result.json").read_text())
     for point in result["points"]:
         config = load(folder / design_file(point["point"]))
@@ -119,12 +119,12 @@ def progress(console):
 work._progress = progress
 door.leave(pareto.main())
 """
-"""A command that gets Ctrl-C after 20 searches."""
+"""Python script of a command that receives Ctrl-C after 20 searches."""
 
 
 @pytest.mark.long
 def test_stopped_run_is_whole(tmp_path):
-    """Ctrl-C keeps the points found so far, in a complete folder with exit code 3."""
+    """After Ctrl-C, a complete folder contains the points found so far; the exit code is 3."""
     place = tmp_path / "run"
     given = [CIC, "-o", str(place), *RADIUS, "--set", "pareto.points=101"]
     command = [sys.executable, "-c", _STOPPED, *given]
@@ -144,8 +144,10 @@ def test_stopped_run_is_whole(tmp_path):
 
 @pytest.mark.long
 def test_front_with_forces(tmp_path):
-    """Peak force against area efficiency: the ends are the optima of `optimize`, each point is what
-    a simulation of its config gives, and the rates are slopes of the front."""
+    """The front of peak force against area efficiency agrees with single runs.
+
+    Its ends are the optima of `optimize`. Each point agrees with a simulation of its config. The
+    rates are slopes of the front."""
     assert main([CIC, "-o", str(tmp_path / "run"), "--no-figures", "--set", "pareto.points=5"]) == 0
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     points = result["points"]

@@ -1,4 +1,5 @@
-"""Config files: what loads, what is refused, and that every refusal names its key."""
+"""Tests of config files: which are accepted, which are rejected, and that each message names a
+key."""
 
 from pathlib import Path
 from typing import Literal, get_args, get_origin
@@ -39,13 +40,13 @@ SHIPPED = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 
 
 def with_line(old, new):
-    """The minimal config with one piece of text replaced."""
+    """Return the minimal config with one piece of text replaced."""
     assert MINIMAL.count(old) == 1
     return MINIMAL.replace(old, new)
 
 
 def refusal(text, *overrides):
-    """The message with which a config is refused, which must be one line."""
+    """Return the message with which a config is rejected; it must be one line."""
     with pytest.raises(InputError) as caught:
         parse(text, overrides)
     message = str(caught.value)
@@ -58,7 +59,7 @@ def refusal(text, *overrides):
 
 
 def test_minimal_config_loads_with_its_values_and_defaults():
-    """Required keys are enough; the values arrive as written; absent parts stay absent."""
+    """Required keys are enough. Values are read as written, and absent parts stay absent."""
     config = parse(MINIMAL)
     assert config.profile.pressure_angle_deg == 36.43
     assert config.profile.lobes == 3
@@ -69,19 +70,19 @@ def test_minimal_config_loads_with_its_values_and_defaults():
 
 
 def test_whole_numbers_serve_as_numbers():
-    """`3000` is as good as `3000.0` for a quantity."""
+    """A quantity may be written as `3000` or `3000.0`."""
     config = parse(with_line("speed_rpm: 3000.0", "speed_rpm: 3000"))
     assert config.scene.speed_rpm == 3000.0
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
 def test_shipped_configs_load_and_mesh(path):
-    """Every config in configs/ is valid and its profile can be made."""
+    """Every config in configs/ is valid, and its profile can be made."""
     check_geometry(load(path))
 
 
 def test_there_are_shipped_configs():
-    """The test above has something to test."""
+    """There are shipped configs for the test above."""
     assert any(path.name == "cic.yaml" for path in SHIPPED)
 
 
@@ -97,7 +98,7 @@ def test_there_are_shipped_configs():
     ],
 )
 def test_scientific_notation_is_a_number(written, value):
-    """YAML 1.1 takes `1e5` for text; here every usual spelling is a number."""
+    """YAML 1.1 reads `1e5` as text; a config accepts every usual spelling of a number."""
     config = parse(with_line("2.0e5", written))
     assert config.contact.stiffness_N_per_mm_e == value
 
@@ -113,7 +114,7 @@ def test_resolved_yaml_round_trips():
     for config in (parse(MINIMAL), parse(MINIMAL, overrides), parse(EE_PROFILE)):
         text = config.to_yaml()
         assert parse(text) == config
-        # Written with a plain YAML reader in mind, too.
+        # A plain YAML reader must be able to read it too.
         assert Config.model_validate_json(config.model_dump_json()) == config
         assert yaml.safe_load(text)["solver"]["method"] == config.solver.method
     assert config.solver.rtol == 1e-8
@@ -128,7 +129,7 @@ def test_load_reads_a_file_and_applies_overrides(tmp_path):
 
 
 def test_every_key_is_described():
-    """The help lists every leaf key, once."""
+    """The help lists every key once."""
     lines = describe_keys().splitlines()
     names = [line.split()[0] for line in lines]
     assert len(names) == len(set(names))
@@ -150,7 +151,7 @@ def test_every_key_is_described():
     ],
 )
 def test_unknown_key_is_named_with_its_nearest_match(old, new, wrong, right):
-    """A misspelt key is refused under its full name, with the key probably meant."""
+    """A misspelt key is rejected under its full name, with the key that was probably meant."""
     message = refusal(with_line(old, new))
     assert f"`{wrong}`" in message
     assert "did you mean" in message
@@ -158,7 +159,7 @@ def test_unknown_key_is_named_with_its_nearest_match(old, new, wrong, right):
 
 
 def test_unknown_key_without_a_match_lists_the_valid_ones():
-    """Nothing similar: the valid keys of that section are listed."""
+    """If no key is similar, the message lists the valid keys of the section."""
     message = refusal(MINIMAL, "rotor.zzz=1")
     assert "`rotor.zzz`" in message
     assert "length_mm" in message
@@ -166,7 +167,7 @@ def test_unknown_key_without_a_match_lists_the_valid_ones():
 
 
 def test_key_in_the_wrong_section_is_sent_to_the_right_one():
-    """A known key elsewhere: the message says where it belongs."""
+    """For a key in the wrong section, the message names the right section."""
     message = refusal(MINIMAL, "rotor.speed_rpm=1000")
     assert "`rotor.speed_rpm`" in message
     assert "`scene.speed_rpm`" in message
@@ -185,13 +186,13 @@ def test_key_in_the_wrong_section_is_sent_to_the_right_one():
     ],
 )
 def test_missing_key_is_named(line, key):
-    """A required key left out is named in full."""
+    """The message for a missing key contains its full name."""
     assert f"`{key}" in refusal(with_line(line, ""))
 
 
 @pytest.mark.parametrize("section", ["profile", "rotor", "contact", "scene"])
 def test_missing_section_is_named(section):
-    """A required section left out is named."""
+    """The message for a missing section names it."""
     data = yaml.safe_load(MINIMAL)
     del data[section]
     message = refusal(yaml.safe_dump(data))
@@ -201,7 +202,7 @@ def test_missing_section_is_named(section):
 
 @pytest.mark.parametrize("key", ["pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg"])
 def test_keys_must_belong_to_the_family(key):
-    """cic needs its three keys; ee refuses them."""
+    """The family `cic` needs its three keys; `ee` rejects them."""
     line = next(line for line in MINIMAL.splitlines(keepends=True) if key in line)
     message = refusal(with_line(line, ""))
     assert f"`profile.{key}`" in message
@@ -216,7 +217,7 @@ def test_keys_must_belong_to_the_family(key):
 
 @pytest.mark.parametrize("value", ["fast", "'3000'", "true", "[1, 2]", "{a: 1}", "null", "~", ""])
 def test_what_is_no_number_is_refused(value):
-    """Text, booleans, lists, sections and nothing are no speed."""
+    """Text, booleans, lists, sections and an empty value are not a speed."""
     message = refusal(with_line("speed_rpm: 3000.0", f"speed_rpm: {value}"))
     assert "`scene.speed_rpm` must be a number" in message
     assert repr(yaml.safe_load(value)) in message
@@ -224,7 +225,7 @@ def test_what_is_no_number_is_refused(value):
 
 @pytest.mark.parametrize("value", ["2.5", "three", "true", "null", "[3]"])
 def test_number_of_lobes_is_a_whole_number(value):
-    """A fractional, textual or boolean number of lobes is refused."""
+    """A fraction, a text or a boolean is rejected as number of lobes."""
     message = refusal(with_line("lobes: 3", f"lobes: {value}"))
     assert "`profile.lobes` must be a whole number" in message
     assert repr(yaml.safe_load(value)) in message
@@ -254,7 +255,7 @@ def test_number_of_lobes_is_a_whole_number(value):
     ],
 )
 def test_value_out_of_range_is_refused_with_the_range(override, limit):
-    """Key, limit and value are all in the message."""
+    """The message contains key, limit and value."""
     key, value = override.split("=")
     message = refusal(MINIMAL, override)
     assert f"`{key}` must be {limit}" in message
@@ -295,7 +296,7 @@ def test_nan_and_infinity_are_refused(key, value):
     ],
 )
 def test_word_outside_the_choice_is_refused_with_the_choices(key, choices):
-    """A choice names what there is to choose."""
+    """The message for a wrong word lists the valid words."""
     message = refusal(MINIMAL, f"{key}=nonsense")
     assert f"`{key}`" in message
     assert "'nonsense'" in message
@@ -304,14 +305,14 @@ def test_word_outside_the_choice_is_refused_with_the_choices(key, choices):
 
 @pytest.mark.parametrize("value", ["1", "text", "[1]", "true"])
 def test_section_must_be_a_section(value):
-    """A plain value where keys belong is refused."""
+    """A plain value is rejected where a section belongs."""
     message = refusal(MINIMAL, f"scene.timing_gear={value}")
     assert "`scene.timing_gear`" in message
     assert "section" in message
 
 
 def test_objective_needs_a_weight():
-    """Both weights zero leave nothing to minimise."""
+    """An objective whose weights are all zero is rejected."""
     message = refusal(MINIMAL, "objective.mean_weight=0", "objective.peak_weight=0")
     assert "objective.mean_weight" in message
     assert "objective.peak_weight" in message
@@ -321,7 +322,7 @@ def test_objective_needs_a_weight():
     "value", ["[9, 4]", "[4, 4]", "[1]", "[1, 2, 3]", "[a, b]", "5", "[1, .nan]"]
 )
 def test_bounds_are_two_increasing_numbers(value):
-    """Bounds of the search: (low, high)."""
+    """Bounds of the search must be (low, high)."""
     message = refusal(MINIMAL, f"optimizer.bounds.involute_length_mm={value}")
     assert "optimizer.bounds.involute_length_mm" in message
 
@@ -330,7 +331,7 @@ def test_bounds_are_two_increasing_numbers(value):
 
 
 def leaves():
-    """Dotted key and field of every key that holds no keys of its own."""
+    """Return dotted key and field of every key that has no keys below it."""
     kinds: list[tuple[str, type[Section]]] = [("", Config)]
     while kinds:
         prefix, model = kinds.pop()
@@ -347,7 +348,7 @@ def leaves():
 
 
 def numeric(annotation):
-    """Whether what is annotated holds numbers."""
+    """Return whether an annotation stands for numbers."""
     if get_origin(annotation) is Literal:
         return False
     return annotation in (float, int) or any(numeric(part) for part in get_args(annotation))
@@ -355,12 +356,12 @@ def numeric(annotation):
 
 NUMERIC = [key for key, field in leaves() if numeric(field.annotation) and "bounds" not in key]
 PUMP = next(path for path in SHIPPED if path.name == "pump.yaml").read_text(encoding="utf-8")
-"""A config with every part of a scene."""
+"""Text of a config with every part of a scene."""
 
 
 @pytest.mark.parametrize("key", NUMERIC)
 def test_every_number_has_two_ends(key):
-    """No number is as small or as great as one likes, and the help says how far it may go."""
+    """Every number has a lower and an upper limit, and the help lists both."""
     parts = "timing_gear", "motor", "supports", "load", "friction"
     text = PUMP if any(part in key for part in parts) else MINIMAL
     if key.startswith("tolerances."):
@@ -378,7 +379,7 @@ def test_every_number_has_two_ends(key):
 
 
 def test_help_has_unit_default_range_and_choices():
-    """One line for each key."""
+    """The help has one line for each key."""
     lines = {line.split()[0]: line for line in describe_keys().splitlines()}
     assert lines["profile.pitch_radius_mm"].endswith("[mm, from 1 to 5000, required]")
     assert lines["scene.timing_gear.damping_ratio"].endswith("[from 0 to 100, default 0.0]")
@@ -415,7 +416,7 @@ def test_help_has_unit_default_range_and_choices():
     ],
 )  # fmt: skip
 def test_number_in_another_unit_is_recognised(text, override, words):
-    """What is out of range, but would be in range in a unit often written, is asked about."""
+    """If a value out of range would fit in a usual other unit, the message asks about this unit."""
     with pytest.raises(InputError) as caught:
         check_geometry(parse(text, [override]))
     message = str(caught.value)
@@ -425,7 +426,7 @@ def test_number_in_another_unit_is_recognised(text, override, words):
 
 @pytest.mark.parametrize("value", ["0", "-33", "1e-300", "1e300", "0.0005"])
 def test_hint_is_given_only_where_it_fits(value):
-    """A value that fits in no unit gets the range alone."""
+    """If a value fits in no unit, the message states only the range."""
     assert "is that" not in refusal(MINIMAL, f"profile.pitch_radius_mm={value}")
 
 
@@ -442,7 +443,7 @@ CHOICES = [
 
 @pytest.mark.parametrize(("key", "word", "spellings"), CHOICES)
 def test_choices_are_taken_in_any_spelling(key, word, spellings):
-    """Case, spaces and dashes do not matter; what is written down is the listed word."""
+    """Case, spaces and dashes do not matter. The config stores the word as listed."""
     expected = parse(MINIMAL, [f"{key}={word}"])
     for spelling in spellings:
         config = parse(MINIMAL, [f"{key}='{spelling}'"])
@@ -458,7 +459,7 @@ def test_choices_are_taken_in_any_spelling(key, word, spellings):
     ],
 )
 def test_family_is_taken_in_any_spelling(spelling, family):
-    """In the file and with --set; the key's own checks come after."""
+    """Any spelling is accepted in the file and with --set, before the family's keys are checked."""
     keys = {
         "cic": "pressure_angle_deg: 36, involute_length_mm: 8, tip_arc_angle_deg: 4",
         "hypo_epicycloid": "tip_arc_angle_deg: 4",
@@ -475,7 +476,7 @@ def test_family_is_taken_in_any_spelling(spelling, family):
 
 
 def test_keys_that_are_choices_are_taken_in_any_case():
-    """So are from, to and points of a sweep; but none may be given twice."""
+    """So are the keys `from`, `to` and `points` of a sweep, but no key may be given twice."""
     given = parse(MINIMAL, ["sweep.speed_rpm={From: 300, TO: 6000, Points: 39}"])
     assert given == parse(MINIMAL, ["sweep.speed_rpm={from: 300, to: 6000, points: 39}"])
     message = refusal(MINIMAL, "sweep.speed_rpm={from: 300, From: 400, to: 6000, points: 39}")
@@ -491,7 +492,7 @@ def test_keys_that_are_choices_are_taken_in_any_case():
     ],
 )
 def test_near_miss_of_a_choice_names_what_was_meant(override, word):
-    """As for keys."""
+    """The message for a misspelt word suggests a valid one, as for keys."""
     assert f"did you mean {word}?" in refusal(MINIMAL, override)
 
 
@@ -523,7 +524,8 @@ def test_near_miss_of_a_choice_names_what_was_meant(override, word):
     ids=lambda text: text[:30],
 )  # fmt: skip
 def test_odd_values_have_their_words(override, words):
-    """What pydantic says of lists, unions and dictionaries is put into the words of a config."""
+    """Messages of pydantic about lists, unions and dictionaries are expressed in the words of a
+    config."""
     text = MINIMAL
     if "arc_center" in override:
         arc = "profile: {family: arc, lobes: 3, pitch_radius_mm: 33, arc_center_mm: 29.7}\n"
@@ -537,7 +539,7 @@ def test_odd_values_have_their_words(override, words):
 
 
 def test_file_that_cannot_be_read_is_refused(tmp_path):
-    """Missing file, folder, and bytes that are no UTF-8: the path is named."""
+    """The message names the path if it is missing, a folder, or not UTF-8 text."""
     binary = tmp_path / "binary.yaml"
     binary.write_bytes(MINIMAL.encode() + b"# \xff\xfe\n")
     for path, words in (
@@ -554,13 +556,13 @@ def test_file_that_cannot_be_read_is_refused(tmp_path):
 
 @pytest.mark.parametrize("text", ["", "\n# only a comment\n", "---\n", "{}"])
 def test_empty_config_names_what_is_missing(text):
-    """An empty file lacks its first required section."""
+    """The message for an empty file names the first required section."""
     assert "`profile` is missing" in refusal(text)
 
 
 @pytest.mark.parametrize("text", ["- profile\n- scene\n", "just words", "42", "true"])
 def test_config_must_be_sections(text):
-    """A list or a plain value at top level is refused."""
+    """A list or a plain value at top level is rejected."""
     assert "sections" in refusal(text)
 
 
@@ -576,7 +578,7 @@ def test_config_must_be_sections(text):
     ],
 )
 def test_broken_yaml_is_refused_with_its_line(text, line):
-    """A syntax error says where it is."""
+    """The message for a syntax error names its line."""
     message = refusal(text)
     assert "not valid YAML" in message
     assert f"line {line}" in message or f"line {line + 1}" in message
@@ -590,7 +592,7 @@ def test_broken_yaml_is_refused_with_its_line(text, line):
     ],
 )
 def test_key_given_twice_is_refused(text, key):
-    """The last one does not silently win."""
+    """A key given twice is rejected; the last one does not replace the first."""
     message = refusal(text)
     assert f"'{key}'" in message
     assert "twice" in message
@@ -600,7 +602,7 @@ def test_key_given_twice_is_refused(text, key):
 
 
 def test_overrides_replace_and_create_nested_keys():
-    """--set reaches any key, makes missing sections, and the last one wins."""
+    """`--set` reaches any key and creates missing sections. The last override has precedence."""
     config = parse(
         MINIMAL,
         [
@@ -628,7 +630,7 @@ def test_override_can_take_a_part_away():
 
 @pytest.mark.parametrize("override", ["scene.speed_rpm", "=5", "scene..speed_rpm=5", ".=5", ""])
 def test_override_of_wrong_form_is_refused(override):
-    """The form dotted.key=value is asked for, and what was given is shown."""
+    """The message asks for the form dotted.key=value and shows what was given."""
     message = refusal(MINIMAL, override)
     assert "--set" in message
     assert repr(override) in message
@@ -646,7 +648,7 @@ def test_override_of_wrong_form_is_refused(override):
     ],
 )
 def test_override_with_a_bad_key_or_value_is_refused(override, words):
-    """An override is checked as the file is."""
+    """An override is checked in the same way as the file."""
     assert words in refusal(MINIMAL, override)
 
 
@@ -661,7 +663,7 @@ def geometry_refusal(*overrides):
 
 
 def test_sound_geometry_is_accepted():
-    """The minimal design, the paper's (1.2 % past u_max), and any EE."""
+    """The minimal design, the paper's (1.2 % past u_max) and any EE are accepted."""
     check_geometry(parse(MINIMAL))
     check_geometry(parse(MINIMAL, ["profile.involute_length_mm=9.0"]))
     for lobes in (2, 6):
@@ -669,7 +671,7 @@ def test_sound_geometry_is_accepted():
 
 
 def test_involute_past_its_longest_is_refused():
-    """u > u_max: key, value and the longest length (8.893 mm here) are named."""
+    """For u > u_max, the message contains key, value and the longest length (8.893 mm here)."""
     message = geometry_refusal("profile.involute_length_mm=9.2")
     assert "`profile.involute_length_mm`" in message
     assert "8.893" in message
@@ -677,7 +679,7 @@ def test_involute_past_its_longest_is_refused():
 
 
 def test_tip_arc_without_radius_is_refused():
-    """Near 90° an involute only 1.8 % past its longest leaves no tip arc."""
+    """Near 90°, an involute only 1.8 % longer than the longest leaves no tip arc."""
     message = geometry_refusal(
         "profile.pressure_angle_deg=89.78",
         "profile.tip_arc_angle_deg=0.475",
@@ -688,7 +690,7 @@ def test_tip_arc_without_radius_is_refused():
 
 
 def test_undercut_is_refused():
-    """α below the canonical 27.64° with nearly the longest involute undercuts the root."""
+    """For α below the canonical 27.64° and nearly the longest involute, the root is undercut."""
     message = geometry_refusal(
         "profile.pressure_angle_deg=25",
         "profile.tip_arc_angle_deg=0",
@@ -707,3 +709,46 @@ def test_tip_wider_than_its_lobe_is_refused(lobes, limit):
     assert "`profile.tip_arc_angle_deg`" in message
     assert f"less than {limit}" in message
     assert f"but is {limit}" in message
+
+
+def test_replaced_values_take_following_defaults_along():
+    """A smoothing length that follows the load follows the new load; one that is given stays."""
+    key = {"scene.load.torque_N_m": 1e-3}
+    light = parse(MINIMAL, ["scene.load.torque_N_m=1e-3"])
+    assert light.contact.smoothing_mm != parse(MINIMAL).contact.smoothing_mm
+    assert parse(MINIMAL).replaced(key) == light
+    given = parse(MINIMAL, ["contact.smoothing_mm=3e-5"]).replaced(key)
+    assert given.contact.smoothing_mm == 3e-5
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"scene.sped_rpm": 1.0}, "did you mean `scene.speed_rpm`"),
+        ({"scen.speed_rpm": 1.0}, "did you mean `scene`"),
+        ({"scene.speed_rpm.x": 1.0}, "`scene.speed_rpm` holds no keys"),
+        ({"profile.family": "ciq"}, "'ciq'; did you mean cic"),
+        ({"profile.lobes": 3.5}, "`profile.lobes` must be a whole number, but is 3.5"),
+        ({"scene.timing_gear": {"stiffness_N_m_per_rad": -1.0}}, "timing_gear.stiffness"),
+    ],
+)
+def test_values_are_checked_by_themselves(values, words):
+    with pytest.raises(InputError, match=words):
+        parse(MINIMAL).check_values(values)
+
+
+def test_values_that_only_clash_with_others_pass_by_themselves():
+    for values in ({"profile.family": "ee"}, {"scene.load.torque_N_m": None}):
+        parse(MINIMAL).check_values(values)
+        with pytest.raises(InputError):
+            parse(MINIMAL).replaced(values)
+
+
+def test_entries_of_a_list_are_replaced_by_number():
+    config = load("free")
+    changed = config.replaced({"profile.coefficients_3": 0.5}).profile.coefficients
+    assert changed == (*config.profile.coefficients[:2], 0.5, *config.profile.coefficients[3:])
+    with pytest.raises(InputError, match=r"`profile\.coefficients\.2` must be at most 1"):
+        config.check_values({"profile.coefficients_3": 9e9})
+    with pytest.raises(InputError, match="coefficients_99"):
+        config.check_values({"profile.coefficients_99": 0.5})

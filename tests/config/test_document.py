@@ -1,4 +1,5 @@
-"""What the reader of YAML takes, refuses and bounds; the fuzzing campaign, reduced."""
+"""Tests of the YAML reader: what it accepts, rejects and limits. Also a reduced fuzzing
+campaign."""
 
 import os
 import random
@@ -22,7 +23,7 @@ LONGEST = 500
 
 
 def refusal(text, *overrides):
-    """The message of a config that must be refused soon, in one line of bounded length."""
+    """Return the message of a config that must be rejected soon, in one line of limited length."""
     began = time.process_time()
     with pytest.raises(InputError) as caught:
         parse(text, overrides)
@@ -33,14 +34,14 @@ def refusal(text, *overrides):
 
 
 def laughs(levels, left="[", right="]"):
-    """Every level holds the one before nine times."""
+    """Return a YAML text in which every level contains the previous one nine times."""
     first = f"a0: &a0 {left}{'x' if left == '[' else 'k: 1'}{right}\n"
     rows = [f"a{k}: &a{k} {left}{', '.join([f'*a{k - 1}'] * 9)}{right}\n" for k in range(1, levels)]
     return first + "".join(rows) + f"profile: *a{levels - 1}\n"
 
 
 def merges(levels):
-    """Every level merges the one before nine times."""
+    """Return a YAML text in which every level merges the previous one nine times."""
     rows = [f"a{k}: &a{k} {{<<: [{', '.join([f'*a{k - 1}'] * 9)}]}}\n" for k in range(1, levels)]
     return "a0: &a0 {k: 1}\n" + "".join(rows) + f"profile: *a{levels - 1}\n"
 
@@ -70,7 +71,8 @@ def merges(levels):
     ],
 )
 def test_size_of_what_is_read_is_bounded(text, words):
-    """Bombs, loops, depth and length are refused at once, in the file and with --set."""
+    """Alias bombs, loops, deep nesting and long values are rejected at once, in the file and with
+    --set."""
     assert words in refusal(text)
     value = text.partition(": ")[2] if text.startswith(("a: ", "profile: ")) else text
     refusal(MINIMAL, f"profile={value}")
@@ -149,7 +151,7 @@ def test_size_of_what_is_read_is_bounded(text, words):
 )
 @pytest.mark.parametrize("key", ["scene.speed_rpm", "profile.family", "scene", "nothing.at.all"])
 def test_odd_value_is_refused_in_one_line(key, value):
-    """Whatever a value is, as an override and in the file, what is said of it is one short line."""
+    """The message for any odd value is one short line, both as an override and in the file."""
     refusal(MINIMAL, f"{key}={value}")
     if "." in key:
         section, name = key.split(".", 1)
@@ -169,19 +171,20 @@ def test_odd_value_is_refused_in_one_line(key, value):
     ids=lambda override: ascii(override[:24]),
 )
 def test_odd_override_is_refused_in_one_line(override):
-    """So is whatever stands behind --set."""
+    """The same holds for any text after --set."""
     refusal(MINIMAL, override)
 
 
 @pytest.mark.parametrize("written", ['"\\uD800"', '"x \\uDFFF"', '{"\\uDBFF": 1}'])
 def test_half_a_character_is_refused(written):
-    """No file could hold what is read from it."""
+    """A lone surrogate is rejected, because no file could contain it."""
     with pytest.raises(InputError, match="half of a character"):
         read_document(written, "text")
 
 
 def test_merge_keys_work():
-    """`<<` takes one section or a list of them; own keys come first, then those merged first."""
+    """`<<` accepts one section or a list of them. Own keys have precedence, then those merged
+    first."""
     text = MINIMAL.replace("rotor:\n", "rotor:\n  <<: [*one, *two]\n").replace(
         "  length_mm: 100.0\n", ""
     )
@@ -199,7 +202,7 @@ def test_merge_keys_work():
 
 
 def test_override_changes_one_place_of_what_an_alias_shares():
-    """What an anchor names is copied wherever an alias stands."""
+    """An alias is a copy of its anchor, so an override changes one place only."""
     text = MINIMAL + "  timing_gear: &g {stiffness_N_m_per_rad: 1.0e4, backlash_mm: 0.1}\n"
     text = text.replace("    torque_N_m: 1.0\n", "    torque_N_m: 1.0\n  supports: null\n")
     data = read_document("{a: &a {x: {y: 1}}, b: *a}", "text")
@@ -238,7 +241,7 @@ def test_override_changes_one_place_of_what_an_alias_shares():
     ],
 )
 def test_words_and_numbers_are_told_apart(written, value):
-    """No number is read from a time, a date or an octal, no boolean from a word."""
+    """A time, a date or an octal is not a number, and a word is not a boolean."""
     found = read_document(written, "text")
     assert found == value
     assert type(found) is type(value)
@@ -248,7 +251,7 @@ def test_words_and_numbers_are_told_apart(written, value):
 
 
 def test_what_is_no_regular_file_is_refused(tmp_path):
-    """A pipe does not make the command wait, and a device does not go on for ever."""
+    """The command neither waits for a pipe nor reads a device without end."""
     pipe, bound = tmp_path / "pipe.yaml", tmp_path / "socket"
     os.mkfifo(pipe)
     with socket.socket(socket.AF_UNIX) as server:
@@ -270,7 +273,7 @@ def test_what_is_no_regular_file_is_refused(tmp_path):
     ],
 )
 def test_odd_path_is_refused(name, words):
-    """Paths that no file can have, in one printable line."""
+    """A path that no file can have is rejected in one printable line."""
     with pytest.raises(InputError) as caught:
         load(name)
     assert words in str(caught.value)
@@ -293,7 +296,7 @@ def test_odd_path_is_refused(name, words):
     ids=range(9),
 )
 def test_bytes_that_are_no_config_are_refused(tmp_path, data, words):
-    """Other encodings, and what is too long to be a config."""
+    """Other encodings are rejected, and so are files too long for a config."""
     path = tmp_path / "x.yaml"
     path.write_bytes(data)
     with pytest.raises(InputError) as caught:
@@ -303,14 +306,14 @@ def test_bytes_that_are_no_config_are_refused(tmp_path, data, words):
 
 
 def test_byte_order_mark_of_utf8_is_taken(tmp_path):
-    """Some editors write one."""
+    """A byte order mark is accepted, because some editors write one."""
     path = tmp_path / "x.yaml"
     path.write_bytes(MINIMAL.encode("utf-8-sig"))
     assert load(path) == parse(MINIMAL)
 
 
 def test_long_path_is_shown_by_its_end(tmp_path):
-    """The message stays short, and the file's name in it."""
+    """The message stays short and contains the file's name."""
     folder = tmp_path.joinpath(*["d" * 100] * 5)
     with pytest.raises(InputError) as caught:
         load(folder / "scene.yaml")
@@ -322,7 +325,7 @@ def test_long_path_is_shown_by_its_end(tmp_path):
 
 
 def test_words_are_bounded():
-    """Values, keys, paths and messages are each cut, however large they are, and on one line."""
+    """Values, keys, paths and messages are shortened to one line, however long they are."""
     endless = [["x" * 10_000] * 1000] * 1000
     for value in (endless, {k: endless for k in range(1000)}, "x" * 10**6, 10**3999, "a\nb"):
         assert len(shown(value)) <= 160
@@ -347,7 +350,7 @@ def test_words_are_bounded():
     ],
 )
 def test_command_refuses_in_one_line(tmp_path, text, options, words):
-    """Exit code 2 and one line on stderr."""
+    """The command ends with exit code 2 and one line on stderr."""
     path = tmp_path / "x.yaml"
     path.write_text(text)
     command = [sys.executable, "-m", "rootsopt.profile", str(path), "-o", str(tmp_path / "o")]
@@ -362,7 +365,7 @@ def test_command_refuses_in_one_line(tmp_path, text, options, words):
 
 
 def test_random_configs(monkeypatch):
-    """A few hundred configs of `python -m tests.fuzz configs`, without geometry."""
+    """Some hundred configs of `python -m tests.fuzz configs` pass, without geometry."""
     monkeypatch.setattr(configs, "_GEOMETRIES", 0.0)
     report = Report("configs", 280, 300)
     configs.run(report, 0)
@@ -374,8 +377,10 @@ def test_random_configs(monkeypatch):
 
 
 def test_campaign_notices(tmp_path, monkeypatch):
-    """A traceback, a long message, one of two lines, one too late, and a config that is not read
-    back are failures of the campaign."""
+    """The campaign reports five kinds of failure.
+
+    They are a traceback, a long message, a message of two lines, a late one, and a config that is
+    not read back."""
 
     def outcome(action):
         monkeypatch.setattr(configs, "load", action)

@@ -18,7 +18,7 @@ _NAMES = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
 
 @pytest.mark.parametrize("name", _NAMES)
 def test_a_shipped_config_is_found_by_its_name(name, monkeypatch, tmp_path):
-    """From any folder, even where a folder has that name."""
+    """A shipped config is found from any folder, even if a folder has its name."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cic").mkdir()
     expected = load_config(ROOT / "configs" / f"{name}.yaml")
@@ -35,14 +35,16 @@ def test_a_file_comes_before_a_shipped_config(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("path", ["folder/cic", "cic.yml", "cics", "./other/ee.yaml"])
 def test_other_names_are_refused_with_those_that_exist(path):
-    with pytest.raises(InputError, match=r"no such file; give the path .*\(cic, ee, ") as caught:
+    with pytest.raises(
+        InputError, match=r"no such file; give the path .*\(blower, cic, ee, "
+    ) as caught:
         load_config(path)
     if path == "cics":
         assert "did you mean 'cic'?" in str(caught.value)
 
 
 def test_an_installed_package_has_its_configs_and_types(tmp_path):
-    """A wheel, unpacked, is used from an empty folder."""
+    """An unpacked wheel can be used from an empty folder."""
     builders = pytest.importorskip("hatchling.builders.wheel")
     (wheel,) = builders.WheelBuilder(str(ROOT)).build(
         directory=str(tmp_path), versions=["standard"]
@@ -50,6 +52,8 @@ def test_an_installed_package_has_its_configs_and_types(tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "site")
     assert (tmp_path / "site" / "rootsopt" / "py.typed").exists()
+    pages = tmp_path / "site" / "rootsopt" / "report" / "template"
+    assert {file.name for file in pages.iterdir()} == {"page.html.j2", "page.css", "page.js"}
     empty = tmp_path / "empty"
     empty.mkdir()
     program = "import rootsopt; print(rootsopt.__file__, rootsopt.load_config('cic').design_keys)"

@@ -1,4 +1,4 @@
-"""What every contact must do (`rootsopt.contact.Contact`)."""
+"""Checks that every contact must pass (`rootsopt.contact.Contact`)."""
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ from tests.conformance.kinks import along, unmarked
 
 @eqx.filter_jit
 def _look(contact, rolls, relatives):
-    """Gap and levers, and the derivatives of the gap with respect to φ1 and φ2, at many poses."""
+    """Return gap, levers and derivatives of the gap with respect to φ1 and φ2, at many poses."""
 
     def at(roll, relative):
         # x = -(φ1 + φ2) / 2, ε = φ2 - φ1.
@@ -28,11 +28,11 @@ def _look(contact, rolls, relatives):
 
 
 def check_contact(contact, profile, outline, deepest, gap_error, lever_error=1e-12):
-    """Check a contact of `profile`, whose closed `outline` (n, 2) (m) has been made otherwise.
+    """Check a contact of `profile`, whose closed `outline` (n, 2) (m) comes from another method.
 
-    `deepest` (rad) < 0: ε down to which it is used; `gap_error` (m): what it promises against the
-    polygon; `lever_error` (m): how closely its levers are derivatives of its gap.
-    """
+    `deepest` (rad) < 0: ε down to which the contact is used; `gap_error` (m): promised error of the
+    gap against the polygon; `lever_error` (m): promised difference between the levers and the
+    derivatives of the gap."""
     rng = np.random.default_rng(9)
     half, lobes = float(profile.half_pitch), profile.lobes
     rolls = rng.uniform(0.02, 2 * half - 0.02, 80)
@@ -49,7 +49,7 @@ def check_contact(contact, profile, outline, deepest, gap_error, lever_error=1e-
     # Virtual work: d gap = -lever1 dφ1 + lever2 dφ2.
     np.testing.assert_allclose(-lever1[deep], slopes[deep, 0], rtol=0, atol=lever_error)
     np.testing.assert_allclose(lever2[deep], slopes[deep, 1], rtol=0, atol=lever_error)
-    # A mesh further on it is the same, and with the rotors exchanged.
+    # The gap is the same one mesh period later, and with the rotors exchanged.
     again = [np.asarray(x) for x in _look(contact, rolls + 4 * half, relatives)[1:4]]
     other = [np.asarray(x) for x in _look(contact, 2 * half - rolls, relatives)[1:4]]
     for found in (again, [other[0], other[2], other[1]]):
@@ -64,7 +64,8 @@ def check_contact(contact, profile, outline, deepest, gap_error, lever_error=1e-
 
 
 def _check_kinks(contact, half, deepest):
-    """Kinks of the levers, second derivatives of the gap, are marked where flanks touch."""
+    """Check that kinks of the levers (second derivatives of the gap) are marked where flanks
+    touch."""
 
     def function(pose):
         found = contact.approach(*pose)
@@ -80,7 +81,7 @@ def _check_kinks(contact, half, deepest):
 
 
 def _check_place(contact, roll, relative):
-    """What a contact says of the point of contact belongs to its gap, or it says nothing."""
+    """Check that the point of contact agrees with the gap, if the contact gives one."""
 
     def known(roll, relative):
         found = contact.approach(roll, relative)

@@ -1,8 +1,8 @@
-"""What every profile family must hold, whoever registers it.
+"""Checks that every profile family must pass, including families from outside the package.
 
-Each of `CHECKS` takes the name of a registered family and looks at its example, a sound design for
-three lobes and a pitch radius of 33 mm. Lengths are in m but for outlines, which are in mm.
-"""
+Each of `CHECKS` takes the name of a registered family and checks its example, a sound design for
+three lobes and a pitch radius of 33 mm. Lengths are in m, except those of outlines, which are in
+mm."""
 
 import functools
 import re
@@ -26,12 +26,12 @@ from rootsopt.scene.families import check, design_of, profile_of, with_design
 R = 0.033
 LOBES = 3
 COUNT = 1401
-"""Places on a flank, always as many, so that they are looked at by one program."""
+"""Number of points on a flank. It is always the same, so that one program evaluates them."""
 measure = jax.jit(geometry)
 
 
 def text_of(family, lobes=LOBES, **changes):
-    """A whole config with the family's example."""
+    """Return the text of a complete config with the family's example."""
     with open("configs/cic.yaml", encoding="utf-8") as file:
         rest = file.read().split("\nrotor:")[1]
     keys = {"family": family, "lobes": lobes, "pitch_radius_mm": 33.0}
@@ -42,25 +42,25 @@ def text_of(family, lobes=LOBES, **changes):
 
 
 def config_of(family, lobes=LOBES, **changes):
-    """The profile section of such a config."""
+    """Return the profile section of such a config."""
     return parse(text_of(family, lobes, **changes)).profile
 
 
 @functools.cache
 def maker(family):
-    """Design to profile."""
+    """Return a function from a design to its profile."""
     return jax.jit(lambda design: profile_of(family, LOBES, jnp.asarray(R), design))
 
 
 @functools.cache
 def made(family):
-    """The profile of the example."""
+    """Return the profile of the example."""
     return maker(family)(design_of(config_of(family)))
 
 
 @jax.jit
 def looked_at(profile, nu):
-    """Everything the core says of normal angles, and slopes by them."""
+    """Return everything that a profile computes at normal angles, with derivatives."""
 
     def along(nu):
         point = profile.addendum(nu)
@@ -83,7 +83,7 @@ def looked_at(profile, nu):
 
 @functools.cache
 def sampled(family):
-    """Normal angles, always as many, with all joints, and what is there."""
+    """Return normal angles, always as many, with all joints, and the profile's values there."""
     segments = [(float(s.start), float(s.stop)) for s in made(family).segments()]
     segments = [(start, stop) for start, stop in segments if stop > start]
     counts = [max(60, round(1200 * (stop - start) / segments[-1][1])) for start, stop in segments]
@@ -97,7 +97,7 @@ def sampled(family):
 
 @functools.cache
 def outline_of(family):
-    """Closed outline in mm, crowded where the flank turns."""
+    """Return the closed outline in mm, with more points where the flank turns."""
     _, found = sampled(family)
     flank = np.concatenate([found["addendum"], found["dedendum"][-2::-1]]) @ [1, 1j] * 1e3
     turn = np.exp(2j * np.pi / LOBES)
@@ -107,8 +107,9 @@ def outline_of(family):
 
 
 def curve_is_the_one_its_normals_say(family):
-    """Normals, levers, arc lengths and the inverse of the roll angle, by differentiation of the
-    outline; the law of gearing ds/dβ = -r cos ψ."""
+    """Check normals, levers, arc lengths, the inverse of the roll angle, and the law of gearing.
+
+    They are compared with derivatives of the outline; the law of gearing is ds/dβ = -r cos ψ."""
     nu, found = sampled(family)
     normal = np.stack([np.cos(nu), np.sin(nu)], axis=-1)
     tangent = np.stack([-np.sin(nu), np.cos(nu)], axis=-1)
@@ -120,10 +121,10 @@ def curve_is_the_one_its_normals_say(family):
     assert place[0, 1] == pytest.approx(0, abs=1e-11)
     half = np.pi / (2 * LOBES)
     np.testing.assert_allclose(place[-1], R * np.array([np.cos(half), np.sin(half)]), atol=1e-15)
-    # Neighbours are next to each other: no joint is torn.
+    # The outline has no gap at a joint.
     steps = np.hypot(*np.diff(place, axis=0).T)
     assert np.max(steps) < 2e-3 * R
-    # Where the roll angle rises and none that follows is as small, one normal has it.
+    # A roll angle belongs to one normal only where it rises and does not come back later.
     later = np.minimum.accumulate(found["beta"][::-1])[::-1]
     single = (found["rate"] > 1e-6) & (found["beta"] <= later)
     assert np.mean(single) > 0.5
@@ -131,8 +132,10 @@ def curve_is_the_one_its_normals_say(family):
 
 
 def what_margins_call_sound_is_one_curve(family):
-    """Wherever in its bounds a member is sound, support function and lever go on without a jump,
-    and the law of gearing holds: h′ = -lever. Two members at least are sound."""
+    """Check all members within the bounds that the margins call sound.
+
+    Support function and lever must be continuous, and the law of gearing must hold: h′ = -lever. At
+    least two members must be sound."""
     row, designs = family_of(family), [design_of(config_of(family))]
     if row.classical and row.parameters:
         low, high = np.array([one.usually(1e3 * R, LOBES) for one in row.parameters]).T
@@ -148,7 +151,7 @@ def what_margins_call_sound_is_one_curve(family):
 
     found = jax.jit(lambda designs: jax.lax.map(looked, designs))(jnp.asarray(designs))
     least, curved, step, support, lever = map(np.asarray, found)
-    # All but straight flanks: there the lever may change at any rate.
+    # Exclude almost straight flanks, where the lever may change at any rate.
     sound = (least >= -1e-9) & (curved < 3 * R)
     assert sound[0] or row.by_limits
     assert np.sum(sound) >= min(2, len(designs))
@@ -160,7 +163,7 @@ def what_margins_call_sound_is_one_curve(family):
 
 
 def area_and_moment_are_those_of_the_outline(family):
-    """By the shoelace formula for the polygon of the outline."""
+    """Compare area and polar moment with the shoelace formula for the outline's polygon."""
     here, there = outline_of(family)[:-1] @ [1, 1j], outline_of(family)[1:] @ [1, 1j]
     cross = (np.conj(here) * there).imag
     square = abs(here) ** 2 + (np.conj(here) * there).real + abs(there) ** 2
@@ -171,7 +174,7 @@ def area_and_moment_are_those_of_the_outline(family):
 
 
 def rolling_pair_touches_and_does_not_overlap(family):
-    """|gap| < 1 nm through a mesh period, by node search."""
+    """Check that |gap| < 1 nm through a mesh period, by node search."""
     pitch = 2 * np.pi / LOBES
     gaps = [
         pair_gap(outline_of(family), LOBES, 2e3 * R, phi, phi)
@@ -192,7 +195,7 @@ def _searched(profile, roll, relative):
 
 
 def search_finds_the_closest_approach(family):
-    """What Newton's method calls certain is what the nodes find, and the nodes of outlines."""
+    """Compare reliable results of Newton's method with the search on nodes, and with outlines."""
     profile = made(family)
     rng = np.random.default_rng(3)
     half = float(profile.half_pitch)
@@ -215,7 +218,7 @@ def search_finds_the_closest_approach(family):
 
 
 def slopes_of_geometry_are_those_of_differences(family):
-    """By each design parameter, against central differences."""
+    """Compare derivatives with respect to each design parameter with central differences."""
 
     @jax.jit
     def look(design, way):
@@ -234,7 +237,8 @@ def slopes_of_geometry_are_those_of_differences(family):
 
 
 def designs_are_points_of_the_unit_box_and_back(family):
-    """The ends of the box are the bounds, or the ends of a range that depends on the others."""
+    """Check the unit box. Its ends are the bounds, or the ends of a range that depends on the
+    others."""
     row = family_of(family)
     if not row.parameters:
         return
@@ -257,7 +261,8 @@ def designs_are_points_of_the_unit_box_and_back(family):
 
 
 def config_is_read_and_written(family):
-    """The example is accepted; a config written out is the same one; a design can be put in."""
+    """Check that the example is accepted, is the same after writing, and can take another
+    design."""
     config = parse(text_of(family))
     check(config.profile)
     assert parse(config.to_yaml()) == config
@@ -273,7 +278,8 @@ def config_is_read_and_written(family):
 
 
 def config_wants_the_keys_of_the_family(family):
-    """A missing key is named, a foreign one refused, a misspelt one corrected."""
+    """Check the messages: a missing key is named, a foreign one rejected, a misspelt one
+    corrected."""
     own = family_of(family).keys
     for key in own:
         with pytest.raises(InputError, match=rf"profile\.{key}. is required for family {family}"):
@@ -291,7 +297,8 @@ def config_wants_the_keys_of_the_family(family):
 
 
 def help_mentions_it(family):
-    """Its name, what it is made of, its keys with the families that take them, and their bounds."""
+    """Check that the help lists the family, its curves, its keys with their families, and their
+    bounds."""
     lines = {line.split()[0]: line for line in describe_keys().splitlines()}
     assert family in re.findall(r"\w+", lines["profile.family"])
     about = {line.split()[0]: line for line in describe_families().splitlines()}

@@ -1,23 +1,23 @@
-"""Kinks and jumps along lines, which switches must mark."""
+"""Find kinks and jumps along lines, which switches must mark."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 COUNT = 801
-"""Points along a line: odd, so that steps are no whole fraction of it."""
+"""Number of points along a line. It is odd, so that steps are not a simple fraction of the line."""
 _AGAINST = 8.0
-"""Change of a slope, in units of the greatest beside it, that only a kink makes."""
+"""Change of a slope (multiples of the greatest change beside it) above which there is a kink."""
 _ROUNDINGS = 1e-6
-"""The same relative to the greatest slope along the line, which rounding may make."""
+"""Change of a slope (fraction of the greatest slope along the line) below which it may be
+rounding."""
 
 
 def along(function, lines):
-    """Values, slopes and flags of `function` at COUNT points of each of several lines.
+    """Yield values, slopes and flags of `function` at `COUNT` points on each of several lines.
 
     `function(point)` → (values (r,), flags (s,)); `lines`: pairs (start, stop) of points, which are
-    trees of arrays. One program serves all of them.
-    """
+    trees of arrays. One program serves all of them."""
 
     @jax.jit
     def look(start, way):
@@ -34,12 +34,13 @@ def along(function, lines):
 
 
 def kinks(values, slopes):
-    """Intervals between points (COUNT - 1,) in which a value jumps or a slope does."""
+    """Return a mask of the intervals between points (COUNT - 1,) with a jump of a value or of a
+    slope."""
     found = np.zeros(len(values) - 1, bool)
     step = 1 / (len(values) - 1)
     for value, slope in zip(values.T, slopes.T, strict=True):
         scale = np.max(np.abs(slope)) + np.finfo(float).tiny
-        # A jump of the value is more than its slopes at both ends can make of it.
+        # At a jump, a value changes by more than its slopes at both ends explain.
         rise = np.abs(np.diff(value) - step * (slope[1:] + slope[:-1]) / 2)
         for change, size in ((np.abs(np.diff(slope)), scale), (rise / step, scale)):
             padded = np.pad(change, 2, mode="edge")
@@ -49,9 +50,9 @@ def kinks(values, slopes):
 
 
 def unmarked(values, slopes, flags):
-    """Kinks without a change of flags, and how many there are with one."""
+    """Return the indices of kinks without a change of flags, and the number of kinks with one."""
     seen = kinks(values, slopes)
     marked = np.any(flags[1:] != flags[:-1], axis=1)
-    # A kink on a point shows in the interval beside it.
+    # A kink exactly on a point appears in the neighbouring interval.
     near = marked | np.roll(marked, 1) | np.roll(marked, -1)
     return np.flatnonzero(seen & ~near), int(np.sum(seen & near))

@@ -1,4 +1,4 @@
-"""What every contact law must do (`rootsopt.contact.ContactLaw`)."""
+"""Checks that every contact law must pass (`rootsopt.contact.ContactLaw`)."""
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +10,7 @@ from tests.conformance.kinks import along, unmarked
 def check_law(law, depth, rate, sharp=0.0):
     """Check a law at penetrations about `depth` (m) and rates about `rate` (m/s).
 
-    `sharp` (m): the depth up to which its onset is rounded, where `depth_at` need not hold.
-    """
+    `sharp` (m): depth up to which the onset is rounded, where `depth_at` need not hold."""
     rng = np.random.default_rng(5)
     force = jax.jit(jax.vmap(law))
     depths = depth * rng.uniform(-2, 2, 400)
@@ -31,7 +30,7 @@ def check_law(law, depth, rate, sharp=0.0):
 
 
 def _check_inverse(law, depth, sharp):
-    """`depth_at`, `stiffness_at`, `depth_absorbing` belong to the law at rest."""
+    """Check that `depth_at`, `stiffness_at` and `depth_absorbing` agree with the law at rest."""
     deep = sharp + depth * np.array([0.1, 0.5, 1.0, 3.0])
     still = jnp.zeros(4)
     loads = jax.vmap(law)(deep, still)
@@ -47,7 +46,7 @@ def _check_inverse(law, depth, sharp):
 
 
 def _check_kinks(law, depth, rate):
-    """Every kink along lines through onset and release is marked."""
+    """Check that every kink along lines through onset and release is marked."""
     lines = [((0.8 * depth, -4 * rate), (0.9 * depth, 3 * rate))]
     for speed in rate * np.array([-3.0, -1.0, 0.0, 1.0]):
         lines.append(((-0.3 * depth, speed), (1.7 * depth, 1.3 * speed)))

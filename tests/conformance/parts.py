@@ -1,4 +1,4 @@
-"""What every part of a scene must do (`rootsopt.dynamics.parts.Part`)."""
+"""Checks that every part of a scene must pass (`rootsopt.dynamics.parts.Part`)."""
 
 import dataclasses
 
@@ -16,13 +16,13 @@ SPEED = 314.0
 
 
 def nothing(part, motion, own):
-    """No energy, no power."""
+    """Return 0: no energy, no power."""
     del part, motion, own
     return jnp.zeros(())
 
 
 def draw(part, rng, reach, axes):
-    """A motion and own states, `reach` times the units of each, and what acts beside the part."""
+    """Return a random motion and own states, `reach` times the units of each, and other loads."""
     angle, rate = float(UNITS.angle), float(UNITS.angle / UNITS.time)
     own = jnp.zeros(0)
     if part.states:
@@ -43,7 +43,8 @@ def draw(part, rng, reach, axes):
 
 
 def actions(part, motion, own, loads):
-    """All that the part does: torques, forces, rates of its own states, as one vector."""
+    """Return everything the part does: torques, forces and rates of its own states, as one
+    vector."""
     found = [part.torque_on_1(motion, own), part.torque_on_2(motion, own)]
     if motion.shift is not None:
         found.append(part.force_on_axes(motion, own))
@@ -55,10 +56,9 @@ def actions(part, motion, own, loads):
 def check_part(part, energy=nothing, supply=nothing, losses=nothing, reach=2.0, axes=False):
     """Check a part by itself.
 
-    `energy(part, motion, own)` (J) that it stores, power (W) that it takes in from outside
-    (`supply`) and dissipates (`losses`); `reach`: of the states, in their units, such that its
-    kinks lie within; `axes`: whether it acts on axes that move.
-    """
+    `energy(part, motion, own)`: stored energy (J); `supply`, `losses`: power (W) taken in from
+    outside, and dissipated, with the same arguments; `reach`: size of the states, in their units,
+    within which the kinks of the part lie; `axes`: whether the part acts on moving axes."""
     rng = np.random.default_rng(11)
     check_states(part)
     cases = [draw(part, rng, reach, axes) for _ in range(20)]
@@ -78,7 +78,8 @@ def check_part(part, energy=nothing, supply=nothing, losses=nothing, reach=2.0, 
 
 
 def check_states(part):
-    """Names, sizes and starts of its own states belong together, and its numbers are arrays."""
+    """Check that names, sizes and starts of the own states match, and that all numbers are
+    arrays."""
     count = len(part.states)
     assert len(set(part.states)) == count
     if count:
@@ -92,7 +93,7 @@ def check_states(part):
 
 
 def _check_power(part, cases, energy, supply, losses):
-    """Power in, less power to the rotors, is stored or dissipated; nothing is made of nothing."""
+    """Check that the power taken in, minus the power to the rotors, is stored or dissipated."""
 
     @jax.jit
     def powers(motion, own, loads):
@@ -119,7 +120,7 @@ def _check_power(part, cases, energy, supply, losses):
 
 
 def _check_kinks(part, rng, reach, axes):
-    """Along lines through its states every kink of what it does is marked."""
+    """Check that every kink of the part's actions along lines through its states is marked."""
     lines = [[draw(part, rng, 2 * reach, axes) for _ in range(2)] for _ in range(6)]
 
     def function(point):
@@ -132,7 +133,7 @@ def _check_kinks(part, rng, reach, axes):
 
 
 def _check_drag(part):
-    """Drag opposes the sliding and has its kinks marked."""
+    """Check that drag opposes the sliding and that its kinks are marked."""
     speeds = np.random.default_rng(2).normal(size=50) * np.geomspace(1e-3, 10, 50)
     drag = jax.jit(jax.vmap(lambda v: part.drag(jnp.asarray(100.0), v)))(jnp.asarray(speeds))
     assert np.all(np.asarray(drag) * speeds >= 0)
@@ -144,7 +145,7 @@ def _check_drag(part):
 
 
 def equations(jaxpr):
-    """Equations of a traced program, with those of its inner ones."""
+    """Return the number of equations of a traced program, including those of inner programs."""
     total = len(jaxpr.eqns)
     for equation in jaxpr.eqns:
         for value in jax.tree.leaves(equation.params, is_leaf=lambda v: hasattr(v, "jaxpr")):
@@ -154,7 +155,7 @@ def equations(jaxpr):
 
 
 def size(pair):
-    """States, equations and numbers of a pair's right-hand side."""
+    """Return the number of states, equations and numbers of a pair's right-hand side."""
     numbers, static = eqx.partition(pair, eqx.is_array)
     program = jax.make_jaxpr(lambda tau, y, n: eqx.combine(n, static).derivative(tau, y)[0])(
         jnp.zeros(()), jnp.zeros(pair.states), numbers
@@ -163,8 +164,10 @@ def size(pair):
 
 
 def check_in_pair(pair, part, reach=2.0):
-    """Check a part in a `pair` without it: it adds its own states and numbers, and the motion has a
-    derivative with respect to each of them."""
+    """Check a part in a `pair` without it.
+
+    The part must add its own states and numbers. The motion must have a derivative with respect to
+    each of these numbers."""
     with_part = dataclasses.replace(pair, parts=(*pair.parts, part))
     added = len(part.states) + (part.free and not pair.free)
     before, after = size(pair), size(with_part)

@@ -1,5 +1,6 @@
-"""Every contact, contact law and part of the package in its conformance suite, and what the suites
-find wrong in broken ones."""
+"""Tests every contact, law and part of the package in its conformance suite.
+
+Broken contacts, laws and parts show that the suites find mistakes."""
 
 import dataclasses
 
@@ -39,7 +40,7 @@ PROFILES = {
 }
 DEEPEST = -2e-3
 CONTACTS = {
-    # Name: how it is made, error of the gap (m), of levers as derivatives of it (m).
+    # Name: (maker, error of the gap (m), error of the levers as its derivatives (m)).
     "search": (SearchContact.of, 2e-8, 1e-9),
     "two-sided search": (
         lambda profile: SearchContact.of(profile, 2 * profile.pitch_radius, two_sided=True),
@@ -67,7 +68,8 @@ def test_contacts(name, family, graded_outline):
 
 
 def law(exponent, smoothing):
-    """A law of any exponent with the same force at 20 µm, which its damping can release."""
+    """Return a law with any exponent that has the same force at 20 µm, and whose damping can
+    release it."""
     stiffness = 4e11 * 2e-5 ** (2.2 - exponent)
     return ImpactLaw(*(jnp.asarray(x) for x in (stiffness, exponent, 250.0, 1e-5, smoothing)))
 
@@ -82,13 +84,13 @@ def arrays(*numbers):
 
 
 def held(part, motion, own):
-    """Energy (J) of a gear with sharp edges."""
+    """Return the energy (J) of a gear with sharp edges."""
     excess = jnp.maximum(jnp.abs(motion.relative - part.offset) - part.half_backlash, 0)
     return part.stiffness * excess**2 / 2
 
 
 def rubbed(part, motion, own):
-    """Power (W) that the damper of such a gear takes."""
+    """Return the power (W) that the damper of such a gear dissipates."""
     engaged = jnp.abs(motion.relative - part.offset) > part.half_backlash
     return jnp.where(engaged, part.damping * motion.rate**2, 0.0)
 
@@ -135,11 +137,12 @@ def test_parts(name):
 
 
 class Absent(Part):
-    """A part that leaves everything as it is."""
+    """A part that changes nothing."""
 
 
 def test_what_a_part_leaves_alone_costs_nothing():
-    """Neither state nor equation nor number: the program is that of the pair without it."""
+    """A part without overrides adds no state, equation or number: the program is that without
+    it."""
     pair = oscillator()
     assert size(dataclasses.replace(pair, parts=(Absent(), Absent()))) == size(pair)
 
@@ -155,7 +158,7 @@ class Unbalance(Part):
 
 
 class FarAnywhere(Far):
-    """The same at any distance of the axes."""
+    """The contact `Far` at any distance of the axes."""
 
     two_sided = True
     center_distance = jnp.asarray(2 * R)
@@ -168,7 +171,8 @@ class FarAnywhere(Far):
 
 
 def test_a_part_that_acts_on_axes_needs_them_to_move():
-    """In rigid bearings its force adds nothing; on supports each axis begins to move by F / m."""
+    """With rigid bearings its force adds nothing; on supports each axis starts to move with F /
+    m."""
     pair = oscillator()
     pulls = (Unbalance(jnp.asarray(7.0)),)
     assert size(dataclasses.replace(pair, parts=pulls))[:2] == size(pair)[:2]
@@ -196,7 +200,7 @@ def test_parts_that_exclude_each_other_are_refused():
 
 
 class Leaky(Part):
-    """A spring with a stop, wrong in the ways that are switched on."""
+    """A spring with a stop, and with the mistakes that are switched on."""
 
     gain: jnp.ndarray
     silent: bool = eqx.field(static=True, default=False)
@@ -228,7 +232,7 @@ def test_the_suite_finds_a_part_that_makes_energy_or_hides_a_kink():
 
 
 class Idle(Part):
-    """A number without effect."""
+    """A part with a number that has no effect."""
 
     number: jnp.ndarray
 
@@ -237,7 +241,7 @@ class Idle(Part):
 
 
 class Wrong(ContactLaw):
-    """F = K δ^e (1 + c v), wrong in one way or another."""
+    """F = K δ^e (1 + c v), with one of several mistakes."""
 
     exponent: jnp.ndarray
     how: str = eqx.field(static=True)
@@ -264,7 +268,7 @@ def test_the_suite_finds_a_wrong_law():
 
 
 class Tilted(LinearContact):
-    """Levers that are no derivatives of the gap."""
+    """A contact whose levers are not derivatives of its gap."""
 
     def __call__(self, roll, relative):
         gap, lever1, lever2 = super().__call__(roll, relative)

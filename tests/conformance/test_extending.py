@@ -1,4 +1,4 @@
-"""docs/extending.md is executed: its files join the suites that the package's own pieces pass."""
+"""Tests that execute docs/extending.md: its files pass the suites of the package's own objects."""
 
 import functools
 import json
@@ -35,14 +35,14 @@ MOST_LINES = 60
 
 
 def block_of(name):
-    """The code block of the page that begins with a file's name."""
+    """Return the code block of the page that begins with a file's name."""
     blocks = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
     return next(block for block in blocks if block.startswith(f'"""{name}'))
 
 
 @pytest.fixture(scope="module")
 def blunt_cycloid(tmp_path_factory):
-    """The path of the family's file, which has been imported."""
+    """Return the path of the family's file, after importing it."""
     path = tmp_path_factory.mktemp("family") / "blunt_cycloid.py"
     path.write_text(block_of(path.name), encoding="utf-8")
     with for_a_time():
@@ -56,7 +56,7 @@ def test_family_is_short(blunt_cycloid):
 
 @pytest.mark.parametrize("holds", suite.CHECKS, ids=lambda one: one.__name__)
 def test_family_conforms(blunt_cycloid, holds):
-    """A stranger's family passes what the package's own pass."""
+    """A family from outside passes the checks of the package's own families."""
     holds(blunt_cycloid.stem)
 
 
@@ -78,7 +78,7 @@ DESIGN = (
 
 
 def test_family_is_known_to_a_command_by_its_file(blunt_cycloid, tmp_path):
-    """In a process that has heard of it by the option alone, and not without."""
+    """A new process knows the family with the option `--import`, and does not know it without."""
     call = [sys.executable, "-m", "rootsopt.profile", "configs/ee.yaml", "--no-figures", *DESIGN]
     call += ["-o", str(tmp_path / "out")]
     run = functools.partial(subprocess.run, capture_output=True, text=True, cwd=ROOT, check=False)
@@ -94,7 +94,7 @@ def test_family_is_known_to_a_command_by_its_file(blunt_cycloid, tmp_path):
 
 @pytest.mark.long
 def test_family_is_optimised(blunt_cycloid, tmp_path):
-    """Better than the baseline, within the bounds of its parameters."""
+    """The optimum is better than the baseline, within the bounds of the parameters."""
     budget = ("screening=4", "starts=1", "iterations=40")
     given = [word for setting in budget for word in ("--set", f"optimizer.{setting}")]
     given += ["--no-figures", "-o", str(tmp_path / "out")]
@@ -132,7 +132,7 @@ def test_file_that_fails_is_one_line(tmp_path, text, words):
 
 
 def test_installed_package_is_found_by_its_entry_point(tmp_path, monkeypatch):
-    """A config that names an unknown family loads the package that offers it."""
+    """A config that names an unknown family loads the installed package that offers it."""
     (tmp_path / "offered.py").write_text(
         block_of("blunt_cycloid.py").replace("blunt_cycloid", "offered_cycloid"), encoding="utf-8"
     )
@@ -148,7 +148,7 @@ def test_installed_package_is_found_by_its_entry_point(tmp_path, monkeypatch):
 
 
 def made(lobes, pitch_radius, depth):
-    """A maker that is never called."""
+    """Stand in for a maker that is never called."""
 
 
 DEPTH = Parameter("depth_mm", "a depth", 1, 9, usual=(2, 3))
@@ -177,7 +177,7 @@ GOOD = {"name": "mine", "help": "mine", "maker": made, "parameters": (DEPTH,)} |
     ],
 )
 def test_incomplete_families_are_refused(change, words):
-    """With what is missing; nothing of them is left in the table."""
+    """The message names what is missing, and the table of families is unchanged."""
     before = families()
     with pytest.raises(ValueError, match=re.escape(words)):
         register_family(Family(**(GOOD | change)))
@@ -185,7 +185,7 @@ def test_incomplete_families_are_refused(change, words):
 
 
 def test_family_may_be_taken_back():
-    """For tests: the config is then as it was."""
+    """A registered family can be removed, for tests; the config is then as before."""
     text = ["profile={family: mine, lobes: 3, pitch_radius_mm: 33, depth_mm: 2}"]
     with for_a_time():
         register_family(Family(**GOOD))
@@ -200,7 +200,7 @@ def test_family_may_be_taken_back():
 
 @pytest.mark.parametrize("family", ["cic", "four_arcs", "free_form", "extended_cycloid"])
 def test_searched_normal_is_that_of_the_closed_form(family):
-    """And so are its derivatives with respect to roll angle and design."""
+    """The searched normal angle equals the closed form, and so do its derivatives."""
     row = families()[family]
     values = [np.atleast_1d(row.example[key]) for key in row.keys]
     design = jnp.asarray(np.concatenate(values))

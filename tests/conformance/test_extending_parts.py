@@ -1,5 +1,6 @@
-"""The page on parts and contact laws of one's own: its files are imported from outside the package,
-pass the conformance suites, and give motions that conserve energy and have right gradients."""
+"""Tests of the page on parts and contact laws: its files are imported from outside the package.
+
+They pass the conformance suites. Their motions conserve energy and have correct gradients."""
 
 import importlib
 import re
@@ -33,7 +34,7 @@ LAW = {"stiffness": 2.0e10, "exponent": 1.5, "loss": 0.4}
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
-    """The page's modules by name, and its scripts."""
+    """Return the page's modules by name, and its scripts."""
     folder, scripts = tmp_path_factory.mktemp("outside"), []
     found = {}
     sys.path.insert(0, str(folder))
@@ -66,7 +67,7 @@ def test_scripts_of_the_page_run(page, monkeypatch, capsys):
 
 @pytest.fixture(scope="module")
 def model():
-    """The paper's pair with a part and a law that the package does not know."""
+    """Return a scene of the paper's pair with a part and a law from outside the package."""
     return Scene.from_config(load("configs/cic.yaml", ["solver.fidelity=search"]))
 
 
@@ -81,13 +82,13 @@ def built(model, design):
 
 
 def stored(part, motion, own):
-    """Energy (J) of the coupling."""
+    """Return the energy (J) of the coupling."""
     excess = jnp.maximum(jnp.abs(own[0]) - part.stop, 0)
     return (part.stiffness * own[0] ** 2 + part.buffer * excess**2) / 2
 
 
 def transmitted(part, motion, own):
-    """Power (W) that the drive puts in at its own speed."""
+    """Return the power (W) that the drive supplies at its own speed."""
     return part.torque_on_1(motion, own) * part.speed
 
 
@@ -111,8 +112,9 @@ def test_the_law_conforms(page, model):
 
 @eqx.filter_jit
 def balance(pair, start, how):
-    """Change of the energy (J) over a mesh period, and work done: by drive, by load, by dampers and
-    contact."""
+    """Return the change of the energy (J) over a mesh period, and the work of all loads.
+
+    The work is that of drive, load, dampers and contact."""
     (coupling,), gear = pair.parts, pair.gear
 
     def energy(tau, state):
@@ -131,7 +133,7 @@ def balance(pair, start, how):
             transmitted(coupling, motion, own),
             -pair.load.torque * other,
             -damped(coupling, motion, own),
-            # What gear and contact take: their springs give it back, or not.
+            # Work that gear and contact take; their springs return part of it.
             contact.torque1 * motion.speed + contact.torque2 * other - hold * motion.rate,
         ]
         lapse = pair.lapse(state) * pair.mesh_period
@@ -148,7 +150,7 @@ def balance(pair, start, how):
 
 
 def test_energy_balance_with_a_part_of_ones_own(page, model, design):
-    """Kinetic energy and that of the coupling change by the work of all others, to 1e-8."""
+    """Kinetic energy and energy of the coupling change by the work of all other loads, to 1e-8."""
     scene = model.with_parts(page.coupling.FlexibleCoupling(**COUPLING))
     scene = scene.with_law(page.law.HuntCrossley(**LAW))
     pair = built(scene, design)
@@ -164,8 +166,9 @@ def test_energy_balance_with_a_part_of_ones_own(page, model, design):
 
 @eqx.filter_jit
 def closed(scene, design, factors, state, period, how):
-    """Closed orbit with derivatives in factors of the stiffness of coupling and law, of the stop,
-    and of the load."""
+    """Return a closed orbit with derivatives with respect to factors on four numbers.
+
+    They are the stiffness of coupling and law, the stop, and the load."""
 
     def entries(scene):
         (coupling,) = scene.extra
@@ -189,8 +192,10 @@ def settled(pair, how):
 
 
 def test_gradient_with_respect_to_numbers_of_ones_own(page, model, design):
-    """Mean and mean square by stiffness and stop of the coupling, stiffness of the law and load,
-    against central differences of orbits; the orbit crosses the stop, a kink."""
+    """Gradients of mean and mean square agree with central differences of orbits.
+
+    They are with respect to stiffness and stop of the coupling, stiffness of the law, and load. The
+    orbit crosses the stop, a kink."""
     scene = model.with_parts(page.coupling.FlexibleCoupling(**COUPLING))
     scene = scene.with_law(page.law.HuntCrossley(**LAW))
     transient = settled(built(scene, design), Integrator("tsit5", jnp.asarray(1e-8), 4096))

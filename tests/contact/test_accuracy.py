@@ -1,4 +1,4 @@
-"""The ladder of fidelities: exactness of its top, stated errors of its rungs, the choice."""
+"""Tests of the contact fidelities: exactness of the search, stated errors, the automatic choice."""
 
 import dataclasses
 import itertools
@@ -50,17 +50,18 @@ def poses(count, half, seed=0):
 @every_profile
 @pytest.mark.parametrize("error_mm", [-0.3, 0.0, 0.3])
 def test_root_is_found_to_twelve_digits(name, error_mm):
-    """Over ±20 mrad and ±0.3 mm of centre distance: T vanishes to 1e-12 of the pitch radius
-    wherever T crosses zero smoothly, and the two normals are parallel by construction."""
+    """T vanishes to 1e-12 of the pitch radius over ±20 mrad and ±0.3 mm of centre distance.
+
+    This holds wherever T crosses zero smoothly. The two normals are parallel by construction."""
     profile = PROFILES[name]
     pair = FlankPair.of(profile, jnp.asarray(2 * R + error_mm * 1e-3))
     x, relative = poses(4000, float(profile.half_pitch))
     found = closest(pair, x, relative)
-    offset = np.abs(jax.vmap(pair._offset)(found.normal2, x, relative)) / R
+    offset = np.abs(jax.vmap(pair._mesh)(found.normal2, x, relative)[0]) / R
     touching = np.asarray(found.found)
     assert np.mean(touching) > 0.6
     assert np.quantile(offset[touching], 0.995) < 1e-12
-    # What T leaves at a kink inside the bracket costs the gap its square over curvature.
+    # At a kink inside the bracket, the error of the gap is T² divided by the curvature.
     assert np.max(offset[touching]) < 1e-6
 
 
@@ -72,7 +73,7 @@ gap_of = eqx.filter_jit(lambda pair, roll, relative: pair(roll, relative).gap)
 )
 @pytest.mark.parametrize("error_mm", [0.0, pytest.param(0.3, marks=pytest.mark.long)])
 def test_gap_is_that_of_nodes_far_out(graded_outline, name, error_mm):
-    """Against node search, which knows no flanks: ±20 mrad, wrong centre distance."""
+    """The gap agrees with node search, which uses no flanks: ±20 mrad, wrong centre distance."""
     profile, distance = PROFILES[name], 2 * R + error_mm * 1e-3
     pair = FlankPair.of(profile, jnp.asarray(distance))
     outline = graded_outline(profile, 6000)
@@ -83,12 +84,12 @@ def test_gap_is_that_of_nodes_far_out(graded_outline, name, error_mm):
         drive = float(gap_of(pair, jnp.asarray(-mean), jnp.asarray(relative)))
         coast = float(gap_of(pair, jnp.asarray(mean), jnp.asarray(-relative)))
         flank = min(drive, coast)
-        # Lands pass at the centre distance's error; only what is deeper is a flank's.
+        # With a centre distance error, lands may touch too; only greater depths belong to flanks.
         if flank > -2e-5:
             continue
         phi1, phi2 = mean - relative / 2, mean + relative / 2
         nodes = pair_gap(outline, 3, distance, phi1, phi2, reach=2e-3)
-        # Nodes, and the parabola through three of them, are poor where the epicycloid's
+        # Nodes, and the parabola through three of them, are inaccurate where the epicycloid's
         # radius of curvature vanishes; the search is the deeper one there.
         resolution = 2e-4 * abs(nodes) if name == "epicycloid" else 0.0
         assert flank == pytest.approx(nodes, rel=0, abs=max(2e-8, resolution))
@@ -98,7 +99,8 @@ def test_gap_is_that_of_nodes_far_out(graded_outline, name, error_mm):
 
 @eqx.filter_jit
 def both_searches(pair, roll, relative):
-    """Newton's method and the nodes at many poses: whether it is certain, and both results."""
+    """Return whether Newton's method is reliable, and the results of Newton and of nodes, at many
+    poses."""
 
     def one(roll, relative):
         attempts, best = pair._search(roll, relative)
@@ -117,9 +119,11 @@ def both_searches(pair, roll, relative):
     seed=st.integers(0, 10**6),
 )
 def test_newton_finds_what_the_nodes_find(lobes, above, share, tip, cycloid, seed):
-    """Wherever Newton's method calls itself certain, it has the closest approach, and it never
-    calls a touching pair apart. (`above` the pressure angle, in degrees, at which the longest
-    involute undercuts: lobes cut into each other touch everywhere.)"""
+    """Newton's method finds the closest approach wherever it is reliable, and never misses a
+    contact.
+
+    `above`: pressure angle (°) at which the longest involute undercuts; lobes that cut into each
+    other touch everywhere."""
     half = np.pi / (2 * lobes)
     angle = np.degrees(np.arctan(half)) + above
     longest = R * np.sin(angle * DEG) * half * (1 - tip)
@@ -143,7 +147,8 @@ WAVY = (1.0, 0.9463, 0.666, 0.8701, 1.0, 0.7063, 0.503, 0.5937, 0.7152, 0.847, 0
 
 @eqx.filter_jit
 def _sampled(pair, roll, relative):
-    """The deepest of all common normals on 4000 nodes (m), how many there are, and the search."""
+    """Return the deepest of all common normals on 4000 nodes (m), their number, and the search's
+    result."""
     normal = jnp.linspace(pair.nodes.normal[0], pair.nodes.normal[-1], 4001)
 
     def one(at):
@@ -157,8 +162,10 @@ def _sampled(pair, roll, relative):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_deepest_of_several_minima_is_found_on_a_wavy_flank(seed):
-    """Newton's method from perfect rolling ends at either minimum, and an interval of nodes at the
-    first or last one; the rank tells which of them is the deepest."""
+    """The search finds the deepest of several minima, and the rank tells which one it is.
+
+    Newton's method from perfect rolling ends at either minimum. Intervals of nodes lead to the
+    first or the last one."""
     rng = np.random.default_rng(seed)
     moved = np.clip(np.array(WAVY) + rng.uniform(-0.2, 0.2, len(WAVY)) * (seed > 0), -1, 1)
     pair = FlankPair.of(FreeForm(3, R, 1.2658 * DEG, moved))
@@ -177,7 +184,8 @@ def test_deepest_of_several_minima_is_found_on_a_wavy_flank(seed):
 
 @pytest.mark.parametrize("name", ["paper", "short", "epicycloid"])
 def test_second_derivatives_are_those_of_the_gap(name):
-    """Hessian of the gap in pose and centre distance = differences of the first derivative."""
+    """The Hessian of the gap in pose and centre distance equals differences of the first
+    derivative."""
     profile = PROFILES[name]
 
     def gap(at):
@@ -213,7 +221,7 @@ def test_second_derivatives_are_those_of_the_gap(name):
     deepest=st.floats(-2e-3, -1e-4),
 )
 def test_map_keeps_its_stated_error(angle, share, tip, deepest):
-    """A map sized for an error has it, at poses that are none of the probed ones."""
+    """A map sized for an error meets it at poses other than the probed ones."""
     longest = R * np.sin(angle * DEG) * (np.pi / 6 - tip * DEG)
     profile = CIC(3, R, angle * DEG, share * longest, tip * DEG)
     size = size_map(profile, deepest, 4e-7)
@@ -226,7 +234,7 @@ def test_map_keeps_its_stated_error(angle, share, tip, deepest):
     table = tabulate(profile, jnp.asarray(deepest), size.rolls, size.relatives)
     made = table_gap(table, x, relative)
     true = closest(FlankPair.of(profile), x, relative)
-    # Cells next to the beginning of contact are not counted (see `size_map`).
+    # Cells next to the start of contact are not counted (see `size_map`).
     inside = np.asarray(true.found) & (np.asarray(true.gap) < -0.05 * R * abs(deepest))
     assert np.max(np.abs(made - true.gap), where=inside, initial=0.0) < 2 * max(size.error, 4e-7)
 
@@ -236,7 +244,7 @@ table_gap = eqx.filter_jit(lambda table, x, e: jax.vmap(lambda a, b: table(a, b)
 
 
 def test_a_smaller_error_needs_no_smaller_map():
-    """Sizes grow as the error falls; what cannot be met is said."""
+    """The size grows as the error falls. An error that cannot be met is reported."""
     sizes = [size_map(PAPER, -4e-4, error) for error in (1e-6, 1e-7, 1e-8, 1e-9, 1e-13)]
     assert all(a.rolls <= b.rolls for a, b in itertools.pairwise(sizes[:-1]))
     assert sizes[0].enough
@@ -248,18 +256,17 @@ def test_a_smaller_error_needs_no_smaller_map():
 
 @pytest.fixture(scope="module")
 def default():
-    """Evaluator and evaluation of the shipped scene."""
+    """Return evaluator and evaluation of the shipped scene."""
     evaluator = Evaluator.of(load("configs/cic.yaml"))
     return evaluator, evaluator(series=False)
 
 
 @pytest.mark.long
 def test_single_precision(default):
-    """float32 reaches forces to 1e-4 and the gradient of the mean to 1 %, in float32.
+    """float32 reaches forces to 1e-4 and the gradient of the mean to 1 %, and results are float32.
 
-    With the map, which is tabulated in double precision: a gap searched for in single
-    precision is the difference of lengths ten thousand times as large.
-    """
+    The contact is the map, which is tabulated in double precision. A gap searched for in single
+    precision is a difference of lengths ten thousand times as large."""
     overrides = ["solver.precision=float32", "solver.fidelity=map"]
     evaluator = Evaluator.of(load("configs/cic.yaml", overrides))
     single, double = evaluator(series=False), default[1]
@@ -278,8 +285,9 @@ DESIGNS = jnp.array([[36.43, 9.0, 4.0], [28.0, 3.0, 1.5], [30.0, 4.0, 2.0]])
 
 
 def test_batch_is_the_designs_one_by_one(default):
-    """Responses and gradients of a batch are those of its members; a hopeless one (given no
-    time to settle here) is marked, and spoils no other."""
+    """Responses and gradients of a batch equal those of its designs alone.
+
+    A design that has no time to settle is marked, and does not affect the others."""
     evaluator, _ = default
     designs = DESIGNS
     given = evaluator.scene.solver
@@ -303,8 +311,9 @@ def test_batch_is_the_designs_one_by_one(default):
 
 @pytest.mark.long
 def test_batch_at_a_coarse_tolerance(default):
-    """Kinks are looked for again where the orbit has moved away from the first look: else gradients
-    would be some 1e-2 off at this tolerance."""
+    """Kinks are searched for again where the orbit has moved since the first search.
+
+    Otherwise gradients would be wrong by about 1e-2 at this tolerance."""
     evaluator, _ = default
     scene = evaluator.scene
 
@@ -340,7 +349,7 @@ def test_auto_meets_the_request(wanted):
 
 
 def test_auto_must_be_resolved_before_use():
-    """A pair of a config with `auto` says what to call."""
+    """The message for a pair of a config with `auto` names the function to call."""
     config = load("configs/cic.yaml", ["solver.fidelity=auto"])
     with pytest.raises(InputError, match=r"choice\.choose"):
         Scene.from_config(config).pair(design_vector(config))
@@ -348,8 +357,8 @@ def test_auto_must_be_resolved_before_use():
 
 @pytest.mark.parametrize("settles", [True, False])
 def test_auto_looks_more_closely_at_what_does_not_settle(monkeypatch, settles):
-    """A motion that the reference finds unsettled is taken at a hundredth of its tolerance
-    before it is given up."""
+    """A motion that does not settle in the reference is tried again at a hundredth of its
+    tolerance."""
     asked = []
 
     @dataclasses.dataclass

@@ -1,4 +1,4 @@
-"""Small parts of the contact, against closed forms and interpolation of their own."""
+"""Tests of small parts of the contact, against closed forms and an independent interpolation."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +12,9 @@ from rootsopt.profiles import CIC
 
 
 def test_levers_may_jump_where_flanks_do_not_roll():
-    """At the nominal centre distance conjugate flanks roll on each other, with one closest
-    approach; anywhere else there may be two as deep."""
+    """Conjugate flanks have one closest approach at the nominal centre distance.
+
+    At any other distance there may be two of equal depth."""
     paper = CIC(3, 0.033, np.radians(36.43), 8e-3, np.radians(4.0))
     assert not SearchContact.of(paper).jumps
     displaced = SearchContact.of(paper, jnp.asarray(0.0662), two_sided=True)
@@ -22,8 +23,10 @@ def test_levers_may_jump_where_flanks_do_not_roll():
 
 
 def test_distance_from_a_circle_of_few_nodes():
-    """Outside positive; to the chords too great by up to R (1 - cos π/n) outside, and by the cubics
-    with an error of fourth order."""
+    """The distance is positive outside.
+
+    Distances to chords are too great by up to R (1 - cos π/n) outside; those to cubics have an
+    error of fourth order."""
     rng = np.random.default_rng(0)
     radii, angles = rng.uniform(0.5, 1.5, 300), rng.uniform(0, 2 * np.pi, 300)
     nodes = radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -42,8 +45,10 @@ def test_distance_from_a_circle_of_few_nodes():
 
 
 def test_error_of_a_map_is_what_its_spline_leaves():
-    """The greatest difference between a fine sampling and the cubic spline through the map's own
-    points, where the flanks overlap, by an interpolation written anew."""
+    """The stated error of a map is the greatest difference between a fine sampling and its spline.
+
+    The spline goes through the map's own points, where the flanks overlap. The interpolation here
+    is independent."""
     from scipy.interpolate import make_interp_spline
 
     points = np.linspace(0.0, 1.0, 3073)
@@ -54,7 +59,7 @@ def test_error_of_a_map_is_what_its_spline_leaves():
             (12, 24, 48, 96, 192), 0.0, 1.0, (jnp.asarray(points), jnp.asarray(lines)), asked
         )
         assert error <= asked
-        # A map of n points has some beyond the range: those within it are a uniform grid.
+        # Some points of a map lie beyond the range; those within it are a uniform grid.
         step = 1.0 / (count - 1 - MARGIN)
         knots = step * np.arange(count - MARGIN)
         left = [

@@ -1,4 +1,4 @@
-"""Closest approach, its map, the IMPACT law and the timing gear. SI units throughout."""
+"""Tests of closest approach, its map, the IMPACT law and the timing gear (SI units)."""
 
 import functools
 
@@ -21,7 +21,7 @@ DEG = np.pi / 180
 
 
 def cic(lobes, alpha, fraction, tip):
-    """CIC with u given as a fraction of u_max."""
+    """Return a CIC profile with u given as a fraction of u_max."""
     longest = R * np.sin(alpha) * (np.pi / (2 * lobes) - tip)
     return CIC(lobes, R, alpha, fraction * longest, tip)
 
@@ -41,7 +41,9 @@ few_profiles = pytest.mark.parametrize("profile", [PROFILES["paper"], PROFILES["
 
 
 def over_poses(function, subject, rolls, relatives):
-    """A jitted function of poses, its batch padded to one of two sizes: fewer compilations."""
+    """Return the results of a jitted function at poses, padded to one of two batch sizes.
+
+    This saves compilations."""
     count = len(rolls)
     size = 640 if count <= 640 else 3840
     padded = (jnp.asarray(np.resize(a, size)) for a in (rolls, relatives))
@@ -54,12 +56,12 @@ def _approach(profile, rolls, relatives):
 
 
 def approach(profile, rolls, relatives):
-    """Closest approaches at many poses."""
+    """Return the closest approaches at many poses."""
     return over_poses(_approach, profile, rolls, relatives)
 
 
 def poses(lobes, count, seed, deepest=-0.020):
-    """Random poses: the whole mesh, and both hand-overs seen from both sides."""
+    """Return random poses: the whole mesh, and both hand-overs seen from both sides."""
     rng = np.random.default_rng(seed)
     whole = np.pi / lobes
     rolls = np.concatenate(
@@ -77,15 +79,15 @@ def poses(lobes, count, seed, deepest=-0.020):
 
 @every_profile
 def test_penetration_is_that_of_two_full_outlines(profile, graded_outline):
-    """The search finds the depth that nodes of the whole outlines find, hand-over included."""
-    # Near the pitch point of EE nodes beyond 0.4 mm deep see past the medial axis of their
+    """The search finds the same depth as nodes of the whole outlines, also at the hand-over."""
+    # Near the pitch point of EE, nodes deeper than 0.4 mm lie beyond the medial axis of their
     # mate: the nearest point of its outline is then no longer the one they have come through.
     deepest = -0.020 if isinstance(profile, CIC) else -0.012
     rolls, relatives = poses(profile.lobes, 20, 1, deepest)
     found = approach(profile, rolls, relatives)
     gaps = np.asarray(found.gap)
     points = graded_outline(profile, 1000)
-    # Shallower than this the tip land, which is not searched, may be deeper.
+    # At smaller depths the tip land, which is not searched, may be deeper.
     deep = gaps < -1e-7
     assert deep.sum() > 0.4 * len(gaps)
     assert np.all(np.asarray(found.found)[deep])
@@ -93,13 +95,13 @@ def test_penetration_is_that_of_two_full_outlines(profile, graded_outline):
         pair_gap(points, profile.lobes, 2 * R, -x - e / 2, -x + e / 2)
         for x, e in zip(rolls[deep], relatives[deep], strict=True)
     ]
-    # 2e-5 mm, what the node method resolves with nodes 0.03 mm apart.
+    # 2e-5 mm is the resolution of the node method with nodes 0.03 mm apart.
     np.testing.assert_allclose(gaps[deep], nodes, rtol=0, atol=2e-8)
 
 
 @few_profiles
 def test_coast_flank_is_the_mirror_image(profile, graded_outline):
-    """At ε > 0 the pair penetrates as the mirrored drive flank says: x → -x, ε → -ε."""
+    """At ε > 0 the pair penetrates like the mirrored drive flank: x → -x, ε → -ε."""
     rolls, relatives = poses(profile.lobes, 8, 2, deepest=-0.012)
     gaps = np.asarray(approach(profile, rolls, relatives).gap)
     points = graded_outline(profile, 1000)
@@ -113,7 +115,7 @@ def test_coast_flank_is_the_mirror_image(profile, graded_outline):
 
 @every_profile
 def test_rolling_flanks_touch_without_penetration(profile):
-    """ε = 0: the gap vanishes all along the mesh, at the roll angle's own flank points."""
+    """At ε = 0 the gap vanishes along the whole mesh, at the flank points of the roll angle."""
     whole = np.pi / profile.lobes
     # Inside the flank: where only a land passes there is no flank contact.
     first = profile.segments()[0]
@@ -127,7 +129,7 @@ def test_rolling_flanks_touch_without_penetration(profile):
 
 @every_profile
 def test_flanks_swap_under_exchange_of_the_rotors(profile):
-    """x → π/N - x exchanges the rotors: same gap, levers swapped; 2π/N is a period."""
+    """x → π/N - x exchanges the rotors: same gap, exchanged levers. 2π/N is a period."""
     rolls, relatives = poses(profile.lobes, 40, seed=3)
     whole = np.pi / profile.lobes
     here = approach(profile, rolls, relatives)
@@ -140,7 +142,7 @@ def test_flanks_swap_under_exchange_of_the_rotors(profile):
 
 
 def test_involute_contact_in_closed_form():
-    """Involute on involute, both levers are the base radius and the gap is r cos α · ε."""
+    """Where involute meets involute, both levers are the base radius and the gap is r cos α · ε."""
     profile = PROFILES["short involute"]
     start, half = float(profile.involute_start), float(profile.half_pitch)
     rolls = np.linspace(start + 0.02, 2 * half - start - 0.02, 31)
@@ -153,8 +155,10 @@ def test_involute_contact_in_closed_form():
 
 @every_profile
 def test_common_normal_is_stationary(profile):
-    """The result is a common normal: E cos λ equals the sum of the levers, and the gap is
-    E sin λ less both support functions, at the normal angles returned."""
+    """The result is a common normal.
+
+    E cos λ equals the sum of the levers, and the gap is E sin λ minus both support functions, at
+    the returned normal angles."""
     rolls, relatives = poses(profile.lobes, 40, seed=4)
     half = np.pi / (2 * profile.lobes)
     folded = half - np.abs(rolls - half)
@@ -164,7 +168,7 @@ def test_common_normal_is_stationary(profile):
     direction = np.asarray(found.normal1) - folded - relatives / 2
     reach = 2 * R * np.sin(direction)
     offset = (reach - found.lever1 - found.lever2)[sound]
-    # The normal angle is good to 1e-6 rad, on radii of curvature below 2 R.
+    # The normal angle is accurate to 1e-6 rad, on radii of curvature below 2 R.
     np.testing.assert_allclose(offset, 0, atol=2e-6 * R)
     assert sound.mean() > 0.4
 
@@ -179,7 +183,7 @@ def _gap_slopes(profile, rolls, relatives):
 
 
 def gap_slopes(profile, rolls, relatives):
-    """∂G/∂x and ∂G/∂ε at many poses."""
+    """Return ∂G/∂x and ∂G/∂ε at many poses."""
     return over_poses(_gap_slopes, profile, rolls, relatives)
 
 
@@ -217,7 +221,7 @@ over_designs = jax.jit(jax.vmap(jax.vmap(results, (None, 0, 0)), (0, None, None)
 
 @pytest.mark.parametrize("involute", [8.0e-3, 6.0e-3])
 def test_design_derivatives_of_gap_and_levers(involute):
-    """Derivatives in (α, u, θ1) agree with central differences, forward with reverse mode."""
+    """Derivatives in (α, u, θ1) agree with central differences, and forward with reverse mode."""
     design = jnp.array([36.43 * DEG, involute, 4.0 * DEG])
     rolls = jnp.asarray(np.linspace(0.085, np.pi / 3 - 0.085, 41))
     relatives = jnp.asarray(-(10.0 ** np.random.default_rng(6).uniform(-5, -2, 41)))
@@ -239,7 +243,7 @@ def test_design_derivatives_of_gap_and_levers(involute):
 
 @every_profile
 def test_no_pose_gives_nan(profile):
-    """Gap, levers and slopes are finite for any roll, however large, and any ε."""
+    """Gap, levers and slopes are finite for any roll, however large, and for any ε."""
     rng = np.random.default_rng(7)
     rolls = np.concatenate([rng.uniform(-4, 4, 500), rng.uniform(-1e6, 1e6, 100), [0.0]])
     relatives = np.concatenate([rng.uniform(-0.3, 0.3, 500), rng.uniform(-1e-3, 0, 100), [0.0]])
@@ -264,7 +268,7 @@ def _tabulate(profile, rolls, relatives):
 
 @functools.cache
 def tabulate(name, rolls, relatives):
-    """The map of a profile, made once."""
+    """Return the map of a profile, made once."""
     return _tabulate(PROFILES[name], rolls, relatives)
 
 
@@ -274,7 +278,7 @@ def _look_up(table, rolls, relatives):
 
 
 def look_up(table, rolls, relatives):
-    """Gap and levers from a map at many poses."""
+    """Return gap and levers from a map at many poses."""
     return over_poses(_look_up, table, rolls, relatives)
 
 
@@ -286,19 +290,19 @@ def _map_slopes(table, rolls, relatives):
 
 
 def map_slopes(table, rolls, relatives):
-    """First and second derivatives of the map's gap over the pose."""
+    """Return first and second derivatives of the map's gap with respect to the pose."""
     return over_poses(_map_slopes, table, rolls, relatives)
 
 
 def mesh_grid(lobes, deepest=DEEPEST):
-    """Poses in contact over the mesh, off the nodes of any map."""
+    """Return poses in contact over the mesh, away from the nodes of any map."""
     rolls = np.linspace(-0.01, np.pi / lobes + 0.01, 156)
     relatives = deepest * np.linspace(0.013, 0.987, 23)
     return (a.ravel() for a in np.meshgrid(rolls, relatives))
 
 
 def torque_errors(name, sizes):
-    """Relative rms error of the contact torque on rotor 2 for maps of several sizes."""
+    """Return the relative RMS error of the contact torque on rotor 2 for maps of several sizes."""
     rolls, relatives = mesh_grid(PROFILES[name].lobes)
     exact = approach(PROFILES[name], rolls, relatives)
 
@@ -315,13 +319,13 @@ def torque_errors(name, sizes):
 
 @pytest.mark.parametrize("name", ["paper", "short involute", "ee three"])
 def test_torque_from_the_default_map_is_accurate(name):
-    """128 × 24 points: below 5e-4 relative (rms) of the torque from the search."""
+    """With 128 × 24 points, the RMS error of the torque is below 5e-4 of the search's torque."""
     assert torque_errors(name, [(128, 24)])[0] < 5e-4
 
 
 @pytest.mark.parametrize("name", ["paper", "short involute"])
 def test_map_approaches_the_search_when_refined(name):
-    """The torque error falls with the size of the map."""
+    """The torque error falls as the map grows."""
     coarse, default, fine = torque_errors(name, [(64, 12), (128, 24), (256, 48)])
     # Curvature jumps allow second order on average; the single steps scatter with where
     # the jumps lie between the points.
@@ -334,7 +338,7 @@ few_maps = pytest.mark.parametrize("name", ["paper", "ee three"])
 
 @few_maps
 def test_levers_of_the_map_are_derivatives_of_its_gap(name):
-    """Forces come from a potential: levers and gap of the map agree to rounding."""
+    """Levers and gap of the map agree to rounding, so that forces come from a potential."""
     table = tabulate(name, 128, 24)
     rolls, relatives = mesh_grid(PROFILES[name].lobes)
     _, lever1, lever2 = look_up(table, rolls, relatives)
@@ -345,7 +349,7 @@ def test_levers_of_the_map_are_derivatives_of_its_gap(name):
 
 @few_maps
 def test_map_is_twice_continuously_differentiable(name):
-    """Gap, slopes and second derivatives have no jump at the nodes of the map."""
+    """Gap, slopes and second derivatives do not jump at the nodes of the map."""
     table = tabulate(name, 64, 12)
     nodes = np.asarray(table.first_roll + table.roll_step * np.arange(1, 60))
     depths = np.asarray(table.deepest + table.relative_step * np.arange(1, 8))
@@ -364,18 +368,18 @@ def test_map_is_twice_continuously_differentiable(name):
 
 @few_maps
 def test_map_is_smooth_where_it_is_folded(name):
-    """At the middle of the flank, where the map is mirrored, the slope over roll vanishes."""
+    """In the middle of the flank, where the map is mirrored, the slope over roll vanishes."""
     half = float(PROFILES[name].half_pitch)
     table = tabulate(name, 128, 24)
     relatives = DEEPEST * np.linspace(0.05, 1, 9)
     (by_roll, _), _ = map_slopes(table, np.full(9, half - 1e-9), relatives)
-    # Of levers of order r, so that a passing trajectory sees no kink above the map's error.
+    # Relative to levers of order r: a trajectory there meets no kink above the map's error.
     np.testing.assert_allclose(by_roll, 0, atol=1e-5 * R)
 
 
 @few_maps
 def test_map_has_the_symmetry_and_period_of_the_flank(name):
-    """x → π/N - x swaps the levers; 2π/N is a period."""
+    """x → π/N - x exchanges the levers; 2π/N is a period."""
     table = tabulate(name, 64, 12)
     rolls, relatives = (a[::7] for a in mesh_grid(PROFILES[name].lobes))
     gap, lever1, lever2 = look_up(table, rolls, relatives)
@@ -402,7 +406,7 @@ def test_map_goes_on_linearly_below_its_deepest(name):
 
 
 def test_design_derivative_of_the_map_is_that_of_the_search():
-    """Differentiating the table gives the envelope derivative at its nodes."""
+    """The derivative of the table is the envelope derivative at its nodes."""
     design = jnp.array([36.43 * DEG, 8.0e-3, 4.0 * DEG])
     rolls, relatives = jnp.linspace(0.15, 0.9, 31), jnp.full(31, -1.3e-3)
 
@@ -423,7 +427,7 @@ def test_design_derivative_of_the_map_is_that_of_the_search():
 
 @given(x=st.floats(-5, 5), width=st.floats(1e-3, 2))
 def test_ramp_lies_under_the_corner_and_meets_it(x, width):
-    """0 ≤ ramp ≤ max(0, x), equal to it outside 0 < x < width."""
+    """0 ≤ ramp ≤ max(0, x), with equality outside 0 < x < width."""
     value = float(ramp(jnp.asarray(x), jnp.asarray(width)))
     corner = max(0.0, x)
     assert 0 <= value <= corner + 1e-15
@@ -433,7 +437,7 @@ def test_ramp_lies_under_the_corner_and_meets_it(x, width):
 
 
 def test_ramp_rises_with_continuous_slope():
-    """Slope 0 at the onset and 1 from the width on, non-negative and continuous between."""
+    """The slope is 0 at the onset and 1 from the width on, and is continuous and ≥ 0 in between."""
     x = jnp.linspace(-0.5, 1.5, 4001)
     slope = np.asarray(jax.vmap(jax.grad(ramp), (0, None))(x, jnp.asarray(0.8)))
     assert slope.min() >= 0
@@ -444,13 +448,14 @@ def test_ramp_rises_with_continuous_slope():
 
 
 def test_ramp_is_flat_at_its_very_onset():
-    """At x = 0 exactly, automatic differentiation gives the slope 0 that the ramp has there."""
+    """At x = 0 exactly, automatic differentiation gives the ramp's slope 0."""
     slope = jax.grad(ramp)(jnp.asarray(0.0), jnp.asarray(0.8))
     assert float(slope) == 0.0
 
 
 def test_smooth_step_is_the_clamped_cubic():
-    """3x² - 2x³ on 0 … 1, 0 and 1 outside, point symmetric, flat at both ends."""
+    """The step is 3x² - 2x³ on 0 … 1, and 0 and 1 outside; it is point symmetric and flat at both
+    ends."""
     x = jnp.linspace(-1, 2, 301)
     value = np.asarray(smooth_step(x))
     inside = np.clip(x, 0, 1)
@@ -464,7 +469,8 @@ def test_smooth_step_is_the_clamped_cubic():
 
 
 def impact_law(exponent=2.2, damping=250.0, depth=1e-5, smoothing=1e-7):
-    """About the paper's Table 2 (8 N at 0.01 mm) in SI units, with some parameters changed."""
+    """Return about the paper's Table 2 law (8 N at 0.01 mm) in SI units, with some parameters
+    changed."""
     values = (8.0 / 1e-5**exponent, exponent, damping, depth, smoothing)
     return ImpactLaw(*(jnp.asarray(float(v)) for v in values))
 
@@ -480,7 +486,7 @@ def force_slopes(law, depths, rates):
 
 
 def plain_law(law, depth, rate):
-    """IMPACT as the solver has it, in NumPy."""
+    """Return the force of the solver's IMPACT law, in NumPy."""
     k, e, c, d = (
         float(v) for v in (law.stiffness, law.exponent, law.damping, law.full_damping_depth)
     )
@@ -491,7 +497,7 @@ def plain_law(law, depth, rate):
 
 
 def impacts():
-    """Depths around every seam and rates from fast release to fast impact."""
+    """Return depths around every seam, and rates from fast release to fast impact."""
     depths = np.concatenate([np.linspace(-2e-5, 4e-5, 121), np.geomspace(1e-9, 1e-4, 81)])
     rates = np.concatenate([-np.geomspace(1e-4, 10, 15), [0.0], np.geomspace(1e-4, 10, 15)])
     return (jnp.asarray(a.ravel()) for a in np.meshgrid(depths, rates))
@@ -499,7 +505,7 @@ def impacts():
 
 @pytest.mark.parametrize("exponent", [1.0, 1.5, 2.2])
 def test_unsmoothed_law_in_closed_form(exponent):
-    """smoothing = 0 is max(0, K δ^e + C step(δ/d) dδ/dt)."""
+    """With smoothing 0, the force is max(0, K δ^e + C step(δ/d) dδ/dt)."""
     law = impact_law(exponent=exponent, smoothing=0.0)
     depths, rates = impacts()
     np.testing.assert_allclose(
@@ -516,7 +522,7 @@ def test_unsmoothed_law_in_closed_form(exponent):
     smoothing=st.sampled_from([0.0, 1e-9, 1e-7, 1e-5, 1e-3]),
 )
 def test_force_is_never_adhesive(depth, rate, exponent, damping, full, smoothing):
-    """Force ≥ 0 and finite whatever the state; exactly 0 without penetration."""
+    """The force is ≥ 0 and finite in any state, and exactly 0 without penetration."""
     law = impact_law(exponent, damping, full, smoothing)
     force = float(forces(law, jnp.asarray([depth]), jnp.asarray([rate]))[0])
     assert np.isfinite(force)
@@ -526,7 +532,7 @@ def test_force_is_never_adhesive(depth, rate, exponent, damping, full, smoothing
 
 
 def test_smoothing_leaves_the_law_alone_outside_its_zones():
-    """Equal to the plain law where δ ≥ h and the force exceeds h/d · K δ^e."""
+    """The force equals that of the plain law where δ ≥ h and the force exceeds h/d · K δ^e."""
     law = impact_law(smoothing=5e-7)
     depths, rates = (np.asarray(a) for a in impacts())
     plain = plain_law(law, depths, rates)
@@ -540,7 +546,7 @@ def test_smoothing_leaves_the_law_alone_outside_its_zones():
 
 
 def seams(law, rate):
-    """Depths at which the law changes its formula, for one rate."""
+    """Return the depths at which the law changes its formula, for one rate."""
     h, d = float(law.smoothing), float(law.full_damping_depth)
     places = [0.0, h, d]
     depth = np.linspace(1.5 * h, 30 * d, 300001)
@@ -560,7 +566,7 @@ def test_law_is_continuously_differentiable(exponent, rate):
     law = impact_law(exponent=exponent, smoothing=1e-6)
     places = seams(law, rate)
     assert rate >= 0 or len(places) >= 5
-    # Through each seam in steps that shrink: a jump stays, a C¹ law's change shrinks with them.
+    # Cross each seam with shrinking steps: a jump stays, the change of a C¹ law shrinks.
     changes = []
     for reach in (1e-8, 1e-10):
         offsets = reach * np.linspace(-1, 1, 41)
@@ -581,7 +587,7 @@ def test_law_is_continuously_differentiable(exponent, rate):
 
 
 def test_slopes_of_the_law_are_finite_everywhere():
-    """No NaN in the derivatives, smoothed or not, at any depth including zero."""
+    """The derivatives are not NaN at any depth including zero, smoothed or not."""
     depths, rates = impacts()
     depths = depths.at[0].set(0.0)
     for smoothing in (0.0, 1e-7):
@@ -603,7 +609,7 @@ def test_smoothed_law_converges_to_the_plain_one():
 
 
 def test_static_depth_carries_its_force():
-    """depth_at inverts the law at rest."""
+    """`depth_at` inverts the law at rest."""
     law = impact_law()
     loads = jnp.array([1.0, 30.0, 2000.0])
     depths = jax.vmap(law.depth_at)(loads)
@@ -625,7 +631,8 @@ def gear_torques(gear, relatives, rates):
 
 @pytest.mark.parametrize("rounding", [0.0, 3e-6])
 def test_timing_gear_in_closed_form(rounding):
-    """Zero inside the backlash; stiffness · excess + damping · rate beyond the rounding."""
+    """The torque is 0 inside the backlash, and stiffness · excess + damping · rate beyond the
+    rounding."""
     gear = timing_gear(rounding)
     rates = np.linspace(-3, 3, 41)
     inside = gear_torques(gear, 7.5e-4 * np.linspace(-1, 1, 41), rates)
@@ -637,7 +644,7 @@ def test_timing_gear_in_closed_form(rounding):
 
 
 def test_timing_gear_is_odd_and_rounded():
-    """T(-ε, -ε̇) = -T(ε, ε̇); torque and slope are continuous over the rounding."""
+    """T(-ε, -ε̇) = -T(ε, ε̇). Torque and slope are continuous over the rounding."""
     gear = timing_gear()
     relatives = 7.5e-4 + np.linspace(-2e-6, 5e-6, 7001)[:-1] + 0.5e-9
     rates = np.full(7000, 0.4)
@@ -651,8 +658,10 @@ def test_timing_gear_is_odd_and_rounded():
 
 
 def test_rounded_edges_of_the_gear_keep_their_integrals():
-    """Across the rounding the spring stores k w² / 2 and the damper takes c w ε̇, as sharp edges
-    do; neither pushes the wrong way."""
+    """Across the rounding, the spring stores k w² / 2 and the damper takes c w ε̇, as at a sharp
+    edge.
+
+    Neither pushes in the wrong direction."""
     gear, width = timing_gear(), 3e-6
     nodes, weights = np.polynomial.legendre.leggauss(8)
     excess = width * (nodes + 1) / 2
@@ -668,8 +677,10 @@ def test_rounded_edges_of_the_gear_keep_their_integrals():
 
 
 def test_no_root_is_lost_on_a_node():
-    """A root of T on a search node is found in compiled programs too: one lost grid point
-    put a spike of 2000 N into the force of this design (u near its least)."""
+    """A root of T on a search node is also found in compiled programs.
+
+    A single lost grid point put a peak of 2000 N into the force of this design, whose u is near its
+    minimum."""
     deepest = -0.00859830772827668
     first = -2 * np.sqrt(-deepest) - 0.02
     step = (np.pi / 6 - first) / 124
@@ -692,9 +703,11 @@ def test_no_root_is_lost_on_a_node():
 
 @pytest.mark.parametrize(("lobes", "tip"), [(2, 0.5), (2, 3.28), (3, 4.0)])
 def test_contact_beside_a_land_is_not_lost_between_nodes(lobes, tip):
-    """Where the contact begins, the stretch of the flank on which it can be is far shorter than the
-    distance of the nodes; on a dense grid of normals it is seen. Lost, the contact began at a depth
-    of 1 µm, and the gradient of the mean force was 3e-3 off."""
+    """The search finds contacts that a dense grid of normals finds.
+
+    At the start of contact, the flank segment that can touch is far shorter than the distance
+    between nodes. If the contact were missed, it would start at a depth of 1 µm, and the gradient
+    of the mean force would be wrong by 3e-3."""
     profile = cic(lobes, 0.67, 0.5, tip * DEG)
     pair = FlankPair.of(profile)
     low, high = float(profile.segments()[0].stop), float(pair.nodes.normal[-1])

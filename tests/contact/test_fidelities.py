@@ -1,4 +1,4 @@
-"""First-order contact and the paper's node-against-segment contact. SI units throughout."""
+"""Tests of first-order contact and of the paper's node-against-segment contact (SI units)."""
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ COUNT = 600
 
 
 def cic(lobes, alpha, fraction, tip):
-    """CIC with u given as a fraction of u_max."""
+    """Return a CIC profile with u given as a fraction of u_max."""
     longest = R * np.sin(alpha) * (np.pi / (2 * lobes) - tip)
     return CIC(lobes, R, alpha, fraction * longest, tip)
 
@@ -50,19 +50,19 @@ every_fidelity = pytest.mark.parametrize("build", FIDELITIES.values(), ids=FIDEL
 
 @eqx.filter_jit
 def built(build, profile):
-    """The contact of a profile, made in one compiled program."""
+    """Return the contact of a profile, made in one compiled program."""
     return build(profile)
 
 
 @eqx.filter_jit
 def evaluate(contact, rolls, relatives):
-    """Gap, lever1, lever2 at many poses."""
+    """Return gap, lever1, lever2 at many poses."""
     return jax.vmap(contact)(jnp.asarray(rolls), jnp.asarray(relatives))
 
 
 @eqx.filter_jit
 def slopes(contact, rolls, relatives):
-    """∂G/∂x and ∂G/∂ε at many poses."""
+    """Return ∂G/∂x and ∂G/∂ε at many poses."""
     gradient = jax.jacfwd(lambda x, e: contact(x, e)[0], (0, 1))
     return jax.vmap(gradient)(jnp.asarray(rolls), jnp.asarray(relatives))
 
@@ -73,13 +73,13 @@ def _search(profile, rolls, relatives):
 
 
 def search(profile, rolls, relatives):
-    """The reference: gap, lever1, lever2."""
+    """Return the reference: gap, lever1, lever2 of the search."""
     found = _search(profile, rolls, relatives)
     return np.stack([found.gap, found.lever1, found.lever2])
 
 
 def poses(lobes, seed, deepest=-4e-4):
-    """Random poses over the flank and a little more, penetrating or not."""
+    """Return random poses over the flank and a little more, with and without penetration."""
     rng = np.random.default_rng(seed)
     return rng.uniform(-0.1, np.pi / lobes + 0.1, COUNT), deepest * rng.uniform(0, 1, COUNT)
 
@@ -95,7 +95,7 @@ def test_normal_at_inverts_the_roll_angle(profile):
 
 
 def test_involute_is_preferred_where_the_roll_angle_turns_back():
-    """u > u_max: ψ = α from the involute's start on, which lies before the arc's."""
+    """For u > u_max, ψ = α from the start of the involute, which lies before the end of the arc."""
     start, tip = float(PAPER.involute_start), float(PAPER.tip_arc_angle)
     assert start < tip
     beta = jnp.linspace(start, tip, 21)
@@ -106,7 +106,7 @@ def test_involute_is_preferred_where_the_roll_angle_turns_back():
 
 
 def test_arc_shrinks_to_an_instant_as_its_center_nears_the_pitch_circle():
-    """c → r: the arc's normals are met within a roll angle that tends to zero."""
+    """As c → r, the arc's normals mesh within a roll angle that tends to zero."""
     for short in (1e-3, 1e-6, 1e-9):
         profile = cic(3, 0.62, 1 - short, 0.06)
         start, stop = float(profile.tip_arc_angle), float(profile.involute_start)
@@ -125,7 +125,7 @@ def test_arc_shrinks_to_an_instant_as_its_center_nears_the_pitch_circle():
 @every_fidelity
 @every_profile
 def test_levers_are_the_derivatives_of_the_gap(build, profile):
-    """d gap = -lever1 dφ1 + lever2 dφ2: by JAX, and by central differences off the joints."""
+    """d gap = -lever1 dφ1 + lever2 dφ2, by JAX and, away from joints, by central differences."""
     contact = built(build, profile)
     rolls, relatives = poses(profile.lobes, 1)
     gap, lever1, lever2 = (np.asarray(v) for v in evaluate(contact, rolls, relatives))
@@ -145,7 +145,7 @@ def test_levers_are_the_derivatives_of_the_gap(build, profile):
 @every_fidelity
 @every_profile
 def test_flanks_swap_under_exchange_of_the_rotors(build, profile):
-    """x → π/N - x exchanges the rotors: same gap, levers swapped; 2π/N is a period."""
+    """x → π/N - x exchanges the rotors: same gap, exchanged levers. 2π/N is a period."""
     contact = built(build, profile)
     rolls, relatives = poses(profile.lobes, 2)
     whole = np.pi / profile.lobes
@@ -169,8 +169,9 @@ SPECIAL = [
 
 @eqx.filter_jit
 def _derivatives(design, rolls, relatives, weights, build):
-    """Derivatives of the outputs at every pose in (α, u, θ1, shift of x, shift of ε), and by
-    reverse mode those of their weighted sum."""
+    """Return the derivatives of the outputs in (α, u, θ1, shift of x, shift of ε) at every pose.
+
+    Also return, by reverse mode, those of their weighted sum."""
 
     def outputs(inputs):
         contact = build(CIC(3, R, inputs[0], inputs[1], inputs[2]))
@@ -181,7 +182,7 @@ def _derivatives(design, rolls, relatives, weights, build):
 
 
 def special_poses(profile, rng):
-    """Design, roll and ε at joints, at the ends of contact, beside them and at random."""
+    """Return design, roll and ε at joints, at the ends of contact, beside them and at random."""
     half = profile.half_pitch
     joints = [0.0, float(profile.tip_arc_angle), float(profile.involute_start), half]
     joints += [2 * half - j for j in joints] + [-half, 3 * half]
@@ -196,7 +197,8 @@ def special_poses(profile, rng):
     "build", [LinearContact.of, pytest.param(nodes_100, marks=pytest.mark.long)]
 )
 def test_derivatives_are_finite_and_equal_in_both_modes(build):
-    """In pose and design, inside contact and outside it, with c < r, c = r and c > r."""
+    """Derivatives in pose and design are finite inside and outside contact, for c < r, c = r and c
+    > r."""
     rng = np.random.default_rng(3)
     for profile in SPECIAL:
         design, rolls, relatives = special_poses(profile, rng)
@@ -217,7 +219,8 @@ def test_derivatives_are_finite_and_equal_in_both_modes(build):
     relative=st.floats(-0.3, 0.3),
 )
 def test_any_pose_gives_finite_numbers(build, index, roll, relative):
-    """Gap, levers and slopes; no contact means levers of zero and the pitch radius."""
+    """Gap, levers and slopes are finite. Without contact, levers are 0 and the gap is the pitch
+    radius."""
     contact = built(build, SPECIAL[index])
     gap, lever1, lever2 = evaluate(contact, np.full(1, roll), np.full(1, relative))
     assert np.all(np.isfinite(slopes(contact, np.full(1, roll), np.full(1, relative))))
@@ -231,7 +234,7 @@ def test_any_pose_gives_finite_numbers(build, index, roll, relative):
 
 @every_profile
 def test_linear_error_is_of_second_order_in_relative_rotation(profile):
-    """Gap against the search: order 2 in ε, and order 1 for the levers, off the joints."""
+    """Against the search, the gap has order 2 in ε and the levers order 1, away from joints."""
     contact = LinearContact.of(profile)
     half = profile.half_pitch
     start, stop = 0.0, half
@@ -252,7 +255,7 @@ def test_linear_error_is_of_second_order_in_relative_rotation(profile):
 
 
 def test_linear_is_exact_on_the_involute():
-    """Involute on involute: gap r cos α · ε, both levers the base radius."""
+    """Where involute meets involute, the gap is r cos α · ε and both levers are the base radius."""
     profile = PAPER
     start, half = float(profile.involute_start), float(profile.half_pitch)
     rolls = np.resize(np.linspace(start + 0.02, 2 * half - start - 0.02, 31), COUNT)
@@ -263,7 +266,7 @@ def test_linear_is_exact_on_the_involute():
 
 
 def test_linear_contact_begins_at_the_end_of_the_land():
-    """Before it nothing touches; the depth starts from zero unless c ≥ r."""
+    """Before the land's end nothing touches; the depth starts from zero unless c ≥ r."""
     profile = PROFILES["three lobes"]
     tip = float(profile.tip_arc_angle)
     rolls = np.resize([tip - 1e-3, tip, tip + 1e-7, -0.1], COUNT)
@@ -283,7 +286,7 @@ def _by_nodes(profile, count, rolls, relatives):
 
 @few_profiles
 def test_node_error_is_of_second_order_in_spacing(profile):
-    """Gap against the search over nodes per flank: order 2, and order 1 for the levers."""
+    """Against the search, the gap has order 2 in the node spacing and the levers order 1."""
     rolls, relatives = poses(profile.lobes, 4)
     exact = search(profile, rolls, relatives)
     deep = exact[0] < -1e-6
@@ -294,7 +297,7 @@ def test_node_error_is_of_second_order_in_spacing(profile):
         found = np.asarray(_by_nodes(profile, count, jnp.asarray(rolls), jnp.asarray(relatives)))
         errors.append(np.sqrt(np.mean((found - exact)[:, deep] ** 2, axis=1)))
     order = -np.polyfit(np.log(counts), np.log(errors), 1)[0]
-    # EE falls a little slower: the sharp spot at its pitch point takes over.
+    # The error of EE falls a little slower, because its cusp at the pitch point dominates.
     assert 1.6 < order[0] < 2.2
     assert np.all((order[1:] > 0.8) & (order[1:] < 1.5))
     assert errors[-1][0] < 2e-7
@@ -302,8 +305,9 @@ def test_node_error_is_of_second_order_in_spacing(profile):
 
 @pytest.mark.parametrize("profile", [PAPER, PROFILES["ee three"]])
 def test_node_gap_is_continuous(profile):
-    """Steps of the depth shrink with those of the roll, at the ends of the contact too: with
-    the levers as its derivatives, the gap is then a potential's."""
+    """Steps of the depth shrink with those of the roll, also at the ends of contact.
+
+    The levers are derivatives of the gap, which is therefore a potential."""
     contact = built(nodes_100, profile)
     steps = 24001
     rolls = np.linspace(-0.06, np.pi / profile.lobes + 0.06, steps)
@@ -315,11 +319,11 @@ def test_node_gap_is_continuous(profile):
 
 @every_profile
 def test_levers_of_nodes_belong_to_one_line(profile):
-    """Both levers are those of one normal: their sum is at most the centre distance."""
+    """Both levers belong to one normal: their sum is at most the centre distance."""
     rolls, relatives = poses(profile.lobes, 5, deepest=-0.01)
     contact = built(nodes_100, profile)
     gap, lever1, lever2 = (np.asarray(v) for v in evaluate(contact, rolls, relatives))
-    # Shallower than a node's protrusion flanks may touch that have not come to mesh.
+    # At depths below a node's protrusion, flanks may touch that do not mesh yet.
     touch = gap < -1e-6
     assert np.all(lever1[touch] + lever2[touch] <= 2 * R)
     assert np.all(lever1[touch] + lever2[touch] > 0)
@@ -327,8 +331,10 @@ def test_levers_of_nodes_belong_to_one_line(profile):
 
 @pytest.mark.parametrize("profile", [*PROFILES.values(), EE(2, R)])
 def test_nodes_ahead_are_ahead(profile):
-    """What the bisection stands on: seen from any node, along the bisector at any other,
-    those nearer the tip lie behind and those nearer the root ahead."""
+    """The assumption of the bisection holds.
+
+    Seen from any node along the bisector at any other node, the nodes nearer to the tip lie behind
+    and those nearer to the root ahead."""
     contact = built(nodes_200, profile)
     for nodes, tangent in zip(contact.nodes, contact.tangent, strict=True):
         ahead = np.einsum("ijk,jk->ij", nodes[:, None] - nodes[None], tangent)
@@ -356,7 +362,8 @@ def test_single_precision_is_kept(build):
 
 @few_profiles
 def test_edges_of_linear_contact(profile):
-    """Their distance is continuous with the stated slope, and has a kink wherever the gap jumps."""
+    """The distance from the edges is continuous with the stated slope, with a kink at each jump of
+    the gap."""
     contact = built(LinearContact.of, profile)
     rolls = np.linspace(-0.1, np.pi / profile.lobes + 0.1, 4001)
 

@@ -1,4 +1,4 @@
-"""The contact law on its own: a single impact, its laws of scale, and restitution."""
+"""Tests of the contact law alone: a single impact, its scaling laws, and restitution."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,8 @@ def law(stiffness=K, exponent=E, damping=C):
 
 
 def impact(law):
-    """Restitution, peak force (N), penetration (m), duration (s) of a mass against a wall."""
+    """Return restitution, peak force (N), penetration (m) and duration (s) of a mass hitting a
+    wall."""
     force = jax.jit(law.__call__)
 
     def slope(_, state):
@@ -52,8 +53,10 @@ def test_a_single_impact_is_that_of_the_stated_law():
 
 @pytest.mark.parametrize("exponent", [1.0, 1.5, 2.2])
 def test_the_undamped_peak_scales_with_stiffness_and_speed(exponent):
-    """d ln F / d ln K = 1 / (n + 1), d ln F / d ln v = 2n / (n + 1), by automatic differentiation:
-    the implicit function theorem on the energy balance of the law as it is implemented."""
+    """d ln F / d ln K = 1 / (n + 1) and d ln F / d ln v = 2n / (n + 1), by automatic
+    differentiation.
+
+    The implicit function theorem is applied to the energy balance of the implemented law."""
 
     def balance(depth, stiffness, speed):
         bare = law(stiffness, exponent, 0.0)

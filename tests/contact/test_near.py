@@ -104,7 +104,7 @@ def test_root_at_the_end_of_a_segment_has_one_slope():
     flanks = FlankPair.of(CIC(3, 0.033, np.radians(34.85), 3.956e-3, np.radians(3.29)))
     relative = jnp.asarray(-1.135e-3)
     end = flanks.profile.segments()[1].stop
-    offset = eqx.filter_jit(flanks._offset)
+    offset = eqx.filter_jit(lambda *at: flanks._mesh(*at)[0])
     roll = brentq(lambda x: float(offset(end, jnp.asarray(x), relative)), 0.2, 0.4, xtol=1e-15)
     at = eqx.filter_jit(
         lambda roots: NearContact(flanks, roots).approach(jnp.asarray(roll), relative)

@@ -36,8 +36,10 @@ def forces(name, *changes):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_default_smoothing_does_not_change_the_forces(name):
-    """Mean, peak and RMS force by less than 1e-4; experiments/smoothing has many more scenes.
-    Half the length takes away at least half of a bias that falls in proportion or faster."""
+    """Mean, peak and RMS force change by less than 1e-4; experiments/smoothing has many more
+    scenes.
+
+    Half the length removes at least half of a bias that falls in proportion or faster."""
     default, length = forces(name)
     half, _ = forces(name, f"contact.smoothing_mm={length / 2!r}")
     np.testing.assert_allclose(half, default, rtol=LIMIT / 2)
@@ -48,8 +50,9 @@ def length_of(*changes):
 
 
 def test_smoothing_length_follows_the_scene():
-    """1e-4 mm in all shipped scenes; less where the load twists the gear little, or dents the
-    flanks little; what is given stands, and the resolved config has the number."""
+    """The length is 1e-4 mm in all shipped scenes, and less where gear or flanks deflect little.
+
+    A given length is kept, and the resolved config contains the number."""
     shipped = sorted(Path("configs").glob("*.yaml"))
     assert len(shipped) >= 6
     assert {load(path).contact.rounding_mm for path in shipped} == {1e-4}

@@ -1,4 +1,4 @@
-"""Curves followed through folds, and periodic orbits of the rotor pair among them."""
+"""Tests of curves followed through folds, and of periodic orbits of the rotor pair."""
 
 import csv
 import dataclasses
@@ -15,7 +15,7 @@ from rootsopt.config import load
 from rootsopt.continuation.arclength import (
     CORNER,
     End,
-    Look,
+    Linearization,
     StepSizes,
     StoppedError,
     corrected,
@@ -30,7 +30,7 @@ from rootsopt.continuation.branch import (
     value_of,
     with_value,
 )
-from rootsopt.continuation.orbits import Orbits, _longest_gap
+from rootsopt.continuation.orbits import OrbitFamily, _longest_gap
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
@@ -39,10 +39,10 @@ from rootsopt.status import Status
 
 
 def curve_of(residual, jacobian):
-    """A curve of one equation in (x, parameter)."""
+    """Return a curve of one equation in (x, parameter)."""
 
     def look(place, memory, careful):
-        return Look(np.array([residual(*place)]), np.array([jacobian(*place)]))
+        return Linearization(np.array([residual(*place)]), np.array([jacobian(*place)]))
 
     return look
 
@@ -57,7 +57,7 @@ def start_of(curve, x, p, way=1.0):
 
 
 def test_circle_is_closed_with_a_fold_on_either_side():
-    """Every point lies on the circle, both folds are at ±1, and the curve ends at its start."""
+    """Every point lies on the circle, the folds are at ±1, and the curve ends at its start."""
     path = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), StepSizes(-2, 2, 0.02, 1e-6, 0.1), FOLD)
     assert path.end is End.CLOSED
     places = np.array([spot.place for spot in path.spots])
@@ -70,7 +70,7 @@ def test_circle_is_closed_with_a_fold_on_either_side():
 
 
 def test_cubic_passes_both_folds_to_the_end_of_the_range():
-    """λ = x - x³ folds at x = ±1/√3; three points at λ = 0 are on one curve."""
+    """λ = x - x³ has folds at x = ±1/√3; three points at λ = 0 are on one curve."""
     path = follow_curve(CUBIC, start_of(CUBIC, -1.4, 1.3, -1), StepSizes(-1.5, 1.5), FOLD)
     assert path.end is End.RANGE_END
     assert path.spots[-1].place[-1] == -1.5
@@ -85,7 +85,7 @@ def test_cubic_passes_both_folds_to_the_end_of_the_range():
 
 
 def test_steps_follow_the_rate_of_convergence():
-    """StepSizes grow to the greatest on a straight stretch."""
+    """Steps grow to the maximum on a straight stretch."""
     line = curve_of(lambda x, p: x - p, lambda x, p: [1.0, -1.0])
     path = follow_curve(line, start_of(line, 0.0, 0.0), StepSizes(-1, 1, 1e-3, 1e-6, 0.05))
     strides = [np.linalg.norm(b.place - a.place) for a, b in itertools.pairwise(path.spots)]
@@ -94,7 +94,8 @@ def test_steps_follow_the_rate_of_convergence():
 
 
 def test_ends_are_named():
-    """Too many points, a curve that stops, a start that leaves the range at once."""
+    """A curve ends after too many points, where it stops, and if its start leaves the range at
+    once."""
     few = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), StepSizes(-2, 2, points=7))
     assert (few.end, len(few.spots)) == (End.MAX_POINTS, 7)
 
@@ -114,7 +115,8 @@ def test_ends_are_named():
 
 
 def test_a_corner_is_passed():
-    """λ = -|x| turns by a right angle; the curve is found again beyond, and the corner noted."""
+    """λ = -|x| turns by a right angle; the curve is found again beyond the corner, which is
+    recorded."""
     roof = curve_of(lambda x, p: p + abs(x), lambda x, p: [np.sign(x), 1.0])
     path = follow_curve(roof, start_of(roof, -1.0, -1.0), StepSizes(-2, 1), FOLD)
     assert path.end is End.RANGE_END
@@ -157,7 +159,7 @@ def config_at(speed):
 
 @pytest.fixture(scope="module")
 def branch():
-    """Orbits over speed, from a stable one at 4000 rpm on."""
+    """Return orbits over speed, beginning with a stable one at 4000 rpm."""
     config = config_at(4000.0)
     found = Evaluator.of(config)(start=np.array(START), series=False)
     assert found.status is Status.PERIODIC
@@ -166,11 +168,11 @@ def branch():
 
 
 def test_points_agree_with_orbits_closed_for_themselves(branch):
-    """Mean, peak and RMS of stable points are those an `Evaluator` finds, started nearby.
+    """Mean, peak and RMS of stable points agree with those of an `Evaluator` started nearby.
 
-    So is the greatest multiplier. Beside a grazing touch, such as near the fold, it changes with
-    the square root of the state's error: there it must lie among those of the neighbouring points.
-    """
+    The greatest multiplier agrees as well. Next to a grazing touch, such as near the fold, it
+    changes with the square root of the state's error. There it must lie among those of the
+    neighbouring points."""
     stable = [point for point in branch.points if point.stable]
     sizes = [np.max(np.abs(point.multipliers)) for point in stable]
     steady = 0
@@ -185,7 +187,7 @@ def test_points_agree_with_orbits_closed_for_themselves(branch):
             steady += 1
             assert sizes[number] == pytest.approx(largest, rel=1e-5)
         else:
-            assert min(near) < largest < max(near)
+            assert min(near) * (1 - 1e-5) < largest < max(near) * (1 + 1e-5)
         np.testing.assert_allclose(point.state, alone.state, atol=1e-6, rtol=0)
     assert steady >= 2
 
@@ -197,7 +199,7 @@ def test_every_point_is_closed(branch):
 
 
 def test_branch_turns_back_at_folds(branch):
-    """A multiplier is +1 there, stability is lost, and several orbits share one speed."""
+    """At a fold, a multiplier is +1 and stability is lost; several orbits have the same speed."""
     folds = [one for one in branch.bifurcations if one.kind is Kind.FOLD]
     assert len(folds) == 2
     for fold in folds:
@@ -220,11 +222,13 @@ def test_branch_turns_back_at_folds(branch):
 @pytest.mark.parametrize("parameter", ["speed_rpm", "torque_N_m", "backlash_mm", "damping_ratio",
                                        "involute_length_mm"])  # fmt: skip
 def test_derivatives_are_those_of_finite_differences(branch, parameter):
-    """The Jacobian, by state (the monodromy) and by the parameter, on repeated steps."""
+    """The Jacobian with respect to state (monodromy matrix) and parameter agrees with differences.
+
+    All are computed on repeated steps."""
     point = branch.at(4000.0)[0]
     config = config_at(4000.0)
     value = value_of(config, parameter)
-    orbits = Orbits(config, parameter, 1, StepSizes(0.9 * value, 1.0 * value + 1e-3))
+    orbits = OrbitFamily(config, parameter, 1, StepSizes(0.9 * value, 1.0 * value + 1e-3))
     place = orbits.place(point.state, value)
     fixed = np.eye(3)[-1]
     spot = corrected(orbits, place, fixed, fixed)
@@ -243,7 +247,7 @@ def test_derivatives_are_those_of_finite_differences(branch, parameter):
 
 
 def test_units_of_the_state_are_those_of_each_config(branch):
-    """Where the scale of the angle changes with the parameter, states can still be started from."""
+    """States can be used as a start even if the scale of the angle changes with the parameter."""
     point = branch.at(4000.0)[0]
     config = config_at(4000.0)
     other = follow(config, "backlash_mm", point.state, 1, StepSizes(0.19, 0.21), ways=(-1,))
@@ -256,8 +260,9 @@ def test_units_of_the_state_are_those_of_each_config(branch):
 
 
 def test_period_doubling_leads_to_the_doubled_orbit(branch, monkeypatch):
-    """Below 3651 rpm the orbit is unstable and one of twice the period is born; it is found on the
-    other side where the first gives none."""
+    """Below 3651 rpm the orbit is unstable, and one of twice the period is born.
+
+    It is found on the other side if the first side gives none."""
     lowest = min((p for p in branch.at(3900.0) if p.stable), key=lambda p: p.peak)
     below = follow(
         config_at(3900.0), "speed_rpm", lowest.state, 1, StepSizes(3600, 4000), ways=(-1,)
@@ -278,7 +283,9 @@ def test_period_doubling_leads_to_the_doubled_orbit(branch, monkeypatch):
 
     monkeypatch.setattr("rootsopt.continuation.branch.corrected", one_side)
     doubled = follow_doubled(below, doubling, StepSizes(3600, 4000, points=6))
-    assert asked == [1, 2, 2]
+    # The sign of the eigenvector depends on the machine; one side may fail at the first distance.
+    assert asked[:3] == [1, 2, 2]
+    assert set(asked[3:]) <= {2}
     assert np.linalg.norm(sides[1]) == pytest.approx(1)
     np.testing.assert_array_equal(sides[2], -sides[1])
     assert doubled is not None
@@ -311,7 +318,7 @@ def test_wrong_input_is_explained(branch):
 
 
 def test_a_design_ends_where_no_profile_can_be_made(branch):
-    """The involute cannot grow longer than the roll angle allows."""
+    """The branch ends where the roll angle allows no longer involute."""
     config = config_at(4000.0)
     state = branch.at(4000.0)[0].state
     path = follow(config, "involute_length_mm", state, 1, StepSizes(8.9, 9.5), ways=(1,))
@@ -328,7 +335,7 @@ def test_longest_gap_goes_around():
 
 @pytest.mark.long
 def test_experiment(tmp_path):
-    """The quick run finds a fold with two stable orbits beside it, and writes its files."""
+    """The reduced run finds a fold with two stable orbits beside it, and writes its files."""
     command = [sys.executable, "-m", "experiments.bifurcation", "--quick", "-o", str(tmp_path)]
     environment = os.environ | {"JAX_PLATFORMS": "cpu"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)

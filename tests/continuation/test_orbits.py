@@ -1,4 +1,4 @@
-"""Steps and gaps of a continued orbit, from shots made by hand."""
+"""Tests of steps and gaps of a continued orbit, from made-up integrations."""
 
 import types
 
@@ -13,8 +13,10 @@ from rootsopt.dynamics.measures import Measures
 
 
 def test_long_steps_of_an_orbit_are_divided():
-    """No step of a continued orbit is longer than 1/256 mesh period and a quarter, the ends there
-    were stay, and none is added within a quarter of another, or beyond the orbit."""
+    """No step of a continued orbit is longer than 1/256 mesh period and a quarter.
+
+    Existing step ends are kept. No step end is added within a quarter of another one, or beyond the
+    orbit."""
     given = np.array([0.3 / 256, 2.1 / 256, 0.1, 0.1001, 1.0, 1.5])
     grid = np.concatenate([given, np.full(1024 - len(given), np.inf)])
     made = np.asarray(orbits._without_long(jnp.asarray(grid), jnp.asarray(1.5)))
@@ -31,7 +33,7 @@ def test_long_steps_of_an_orbit_are_divided():
 
 @pytest.mark.parametrize("period", [1, 3])
 def test_longest_gap_of_an_orbit_is_in_mesh_periods(monkeypatch, period):
-    """A quarter of an orbit of k mesh periods without a touch lasts k/4 of them."""
+    """A quarter of an orbit of k mesh periods without a touch lasts k/4 mesh periods."""
     touching = np.ones(504, bool)
     touching[100:226] = False
     out = Flow.empty(2, 1, 4, 4, Measures(), jnp.zeros(0).dtype)._replace(
@@ -40,12 +42,12 @@ def test_longest_gap_of_an_orbit_is_in_mesh_periods(monkeypatch, period):
         states=np.array([[0.4, -0.2], [0.6, 0.1], [-0.7, 0.3], [0.2, 0.2]]),
     )  # fmt: skip
     shot = orbits._Shot(out, np.zeros(4), np.asarray(False), touching, np.asarray(2e-3))
-    subject = object.__new__(orbits.Orbits)
+    subject = object.__new__(orbits.OrbitFamily)
     subject.period, subject.unit, subject.width = period, 1e-3, 200.0
     subject.limits = StepSizes(100.0, 300.0)
     subject.scene = types.SimpleNamespace(fidelity="search", pitch_radius=0.033)
-    monkeypatch.setattr(orbits.Orbits, "_check_design", lambda self, value: None)
-    monkeypatch.setattr(orbits.Orbits, "_shot", lambda self, *args, **options: shot)
+    monkeypatch.setattr(orbits.OrbitFamily, "_check_design", lambda self, value: None)
+    monkeypatch.setattr(orbits.OrbitFamily, "_shot", lambda self, *args, **options: shot)
     look = subject(np.array([0.4, -0.2, 0.5 * orbits.SPAN]) / orbits.SPAN, None, False)
     seen = look.data
     assert seen.gap_time == pytest.approx(period / 4)

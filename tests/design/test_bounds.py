@@ -1,4 +1,4 @@
-"""Default ranges of the design parameters."""
+"""Tests of the default ranges of the design parameters."""
 
 import pytest
 
@@ -6,8 +6,9 @@ from rootsopt.config.families import Parameter, parameters
 
 
 def test_ranges_of_parameters_that_a_config_leaves_open():
-    """Lengths go with the pitch radius, the tip land with the lobe pitch, and every other one has
-    the range of its kind; no length is negative."""
+    """Lengths scale with the pitch radius and the tip land with the lobe pitch.
+
+    Every other parameter has the range of its kind; no length is negative."""
     other = Parameter("some_other_angle_deg", "an angle", 0, 180)
     expected = {
         "arc_center_mm": (15.0, 29.97),

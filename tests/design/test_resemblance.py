@@ -1,4 +1,4 @@
-"""Likeness of profiles: the distance is the true one, and no optimiser finds a nearer member."""
+"""Tests of resemblance: the distance is correct, and no optimiser finds a nearer member."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,20 +25,21 @@ PROFILES = {
 
 
 def polygon(profile, points=1500):
-    """Closed outline (m) with a vertex about every 20 µm."""
+    """Return the closed outline (m) with a vertex about every 20 µm."""
     return np.asarray(outline(profile, points))
 
 
 def hausdorff(one, other):
-    """Hausdorff distance (m) of closed polygons by their vertices alone, with no code shared.
+    """Return the Hausdorff distance (m) of closed polygons from their vertices alone.
 
-    A vertex on a step `h` of the other polygon is at most h² / 8d too far, d the distance."""
+    No code is shared with the package. If the other polygon has steps `h`, the distance of a vertex
+    is too great by at most h² / 8d, where d is the distance."""
     there = KDTree(one).query(other)[0].max()
     return max(there, KDTree(other).query(one)[0].max())
 
 
 def denser(points):
-    """Closed polygon with twelve vertices in place of each one, on the same edges."""
+    """Return a closed polygon with twelve vertices in place of each one, on the same edges."""
     places = np.arange(12 * len(points) - 11) / 12
     return np.stack([np.interp(places, np.arange(len(points)), x) for x in points.T], axis=1)
 
@@ -61,9 +62,10 @@ def test_departure_is_the_hausdorff_distance_of_the_closed_outlines(pair):
 
 
 def test_smooth_feet_see_the_curve_and_not_its_chords():
-    """Points inside and outside a circle of few vertices; signs and directions, too.
+    """Distances are those from the curve, for points inside and outside a circle of few vertices.
 
-    Up to an eighth of the squared turn of a segment, times the distance."""
+    Signs and directions are correct too. The error is at most an eighth of the squared turn of a
+    segment, times the distance."""
     angle = np.linspace(0, 1, 12)
     line = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     at = np.linspace(0.2, 0.8, 30)
@@ -84,7 +86,7 @@ def test_flanks_are_continued_by_their_mirror_images():
 
 
 def test_members_of_a_family_are_found_again():
-    """Parameters within 1e-3 of their size, distance below a tenth of a micrometre."""
+    """Parameters are found to 1e-3 of their size; the distance is below 0.1 µm."""
     found = likeness(PROFILES["cic"], "cic")
     assert found is not None
     assert list(found.design.values()) == pytest.approx([36.43, 8.5, 4.0], rel=1e-3)
@@ -93,7 +95,9 @@ def test_members_of_a_family_are_found_again():
 
 
 def test_no_optimiser_finds_a_nearer_member():
-    """Nelder and Mead's search from the found member and beside it, by the independent distance."""
+    """Nelder and Mead's search, from the found member and beside it, finds no nearer one.
+
+    It uses the independent distance."""
     target = denser(polygon(PROFILES["ellipse"], 300))
     found = likeness(PROFILES["ellipse"], "cic")
     assert found is not None
@@ -113,7 +117,8 @@ def test_no_optimiser_finds_a_nearer_member():
 
 
 def test_free_form_comes_closer(monkeypatch):
-    """To a projection of twelve coefficients, within 0.1 µm; beginning from a neighbour, too."""
+    """A free form of twelve coefficients comes within 0.1 µm of a projection, also from a
+    neighbour."""
     monkeypatch.setattr(resemblance, "_PROGRAMS", 12)
     target = project(PROFILES["arc"], 12)
     near = likeness(target, "arc")

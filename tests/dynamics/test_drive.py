@@ -1,4 +1,4 @@
-"""The drives: a motor's torque-speed line, and what its freedom changes of time and averages."""
+"""Tests of the drives: a motor's characteristic, and its effect on time and averages."""
 
 import equinox as eqx
 import jax
@@ -31,14 +31,14 @@ def test_a_motor_without_torque_of_its_own_balances_the_load():
 
 
 def test_time_passes_as_the_rotor_turns():
-    """dt/dτ is the mesh period over the speed's ratio, and a mesh period takes ∫ lapse dτ."""
+    """dt/dτ is the mesh period divided by the speed ratio; a mesh period takes ∫ lapse dτ."""
     pair, _ = pair_of(MOTOR)
     assert pair.states == 3
     share = pair.angle_scale / pair.mesh_period / pair.drive.speed
     state = jnp.asarray([0.1, -0.2, 0.02 / share])
     assert float(pair.speed(state)) == pytest.approx(1.02 * float(pair.drive.speed))
     assert float(pair.lapse(state)) == pytest.approx(1 / 1.02)
-    # A stalled motor creeps on, so that τ, and with it the integration, can go on to its end.
+    # A stalled motor keeps creeping, so that τ and the integration can reach their end.
     stalled = jnp.asarray([0.0, 0.0, -2 / share])
     assert bool(pair.stalled(stalled))
     assert bool(pair.lost(stalled))
@@ -49,7 +49,7 @@ def test_time_passes_as_the_rotor_turns():
 
 
 def test_inertia_of_a_motor_turns_with_rotor_1():
-    """Rotor 1 is sped up by the excess torque over both inertias, rotor 2 slowed by its load."""
+    """The excess torque accelerates rotor 1 with both inertias; the load decelerates rotor 2."""
     slope, torque, own, over = 0.2, 5.0, 7e-3, 4.0
     motor = MotorDrive(*(jnp.asarray(x) for x in (SPEED, torque, slope, own)))
     pair = oscillator(drive=motor, gear=None)

@@ -1,8 +1,7 @@
-"""The motion of a rotor pair: against SciPy, energy, virtual work, solvers, closed forms.
+"""Tests of the motion of a rotor pair against SciPy, energy, virtual work and closed forms.
 
-The reference below is written from the contract alone (NumPy and SciPy; outlines, gap by
-nearest points, contact law, timing gear and load are all its own).
-"""
+The reference below is written from the specification alone, in NumPy and SciPy. It has its own
+outlines, gap by nearest points, contact law, timing gear and load."""
 
 import diffrax
 import equinox as eqx
@@ -30,8 +29,9 @@ MESH = 2 * np.pi / LOBES
 
 
 def flank_points(profile, points):
-    """Points of half a lobe (complex, m) and their outward unit normals, from the paper's
-    Eqs. 1, 2, 7 in roll-angle form."""
+    """Return points of half a lobe (complex, m) and their outward unit normals.
+
+    They come from the paper's Eqs. 1, 2 and 7 in roll-angle form."""
     half = np.pi / (2 * LOBES)
     if profile.family == "ee":
         beta = np.linspace(0, half, 2 * points)
@@ -84,14 +84,15 @@ class Rotors:
         self.inertia = config.rotor.density_kg_m3 * config.rotor.length_mm * 1e-3 * moment
 
     def cubic(self, a):
-        """The curve from node `a` to the next: start, chord, and coefficients."""
+        """Return the curve from node `a` to the next: start, chord, and coefficients."""
         b = (a + 1) % len(self.nodes)
         chord = self.nodes[b] - self.nodes[a]
         m0, m1 = (1j * self.normals[i] * abs(chord) for i in (a, b))
         return self.nodes[a], chord, m0, 3 * chord - 2 * m0 - m1, m0 + m1 - 2 * chord
 
     def distance(self, w, refine=True):
-        """Signed distance of points `w` (rotor frame) from the outline, negative inside."""
+        """Return the signed distance of points `w` (rotor frame) from the outline, negative
+        inside."""
         nearest = self.tree.query(np.stack([w.real, w.imag], -1))[1]
         if not refine:
             return ((w - self.nodes[nearest]) * self.normals[nearest].conj()).real
@@ -110,7 +111,7 @@ class Rotors:
         return best
 
     def gap(self, phi, relative):
-        """Least signed distance (m) for one φ1 and an array of ε."""
+        """Return the least signed distance (m) for one φ1 and an array of ε."""
         turn1 = np.exp(1j * phi)
         turn2 = np.exp(-1j * (phi + relative + np.pi / LOBES))
         count = len(self.nodes)
@@ -145,7 +146,7 @@ class Rotors:
         return np.where(inside, d1 - tilt**2 / (4 * np.where(inside, bend, 1.0)), found.min(axis=0))
 
     def map(self, deepest, columns, rows=12):
-        """Gap spline over (φ1, ε) for each sign of ε: {-1: drive, +1: coast}."""
+        """Return a spline of the gap over (φ1, ε) for each sign of ε: {-1: drive, +1: coast}."""
         t = np.linspace(-0.12, MESH + 0.12, columns)
         # Where one flank hands over to the next (φ1 = 0 and half a mesh period) the gap
         # bends most.
@@ -184,7 +185,7 @@ class Reference:
         self.period = MESH / self.speed
 
     def force(self, time, relative, rate):
-        """Contact force (N) and its torque on rotor 2 (N·m)."""
+        """Return the contact force (N) and its torque on rotor 2 (N·m)."""
         assert np.all(abs(relative) < self.deepest)
         spline = self.splines[-1 if relative < 0 else 1]
         phi = self.speed * time % MESH
@@ -200,7 +201,7 @@ class Reference:
         return force, force * by_relative
 
     def slope(self, time, state):
-        """Of (ε, dε/dt, ∫F dt, ∫F² dt)."""
+        """Return the time derivatives of (ε, dε/dt, ∫F dt, ∫F² dt)."""
         relative, rate = state[:2]
         force, torque = self.force(time, relative, rate)
         torque -= self.load
@@ -210,7 +211,7 @@ class Reference:
         return [rate, torque / self.inertia, force, force**2]
 
     def run(self, periods, rtol=1e-9):
-        """Stroboscopic states, and (mean, peak, rms) of the last period."""
+        """Return stroboscopic states, and (mean, peak, RMS) of the last period."""
         state, states = np.zeros(4), []
         for k in range(periods):
             last = k == periods - 1
@@ -274,7 +275,7 @@ def statistics(out):
 
 
 def contact_at(pair, *pose):
-    """Flank contact at one pose of plain numbers."""
+    """Return the flank contact at one pose of plain numbers."""
     return jax.tree.map(lambda x: x[0], contacts_at(pair, *(jnp.asarray([p]) for p in pose)))
 
 
@@ -288,7 +289,7 @@ contacts_at = eqx.filter_jit(
 
 @pytest.fixture(scope="module")
 def references():
-    """Stroboscopic states and orbit statistics of the SciPy reference by family."""
+    """Return stroboscopic states and orbit statistics of the SciPy reference, by family."""
     found = {}
     for family in ("cic", "ee"):
         config = load(f"configs/{family}.yaml", ["contact.smoothing_mm=0"])
@@ -306,7 +307,7 @@ REACH = {"cic": (2e-4, 1e-3, 1e-3), "ee": (1e-5, 1e-4, 2e-4)}
     "scene", ["cic search", "cic map", pytest.param("ee map", marks=pytest.mark.long)]
 )
 def test_motion_and_force_are_those_of_an_independent_integration(scene, references):
-    """From ε = 0 the stroboscopic states, then mean, RMS and peak force, match SciPy's."""
+    """From ε = 0, stroboscopic states and mean, RMS and peak force agree with SciPy's."""
     pair, _ = pair_of(*SCENES[scene])
     family = scene.split()[0]
     reference, states, (mean, peak, rms) = references[family]
@@ -315,7 +316,7 @@ def test_motion_and_force_are_those_of_an_independent_integration(scene, referen
     expected = states * [1 / scale, reference.period / scale]
     found = run_strobe(pair, jnp.zeros(2), PERIODS, integrator())
     assert bool(found.solved)
-    # Otherwise closeness would be that of two standing pairs.
+    # Otherwise, two pairs at rest would agree as well.
     assert np.ptp(expected[:3, 0]) > 10 * state or np.ptp(expected[:3, 1]) > 10 * state
     np.testing.assert_allclose(found.states, expected, rtol=0, atol=state * np.ptp(expected))
     orbit = run_flow(pair, found.states[-1], integrator())
@@ -340,7 +341,8 @@ def test_reference_outline_and_inertia_are_those_of_the_package(family, referenc
 
 @eqx.filter_jit
 def powers(pair, state, how):
-    """End state and work (J) over one mesh period: drive, load, lost in flanks and gear."""
+    """Return end state and work (J) over one mesh period: drive, load, losses in flanks and
+    gear."""
     law = eqx.tree_at(lambda law: law.damping, pair.law, jnp.zeros(()))
     speed, gear = pair.drive.speed, pair.gear
 
@@ -375,7 +377,7 @@ def powers(pair, state, how):
 
 @pytest.mark.parametrize("path", ["configs/cic.yaml", "configs/ee.yaml"])
 def test_drive_work_is_load_work_plus_losses(path):
-    """Over a period of the steady orbit the drive's work is that of the load and the dampers."""
+    """Over a period of the steady orbit, the drive's work is that of load and dampers."""
     pair, _ = pair_of(path, ["solver.fidelity=search"])
     state = jnp.zeros(2)
     for _ in range(12):
@@ -401,7 +403,7 @@ rates = st.floats(-5.0, 5.0)
 
 @pytest.fixture(scope="module", params=["search", "map"])
 def touching(request):
-    """A CIC pair per fidelity, its map deep enough for the states drawn here."""
+    """Return a CIC pair for each fidelity, with a map deep enough for the states drawn here."""
     fidelity = [f"solver.fidelity={request.param}", "solver.map_rolls=256"]
     return pair_of("configs/cic.yaml", fidelity, deepest=-1e-2)[0]
 
@@ -423,7 +425,7 @@ def test_torques_are_the_virtual_work_of_one_force(touching, phi, side, size, ra
     by1 = (depth(step, 0) - depth(-step, 0)) / (2 * step)
     by2 = (depth(0, step) - depth(0, -step)) / (2 * step)
     speed = float(pair.drive.speed)
-    # Levers bend at segment ends: an error of step times r, doubled for the difference.
+    # Levers have kinks at segment ends: an error of step times r, twice in the difference.
     lever = 4 * step * R
     assert float(contact.torque1) == pytest.approx(-force * by1, abs=force * lever)
     assert float(contact.torque2) == pytest.approx(-force * by2, abs=force * lever)
@@ -433,7 +435,8 @@ def test_torques_are_the_virtual_work_of_one_force(touching, phi, side, size, ra
 
 
 def test_force_is_one_sided_and_finite(touching):
-    """Never adhesive, never on both flanks, none without penetration, finite at extremes."""
+    """The force is never adhesive, never on both flanks, 0 without penetration, and always
+    finite."""
     rng = np.random.default_rng(3)
     count = 4000
     phi = rng.uniform(-10, 10, count)
@@ -461,7 +464,7 @@ def test_force_is_one_sided_and_finite(touching):
 
 
 def test_clearance_is_added_to_the_gap(touching):
-    """A clearance takes exactly itself off the depth."""
+    """A clearance reduces the depth by exactly its size."""
     pose = 1.5, -3e-3, 0.2
     loose = eqx.tree_at(lambda p: p.clearance, touching, jnp.asarray(2e-5))
     tight, slack = contact_at(touching, *pose), contact_at(loose, *pose)
@@ -470,7 +473,7 @@ def test_clearance_is_added_to_the_gap(touching):
 
 
 def test_mirrored_motion_touches_the_other_flank(touching):
-    """Mirrored about the line of centres a drive contact is a coast contact of equal force."""
+    """Mirrored in the line of centres, a drive contact is a coast contact with the same force."""
     rng = np.random.default_rng(4)
     pose = [rng.uniform(0, MESH, 200), rng.uniform(-6e-3, -1e-5, 200), rng.normal(0, 2, 200)]
     pose = [jnp.asarray(p) for p in pose]
@@ -486,7 +489,7 @@ def test_mirrored_motion_touches_the_other_flank(touching):
 
 
 def equations(jaxpr):
-    """Number of equations, those of inner programs included."""
+    """Return the number of equations, including those of inner programs."""
     total = 0
     for equation in jaxpr.eqns:
         total += 1
@@ -500,7 +503,7 @@ def equations(jaxpr):
 
 
 def test_an_absent_gear_costs_nothing():
-    """Without timing gear the program has two states, fewer equations and no gear numbers."""
+    """Without a timing gear, the program has two states, fewer equations and no gear numbers."""
     geared, config = pair_of("configs/cic.yaml")
     bare = eqx.tree_at(lambda p: p.gear, geared, None)
     programs = []
@@ -532,7 +535,7 @@ def test_an_absent_gear_costs_nothing():
 
 @pytest.fixture(scope="module")
 def orbit_by():
-    """Function (method, rtol) → mean, peak, RMS on the CIC orbit, and the solver steps."""
+    """Return a function (method, rtol) → mean, peak, RMS on the CIC orbit, and the solver steps."""
     pair, _ = pair_of("configs/cic.yaml")
 
     def find(method, rtol):
@@ -549,7 +552,7 @@ def orbit_by():
 
 @pytest.fixture(scope="module")
 def tight_orbit(orbit_by):
-    """Mean, peak, RMS at rtol 1e-11."""
+    """Return mean, peak and RMS at rtol 1e-11."""
     return orbit_by("tsit5", 1e-11)[0]
 
 
@@ -557,13 +560,13 @@ def tight_orbit(orbit_by):
     "method", ["tsit5", "dopri8", "kvaerno5", pytest.param("dopri5", marks=pytest.mark.long)]
 )
 def test_solvers_agree(method, orbit_by, tight_orbit):
-    """Explicit and implicit solvers find the same mean, peak and RMS force."""
+    """Explicit and implicit solvers give the same mean, peak and RMS force."""
     found, _ = orbit_by(method, 1e-8)
     np.testing.assert_allclose(found, tight_orbit, rtol=1e-5)
 
 
 def test_error_falls_with_the_tolerance(orbit_by, tight_orbit):
-    """Each hundredth of rtol takes mean and peak nearer the limit, for more steps."""
+    """With rtol a hundred times smaller, mean and peak are closer to the limit, with more steps."""
     errors, steps = [], []
     for rtol in (1e-5, 1e-7, 1e-9):
         found, count = orbit_by("tsit5", rtol)
@@ -578,10 +581,9 @@ def test_error_falls_with_the_tolerance(orbit_by, tight_orbit):
 
 
 def loose_pair(load_torque):
-    """A pair whose flanks never meet: clearance far beyond the gear's backlash.
+    """Return a pair whose flanks never meet: its clearance far exceeds the gear's backlash.
 
-    Gear: 2.0e4 N·m/rad, ζ = 0.3, 0.1 mm of play.
-    """
+    Gear: 2.0e4 N·m/rad, ζ = 0.3, 0.1 mm of backlash."""
     gear = "{stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.3, backlash_mm: 0.1}"
     overrides = [
         "contact.clearance_mm=0.5",
@@ -603,7 +605,7 @@ def test_gear_alone_carries_the_load_when_flanks_cannot_touch():
 
 
 def test_gear_swings_as_a_damped_oscillator():
-    """Inside one end of the backlash ε is the closed-form oscillator of DESIGN's gear."""
+    """Beyond one edge of the backlash, ε is the closed-form damped oscillator of the gear."""
     pair = loose_pair(4.775)
     inertia, stiffness, ratio = float(pair.inertia), 2.0e4, 0.3
     # I ε̈ + c ε̇ + k ε = 0 about the rest, c = 2 ζ √(k I/2).
@@ -631,7 +633,7 @@ def test_rotor_falls_freely_inside_the_backlash():
 
 
 def test_a_pair_without_mesh_stands_still():
-    """Beyond the angle limit the motion stops, so that a lost pair stays finite."""
+    """Beyond the angle limit the motion stops, so that the state stays finite."""
     pair, _ = pair_of("configs/cic.yaml")
     for side in (-1, 1):
         state = jnp.array([side * 1.01 * pair.angle_limit / float(pair.angle_scale), 7.0])

@@ -1,4 +1,4 @@
-"""At the limits of what a config may ask for: a right result or a named status."""
+"""Tests at the limits of what a config may contain: a correct result or a named status."""
 
 import itertools
 import json
@@ -29,7 +29,7 @@ from rootsopt.status import Status
 
 
 def config_of(**changes):
-    """The shipped CIC scene with changed keys, `__` for a dot."""
+    """Return the shipped CIC scene with changed keys, `__` for a dot."""
     return load("configs/cic.yaml", [f"{k.replace('__', '.')}={v}" for k, v in changes.items()])
 
 
@@ -40,7 +40,7 @@ pair_of = eqx.filter_jit(Scene.pair)
 
 
 def extreme_laws():
-    """Parameters (n, 5; SI units) of laws at every combination of limits (N/mm^e, N s/mm, mm)."""
+    """Return the parameters (n, 5; SI units) of laws at every combination of limits."""
     stiffness, exponents = (1e3, 1e6, 1e9), (1.0, 1.5, 2.0, 3.0, 5.0)
     damping, depths, smoothing = (0.0, 1e-4, 10.0), (1e-5, 1e-2, 1.0), (0.0, 1e-6, 1e-4, 0.1)
     rows = [
@@ -71,7 +71,8 @@ def values_and_slopes(rows, depths, rates):
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_law_and_its_slopes_are_finite_at_every_limit(dtype):
-    """Force and its derivatives in depth, rate and parameters, from 1e-36 m to 10 mm of depth."""
+    """Force and derivatives in depth, rate and parameters are finite, from 1e-36 m to 10 mm of
+    depth."""
     rows = extreme_laws()
     found = values_and_slopes(*(jnp.asarray(x, dtype) for x in (rows, DEPTHS, RATES)))
     assert found.dtype == dtype
@@ -81,7 +82,8 @@ def test_law_and_its_slopes_are_finite_at_every_limit(dtype):
 
 
 def test_single_precision_force_is_that_of_the_law():
-    """Where the law is not rounded: K δ^e + C (3x² - 2x³) dδ/dt in double, to 1e-5 of itself."""
+    """Where the law is not rounded, the force agrees to 1e-5 with K δ^e + C (3x² - 2x³) dδ/dt in
+    double."""
     rows = extreme_laws()
     depths, rates = np.geomspace(1e-8, 1e-3, 21), np.array([0.0, 1e-3, 10.0])
     single = (jnp.asarray(x, jnp.float32) for x in (rows, depths, rates))
@@ -99,7 +101,7 @@ def test_single_precision_force_is_that_of_the_law():
 
 
 def timescales(play=1e-3, torque=5.0, inertia=2e-3, exponent=1.0, stiffness=1e7):
-    """Timescales of a pair of 33 mm pitch radius, a gear of 2e4 N m/rad, and its parts."""
+    """Return timescales of a pair of 33 mm pitch radius, a gear of 2e4 N·m/rad, and its parts."""
     law = ImpactLaw(*(jnp.asarray(x) for x in (stiffness, exponent, 0.0, 1e-5, 0.0)))
     gear = TimingGear(*(jnp.asarray(x) for x in (2e4, 0.0, play / 2, 0.0)))
     radius = 0.033
@@ -110,7 +112,7 @@ def timescales(play=1e-3, torque=5.0, inertia=2e-3, exponent=1.0, stiffness=1e7)
 
 
 def test_pace_in_closed_form():
-    """A linear contact beside the gear is a spring, and the fall through the play s = a t²/2."""
+    """A linear contact beside the gear is a spring; the fall through the backlash is s = a t²/2."""
     found = timescales()
     spring = 1e7 * 0.033**2 + 2e4
     assert float(found.swing) == pytest.approx(np.sqrt(2e-3 / spring), rel=1e-12)
@@ -118,8 +120,10 @@ def test_pace_in_closed_form():
 
 
 def test_impact_after_a_fall_sets_the_pace():
-    """With e = 2 the work of the load on the play, K δ³/3, goes into a deeper and stiffer
-    contact; without play the static depth counts, and there is no flight."""
+    """With e = 2, the work of the load over the backlash equals K δ³/3, in a deeper, stiffer
+    contact.
+
+    Without backlash, the static depth counts and there is no free flight."""
     found, radius, torque = timescales(play=5e-3, exponent=2.0, stiffness=1e12), 0.033, 5.0
     depth = (3 * torque * 5e-3 / 1e12) ** (1 / 3)
     assert depth > (torque / radius / 1e12) ** 0.5
@@ -133,8 +137,10 @@ def test_impact_after_a_fall_sets_the_pace():
 
 @pytest.mark.parametrize(("speed", "stiffness"), [(3000, 2e5), (1, 1e9), (60_000, 1e3)])
 def test_steps_follow_the_scene(speed, stiffness):
-    """The first step is short against a swing and the longest against a flight, but not so short
-    that steps as long as that use up those allowed."""
+    """The first step is short compared with an oscillation, the longest compared with a free
+    flight.
+
+    Steps of that length do not use up the allowed number."""
     config = config_of(scene__speed_rpm=speed, contact__stiffness_N_per_mm_e=stiffness)
     pair = pair_of(Scene.from_config(config), design_vector(config))
     how = Integrator("tsit5", jnp.asarray(1e-8), 4096)
@@ -154,7 +160,7 @@ def test_steps_follow_the_scene(speed, stiffness):
 
 
 def test_motion_inside_a_step_is_a_cubic():
-    """Between the ends of the steps, ε and its rate are those of any cubic motion."""
+    """Between the ends of the steps, ε and its rate are exact for any cubic motion."""
     config = config_of(solver__fidelity="linear")
     pair = pair_of(Scene.from_config(config), design_vector(config))
     ends = np.array([0.1, 0.4, 0.45, np.inf])
@@ -176,8 +182,10 @@ def peak_of(pair, states, steps):
 
 
 def test_impact_between_the_samples_is_found():
-    """A dip into the flank a hundredth of a period long lies between two of 60 samples; the steps
-    of the solver are short there. The greatest force is where the dip is deepest."""
+    """An impact of a hundredth of a period between two of 60 samples is found at its greatest
+    force.
+
+    The steps of the solver are short there."""
     config = config_of(solver__fidelity="linear", contact__max_damping_N_s_per_mm=0)
     pair = pair_of(Scene.from_config(config), design_vector(config))
     middle, width = 0.7083, 1e-3
@@ -201,7 +209,9 @@ def test_impact_between_the_samples_is_found():
 
 
 def test_the_greatest_sample_need_not_lie_by_the_greatest_peak():
-    """The deeper of two dips has its bottom half way between two samples, the other on one."""
+    """The deeper of two dips is found.
+
+    Its bottom is half way between two samples, that of the other on a sample."""
     config = config_of(solver__fidelity="linear", contact__max_damping_N_s_per_mm=0)
     pair = pair_of(Scene.from_config(config), design_vector(config))
     bottoms, depths, width = np.array([[20 / 60], [42.5 / 60]]), [[0.5], [0.501]], 0.02
@@ -226,7 +236,7 @@ def test_the_greatest_sample_need_not_lie_by_the_greatest_peak():
 def orbit_of(
     multipliers=(0.5, 0.1), size=1.0, residual=0.0, peak=1.0, depth=1e-5, mean=1.0, strain=1.0
 ):
-    """A closed orbit with a diagonal monodromy matrix and little else."""
+    """Return a closed orbit with a diagonal monodromy matrix and little else."""
     none = Flow.empty(2, 0, 1, 1, Measures(), np.dtype(float))
     numbers = {"mean": mean, "peak": peak, "depth": depth, "strain": strain}
     flow = none._replace(**{k: jnp.asarray(v) for k, v in numbers.items()})
@@ -255,7 +265,7 @@ def accepted(orbit, rtol=1e-8, moved=0.0, residual=1e-9):
 
 
 def test_an_orbit_that_multiplies_errors_is_none():
-    """Errors of the tolerance grow by 1/(1 - multiplier): too near to 1 nothing is known."""
+    """Errors grow by 1/(1 - multiplier). If that is too large, the orbit is rejected."""
     near = orbit_of((1 - 1e-5, 0.1))
     assert accepted(near, 1e-8)
     assert not accepted(near, 1e-3)
@@ -264,14 +274,15 @@ def test_an_orbit_that_multiplies_errors_is_none():
 
 
 def test_an_orbit_on_steps_no_solver_would_take_is_none():
-    """However well it is closed on them; nor one whose error is not a number."""
+    """An orbit is rejected if its steps have a large error, or one that is NaN, however well it
+    closes."""
     assert accepted(orbit_of(strain=50.0))
     assert not accepted(orbit_of(strain=200.0))
     assert not accepted(orbit_of(strain=np.nan))
 
 
 def test_distances_are_relative_to_large_states():
-    """A residual of 3e-8 is an open orbit of size 1 and a closed one of size 400."""
+    """With a residual of 3e-8, an orbit of size 1 is open and one of size 400 is closed."""
     assert not accepted(orbit_of(residual=3e-8))
     assert accepted(orbit_of(residual=3e-8, size=400.0))
     assert accepted(orbit_of(), moved=1e-3)
@@ -279,7 +290,7 @@ def test_distances_are_relative_to_large_states():
 
 
 def test_rounding_of_the_gap():
-    """The gap is known to a rounding of the pitch radius, and the force is a power of it."""
+    """The gap has a rounding error of the pitch radius, and the force is a power of the gap."""
     radius, exponent = jnp.asarray(0.033), jnp.asarray(2.0)
     eps = np.finfo(float).eps
     found = float(force_rounding(jnp.asarray(1e-9), exponent, radius))
@@ -290,7 +301,7 @@ def test_rounding_of_the_gap():
 
 
 def test_mean_rms_and_peak_must_not_contradict_each_other():
-    """mean ≤ RMS ≤ peak, but for 1 % and what is below the least force."""
+    """mean ≤ RMS ≤ peak, except for 1 % and for forces below the least force."""
 
     def consistent(mean, square, peak, least=1e-3):
         orbit = orbit_of(mean=mean, peak=peak)
@@ -306,7 +317,7 @@ def test_mean_rms_and_peak_must_not_contradict_each_other():
 
 
 def test_idle_is_without_force():
-    """No force at all, and free drift (a multiplier of 1, or none) or a steady orbit."""
+    """An idle orbit has no force, and drifts freely (multiplier 1 or unknown) or is steady."""
     nothing = {"mean": 0.0, "peak": 0.0}
     assert bool(is_idle(orbit_of((1.0, 1.0), **nothing)))
     assert bool(is_idle(orbit_of((np.nan, 1.0), **nothing)))
@@ -321,7 +332,7 @@ def test_idle_is_without_force():
 # Whole scenes; one compiled program serves them all
 
 BOUNDARIES = {
-    # A million swings in a mesh period: as many steps as are allowed, and no more.
+    # A million oscillations in a mesh period: the allowed number of steps, and no more.
     "slow and stiff": (
         {"scene__speed_rpm": 1, "contact__stiffness_N_per_mm_e": 1e9},
         Status.SOLVER_FAILED,
@@ -336,7 +347,7 @@ BOUNDARIES = {
 
 @pytest.mark.parametrize("name", BOUNDARIES)
 def test_boundary_scenes_end_as_they_must(name):
-    """A finite result or a named status, in a bounded number of steps."""
+    """Each scene ends with a finite result or a named status, in a bounded number of steps."""
     changes, expected = BOUNDARIES[name]
     evaluation = Evaluator.of(config_of(**changes))(series=False)
     assert evaluation.status is expected
@@ -349,7 +360,7 @@ def test_boundary_scenes_end_as_they_must(name):
 
 @pytest.mark.long
 def test_a_pair_with_a_motor_that_floats_is_idle():
-    """Newton's equations are singular then, and the state is kept."""
+    """Newton's equations are then singular, and the state is kept."""
     scene = {"scene__drive": "torque", "scene__motor": "{slope_N_m_s_per_rad: 0.1}"}
     scene |= {"scene__timing_gear": "null", "scene__load__torque_N_m": 0}
     contact = {"solver__fidelity": "linear", "contact__clearance_mm": 0.01}
@@ -358,7 +369,7 @@ def test_a_pair_with_a_motor_that_floats_is_idle():
 
 
 def test_a_force_lost_in_rounding_is_no_result(monkeypatch):
-    """Beyond the limit of `force_rounding` the numbers come with a status and no gradient."""
+    """Beyond the limit of `force_rounding`, the forces have a status and no gradient."""
 
     def stricter(pair, tangents, state, radius, solver):
         found = _motion(pair, tangents, state, radius, solver)
@@ -375,8 +386,9 @@ def test_a_force_lost_in_rounding_is_no_result(monkeypatch):
 
 
 def test_motion_of_many_swings_agrees_with_scipy():
-    """A stiff pair at low speed, hundreds of swings in a mesh period: SciPy comes back to the
-    orbit's state, and finds the same mean and peak force."""
+    """A stiff pair at low speed has hundreds of oscillations in a mesh period.
+
+    SciPy returns to the orbit's state and gives the same mean and peak force."""
     changes = {
         "contact__stiffness_N_per_mm_e": 4.29e7,
         "contact__max_damping_N_s_per_mm": 0.00424,
@@ -425,7 +437,7 @@ def shape_of(model, design):
 
 
 def refused(config):
-    """Why the profile of a config is refused, or nothing."""
+    """Return the message with which the profile of a config is rejected, or ""."""
     try:
         check_geometry(config)
     except InputError as error:
@@ -434,7 +446,7 @@ def refused(config):
 
 
 def test_a_tip_arc_that_misses_the_pitch_circle_is_refused():
-    """With a small pressure angle the involute must be long enough; the message says how long."""
+    """At a small pressure angle the involute must be long enough; the message says how long."""
     keys = {"profile__pressure_angle_deg": 12, "profile__tip_arc_angle_deg": 4}
     short = config_of(**keys, profile__involute_length_mm=0.2)
     assert "`profile.involute_length_mm` must be at least 0.2395" in refused(short)
@@ -444,7 +456,7 @@ def test_a_tip_arc_that_misses_the_pitch_circle_is_refused():
 @pytest.mark.parametrize("angle", [1.0, 10.0, 20.0, 45.0, 89.0])
 @pytest.mark.parametrize("tip", [0.0, 15.0, 29.9])
 def test_profiles_on_their_limits_are_finite_or_refused(angle, tip):
-    """The shortest and the longest involute that are not refused have a finite geometry."""
+    """The shortest and the longest accepted involute have a finite geometry."""
     keys = {"profile__pressure_angle_deg": angle, "profile__tip_arc_angle_deg": tip}
     lengths = np.geomspace(1e-6, 60, 40)
     configs = [config_of(**keys, profile__involute_length_mm=length) for length in lengths]

@@ -1,4 +1,4 @@
-"""What is seen of a motion between samples and within steps, against closed forms."""
+"""Tests of a motion between samples and within steps, against closed forms."""
 
 import os
 import subprocess
@@ -30,8 +30,10 @@ print([str(jax.make_jaxpr(program)(state)).count("callback") for program in prog
 
 
 def test_no_callback_to_python_in_an_integration():
-    """Programs with callbacks cannot be cached. Equinox's checks of what diffrax is given would be
-    such callbacks; a command turns them off, a caller from Python does not."""
+    """An integration has no callback to Python, because programs with callbacks cannot be cached.
+
+    Equinox's checks of the arguments of diffrax would be such callbacks. A command turns them off,
+    but a caller from Python does not."""
     variables = {name: x for name, x in os.environ.items() if name != "EQX_ON_ERROR"}
     command = [sys.executable, "-c", _COUNT]
     done = subprocess.run(command, env=variables, check=True, capture_output=True, text=True)
@@ -39,8 +41,9 @@ def test_no_callback_to_python_in_an_integration():
 
 
 def test_motion_between_samples_and_within_steps():
-    """A motion of degree five in time is known exactly between its samples, and one of degree three
-    within a step, with its rate; other states to degree four and in proportion."""
+    """A motion of degree five in time is exact between samples; one of degree three within a step.
+
+    This includes the rate. Other states are exact to degree four, and linearly within a step."""
     pair = oscillator()
     curve, other = (
         np.polynomial.Polynomial([0.3, -1, 2, 0.5, -3, 2]),
@@ -66,6 +69,7 @@ def test_motion_between_samples_and_within_steps():
     for tau in (0.05, 0.2, 0.44, 0.8, 1.1):
         expected = [cubic(tau), cubic.deriv()(tau), 5 * tau]
         np.testing.assert_allclose(within(jnp.asarray(tau)), expected, atol=1e-12)
-    # At x of a step of length h the cubic is as good as samples a width w apart: x (1 - x) h² < w².
+    # At the fraction x of a step of length h, the cubic is as accurate as samples w apart if
+    # x (1 - x) h² < w².
     for tau, good in ((0.51, True), (0.8, False), (1.09, True), (0.35, True)):
         assert bool(steps.reaches(jnp.asarray(tau), jnp.asarray(0.2))) == good

@@ -1,4 +1,4 @@
-"""Coulomb friction as multibody programs smooth it."""
+"""Tests of Coulomb friction as multibody programs smooth it."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Gradients of closed orbits against central differences of the orbits themselves."""
+"""Tests of gradients of closed orbits against central differences of the orbits."""
 
 import dataclasses
 
@@ -33,12 +33,12 @@ CIC = [(36.43, 9.0, 4.0), (36.43, 8.0, 4.0), (30.0, 5.0, 2.0)]
 EE_LOBES = [*(pytest.param(n, marks=pytest.mark.long) for n in (2, 3)), 4]
 MEASURES = Measures(np.array([1.0, 2.0]), jnp.asarray(16.0))
 STEP = 2e-5
-"""Relative step: differences of order 4 agree from 1e-3 down to 1e-5; orbits have a noise of
+"""Relative step. Differences of order 4 agree from 1e-3 down to 1e-5; orbits have a noise of
 1e-12."""
 
 
 def moved(model, design, factors):
-    """The pair with its design multiplied by `factors`; speed, load and backlash if it has none."""
+    """Return the pair with its design multiplied by `factors`, or else speed, load and backlash."""
     if design.shape[0]:
         return model.pair(design * factors)
 
@@ -51,7 +51,7 @@ def moved(model, design, factors):
 
 @eqx.filter_jit
 def closed(model, design, factors, state, period, how):
-    """Closed orbit with derivatives in the factors."""
+    """Return a closed orbit with derivatives with respect to the factors."""
 
     def arrays(factors):
         return eqx.filter(moved(model, design, factors), eqx.is_inexact_array)
@@ -64,13 +64,13 @@ def closed(model, design, factors, state, period, how):
 
 @eqx.filter_jit
 def settled(model, design, how):
-    """The motion from rest until it repeats."""
+    """Return the end of the motion from rest, when it repeats."""
     within, most = settled_within(how.rtol), jnp.asarray(400)
     return settle(model.pair(design), jnp.zeros(2), how, within, most, 4)
 
 
 def orbits_of(config):
-    """Function (factors, state or None) → closed orbit, from rest if there is no state."""
+    """Return a function (factors, state or None) → closed orbit, from rest without a state."""
     evaluator, design = Evaluator.of(config), design_vector(config)
     transient = settled(evaluator.scene, design, evaluator.scene.solver.transient)
     assert int(transient.period) > 0
@@ -87,7 +87,8 @@ def orbits_of(config):
 
 
 def errors(config):
-    """Error of each response's derivatives relative to the greatest of them, by name."""
+    """Return the error of each response's derivatives, relative to the greatest of them, by
+    name."""
     orbit, _, period = orbits_of(config)
     ones = jnp.ones(3)
 
@@ -112,7 +113,8 @@ def errors(config):
 @pytest.mark.parametrize("design", CIC)
 @pytest.mark.parametrize("scene", SCENES)
 def test_cic(scene, design):
-    """Mean, peak, lines and p-norm by the three design parameters."""
+    """Derivatives of mean, peak, lines and p-norm with respect to the three design parameters are
+    correct."""
     changes = [f"profile.{k}={v}" for k, v in zip(DESIGN_KEYS, design, strict=True)]
     found = errors(load("configs/cic.yaml", [*SHARP, *SCENES[scene], *changes]))
     if "lively" in scene:
@@ -125,7 +127,8 @@ def test_cic(scene, design):
 @pytest.mark.parametrize("lobes", EE_LOBES)
 @pytest.mark.parametrize("scene", SCENES)
 def test_ee(scene, lobes):
-    """The same by speed, load and backlash for a profile that has no design parameter."""
+    """Derivatives with respect to speed, load and backlash are correct for a profile without
+    parameters."""
     found = errors(load("configs/ee.yaml", [*SHARP, *SCENES[scene], f"profile.lobes={lobes}"]))
     assert max(found.values()) < 1e-6, found
 
@@ -146,8 +149,10 @@ NARROW = (
 
 
 def test_many_kinks_in_a_thousandth_of_a_mesh():
-    """Light rotors cross the rounded edges of the backlash four times in a mesh, each within 1e-5
-    of it: derivatives of a coarse motion hold to what its tolerance lets expect."""
+    """Derivatives of a coarse motion are as accurate as its tolerance promises.
+
+    Light rotors cross the rounded edges of the backlash four times in a mesh period, each within
+    1e-5 mesh periods."""
     design = ("profile.pressure_angle_deg=10.9", "profile.tip_arc_angle_deg=14.44")
     changes = [*SHARP, *NARROW, *design, "profile.involute_length_mm=1.146"]
     orbit, evaluator, period = orbits_of(load("configs/cic.yaml", changes))
@@ -167,11 +172,12 @@ def test_many_kinks_in_a_thousandth_of_a_mesh():
 @pytest.mark.parametrize("design", [CIC[0], pytest.param(CIC[2], marks=pytest.mark.long)])
 @pytest.mark.parametrize("scene", SCENES)
 def test_linear_contact_jumps(scene, design):
-    """Gap and force jump where linear contact begins, which is also where the peak is. Derivatives
-    follow the jump. Without that, the mean's are wrong by their own size, the peak's by a tenth.
+    """Derivatives follow the jump of gap and force where linear contact begins, which is also the
+    peak.
 
-    The force at the peak is taken within 4e-8 mesh periods after the jump. Of its difference over
-    the step 3e-3 is lost by that."""
+    Otherwise, those of the mean would be wrong by their own size, those of the peak by a tenth. The
+    force at the peak is taken within 4e-8 mesh periods after the jump. This causes an error of 3e-3
+    in its difference over the step."""
     changes = [f"profile.{k}={v}" for k, v in zip(DESIGN_KEYS, design, strict=True)]
     fidelity = "solver.fidelity=linear"
     found = errors(load("configs/cic.yaml", [*SHARP, fidelity, *SCENES[scene], *changes]))
@@ -180,7 +186,7 @@ def test_linear_contact_jumps(scene, design):
 
 
 def test_jump_in_both_modes():
-    """Across a jump of the contact, reverse mode gives what forward mode gives, to rounding."""
+    """Across a jump of the contact, reverse and forward mode agree to rounding."""
     config = load("configs/ee.yaml", [*SHARP, "profile.lobes=4"])
     orbit, evaluator, period = orbits_of(config)
     here = orbit(jnp.ones(3))
@@ -208,8 +214,9 @@ def test_jump_in_both_modes():
 
 
 def test_jump_is_a_switch():
-    """Where the levers jump beside a cusp, twice in a mesh, a switch changes: so that a step
-    short enough for the derivative holds the jump at any tolerance."""
+    """A switch changes where the levers jump beside a cusp, twice in a mesh period.
+
+    A step short enough for the derivative therefore encloses the jump at any tolerance."""
     pair = FlankPair.of(EE(3, 0.033))
     rolls = pair.profile.half_pitch + jnp.linspace(-0.02, 0.02, 801)
 

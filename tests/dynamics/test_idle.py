@@ -1,4 +1,4 @@
-"""Scenes and designs whose flanks never touch: `idle`, forces of zero, and advice."""
+"""Tests of scenes and designs whose flanks never touch: `idle`, forces of zero, and advice."""
 
 import dataclasses
 import json
@@ -33,7 +33,7 @@ def config_of(*overrides):
 
 
 def made_up(response, status=Status.PERIODIC, state=(0.1, 0.0)) -> Evaluation:
-    """An evaluation of the shipped design with made-up forces."""
+    """Return an evaluation of the shipped design with made-up forces."""
     config = config_of()
     design = {"pressure_angle_deg": 36.43, "involute_length_mm": 9.0, "tip_arc_angle_deg": 4.0}
     shape = geometry(Scene.from_config(config).profile(jnp.asarray(list(design.values()))))
@@ -61,7 +61,7 @@ def problem_of(config, baseline):
 
 @pytest.fixture(scope="module")
 def held():
-    """A pair that its timing gear holds apart."""
+    """Return a pair whose timing gear holds the flanks apart."""
     return Evaluator.of(config_of("contact.clearance_mm=0.3"))()
 
 
@@ -77,7 +77,7 @@ def test_a_pair_held_by_its_gear_is_idle(held):
 
 
 def test_advice_names_the_clearance_at_which_flanks_touch(held):
-    """Just above it the pair is idle, just below it there is a force."""
+    """Just above this clearance the pair is idle; just below it there is a force."""
     touching = float(re.search(r"clearance_mm below ([0-9.]+)\.", held.message)[1])
     above = Evaluator.of(config_of(f"contact.clearance_mm={touching + 2e-4}"))(series=False)
     below = Evaluator.of(config_of(f"contact.clearance_mm={touching - 2e-4}"))(series=False)
@@ -86,7 +86,7 @@ def test_advice_names_the_clearance_at_which_flanks_touch(held):
 
 
 def test_optimize_says_why_there_is_nothing_to_optimise(tmp_path, capsys):
-    """Exit 3, with the baseline's status and what to change."""
+    """The exit code is 3, and the message has the baseline's status and what to change."""
     arguments = [CIC, "-o", str(tmp_path / "out"), "--set", "contact.clearance_mm=0.3"]
     assert optimize.main([*arguments, "--no-figures"]) == 3
     said = " ".join(capsys.readouterr().out.split())
@@ -98,7 +98,8 @@ def test_optimize_says_why_there_is_nothing_to_optimise(tmp_path, capsys):
 
 
 def window(peak, exponent):
-    """A window of 16 mesh periods with these peaks (N) and this exponent, known to some 0.01."""
+    """Return a window of 16 mesh periods with these peaks (N) and this exponent, known to about
+    0.01."""
     growth = exponent + 0.04 * (-1.0) ** np.arange(16) * np.arange(16) / 16
     empty = Window.empty(jnp.zeros(2), 16)
     return empty._replace(
@@ -111,7 +112,7 @@ def window(peak, exponent):
 
 @pytest.mark.parametrize("exponent", [0.5, 0.0])
 def test_a_motion_without_contact_that_does_not_repeat_is_idle(exponent):
-    """Whether the gear's play makes it chaotic or not."""
+    """The motion is idle whether or not the gear's backlash makes it chaotic."""
     evaluator = Evaluator.of(config_of())
     pair = evaluator.pair(design_vector(evaluator.config))
     still = window(np.zeros(16), exponent)
@@ -128,7 +129,8 @@ def test_a_motion_without_contact_that_does_not_repeat_is_idle(exponent):
 
 
 def test_advice_depends_on_what_holds_the_flanks_apart():
-    """Clearance where that is the cause, else the gear's backlash, else nothing to name."""
+    """The advice names the clearance, or the gear's backlash, or nothing, depending on the
+    cause."""
     wide, tight = config_of("contact.clearance_mm=0.3"), config_of("contact.clearance_mm=0.01")
     assert idle_hint(wide, -0.1e-3).endswith("contact.clearance_mm below 0.2.")
     assert idle_hint(tight, -0.1e-3).endswith("scene.timing_gear.backlash_mm above 0.3.")
@@ -142,7 +144,8 @@ def test_advice_depends_on_what_holds_the_flanks_apart():
 
 
 def test_a_design_that_never_touches_has_no_objective():
-    """Else it would be the perfect optimum of a force that is not there."""
+    """Without contact the objective is NaN; otherwise such a design would be the perfect
+    optimum."""
     problem = problem_of(config_of(), made_up(FORCES))
     assert problem.objective(made_up(FORCES)) == pytest.approx(1)
     assert np.isnan(problem.objective(made_up(NONE, Status.IDLE)))
@@ -166,7 +169,8 @@ LINE = "line_1_force_N"
     ],
 )
 def test_nothing_is_relative_to_a_force_of_zero(overrides, response, words):
-    """One message for every measure with a weight; measures without one do not count."""
+    """There is one message for every measure with a weight; measures without a weight do not
+    count."""
     config = config_of(*overrides)
     with pytest.raises(InputError, match=words):
         problem_of(config, made_up(response))
@@ -179,7 +183,7 @@ def test_measures_without_weight_may_be_zero():
 
 
 def test_forces_of_any_size_have_a_finite_objective():
-    """Down to the least number, whose inverse overflows."""
+    """The objective is finite down to the least number, whose inverse overflows."""
     tiny = {name: 1e-300 * value for name, value in FORCES.items()}
     problem = problem_of(config_of(), made_up(tiny))
     assert problem.objective(made_up(tiny)) == pytest.approx(1)
@@ -189,7 +193,7 @@ def test_forces_of_any_size_have_a_finite_objective():
 
 
 def several(*responses, shares=(0.0, 1.0)):
-    """An evaluation at two speeds, idle where the response is zero."""
+    """Return an evaluation at two speeds, idle where the response is zero."""
     parts = tuple(
         AtSpeed(1000.0 * k, share, made_up(r, Status.PERIODIC if any(r.values()) else Status.IDLE))
         for k, (share, r) in enumerate(zip(shares, responses, strict=True), 1)
@@ -200,7 +204,7 @@ def several(*responses, shares=(0.0, 1.0)):
 
 
 def test_one_idle_speed_is_named():
-    """A speed without contact is not usable, whatever its share; the message says which."""
+    """A speed without contact is not usable, whatever its share; the message names it."""
     found = several(FORCES, NONE)
     assert found.status is Status.IDLE
     assert found.message.startswith("At 2000 rpm: No flank touches")
@@ -210,7 +214,7 @@ def test_one_idle_speed_is_named():
 
 
 def test_a_speed_without_share_has_nothing_to_be_relative_to():
-    """A line that is 0 at a speed that does not count is no hindrance, and has no objective."""
+    """A line that is 0 at a speed without share causes no error there, and has no objective."""
     config = config_of("objective.speeds_rpm=[2000]", "objective.line_weights={1: 1}")
     with_line, without = FORCES | {LINE: 3.0}, FORCES | {LINE: 0.0}
     baseline = several(without, with_line)
@@ -236,7 +240,7 @@ def basins_of(*evaluations, lost=None):
 
 
 def test_a_motion_without_contact_beside_others_counts_as_zero(monkeypatch):
-    """Held by the gear it is a motion like others; a pair that floats is none."""
+    """A motion held by the gear counts like others; a floating pair does not count."""
     noisy, quiet = made_up(FORCES), made_up(NONE, Status.IDLE)
     floating = made_up(NONE, Status.IDLE, state=None)
     assert basins_of(noisy, quiet).status is Status.PERIODIC

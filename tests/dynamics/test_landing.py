@@ -1,4 +1,4 @@
-"""Steps that end where free flight may, and derivatives that are checked before they are told."""
+"""Tests of steps that end where free flight may end, and of the check of derivatives."""
 
 import dataclasses
 
@@ -30,20 +30,23 @@ LIVELY = (
     "profile.involute_length_mm=4",
     "profile.tip_arc_angle_deg=1.5",
 )
-"""A stable orbit of two mesh periods with touches of 1/64 mesh period: steps in free flight are
-twice as long, and some passed over one."""
+"""Overrides for a stable orbit of two mesh periods with touches of 1/64 mesh period.
+
+Steps in free flight would be twice as long, and some would pass over a touch."""
 
 
 @pytest.fixture(scope="module")
 def lively():
-    """The lively scene at three tolerances."""
+    """Return the lively scene at three tolerances."""
     evaluator = Evaluator.of(load("configs/cic.yaml", LIVELY), survey=True)
     return {rtol: evaluator.at_tolerance(rtol)(series=False) for rtol in (1e-8, 1e-9, 1e-10)}
 
 
 def test_a_tighter_tolerance_does_no_worse(lively):
-    """Steps that passed over a touch left d mean / d tip arc angle 1 % off at 1e-9, and no orbit
-    at 1e-10."""
+    """A tighter tolerance gives no worse gradient.
+
+    With steps that passed over a touch, d mean / d tip arc angle was wrong by 1 % at 1e-9, and
+    there was no orbit at 1e-10."""
     for evaluation in lively.values():
         assert evaluation.status.label == "periodic"
         assert evaluation.steady_state["period"] == 2
@@ -94,12 +97,13 @@ def test_edges_are_those_of_clearance_and_backlash():
     edges = np.sort(np.asarray(with_gap.edges)) * float(pair.angle_scale)
     assert edges == pytest.approx([-half, -0.03 / 33, 0.03 / 33, half])
     assert float(with_gap.inside * pair.angle_scale) == pytest.approx(0.03 / 33)
-    # Displaced axes may bring the flanks together anywhere.
+    # With displaced axes, the flanks may touch at any ε.
     assert float(control(more=["scene.center_distance_error_mm=0.01"]).inside) == 0
 
 
 def adapted(landing, before, after, step):
-    """Whether a step of these states without an error is kept, and where the next one ends."""
+    """Return whether a step between these states, with no error, is kept, and where the next one
+    ends."""
     before, after = jnp.asarray(before), jnp.asarray(after)
     begin = jnp.asarray(0.2)
     args = begin, begin + step, before, after, None, jnp.zeros(2), 5.0
@@ -115,7 +119,8 @@ def parabola(place, rate, bend, time):
 @pytest.mark.parametrize("bend", [-30.0, 0.0, 40.0])
 @pytest.mark.parametrize("place", [0.3, -0.2])
 def test_the_next_step_ends_just_beyond_the_edge(place, bend):
-    """ε = 0 is an edge; steps of 1/32 mesh period would pass it by far."""
+    """The next step ends just beyond the edge ε = 0; steps of 1/32 mesh period would pass it by
+    far."""
     landing, step = control(), 0.004
     rate = -12.0 * np.sign(place)
     before = parabola(place, rate, bend, 0.0)
@@ -133,7 +138,7 @@ def test_a_step_that_passed_an_edge_far_is_taken_again():
     assert not keep
     assert start == 0
     assert stop == pytest.approx(0.005 + 1e-4)
-    # Not one that passed it as it was meant to; the next begins short.
+    # A step that passes the edge as intended is kept; the next one starts short.
     keep, start, stop = adapted(control(), [0.05, -10.0], [-0.001, -10.0], 0.0051)
     assert keep
     assert start == pytest.approx(0.0051)
@@ -141,7 +146,7 @@ def test_a_step_that_passed_an_edge_far_is_taken_again():
 
 
 def test_a_step_ends_at_a_turn_beside_an_edge():
-    """A parabola that turns 0.01 before the edge may reach it all the same."""
+    """A step ends where a parabola turns 0.01 before the edge, because it might reach the edge."""
     landing, step = control(), 0.002
     bend = 100.0
     turn = 0.02
@@ -150,7 +155,7 @@ def test_a_step_ends_at_a_turn_beside_an_edge():
     keep, _, stop = adapted(landing, before, after, step)
     assert keep
     assert stop == pytest.approx(turn)
-    # Far from every edge nothing is in the way.
+    # Far from every edge, the step is not limited.
     far = [0.3 + place, rate]
     _, _, stop = adapted(landing, far, parabola(*far, bend, step), step)
     assert stop > turn
@@ -158,7 +163,8 @@ def test_a_step_ends_at_a_turn_beside_an_edge():
 
 @pytest.mark.parametrize("rtol", [1e-4, 1e-8, 1e-11])
 def test_a_touch_between_two_stages_is_met(rtol):
-    """Free fall on to a stiff floor at ε = 0, from a height at which steps are long."""
+    """A touch is found in a free fall onto a stiff floor at ε = 0, from a height at which steps are
+    long."""
     landing = control()
     control_of = dataclasses.replace(
         landing, base=diffrax.PIDController(rtol=rtol, atol=rtol, dtmax=1.0)
@@ -190,7 +196,7 @@ def test_a_touch_between_two_stages_is_met(rtol):
 
 @pytest.mark.parametrize("rtol", [1e-4, 1e-6])
 def test_an_orbit_that_a_loose_tolerance_does_not_close_is_integrated_more_finely(lively, rtol):
-    """It is the orbit of the usual tolerance, and the statistics say at which it was found."""
+    """The orbit is that of the usual tolerance, and the statistics state the tolerance used."""
     evaluator = Evaluator.of(load("configs/cic.yaml", [*LIVELY, f"solver.rtol={rtol}"]))
     found = evaluator(series=False)
     assert found.status is Status.PERIODIC
@@ -201,8 +207,10 @@ def test_an_orbit_that_a_loose_tolerance_does_not_close_is_integrated_more_finel
 
 
 def test_two_changes_at_one_instant():
-    """The seal and the contact pass the same joint of the flank 1e-9 mesh periods apart: each was
-    at the end of a step of no length, and the gradient 6e-4 off at any tolerance."""
+    """Gradients are correct if seal and contact pass the same joint 1e-9 mesh periods apart.
+
+    Otherwise each would be at the end of a step without length, and the gradient wrong by 6e-4 at
+    any tolerance."""
     scene = [
         "scene.speed_rpm=3831.1",
         "scene.timing_gear.backlash_mm=0.276",
@@ -228,7 +236,7 @@ def test_two_changes_at_one_instant():
 
 
 def test_a_check_without_room_is_none():
-    """Where a grid cannot hold all its steps halved, nothing is compared."""
+    """If a grid has no room for all halved steps, nothing is compared."""
     grid = jnp.asarray([0.1, 0.1 + 2e-6, 0.5, jnp.inf, jnp.inf])
     assert bool(has_room(grid))
     assert not bool(has_room(grid[:4]))
@@ -237,15 +245,15 @@ def test_a_check_without_room_is_none():
 def test_halved_steps():
     grid = jnp.asarray([0.1, 0.4, 0.5, jnp.inf, jnp.inf, jnp.inf, jnp.inf])
     assert np.asarray(halved(grid))[:6] == pytest.approx([0.05, 0.1, 0.25, 0.4, 0.45, 0.5])
-    # Without room for all the longest are halved.
+    # Without room for all steps, only the longest are halved.
     assert np.asarray(halved(grid[:4])) == pytest.approx([0.1, 0.25, 0.4, 0.5])
-    # A step about a change is not divided there.
+    # A short step around a change is not halved.
     about = jnp.asarray([0.1, 0.1 + 2e-6, 0.3, jnp.inf, jnp.inf])
     assert np.asarray(halved(about)) == pytest.approx([0.05, 0.1, 0.1 + 2e-6, 0.2, 0.3], abs=1e-5)
 
 
 def test_disagreement_is_that_of_the_orbits_derivatives():
-    """Against the implicit function theorem written out with NumPy."""
+    """The disagreement agrees with the implicit function theorem written in NumPy."""
     draw = np.random.default_rng(0)
     count, designs = 2, 3
     first = draw.normal(size=(count + 3, count + designs))

@@ -1,4 +1,4 @@
-"""The loads: gas torque against geometry and displaced volume."""
+"""Tests of the loads: gas torque against geometry and displaced volume."""
 
 import equinox as eqx
 import jax
@@ -20,8 +20,9 @@ LENGTH = 0.1
     [("cic", ["profile.involute_length_mm=7"]), ("ee", []), ("ee", ["profile.lobes=2"])],
 )
 def test_the_mean_gas_torque_is_the_displaced_volume(family, overrides):
-    """Over a revolution both rotors together take Δp times the displaced volume over 2π: twice
-    the housing's bore less the rotor, from the outline's polygon."""
+    """Over a revolution, both rotors together take Δp times the displaced volume / 2π.
+
+    The volume is twice the difference of the bore and the rotor, from the outline's polygon."""
     pair, config = pair_of([*GAS, *overrides], family)
     phi = np.linspace(0, 2 * np.pi, 60001)[:-1] + 1e-6
     both = [np.asarray(jax.jit(jax.vmap(f))(phi)) for f in (pair.load.torque1, pair.load.torque2)]
@@ -37,8 +38,9 @@ def test_the_mean_gas_torque_is_the_displaced_volume(family, overrides):
 
 @pytest.mark.parametrize("family", ["cic", "ee"])
 def test_gas_torque_follows_the_radius_of_contact(family):
-    """A vane from the point of contact to the tip, found on the outline; at the line of centres
-    the tip of one rotor seals and takes no torque."""
+    """The torque is that of a vane from the contact point to the tip, found on the outline.
+
+    On the line of centres, the tip of one rotor seals and this rotor takes no torque."""
     pair, config = pair_of([*GAS, *(["profile.involute_length_mm=7"] * (family == "cic"))], family)
     x, y = 1e-3 * outline_mm(config).T
     points, outer = x + 1j * y, np.max(np.hypot(x, y))
@@ -46,7 +48,7 @@ def test_gas_torque_follows_the_radius_of_contact(family):
     assert float(pair.load.torque1(0.0)) == pytest.approx(0, abs=1e-12)
     assert float(pair.load.torque2(jnp.pi / lobes)) == pytest.approx(0, abs=1e-12)
     for phi in (0.2, 0.5, 0.9, 1.3, 1.9):
-        # In contact the two outlines, placed by hand, come closest at a point of both.
+        # In contact, the two placed outlines are closest at a common point.
         first = points * np.exp(1j * phi)
         second = 2 * radius - np.conjugate(points * np.exp(1j * (phi + np.pi / lobes)))
         apart = abs(first[:, None] - second[None, :])
@@ -60,7 +62,7 @@ def test_gas_torque_follows_the_radius_of_contact(family):
 
 @pytest.mark.parametrize("length", [7.0, 8.893, 9.0])
 def test_gas_torque_has_no_jump_and_its_derivative_is_that_of_differences(length):
-    """Also at and past the longest involute, where the whole tip arc meshes at once."""
+    """This also holds at and past the longest involute, where the whole tip arc meshes at once."""
     config = load("configs/cic.yaml", [*GAS, f"profile.involute_length_mm={length}"])
     model, design = Scene.from_config(config), design_vector(config)
     phi = jnp.linspace(0.001, 1.04, 4001)
@@ -87,7 +89,8 @@ def test_gas_torque_has_no_jump_and_its_derivative_is_that_of_differences(length
 
 @pytest.mark.parametrize("length", [8.89, 9.0])
 def test_steps_end_where_a_spread_jump_begins_and_ends(length):
-    """Wherever the slope of the torque bends, a flag changes. The bends come from the torque."""
+    """Wherever the slope of the torque has a kink, a flag changes. The kinks are found in the
+    torque."""
     config = load("configs/cic.yaml", [*GAS, f"profile.involute_length_mm={length}"])
     pair = eqx.filter_jit(Scene.pair)(Scene.from_config(config), design_vector(config))
     phi = jnp.linspace(0.02, 1.02, 10001)

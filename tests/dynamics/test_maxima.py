@@ -1,4 +1,4 @@
-"""Local maxima of the contact force along an orbit: found, told apart, and differentiated."""
+"""Tests of local maxima of the contact force along an orbit, with their derivatives."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ _STEP = 2e-4
 
 @pytest.fixture(scope="module")
 def evaluator():
-    """The smallest scene with a timing gear, at a tight tolerance."""
+    """Return an evaluator of the smallest scene with a timing gear, at a tight tolerance."""
     config = load_config("configs/cic.yaml", ["profile.involute_length_mm=8.0"])
     return Evaluator.of(config).at_tolerance(1e-11).with_maxima()
 
@@ -25,7 +25,7 @@ def found(evaluator):
 
 
 def test_maxima_are_those_of_the_series(found):
-    """Against the uniform samples of the force: every maximum is listed, none lower."""
+    """Every maximum of the uniform samples of the force is listed, and no lower one."""
     cycle, maxima, samples = found.series.force[:SAMPLES], found.maxima, SAMPLES
     period = found.steady_state["period"]
     higher = (cycle > np.roll(cycle, 1)) & (cycle >= np.roll(cycle, -1))
@@ -35,14 +35,14 @@ def test_maxima_are_those_of_the_series(found):
         near = np.abs(maxima.times - period * top / samples) < 2 * period / samples
         assert near.any()
         assert cycle[top] <= maxima.forces[near].max() * (1 + 1e-9)
-    # Every one is the force at its instant, so that none bounds the peak from above.
+    # Each is the force at its instant, so no maximum exceeds the peak.
     places = period * np.arange(samples + 1) / samples
     there = np.interp(maxima.times, places, np.append(cycle, cycle[0]))
     np.testing.assert_allclose(maxima.forces, there, atol=1e-2 * maxima.forces[0])
 
 
 def test_gradients_are_those_of_differences(evaluator, found):
-    """Of every maximum with respect to every design parameter, the first as that of the peak."""
+    """Gradients of every maximum agree with differences; the first one equals that of the peak."""
     design, maxima = np.array(list(found.design.values())), found.maxima
     peak = np.array(list(found.gradient["peak_force_N"].values()))
     np.testing.assert_allclose(maxima.slopes[0], peak, rtol=1e-4)
@@ -55,14 +55,14 @@ def test_gradients_are_those_of_differences(evaluator, found):
 
 
 def test_without_request_there_are_none(evaluator):
-    """They cost nothing then: the evaluator has no further program to call."""
+    """Without a request, no maxima are computed and no further program is compiled."""
     plain = Evaluator.of(evaluator.config)
     assert not plain.maxima
     assert plain.with_maxima().maxima
 
 
 def test_candidates_are_told_apart():
-    """Three maxima, one at the seam, and a ripple that rounding may leave on a plateau."""
+    """Three maxima, one of them at the seam, are distinguished from ripple on a plateau."""
     places = np.linspace(0, 1, 201)
     forces = 2 + np.cos(2 * np.pi * places) + np.cos(6 * np.pi * places)
     at, sides = candidates(places, forces)
@@ -77,7 +77,7 @@ def test_candidates_are_told_apart():
 
 
 def test_shoulder_is_found_before_it_is_a_maximum():
-    """A bump on a slope: a shoulder while the force still rises there, then a maximum."""
+    """A bump on a slope is a shoulder while the force rises there, and a maximum later."""
     x = np.arange(400) / 400
     for height, maxima in ((0.02, 1), (0.03, 2)):
         force = 10 + np.cos(2 * np.pi * x) * 0.08 + height * np.exp(-(((x - 0.8) / 0.04) ** 2))

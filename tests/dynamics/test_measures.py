@@ -1,4 +1,4 @@
-"""Spectral lines, p-norm, and orbits of more than two states."""
+"""Tests of spectral lines, p-norm, and orbits of more than two states."""
 
 import dataclasses
 
@@ -33,7 +33,8 @@ def evaluated(*overrides):
 
 @pytest.mark.parametrize("scene", [(), LIVELY])
 def test_lines_are_those_of_the_sampled_force(scene):
-    """Amplitudes from the integrated coefficients and from the transform of 2520 samples."""
+    """Amplitudes from integrated coefficients agree with those from the transform of 2520
+    samples."""
     evaluation = evaluated("response.lines=[1, 2, 7, 0.5, 0.3]", *scene)
     period = evaluation.steady_state["period"]
     assert period == (2 if scene else 1)
@@ -53,7 +54,7 @@ def test_lines_are_those_of_the_sampled_force(scene):
 
 
 def test_p_norm_tends_to_the_peak_as_stated():
-    """It rises to the peak with p, by the share that Laplace's method gives for a smooth peak."""
+    """The p-norm rises to the peak with p, at the rate of Laplace's method for a smooth peak."""
     found = {p: evaluated(f"objective.peak_norm={p}") for p in (8, 16, 32, 64)}
     norms = [one.response["peak_norm_force_N"] for one in found.values()]
     peaks = [one.response["peak_force_N"] for one in found.values()]
@@ -71,7 +72,7 @@ def test_p_norm_tends_to_the_peak_as_stated():
 
 @pytest.mark.long
 def test_what_is_not_asked_for_is_not_computed():
-    """No lines, no norm: no quadrature for them in the program."""
+    """Without lines and norm, the program has no integrals for them."""
     plain, more = (
         Evaluator.of(load("configs/cic.yaml", over)) for over in ([], ["response.lines=[1]"])
     )
@@ -127,7 +128,7 @@ def test_a_line_the_baseline_has_not_got_is_refused():
 
 @given(st.integers(1, 5), st.integers(0, 2**32 - 1))
 def test_spectral_radius(count, seed):
-    """As NumPy's eigenvalues say, for any number of states."""
+    """The result agrees with NumPy's eigenvalues, for any number of states."""
     matrix = np.random.default_rng(seed).normal(size=(count, count))
     expected = np.max(np.abs(np.linalg.eigvals(matrix)))
     assert float(spectral_radius(jnp.asarray(matrix))) == pytest.approx(expected, rel=1e-8)
@@ -141,7 +142,8 @@ def test_spectral_radius_of_a_nilpotent_matrix_is_zero():
 
 
 class Lagging(RotorPair):
-    """A third state: the load follows the contact torque with a lag of a tenth of a mesh period."""
+    """A pair with a third state: the load follows the contact torque with a lag of 0.1 mesh
+    periods."""
 
     def derivative(self, tau, state):
         slope, contact = super().derivative(tau, state[:2])
@@ -158,7 +160,7 @@ class Lagging(RotorPair):
 
 @pytest.mark.long
 def test_an_orbit_of_three_states():
-    """Closed to 1e-9, with the derivative that differences of orbits give."""
+    """The orbit closes to 1e-9, and its derivative agrees with differences of orbits."""
     model = Evaluator.of(load("configs/cic.yaml", [])).scene
     how = Integrator("dopri8", jnp.asarray(1e-11), 4096)
 

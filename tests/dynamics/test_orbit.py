@@ -1,4 +1,4 @@
-"""The monodromy of an orbit, against the matrix exponential of an oscillator."""
+"""Tests of an orbit's monodromy matrix against the matrix exponential of an oscillator."""
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +22,10 @@ from tests.standins import (
 
 
 def test_multiplier_is_that_of_the_whole_orbit():
-    """Around its rest a damped oscillator decays by exp(-c t/2I): over k mesh periods, k times as
-    far as over one. The monodromy is its matrix exponential, and the multiplier no root or power
-    of that."""
+    """A damped oscillator decays by exp(-c t/2I): over k mesh periods, k times as far as over one.
+
+    The monodromy matrix is its matrix exponential, and the multiplier is not a root or power of
+    that."""
     pair = oscillator()
     period = 2 * np.pi / (LOBES * SPEED)
     matrix = np.array([[0.0, 1.0], [-STIFFNESS / INERTIA, -DAMPING / INERTIA]])
@@ -49,5 +50,5 @@ def test_multiplier_is_that_of_the_whole_orbit():
         )
         np.testing.assert_allclose(orbit.state, [rest, 0.0], atol=1e-8)
         assert float(orbit.residual) < 1e-9
-        # Of a linear equation one step of Newton's method finds the orbit.
+        # For a linear equation, one step of Newton's method finds the orbit.
         assert int(orbit.newton_steps) < 8

@@ -1,4 +1,4 @@
-"""Steady state: closed orbit, its statistics and gradients, and the status of what has none."""
+"""Tests of the steady state: closed orbit, statistics, gradients, and statuses without them."""
 
 import json
 
@@ -18,7 +18,7 @@ from rootsopt.dynamics.window import no_tangents
 from rootsopt.response.evaluation import RESPONSES, Evaluator, evaluate
 from rootsopt.status import Status
 
-# The scene of the shipped configs as it was when the figures below were measured.
+# A scene like that of the shipped configs, for which the figures below were measured.
 SCENE = (
     "scene.speed_rpm=3000",
     "scene.load.torque_N_m=4.775",
@@ -34,7 +34,7 @@ def config_of(*overrides, path="configs/cic.yaml"):
 
 
 def gear(**changes):
-    """Overrides for a scene with another gear, load or speed."""
+    """Return overrides for a scene with another gear, load or speed."""
     names = {"damping": "timing_gear.damping_ratio", "backlash": "timing_gear.backlash_mm"}
     names |= {"load": "load.torque_N_m", "speed": "speed_rpm"}
     return [f"scene.{names[key]}={value}" for key, value in changes.items()]
@@ -45,7 +45,7 @@ def numbers(evaluation):
 
 
 def gradients(evaluation):
-    """(response, design parameter)."""
+    """Return the gradients as an array (response, design parameter)."""
     rows = (evaluation.gradient[name] for name in RESPONSES)
     return np.array([[row[key] for key in DESIGN_KEYS] for row in rows])
 
@@ -56,13 +56,13 @@ def integrator(rtol):
 
 @eqx.filter_jit
 def run_strobe(pair, states, periods, how):
-    """End states of every period from several starts, (starts, periods, 2)."""
+    """Return the end states of every period from several starts (starts, periods, 2)."""
     return jax.lax.map(lambda y: strobe(pair, y, periods, how).states, states)
 
 
 @eqx.filter_jit
 def force_at(pair, start, times, how):
-    """Force at ascending `times` (mesh periods), each the end of a solver step."""
+    """Return the force at ascending `times` (mesh periods), each the end of a solver step."""
     states = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda tau, y, _: pair.derivative(tau, y)[0]),
         how.solver(times.dtype),
@@ -89,13 +89,14 @@ def pair_of(evaluator, design):
 
 @pytest.fixture(scope="module")
 def sharp():
-    """Evaluator at the reference settings; its program serves every test that needs it."""
+    """Return an evaluator at the reference settings; its program serves every test that needs
+    it."""
     return Evaluator.of(config_of(*SHARP))
 
 
 @pytest.fixture(scope="module")
 def orbits(sharp):
-    """Sharp evaluations of both designs, and of a scene whose orbit forgets slowly."""
+    """Return sharp evaluations of both designs, and of a scene with a multiplier close to 1."""
     found = {name: (sharp, sharp(jnp.array(design))) for name, design in DESIGNS.items()}
     slow = Evaluator.of(config_of(*SHARP, *gear(damping=0.02, load=2.0)))
     return found | {"slow": (slow, slow())}
@@ -112,7 +113,7 @@ def pair_and_state(orbits, name):
 
 @every_orbit
 def test_orbit_is_closed_and_stays_closed(orbits, name):
-    """PERIODIC with a tiny Newton residual, and 50 more periods of plain motion stay on it."""
+    """The orbit is PERIODIC with a tiny residual, and 50 further periods stay on it."""
     _, evaluation = orbits[name]
     assert evaluation.status is Status.PERIODIC
     assert evaluation.usable
@@ -121,13 +122,13 @@ def test_orbit_is_closed_and_stays_closed(orbits, name):
     assert evaluation.steady_state["residual"] < 1e-9
     pair, state = pair_and_state(orbits, name)
     states = run_strobe(pair, state[None], 50, integrator(1e-11))[0]
-    # Solver noise of 1e-9 a period, summed over the memory of the orbit, 1/(1 - 0.83).
+    # Solver noise of 1e-9 per period, multiplied by 1/(1 - 0.83) for the decay of the orbit.
     assert np.max(np.abs(states - state)) < 1e-7
 
 
 @every_orbit
 def test_floquet_multiplier_is_the_decay_of_a_perturbation(orbits, name):
-    """States set beside the orbit come back as the monodromy matrix says."""
+    """States beside the orbit return as the monodromy matrix predicts."""
     pair, state = pair_and_state(orbits, name)
     _, evaluation = orbits[name]
     size = 1e-4
@@ -147,7 +148,7 @@ def test_floquet_multiplier_is_the_decay_of_a_perturbation(orbits, name):
 
 @every_orbit
 def test_mean_and_rms_are_those_of_a_fine_sampling(orbits, name):
-    """Quadrature carried along with the motion equals the average of the sampled force."""
+    """The integrals along the motion agree with averages of the sampled force."""
     _, evaluation = orbits[name]
     force = evaluation.series.force
     mean, _, rms = numbers(evaluation)
@@ -176,7 +177,8 @@ def test_peak_is_the_greatest_force(orbits, name):
 
 
 def test_series_is_the_motion_over_one_revolution(orbits):
-    """Uniform times over a revolution, repeating with the mesh; forces where flanks overlap."""
+    """Uniform times cover a revolution and repeat with the mesh; forces act where flanks
+    overlap."""
     evaluator, evaluation = orbits["paper"]
     series = evaluation.series
     count = len(series.time)
@@ -197,7 +199,7 @@ def test_series_is_the_motion_over_one_revolution(orbits):
 
 
 def central(evaluator, design, key, step):
-    """Central difference of the three responses in one design parameter."""
+    """Return the central difference of the three responses in one design parameter."""
     ends = []
     for sign in (1, -1):
         moved = np.array(design)
@@ -222,12 +224,11 @@ def test_finite_differences_approach_the_gradient_with_the_square_of_the_step(sh
 
 @pytest.mark.parametrize("name", DESIGNS)
 def test_gradient_is_that_of_finite_differences(sharp, orbits, name):
-    """d mean, peak, RMS by each design parameter match central differences to 1e-4.
+    """Gradients of mean, peak and RMS agree with central differences to 1e-4.
 
-    Step 0.01 (degree, mm): between the h² error seen above and the noise of the orbit,
-    1e-10 of the response, over h. Where AD is taken at looser settings its own error is
-    the larger one: the adaptive steps control the motion's error, not its derivative's.
-    """
+    The step is 0.01 (degree, mm), between the h² error above and the noise of the orbit, 1e-10 of
+    the response, divided by h. At looser settings, the error of automatic differentiation is
+    larger: adaptive steps control the error of the motion, not that of its derivative."""
     exact = gradients(orbits[name][1])
     found = np.stack([central(sharp, DESIGNS[name], key, 0.01) for key in range(3)], axis=1)
     np.testing.assert_allclose(exact, found, rtol=1e-4)
@@ -235,8 +236,9 @@ def test_gradient_is_that_of_finite_differences(sharp, orbits, name):
 
 @pytest.mark.long
 def test_forward_and_reverse_gradients_agree(settled):
-    """By the map, which compiles in a third of the time, both modes give one gradient to 1e-8
-    (by the search: see below), spectral lines and p-norm included."""
+    """With the map, both modes give the same gradient to 1e-8, including spectral lines and p-norm.
+
+    The map compiles in a third of the time; see below for the search."""
     size = "solver.fidelity=map", "solver.map_rolls=384", "solver.map_relatives=16"
     options = *size, "response.lines=[1, 3]", "objective.peak_norm=12"
     for design in DESIGNS.values():
@@ -252,13 +254,12 @@ def test_forward_and_reverse_gradients_agree(settled):
 
 @pytest.mark.long
 def test_both_modes_differentiate_the_same_motion(sharp, orbits, monkeypatch):
-    """On one sequence of steps w·(J v) is (w·J) v to rounding, search contact included.
+    """On one sequence of steps w·(J v) = (w·J) v to rounding, with contact by search.
 
-    J v comes from the linearised steps, w·J from the same steps in reverse. With which weights the
-    forces beside a peak make up its slope is told to both: it follows from the bend of the force,
-    1e-8 of it, while the gap leaves 3e-13 of the force unknown. Two programs that round
-    differently find weights 3e-5 apart, and slopes of the peak 1e-7 apart.
-    """
+    J v comes from the linearised steps, w·J from the same steps in reverse. Both get the same
+    weights of the forces beside a peak. These weights follow from the curvature of the force, 1e-8
+    of it, and the gap leaves a relative error of 3e-13 in the force. Two programs with different
+    rounding find weights that differ by 3e-5, and slopes of the peak by 1e-7."""
     weights = jnp.array([[1.0], [0], [0], [0], [0], [0.5], [-0.5]])
     assert weights.shape == (len(BESIDE), 1)
     monkeypatch.setattr(
@@ -306,8 +307,10 @@ def test_both_modes_differentiate_the_same_motion(sharp, orbits, monkeypatch):
 
 @pytest.mark.long
 def test_recorded_steps_give_the_same_motion(sharp, orbits):
-    """Repeating the recorded steps changes nothing, and on them central differences of the
-    flow are its slope down to small steps, which adaptive steps would drown in noise."""
+    """Repeating the recorded steps does not change the motion.
+
+    On them, central differences of the flow agree with its slope down to small steps. On adaptive
+    steps, noise would hide this."""
     evaluation = orbits["shorter involute"][1]
     state = jnp.asarray(evaluation.state)
     pair = pair_of(sharp.scene, jnp.array(DESIGNS["shorter involute"]))
@@ -326,9 +329,10 @@ def test_recorded_steps_give_the_same_motion(sharp, orbits):
 
 @pytest.mark.long
 def test_repeated_steps_tell_of_their_error(sharp, orbits):
-    """Steps chosen for this motion repeat it within a tolerance or so; half as many do not, nor
-    those of another motion. Steps just chosen tell nothing, nor do those over contact by nodes.
-    """
+    """Steps chosen for a motion repeat it within about a tolerance; half as many do not.
+
+    Steps of another motion do not either. Steps just chosen have no error estimate, nor do those of
+    contact by nodes."""
     state, one = jnp.asarray(orbits["shorter involute"][1].state), jnp.asarray(1.0)
     design, how = jnp.array(DESIGNS["shorter involute"]), integrator(1e-8)
     nodes = Evaluator.of(config_of("solver.fidelity=nodes"))
@@ -352,8 +356,9 @@ def test_repeated_steps_tell_of_their_error(sharp, orbits):
 
 
 def test_peak_on_a_corner_has_its_gradient():
-    """Where the contact moves from the involute to the tip arc the force has a corner, and here
-    its peak: the derivative is neither of the two beside it."""
+    """If the peak is on a corner of the force, its derivative is neither of the two beside it.
+
+    The corner is where the contact moves from the involute to the tip arc."""
     evaluator = Evaluator.of(load("configs/cic.yaml"))
     design, step = jnp.array([35.0, 5.602843, 3.5]), 1e-3
 
@@ -369,8 +374,9 @@ def test_peak_on_a_corner_has_its_gradient():
 
 @pytest.mark.parametrize("design", [(28.0, 3.0, 1.5), (34.0, 7.0, 3.0)])
 def test_gradient_at_the_default_tolerance(design):
-    """It is that at 1e-11: steps end where the equation is not smooth. (If they do not, the
-    gradients are 1e-3 to 6e-3 off.)"""
+    """The gradient agrees with that at 1e-11, because steps end where the equation is not smooth.
+
+    Otherwise, gradients would be wrong by 1e-3 to 6e-3."""
     usual, tight = (
         gradients(
             Evaluator.of(load("configs/cic.yaml"), rtol=rtol)(jnp.array(design), series=False)
@@ -382,8 +388,11 @@ def test_gradient_at_the_default_tolerance(design):
 
 
 def test_weights_of_a_peak():
-    """Smooth: the vertex of a parabola; a corner: the mean for which the force is stationary,
-    found although the instant is a little beside it; a jump: its higher side."""
+    """The weights are correct for a smooth peak, a corner and a jump.
+
+    For a smooth peak, they give the vertex of a parabola. For a corner, they give the mean for
+    which the force is stationary, although the instant is slightly beside it. For a jump, they give
+    its higher side."""
     times = np.array(BESIDE)
 
     def weights(force, noise=0.0):
@@ -399,15 +408,15 @@ def test_weights_of_a_peak():
     value, found = weights(lambda t: 3 - 1e-9 * (t - 0.3) ** 2)
     assert value == pytest.approx(3)
     assert found @ (5 + 2 * times) == pytest.approx(5.6, rel=1e-4)
-    # A peak that was located some way off is still found, value and all.
+    # A peak that was located inaccurately is still found, with its value.
     value, found = weights(lambda t: 3 - 1e-9 * (t - 300) ** 2)
     assert value == pytest.approx(3, rel=1e-12)
     assert found @ (5 + 2 * times) == pytest.approx(605, rel=1e-6)
-    # Noise is no bend either, where it is known.
+    # Known noise is not taken for curvature.
     noise = 3e-7 * np.array([0, 1, -1, -1, 1, 0, 0])
     value, found = weights(lambda t: 3 - 1e-9 * (t - 0.3) ** 2 + noise, 1e-7)
     assert found @ (5 + 2 * times) == pytest.approx(5.6, rel=1e-4)
-    # A jump away from the peak is no bend.
+    # A jump away from the peak is not taken for curvature.
     value, found = weights(lambda t: np.where(t > -30, 4.0, 1.0))
     assert value == 4
     np.testing.assert_array_equal(found, [1, 0, 0, 0, 0, 0, 0])
@@ -424,8 +433,9 @@ def test_weights_of_a_peak():
 
 @pytest.mark.parametrize("method", ["tsit5", pytest.param("kvaerno5", marks=pytest.mark.long)])
 def test_peak_where_the_force_jumps(method):
-    """Linear contact begins with a jump of the force, here the peak. Implicit steps across it
-    that cannot be made shorter are solved all the same."""
+    """Linear contact begins with a jump of the force, which is the peak here.
+
+    Implicit steps across the jump that cannot be shortened are still solved."""
     overrides = [f"solver.method={method}", "solver.fidelity=linear"]
     evaluation = evaluate(load("configs/cic.yaml", overrides))
     assert evaluation.status is Status.PERIODIC
@@ -471,13 +481,13 @@ OUTCOMES = {
 
 @pytest.fixture(scope="module")
 def settled():
-    """Evaluation of every scene at the default settings."""
+    """Return the evaluation of every scene at the default settings."""
     return {name: evaluate(config) for name, config in SCENES.items()}
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_status_names_the_outcome(settled, name):
-    """Each scene ends with the status that is true of it."""
+    """Each scene ends with the correct status."""
     evaluation = settled[name]
     assert evaluation.status in OUTCOMES[name]
     assert evaluation.message == evaluation.status.value
@@ -486,7 +496,7 @@ def test_status_names_the_outcome(settled, name):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_no_number_without_its_status(settled, name):
-    """Responses, gradient and series are there exactly where the status stands for them."""
+    """Responses, gradient and series exist exactly where the status allows them."""
     evaluation = settled[name]
     status, steady = evaluation.status, evaluation.steady_state
     described = status in (Status.PERIODIC, Status.TOO_DEEP, Status.CHAOTIC, Status.NOT_SETTLED)
@@ -507,19 +517,19 @@ def test_no_number_without_its_status(settled, name):
 
 
 def test_status_does_not_depend_on_the_series():
-    """Asking for no series does not turn a motion that is too deep into a usable one."""
+    """Without a series, a motion that is too deep is still not usable."""
     assert Evaluator.of(SCENES["soft"])(series=False).status is Status.TOO_DEEP
 
 
 def test_chaos_has_a_positive_exponent_and_no_gradient(settled):
-    """A chaotic scene says so, with an exponent that is beyond its own error."""
+    """A chaotic scene has an exponent that exceeds its own error."""
     evaluation = settled["chaotic"]
     steady = evaluation.steady_state
     exponent = steady["lyapunov_exponent_per_mesh_period"]
     assert exponent > 3 * steady["lyapunov_standard_error"] > 0
     assert evaluation.gradient == {}
     assert not evaluation.usable
-    # Two motions 1e-9 apart part company at about that rate, from 1e-9 to 1e-2.
+    # Two motions 1e-9 apart diverge at about that rate, up to 1e-2.
     evaluator = Evaluator.of(SCENES["chaotic"])
     pair = pair_of(evaluator.scene, jnp.array(list(evaluation.design.values())))
     scale, rate = float(pair.angle_scale), float(pair.angle_scale) / float(pair.mesh_period)
@@ -532,11 +542,10 @@ def test_chaos_has_a_positive_exponent_and_no_gradient(settled):
 
 @pytest.mark.parametrize(("name", "period"), [("doubled", 2), ("tripled", 3), ("noisy", 1)])
 def test_the_least_period_is_named(settled, name, period):
-    """Period k: neighbouring mesh periods differ, and the motion repeats after k of them.
+    """With period k, neighbouring mesh periods differ and the motion repeats after k of them.
 
-    In the noisy scene the transient, at its coarser tolerance, never repeats to the
-    settling threshold, and first seems to repeat after four periods.
-    """
+    In the noisy scene the transient, at its coarser tolerance, never repeats to the settling
+    threshold, and first seems to repeat after four periods."""
     evaluation = settled[name]
     assert evaluation.steady_state["period"] == period
     # A gap of some 1e-5 m is the difference of lengths of 0.1 m: forces round at 1e-12.
@@ -552,7 +561,7 @@ def test_the_least_period_is_named(settled, name, period):
 
 
 def test_period_doubled_orbit_agrees_with_plain_motion(settled):
-    """The closed period-2 orbit is where a long tight integration from rest ends up."""
+    """A long, tight integration from rest ends on the closed orbit of period 2."""
     evaluation = settled["doubled"]
     evaluator = Evaluator.of(SCENES["doubled"])
     pair = pair_of(evaluator.scene, jnp.array(list(evaluation.design.values())))
@@ -562,7 +571,7 @@ def test_period_doubled_orbit_agrees_with_plain_motion(settled):
 
 
 def test_more_time_settles_an_impatient_scene():
-    """What 16 mesh periods leave unsettled is periodic when given the default time."""
+    """A motion that does not settle within 16 mesh periods is periodic within the default time."""
     patient = evaluate(config_of(*gear(backlash=0.2, damping=0.05, load=2.0, speed=4000)))
     assert patient.status is Status.PERIODIC
     assert patient.statistics["transient_mesh_periods"] > 16
@@ -577,7 +586,7 @@ def test_epicycloid_has_responses_and_nothing_to_differentiate(settled):
 
 
 def test_a_found_orbit_is_a_start_that_changes_nothing(sharp, orbits):
-    """Begun on the orbit of the design, the evaluation finds the same numbers again."""
+    """Started on the design's orbit, the evaluation gives the same numbers."""
     _, evaluation = orbits["paper"]
     again = sharp(jnp.array(DESIGNS["paper"]), start=evaluation.state)
     np.testing.assert_allclose(numbers(again), numbers(evaluation), rtol=1e-9)

@@ -1,4 +1,4 @@
-"""The Lyapunov exponent of a window, from growths made by hand."""
+"""Tests of the Lyapunov exponent of a window, from made-up growth factors."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,8 +10,10 @@ from tests.standins import oscillator, told_flow
 
 
 def test_lyapunov_exponent_and_its_standard_error(monkeypatch):
-    """The mean logarithm of the growth, with the standard error of the mean of 16 batches: for
-    independent growths, their standard deviation over the root of their number."""
+    """The exponent is the mean logarithm of the growth, with the standard error from 16 batches.
+
+    For independent growth factors, this error is their standard deviation over the root of their
+    number."""
     periods = 4096
     growth = 0.3 + 0.5 * np.random.default_rng(3).normal(size=periods)
 

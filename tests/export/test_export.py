@@ -1,4 +1,4 @@
-"""Drawings, solids and animation, read back and compared with the exact geometry."""
+"""Tests of drawings, solids and animation, read back and compared with the exact geometry."""
 
 import io
 import itertools
@@ -35,7 +35,7 @@ LENGTH = 100.0
 
 
 def textbook(lobes, alpha, tip):
-    """CIC with its tip arc centred on the pitch circle: every flank has two arcs."""
+    """Return a CIC whose tip arc is centred on the pitch circle: every flank has two arcs."""
     longest = float(CIC(lobes, R, alpha, 1e-3, tip).longest_involute)
     return CIC(lobes, R, alpha, longest, tip)
 
@@ -58,7 +58,7 @@ def area_mm2(shape):
 
 
 def written(shape, folder):
-    """A solid or assembly, read back from its STEP file."""
+    """Return a solid or assembly, read back from its STEP file."""
     from build123d import import_step
 
     file = folder / "shape.step"
@@ -76,17 +76,20 @@ def drawing(shape, **changes):
         "helix_deg": 0.0,
         "bore": None,
         "notes": ("one", "two & <three>"),
+        "root_radius": float(geometry(shape).root_radius) * 1e3,
+        "block": (("Title", "Rotor"), ("Material", "iron")),
+        "points": 181,
     }
     return Drawing(**(given | changes))
 
 
 def green(points):
-    """Shoelace area of a closed run of complex points."""
+    """Return the shoelace area of a closed run of complex points."""
     return np.sum(np.imag(np.conj(points) * np.roll(points, -1))) / 2
 
 
 def read(document):
-    """(start, stop, fine points) of every entity on the layer OUTLINE, by ezdxf alone."""
+    """Return (start, stop, fine points) of every entity on the layer OUTLINE, by ezdxf alone."""
     for entity in document.modelspace().query('*[layer=="OUTLINE"]'):
         assert entity.dxftype() in ("ARC", "SPLINE")
         curve = entity.construction_tool()
@@ -105,8 +108,9 @@ def read(document):
 
 
 def chained(parts):
-    """All points in one closed counter-clockwise run (a concave arc of a DXF runs the other
-    way round), and the largest gap between two entities."""
+    """Return all points in one closed counter-clockwise run, and the largest gap between entities.
+
+    A concave arc of a DXF runs the other way round."""
     gaps, run = [], []
     ends = parts[-1][[0, -1]]
     here = ends[np.argmin(np.min(np.abs(ends[:, None] - parts[0][[0, -1]]), axis=1))]
@@ -121,8 +125,10 @@ def chained(parts):
 
 @every_profile
 def test_pieces_lie_on_the_flank(shape):
-    """Every point of the package's own outline, found through another set of normals, lies on
-    the pieces within their tolerance; arcs are found where there are some."""
+    """The package's outline, computed with other normals, lies on the pieces within their
+    tolerance.
+
+    Arcs are recognised where the profile has them."""
     pieces = outline_pieces(shape)
     fine = polyline(pieces, 0.01)
     true = np.asarray(outline(shape, 20))[:-1] * 1e3
@@ -144,8 +150,9 @@ def test_pieces_lie_on_the_flank(shape):
 
 
 def test_textbook_cic_has_arcs_about_the_pitch_circle():
-    """Known: its tip arc and its conjugate are circles of one radius centred on the pitch circle;
-    halves of an arc on either side of a lobe's axis are one piece."""
+    """The tip arc and its conjugate are circles of equal radius, centred on the pitch circle.
+
+    Halves of an arc on both sides of a lobe's axis are one piece."""
     pieces = outline_pieces(textbook(3, 0.6358, 0.0))
     arcs = [piece for piece in pieces if isinstance(piece, Arc)]
     assert len(arcs) == 6
@@ -157,12 +164,16 @@ def test_textbook_cic_has_arcs_about_the_pitch_circle():
 
 @every_profile
 def test_dxf_read_back(shape):
-    """Millimetres, layers, closed to 1e-9 mm, and the area within 1e-6."""
+    """The DXF is in millimetres, has the layers, and is closed to 1e-9 mm; its area is right to
+    1e-6."""
     document = ezdxf.read(io.StringIO(dxf_bytes(drawing(shape, bore=12.0)).decode()))
     assert document.units == ezdxf.units.MM
     assert not document.audit().has_errors
     layers = Counter(entity.dxf.layer for entity in document.modelspace())
-    assert set(layers) == {"OUTLINE", "BORE", "PITCH_CIRCLE", "CENTER_LINES", "TEXT"}
+    assert set(layers) == {
+        "OUTLINE", "BORE", "PITCH_CIRCLE", "CENTER_LINES", "TEXT",
+        "CIRCLES", "DIMENSIONS", "TITLE_BLOCK", "TABLE",
+    }  # fmt: skip
     (bore,) = document.modelspace().query('CIRCLE[layer=="BORE"]')
     assert bore.dxf.radius == 6.0
     (pitch,) = document.modelspace().query('CIRCLE[layer=="PITCH_CIRCLE"]')
@@ -184,7 +195,8 @@ OTHERS = {
 
 @pytest.mark.parametrize("family", OTHERS)
 def test_any_family_is_drawn(family, tmp_path):
-    """Arcs with an edge, a curve with a cusp, a free form: DXF and STEP read back, area 1e-6."""
+    """Arcs with an edge, a curve with a cusp and a free form are read back with an area right to
+    1e-6."""
     shape = profile_of(family, 3, jnp.asarray(R), jnp.asarray(OTHERS[family]))
     document = ezdxf.read(io.StringIO(dxf_bytes(drawing(shape)).decode()))
     run, gap = chained(list(read(document)))
@@ -200,7 +212,7 @@ def test_any_family_is_drawn(family, tmp_path):
 
 @pytest.mark.parametrize("name", ["cic 2, no land", "cic 3", "ee 4"])
 def test_svg_read_back(name):
-    """True size, and the path's own curves enclose the area within 1e-6."""
+    """The drawing has true size, and its own curves enclose the area to 1e-6."""
     shape = PROFILES[name]
     text = svg.svg_text(drawing(shape))
     size, unit = re.search(r'<svg [^>]*width="([\d.]+)(\w+)"', text).groups()
@@ -240,8 +252,9 @@ def test_svg_read_back(name):
 
 @pytest.mark.parametrize("name", SOLIDS)
 def test_step_read_back(name, tmp_path):
-    """The solid's volume over its length, and the section's area, within 1e-6; true arcs are
-    cylinders; with bore and twist too."""
+    """Volume over length, and area of the section, are right to 1e-6; arcs are cylinders.
+
+    This also holds with bore and twist."""
     build123d = pytest.importorskip("build123d")
     shape = PROFILES[name]
     pieces = outline_pieces(shape)
@@ -262,8 +275,9 @@ def test_step_read_back(name, tmp_path):
 
 
 def test_pair_meshes_along_its_length(tmp_path):
-    """In every section of the twisted pair rotor 2 is where the package's own frame puts it, the
-    rotors nowhere overlap, and the STL is closed."""
+    """In every section of the twisted pair, rotor 2 is where the package's frame puts it.
+
+    The rotors overlap nowhere, and the STL is closed."""
     build123d = pytest.importorskip("build123d")
     shape, helix = PROFILES["cic 3"], np.radians(50.0)
     pair = solid.pair(outline_pieces(shape), 3, 66.0, LENGTH, None, helix)
@@ -294,7 +308,8 @@ def test_pair_meshes_along_its_length(tmp_path):
 
 
 def test_solids_without_a_kernel(tmp_path, monkeypatch, capsys):
-    """Exit 2 and one line that says what to install, before anything is written."""
+    """Without a kernel, the exit code is 2, and one line says what to install; nothing is
+    written."""
     monkeypatch.setitem(sys.modules, "build123d", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     arguments = [str(ROOT / "configs/cic.yaml"), "-o", str(tmp_path / "x"), "--export", "dxf,step"]
@@ -313,12 +328,12 @@ def test_formats_that_are_not_known(text):
 
 @pytest.fixture
 def few_frames(monkeypatch):
-    """Eight frames per mesh period, a fifth of the usual."""
+    """Use eight frames per mesh period, a fifth of the usual number."""
     monkeypatch.setattr("rootsopt.export.animation._FRAMES", 8)
 
 
 def test_profile_writes_drawings_and_animation(tmp_path, few_frames):
-    """DXF and SVG without being asked; the GIF has a frame per step and moves."""
+    """DXF and SVG are written by default; the GIF has one frame per step and moves."""
     folder, config = tmp_path / "out", str(ROOT / "configs/cic.yaml")
     assert profile.main([config, "-o", str(folder), "--no-figures"]) == 0
     assert {"rotor.dxf", "rotor.svg"} <= {path.name for path in folder.iterdir()}
@@ -338,8 +353,9 @@ def test_profile_writes_drawings_and_animation(tmp_path, few_frames):
 
 @every_profile
 def test_rolling_contacts_touch_both_rotors(shape):
-    """The point lies on both outlines, with the normal across them: a step along it leaves
-    rotor 1 and enters rotor 2. Drive and coast flanks take turns."""
+    """The contact point lies on both outlines, and a step along the normal leads from rotor 1 to 2.
+
+    Drive and coast flanks take turns."""
     points = np.asarray(outline(shape, 200)) * 1e3
     angles = np.linspace(0.05, 2 * np.pi / shape.lobes - 0.03, 7)
     flanks = [rolling_contacts(shape, angles, coast) for coast in (False, True)]
@@ -356,8 +372,9 @@ def test_rolling_contacts_touch_both_rotors(shape):
 
 
 def test_arrow_follows_the_force(few_frames):
-    """The GIF of a simulation covers the periods asked for, and has red and blue arrows only
-    while that flank carries a force."""
+    """The GIF of a simulation covers the requested periods.
+
+    It has red and blue arrows only while that flank carries a force."""
     shape = PROFILES["cic 3"]
     turn = 2 * np.pi * np.arange(360) / 360
     force = np.where(np.arange(360) % 120 >= 60, 50.0, 0.0)
@@ -374,8 +391,9 @@ def test_arrow_follows_the_force(few_frames):
 
 
 def test_bore_takes_mass_and_inertia():
-    """Less a cylinder's π/2 ρ L r⁴ and π ρ L r², with the design's derivative unchanged; an
-    optimisation keeps the root circle outside."""
+    """A bore removes π ρ L r² and π/2 ρ L r⁴; derivatives with respect to the design do not change.
+
+    An optimisation keeps the root circle outside the bore."""
     plain, bored = (load(ROOT / "configs/cic.yaml", sets) for sets in ([], ["rotor.bore_mm=20"]))
     shape = geometry(Scene.from_config(plain).profile(design_vector(plain)))
     one, other = Scene.from_config(plain), Scene.from_config(bored)
@@ -397,14 +415,16 @@ def test_bore_takes_mass_and_inertia():
     assert "root radius" not in {c.name for c in Space.of(plain, one, 0.4).constraints}
 
 
-def test_bore_must_fit_and_twist_is_not_simulated(tmp_path, capsys):
+def test_bore_must_fit_and_twist_needs_a_contact_that_supports_it(tmp_path, capsys):
     config = load(ROOT / "configs/ee.yaml", ["rotor.bore_mm=44.0"])
     with pytest.raises(InputError, match=r"`rotor.bore_mm` must be less than 44 .* but is 44"):
         check_geometry(config)
     check_geometry(load(ROOT / "configs/ee.yaml", ["rotor.bore_mm=43.9"]))
-    arguments = [str(ROOT / "configs/cic.yaml"), "-o", str(tmp_path), "--set", "rotor.helix_deg=9"]
-    assert simulate.main(arguments) == 2
-    assert "`rotor.helix_deg` must be 0" in capsys.readouterr().err
+    changes = "rotor.helix_deg=9", "solver.fidelity=linear", "solver.slices=2"
+    sets = [word for change in changes for word in ("--set", change)]
+    assert simulate.main([str(ROOT / "configs/cic.yaml"), "-o", str(tmp_path), *sets]) == 2
+    message = capsys.readouterr().err
+    assert "`solver.fidelity` must be search (or auto) with `rotor.helix_deg`" in message
 
 
 def test_notes_name_the_design():

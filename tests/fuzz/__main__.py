@@ -1,7 +1,6 @@
-"""`python -m tests.fuzz [NAME ...]`: run fuzzing campaigns, each bounded in time.
+"""`python -m tests.fuzz [NAME ...]`: run fuzzing campaigns, each with a time limit.
 
-Exit code 1 if any case failed or a campaign tried fewer cases than asked for.
-"""
+The exit code is 1 if a case fails, or if a campaign tries fewer cases than requested."""
 
 import argparse
 import importlib
@@ -14,11 +13,11 @@ CAMPAIGNS = {
     "resumes": 20,
     "environment": 200,
 }
-"""Cases of each campaign; module `tests.fuzz.NAME` has `run(report, seed)`."""
+"""Number of cases of each campaign; the module `tests.fuzz.NAME` has `run(report, seed)`."""
 
 
 def main() -> int:
-    """Run the campaigns named, print their tables."""
+    """Run the named campaigns and print their tables."""
     from tests.fuzz.report import Report
 
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)

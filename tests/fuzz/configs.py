@@ -1,10 +1,9 @@
-"""Configs of all kinds through the loading that the commands do.
+"""Random configs of several classes, loaded as the commands load them.
 
-A case fails if loading takes longer than `SECONDS` of CPU time, raises anything but `InputError`,
-or raises one whose message is empty, long, of several lines or unprintable. What is accepted must
-load again from its own `to_yaml` as the same config; of some of that the geometry is made, which
-must be finite or refused.
-"""
+A case fails if loading takes longer than `SECONDS` of CPU time, or raises anything but
+`InputError`. It also fails if the message of the error is empty, long, of several lines or
+unprintable. An accepted config must load again from its own `to_yaml` as the same config. For some
+of them the geometry is made, which must be finite or rejected."""
 
 import copy
 import functools
@@ -26,21 +25,21 @@ from rootsopt.errors import InputError
 from tests.fuzz.report import Report
 
 SECONDS = 2.0
-"""CPU time that a config may take to be accepted or refused."""
+"""CPU time (s) above which loading a config counts as a failure."""
 LONGEST = 500
-"""Longest message (characters)."""
+"""Length (characters) of a message above which it counts as a failure."""
 SHIPPED = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 _GEOMETRIES = 0.02
 """Share of accepted configs whose geometry is made."""
 _ONES = (1, 1, 1, 2, 3, 8)
-"""How many things are changed at a time."""
+"""Numbers of changes made at once, drawn at random."""
 
 Case = tuple[bytes, tuple[str, ...]]
 """Bytes of a config file, and overrides."""
 
 
 class _LateError(BaseException):
-    """Loading took too long; nothing that catches `Exception` keeps it from getting here."""
+    """Raised if loading takes too long; code that catches `Exception` does not stop it."""
 
 
 def run(report: Report, seed: int) -> None:
@@ -64,7 +63,7 @@ def run(report: Report, seed: int) -> None:
 
 
 def tried(case: Case, folder: Path) -> tuple[Config | None, str | None]:
-    """The config of a case if it is accepted, and what went wrong, if anything did."""
+    """Return the config of a case if it is accepted, and a description of the failure, if any."""
     data, overrides = case
     path = folder / "case.yaml"
     path.write_bytes(data)
@@ -83,7 +82,7 @@ def tried(case: Case, folder: Path) -> tuple[Config | None, str | None]:
 
 
 def wrong_message(message: str) -> str | None:
-    """What is wrong with the message of an `InputError`, if anything is."""
+    """Return what is wrong with the message of an `InputError`, or None."""
     faults = {
         "empty": not message.strip(),
         "long": len(message) > LONGEST,
@@ -96,7 +95,9 @@ def wrong_message(message: str) -> str | None:
 
 
 def wrong_geometry(config: Config) -> str | None:
-    """What is wrong with the geometry of an accepted config, neither finite nor refused."""
+    """Return what is wrong with the geometry of an accepted config, or None.
+
+    The geometry must be finite or rejected."""
     import jax
     import numpy as np
 
@@ -124,7 +125,7 @@ _measured: Any = None
 
 @contextmanager
 def _guarded(times: float = 1):
-    """Raise `_LateError` in what takes more CPU time than `SECONDS`, so many times."""
+    """Raise `_LateError` in code that takes more CPU time than `times` times `SECONDS`."""
     seconds = times * SECONDS
 
     def late(*_):
@@ -132,7 +133,7 @@ def _guarded(times: float = 1):
 
     before = signal.signal(signal.SIGVTALRM, late)
     began = time.process_time()
-    # Again and again: what is raised within a destructor or the like is lost.
+    # Raise it repeatedly, because an exception inside a destructor is lost.
     signal.setitimer(signal.ITIMER_VIRTUAL, seconds, 0.1)
     try:
         yield
@@ -153,8 +154,9 @@ def _brief(case: Case) -> str:
 
 @functools.cache
 def _texts() -> tuple[list[str], list[dict]]:
-    """The shipped configs without their comments, half of them in YAML's other style, and as
-    plain data."""
+    """Return the shipped configs without comments, as text and as plain data.
+
+    Half of the texts are in YAML's other style."""
     trees = [yaml.safe_load(path.read_text()) for path in SHIPPED]
     return [
         yaml.safe_dump(tree, default_flow_style=k % 2 > 0) for k, tree in enumerate(trees)
@@ -171,7 +173,7 @@ def _tree(draw: random.Random) -> dict:
 
 @functools.cache
 def _keys() -> list[str]:
-    """All dotted keys and sections."""
+    """Return all dotted keys and sections."""
     return list(all_keys(Config))
 
 
@@ -188,7 +190,7 @@ WORDS = (  # noqa: SIM905
 
 
 def _scalar(draw: random.Random) -> str:
-    """A scalar in YAML's words, odd more often than not."""
+    """Return a YAML scalar, in most cases an odd one."""
     size = draw.choice(SIZES)
     kinds: tuple[Callable[[], str], ...] = (
         lambda: draw.choice(NUMBERS),
@@ -214,7 +216,7 @@ TAGS = (  # noqa: SIM905
 
 
 def _hostile(draw: random.Random) -> str:
-    """A construct that is meant to hang or break a reader of YAML."""
+    """Return a construct meant to hang or break a YAML reader."""
     size, deep = draw.choice(SIZES), draw.randrange(2, 14)
     wide = draw.randrange(2, 12)
 
@@ -396,14 +398,14 @@ DESIGNS: dict[str, dict[str, Any]] = {
 UNDRAWN = ("profile.", "scene.", "sweep.", "pareto.", "tolerances.")
 """Sections whose choices are not drawn at random."""
 TIED = ("optimizer.family", "solver.fidelity", "objective.motion", "objective.over_speeds")
-"""Choices that other keys must go with."""
+"""Choices that require certain other keys."""
 OPTIONAL = ("rotor.bore_mm", "contact.friction", "scene.timing_gear", "scene.supports")
 SCATTER = {"rotor.length_mm": {"relative_uniform": 0.01}}
 """Distributions of a config with `tolerances`."""
 
 
 def _inside(draw: random.Random, low: float, high: float) -> float:
-    """A number within limits: an end, or even in its logarithm."""
+    """Return a number within limits: an end, or a number drawn evenly in its logarithm."""
     if draw.random() < 0.3:
         return draw.choice((low, high))
     if low <= 0:
@@ -420,7 +422,7 @@ def _set(data: dict, key: str, value: Any) -> None:
 
 @functools.cache
 def _numbers() -> dict[str, tuple[float, float, bool]]:
-    """Limits of every plain number outside of `profile`, and whether it is whole."""
+    """Return limits of every plain number outside `profile`, and whether it is whole."""
     found = {}
     for key in _keys():
         field: Any = field_of(Config, key.split("."))
@@ -436,7 +438,7 @@ def _numbers() -> dict[str, tuple[float, float, bool]]:
 
 
 def _valid(draw: random.Random) -> Case:
-    """A config whose numbers all lie within their limits, with a design near a sound one."""
+    """Return a config whose numbers lie within their limits, with a design near a sound one."""
     family = draw.choice(list(DESIGNS))
     radius = _inside(draw, 1, 5000)
     spread = draw.choice((0.0, 0.0, 0.01, 0.1, 1.0))
@@ -507,4 +509,4 @@ CLASSES: dict[str, Callable[[random.Random], Case]] = {
     "hostile YAML": _hostiles,
     "numbers within limits": _valid,
 }
-"""What the random configs are, each made from a seeded source of random numbers."""
+"""Classes of random configs, each made from a seeded source of random numbers."""

@@ -1,8 +1,7 @@
-"""Commands under random environments: the same result, or exit 2 with one line.
+"""Commands in random environments: the same result, or exit 2 with one line.
 
-Every case takes a few variables at once from those that work, that are set aside or that are
-refused, and runs `profile` with them.
-"""
+Each case sets a few variables that work, are ignored or are rejected, and runs `profile` with
+them."""
 
 import json
 import os
@@ -137,7 +136,7 @@ def run(report: Report, seed: int) -> None:
 
 
 def _profile(folder: Path, variables: dict[str, str]):
-    """Exit code, both outputs and the geometry in the result, if there is one."""
+    """Return exit code, both outputs, and the geometry in the result, if there is one."""
     out = folder / "out"
     shutil.rmtree(out, ignore_errors=True)
     done = subprocess.run(

@@ -1,11 +1,10 @@
 """Runs killed (SIGKILL) at random instants while they write into a folder with an older run.
 
-What is written is what real commands have written, again by the same file layer, in a process
-forked for each case: on a disk and in memory, with and without `--overwrite`, moving or exchanging
-folders. Some cases are whole commands, killed at any instant from their start on. Afterwards the
-folder must be the older run or the new one, whole, and the run that follows must leave whole runs
-and nothing else.
-"""
+Each case writes the files of a real command again, with the same file layer, in a forked process.
+Cases differ: on a disk or in memory, with or without `--overwrite`, moving or exchanging folders.
+Some cases are whole commands, killed at any instant after their start. Afterwards the folder must
+be the complete older run or the complete new one. The next run must leave complete runs and nothing
+else."""
 
 import json
 import os
@@ -29,18 +28,18 @@ COMMANDS = {
     "simulate": ["--no-figures", "--set", "solver.fidelity=linear"],
 }
 _WHOLE = 60
-"""One case of so many is a whole command."""
+"""Number of cases of which one is a whole command."""
 
 
 class Recorded(NamedTuple):
-    """Files that a command has written, by name, and what its result holds."""
+    """Files that a command has written, by name, and the content of its result."""
 
     command: str
     files: dict[str, bytes]
     result: dict
 
     def write(self, folder: Path, overwrite: bool = False) -> None:
-        """The same run, into another folder."""
+        """Write the same run into another folder."""
         with RunFolder(folder, self.command, overwrite) as run:
             for name, data in self.files.items():
                 run.write_bytes(name, data)
@@ -49,7 +48,7 @@ class Recorded(NamedTuple):
 
 
 def run(report: Report, seed: int) -> None:
-    """Kill until the report is over."""
+    """Kill processes until the report is over."""
     chance = random.Random(seed)
     disk, memory = Path(tempfile.mkdtemp(prefix="kills-")), scratch()
     os.environ["ROOTSOPT_CACHE"] = str(disk / "cache")
@@ -76,7 +75,7 @@ def _arguments(command: str, folder: Path, *more: str) -> list[str]:
 
 
 def _recorded(place: Path) -> tuple[list[Recorded], float]:
-    """Two different runs of each command, and how long one takes (s)."""
+    """Return two different runs of each command, and the time (s) that one takes."""
     found = []
     for command in COMMANDS:
         for design in ("30.0", "33.0"):
@@ -144,7 +143,7 @@ def _replayed(report: Report, chance: random.Random, place: Path, known: list[Re
 
 
 def _afterwards(place: Path, whole: set[str | None]) -> list[str]:
-    """What is wrong with what a kill and the run after it have left."""
+    """Return what is wrong with the files left by a kill and by the next run."""
     names = os.listdir(place)
     wrong = [f"the next run leaves {name}" for name in names if name.startswith(".")]
     if any(digest(place / name) not in whole for name in names):
@@ -153,7 +152,7 @@ def _afterwards(place: Path, whole: set[str | None]) -> list[str]:
 
 
 def _whole(report: Report, chance: random.Random, place: Path, seconds: float) -> None:
-    """A command from its start on."""
+    """Kill a command at a random instant after its start."""
     command = chance.choice(list(COMMANDS))
     arguments = _arguments(command, place / "run")
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": ROOT}
@@ -178,7 +177,7 @@ def _whole(report: Report, chance: random.Random, place: Path, seconds: float) -
 
 
 def _consistent(folder: Path) -> bool:
-    """Whether a folder holds the files its result lists and no others."""
+    """Return whether a folder contains the files that its result lists and no others."""
     try:
         listed = json.loads((folder / RESULT).read_bytes())["run"]["files"]
     except (OSError, ValueError):

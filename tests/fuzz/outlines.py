@@ -1,10 +1,9 @@
-"""Malformed outline files against the reader, the fit and the roll check.
+"""Malformed outline files for reader, fit and roll check.
 
 Good files of this program are damaged: bytes, DXF tags, entities, headers, cells, encodings, and
-the outline itself. A file passes if it gives a profile or one `InputError` of one line, with
-nothing on stderr, in 20 s of processor time and 8 GB of address space. A few go through the command
-itself.
-"""
+the outline itself. A file passes if it gives a profile or an `InputError` of one line, with nothing
+on stderr. The limits are 20 s of processor time and 8 GB of address space. A few files go through
+the command itself."""
 
 import contextlib
 import functools
@@ -26,9 +25,9 @@ from rootsopt.errors import InputError
 from tests.fuzz.report import Report
 
 SECONDS, MEMORY, LONGEST = 20, 8 << 30, 450
-"""Processor time (s) and memory (bytes) for a file; characters of a message."""
+"""Limits for a file: processor time (s), memory (bytes), and characters of a message."""
 _EVERY = 100
-"""One file of so many goes through the command in a process of its own."""
+"""Number of files of which one goes through the command in its own process."""
 _R = 33.0
 CONFIG = """
 profile: {{family: outline, lobes: 3, pitch_radius_mm: 33.0, outline_file: "{}",
@@ -73,7 +72,7 @@ ENTITIES = {
 
 @functools.cache
 def points(family: str, count: int = 30) -> np.ndarray:
-    """Outline (mm, x + iy) of a good rotor, the first point not repeated."""
+    """Return the outline (mm, x + iy) of a good rotor, without repeating the first point."""
     from rootsopt.profiles import CIC, EE, outline
 
     rotor = CIC(3, 0.033, 0.6358, 8.5e-3, 0.0698) if family == "cic" else EE(3, 0.033)
@@ -81,14 +80,14 @@ def points(family: str, count: int = 30) -> np.ndarray:
 
 
 def table(z: np.ndarray, split: str = ",", comma: bool = False, header: str = "x_mm,y_mm") -> bytes:
-    """A CSV file of points."""
+    """Return a CSV file of points."""
     rows = [split.join(f"{v:.10g}" for v in (p.real, p.imag)) for p in [*z, *z[:1]]]
     rows = [row.replace(".", ",") for row in rows] if comma else rows
     return "\n".join([header.replace(",", split), *rows, ""]).encode()
 
 
 def drawing(draw, version: str = "R2000", units: int = 4, fmt: str = "asc") -> bytes:
-    """A DXF file of what `draw` adds to a document, the same bytes each time."""
+    """Return a DXF file with what `draw` adds to a document, the same bytes each time."""
     import ezdxf
 
     ezdxf.options.write_fixed_meta_data_for_testing = True
@@ -104,7 +103,7 @@ def drawing(draw, version: str = "R2000", units: int = 4, fmt: str = "asc") -> b
 
 
 def lines(z: np.ndarray, random: random.Random):
-    """Draws loose lines in any order and direction."""
+    """Return a function that draws loose lines in any order and direction."""
 
     def draw(document):
         ends = list(zip(z, np.roll(z, -1), strict=True))
@@ -117,7 +116,7 @@ def lines(z: np.ndarray, random: random.Random):
 
 
 def polyline(z: np.ndarray, old: bool = False, block: bool = False):
-    """Draws one closed polyline with small bulges, in a block if asked for."""
+    """Return a function that draws a closed polyline with small bulges, optionally in a block."""
 
     def draw(document):
         space = document.blocks.new("ROTOR") if block else document.modelspace()
@@ -132,7 +131,7 @@ def polyline(z: np.ndarray, old: bool = False, block: bool = False):
 
 @functools.cache
 def good() -> dict[str, bytes]:
-    """Sound files by name."""
+    """Return valid files by name."""
     import ezdxf
 
     from rootsopt.config import load
@@ -148,6 +147,8 @@ def good() -> dict[str, bytes]:
 
     def own(document):
         for entity in entities:
+            if entity.dxftype() == "DIMENSION":
+                continue  # ezdxf cannot copy these between documents.
             document.modelspace().add_foreign_entity(entity)
 
     cic, ee = points("cic"), points("ee")
@@ -166,7 +167,7 @@ def good() -> dict[str, bytes]:
 
 
 def damaged_bytes(data: bytes, chance: random.Random) -> bytes:
-    """Bytes changed, lost, repeated or put in."""
+    """Return the data with bytes changed, lost, repeated or inserted."""
     for _ in range(chance.choice([1, 1, 2, 5, 40])):
         at = chance.randrange(len(data) + 1)
         size = chance.choice([1, 1, 2, 8, 100, len(data) // 3])
@@ -194,7 +195,8 @@ def _section(tags: list[list[str]], name: str) -> tuple[int, int]:
 
 
 def damaged_tags(data: bytes, chance: random.Random) -> bytes:
-    """Values, codes or whole tags of a text DXF, mostly of its entities."""
+    """Return the data with values, codes or whole tags of a text DXF changed, mostly of
+    entities."""
     tags = _tags(data)
     low, high = _section(tags, "ENTITIES") if chance.random() < 0.8 else (0, len(tags))
     low, high = (low, high) if high > low else (0, len(tags))
@@ -213,7 +215,8 @@ def damaged_tags(data: bytes, chance: random.Random) -> bytes:
 
 
 def damaged_header(data: bytes, chance: random.Random) -> bytes:
-    """Units, version or another variable of the header; or no header."""
+    """Return the data with units, version or another header variable changed, or without a
+    header."""
     tags = _tags(data)
     low, high = _section(tags, "HEADER")
     places = [k for k in range(low, high) if tags[k][0].strip() == "9"]
@@ -228,7 +231,8 @@ def damaged_header(data: bytes, chance: random.Random) -> bytes:
 
 
 def damaged_entities(data: bytes, chance: random.Random) -> bytes:
-    """Entities lost, repeated, moved, flattened, or senseless ones put in."""
+    """Return the data with entities lost, repeated, moved or flattened, or with senseless ones
+    added."""
     tags = _tags(data)
     low, high = _section(tags, "ENTITIES")
     groups: list[list[list[str]]] = []
@@ -271,7 +275,7 @@ def _senseless(chance: random.Random) -> list[list[str]]:
 
 
 def damaged_cells(data: bytes, chance: random.Random) -> bytes:
-    """Cells, rows, separators, headers, marks or the encoding of a table."""
+    """Return the data with cells, rows, separators, headers, marks or the encoding changed."""
     rows = data.decode().splitlines()
     for _ in range(chance.choice([1, 1, 2, 10])):
         k = chance.randrange(len(rows))
@@ -312,7 +316,7 @@ def damaged_cells(data: bytes, chance: random.Random) -> bytes:
 
 
 def wrong_outline(chance: random.Random) -> np.ndarray:
-    """Points that can be read and are no rotor, or a strange one."""
+    """Return readable points that are not a rotor, or a strange one."""
     z = points(chance.choice(["cic", "ee"]), chance.choice([4, 15, 30, 60])).copy()
     noise = np.random.default_rng(chance.randrange(1 << 30))
     n, k = len(z), chance.randrange(len(z))
@@ -348,7 +352,7 @@ def wrong_outline(chance: random.Random) -> np.ndarray:
 
 
 def malformed(chance: random.Random) -> tuple[str, str, bytes]:
-    """Class, ending and content of a file."""
+    """Return class, file extension and content of a file."""
     if chance.random() < 0.3:
         z = wrong_outline(chance)
         if chance.random() < 0.3 and 0 < len(z) < 400:
@@ -372,7 +376,7 @@ def malformed(chance: random.Random) -> tuple[str, str, bytes]:
 
 
 def fault_of(error: BaseException) -> str | None:
-    """What is wrong with an exception that a file has raised."""
+    """Return what is wrong with an exception that a file has raised."""
     text = str(error)
     if not isinstance(error, InputError):
         return f"{type(error).__name__}: {text[:200]}"
@@ -382,7 +386,8 @@ def fault_of(error: BaseException) -> str | None:
 
 
 def tried(path: Path, smoothing: float, roll: bool = True) -> str | None:
-    """Read, fit and roll the outline in a file, as `rootsopt profile` does; what went wrong."""
+    """Read, fit and roll the outline in a file, as `rootsopt profile` does; return the failure, if
+    any."""
     from rootsopt.measured.conjugacy import conjugacy
     from rootsopt.measured.fit import imported
     from rootsopt.measured.reading import read
@@ -397,7 +402,7 @@ def tried(path: Path, smoothing: float, roll: bool = True) -> str | None:
 
 
 def _work(jobs) -> None:
-    """A worker: tries the files whose paths come, with stderr into a file, and answers."""
+    """Try the files whose paths arrive, with stderr in a file, and answer (worker process)."""
     from rootsopt.runtime.environment import use_float64
 
     use_float64()
@@ -418,7 +423,7 @@ def _work(jobs) -> None:
 
 
 class _Late(BaseException):
-    """A file took too long; no handler of the package may take it for an error of a library."""
+    """Raised if a file takes too long. The package must not take it for an error of a library."""
 
 
 def _late(*_):
@@ -426,13 +431,13 @@ def _late(*_):
 
 
 class Worker:
-    """A process that tries files one after another; a new one where it has died."""
+    """A process that tries files one after another, and is replaced if it dies."""
 
     def __init__(self):
         self.process = None
 
     def __call__(self, path: Path, smoothing: float) -> str | None:
-        """What went wrong with a file."""
+        """Return the failure of a file, or None."""
         if self.process is None:
             context = multiprocessing.get_context("spawn")
             self.jobs, other = context.Pipe()
@@ -458,7 +463,9 @@ class Worker:
 
 
 def commanded(path: Path, smoothing: float) -> str | None:
-    """The file through `rootsopt profile`: exit code 0, or 2 with one line on stderr."""
+    """Return the failure of a file with `rootsopt profile`, or None.
+
+    The exit code must be 0, or 2 with one line on stderr."""
     scene = path.with_suffix(".yaml")
     scene.write_text(CONFIG.format(path, smoothing))
     arguments = [
@@ -482,7 +489,7 @@ def commanded(path: Path, smoothing: float) -> str | None:
 
 
 def run(report: Report, seed: int) -> None:
-    """Try damaged files until `report` is over; failed ones are kept in a folder it names."""
+    """Try damaged files until `report` is over; keep failed ones in a folder that it names."""
     from rootsopt.runtime.environment import use_float64
 
     use_float64()

@@ -1,4 +1,4 @@
-"""What a fuzzing campaign tried and what failed."""
+"""Cases and failures of a fuzzing campaign."""
 
 import time
 from dataclasses import dataclass, field
@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Report:
-    """Cases tried and failures, by class of case; stops a campaign when its time is over."""
+    """Cases tried and failures, by class of case. It ends a campaign when its time is over."""
 
     name: str
     cases: int
@@ -22,17 +22,19 @@ class Report:
 
     @property
     def total(self) -> int:
-        """Cases tried so far."""
+        """Number of cases tried so far."""
         return sum(self.tried.values())
 
     def add(self, kind: str, failure: str | None = None) -> None:
-        """Count one case of class `kind`; `failure` says how to repeat it and what went wrong."""
+        """Count one case of class `kind`.
+
+        `failure`: how to repeat the case, and what went wrong."""
         self.tried[kind] = self.tried.get(kind, 0) + 1
         if failure is not None:
             self.failures.append((kind, failure))
 
     def table(self) -> str:
-        """Cases tried and failed for each class, then each failure."""
+        """Return the numbers of cases tried and failed for each class, then each failure."""
         failed = {kind: sum(k == kind for k, _ in self.failures) for kind in self.tried}
         width = max([len(kind) for kind in self.tried] + [len("all")])
         rows = [f"  {kind:<{width}} {self.tried[kind]:>8} {failed[kind]:>7}" for kind in self.tried]

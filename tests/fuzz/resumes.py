@@ -42,7 +42,7 @@ _OWN = "compile_seconds", "run_seconds", "seconds", "statistics", "run", "versio
 
 
 def run(report: Report, seed: int) -> None:
-    """Kill until the report is over."""
+    """Kill searches until the report is over."""
     chance = random.Random(seed)
     place = Path(tempfile.mkdtemp(prefix="resumes-"))
     os.environ["ROOTSOPT_CACHE"] = str(place / "cache")

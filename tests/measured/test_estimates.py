@@ -1,6 +1,6 @@
-"""Estimates of scatter, centre and unit from the points of a file, and what messages make of them.
+"""Tests of estimated scatter, centre and unit of a file's points, and of the messages about them.
 
-The files are made from known rotors with known errors, so that the estimates can be compared."""
+The files are made from known rotors with known errors."""
 
 import functools
 import re
@@ -30,13 +30,13 @@ scene: {{speed_rpm: 3000.0, load: {{torque_N_m: 4.775}}}}
 
 @functools.cache
 def rotor(name="cic", count=240):
-    """Points of a rotor (mm), the first not repeated."""
+    """Return points of a rotor (mm), without repeating the first."""
     profile = CIC(3, R, np.deg2rad(36.43), 8.5e-3, np.deg2rad(4.0)) if name == "cic" else EE(3, R)
     return np.asarray(outline(profile, count))[:-1] @ [1, 1j] * 1e3
 
 
 def scattered(points, size, seed=0):
-    """Points with normal scatter of standard deviation `size` (mm) in x and in y."""
+    """Return points with normal scatter of standard deviation `size` (mm) in x and in y."""
     chance = np.random.default_rng(seed)
     return points + size * (chance.normal(size=(len(points), 2)) @ [1, 1j])
 
@@ -47,7 +47,7 @@ def write(path, points):
 
 
 def read(path, **keys):
-    """Config, profile and checks of an outline file, with further `keys` of the profile."""
+    """Return config, profile and checks of an outline file, with further `keys` of the profile."""
     more = "".join(f", outline_{key}: {value}" for key, value in keys.items())
     config = parse(CONFIG.format(path, more)).profile
     return config, *outline_of(config)
@@ -56,7 +56,9 @@ def read(path, **keys):
 @pytest.mark.parametrize("name", ["cic", "ee"])
 @pytest.mark.parametrize("size", [0.0, 1e-3, 5e-3, 20e-3])
 def test_scatter_and_centre_are_those_put_in(name, size):
-    """Scatter to 15 %, centre to four times the scatter over √n, of shifted and turned points."""
+    """Scatter is found to 15 %, the centre to four times the scatter over √n.
+
+    The points are shifted and turned."""
     points = scattered(rotor(name) * np.exp(0.4j), size) + (12 - 7j)
     found = estimates(points, 3)
     if size:
@@ -79,14 +81,15 @@ def test_standard_error_of_the_centre_is_that_of_repetitions():
 
 @pytest.mark.parametrize("size", [5e-3, 20e-3])
 def test_scatter_of_points_closer_than_they_scatter(size):
-    """Points a few micrometres apart: their order along the outline is lost."""
+    """Scatter is found for points a few micrometres apart, whose order along the outline is
+    lost."""
     t = np.linspace(0, 2 * np.pi, 60_000, endpoint=False)
     dense = (33 + 10 * np.cos(3 * t)) * np.exp(1j * t)
     assert scatter(scattered(dense, size)) == pytest.approx(size, rel=0.15)
 
 
 def test_few_points_have_no_known_scatter():
-    """20 points a flank: what a polynomial misses is no scatter."""
+    """With 20 points per flank, the error of a polynomial is not taken for scatter."""
     found = estimates(rotor()[::24], 3)
     assert np.isnan(found.scatter)
     assert "too few" in found.remedy(0.0)
@@ -100,7 +103,7 @@ def test_few_points_have_no_known_scatter():
     shift=st.complex_numbers(max_magnitude=100, allow_nan=False),
 )
 def test_estimates_do_not_depend_on_how_the_points_are_given(turn, start, backwards, shift):
-    """Turned, moved, in the other direction and from another first point."""
+    """Points may be turned, moved, reversed, and start anywhere."""
     points = scattered(rotor(), 5e-3)
     moved = np.roll(points, start)[:: -1 if backwards else 1] * np.exp(1j * turn) + shift
     one, other = estimates(points, 3), estimates(moved, 3)
@@ -111,7 +114,8 @@ def test_estimates_do_not_depend_on_how_the_points_are_given(turn, start, backwa
 
 
 def test_fitted_centre_replaces_the_origin(tmp_path, capsys):
-    """The flanks of a shifted file are then equal, and the centre is reported in mm."""
+    """With the fitted centre, the flanks of a shifted file are equal, and the centre is reported in
+    mm."""
     path = write(tmp_path / "shifted.csv", rotor() + (0.1 - 0.05j))
     config, _, checks = read(path)
     assert checks.lobe_deviation_um > 100
@@ -144,7 +148,9 @@ def test_units_are_offered_and_not_taken(tmp_path, unit, size):
 
 
 def test_unit_of_a_drawing_can_be_replaced(tmp_path):
-    """A drawing in inches that states millimetres; scatter and centre of its polyline."""
+    """A drawing in inches that states millimetres is read in inches.
+
+    Scatter and centre of its polyline are estimated."""
     points = scattered(rotor() + 0.2, 5e-3) / 25.4
     document = ezdxf.new("R2010", units=units.MM)
     corners = np.stack([points.real, points.imag], axis=1)
@@ -166,7 +172,9 @@ def test_a_wrong_pitch_radius_is_told_from_a_wrong_unit(tmp_path):
 
 @pytest.mark.parametrize("size", [1, 5, 20])
 def test_refused_points_are_said_to_be_scattered(tmp_path, size):
-    """Without smoothing; with too little; and what the message advises is accepted in the end."""
+    """The message states the scatter, without smoothing and with too little.
+
+    The advised smoothing is accepted in the end."""
     path = write(tmp_path / "points.csv", scattered(rotor(), size * 1e-3, seed=2))
     for keys in ({}, {"smoothing_mm": 0.1e-3 * size}):
         with pytest.raises(InputError) as refused:

@@ -1,4 +1,4 @@
-"""Import of outlines: files in, the profile they hold and what is wrong with it out."""
+"""Tests of imported outlines: profile and deviations from files."""
 
 import importlib.util
 import json
@@ -39,7 +39,8 @@ scene: {{speed_rpm: 3000.0, load: {{torque_N_m: 4.775}},
 
 
 def points_of(profile, count=1000):
-    """Points of an outline (mm) to ten digits, as in a CSV file; the first not repeated."""
+    """Return points of an outline (mm) to ten digits, as in a CSV file, without repeating the
+    first."""
     points = np.asarray(outline(profile, count))[:-1] * 1e3
     return np.array([[float(f"{x:.10g}") for x in row] for row in points]) @ [1, 1j]
 
@@ -53,7 +54,7 @@ def closed(points):
 
 
 def bulged(points, by):
-    """Points with the addenda `by` mm too thick."""
+    """Return points with the addenda `by` mm too thick."""
     along = np.roll(points, -1) - np.roll(points, 1)
     above = np.clip((np.abs(points) - 33) / (np.max(np.abs(points)) - 33), 0, 1)
     return points - 1j * along / np.abs(along) * by * np.sin(np.pi * above) ** 2
@@ -80,8 +81,9 @@ def contact_of(profile):
 
 @every_profile
 def test_points_of_a_profile_give_its_contact_and_geometry(profile):
-    """Gap within 1 nm, levers within 3e-4 of the pitch radius (where arcs conform, ten digits say
-    no more of where they touch), area and inertia within 1e-9."""
+    """Gap within 1 nm, levers within 3e-4 of the pitch radius, area and inertia within 1e-9.
+
+    Where arcs conform, ten digits do not determine the levers more closely."""
     found, checks = profile_of(points_of(profile))
     truth, contact = contact_of(profile), contact_of(found)
     assert np.array_equal(truth.found, contact.found)
@@ -105,7 +107,7 @@ def test_points_of_a_profile_give_its_contact_and_geometry(profile):
 @every_profile
 @pytest.mark.parametrize("by", [0.02, -0.02])
 def test_a_wrong_outline_leaves_the_gap_that_its_points_leave(profile, by):
-    """20 µm on the addenda are 20 µm of overlap or gap, as node against segment sees them."""
+    """Addenda 20 µm too thick overlap by 20 µm, as node against segment finds."""
     points = bulged(points_of(profile), by)
     found, _ = profile_of(points)
     rolled = conjugacy(found)
@@ -122,7 +124,7 @@ def test_a_wrong_outline_leaves_the_gap_that_its_points_leave(profile, by):
 
 
 def test_levers_are_the_derivatives_of_the_gap():
-    """Of flanks that are not conjugate, by central differences in φ1 and φ2."""
+    """The levers of flanks that are not conjugate agree with central differences in φ1 and φ2."""
     found, _ = profile_of(bulged(points_of(CIC3), 0.02))
     pair = FlankPair.of(found, 2 * found.pitch_radius, two_sided=True)
     rolls, h = np.linspace(0.15, 0.9, 7), 1e-6
@@ -172,7 +174,7 @@ def test_scattered_points_are_smoothed():
 
 
 def test_joints_are_seen():
-    """Land, arc, involute and their mates: eight places a lobe, the pitch circle not among them."""
+    """Land, arc, involute and their mates give eight joints per lobe, without the pitch circle."""
     points = points_of(CIC3, 240)
     found = np.degrees(np.angle(points[np.roll(_jumps(np.roll(points, 77)), -77)]))
     assert np.sum(np.abs(found) < 59) == 8
@@ -187,7 +189,7 @@ def test_csv_dialects(tmp_path, header, separator):
 
 
 def dxf(path, draw, units):
-    """A DXF file of what `draw` adds to its model space."""
+    """Write a DXF file with what `draw` adds to its model space."""
     document = ezdxf.new("R2010", units=units)
     draw(document.modelspace())
     document.saveas(path)
@@ -195,8 +197,9 @@ def dxf(path, draw, units):
 
 
 def test_dxf_in_inches_of_polylines_and_lines(tmp_path):
-    """A polyline with arcs (a slot), and lines in any order and direction: scaled, joined, and the
-    largest loop taken."""
+    """A polyline with arcs and loose lines in any order are scaled and joined.
+
+    The loop of the largest area is used."""
     corners = [(0, 0, 0), (2, 0, 1), (2, 1, 0), (0, 1, 1)]
 
     def slot(space):
@@ -222,7 +225,7 @@ def test_dxf_in_inches_of_polylines_and_lines(tmp_path):
 
 
 def test_dxf_of_an_ellipse(tmp_path):
-    """Turned, off the origin, without units, which are millimetres then."""
+    """A turned ellipse off the origin is read in millimetres if the file states no unit."""
 
     def ellipse(space):
         space.add_ellipse((5, 1), major_axis=(4, 3), ratio=0.6)
@@ -290,7 +293,7 @@ def test_config_keys(tmp_path):
 
 
 def test_profile_command_reads_its_own_files(tmp_path):
-    """The CSV that was read, and the DXF drawn of it where ezdxf is there; the folder is whole."""
+    """`profile` reads the CSV that it copies and the DXF that it draws; the folder is complete."""
     path = write(tmp_path / "points.csv", points_of(CIC3, 240))
     (tmp_path / "scene.yaml").write_text(CONFIG.format(path))
     drawn = "dxf" if importlib.util.find_spec("ezdxf") else "none"
@@ -313,7 +316,7 @@ def test_profile_command_reads_its_own_files(tmp_path):
 
 @pytest.mark.long
 def test_pair_has_the_forces_of_the_profile(tmp_path):
-    """Force and torques of a whole pair, drive and coast, over poses and speeds."""
+    """Force and torques of a whole pair agree, drive and coast, over poses and speeds."""
     path = write(tmp_path / "points.csv", points_of(CIC3))
     config = parse(CONFIG.format(path))
     truth = parse(

@@ -1,4 +1,4 @@
-"""Outline files: malformed ones are answered in a line, loose entities joined, CAD's ways known."""
+"""Tests of outline files: one-line messages for malformed files, joining, conventions of CAD."""
 
 import io
 import os
@@ -23,7 +23,7 @@ ROTOR = (40 + 8 * np.cos(3 * T)) * np.exp(1j * T)
 
 
 def drawn(path, draw, version="R2010", units=units.MM, fmt="asc"):
-    """The outline in a drawing of what `draw` adds to the model space."""
+    """Return the outline in a drawing with what `draw` adds to the model space."""
     document = ezdxf.new(version, units=units)
     draw(document.modelspace())
     document.saveas(path, fmt=fmt)
@@ -36,7 +36,7 @@ def line(space, start, stop, **attributes):
 
 
 def lines(space, z, order=None):
-    """Loose lines along a polygon, every other one backwards."""
+    """Draw loose lines along a polygon, every other one reversed."""
     for k in range(len(z)) if order is None else order:
         line(space, *(z[k], z[(k + 1) % len(z)])[:: 1 if k % 2 else -1])
 
@@ -46,7 +46,7 @@ def polyline(z, **how):
 
 
 def fault(path, data):
-    """The one line that a file's content is answered with."""
+    """Return the one-line message for a file with this content."""
     path.write_bytes(data if isinstance(data, bytes) else data.encode())
     with pytest.raises(InputError) as raised:
         imported(read(path), 3, 33.0, 0.0)
@@ -55,7 +55,7 @@ def fault(path, data):
 
 
 def test_fuzzed_files_are_answered(tmp_path, capfd):
-    """The campaign of tests/fuzz, reduced."""
+    """A reduced campaign of tests/fuzz finds no failure."""
     wrong = []
     for number in range(50):
         chance = random.Random(f"test-{number}")
@@ -69,7 +69,7 @@ def test_fuzzed_files_are_answered(tmp_path, capfd):
 
 
 def test_good_files_of_the_campaign_are_read(tmp_path):
-    """Else nothing but the damage done before would be tried."""
+    """The undamaged files of the campaign are accepted, so that it tests the damage."""
     areas = {}
     for name, data in outlines.good().items():
         (tmp_path / name).write_bytes(data)
@@ -211,7 +211,8 @@ def text_of(draw, version="R2010", units=units.MM):
 
 
 def test_damaged_drawings_are_not_read_as_others(tmp_path, capfd):
-    """A decimal comma, an unknown unit, a file that was cut off; the library would go on."""
+    """A decimal comma, an unknown unit or a truncated file is rejected; the library would accept
+    it."""
     path, whole = tmp_path / "drawing.dxf", text_of(polyline(ROTOR))
     assert "a number of LWPOLYLINE must be" in fault(path, whole.replace("48.0", "48,0"))
     assert "end with the mark EOF" in fault(path, whole[: whole.rindex("ENDSEC")])
@@ -229,7 +230,7 @@ def test_damaged_drawings_are_not_read_as_others(tmp_path, capfd):
 
 
 def test_what_the_library_says_stays_inside(tmp_path, caplog):
-    """It logs what it repairs; without a handler of the program's that would go to stderr."""
+    """Log records of the library do not appear on stderr."""
     whole = text_of(polyline(ROTOR))
     odd = whole.replace(" 90\n60\n", " 90\n60.0\n")
     assert odd != whole
@@ -259,7 +260,7 @@ def test_versions_of_drawings(tmp_path, version, fmt):
 
 
 def test_entities_seen_from_below(tmp_path):
-    """CAD mirrors an arc or a polyline by turning its normal over: x then runs the other way."""
+    """CAD mirrors an arc or a polyline by reversing its normal; its x axis is then reversed."""
     below = {"extrusion": (0, 0, -1)}
 
     def draw(space):
@@ -275,7 +276,7 @@ def test_entities_seen_from_below(tmp_path):
 
 
 def test_blocks(tmp_path):
-    """An outline in a block, turned; entities drawn directly come first."""
+    """A turned outline in a block is read; entities drawn directly have precedence."""
     document = ezdxf.new(units=units.MM)
     inner, outer = document.blocks.new("ROTOR"), document.blocks.new("SHEET")
     polyline(ROTOR)(inner)
@@ -294,8 +295,8 @@ def test_blocks(tmp_path):
 
 
 def test_many_loose_lines_are_joined_in_order(tmp_path, monkeypatch):
-    """Twenty thousand chains in any order: one query of the tree for all of them, and no more
-    memory or time than that takes."""
+    """Twenty thousand chains in any order are joined with one tree query, within its memory and
+    time."""
     t = np.linspace(0, 2 * np.pi, 20_000, endpoint=False)
     z = (40 + 8 * np.cos(3 * t)) * np.exp(1j * t)
     order = np.random.default_rng(0).permutation(len(z))
@@ -313,8 +314,7 @@ def test_many_loose_lines_are_joined_in_order(tmp_path, monkeypatch):
 
 
 def test_what_does_not_belong_to_the_outline(tmp_path):
-    """Lines drawn twice, center lines from the axis and from a corner, a bore of arcs: none of them
-    matters."""
+    """Repeated lines, centre lines from the axis or a corner, and a bore of arcs have no effect."""
 
     def draw(space):
         lines(space, ROTOR)
@@ -353,10 +353,10 @@ def test_a_gap_is_not_answered_with_the_bore(tmp_path):
 
 
 def test_joints_of_a_clockwise_drawing():
-    """Corners and jumps of curvature keep their places when a loop is turned round.
+    """Corners and jumps of curvature keep their places if a loop is reversed.
 
-    The loop is that of a rotor with joints on one flank of every lobe, so that joints in the order
-    they came in would lie on the other."""
+    The rotor has joints on one flank of every lobe. Joints in the original order would lie on the
+    other flank."""
     z = outlines.points("cic", 60)
     step = len(z) // 3
     joints = np.zeros(len(z), bool)
@@ -374,7 +374,7 @@ def test_joints_of_a_clockwise_drawing():
 
 
 def test_a_drawing_that_begins_with_a_valley_is_clockwise(tmp_path):
-    """This program's own drawing, entities the other way round: the same rotor, as conjugate."""
+    """This program's own drawing with reversed entities gives the same conjugate rotor."""
     own = tmp_path / "own.dxf"
     own.write_bytes(outlines.good()["own.dxf"])
     document = ezdxf.readfile(own)
@@ -401,7 +401,8 @@ def test_a_drawing_that_begins_with_a_valley_is_clockwise(tmp_path):
 
 @pytest.mark.parametrize("smoothing", [1e-9, 1e-4, 10.0, 1e4])
 def test_smoothing_that_does_not_fit_the_scatter(smoothing, capfd):
-    """Too little would take minutes of fitting for a curve that follows the noise."""
+    """Too little smoothing is rejected: fitting would take minutes, and the curve would follow the
+    noise."""
     random = np.random.default_rng(0)
     z = outlines.points("cic", 800)
     z = z + random.normal(0, 1e-3, len(z)) + 1j * random.normal(0, 1e-3, len(z))

@@ -1,1 +1,1 @@
-"""Mistakes put into a copy of the package, each to be noticed by a test; run by `make mutants`."""
+"""Mistakes in a copy of the package, each of which a test should notice; run by `make mutants`."""

@@ -1,10 +1,9 @@
-"""`python -m tests.mutants`: put mistakes into a copy of the package and see which tests notice.
+"""`python -m tests.mutants`: make mistakes in a copy of the package and see which tests notice.
 
-First those that tests once missed (tests/mutants/by_hand.py), then a seeded choice of all that
-the operators can make in the numerical rooms. Exit code 1 if one of the first is missed or fewer
-than 95 % of the others are noticed. The tree itself is not touched. A record of the outcomes lets
-a run go on where another one ended (--resume).
-"""
+First come mistakes that tests once missed (tests/mutants/by_hand.py). Then comes a seeded choice of
+all mistakes that the operators can make in the numerical modules. The exit code is 1 if one of the
+first is missed, or if fewer than 95 % of the others are noticed. The tree itself is not changed.
+With --resume, a run continues from the recorded outcomes of an earlier one."""
 
 import argparse
 import dataclasses
@@ -19,9 +18,9 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def main() -> int:
-    """Run, print the table, judge."""
+    """Run the mutants, print the table, return the exit code."""
     options = _options()
-    # As after Ctrl-C: the copy is removed, and the tests under way end.
+    # End as after Ctrl-C: remove the copy and end the running tests.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     from tests.mutants.by_hand import by_hand
     from tests.mutants.trial import Copy, Outcome
@@ -87,7 +86,7 @@ def main() -> int:
 
 
 def _control(copy, outcomes) -> None:
-    """Take the credit from tests that fail without any change."""
+    """Withdraw the verdict `caught` if the test also fails without any change."""
     tests = sorted({one.by for one in outcomes if one.by.startswith("tests/")})
     failed = copy.failing(tests)
     for one in outcomes:

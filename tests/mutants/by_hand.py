@@ -1,4 +1,4 @@
-"""Mistakes that the tests once missed, of `by_hand.yaml`."""
+"""Mistakes that the tests once missed, from `by_hand.yaml`."""
 
 import dataclasses
 from pathlib import Path
@@ -12,10 +12,9 @@ _LIST = Path(__file__).with_name("by_hand.yaml")
 
 @dataclasses.dataclass(frozen=True)
 class ByHand:
-    """One mistake, called `function`: in `file` the text `was` is replaced.
+    """One mistake with the name `function`: in `file`, the text `was` is replaced.
 
-    `source` is the whole module with the mistake; None where the text does not occur once.
-    """
+    `source`: the whole module with the mistake; None if the text does not occur exactly once."""
 
     function: str
     file: str
@@ -32,7 +31,7 @@ class ByHand:
 
 
 def by_hand(root: Path) -> list[ByHand]:
-    """The mistakes, each with the module that has it."""
+    """Return the mistakes, each with the module that contains it."""
     found = []
     for row in yaml.safe_load(_LIST.read_text()):
         text, was, becomes = (root / row["file"]).read_text(), row["was"], row["becomes"]

@@ -1,4 +1,4 @@
-"""All mutants of the numerical rooms, and the seeded choice among them."""
+"""All mutants of the numerical modules, and the seeded choice among them."""
 
 import ast
 import dataclasses
@@ -16,15 +16,14 @@ from tests.mutants.operators import operators
 from tests.mutants.rooms import ROOMS, modules
 
 _SMALL = 40
-"""Lines of a module below which it has no mutant of its own in a choice."""
+"""Number of lines of a module below which it has no mutant of its own in a choice."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Mutant:
     """One change of one module: the lines it `was` and `becomes`, inside `function`.
 
-    `source` is the whole module with the change; `tests` those that should notice it.
-    """
+    `source`: the whole module with the change; `tests`: those that should notice it."""
 
     file: str
     function: str
@@ -43,7 +42,8 @@ class Mutant:
 
 @dataclasses.dataclass(frozen=True)
 class _Place:
-    """Where an operator applies for the `occurrence`-th time; `rank` orders places by a seed."""
+    """A place where an operator applies for the `occurrence`-th time; `rank` orders places by a
+    seed."""
 
     rank: str
     kind: str
@@ -54,11 +54,10 @@ class _Place:
 
 
 def chosen(root: Path, seed: int, count: int) -> list[Mutant]:
-    """`count` mutants, shared among the modules by their length and in each among the kinds.
+    """Return `count` mutants, distributed over modules by length, and over kinds in each module.
 
-    A place is ranked by a hash of what it says, not of where it stands: a change of one module
-    leaves the mutants of the others as they are. Known equivalent mutants are passed over.
-    """
+    A place is ranked by a hash of its text, not of its line. A change of one module therefore
+    leaves the mutants of the others unchanged. Known equivalent mutants are skipped."""
     known = {tuple(one[key] for key in _KEYS) for one in equivalents()}
     files = modules(root)
     sizes = {file: len((root / file).read_text().splitlines()) for file in files}
@@ -70,7 +69,7 @@ def chosen(root: Path, seed: int, count: int) -> list[Mutant]:
         fresh: list[Mutant] = []
         used: dict[str, int] = {}
         while places and len(fresh) < quota:
-            # Of the kinds met least so far, the place that ranks first.
+            # Take the first place in rank among the kinds used least so far.
             place = min(places, key=lambda one: used.get(one.kind, 0))
             places.remove(place)
             mutant = _mutant(root, file, place)
@@ -86,7 +85,8 @@ _KEYS = "file", "function", "was", "becomes"
 
 
 def _quotas(sizes: dict[str, int], count: int) -> dict[str, int]:
-    """Mutants of each module, by largest remainders of its share of all lines."""
+    """Return the number of mutants of each module, by largest remainders of its share of all
+    lines."""
     counted = {file: size for file, size in sizes.items() if size >= _SMALL}
     total = sum(counted.values())
     exact = {file: count * size / total for file, size in counted.items()}
@@ -121,7 +121,7 @@ def _places(root: Path, file: str, seed: int) -> Iterator[_Place]:
 
 
 def _mutant(root: Path, file: str, place: _Place) -> Mutant | None:
-    """The mutant of a place; None where it is no other program, or none at all."""
+    """Return the mutant of a place; None if the program is unchanged or invalid."""
     source = (root / file).read_text()
     mutated = mutate_code(source, place.operator, place.occurrence)
     try:
@@ -153,7 +153,7 @@ def _mutant(root: Path, file: str, place: _Place) -> Mutant | None:
 
 @functools.cache
 def _outside(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Spans that are no part of what is computed: annotations, messages, assertions, decorators."""
+    """Return spans that do not affect results: annotations, messages, assertions, decorators."""
     lines = source.splitlines()
     found: list[ast.stmt | ast.expr | None] = []
     for node in ast.walk(ast.parse(source)):
@@ -180,7 +180,7 @@ def _outside(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
 
 @functools.cache
 def _functions(source: str) -> list[tuple[str, int, int]]:
-    """(qualified name, first line, last line) of every function and class."""
+    """Return (qualified name, first line, last line) of every function and class."""
     found = []
 
     def walk(node: ast.AST, prefix: str) -> None:

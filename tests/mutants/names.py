@@ -4,5 +4,5 @@ import hashlib
 
 
 def key_of(*words: str) -> str:
-    """A short name for a change, from what it says."""
+    """Return a short name for a change, from its text."""
     return hashlib.sha256("\n".join(words).encode()).hexdigest()[:12]

@@ -1,8 +1,7 @@
-"""What a mutant changes: operators of Cosmic Ray, and three of the same kind for numerical code.
+"""Operators that make mutants: those of Cosmic Ray, and three of the same kind for numerical code.
 
-Left out of Cosmic Ray's: `<` for `<=` and the like, which change nothing but a set of measure zero
-of real numbers; and exchanges that no one makes by mistake (`+` for `>>`).
-"""
+Two kinds of Cosmic Ray's operators are left out. `<` for `<=` and the like change nothing except on
+a set of measure zero. Exchanges such as `+` for `>>` are unlikely mistakes."""
 
 from collections.abc import Iterator
 
@@ -33,13 +32,13 @@ _SHAPED = {"ones", "zeros", "full", "asarray", "array", "eye"}
 
 
 def _of_arrays(name) -> bool:
-    """Whether a name is that of a function of JAX or NumPy."""
+    """Return whether a name is that of a function of JAX or NumPy."""
     dot = name.get_previous_leaf()
     return dot is not None and dot.value == "." and dot.get_previous_leaf().value in ("jnp", "np")
 
 
 class ExchangeWord(Operator):
-    """Take another function or operator that is easily mistaken for it: sine for cosine."""
+    """Replace a function or operator by one that is easily confused with it: sine by cosine."""
 
     def mutation_positions(self, node):
         if isinstance(node, tree.Operator | tree.Name):
@@ -91,7 +90,7 @@ class ExchangeArguments(Operator):
 
 
 class Double(Operator):
-    """Double a result that is returned: a forgotten factor."""
+    """Double a returned result: a forgotten factor."""
 
     def mutation_positions(self, node):
         if node.type == "return_stmt" and len(node.children) == 2:
@@ -109,7 +108,7 @@ class Double(Operator):
 
 
 def operators() -> Iterator[tuple[str, str, Operator]]:
-    """(kind, name, operator) of every operator used, in a fixed order."""
+    """Yield (kind, name, operator) of every operator used, in a fixed order."""
     provided = OperatorProvider()
     names = {
         "arithmetic": [f"ReplaceBinaryOperator_{one}" for one in _BINARY],

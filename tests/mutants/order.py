@@ -1,5 +1,4 @@
-"""Pytest plugin: tests run in the order of the command line, cheapest first, whatever conftest
-prefers for a whole run."""
+"""Pytest plugin: run tests in the order of the command line, cheapest first, not in conftest's."""
 
 import pytest
 

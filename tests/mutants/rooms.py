@@ -1,4 +1,4 @@
-"""The numerical rooms, and the tests that should notice a change in each, quickest first."""
+"""The numerical modules, and the tests that should notice a change in each, quickest first."""
 
 from pathlib import Path
 
@@ -19,6 +19,9 @@ _OF = {
     "contact/search": "closed_forms conformance",
     "contact/segments": "fidelities",
     "contact/size": "closed_forms evaluation accuracy",
+    "contact/twisted": "twisted",
+    "contact/worn": "worn",
+    "contact/wrapped": "worn twisted",
     "dynamics/collocation/blocks": "system mesh",
     "dynamics/collocation/closing": "motion",
     "dynamics/collocation/elements": "mesh system",
@@ -46,6 +49,7 @@ _OF = {
     "dynamics/saltation": "gradients steady",
     "dynamics/settle": "dynamics steady gradients",
     "dynamics/steady": "orbit measures steady gradients extremes",
+    "dynamics/stepping": "stepping flow",
     "dynamics/switches": "pair steady gradients continuation",
     "dynamics/tangent": "orbit steady gradients measures",
     "dynamics/verdict": "pair extremes steady accuracy",
@@ -55,6 +59,7 @@ _OF = {
     "dynamics/parts/friction": "friction scene",
     "dynamics/parts/gear": "pair orbit contact dynamics",
     "dynamics/parts/load": "load scene dynamics",
+    "dynamics/parts/resultants": "bearings loads",
     "dynamics/parts/supports": "scene",
     "config/families": "extending families config",
     "design/bounds": "bounds families optimize freeform beginning",
@@ -64,8 +69,9 @@ _OF = {
     "optimize/certificate": "sqp robust tradeoffs",
     "optimize/checkpoint": "checkpoint",
     "optimize/design": "optimize pareto",
-    "optimize/infeasible": "optimize",
-    "optimize/local": "sqp robust tradeoffs",
+    "optimize/infeasible": "optimize limits",
+    "optimize/limits": "limits",
+    "optimize/local": "sqp robust tradeoffs limits",
     "optimize/noise": "search noise ensemble",
     "optimize/problem": "search optimize speeds families freeform",
     "optimize/optimality": "optimality",
@@ -97,6 +103,7 @@ _OF = {
     "pump/gas": "leakage",
     "pump/laminar": "leakage",
     "pump/leakage": "leakage",
+    "pump/loads": "loads",
     "pump/play": "play",
     "pump/section": "play leakage",
     "pump/sheet": "pump_flow play leakage",
@@ -109,7 +116,11 @@ _OF = {
     "response/speeds": "speeds",
     "response/steady": "steady gradients",
     "response/terms": "terms",
+    "response/together": "together",
     "response/tolerances": "tolerances",
+    "sweeps/axes": "axes",
+    "sweeps/plan": "plan",
+    "sweeps/table": "scenes",
     "tradeoffs/aims": "tradeoffs",
     "tradeoffs/assembly": "tradeoffs",
     "tradeoffs/front": "tradeoffs",
@@ -119,7 +130,7 @@ _OF = {
     "tradeoffs/study": "tradeoffs",
     "tradeoffs/trace": "tradeoffs",
 }
-"""Modules, and the WORDs in their tests' names `test_WORD.py`."""
+"""Modules, and the WORDs in the names `test_WORD.py` of their tests."""
 
 _FILES = {
     path.stem: path.relative_to(_TESTS.parent).as_posix() for path in _TESTS.rglob("test_*.py")
@@ -150,12 +161,15 @@ _RESPONSE = (
     "speeds",
     "steady",
     "terms",
+    "together",
     "tolerances",
 )
 
 
 def modules(root: Path) -> list[str]:
-    """The modules of the rooms; `LookupError` for one without tests, or tests without one."""
+    """Return the numerical modules.
+
+    Raises `LookupError` for a module without tests, or tests without a module."""
     found = {path.relative_to(root).as_posix() for path in _numerical(root)}
     if found != set(ROOMS):
         odd = ", ".join(sorted(found ^ set(ROOMS)))
@@ -168,6 +182,8 @@ def _numerical(root: Path):
     yield package / "config" / "families.py"
     for name in _RESPONSE:
         yield package / "response" / f"{name}.py"
+    for name in ("axes", "plan", "table"):
+        yield package / "sweeps" / f"{name}.py"
     for folder in _FOLDERS:
         for path in (package / folder).rglob("*.py"):
             if path.name not in ("__init__.py", "__main__.py"):

@@ -1,4 +1,4 @@
-"""One mutant against its tests, in a copy of the tree."""
+"""Run the tests of one mutant in a copy of the tree."""
 
 import dataclasses
 import os
@@ -14,14 +14,16 @@ from pathlib import Path
 _LEFT_OUT = (".git", ".venv", "results", "dist", "build", "__pycache__", ".hypothesis",
              ".pytest_cache", ".ruff_cache")  # fmt: skip
 _OWN_CACHE = "tests/runtime/test_programs.py"
-"""Tests of the package's own cache, which is not used beside that of JAX."""
+"""Tests of the package's own cache, which is not used together with that of JAX."""
 _WORDS = {"caught": "caught by", "timeout": "no end", "survived": "SURVIVED", "void": "VOID"}
 
 
 @dataclasses.dataclass
 class Outcome:
-    """What became of a mutant: `caught` by a test, `timeout` (an endless loop, also noticed),
-    `survived`, or `void`: the test fails without the change too, or the change cannot be made."""
+    """Outcome of a mutant: `caught` by a test, `timeout` (an endless loop, also noticed), or
+    `survived`.
+
+    `void`: the test also fails without the change, or the change cannot be made."""
 
     key: str
     place: str
@@ -32,23 +34,23 @@ class Outcome:
 
     @property
     def noticed(self) -> bool:
-        """Whether a user of the tests would have been told."""
+        """Whether a user of the tests would have noticed the mistake."""
         return self.verdict in ("caught", "timeout")
 
     def row(self) -> str:
-        """Two lines for the table."""
+        """Return two lines for the table."""
         head = f"{self.place}  {_WORDS[self.verdict]} {self.by}  ({self.seconds:.0f} s)"
         return f"{head}\n    {self.change}"
 
 
 class Copy:
-    """A copy of the tree in `folder` where modules can be changed; the tree itself never is."""
+    """A copy of the tree in `folder` in which modules can be changed; the tree itself never is."""
 
     def __init__(self, root: Path, folder: Path, cache: Path, cpu_seconds: int):
         self.folder, self.cpu_seconds = folder, cpu_seconds
         ignore = shutil.ignore_patterns(*_LEFT_OUT)
         shutil.copytree(root, folder, ignore=ignore)
-        # Programs that a mutant does not change are compiled once for all.
+        # Programs that a mutant does not change are compiled only once.
         self.environment = os.environ | {
             "JAX_COMPILATION_CACHE_DIR": str(cache),
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3",
@@ -59,8 +61,9 @@ class Copy:
         self._stamp = time.time()
 
     def run(self, tests: tuple[str, ...], *options: str) -> tuple[int, list[str], str]:
-        """Exit code of pytest, the tests that failed, and the output; killed after so much time
-        of a processor, however busy the machine is."""
+        """Return the exit code of pytest, the failed tests, and the output.
+
+        The process is killed after a limit of processor time, however busy the machine is."""
         command = [sys.executable, "-m", "pytest", "-p", "tests.mutants.order", "-rfE", "--tb=line"]
         command += ["-p", "no:cacheprovider", "-m", "not long", *options, *tests]
 
@@ -88,7 +91,7 @@ class Copy:
         return done.returncode, failed, done.stdout
 
     def failing(self, tests: Iterable[str]) -> list[str]:
-        """Those of `tests` that fail without any change."""
+        """Return those of `tests` that fail without any change."""
         own = [test for test in tests if test.startswith(_OWN_CACHE)]
         groups = own, [test for test in tests if test not in own]
         return [one for group in groups if group for one in self.run(tuple(group))[1]]
@@ -101,7 +104,7 @@ class Copy:
         os.utime(path, (self._stamp, self._stamp))
 
     def trial(self, key: str, place: str, change: str, file: str, source: str, tests) -> Outcome:
-        """The outcome for one module changed to `source`."""
+        """Return the outcome for one module changed to `source`."""
         original = (self.folder / file).read_text()
         began = time.monotonic()
         self.write(file, source)

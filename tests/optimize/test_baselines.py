@@ -1,4 +1,4 @@
-"""The benchmark's competitors give rootsopt's numbers: same scene, other tools."""
+"""Tests that the competitors of the benchmark give rootsopt's numbers in the same scene."""
 
 import functools
 
@@ -43,14 +43,14 @@ every_design = pytest.mark.parametrize("design", DESIGNS, ids=str)
 
 @functools.cache
 def reference():
-    """rootsopt's response and gradient in the shipped scene, as arrays (3,) and (3, 3)."""
+    """Return rootsopt's response and gradient in the shipped scene, as arrays (3,) and (3, 3)."""
     found = Evaluator.of(CONFIG)(series=False)
     gradient = [list(found.gradient[key].values()) for key in RESPONSES]
     return np.array([found.response[key] for key in RESPONSES]), np.array(gradient)
 
 
 def poses(count):
-    """Random poses that sweep the mesh and both hand-overs as a motion does."""
+    """Return random poses that cover the mesh and both hand-overs as a motion does."""
     rng = np.random.default_rng(5)
     rolls = np.sort(rng.uniform(-0.12, np.pi / 3 + 0.12, count))
     return rolls, -(10 ** rng.uniform(-4, -2.5, count))
@@ -69,7 +69,7 @@ def _approach(lobes, radius, design, rolls, relatives):
 
 
 def approach(design, rolls, relatives):
-    """rootsopt's gap and levers (n, 3) in m, NaN without a common normal."""
+    """Return rootsopt's gap and levers (n, 3) in m, NaN without a common normal."""
     found = _approach(SCENE.lobes, SCENE.pitch_radius, design, rolls, relatives)
     columns = np.stack([found.gap, found.lever1, found.lever2], axis=1)
     return np.where(np.asarray(found.found)[:, None], columns, np.nan)
@@ -80,7 +80,7 @@ def error(result):
 
 
 def gradient_error(gradient):
-    """Relative to the greatest entry of each response."""
+    """Return the error of a gradient, relative to the greatest entry of each response."""
     truth = reference()[1]
     return np.max(np.abs(gradient - truth).max(axis=1) / np.abs(truth).max(axis=1))
 
@@ -157,7 +157,7 @@ def test_cheap_compiled_settings_reach_one_in_a_thousand():
 
 @pytest.mark.parametrize("curved", [False, True])
 def test_node_gap_converges_to_the_closest_approach(curved):
-    """Second order in the node spacing with straight segments, better with curved ones."""
+    """The order in the node spacing is two with straight segments, and higher with curved ones."""
     rolls, relatives = poses(300)
     rotor = rotor_of(SCENE, BASELINE)
     truth = numba_pair.gaps(rotor, rolls, relatives)
@@ -174,14 +174,14 @@ def test_node_gap_converges_to_the_closest_approach(curved):
 
 
 def test_node_contact_gives_the_response():
-    """1e-3 with 800 nodes a flank, 2e-4 with 3000."""
+    """The error is 1e-3 with 800 nodes per flank, and 2e-4 with 3000."""
     assert error(ScipyNodes(SCENE, **NODES_1E3).simulate(BASELINE)) < 1e-3
     fine = ScipyNodes(SCENE, nodes=3000, method="RK45", rtol=1e-6, settle=2)
     assert error(fine.simulate(BASELINE)) < 2e-4
 
 
 def test_straight_segments_give_the_response():
-    """Eq. 9 as it stands: the corners of the polygons stay in the peak."""
+    """With Eq. 9 as printed, the corners of the polygons remain in the peak."""
     straight = ScipyNodes(SCENE, nodes=2000, curved=False, rtol=1e-4, settle=1)
     assert error(straight.simulate(BASELINE)) < 2e-2
 

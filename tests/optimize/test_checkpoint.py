@@ -1,4 +1,4 @@
-"""Searches that are cut off and resumed, against one that is not: equal to the last bit."""
+"""Tests of interrupted and resumed searches, which equal an uninterrupted one to the last bit."""
 
 import json
 
@@ -40,7 +40,7 @@ def evaluation(value):
 
 
 def outcome(result):
-    """Everything that a search finds, without the seconds it took."""
+    """Return everything that a search finds, without its run times."""
     rows = [{k: repr(v) for k, v in row.items()} for row in result.history]
     record = result.optimized.record()
     record.pop("statistics")
@@ -76,7 +76,7 @@ def test_a_run_that_does_not_resume_keeps_the_older_checkpoint(tmp_path):
 
 
 def test_the_command_keeps_its_checkpoint_until_the_run_is_in_place(tmp_path, monkeypatch):
-    """A kill while files are written must not lose the search; nor must a run that is given up."""
+    """A kill while files are written does not lose the search, nor does an abandoned run."""
     kept, older = (tmp_path / f".run.checkpoint{end}" for end in ("", ".old"))
     kept.write_text("of an earlier run")
 
@@ -126,7 +126,7 @@ def test_a_line_cut_off_is_ignored(tmp_path):
 
 
 def test_a_resumed_search_equals_one_that_was_not_interrupted(tmp_path):
-    """The file is cut at random bytes, as kill -9 may leave it."""
+    """The file is cut at random bytes, as after a kill."""
     settings, path = parse(SCENE), tmp_path / "c"
     full = Checkpoint(path, HEADER)
     expected = outcome(Search(settings, checkpoint=full).run())

@@ -1,4 +1,4 @@
-"""What a search makes of noise: candidates, and a verification by ensembles of other motions."""
+"""Tests of a search with noise: candidates, and verification by ensembles of other motions."""
 
 import dataclasses
 
@@ -17,7 +17,8 @@ INSIDE = (30.0, 4.0, 3.0)
 
 
 def made_up(objective, error=0.02, design=(30.0, 4.0, 3.0)):
-    """An evaluation whose forces are `objective` of the baseline's, with a standard error."""
+    """Return an evaluation with forces of `objective` times the baseline's, and a standard
+    error."""
     return Evaluation(
         design=dict(zip(DESIGN_KEYS, map(float, design), strict=True)),
         geometry={"area_efficiency": 0.43},
@@ -42,8 +43,9 @@ def problem():
 
 
 def test_a_lucky_trial_is_no_candidate_on_its_own(problem):
-    """One trial far below its near neighbours ranks behind a place where all are good; what
-    is repeated counts once."""
+    """A trial far below its neighbours ranks behind a place where all trials are good.
+
+    Repeated trials count once."""
     good = [trial([0.2, 0.2, 0.2 + 0.01 * k], 0.7) for k in range(4)]
     lucky = [trial([0.8, 0.8, 0.8 + 0.01 * k], 0.9 if k else 0.5) for k in range(3)]
     found = noise.candidates(problem, [*lucky, lucky[0], lucky[0], *good])
@@ -55,7 +57,7 @@ def test_a_lucky_trial_is_no_candidate_on_its_own(problem):
 
 @dataclasses.dataclass(frozen=True)
 class Judge(EnsembleEvaluator):
-    """An evaluator that knows the truth about every design: 1 for the baseline's."""
+    """An evaluator that knows the true objective of every design; the baseline's is 1."""
 
     truth: float = 1.0
     error: float = 0.02
@@ -72,8 +74,9 @@ class Judge(EnsembleEvaluator):
 
 @pytest.mark.parametrize(("truth", "accepted"), [(0.9, True), (0.93, False), (1.1, False)])
 def test_only_a_significant_difference_holds_up(problem, truth, accepted):
-    """0.9 is beyond three combined standard errors of 0.02·√(1 + 1), 0.93 is not; whatever the
-    search promised."""
+    """0.9 differs by more than three combined standard errors of 0.02·√(1 + 1); 0.93 does not.
+
+    The objective in the search does not matter."""
     judge = Judge(Evaluator.of(problem.config), truth=truth)
     verdict = noise.verify(problem, judge, [trial([0.5, 0.5, 0.5], 0.4)])
     assert judge.asked == [1, 2]
@@ -90,7 +93,8 @@ def test_only_a_significant_difference_holds_up(problem, truth, accepted):
 
 
 def test_nothing_promised(problem):
-    """No trial below the baseline: no verdict, and a message that says what to raise."""
+    """Without a trial below the baseline, there is no verdict, and the message says what to
+    raise."""
     judge = Judge(Evaluator.of(problem.config), truth=1.0)
     verdict = noise.verify(problem, judge, [trial([0.5, 0.5, 0.5], 1.4)])
     assert verdict.optimized is None
@@ -98,7 +102,7 @@ def test_nothing_promised(problem):
 
 
 class Particular(Judge):
-    """A judge for whom designs with a first angle above 35 degrees have no average."""
+    """A judge for which designs with a first angle above 35° have no average."""
 
     def __call__(self, design=None, start=None, series=True):
         found = super().__call__(design, start, series)
@@ -107,7 +111,9 @@ class Particular(Judge):
 
 
 def test_a_candidate_without_an_average_is_passed_over(problem):
-    """The next one is judged, though the first promised more; if there is no other, none."""
+    """The next candidate is judged, although the first had a better objective.
+
+    Without another candidate, none is accepted."""
     judge = Particular(Evaluator.of(problem.config), truth=0.8)
     lost, good = trial([0.9, 0.5, 0.5], 0.3), trial([0.1, 0.5, 0.5], 0.7)
     verdict = noise.verify(problem, judge, [lost, good])

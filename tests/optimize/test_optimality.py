@@ -1,4 +1,4 @@
-"""Distinct optima of several starts, and the estimates of optima that were not seen."""
+"""Tests of the distinct optima of several starts, and of the estimated number of unseen optima."""
 
 import numpy as np
 import pytest
@@ -21,8 +21,10 @@ def test_optima_are_told_apart_by_objective_and_point():
 
 
 def test_unseen_optima_by_simulation():
-    """The share of unseen basins against draws from the posterior that the formulas are for:
-    Dirichlet sizes with a uniform prior, for a known number of basins averaged over many."""
+    """The estimated share of unseen basins agrees with draws from the posterior of the formulas.
+
+    The sizes are Dirichlet with a uniform prior for a known number of basins, averaged over many
+    numbers."""
     found = unseen(10, 1)
     assert found["share_of_starts"] == pytest.approx(2 / 90)
     assert found["expected_optima"] == pytest.approx(9 / 7)

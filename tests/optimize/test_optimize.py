@@ -1,4 +1,4 @@
-"""Optimiser: space, constraints, projection, descent directions, and a whole small run."""
+"""Tests of the optimiser: space, constraints, projection, descent, and a whole small run."""
 
 import dataclasses
 import itertools
@@ -46,7 +46,7 @@ def config(*overrides):
 
 
 def baseline(settings) -> Evaluation:
-    """An evaluation with made-up forces: the space needs only its geometry."""
+    """Return an evaluation with made-up forces; the space needs only its geometry."""
     model = Scene.from_config(settings)
     design = {"pressure_angle_deg": 36.43, "involute_length_mm": 8.0, "tip_arc_angle_deg": 4.0}
     shape = geometry(model.profile(jnp.asarray(list(design.values()))))
@@ -89,7 +89,7 @@ def test_involute_never_exceeds_its_longest(problem):
 
 
 def test_projection_makes_feasible_and_keeps_feasible_points(problem):
-    """Projected points satisfy the constraints; feasible ones are not moved."""
+    """Projected points satisfy the constraints; feasible points do not move."""
     for point in sobol(32, 3):
         projected = problem.project(point)
         assert problem.feasible(projected)
@@ -100,7 +100,7 @@ def test_projection_makes_feasible_and_keeps_feasible_points(problem):
 
 
 def test_rotor_stays_in_its_housing(problem):
-    """Floor and ceiling of the outer radius bind on their own sides, and are reported as such."""
+    """Lower and upper limit of the outer radius apply on their own sides, and are reported so."""
     limits = "constraints.outer_radius_min_mm=44.2", "constraints.outer_radius_max_mm=44.5"
     settings = config(*limits, "constraints.area_efficiency_min=0.4")
     model, start = Scene.from_config(settings), baseline(settings)
@@ -137,7 +137,7 @@ def _radii(outer):
 
 
 def test_descent_respects_active_constraints(problem):
-    """The stripped slope leads into no active constraint and vanishes at a KKT point."""
+    """The projected gradient leads into no active constraint and vanishes at a KKT point."""
     rng = np.random.default_rng(5)
     on_edge = [problem.project(p) for p in sobol(64, 6) if not problem.feasible(p)]
     assert on_edge
@@ -147,15 +147,16 @@ def test_descent_respects_active_constraints(problem):
         slope = rng.normal(size=3)
         direction = -problem.descent(point, slope)
         assert np.all(jacobian[active] @ direction >= -1e-9)
-        # The stripped slope is still one of descent.
+        # The projected gradient is still a direction of descent.
         assert slope @ direction <= 1e-12
         outward = jacobian[active].sum(axis=0)
         np.testing.assert_allclose(problem.descent(point, outward), 0, atol=1e-9)
 
 
 def test_contradicting_constraints_are_explained():
-    """A rotor with more area than its housing allows: both limits are named, and each can be met
-    at the value that the other one leaves, found on a grid by projection."""
+    """If a rotor needs more area than its housing allows, both limits are named.
+
+    Each can be met at the value that the other one leaves, found on a grid by projection."""
     limits = "constraints.outer_radius_max_mm=42.0", "constraints.area_efficiency_min=0.44"
     settings = config(*limits, "optimizer.screening=4", "constraints.seal_width_min_mm=0.1")
     search = Search(settings)
@@ -177,7 +178,7 @@ def test_contradicting_constraints_are_explained():
 
 
 def test_ee_has_nothing_to_optimise():
-    """A family without design parameters is refused by name."""
+    """A family without design parameters is rejected by name."""
     text = SCENE.replace("family: cic", "family: ee").replace("pressure_angle_deg: 36.43,", "")
     text = text.replace("involute_length_mm: 8.0, tip_arc_angle_deg: 4.0", "")
     with pytest.raises(InputError, match=r"profile\.family"):
@@ -185,7 +186,8 @@ def test_ee_has_nothing_to_optimise():
 
 
 def test_search_improves_within_the_constraints():
-    """A small run: better than the baseline, feasible, verified, best-so-far monotone."""
+    """A small run is better than the baseline, feasible and verified; its best-so-far is
+    monotone."""
     settings = config(
         "optimizer.screening=4",
         "optimizer.starts=1",
@@ -221,7 +223,7 @@ SMALL = (
 
 
 def _stopped(after, patience, hinder=lambda search: None):
-    """Outcome of a search that is stopped after some evaluations, and the search."""
+    """Return the outcome of a search that is stopped after some evaluations, and the search."""
     stop, seen = threading.Event(), []
 
     def progress(done, expected, best):
@@ -236,7 +238,7 @@ def _stopped(after, patience, hinder=lambda search: None):
 
 
 def test_a_stopped_search_keeps_the_best_so_far():
-    """Verified, as there is time for it; no more designs are tried than those under way."""
+    """If there is time, the best design is verified. Only running evaluations are completed."""
     result, search = _stopped(8, patience=600.0)
     assert result.interrupted
     assert result.status is Status.INTERRUPTED
@@ -251,7 +253,7 @@ def test_a_stopped_search_keeps_the_best_so_far():
 
 
 def test_a_stopped_search_without_time_to_verify():
-    """The best trial itself, and it says that nothing was verified."""
+    """The best trial itself is returned, and the result says that it was not verified."""
 
     def hinder(search):
         search.exact = _Slow.of(search.config)
@@ -275,7 +277,7 @@ class _Slow(Evaluator):
 
 
 def test_a_search_stopped_before_it_found_anything():
-    """During screening's first design; and before the baseline was simulated."""
+    """The search stops during the first screened design, and before the baseline is simulated."""
     stop = threading.Event()
     search = Search(config(*SMALL), None, stop)
     assert search.so_far() is None
@@ -296,14 +298,14 @@ def test_designs_that_did_not_hold_up_are_not_reported():
 
 @pytest.fixture
 def interruptible():
-    """Ctrl-C raises, also where whoever started the tests has it ignored."""
+    """Let Ctrl-C raise, even if the tests were started with it ignored."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
 def test_an_interrupt_stops_a_search_and_a_second_one_the_wait(interruptible):
-    """`KeyboardInterrupt`, as Python raises it where no command line owns the process."""
+    """`KeyboardInterrupt` works as Python raises it where no command line owns the process."""
     stop = threading.Event()
 
     def interrupt(seconds):
@@ -353,7 +355,7 @@ command.door.leave(command.main())
 
 @pytest.mark.parametrize(("after", "number"), [(0, "SIGINT"), (8, "SIGINT"), (9, "SIGTERM")])
 def test_signals_to_the_command(tmp_path, after, number):
-    """Status, exit code, and a folder that is complete."""
+    """After a signal, status and exit code are right, and the folder is complete."""
     path = tmp_path / "scene.yaml"
     path.write_text(SCENE)
     overrides = [part for text in SMALL for part in ("--set", text)]
@@ -381,13 +383,13 @@ def test_signals_to_the_command(tmp_path, after, number):
         assert result["improvement"]["objective"] > 0
         names = {"history.csv", "optimized.yaml", "profile_optimized.csv", "response_optimized.csv"}
         assert names <= written
-    # With designs to go on with, the checkpoint stays.
+    # If there are designs to continue with, the checkpoint is kept.
     kept = [".run.checkpoint"] if after else []
     assert sorted(os.listdir(tmp_path)) == [*kept, "run", "scene.yaml"]
 
 
 def test_objective_slope_agrees_with_finite_differences():
-    """The gradient in the unit box, chain rule included, against central differences."""
+    """The gradient in the unit box, with the chain rule, agrees with central differences."""
     settings = config("solver.rtol=1e-10")
     search = Search(settings)
     base = search.exact(series=False)

@@ -1,4 +1,4 @@
-"""Combinations of the objectives in many scenes, against SciPy and differences."""
+"""Tests of combined objectives of many scenes, against SciPy and differences."""
 
 import numpy as np
 import pytest
@@ -39,8 +39,10 @@ def test_values_agree_with_numpy_and_scipy():
 
 @pytest.mark.parametrize("name", RULES)
 def test_weights_are_the_gradient(name):
-    """Central differences: their error is the third derivative times step²/6, about 1e-10, plus
-    rounding 1e-16 / step."""
+    """The weights agree with central differences.
+
+    The error of these is the third derivative times step²/6, about 1e-10, plus rounding 1e-16 /
+    step."""
     step = 1e-5
     for k in range(len(VALUES)):
         ends = [VALUES + sign * step * np.eye(len(VALUES))[k] for sign in (1, -1)]
@@ -61,7 +63,9 @@ def test_worst_quantile_median_in_order(values):
 
 
 def test_the_quantile_follows_its_level():
-    """Of uniform numbers, within a few standard errors (0.007); its weights lie about the level."""
+    """The quantile of uniform numbers is right within a few standard errors (0.007).
+
+    Its weights lie around the level."""
     sample = np.random.default_rng(3).random(1000)
     for level in (0.5, 0.8, 0.95):
         found = combine(rule(combine="quantile", quantile=level), sample).value

@@ -1,4 +1,4 @@
-"""Robust optima: objective over many scenes, its gradient, both stages of the search."""
+"""Tests of robust optima: objective over many scenes, its gradient, both stages of the search."""
 
 import csv
 import json
@@ -45,7 +45,7 @@ def problem_of(evaluator, baseline, *overrides):
 
 @pytest.fixture(scope="module")
 def spread():
-    """Evaluator over four scenes with all maxima, the baseline, and another design."""
+    """Return an evaluator over four scenes with all maxima, the baseline, and another design."""
     config = config_of(LOAD, TIP, "solver.rtol=1e-10", "tolerances.samples=4")
     evaluator = ToleranceEvaluator.of(config, Evaluator.of(config)).with_maxima()
     baseline = evaluator(series=False)
@@ -54,13 +54,15 @@ def spread():
 
 
 def relative(one, base):
-    """The config's objective by hand: half the mean force, half the peak."""
+    """Return the config's objective by hand: half the mean force, half the peak."""
     keys = "mean_force_N", "peak_force_N"
     return sum(0.5 * one.response[key] / base.response[key] for key in keys)
 
 
 def test_objective_combines_the_scenes(spread):
-    """Against combinations by hand; 1 for the baseline; worst ≥ mean + 0 σ."""
+    """The objective agrees with combinations by hand, and is 1 for the baseline.
+
+    Worst ≥ mean + 0 σ."""
     evaluator, baseline, moved = spread
     rows = [
         np.array([relative(part.evaluation, baseline.nominal) for part in one.samples])
@@ -81,8 +83,9 @@ def test_objective_combines_the_scenes(spread):
 
 
 def test_gradient_agrees_with_central_differences(spread):
-    """Along one direction of the unit box, for every rule; the local model has the same value,
-    slope and limits."""
+    """The gradient is right along one direction of the unit box, for every rule.
+
+    The local model has the same value, gradient and constraints."""
     evaluator, baseline, moved = spread
     direction = np.array([0.6, -0.5, 0.4])
     # Differences of second order: 1e-4 leaves some 1e-6 of curvature and 1e-6 of tolerance.
@@ -108,9 +111,11 @@ def test_gradient_agrees_with_central_differences(spread):
 
 
 def test_small_scatter_is_the_nominal_objective_and_its_sensitivity():
-    """With a tiny σ, mean + kσ is the nominal objective. With a small one, the σ of each force is
-    the force's derivative with respect to the clearance, times the σ of the clearance. The
-    derivative comes from the table of sensitivities, which shares no code with the sample."""
+    """With a tiny σ, mean + kσ is the nominal objective.
+
+    With a small one, the σ of each force is the force's derivative with respect to the clearance,
+    times the σ of the clearance. The derivative comes from the table of sensitivities, which shares
+    no code with the sample."""
     width = 1e-5
     config = config_of("solver.rtol=1e-10", "tolerances.samples=8", width=width)
     single = Evaluator.of(config)
@@ -138,8 +143,10 @@ def test_small_scatter_is_the_nominal_objective_and_its_sensitivity():
 
 
 def toy(monkeypatch, branches, *overrides):
-    """A robust problem in one variable x, whose scenes have the objectives max over `branches` of
-    (level + slope * (x - place)²): one list of (level, slope, place) per scene."""
+    """Return a robust problem in one variable x.
+
+    Its scenes have the objectives max over `branches` of (level + slope * (x - place)²): one list
+    of (level, slope, place) per scene."""
 
     def local_of(number, x):
         rows = branches[number]
@@ -173,8 +180,9 @@ def toy(monkeypatch, branches, *overrides):
 
 @pytest.mark.parametrize("name", RULES)
 def test_local_search_finds_the_minimum_over_scenes_with_corners(name, monkeypatch):
-    """Each scene is a maximum of two parabolas. The minimum agrees with a fine grid, and the
-    certificate there holds."""
+    """The minimum agrees with a fine grid, and the certificate there holds.
+
+    Each scene is a maximum of two parabolas."""
     draws = np.random.default_rng(5)
     branches = [
         [(draws.uniform(0.8, 1), draws.uniform(0.5, 2), draws.uniform(0.1, 0.9)) for _ in range(2)]
@@ -198,7 +206,8 @@ def test_local_search_finds_the_minimum_over_scenes_with_corners(name, monkeypat
 
 
 def test_the_worst_scenes_hold_the_optimum(monkeypatch):
-    """Two parabolas that cross at 0.5, and one far below: the first two share the optimum."""
+    """Of two parabolas that cross at 0.5 and one far below, the first two are active at the
+    optimum."""
     branches = [[(1, 1, 0.25)], [(1, 1, 0.75)], [(0.1, 1, 0.5)]]
     problem, evaluate = toy(monkeypatch, branches, "tolerances.combine=worst")
     found = descend(lambda x: problem.local(evaluate(float(x[0])), x), np.array([0.1]))
@@ -227,7 +236,7 @@ def test_statistics_of_fresh_scenes():
 
 
 def test_fresh_scenes_from_the_neighbouring_orbit(spread):
-    """Forces in fresh scenes are those found from rest; equal designs are simulated once."""
+    """Forces in fresh scenes equal those found from rest; equal designs are simulated once."""
     evaluator, baseline, moved = spread
     problem = problem_of(evaluator, baseline)
     config = problem.config
@@ -256,7 +265,7 @@ def test_without_tolerances_the_search_is_the_plain_one():
 
 
 def test_optimize_command(tmp_path, capsys):
-    """A short run end to end: both optima, certificates, table, files, picture."""
+    """A short run gives both optima, certificates, tables, files and a picture."""
     overrides = [
         PLAY,
         "tolerances.over={contact.clearance_mm: {normal: 0.002}}",

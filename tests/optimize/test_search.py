@@ -1,4 +1,4 @@
-"""The search for a design, on made-up objectives: no rotor is simulated."""
+"""Tests of the search on made-up objectives, without simulations."""
 
 import dataclasses
 import threading
@@ -18,14 +18,13 @@ from tests.standins import evaluation_of
 
 
 def trial_of(point, objective, feasible=True) -> Trial:
-    """A trial at a point of the unit box."""
+    """Return a trial at a point of the unit box."""
     evaluation = evaluation_of(objective, design=point)
     return Trial(np.asarray(point, float), 0, 0, evaluation, objective, feasible)
 
 
 def searching(truth=lambda point: 1.0, **settings) -> Search:
-    """A search whose designs are points of the unit box, and whose verification finds the `truth`
-    about them."""
+    """Return a search over points of the unit box whose verification finds the `truth`."""
     search = object.__new__(Search)
     search.stop, search._refuted, search._trials = threading.Event(), [], []
     search._found, search.checkpoint, search.noisy = {}, None, True
@@ -38,7 +37,9 @@ def searching(truth=lambda point: 1.0, **settings) -> Search:
         project=lambda point: point,
         toward=lambda point, inside: point,
         feasible=lambda point: True,
+        excess=lambda evaluation: 0.0,
     )
+    search._bar = 1.0
 
     def exact(point):
         found = truth(tuple(point))
@@ -63,8 +64,8 @@ def searching(truth=lambda point: 1.0, **settings) -> Search:
     ],
 )
 def test_a_promise_must_hold_up(promised, true, accepted):
-    """A design is accepted if simulated again it is better than the baseline and within 1 % of
-    what the search had."""
+    """A design is accepted only if its verified objective beats the baseline and agrees within 1
+    %."""
     search = searching(lambda point: true)
     found, record = search._verify([trial_of([0.3, 0.4], promised)])
     assert (found is not None) == accepted
@@ -76,8 +77,9 @@ def test_a_promise_must_hold_up(promised, true, accepted):
 
 
 def test_the_best_feasible_trial_that_holds_up_is_taken():
-    """Neither an infeasible one, though it is better, nor one without a steady state, nor one that
-    does not hold up; and neighbours of a trial that failed are not tried."""
+    """An infeasible, unusable or unconfirmed trial is not taken, even if it is better.
+
+    Neighbours of a failed trial are not tried."""
     truth = {(0.9, 0.9): 0.3, (0.1, 0.1): 0.95, (0.11, 0.1): 0.5, (0.5, 0.5): 0.602,
              (0.7, 0.2): 0.65}  # fmt: skip
     search = searching(lambda point: truth[point])
@@ -118,7 +120,7 @@ def test_an_ensemble_takes_no_infeasible_candidate():
 
 @dataclasses.dataclass(frozen=True)
 class Told(Evaluator):
-    """An evaluator for which a quadratic bowl about 0.6 has no steady state beyond 0.3 at first."""
+    """An evaluator in which a quadratic bowl about 0.6 has no steady state beyond 0.3 at first."""
 
     asked: list = dataclasses.field(default_factory=list)
 
@@ -131,7 +133,7 @@ class Told(Evaluator):
 
 
 def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state():
-    """By the rule's own steps otherwise, each from the orbit of the trial before."""
+    """Other steps are those of the update rule, each from the orbit of the previous trial."""
     search = searching(method="sgd", learning_rate=0.2, iterations=6)
     search.problem.descent = lambda point, slope: slope
     search.problem.slope = lambda evaluation, point: 2 * (point - 0.6)
@@ -166,8 +168,10 @@ def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state():
 
 
 def test_a_slope_is_stripped_only_of_what_is_forbidden():
-    """Steepest descent in a box with one linear constraint x + y ≥ 1: inside it is the slope
-    itself, on a face or on the constraint without its part across, in a corner nothing."""
+    """Steepest descent in a box with the constraint x + y ≥ 1 is projected correctly.
+
+    Inside, it is the gradient itself; on a face or on the constraint, the gradient without its
+    normal part; in a corner, zero."""
     problem = object.__new__(Problem)
     normal = np.array([1.0, 1.0])
     vars(problem)["look"] = lambda point: (
@@ -189,7 +193,7 @@ def test_a_slope_is_stripped_only_of_what_is_forbidden():
 
 
 def test_the_seed_of_a_search_chooses_its_screening():
-    """The screened points are the Sobol sample of `optimizer.seed`, after the baseline's own."""
+    """The screened points are the baseline's own and the Sobol sample of `optimizer.seed`."""
     own = np.array([0.5, 0.5, 0.5])
     samples = {}
     for seed in (0, 1, 5):

@@ -1,4 +1,4 @@
-"""Local search and certificate on problems whose optimum and multipliers are known."""
+"""Tests of local search and certificate on problems with known optimum and multipliers."""
 
 import numpy as np
 import pytest
@@ -10,14 +10,14 @@ from rootsopt.optimize.sqp import EndError, Epigraph, Stops, descend
 
 
 def group(values, slopes):
-    """A group of branches of one kind, told apart by evenly spread phases."""
+    """Return a group of branches of one kind, distinguished by evenly spaced phases."""
     count = len(values)
     tags = np.stack([np.zeros(count), np.arange(count) / count], axis=1)
     return Group(tags, np.asarray(values, float), np.asarray(slopes, float))
 
 
 def smooth(x, limit=0.5):
-    """(x - 0.9)² + 2 (y - 0.8)² under x + y ≤ 2 `limit`."""
+    """Return the problem (x - 0.9)² + 2 (y - 0.8)² with x + y ≤ 2 `limit`."""
     value = (x[0] - 0.9) ** 2 + 2 * (x[1] - 0.8) ** 2
     slope = np.array([2 * (x[0] - 0.9), 4 * (x[1] - 0.8)])
     normals = np.array([[-1.0, -1.0]])
@@ -25,7 +25,7 @@ def smooth(x, limit=0.5):
 
 
 def corner(x, lift=0.0):
-    """The greater of two paraboloids, the first lifted: its minimum has a corner."""
+    """Return the greater of two paraboloids, the first lifted; its minimum has a corner."""
     values = [
         lift + (x[0] - 0.2) ** 2 + (x[1] - 0.3) ** 2,
         (x[0] - 0.8) ** 2 + 2 * (x[1] - 0.5) ** 2,
@@ -38,12 +38,12 @@ def corner(x, lift=0.0):
 
 
 def bounded(x):
-    """2 x - 3 y: the minimum is a corner of the box."""
+    """Return the problem 2 x - 3 y, whose minimum is a corner of the box."""
     return Local(2 * x[0] - 3 * x[1], np.array([2.0, -3.0]), (), np.zeros(0), np.zeros((0, 2)))
 
 
 def ended(x):
-    """-x + (y - 0.4)², without an objective beyond x = 0.7, where x ≤ 0.69 is the limit."""
+    """Return the problem -x + (y - 0.4)² with x ≤ 0.69, without an objective beyond x = 0.7."""
     if x[0] > 0.7:
         return None
     slope = np.array([-1.0, 2 * (x[1] - 0.4)])
@@ -53,14 +53,14 @@ def ended(x):
 
 
 def lowest_corner(count=801):
-    """Least value of `corner` on a fine grid, by its formulas."""
+    """Return the least value of `corner` on a fine grid, from its formulas."""
     x, y = np.meshgrid(*[np.linspace(0, 1, count)] * 2)
     first = (x - 0.2) ** 2 + (y - 0.3) ** 2
     return np.min(np.maximum(first, (x - 0.8) ** 2 + 2 * (y - 0.5) ** 2))
 
 
 def test_multiplier_of_a_constraint_is_the_price_of_its_limit():
-    """By hand: x - 0.9 = -μ/2, y - 0.8 = -μ/4 and x + y = 1, so μ = 14/15."""
+    """By hand, x - 0.9 = -μ/2, y - 0.8 = -μ/4 and x + y = 1, so μ = 14/15."""
     found = descend(smooth, np.array([0.1, 0.1]))
     assert found.converged
     assert found.certificate.multipliers == pytest.approx([14 / 15], abs=1e-6)
@@ -75,7 +75,7 @@ def test_multiplier_of_a_constraint_is_the_price_of_its_limit():
 
 @pytest.mark.parametrize("start", [[0.1, 0.9], [0.9, 0.1], [0.5, 0.5], [0.0, 0.0]])
 def test_converges_to_a_corner_of_the_objective(start):
-    """Both branches are equal there, and their shares make the slope zero."""
+    """Both branches are equal at the corner, and their shares make the gradient zero."""
     found = descend(corner, np.array(start))
     assert found.converged
     assert found.evaluations < 20
@@ -100,7 +100,7 @@ def test_bounds_have_multipliers():
 
 
 def test_steps_into_unusable_designs_are_shortened():
-    """The result is next to them, and never one of them."""
+    """The result is next to unusable designs, but is never one of them."""
     found = descend(ended, np.array([0.1, 0.9]))
     assert found.converged
     np.testing.assert_allclose(found.point, [0.69, 0.4], atol=1e-6)
@@ -108,7 +108,7 @@ def test_steps_into_unusable_designs_are_shortened():
 
 
 def test_reasons_of_an_early_end():
-    """Too few evaluations, a request to stop, and a slope that contradicts the values."""
+    """Three reasons are tested: too few evaluations, a request to stop, and a wrong gradient."""
     start = np.array([0.1, 0.9])
     few = descend(corner, start, Stops(evaluations=2))
     assert (few.reason, few.evaluations) == ("evaluations", 2)
@@ -118,7 +118,7 @@ def test_reasons_of_an_early_end():
 
 
 def test_contradicting_constraints_are_infeasible():
-    """x ≥ 0.8 and x ≤ 0.2: no point is taken for an optimum; one of them is violated by 0.3."""
+    """For x ≥ 0.8 and x ≤ 0.2, no point counts as an optimum; one limit is violated by 0.3."""
 
     def look(x):
         slack, normals = np.array([x[0] - 0.8, 0.2 - x[0]]), np.array([[1.0, 0], [-1.0, 0]])
@@ -131,7 +131,7 @@ def test_contradicting_constraints_are_infeasible():
 
 
 def test_certificate_is_zero_only_at_an_optimum():
-    """It does not depend on the search: at other points it is the slope that is left."""
+    """The residual does not depend on the search: at other points it is the remaining gradient."""
     assert certify(corner(np.array([0.2, 0.3])), np.array([0.2, 0.3])).residual > 0.5
     point = np.array([0.9 - 7 / 15, 0.8 - 7 / 30])
     assert certify(smooth(point), point).residual < 1e-12
@@ -142,7 +142,7 @@ def test_certificate_is_zero_only_at_an_optimum():
 
 
 def test_constraint_that_cannot_move_has_no_multiplier():
-    """Every design meets it with equality: its gradient is zero."""
+    """Every design meets such a constraint with equality: its gradient is zero."""
 
     def look(x):
         found = smooth(x)
@@ -161,9 +161,10 @@ def test_search_is_reproducible():
 
 
 def curved(seed, count=6, branches=3):
-    """Convex quadratic functions of `count` variables: one smooth, branches, and two constraints.
+    """Return a function of a point and of an order of the branches, and the Hessians.
 
-    Returns a function of a point and of an order of the branches, and the Hessians."""
+    The function evaluates convex quadratic functions of `count` variables: one smooth part,
+    branches, and two constraints."""
     rng = np.random.default_rng(seed)
     roots = rng.normal(size=(branches + 3, count, count)) * np.sqrt(3.0 / count)
     bends = roots @ np.swapaxes(roots, 1, 2)
@@ -187,7 +188,7 @@ def curved(seed, count=6, branches=3):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_models_of_quadratic_functions_are_exact(seed):
-    """Whatever the order in which the branches are listed at each point."""
+    """The models are exact in whatever order the branches are listed at each point."""
     look, bends = curved(seed)
     rng = np.random.default_rng(seed)
     point = rng.uniform(0.2, 0.8, 6)
@@ -217,7 +218,7 @@ def test_refining_with_exact_models_takes_a_few_steps(seed):
 
 
 def test_refining_follows_branches_of_higher_order():
-    """Rank-one updates keep the models true where the curvature changes along the way."""
+    """Rank-one updates correct the models where the curvature changes along the way."""
 
     def look(x):
         values = [np.exp(2 * x[0]) + x[1] ** 4, np.exp(-3 * (x[0] - 0.5)) + (1 - x[1]) ** 2]
@@ -231,3 +232,42 @@ def test_refining_follows_branches_of_higher_order():
         refine(problem.at, start, look(start), 0.0)
     found = descend(look, np.array([0.2, 0.9]))
     np.testing.assert_allclose(problem.best[0], found.point, atol=1e-4)
+
+
+def walled(x, limit=0.35, lift=0.0):
+    """(x - 0.9)² + (y - 0.8)², where two branches must be at most `limit`, scaled by it."""
+    value = (x[0] - 0.9) ** 2 + (x[1] - 0.8) ** 2
+    slope = 2 * (x - np.array([0.9, 0.8]))
+    values = np.array([x[0] ** 2 + x[1] + lift, x[0] + x[1] ** 2 + lift])
+    slopes = np.array([[2 * x[0], 1.0], [1.0, 2 * x[1]]])
+    wall = Group(np.array([[0.0, 0.2], [0.0, 0.7]]), values / limit - 1, slopes / limit)
+    return Local(value, slope, (), np.zeros(0), np.zeros((0, 2)), (wall,))
+
+
+@pytest.mark.parametrize("start", [[0.1, 0.1], [0.9, 0.8], [0.0, 1.0]])
+def test_walls_are_limits_of_maxima(start):
+    """The optimum lies on the corner of the wall, that of a grid by formulas, and the multiplier is
+    the price of the limit, found by solving again."""
+    found = descend(walled, np.array(start))
+    assert found.converged
+    assert found.evaluations < 40
+    (wall,), (held,) = found.local.walls, found.certificate.walls
+    np.testing.assert_allclose(wall.values, 0, atol=1e-7)
+    assert min(held) > 0.01
+    x, y = np.meshgrid(*[np.linspace(0, 1, 1201)] * 2)
+    inside = np.maximum(x**2 + y, x + y**2) <= 0.35
+    grid = np.min(np.where(inside, (x - 0.9) ** 2 + (y - 0.8) ** 2, np.inf))
+    assert found.local.objective <= grid + 1e-9
+    assert found.local.objective == pytest.approx(grid, abs=3e-3)
+    up, down = (
+        descend(lambda x, s=s: walled(x, 0.35 + s), np.array(start)).local.objective
+        for s in (1e-4, -1e-4)
+    )
+    assert (down - up) / 2e-4 == pytest.approx(np.sum(held) / 0.35, rel=1e-3)
+
+
+def test_a_wall_out_of_reach_is_infeasible():
+    found = descend(lambda x: walled(x, lift=1.0), np.array([0.5, 0.5]))
+    assert found.reason == "infeasible"
+    assert found.local.violation == pytest.approx(1 / 0.35 - 1, rel=1e-2)
+    assert not found.certificate.holds(1e9, 1e-6)

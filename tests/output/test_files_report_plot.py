@@ -1,4 +1,4 @@
-"""Result files, tables and figures, from evaluations made by hand."""
+"""Tests of result files, tables and figures, from made-up evaluations."""
 
 import csv
 import dataclasses
@@ -294,7 +294,7 @@ def test_evaluation_table():
 
 
 def test_pump_table():
-    """Baseline beside optimum: rows that both or one of them have, with the forces."""
+    """The table shows baseline beside optimum, with rows of both or one of them, and the forces."""
     first = {"pump": {"flow_ripple": 0.2, "flow_lines": [0.1]}, "response": {"mean_force_N": 10.0}}
     second = {"pump": {"flow_ripple": 0.1, "tip_leakage_l_min": 2.5}, "response": {}}
     text = _render(tables.pump_table({"baseline": first, "optimised": second}))

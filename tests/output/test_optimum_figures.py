@@ -1,4 +1,4 @@
-"""Figures of an optimum: departure and forces against the baseline, and ends of the searches."""
+"""Tests of figures of an optimum: departure, forces against the baseline, ends of the searches."""
 
 import numpy as np
 import pytest
@@ -14,12 +14,13 @@ CIC = load("configs/cic.yaml")
 
 
 def drawn(ax, number):
-    """The points (n, 2) of a line on an axis."""
+    """Return the points (n, 2) of a line on an axis."""
     return np.asarray(ax.lines[number].get_xydata())
 
 
 def test_departure_of_a_scaled_rotor_is_that_of_its_supporting_lines():
-    """Scaling by 1.001 moves the tip by 45.1 µm outwards, and every point by its support."""
+    """Scaling by 1.001 moves the tip by 45.1 µm outwards, and every point by 1/1000 of its
+    support."""
     outline = outline_mm(CIC)
     _, axes = figure(6, 4)
     ax = plot_departure(axes[0, 0], outline, 1.001 * outline, 3, 33.0)
@@ -35,7 +36,7 @@ def test_departure_of_a_scaled_rotor_is_that_of_its_supporting_lines():
 
 
 def test_forces_begin_at_the_same_rotation():
-    """A force of the rotor's angle alone is drawn on top of itself, wherever its series begins."""
+    """A force that depends only on the rotor's angle coincides, wherever its series begins."""
     turn = 2 * np.pi / 3
 
     def run(first):

@@ -1,4 +1,4 @@
-"""Result folders: whole, of one run, locked, refused where they cannot be."""
+"""Tests of result folders: complete, of one run, locked, rejected where they cannot be used."""
 
 import ast
 import json
@@ -21,8 +21,10 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_full_disk_or_death_at_every_file_operation():
-    """At each one: the folder is the old run or the new one, and the next run finds it usable and
-    leaves nothing behind. A process of its own, as it forks."""
+    """At each operation, the folder is the old run or the new one.
+
+    The next run finds it usable and leaves nothing behind. This runs in its own process, because it
+    forks."""
     done = subprocess.run(
         [sys.executable, "-m", "tests.deaths"],
         cwd=ROOT,
@@ -130,7 +132,7 @@ def test_places_that_no_folder_can_take(tmp_path, monkeypatch, where):
 
 
 def test_the_current_folder_is_refused_even_if_empty(tmp_path, monkeypatch):
-    """Another one would take its place, and whoever stands in it would stand nowhere."""
+    """The current folder is rejected: another folder would replace it, under the user's shell."""
     here = tmp_path / "here"
     here.mkdir()
     monkeypatch.chdir(here)
@@ -174,7 +176,7 @@ def test_a_second_process_is_kept_out(tmp_path):
 
 
 def test_a_lock_on_a_file_that_is_gone_is_none(tmp_path, monkeypatch):
-    """Between opening and locking it, the last holder removes the file."""
+    """A lock is void if the last holder removes the file between opening and locking."""
     real, calls = lock.fcntl.flock, []
 
     def late(*arguments):
@@ -245,14 +247,16 @@ def _profile(folder, *more):
 
 @pytest.fixture
 def quick():
-    """A folder in memory, where synchronising files takes no time."""
+    """Return a folder in memory, where synchronising files takes no time."""
     folder = scratch()
     yield folder
     shutil.rmtree(folder)
 
 
 def test_a_command_on_a_full_disk(quick, capsys, monkeypatch):
-    """`profile` with each file operation failing: exit 2, one line, the earlier run as it was."""
+    """If a file operation of `profile` fails, the exit code is 2, with one line.
+
+    The earlier run is unchanged."""
     monkeypatch.chdir(ROOT)
     target = quick / "run"
     assert _profile(target, "--export", "none") == 0
@@ -286,7 +290,8 @@ def _loaded_once(path):
 
 
 def test_what_a_command_leaves_when_it_fails(tmp_path, capsys, monkeypatch):
-    """Bad input found late, and an interrupt: nothing new, the earlier run as it was."""
+    """After bad input found late, or an interrupt, nothing is new and the earlier run is
+    unchanged."""
     monkeypatch.chdir(ROOT)
     target = tmp_path / "new" / "run"
     assert _profile(target, "--project", "two") == 2
@@ -306,7 +311,7 @@ def test_what_a_command_leaves_when_it_fails(tmp_path, capsys, monkeypatch):
 
 
 def test_each_command_has_a_folder_of_its_own(tmp_path, monkeypatch):
-    """By default, and the result says which command it is of."""
+    """Each command has its own default folder, and the result names the command."""
     config = str(ROOT / "configs" / "cic.yaml")
     monkeypatch.chdir(tmp_path)
     assert main(["profile", config, "--no-figures"]) == 0
@@ -317,14 +322,17 @@ def test_each_command_has_a_folder_of_its_own(tmp_path, monkeypatch):
 
 
 def test_all_commands_write_through_one_layer():
-    """Every command gets its folder from `cli.run`, and no other module writes, makes, renames or
-    removes files, but for the cache's folder and the checkpoint beside a folder."""
+    """Every command gets its folder from `cli.run`.
+
+    No other module writes, makes, renames or removes files, except for the cache's folder and the
+    checkpoint beside a folder."""
     for command in COMMANDS:
         source = (ROOT / "rootsopt" / "commands" / f"{command}.py").read_text()
         assert f'cli.run("{command}", PURPOSE, argv' in source
         assert f'door.through("{command}", ' in source
         assert "ResultFolder" not in source
     allowed = {"disk.py", "lock.py", "door.py", "programs.py", "store.py", "checkpoint.py"}
+    allowed.add("journal.py")
     names = {"write_text", "write_bytes", "mkdir", "makedirs", "rename", "replace", "unlink"}
     names |= {"rmdir", "rmtree", "remove", "touch", "symlink_to", "move", "copyfile", "copy2"}
     seen = []
@@ -379,8 +387,9 @@ print(*sorted({p for p in seen if not os.path.abspath(p).startswith(allowed)}), 
 
 @pytest.mark.parametrize("formats", ["dxf,svg", pytest.param("all", marks=pytest.mark.long)])
 def test_nothing_is_written_outside_of_the_runs_own_folder(tmp_path, formats):
-    """Figures, drawings, solids and animations too: the system's account of all files opened for
-    writing, made, renamed or removed."""
+    """Figures, drawings, solids and animations are included.
+
+    The system reports all files opened for writing, made, renamed or removed."""
     parent = tmp_path / "parent"
     parent.mkdir()
     others = {name: str(tmp_path / name) for name in ("MPLCONFIGDIR", "XDG_CACHE_HOME")}

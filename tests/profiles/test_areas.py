@@ -1,7 +1,7 @@
-"""Area and polar moment of every family against polygons of its own outline, from positions alone.
+"""Area and polar moment of every family are those of polygons of its own outline.
 
-Derivatives of both with respect to the design against differences of the polygons.
-"""
+The polygons use positions alone. Derivatives of both with respect to the design are compared with
+differences of the polygons."""
 
 import functools
 
@@ -19,7 +19,7 @@ from rootsopt.profiles import geometry
 from rootsopt.scene.families import profile_of
 
 ERROR = 1e-11
-"""Relative; the study in experiments/geometry finds 1e-13."""
+"""Relative error allowed; the study in experiments/geometry finds 1e-13."""
 HARD = {
     # The normals of the arc all but touch the pitch circle, at its end or inside of it.
     "cic": (5, [[36.43, 6.0, 4.0], [9.90309962, 4.61058857e-06, 0.00440706401]]),
@@ -60,14 +60,14 @@ DRAWN = 8
 @settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_random_designs(family, seed):
-    """Over the whole range that a config allows."""
+    """Area and moment agree over the whole range of designs that a config allows."""
     _, found = study.errors(family, 5, DRAWN, np.random.default_rng(seed))
     assert np.max(found, initial=0.0) < ERROR
 
 
 @pytest.mark.long
 def test_study():
-    """All families and numbers of lobes, many sound designs of each."""
+    """The study's run over all families and numbers of lobes agrees for many sound designs."""
     rows = study.study(100, 1)
     assert sum(row["sound"] for row in rows) > 2000
     assert {row["family"].split()[0] for row in rows if row["sound"]} == set(HARD)
@@ -78,7 +78,9 @@ def test_study():
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def slopes(family, lobes, design, way, step):
-    """Derivatives of area and moment along a `way` (d,), and differences of those of polygons."""
+    """Return derivatives along a `way` (d,), and differences of those of polygons.
+
+    Both are of area and moment."""
     make = functools.partial(profile_of, family, lobes, jnp.asarray(33.0 * MM))
 
     def integrals(design):

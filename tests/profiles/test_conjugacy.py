@@ -20,7 +20,7 @@ POINTS = 1000
 
 
 def cic(lobes, alpha, fraction, tip):
-    """CIC with u given as a fraction of u_max."""
+    """Return a CIC profile with u given as a fraction of u_max."""
     longest = R * np.sin(alpha) * (np.pi / (2 * lobes) - tip)
     return CIC(lobes, R * 1e-3, alpha, fraction * longest * 1e-3, tip)
 
@@ -39,12 +39,12 @@ every_pair = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES.
 
 
 def rolling_gaps(points, lobes, angles, center_distance=CENTER_DISTANCE):
-    """Least signed distance (mm) of the pair, rolled without relative rotation."""
+    """Return the least signed distance (mm) of the pair, rolled without relative rotation."""
     return np.array([pair_gap(points, lobes, center_distance, phi, phi) for phi in angles])
 
 
 def mesh_period(lobes, count=37):
-    """Angles over one mesh period, off the symmetric poses, and the pitch point's own."""
+    """Return angles over one mesh period, off the symmetric poses, and the pitch point's own."""
     period = 2 * np.pi / lobes
     pitch = np.pi / (2 * lobes) + np.array([-1e-3, -1e-4, 0.0, 1e-4, 1e-3])
     return np.concatenate([0.0123 + period * np.arange(count) / count, pitch])
@@ -61,7 +61,7 @@ def test_rolling_pair_touches_and_does_not_overlap(profile, graded_outline):
 
 @pytest.mark.parametrize("name", ["paper", "five lobes"])
 def test_exported_outline_is_conjugate(name):
-    """The outline users get passes the same test."""
+    """The exported outline passes the same test."""
     profile = PROFILES[name]
     points = np.asarray(outline(profile, POINTS)) * 1e3
     gaps = rolling_gaps(points, profile.lobes, mesh_period(profile.lobes, 17))
@@ -69,13 +69,13 @@ def test_exported_outline_is_conjugate(name):
 
 
 def test_pair_meshes_in_both_senses_of_rotation(graded_outline):
-    """Turned backwards the other flanks mesh as well."""
+    """Turned backwards, the other flanks mesh as well."""
     points = graded_outline(PROFILES["paper"], POINTS) * 1e3
     gaps = rolling_gaps(points, 3, -mesh_period(3, 17))
     assert np.max(np.abs(gaps)) < NANOMETRE
 
 
-# The measure sees what it must see
+# The measure detects defects
 
 
 INVOLUTE_PHASE = np.deg2rad(-30.0) + np.array([-0.05, 0.02, 0.06])
@@ -104,7 +104,7 @@ def test_measure_sees_a_wrong_centre_distance(graded_outline):
 
 
 def test_measure_sees_a_profile_that_is_not_conjugate(graded_outline):
-    """One node of rotor 1's flank raised by 1e-5 mm is found when it comes into mesh."""
+    """A node of rotor 1's flank raised by 1e-5 mm is found when it comes into mesh."""
     points = graded_outline(PROFILES["paper"], POINTS) * 1e3
     radius = np.hypot(*points.T)
     # A smooth bump around radius 38 mm, on the involute of every flank.
@@ -125,7 +125,9 @@ def circle(count, radius=10.0):
 
 
 def test_signed_distance_to_a_circle():
-    """Positive outside, negative inside; straight segments err as h², cubics as h⁴."""
+    """The distance is positive outside and negative inside; errors fall as h² and h⁴.
+
+    Straight segments err as h², cubics as h⁴."""
     angles = np.linspace(0.01, 6.2, 101)
     rays = np.stack([np.cos(angles), np.sin(angles)], -1)
     for offset in (-0.02, 0.03):

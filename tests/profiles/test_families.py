@@ -1,4 +1,4 @@
-"""Profile families: the conformance suite, known numbers, limits, refusals."""
+"""Profile families pass the conformance suite, have known numbers, and refuse bad designs."""
 
 import itertools
 
@@ -24,11 +24,13 @@ _ALIKE = {
     suite.slopes_of_geometry_are_those_of_differences: ("arc", "five_arcs", "ellipse", "cic"),
     suite.what_margins_call_sound_is_one_curve: ("arc_involute", "ee"),
 }
-"""Families that share the code of the rest in a check that compiles long: in long runs only."""
+"""Families left out of a check that compiles slowly, because others share their code.
+
+They are checked in long runs."""
 
 
 def every_check():
-    """All pairs of a family and a check."""
+    """Return all pairs of a family and a check."""
     pairs = []
     for family, one in itertools.product(FAMILIES, suite.CHECKS):
         marks = [pytest.mark.long] if family in _ALIKE.get(one, ()) else []
@@ -71,8 +73,10 @@ def test_largest_single_arc_without_undercut(lobes, center, efficiency):
 
 
 def test_margins_are_the_least_between_the_places_too():
-    """Undercut and star margin of an arc are least inside a segment: in 400 places they are seen
-    up to 1e-5 too great, with the parabola through three of them right to 3e-7."""
+    """Margins are least values over the whole segment, not only at sampled points.
+
+    Undercut and star margin of an arc are least inside a segment. With 400 samples they are up to
+    1e-5 too great; the parabola through three samples is right to 3e-7."""
     sampled = []
     for center in (0.89, 0.9, 0.92):
         profile, fine, coarse = arc(3, 1.0, center), [], []
@@ -92,9 +96,11 @@ def test_margins_are_the_least_between_the_places_too():
 
 
 def test_ranges_of_the_arc_and_involute_patent():
-    """US 7,320,579, claim 1, with centre distance L and two lobes: base radius above L / 2√2 and
-    arc above √2 π L / 16, where the involute is the longest at 45°; arc below (27 - 5√2) L / 56,
-    where it has none and the tip lies at 3 L / 4."""
+    """The ranges of the arc and involute profile are those of US 7,320,579, claim 1.
+
+    With centre distance L and two lobes, the base radius is above L / 2√2 and the arc above √2 π L
+    / 16, where the involute is longest, at 45°. The arc is below (27 - 5√2) L / 56, where there is
+    no involute and the tip lies at 3 L / 4."""
     distance = 1.0
     r = distance / 2
     longest = r * np.sin(np.pi / 4) * np.pi / 4
@@ -117,8 +123,10 @@ def test_ranges_of_the_arc_and_involute_patent():
     [(0.353554, 0.27769), (0.353554, 0.343), (0.39, 0.3075), (0.39, 0.352), (0.424264, 0.35587)],
 )
 def test_patented_rotors_are_sound(base, wanted):
-    """US 7,320,579 with distance L: for base radii from L / 2√2 to 0.3 √2 L some length of the
-    involute gives arcs of the radii claimed, 0.27768 L to 0.35587 L, and rotors that mesh."""
+    """Rotors with the radii that US 7,320,579 claims exist and mesh.
+
+    With centre distance L and base radii from L / 2√2 to 0.3 √2 L, some length of the involute
+    gives arcs of the radii claimed, 0.27768 L to 0.35587 L."""
     r, distance = 33.0, 66.0
     angle = np.degrees(np.arccos(base * distance / r))
     longest = r * np.sin(angle * DEG) * np.pi / 4
@@ -138,8 +146,10 @@ def test_patented_rotors_are_sound(base, wanted):
 
 
 def test_families_that_become_another():
-    """Two arcs of one radius and an ellipse of equal semi-axes are the single arc; a circle of
-    r / 2N, whole arches without a land and a ratio of 1 are EE."""
+    """Families with special parameters equal a simpler family.
+
+    Two arcs of one radius and an ellipse of equal semi-axes are the single arc. A circle of r / 2N,
+    whole arches without a land and a ratio of 1 are EE."""
     single, ee = maker("arc")(jnp.asarray([29.7])), EE(3, R)
     radius = float(single.radius[0]) * 1e3
     nu = np.linspace(0.01, 1.4, COUNT)
@@ -158,7 +168,7 @@ def test_families_that_become_another():
 
 @pytest.mark.parametrize("ratio", [0.7, 1.3])
 def test_extended_cycloid_is_the_curve_drawn(ratio):
-    """P(θ), its tangents by differences, against the core's form of it."""
+    """P(θ), with tangents by differences, agrees with the core's form of the curve."""
     profile = maker("extended_cycloid")(jnp.asarray([ratio]))
 
     def drawn(theta):
@@ -174,8 +184,10 @@ def test_extended_cycloid_is_the_curve_drawn(ratio):
 
 
 def test_edge_describes_an_extended_epicycloid():
-    """The mate of an edge lies at its radius from what its centre draws on the partner, and is
-    carried over: the contact moves backwards along it."""
+    """The mate of an edge lies at the edge's radius from the curve of its centre.
+
+    That is the curve that the centre draws on the partner, an extended epicycloid. The contact
+    moves backwards along the mate."""
     profile = made("arcs_epicycloid")
     nu, found = sampled("arcs_epicycloid")
     edge = np.flatnonzero((nu > profile.joints[1]) & (nu < profile.joints[2]))[::40]
@@ -193,7 +205,7 @@ def test_edge_describes_an_extended_epicycloid():
 
 
 def test_five_arcs_have_their_land():
-    """Tangents and the pitch crossing are looked at with those of every family."""
+    """Five arcs have a tip land; the suite checks tangents and the pitch crossing."""
     shape = measure(made("five_arcs"))
     assert float(shape.outer_radius) == pytest.approx(0.045, rel=1e-12)
     assert float(shape.seal_width) == pytest.approx(2 * 3 * DEG * 0.045)

@@ -1,4 +1,4 @@
-"""Free form: its spline, conjugacy, projections, gradients, config, optimisation, likeness."""
+"""The free form: spline, conjugacy, projections, gradients, config, optimisation, likeness."""
 
 import dataclasses
 
@@ -31,12 +31,12 @@ measure = jax.jit(geometry)
 
 
 def made(family, *design):
-    """A member of a family, with three lobes."""
+    """Return a member of a family, with three lobes."""
     return profile_of(family, 3, jnp.asarray(R), jnp.asarray(design))
 
 
 def scene(family, inside, *overrides):
-    """The scene of the optimiser's tests with another profile, its contact to first order."""
+    """Return the scene of the optimiser's tests with another profile and the linear contact."""
     text = SCENE.replace("family: cic", f"family: {family}").replace(CIC_KEYS, inside)
     return parse(text, ["solver.fidelity=linear", *overrides])
 
@@ -56,7 +56,9 @@ def profile():
 
 
 def test_shares_and_pressure_angle_are_the_spline(profile):
-    """τ and ψ at given normals, from SciPy's B-spline and its integral; ends of the addendum."""
+    """τ and ψ at given normals are those of SciPy's B-spline and its integral.
+
+    So are the ends of the addendum."""
     spans = len(SHARES) - 2
     knots = np.concatenate([[0, 0], np.arange(spans + 1), [spans, spans]])
     spline = BSpline(knots, SHARES, 2)
@@ -74,8 +76,9 @@ def test_shares_and_pressure_angle_are_the_spline(profile):
 
 
 def test_law_of_gearing_and_inverse(profile):
-    """ds/dβ = -r cos ψ and h′ = -lever by differentiation; ν(β) is the inverse of β(ν), with its
-    derivatives by the coefficients."""
+    """ds/dβ = -r cos ψ and h′ = -lever by differentiation; ν(β) is the inverse of β(ν).
+
+    The derivatives of ν(β) with respect to the coefficients are checked too."""
     nu = jnp.linspace(TIP, float(profile.pitch_normal), 33)[1:-1]
 
     @jax.jit
@@ -101,7 +104,9 @@ def test_law_of_gearing_and_inverse(profile):
 
 
 def test_pair_touches_and_does_not_overlap(profile, graded_outline):
-    """|gap| < 1 nm through a mesh period, by node search; the area by the polygon."""
+    """The |gap| is below 1 nm through a mesh period by the node search.
+
+    The area is that of the polygon."""
     points = graded_outline(profile, 1500) * 1e3
     for phi in 0.0123 + 2 * np.pi / 3 * np.arange(7) / 7:
         assert abs(pair_gap(points, 3, 66.0, phi, phi)) < 1e-6
@@ -111,7 +116,7 @@ def test_pair_touches_and_does_not_overlap(profile, graded_outline):
 
 
 def test_ee_is_a_free_form_of_equal_coefficients():
-    """For any number of lobes, with N / (1 + N) throughout."""
+    """For any number of lobes, EE has the coefficients N / (1 + N) throughout."""
     for lobes in (2, 5):
         same = FreeForm(lobes, R, 0.0, np.full(5, lobes / (1 + lobes)))
         nu = jnp.linspace(0.01, 1.05 * float(same.pitch_normal), 20)
@@ -138,15 +143,16 @@ def test_projections_come_closer_with_more_coefficients(other, within):
 
 
 def test_distance_of_points_from_a_line():
-    """From a corner, an end and the inside of a piece."""
+    """The distance is right from a corner, from an end and from the inside of a piece."""
     line = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0]])
     points = np.array([[1.0, 0.5], [3.0, -1.0], [-3.0, 4.0], [2.0, 1.0]])
     np.testing.assert_allclose(distances(points, line), [0.5, np.sqrt(2), 5.0, 0.0], atol=1e-15)
 
 
 def test_derivatives_by_the_coefficients(profile):
-    """Area, tip radius, margin and lever against central differences. The step, 1e-5, leaves an
-    error of its square and of rounding, 1e-16, over it: some 1e-10 of each."""
+    """Slopes of area, tip radius, margin and lever agree with central differences.
+
+    A step of 1e-5 leaves an error of its square, and rounding, 1e-16, over it: some 1e-10 each."""
     step = 1e-5
 
     def measured(shares):
@@ -198,14 +204,16 @@ def test_what_is_wrong_with_a_config_is_said(override, words):
 
 
 def test_profile_that_does_not_mesh_is_refused():
-    """A dent, and a pressure angle that falls past 0, are found before anything is simulated."""
+    """Profiles that do not mesh are refused before anything is simulated.
+
+    Examples are a dent, and a pressure angle that falls below 0."""
     for shares, word in (([1, 1, 1, 1, 1, 1, -1], "convex"), ([0.8] * 7, "sound")):
         with pytest.raises(InputError, match=word):
             check(free(f"profile.coefficients={shares}").profile)
 
 
 def test_profile_command_projects(tmp_path, capsys):
-    """`--project` writes a config of the same pair that is within what it says."""
+    """`--project` writes a config of the same pair, within the distance that it prints."""
     from rootsopt.commands import profile as command
 
     source = tmp_path / "cic.yaml"
@@ -226,8 +234,9 @@ def test_profile_command_projects(tmp_path, capsys):
 
 @pytest.mark.long
 def test_gradient_of_the_force_agrees_with_central_differences():
-    """Reverse mode, along a direction in all coefficients. With a step of 1e-4 differences of
-    second order are good to some 1e-6 of the greatest slope."""
+    """Reverse mode agrees with differences along a direction in all coefficients.
+
+    With a step of 1e-4, differences of second order are good to some 1e-6 of the greatest slope."""
     evaluator = Evaluator.of(free("solver.rtol=1e-10", "solver.fidelity=search"))
     design = np.asarray(design_vector(evaluator.config))
     direction = np.random.default_rng(2).normal(size=len(design))
@@ -246,7 +255,9 @@ def test_gradient_of_the_force_agrees_with_central_differences():
 
 @pytest.mark.long
 def test_free_form_is_improved_by_a_search():
-    """Some steps of descent: better than the baseline within the constraints, and still sound."""
+    """A few steps of descent improve on the baseline within the constraints.
+
+    The result is still a sound profile."""
     settings = free(
         "optimizer.screening=0",
         "optimizer.starts=1",
@@ -268,7 +279,9 @@ def test_free_form_is_improved_by_a_search():
 
 
 def test_single_arc_is_improved_by_a_search():
-    """A family of one parameter with margins for constraints: less displacement, less force."""
+    """A family of one parameter, with margins as constraints, is improved.
+
+    The displacement is smaller, and so is the force."""
     settings = scene(
         "arc",
         "arc_center_mm: 30.5",
@@ -294,7 +307,7 @@ def test_single_arc_is_improved_by_a_search():
     ],
 )
 def test_points_of_any_box_become_sound_profiles(family, inside):
-    """Wherever a sample lies in the bounds, it is drawn to where a profile can be made."""
+    """Every sample inside the bounds is moved to a profile that can be made."""
     settings = scene(
         family,
         inside,
@@ -324,7 +337,7 @@ def _geometry_alone(model, design):
 
 @pytest.mark.long
 def test_likeness_finds_the_family_it_came_from(monkeypatch):
-    """A projected member of a family resembles that family, in its parameters too."""
+    """A projected member of a family resembles that family, with the same parameters."""
     from rootsopt.design import resemblance
 
     monkeypatch.setattr(resemblance, "classical", lambda: ("ee", "arc"))

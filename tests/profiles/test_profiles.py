@@ -1,4 +1,4 @@
-"""Profiles against closed forms, the paper's equations and numerical differentiation."""
+"""Profiles agree with closed forms, the paper's equations and numerical differentiation."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ measure = jax.jit(geometry)
 
 
 def cic(lobes, alpha, fraction, tip):
-    """CIC with u given as a fraction of u_max."""
+    """Return a CIC profile with u given as a fraction of u_max."""
     longest = R * np.sin(alpha) * (np.pi / (2 * lobes) - tip)
     return CIC(lobes, R, alpha, fraction * longest, tip)
 
@@ -26,7 +26,7 @@ def paper():
 
 
 def profiles():
-    """Sound profiles of both families: land and none, u below and at u_max, 2 to 5 lobes."""
+    """Return sound profiles of both families: land and none, u below and at u_max, 2 to 5 lobes."""
     return {
         "paper": paper(),
         "short involute": cic(3, 0.62, 0.6, 0.06),
@@ -47,7 +47,9 @@ every_cic = pytest.mark.parametrize("profile", cic_profiles.values(), ids=cic_pr
 
 @jax.jit
 def both_flanks(profile, nu):
-    """Addendum and dedendum positions, and their normals' polar angles by the roll angle."""
+    """Return addendum and dedendum positions, and their normals' polar angles.
+
+    All are at the normal angles `nu`."""
     addendum, dedendum = profile.addendum(nu), profile.dedendum(nu)
     normals = [point.beta + jnp.pi / 2 - point.psi for point in (addendum, dedendum)]
     centers = [point.beta for point in (addendum, dedendum)]
@@ -55,7 +57,9 @@ def both_flanks(profile, nu):
 
 
 def inner_normals(profile, count=15, margin=0.02):
-    """Normal angles strictly inside the smooth segments, clear of joints and pitch point."""
+    """Return normal angles strictly inside the smooth segments.
+
+    They keep clear of joints and pitch point."""
     pieces = [
         np.linspace(a + margin * (b - a), b - margin * (b - a), count)
         for a, b in ((float(s.start), float(s.stop)) for s in profile.segments())
@@ -68,7 +72,9 @@ def inner_normals(profile, count=15, margin=0.02):
 
 
 def mean_square_distance(lobes, alpha, u, tip):
-    """⟨s²⟩ over the roll angle of a CIC, from plane geometry and adaptive quadrature."""
+    """Return ⟨s²⟩ over the roll angle of a CIC.
+
+    It comes from plane geometry and adaptive quadrature."""
     half = np.pi / (2 * lobes)
     beta_u = half - u / (R * np.sin(alpha))
     normal = np.exp(1j * (beta_u + np.pi / 2 - alpha))
@@ -126,7 +132,7 @@ def test_area_and_inertia_are_those_of_a_fine_polygon(profile):
     np.testing.assert_allclose(shape.polar_area_moment, (cross * second).sum() / 12, rtol=1e-6)
 
 
-# Numbers known beforehand
+# Numbers from literature and closed forms
 
 
 @pytest.mark.parametrize(("lobes", "efficiency"), [(2, 0.5), (3, 0.40625), (4, 0.34)])
@@ -229,7 +235,7 @@ def test_tip_arc_is_one_circle_tangent_to_land_and_involute(profile):
 
 
 def differentiated(profile, nu, step=1e-4):
-    """Positions (m) of both flanks with first and second differences over ν, as complex."""
+    """Return positions (m) of both flanks with first and second differences over ν, as complex."""
     around = [both_flanks(profile, jnp.asarray(nu + k * step))[0] for k in (-1, 0, 1)]
     for before, here, after in zip(*around, strict=True):
         before, here, after = (np.asarray(p) @ [1, 1j] for p in (before, here, after))

@@ -14,10 +14,11 @@ from rootsopt import load_config
 from rootsopt.contact.nodes import pair_gap, place_pair, signed_distance
 from rootsopt.errors import InputError
 from rootsopt.profiles import geometry
+from rootsopt.profiles.epicycloid import circle_epicycloid
 from rootsopt.pump import gas
 from rootsopt.pump.gap import Allowances, mesh_gap, relative_curvature
 from rootsopt.pump.laminar import parabolic_length, slot_flow
-from rootsopt.pump.leakage import leakage
+from rootsopt.pump.leakage import leakage, tip_length
 from rootsopt.pump.sheet import sheet
 from rootsopt.response.terms import terms_of
 from rootsopt.scene import Scene, design_vector
@@ -74,8 +75,8 @@ def test_laminar_gas_by_quadrature_of_its_pressure():
     """Mass flow per width through a slot, from dp/dx with the density of each place; for a small
     pressure difference it is the liquid's."""
     up, down, h, length, mu = 3e5, 1e5, 5e-5, 4e-3, 1.8e-5
-    values = map(jnp.asarray, (h, length, up, down, mu))
-    found = float(gas.laminar_mass_flow(*values, AIR))
+    gap, depth, inlet, outlet, viscosity = map(jnp.asarray, (h, length, up, down, mu))
+    found = float(gas.laminar_mass_flow(gap, depth, inlet, outlet, viscosity, AIR))
     driven, _ = integrate.quad(lambda p: p / (287.05 * 293.15), down, up)
     assert found == pytest.approx(h**3 * driven / (12 * mu * length), rel=1e-12)
     # Air at 1 bar and 20 °C: 0.066 µm.
@@ -154,6 +155,30 @@ def test_liquid_leaks_like_slots():
     assert float(1 - found.efficiency) == pytest.approx(float(found.total) / (50 * volume))
     thicker = scene_of(*LIQUID, "pump.viscosity_mPa_s=100")
     assert float(leaks(thicker, design).total) == pytest.approx(float(found.total) / 2, rel=1e-12)
+
+
+@eqx.filter_jit
+def tips(profile, height, nu):
+    """Return the length of the tip's slot, and points of the addendum at `nu`."""
+    length = tip_length(profile, geometry(profile), height)
+    return length, profile.position(profile.addendum(nu))
+
+
+@pytest.mark.parametrize("family", ["circle_epicycloid", "cic"])
+def test_tip_gap_by_polygon(family):
+    """The film of the polygon, also for a tip arc almost concentric with the housing: such an arc
+    seals over its own length, and no further."""
+    profile, h = made(family), 2e-3 * R
+    if family == "circle_epicycloid":
+        profile = circle_epicycloid(
+            LOBES, jnp.asarray(R), jnp.asarray(0.1389 * R), jnp.radians(5.0)
+        )
+    nu = np.linspace(0, float(profile.pitch_normal), 20001)
+    length, flank = tips(profile, jnp.asarray(h), jnp.asarray(nu))
+    flank = np.asarray(flank)
+    gap = h + np.linalg.norm(flank[0]) - np.linalg.norm((flank[1:] + flank[:-1]) / 2, axis=1)
+    film = 2 * np.sum(np.linalg.norm(np.diff(flank, axis=0), axis=1) * (h / gap) ** 3)
+    assert float(length) == pytest.approx(film, rel=1e-4)
 
 
 def test_overlapping_flanks_let_nothing_through():
@@ -256,6 +281,7 @@ def test_pressure_is_asked_for():
         load_config("configs/cic.yaml", ["pump.viscosity_mPa_s=50"])
     gas_load = "scene.load={pressure_difference_Pa: 3.0e4}"
     config = load_config("configs/cic.yaml", ["pump.viscosity_mPa_s=50", gas_load])
+    assert config.pump is not None
     assert config.pump.pressure_difference_Pa == 3e4
 
 

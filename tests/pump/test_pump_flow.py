@@ -15,6 +15,7 @@ from rootsopt.config.families import families
 from rootsopt.contact.nodes import place_pair
 from rootsopt.profiles import CIC, EE, geometry
 from rootsopt.pump import flow
+from rootsopt.pump.sheet import sheet
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.families import margins_of
 from tests.conformance.families import LOBES, R, config_of, made, outline_of
@@ -168,3 +169,44 @@ def test_no_cic_comes_near_the_limit(angle, share, land):
     _, ripple, _, height = describe(profile)
     assert 0 < float(height) < 1
     assert 0 < float(ripple) < 0.35
+
+
+def test_twist_evens_the_flow():
+    """EE has one line, so the closed form is exact; it vanishes at π/N."""
+    profile, twists = EE(3, R), np.radians([0, 15, 30, 45, 60, 90])
+    shape, straight, lines, _ = describe(profile)
+    ripple = jax.jit(lambda twist: flow.twisted_ripple(profile, shape, twist))
+    found = np.array([float(ripple(jnp.asarray(twist))) for twist in twists])
+    expected = float(straight) * np.abs(np.sinc(3 * twists / np.pi))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert 100 * found[2] == pytest.approx(9.794, abs=5e-4)
+    assert found[4] < 1e-12
+    turned = flow.twisted_lines(lines, 3, jnp.asarray(twists[2]))
+    assert 2 * abs(float(turned[0])) == pytest.approx(found[2], rel=1e-9)
+
+
+def test_twist_of_other_families_against_samples():
+    """CIC has many lines: against the mean of shifted samples, and their Fourier transform."""
+    profile = made("cic")
+    shape, _, lines, _ = describe(profile)
+    count, twist = 12000, np.radians(20.0)
+    phi = np.arange(count) * 2 * np.pi / LOBES / count
+    straight = np.asarray(over(profile, shape, jnp.asarray(phi)))
+    # 20° are a sixth of the lobe pitch: a whole number of samples.
+    window = np.ones(count // 6 + 1)
+    window[[0, -1]] = 0.5
+    kernel = np.zeros(count)
+    kernel[: len(window)] = window / window.sum()
+    mean = np.fft.ifft(np.fft.fft(straight) * np.fft.fft(kernel)).real
+    found = float(flow.twisted_ripple(profile, shape, jnp.asarray(twist)))
+    assert found == pytest.approx(np.ptp(mean), rel=1e-5)
+    sizes = 2 * np.abs(np.fft.rfft(mean))[2 * np.arange(1, 5)] / count
+    turned = np.abs(np.asarray(flow.twisted_lines(lines, LOBES, jnp.asarray(twist))))[:4]
+    np.testing.assert_allclose(turned, sizes, atol=1e-6)
+
+
+def test_sheet_counts_the_twist():
+    config = load_config("ee", ["rotor.helix_deg=30", "solver.slices=2"])
+    rows = sheet(Scene.from_config(config), design_vector(config))
+    assert 100 * rows["flow_ripple"] == pytest.approx(9.794, abs=5e-4)
+    assert 2 * rows["flow_lines"][0] == pytest.approx(rows["flow_ripple"], rel=1e-9)

@@ -1,5 +1,4 @@
-"""Results of about eighty configs, kept to tell whether a change of the code changes a result.
+"""Stored results of about eighty configs, which show whether a change of code changes results.
 
-`cases` lists the configs, `package` is the one place that calls rootsopt, `compare` says how far
-two results are apart, and `reference.json` holds what the package gave when it was last written.
-"""
+`cases` lists the configs, and `package` is the one place that calls rootsopt. `compare` says how
+far two results are apart. `reference.json` holds the package's results at the last `--write`."""

@@ -1,8 +1,7 @@
-"""`python -m tests.reference [NAME ...]`: evaluate the cases again and compare with what is kept.
+"""`python -m tests.reference [NAME ...]`: evaluate the cases again and compare with stored results.
 
-Prints the greatest relative difference of each quantity and the cases in which one is too great.
-Exit code 1 if there is such a case. With --write it writes the results instead.
-"""
+Prints the greatest relative difference of each quantity, and the cases in which one is too great.
+The exit code is 1 if there is such a case. With --write it writes the results instead."""
 
 import argparse
 import sys
@@ -15,11 +14,11 @@ from tests.reference.cases import CASES, Case
 from tests.reference.compare import ChangedError, differences, limits
 
 _NUDGES = (1e-13, -1e-13, 3e-13, -3e-13)
-"""Relative changes of the speed that stand for rounding."""
+"""Relative changes of the speed that represent rounding."""
 
 
 def result_of(case: Case) -> dict[str, Any]:
-    """What the package gives for a case, and how far rounding moves it."""
+    """Return the package's result of a case, and how far rounding changes it."""
     found = package.evaluate(case.config, case.overrides)
     rounding: dict[str, float] = {}
     for nudge in _NUDGES if case.nudged else ():
@@ -30,7 +29,7 @@ def result_of(case: Case) -> dict[str, Any]:
 
 
 def written(cases: list[Case]) -> int:
-    """Write the results of the cases beside those kept already."""
+    """Write the results of the cases beside those stored already; return the exit code."""
     results, failed = kept.read(), 0
     for case, said in _in_turn(cases):
         try:
@@ -48,7 +47,9 @@ def written(cases: list[Case]) -> int:
 
 
 def compared(cases: list[Case]) -> int:
-    """Evaluate the cases again and print how far they are from what is kept."""
+    """Evaluate the cases again and print their differences from the stored results.
+
+    Returns the exit code."""
     results, failed, worst = kept.read(), 0, {}
     for case, said in _in_turn(cases):
         try:
@@ -71,7 +72,9 @@ def compared(cases: list[Case]) -> int:
 
 
 def check(case: Case, results: dict[str, Any]) -> tuple[dict[str, float], dict[str, float]]:
-    """Differences of a case from its kept result, and those allowed. Raises `ChangedError`."""
+    """Return the differences of a case from its stored result, and those allowed.
+
+    Raises `ChangedError`."""
     if case.name not in results:
         raise ChangedError("nothing is kept; run with --write")
     result = results[case.name]
@@ -81,14 +84,14 @@ def check(case: Case, results: dict[str, Any]) -> tuple[dict[str, float], dict[s
 
 
 def _in_turn(cases: list[Case]) -> Iterator[tuple[Case, str]]:
-    """The cases and a word of progress on each, with the time the one before took."""
+    """Yield each case with a line of progress, which has the time of the case before."""
     began = time.monotonic()
     for number, case in enumerate(cases):
         yield case, f"{time.monotonic() - began:6.0f} s  {number + 1}/{len(cases)} {case.name}"
 
 
 def main() -> int:
-    """Compare or write the cases named, all without a name."""
+    """Compare or write the named cases, or all without a name."""
     parser = argparse.ArgumentParser(prog="python -m tests.reference", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="cases whose name begins so")
     parser.add_argument("--write", action="store_true", help="keep what the package gives now")

@@ -1,16 +1,17 @@
-"""The configs whose results are kept: a shipped config, overrides and a name each.
+"""The configs whose results are stored: a shipped config, overrides and a name each.
 
-Chosen so that every profile family, scene part, contact, method, measure, motion and status occurs
-at least once. What is not itself the subject of a case is as in the shipped config, but for the
-tolerance: at the shipped one, rounding alone chooses other steps, and forces differ by up to 1e-7.
-"""
+Every profile family, scene part, contact, method, measure, motion and status occurs at least once.
+What is not the subject of a case is as in the shipped config, except the tolerance. At the shipped
+tolerance rounding alone can change the steps, and forces differ by up to 1e-7."""
 
 from typing import NamedTuple
 
 
 class Case(NamedTuple):
-    """A config to be evaluated. nudged: whether it is also evaluated at speeds that differ by
-    rounding when it is written, which a long case can do without."""
+    """Hold a config to be evaluated.
+
+    nudged: whether the case is also evaluated at speeds that differ by rounding when it is written.
+    Long cases are not."""
 
     name: str
     config: str
@@ -22,17 +23,17 @@ _TIGHT = "solver.rtol=1e-11"
 
 
 def _tight(case: Case) -> Case:
-    """The case at a tight tolerance, unless its tolerance is its subject."""
+    """Return the case at a tight tolerance, unless its tolerance is its subject."""
     loose = case.name.startswith(_AS_SHIPPED) or any("rtol" in one for one in case.overrides)
     return case if loose else case._replace(overrides=[_TIGHT, *case.overrides])
 
 
 _AS_SHIPPED = ("as shipped", "single precision", "unresolved", "inaccurate", "ensemble", "nodes")
-"""Beginnings of the names of cases at the tolerance of the config."""
+"""Beginnings of the names of cases that use the config's own tolerance."""
 
 
 def _sections(**values: str) -> list[str]:
-    """Overrides of a scene by short names."""
+    """Return overrides of a scene from short names."""
     return [f"{_KEYS[key]}={value}" for key, value in values.items()]
 
 
@@ -89,7 +90,7 @@ _BARE = [
     *_sections(speed="6000", load="0.1"),
     "profile.involute_length_mm=6",
 ]
-"""A light load at high speed, which flanks alone can hold."""
+"""A light load at high speed, at which the motion is sound without a timing gear."""
 _PARTS = {
     "no gear": [],
     "gear": [_GEAR],
@@ -113,9 +114,9 @@ _SHAKY = [
     "profile.involute_length_mm=4",
     "profile.tip_arc_angle_deg=1.5",
 ]
-"""A stable orbit of two mesh periods, which magnifies what is changed."""
+"""A stable orbit of two mesh periods, which is sensitive to small changes."""
 _TWO = ["scene.timing_gear.backlash_mm=0.2", "scene.timing_gear.damping_ratio=0.2"]
-"""Play in which motions coexist at 6000 rpm."""
+"""A backlash at which motions coexist at 6000 rpm."""
 _GRID = ["attractors.relatives=5", "attractors.rates=4"]
 _FEW = ["ensemble.members=4", "ensemble.settle_periods=24", "ensemble.periods=8"]
 _MEASURED = ["response.lines=[1, 2, 3.5]", "objective.peak_norm=16"]
@@ -202,7 +203,7 @@ _EVERY = [
     Case("map of given size", "cic", [*_sections(contact="map"), "solver.map_rolls=96",
                                       "solver.map_relatives=24"]),
 ]  # fmt: skip
-"""Those that share compiled programs stand beside each other."""
+"""All cases; those that share compiled programs are adjacent."""
 CASES = [_tight(case) for case in _EVERY]
 SHORT = ("linear", "linear, doubled load", "passed through, linear", "linear of ee")
-"""Names of cases that are compiled in seconds."""
+"""Names of cases that compile within seconds."""

@@ -1,4 +1,4 @@
-"""How far two results of one config are apart, quantity by quantity."""
+"""Differences between two results of one config, quantity by quantity."""
 
 from typing import Any
 
@@ -13,31 +13,35 @@ LIMITS = {
     "average": 1e-7,
     "share": 1e-9,
 }
-"""Greatest relative difference allowed, by quantity. `of the peak`: its gradient, which rounding of
-the forces beside it changes by some 1e-7. `average`: means over an ensemble."""
+"""Relative difference of each quantity above which a result counts as changed.
+
+`of the peak`: the peak's gradient, which rounding of nearby forces changes by some 1e-7. `average`:
+means over an ensemble."""
 LOOSE = 1.0
-"""The same for forces of a motion that magnifies every difference, until it is another motion."""
+"""Relative difference of forces above which a chaotic result counts as changed.
+
+Such a motion magnifies every difference, until it is another motion."""
 ROUNDING = 10.0
-"""Differences allowed in units of those that a change of the speed by rounding makes."""
+"""Allowed difference, as a multiple of the one that rounding of the speed causes."""
 _SMALL = 1e-3
 """Share of the greatest number beside it below which a number is compared with that share."""
 _MULTIPLIER = "floquet_multiplier"
 
 
 class ChangedError(Exception):
-    """Two results that differ in kind; the message says in what."""
+    """Raised for two results that differ in kind; the message says in what."""
 
 
 def is_loose(result: dict[str, Any]) -> bool:
-    """Whether a result is that of a chaotic motion, or of a window of one that has not settled."""
+    """Return whether a result is chaotic, or a window of a motion that has not settled."""
     return result["steady_state"].get("kind") == "chaotic" or result["status"] == "not_settled"
 
 
 def differences(found: dict[str, Any], kept: dict[str, Any]) -> dict[str, float]:
-    """Greatest relative difference of each quantity that both results have.
+    """Return the greatest relative difference of each quantity that both results have.
 
-    Raises `ChangedError` where status, kind of motion, period or the names of the numbers differ.
-    """
+    Raises `ChangedError` where status, kind of motion, period or the names of the numbers
+    differ."""
     _same("status", found["status"], kept["status"])
     here, there = found["steady_state"], kept["steady_state"]
     for key in ("kind", "period"):
@@ -69,7 +73,9 @@ def differences(found: dict[str, Any], kept: dict[str, Any]) -> dict[str, float]
 
 
 def limits(kept: dict[str, Any]) -> dict[str, float]:
-    """Difference allowed for each quantity of a kept result, with what rounding does to it."""
+    """Return the allowed difference of each quantity of a stored result.
+
+    The effect of rounding is included."""
     rounding = kept.get("rounding", {})
     found = {name: max(LIMITS[name], ROUNDING * rounding.get(name, 0.0)) for name in LIMITS}
     if is_loose(kept):
@@ -88,19 +94,19 @@ def _worst(found: dict[str, float], kept: dict[str, float], scales: dict[str, fl
 
 
 def _lengths(kept: dict[str, float]) -> dict[str, float]:
-    """Scales of a geometry: each number itself, but small lengths by the rotor's size."""
+    """Return scales of a geometry: each number itself, or the rotor's size for small lengths."""
     least = _SMALL * kept["outer_radius_mm"]
     return {k: max(abs(v), least if k.endswith("_mm") else 1e-300) for k, v in kept.items()}
 
 
 def _forces(kept: dict[str, float]) -> dict[str, float]:
-    """Scales of a response: each force itself, but small ones by the greatest."""
+    """Return scales of a response: each force itself, or the greatest force for small ones."""
     least = max(_SMALL * max(map(abs, kept.values()), default=0.0), 1e-300)
     return {key: max(abs(value), least) for key, value in kept.items()}
 
 
 def _row(found: dict[str, float], kept: dict[str, float]) -> float:
-    """Difference of a gradient relative to its greatest entry."""
+    """Return the difference of a gradient relative to its greatest entry."""
     _same("the parameters of a gradient", list(found), list(kept))
     size = max(map(abs, kept.values()), default=0.0)
     return max((abs(found[k] - kept[k]) / max(size, 1e-300) for k in kept), default=0.0)

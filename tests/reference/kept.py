@@ -1,4 +1,4 @@
-"""The file of kept results."""
+"""The file of stored results."""
 
 import json
 from pathlib import Path
@@ -10,12 +10,12 @@ FILE = Path(__file__).with_name("reference.json")
 
 
 def read() -> dict[str, dict[str, Any]]:
-    """Kept results by name of the case."""
+    """Return the stored results by name of the case."""
     return json.loads(FILE.read_text())["results"] if FILE.exists() else {}
 
 
 def write(results: dict[str, dict[str, Any]]) -> None:
-    """Keep results: numbers with all their digits, a line for each case."""
+    """Store results: numbers with all their digits, a line for each case."""
     head = {"call": package.CALL, "versions": package.versions()}
     lines = [f"{json.dumps(name)}: {json.dumps(result)}" for name, result in results.items()]
     body = ",\n".join(lines)

@@ -7,17 +7,17 @@ from typing import Any
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 CALL = "evaluator_for(resolve(load(config, overrides))[0])(series=False).record()"
-"""What is called for each case, as the reference file says it."""
+"""The call of each case, as stated in the reference file."""
 KEPT = ("design", "geometry", "response", "gradient", "steady_state", "status")
-"""Entries of a record that are kept."""
+"""Entries of a record that are stored."""
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "optimistix", "lineax", "numpy", "scipy")
 
 
 def start() -> None:
     """Choose double precision and the cache of compiled programs, as a command does.
 
-    Programs are not optimised, unless XLA_FLAGS says otherwise: most of the time is the compiler's.
-    """
+    Programs are not optimised unless XLA_FLAGS says otherwise, because most of the time is
+    compilation."""
     os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
     from rootsopt.commands.cli import use_cache
     from rootsopt.runtime.environment import use_float64
@@ -27,12 +27,11 @@ def start() -> None:
 
 
 def evaluate(config: str, overrides: list[str], nudge: float = 0.0) -> dict[str, Any]:
-    """Record of the config's own design, as plain data.
+    """Return the record of the config's own design, as plain data.
 
     config: name of a shipped config. overrides: HERE in them is this folder. nudge: relative change
     of the speed, to see how far a result depends on rounding. Raises `rootsopt.errors.InputError`
-    for a config that is refused.
-    """
+    for a config that is refused."""
     from rootsopt.config import load
     from rootsopt.response.choice import resolve
     from rootsopt.response.evaluators import evaluator_for
@@ -48,7 +47,7 @@ def evaluate(config: str, overrides: list[str], nudge: float = 0.0) -> dict[str,
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that numbers depend on."""
+    """Return the versions of Python and of the packages on which the numbers depend."""
     import platform
     from importlib import metadata
 

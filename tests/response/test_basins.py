@@ -1,4 +1,4 @@
-"""Motions that coexist: attractors, basins, and objectives over all of them."""
+"""Coexisting motions: attractors, basins, and objectives over all of them."""
 
 import csv
 import dataclasses
@@ -33,7 +33,7 @@ def config_of(*overrides):
 
 @pytest.fixture(scope="module")
 def coexisting():
-    """Evaluator and basins of a scene with a quiet and noisy motions."""
+    """Return evaluator and basins of a scene with a quiet and noisy motions."""
     evaluator = Evaluator.of(config_of(*COEXIST))
     return evaluator, find(evaluator, series=True)
 
@@ -42,7 +42,7 @@ long_run = Program(lambda pair, state, how: strobe(pair, state, 240, how).states
 
 
 def test_motions_that_coexist_are_told_apart(coexisting):
-    """At least two stable orbits of different force, whose shares make up all initial states."""
+    """There are at least two stable orbits of different force, and their shares add up to 1."""
     _, basins = coexisting
     assert basins.status is Status.PERIODIC
     peaks = [one.evaluation.response["peak_force_N"] for one in basins.attractors]
@@ -68,7 +68,9 @@ def test_the_one_reached_is_that_of_the_plain_evaluation(coexisting):
 
 
 def test_initial_states_lead_where_a_long_simulation_ends(coexisting):
-    """240 mesh periods at another tolerance with another method, from cells of the grid."""
+    """Cells of the grid lead to the attractor that a long simulation reaches.
+
+    It runs for 240 mesh periods at another tolerance with another method."""
     evaluator, basins = coexisting
     pair = evaluator.pair(jnp.array([36.43, 9.0, 4.0]))
     how = Integrator("dopri8", jnp.asarray(1e-9), 4096)
@@ -85,7 +87,7 @@ def test_initial_states_lead_where_a_long_simulation_ends(coexisting):
 
 
 def test_a_known_motion_is_not_lost_on_a_coarse_grid(coexisting):
-    """One initial state finds one motion; a state on another motion brings that in."""
+    """One initial state finds one motion; a state given on another motion adds that one."""
     _, basins = coexisting
     small = Evaluator.of(config_of(*COEXIST, "attractors.relatives=1", "attractors.rates=1"))
     alone = find(small)
@@ -122,7 +124,9 @@ def test_worst_and_weighted(coexisting):
 
 
 def test_the_reference_decides_which_is_worst(coexisting):
-    """Relative to a tiny mean force the motion of the greatest mean is worst, not that of the
+    """The worst motion depends on the reference forces.
+
+    Relative to a tiny mean force, the motion of the greatest mean is worst, not that of the
     greatest peak."""
     _, basins = coexisting
     responses = [one.evaluation.response for one in basins.attractors]
@@ -158,7 +162,7 @@ def test_a_chaotic_basin_is_no_steady_state():
 
 
 def test_a_motion_that_is_not_told_is_no_steady_state(coexisting):
-    """Whatever is lost stands against `periodic`; a failure is named before it."""
+    """A motion that is lost makes the status not periodic; a failure takes precedence."""
     _, basins = coexisting
 
     def status(**lost):
@@ -175,7 +179,7 @@ def test_a_motion_that_is_not_told_is_no_steady_state(coexisting):
 
 
 def test_a_cycle_is_that_of_the_pair_last_evaluated(coexisting, monkeypatch):
-    """An evaluation may fit the contact map to its motion, and the cycle must be on that map."""
+    """The cycle uses the contact map of the evaluation, which may be fitted to the motion."""
     evaluator, found = coexisting
     built, used = [], []
 
@@ -206,7 +210,9 @@ def test_lost_motions_are_counted():
 
 
 def test_command(tmp_path, capsys):
-    """Table, result file, CSV of basins that agrees with it, picture; exit codes."""
+    """The command writes table, result file, a CSV of basins that agrees with it, and a picture.
+
+    The exit codes are checked too."""
     overrides = [f"--set={key}" for key in (*GRID, *COEXIST)]
     assert main(["attractors", "configs/cic.yaml", *overrides, "-o", str(tmp_path)]) == 0
     assert "Coexisting motions" in capsys.readouterr().out
@@ -226,7 +232,7 @@ def test_command(tmp_path, capsys):
 
 @pytest.mark.long
 def test_optimiser_over_all_motions(tmp_path):
-    """`worst` improves the worst motion of the baseline, and says so of all."""
+    """`worst` improves the baseline's worst motion and reports all motions."""
     small = (
         "objective.motion=worst",
         "optimizer.iterations=3",

@@ -1,4 +1,4 @@
-"""Ensembles: averages and their standard errors, gradients estimated from neighbours, commands."""
+"""Ensembles: averages and standard errors, gradients estimated from neighbours, commands."""
 
 import csv
 import functools
@@ -40,7 +40,7 @@ def config_of(*overrides):
 
 
 def averaged(*overrides, gradient=False, survey=True, design=None):
-    """Evaluation by an ensemble, without the Lyapunov exponent unless asked for."""
+    """Evaluate an ensemble, without the Lyapunov exponent unless asked for."""
     evaluator = EnsembleEvaluator(Evaluator.of(config_of(*overrides), survey=survey))
     if not gradient:
         evaluator = evaluator.without_gradient()
@@ -49,13 +49,13 @@ def averaged(*overrides, gradient=False, survey=True, design=None):
 
 @functools.cache
 def chaotic(seed=0, members=32, periods=32):
-    """Averages in the chaotic scene."""
+    """Return averages in the chaotic scene."""
     size = f"ensemble.members={members}", f"ensemble.periods={periods}", f"ensemble.seed={seed}"
     return averaged(*CHAOTIC, "ensemble.settle_periods=24", *size)
 
 
 def numbers(evaluation):
-    """(responses, their standard errors)."""
+    """Return (responses, their standard errors)."""
     errors = [evaluation.steady_state[ERRORS[name]] for name in RESPONSES]
     return np.array([evaluation.response[name] for name in RESPONSES]), np.array(errors)
 
@@ -69,7 +69,7 @@ def rows(gradient):
 
 @pytest.fixture(scope="module")
 def orbit():
-    """The closed orbit of a design inside the box."""
+    """Return the closed orbit of a design inside the box."""
     return Evaluator.of(config_of())(jnp.array(INSIDE), series=False)
 
 
@@ -89,8 +89,9 @@ def test_periodic_averages_are_those_of_the_orbit(orbit):
 
 
 def test_gradient_is_that_of_the_orbit(orbit):
-    """Estimated from close neighbours it agrees with the implicit function theorem within its
-    own standard error, which is small."""
+    """The gradient estimated from close neighbours agrees with the implicit one.
+
+    The difference is within the estimate's own standard error, which is small."""
     small = "ensemble.spread=0.005", "ensemble.designs=16"
     evaluation = averaged(*PERIODIC, *small, gradient=True, design=INSIDE)
     found, truth = rows(evaluation.gradient), rows(orbit.gradient)
@@ -102,7 +103,9 @@ def test_gradient_is_that_of_the_orbit(orbit):
 
 
 def test_neighbours_are_in_pairs_inside_the_box():
-    """Opposite about the middle, which is the point except within a spread of a bound."""
+    """Neighbours lie opposite each other about a middle.
+
+    The middle is the point itself, except within a spread of a bound."""
     settings = EnsembleConfig(designs=64, spread=0.1, seed=3)
     for point in np.array([[0.5, 0.4, 0.6], [0.0, 1.0, 0.5], [0.05, 0.5, 0.97]]):
         points, steps = neighbours(point, settings)
@@ -121,7 +124,7 @@ def test_neighbours_are_in_pairs_inside_the_box():
 
 
 def test_slope_of_a_quadratic_is_exact():
-    """Curvature cancels between opposite neighbours, and leaves no error to state."""
+    """Curvature cancels between opposite neighbours, and the stated error is zero."""
     rng = np.random.default_rng(0)
     slope, bend = rng.normal(size=(2, 3)), rng.normal(size=(2, 3, 3))
     steps = 0.1 * rng.normal(size=(8, 3))
@@ -133,7 +136,7 @@ def test_slope_of_a_quadratic_is_exact():
 
 
 def test_standard_error_of_the_slope_is_honest():
-    """Over many noisy samples the slope is right on average, and scatters as it says."""
+    """Over many noisy samples the slope is right on average, and scatters as stated."""
     rng = np.random.default_rng(1)
     slope = np.array([[1.0, -2.0, 0.5]])
     steps = 0.1 * rng.normal(size=(8, 3))
@@ -151,7 +154,7 @@ def test_standard_error_of_the_slope_is_honest():
 
 
 def test_chaos_is_averaged_and_named():
-    """Usable, with the kind of motion and standard errors beside the averages."""
+    """A chaotic result is usable, and has the kind of motion and standard errors."""
     evaluation = averaged(
         *CHAOTIC, "ensemble.members=8", "ensemble.periods=16", survey=False, gradient=False
     )
@@ -168,7 +171,7 @@ def test_chaos_is_averaged_and_named():
 
 
 def test_standard_errors_are_honest():
-    """Independent ensembles differ by what their standard errors say."""
+    """Independent ensembles differ by as much as their standard errors state."""
     found = [numbers(chaotic(seed=seed)) for seed in range(4)]
     apart = []
     for (first, by_first), (second, by_second) in itertools.combinations(found, 2):
@@ -179,7 +182,7 @@ def test_standard_errors_are_honest():
 
 
 def test_standard_error_falls_with_the_members():
-    """As the square root of their number."""
+    """The standard error falls as the square root of the number of members."""
     few = np.mean([numbers(chaotic(seed=s, members=8))[1] for s in range(4)], axis=0)
     many = np.mean([numbers(chaotic(seed=s))[1] for s in range(4)], axis=0)
     ratio = few / many
@@ -187,16 +190,19 @@ def test_standard_error_falls_with_the_members():
 
 
 def test_peak_does_not_grow_with_the_window():
-    """The mean of every period's peak is the same over long and short windows; the greatest of
-    all forces is not."""
-    short, long = chaotic(periods=8), chaotic(periods=96)
-    (a, by_a), (b, by_b) = numbers(short), numbers(long)
+    """The mean of the periods' peaks is the same over long and short windows.
+
+    The greatest of all forces is not."""
+    short, long = ([chaotic(seed=s, periods=n) for s in range(3)] for n in (8, 96))
+    (a, by_a), (b, by_b) = numbers(short[0]), numbers(long[0])
     assert np.all(np.abs(a - b) < 4 * np.hypot(by_a, by_b))
-    assert long.steady_state["greatest_force_N"] > short.steady_state["greatest_force_N"]
+    # A single seed may have its greatest force in a short window.
+    greatest = [[one.steady_state["greatest_force_N"] for one in some] for some in (short, long)]
+    assert np.mean(greatest[1]) > np.mean(greatest[0])
 
 
 def test_gradient_of_chaos_has_its_standard_error():
-    """Another seed gives another estimate, which differs by what the standard errors say."""
+    """Estimates of two seeds differ by as much as their standard errors state."""
     size = "ensemble.members=4", "ensemble.settle_periods=16", "ensemble.periods=16"
     both = [
         averaged(*CHAOTIC, *size, "ensemble.spread=0.2", f"ensemble.seed={seed}", gradient=True)
@@ -221,7 +227,7 @@ def render(table):
 
 
 def test_same_seed_same_numbers():
-    """The same seed gives the same numbers to the last digit, another one others."""
+    """The same seed gives the same numbers to the last digit; another seed gives others."""
     size = "ensemble.members=4", "ensemble.settle_periods=8", "ensemble.periods=8"
     first, again, other = (averaged(*CHAOTIC, *size, f"ensemble.seed={seed}") for seed in (5, 5, 6))
     assert first.response == again.response
@@ -230,7 +236,7 @@ def test_same_seed_same_numbers():
 
 
 def test_start_is_continued():
-    """From the last states of a neighbour the members go on; other shapes are refused."""
+    """Members continue from the last states of a neighbour; other shapes are refused."""
     settings = config_of(*CHAOTIC, "ensemble.members=4", "ensemble.periods=4")
     evaluator = EnsembleEvaluator(Evaluator.of(settings, survey=True)).without_gradient()
     first = evaluator(series=False)
@@ -242,7 +248,7 @@ def test_start_is_continued():
 
 
 def test_no_number_without_its_status():
-    """A member that fails fails the ensemble: no averages, no gradient."""
+    """If a member fails, the ensemble fails, and has neither averages nor gradient."""
     free = "scene.timing_gear=null", "scene.load.torque_N_m=4.775"
     evaluation = averaged(*free, *PERIODIC, gradient=True)
     assert evaluation.status is Status.PASSED_THROUGH
@@ -257,7 +263,7 @@ ONE = np.array([True, False, False, False])
 
 
 def sound(level=1.0):
-    """Four members of a motion without fault,."""
+    """Return four members of a motion without a failure."""
     few = level * np.ones(4)
     means = np.column_stack([few, few**2, 2 * few + np.arange(4)])
     return Members(
@@ -277,14 +283,14 @@ def test_one_member_that_fails_is_enough():
 
 
 def told(monkeypatch, run, gradient=False):
-    """Evaluation of members that `run(number of the pair)` makes up."""
+    """Evaluate an ensemble whose members are made up by `run(index of the pair)`."""
     made = lambda pairs, *rest: [run(k) for k in range(len(pairs))]  # noqa: E731
     monkeypatch.setattr("rootsopt.response.ensemble.run_members", made)
     return averaged("ensemble.members=4", "ensemble.designs=12", gradient=gradient)
 
 
 def test_responses_stand_where_they_belong(monkeypatch):
-    """Mean, peak and RMS of members that are told, with the standard error of the peaks."""
+    """Mean, peak and RMS of given members are in their columns, with the peaks' standard error."""
     evaluation = told(monkeypatch, lambda number: sound(3.0))
     response, steady = evaluation.response, evaluation.steady_state
     assert response == {"mean_force_N": 3, "peak_force_N": 7.5, "rms_force_N": 3}
@@ -295,7 +301,7 @@ def test_responses_stand_where_they_belong(monkeypatch):
 
 
 def test_members_that_never_touch_are_idle(monkeypatch):
-    """Averages of nothing; one member with contact is enough for averages."""
+    """Members without contact have no averages; one member with contact is enough for them."""
     evaluation = told(monkeypatch, lambda number: sound(0.0)._replace(means=np.zeros((4, 3))))
     assert evaluation.status is Status.IDLE
     assert set(evaluation.response.values()) == {0.0}
@@ -304,7 +310,7 @@ def test_members_that_never_touch_are_idle(monkeypatch):
 
 
 def test_too_deep_is_no_average(monkeypatch):
-    """One member beyond the validity of the contact law takes the result its usability."""
+    """One member beyond the validity of the contact law makes the result unusable."""
     depth = np.array([-1.0, 1.0, 1.0, 1.0]) * 0.0201 * 0.033
     evaluation = told(monkeypatch, lambda number: sound()._replace(depth=depth), gradient=True)
     assert evaluation.status is Status.TOO_DEEP
@@ -314,7 +320,9 @@ def test_too_deep_is_no_average(monkeypatch):
 
 
 def test_a_neighbour_that_fails_leaves_no_gradient(monkeypatch):
-    """Nor averages: they would stand for a neighbourhood that is not there."""
+    """A neighbour that fails leaves neither gradient nor averages.
+
+    The averages are those of the whole neighbourhood."""
     failed = sound()._replace(lost=ONE)
     runs = lambda number: failed if number == 7 else sound()  # noqa: E731
     evaluation = told(monkeypatch, runs, gradient=True)
@@ -326,7 +334,7 @@ def test_a_neighbour_that_fails_leaves_no_gradient(monkeypatch):
 
 
 def test_evaluator_of_a_motion():
-    """`objective.motion` chooses; only an ensemble has a gradient to leave out."""
+    """`objective.motion` chooses the evaluator; only an ensemble can leave out the gradient."""
     plain = evaluator_for(config_of())
     assert type(plain) is Evaluator
     assert plain.without_gradient() is plain
@@ -344,7 +352,7 @@ def test_evaluator_of_a_motion():
 
 
 def test_optimize_a_chaotic_scene(tmp_path, capsys):
-    """A small run: significant or not, it says so; the history has its standard errors."""
+    """A small run says whether its gain is significant; the history has standard errors."""
     size = "ensemble.members=4", "ensemble.designs=12", "ensemble.spread=0.1"
     window = "ensemble.settle_periods=8", "ensemble.periods=8"
     search = "optimizer.screening=2", "optimizer.starts=1", "optimizer.iterations=2"
@@ -372,7 +380,7 @@ def test_optimize_a_chaotic_scene(tmp_path, capsys):
 
 @pytest.mark.long
 def test_reached_refuses_chaos_and_names_the_option(tmp_path):
-    """A single chaotic motion is refused, with the way out."""
+    """A single chaotic motion is refused, and the message names the option that helps."""
     options = itertools.chain.from_iterable(
         ("--set", key) for key in (*CHAOTIC, "objective.motion=reached")
     )
@@ -387,7 +395,7 @@ def test_reached_refuses_chaos_and_names_the_option(tmp_path):
 
 
 def test_simulate_an_ensemble(tmp_path):
-    """Exit 0, averaged, the series of one member, and figures."""
+    """The exit code is 0, and the run has averages, the series of one member, and figures."""
     size = "ensemble.members=4", "ensemble.designs=12", "ensemble.periods=16"
     options = itertools.chain.from_iterable(("--set", key) for key in (*CHAOTIC, *size))
     assert simulate.main(["configs/cic.yaml", "-o", str(tmp_path), *options]) == 0

@@ -1,4 +1,4 @@
-"""Columns and map errors of an evaluation, each against numbers of its own."""
+"""Columns and map errors of an evaluation agree with numbers made up for the test."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +14,7 @@ from tests.standins import oscillator
 
 
 def test_series_has_drive_and_coast_where_they_belong(monkeypatch):
-    """From the contact to the columns of the file: the drive flank's force is the drive column."""
+    """The drive flank's force of the contact is in the file's drive column."""
     count = 5
     tau, states = np.arange(count) / count, np.zeros((count, 2))
     one = np.arange(1.0, count + 1)
@@ -42,7 +42,7 @@ def test_series_has_drive_and_coast_where_they_belong(monkeypatch):
 
 
 def test_stated_error_of_a_map_is_relative_to_the_static_depth(monkeypatch):
-    """`map_error` is that of the penetration over the depth which carries the load: F = K δ^e."""
+    """`map_error` is the error of the penetration over the static depth: F = K δ^e."""
     config = load("configs/cic.yaml", ["solver.fidelity=map", "solver.map_error=2e-3"])
     evaluator = Evaluator.of(config)
     depth = 1e-3 * (4.775 / 33e-3 / 2e5) ** (1 / 2.2)

@@ -1,4 +1,4 @@
-"""Averages of the members of an ensemble, and their errors, from motions made by hand."""
+"""Averages of an ensemble's members, and their errors, from motions made up for the test."""
 
 import types
 
@@ -14,8 +14,10 @@ from tests.standins import SCALE, oscillator, told_flow
 
 
 def test_averages_of_a_member(monkeypatch):
-    """Means, greatest values and drift of a window after `settle` others, against NumPy; the drift
-    is positive where the force rises, and the middle of an odd window belongs to neither half."""
+    """Means, greatest values and drift of a window after `settle` periods agree with NumPy.
+
+    The drift is positive where the force rises. The middle of an odd window belongs to neither
+    half."""
     settle = 3
     means = np.random.default_rng(0).uniform(1, 2, 20) + np.arange(20)
     monkeypatch.setattr(members, "flow", lambda pair, state, *rest: told_flow(pair, state, means))
@@ -49,7 +51,7 @@ def test_averages_of_a_member(monkeypatch):
 
 
 def averages_from(state):
-    """Function (settle, periods) → what a member from `state` comes to."""
+    """Return a function (settle, periods) → averages of a member that starts from `state`."""
     pair, how = oscillator(), Integrator("tsit5", jnp.asarray(1e-6), 64)
     run = jax.jit(lambda *counts: members.member(pair, state, *counts, how))
     return lambda settle, periods: run(jnp.asarray(settle), jnp.asarray(periods))
@@ -70,7 +72,7 @@ def test_a_member_repeats_after_its_period(monkeypatch):
 
 
 def of_means(means) -> Members:
-    """Members of which only the means are of interest."""
+    """Return members of which only the means are given."""
     count = len(means)
     zero, no = np.zeros(count), np.zeros(count, bool)
     return Members(
@@ -79,7 +81,7 @@ def of_means(means) -> Members:
 
 
 def test_standard_errors_of_members_are_their_scatter():
-    """Mean, peak and RMS of 4000 ensembles of independent members scatter as they state."""
+    """Mean, peak and RMS of 4000 ensembles of independent members scatter as stated."""
     rng = np.random.default_rng(7)
     samples, count = 4000, 24
     level = 5 + rng.normal(size=(samples, count))
@@ -97,8 +99,9 @@ def test_standard_errors_of_members_are_their_scatter():
 
 
 def test_slopes_and_errors_per_config_unit():
-    """Random slopes in the unit box, carried to config units one by one, have the mean and scatter
-    stated: dR/dp = dR/dx (dp/dx)⁻¹, with a Jacobian that is far from symmetric."""
+    """Slopes in the unit box become slopes per config unit, with the stated mean and scatter.
+
+    dR/dp = dR/dx (dp/dx)⁻¹, with a Jacobian that is far from symmetric."""
     rng = np.random.default_rng(11)
     jacobian = np.array([[2.0, 0.0, 0.0], [1.5, 0.5, 0.0], [-4.0, 1.0, 3.0]])
     slope = rng.normal(size=(2, 3))

@@ -13,7 +13,7 @@ import optax
 import pytest
 
 import rootsopt
-from rootsopt import InputError, Scene, Status, steady_response
+from rootsopt import Scene, Status, steady_response
 
 TIGHT = "solver.rtol=1e-11", "solver.transient_rtol=1e-8"
 QUANTITIES = {
@@ -52,7 +52,9 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def known(scene):
-    """Response at the config's design; derivatives of its forces by design and quantities."""
+    """Return the response at the config's design and its derivatives.
+
+    They are those of the forces with respect to design and quantities."""
 
     def found(design, *values):
         moved = eqx.tree_at(lambda s: [get(s) for get in QUANTITIES.values()], scene, values)
@@ -157,11 +159,13 @@ PARTS = {
         {"center distance error": lambda s: s.center_distance_error},
     ),
 }
-"""Scenes with single parts, and the quantities that come with them."""
+"""Scenes with single parts, and the quantities of those parts."""
 
 
 def ridders(function, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Derivative at 0 by central differences, extrapolated over six steps, and its error."""
+    """Return the derivative at 0 and its error.
+
+    Central differences are extrapolated over six steps."""
     table = [[(function(step) - function(-step)) / (2 * step)]]
     best, error = table[0][0], np.full(table[0][0].shape, np.inf)
     for row in range(1, 6):
@@ -180,8 +184,10 @@ def ridders(function, step: float) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.long
 @pytest.mark.parametrize("kind", PARTS)
 def test_derivatives_with_respect_to_quantities_of_parts(kind):
-    """To 1e-6 of the force's change with the relative change of a quantity, or the differences' own
-    error. With the quantities of the shipped scene they are more than twenty."""
+    """Derivatives agree to 1e-6 of the change, or to the error of the differences.
+
+    The change is the force's, with the relative change of a quantity. With the quantities of the
+    shipped scene they are more than twenty."""
     overrides, gets = PARTS[kind]
     _, scene = scene_of(*overrides)
     values = [get(scene) for get in gets.values()]
@@ -224,8 +230,9 @@ def test_forward_and_reverse_agree(known):
 
 
 def test_composes_with_jit_and_vmap(scene, known):
-    """`jit(vmap(value_and_grad))` over scenes and designs, one of which passes through: its forces
-    and gradient are NaN, and those of the others are not touched."""
+    """`jit(vmap(value_and_grad))` works over scenes and designs, one of which passes through.
+
+    That one has NaN forces and gradient, and leaves the others as they are."""
     response, *_, jacobian = known
     loads = jnp.array([1.0, 3000.0]) * scene.load_torque
     scenes = eqx.tree_at(lambda s: s.load_torque, scene, loads)
@@ -245,7 +252,9 @@ def test_composes_with_jit_and_vmap(scene, known):
 
 
 def test_batch_is_computed_one_by_one(scene):
-    """On a CPU. As arrays, every motion would take as long as all of them."""
+    """On a CPU, motions of a batch are computed one by one.
+
+    As arrays, every motion would take as long as all of them."""
 
     def mean(design):
         return steady_response(scene, design).mean
@@ -262,7 +271,7 @@ def test_batch_is_computed_one_by_one(scene):
 
 
 def test_design_without_parameters():
-    """Its derivative is empty, and the one by the scene is not."""
+    """The derivative with respect to an empty design is empty; the one of the scene is not."""
     config = rootsopt.load_config("configs/ee.yaml")
     scene = Scene.from_config(config)
     mean = jax.eval_shape(
@@ -281,7 +290,7 @@ def test_function_compiled_with_the_options_of_programs(scene):
 
 @pytest.mark.long
 def test_within_an_optimiser(scene):
-    """A function that calls it twice, in an optax loop."""
+    """A function that calls `steady_response` twice works in an optax loop."""
     faster = eqx.tree_at(lambda s: s.speed, scene, 1.2 * scene.speed)
 
     def both(design):
@@ -299,7 +308,9 @@ def test_within_an_optimiser(scene):
 
 
 def test_unknown_derivatives_are_not_numbers(scene):
-    """All of them without an orbit; multipliers are constants and spoil no other derivative."""
+    """Without an orbit, all derivatives are NaN.
+
+    Multipliers are constants, and leave the other derivatives as they are."""
 
     def both(design, *values):
         moved = eqx.tree_at(lambda s: [get(s) for get in QUANTITIES.values()], scene, values)
@@ -322,7 +333,7 @@ def test_second_derivatives_are_refused(scene):
 
 @pytest.mark.long
 def test_motion_that_leaves_the_contact_map(scene, known):
-    """Its forces are not those of the pair: no number, and a status that says why."""
+    """A motion that leaves the contact map has NaN forces and a status that says so."""
     config, _ = scene_of("solver.fidelity=map")
     wide, narrow = (Scene.from_config(config, deepest) for deepest in (-3e-3, -1e-3))
     found = steady_response(wide, DESIGN)
@@ -370,29 +381,11 @@ def test_precision_is_asked_for_in_words():
 
 @pytest.mark.long
 def test_example_of_the_readme_runs():
-    """As it stands, in a process of its own."""
+    """The README's example runs unchanged, in a process of its own."""
     (text,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.M | re.S)
     found = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, cwd=ROOT)
     assert (found.returncode, found.stderr) == (0, "")
     assert float(found.stdout.split()[0]) > 0
-
-
-def test_sweep_of_any_keys():
-    config, _ = scene_of("objective.terms={outer_radius_mm: 0.5}")
-    axes = {"scene.load.torque_N_m": [4.0, 3000.0], "contact.clearance_mm": [0.0, 0.3]}
-    found = rootsopt.sweep_scenes(config, axes)
-    assert found.mean_force_N.dims == tuple(axes)
-    assert found.status.values.tolist() == [["periodic", "idle"], ["passed_through"] * 2]
-    point = {"scene.load.torque_N_m": 4.0, "contact.clearance_mm": 0.0}
-    one = rootsopt.evaluate(config.replaced(point))
-    assert float(found.mean_force_N.sel(point)) == one.response["mean_force_N"]
-    key = point | {"design_key": "involute_length_mm"}
-    slope = one.gradient["outer_radius_mm"]["involute_length_mm"]
-    assert float(found.gradient_outer_radius_mm.sel(key)) == slope
-    assert found.mean_force_N.attrs["units"] == "N"
-    for wrong in ({"scene.sped_rpm": [1.0]}, {"scene.speed_rpm": [-1.0]}):
-        with pytest.raises(InputError, match="speed_rpm"):
-            rootsopt.sweep_scenes(config, wrong)
 
 
 def test_evaluation_as_a_dataset():

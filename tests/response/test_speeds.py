@@ -34,13 +34,13 @@ def config_of(*overrides):
 
 
 def programs():
-    """How many programs the evaluators have been compiled to."""
+    """Return the number of programs that the evaluators have been compiled to."""
     return sum(len(one._made) for one in (_build, _motion))
 
 
 @pytest.fixture(scope="module")
 def baseline():
-    """Evaluator over two speeds, 3000 rpm beside them, and its evaluation of the own design."""
+    """Return an evaluator over two speeds, with 3000 rpm besides, and its own evaluation."""
     evaluator = SpeedsEvaluator(Evaluator.of(config_of(SPEEDS, WEIGHTS, TIGHT)))
     return evaluator, evaluator(series=False)
 
@@ -53,7 +53,9 @@ def problem(baseline):
 
 @pytest.fixture(scope="module")
 def singles(baseline, problem):
-    """Baseline and another design at 2000 and 4000 rpm, each by an evaluator of one speed."""
+    """Return the baseline and another design at 2000 and 4000 rpm.
+
+    Each is evaluated by an evaluator of one speed."""
     before = programs()
     design = problem.design(POINT)
     found = {}
@@ -71,14 +73,15 @@ def moved(baseline, problem):
 
 
 def relative(one, base):
-    """The config's objective by hand: half the mean force, half the peak."""
+    """Return the config's objective, computed by hand: half the mean force, half the peak."""
     keys = "mean_force_N", "peak_force_N"
     return sum(0.5 * one.response[key] / base.response[key] for key in keys)
 
 
 def test_parts_are_the_evaluations_at_one_speed(baseline, singles):
-    """Every speed from rest is what an evaluator of that speed finds; the scene's heads the
-    record, with no share."""
+    """Each speed, started from rest, equals the result of an evaluator of that speed.
+
+    The scene's own speed comes first in the record, without a share."""
     evaluator, found = baseline
     assert [part.speed_rpm for part in found.parts] == [2000, 3000, 4000]
     assert [part.share for part in found.parts] == [0.25, 0, 0.75]
@@ -97,7 +100,7 @@ def test_parts_are_the_evaluations_at_one_speed(baseline, singles):
 
 
 def test_objective_is_the_weighted_mean_or_the_worst(baseline, problem, singles, moved):
-    """Against combinations by hand of evaluations at one speed."""
+    """The objective equals combinations of single-speed evaluations."""
     values = [relative(*pair[::-1]) for pair in singles.values()]
     assert values[0] != pytest.approx(values[1], rel=1e-3)
     # Begun from the baseline's orbit, not at rest: the same to the tolerance of the orbit.
@@ -111,7 +114,9 @@ def test_objective_is_the_weighted_mean_or_the_worst(baseline, problem, singles,
 
 
 def test_slope_agrees_with_central_differences(baseline, problem, moved):
-    """Along one direction of the unit box, for the weighted mean and for the worst speed."""
+    """Weighted mean and worst speed have the slopes of differences.
+
+    They are taken along one direction of the unit box."""
     evaluator, base = baseline
     direction = np.array([0.6, -0.5, 0.4])
     # Differences of second order: 1e-4 leaves some 1e-6 of curvature and 1e-6 of tolerance.
@@ -130,7 +135,7 @@ def test_slope_agrees_with_central_differences(baseline, problem, moved):
 
 
 def test_each_speed_begins_on_its_own_orbit(baseline, moved, monkeypatch):
-    """The state of an evaluation starts each speed where that speed's motion was."""
+    """The state of an evaluation starts each speed on that speed's own motion."""
     evaluator, found = baseline
     seen = []
     single = Evaluator.fit
@@ -158,7 +163,7 @@ def test_each_speed_begins_on_its_own_orbit(baseline, moved, monkeypatch):
 
 
 def test_without_speeds_all_is_as_before(baseline):
-    """The plain evaluator, its very record, and the objective of one speed to the last bit."""
+    """Without speeds, evaluator, record and objective are those of one speed to the last bit."""
     assert type(evaluator_for(config_of())) is Evaluator
     evaluator = evaluator_for(config_of(TIGHT))
     found = evaluator(series=False)
@@ -172,7 +177,9 @@ def test_without_speeds_all_is_as_before(baseline):
 
 
 def test_a_speed_without_steady_state_is_a_status():
-    """One of two speeds does not settle: its status, with the speed, no gradient, no objective."""
+    """If one of two speeds does not settle, the status names that speed.
+
+    There is neither gradient nor objective."""
     scene = (
         "scene.timing_gear.backlash_mm=0.2",
         "scene.timing_gear.damping_ratio=0.2",
@@ -195,7 +202,9 @@ def test_a_speed_without_steady_state_is_a_status():
 
 
 def test_motions_that_coexist_at_every_speed():
-    """`objective.motion: worst` over speeds: the attractors at each, relative to its baseline."""
+    """`objective.motion: worst` over speeds uses the attractors at each speed.
+
+    Their forces are relative to the baseline's at that speed."""
     small = "attractors.relatives=1", "attractors.rates=1", "objective.motion=worst"
     evaluator = evaluator_for(config_of(SPEEDS, *small))
     assert type(evaluator) is SpeedsEvaluator
@@ -239,7 +248,7 @@ def test_refusals_name_the_key(overrides, words):
 
 
 def test_speeds_of_a_config():
-    """What is simulated and what counts; the resolved config says the same again."""
+    """A config says which speeds are simulated and which count; so does the resolved config."""
     config = config_of(SPEEDS, WEIGHTS, "sweep.speed_rpm={from: 300, to: 600, points: 4}")
     assert speeds.shares(config) == {2000: 0.25, 3000: 0, 4000: 0.75}
     assert speeds.shares(speeds.alone(config)) == {3000: 1}
@@ -257,7 +266,9 @@ def run(command, folder, *overrides, options=()):
 
 
 def test_sweep_command(tmp_path, capsys, singles):
-    """CSV and result file hold what single simulations give; pictures; exit codes."""
+    """CSV and result file hold the values of single simulations.
+
+    Pictures and exit codes are checked too."""
     assert run("sweep", tmp_path, TIGHT, SPEEDS) == 0
     assert "4000.0" in capsys.readouterr().out
     with open(tmp_path / "sweep.csv", newline="") as file:
@@ -284,7 +295,9 @@ def test_sweep_command(tmp_path, capsys, singles):
 
 
 def test_optimize_over_speeds(tmp_path, capsys):
-    """A short run end to end: better over the speeds, each speed in table, records, picture."""
+    """A short run improves over the speeds.
+
+    Table, records and picture have each speed."""
     short = ["optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=2"]
     short.append("optimizer.method=adam")
     assert run("optimize", tmp_path, SPEEDS, WEIGHTS, *short) == 0
@@ -303,7 +316,7 @@ def test_optimize_over_speeds(tmp_path, capsys):
 
 
 def test_simulate_stays_at_the_scene(tmp_path, baseline):
-    """`simulate` is of the scene's own speed, whatever the objective."""
+    """`simulate` uses the scene's own speed, whatever the objective."""
     assert run("simulate", tmp_path, SPEEDS, TIGHT, options=["--no-figures"]) == 0
     record = json.loads((tmp_path / "result.json").read_text())
     assert "speeds" not in record
@@ -325,7 +338,9 @@ def test_auto_agrees_at_every_speed():
 
 
 def test_linearised_pair_has_the_closed_form_stiffness():
-    """In half the mesh the involutes carry, e F/δ · (r cos α)²; in the other half the gear."""
+    """The stiffness is e F/δ · (r cos α)² in the half of the mesh on involutes.
+
+    In the other half it is the gear's."""
     config = config_of("scene.timing_gear.backlash_mm=0.4", "contact.smoothing_mm=0")
     pair = Evaluator.of(config).pair(design_vector(config))
     total, flank, torque, force = (np.asarray(x) for x in equilibria(pair, np.array([0.25, 0.75])))
@@ -340,8 +355,9 @@ def test_linearised_pair_has_the_closed_form_stiffness():
 
 @pytest.mark.parametrize("failing", [2000.0, 3000.0, 4000.0])
 def test_every_speed_simulated_counts_in_the_status(monkeypatch, failing):
-    """The scene's own 3000 rpm has no share in the objective, but a result that fails there is
-    none."""
+    """A failure at the scene's own 3000 rpm fails the result.
+
+    That speed has no share in the objective."""
     config = load("configs/cic.yaml", ["objective.speeds_rpm=[4000, 2000]"])
     evaluator = SpeedsEvaluator(Evaluator.of(config))
 

@@ -21,7 +21,7 @@ OUTSIDE = "revolutions_per_litre"
 
 @pytest.fixture(scope="module")
 def outside(tmp_path_factory):
-    """The page's term, registered from its file."""
+    """Register the term of docs/extending.md from its file."""
     (text,) = re.findall(
         r"^```python displacement.py\n(.*?)^```", PAGE.read_text("utf-8"), re.S | re.M
     )
@@ -51,8 +51,7 @@ def scene() -> Scene:
     ],
 )
 def test_gradients_of_terms_are_those_of_differences(outside, scene, name):
-    """Of every term, the one from outside among them: forces move with the design as their slopes
-    say, geometry as its formulas do."""
+    """Every term, the one from outside among them, has the slopes of differences."""
     design, forces = np.array([36.43, 9.0, 4.0]), np.array([76.0, 242.0, 113.0])
     slopes = np.array([[-1.7, 7.9, -0.1], [-6.9, 4.7, 1.1], [-1.7, 6.3, 0.0]])
     wanted = terms.terms_of([name])
@@ -74,7 +73,9 @@ def test_gradients_of_terms_are_those_of_differences(outside, scene, name):
 
 
 def test_outside_term_is_in_results_and_objective(outside):
-    """The displaced volume against its own formula, and the objective that is made of it alone."""
+    """The outside term is in the results, and an objective can consist of it alone.
+
+    Its value is that of its own formula."""
     only = [f"objective.terms.{OUTSIDE}=1", "objective.mean_weight=0", "objective.peak_weight=0"]
     config = load_config(CIC, only)
     evaluator, found = Evaluator.of(config).fit(series=False)

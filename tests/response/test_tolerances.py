@@ -34,12 +34,14 @@ def config_of(*overrides, file=CIC):
 
 
 def programs():
-    """How many programs the evaluators have been compiled to."""
+    """Return the number of programs that the evaluators have been compiled to."""
     return sum(len(one._made) for one in (_build, _motion))
 
 
 def test_config_names_distributions_in_two_ways():
-    """Dotted overrides and a mapping with dotted keys mean the same; the resolved config again."""
+    """Dotted overrides and a mapping with dotted keys mean the same.
+
+    The resolved config can be read again."""
     config = config_of(*SPREAD)
     over = (
         "{contact.clearance_mm: {normal: 0.002}, scene.timing_gear.backlash_mm: {Uniform: 0.02}, "
@@ -66,7 +68,12 @@ def test_config_names_distributions_in_two_ways():
         ([PLAY, "tolerances.over.contact.clearence_mm.normal=1"], ["mean `contact.clearance_mm`"]),
         ([PLAY, "tolerances.over.contact.clearance_mm.nomal=1"], ["mean `normal`"]),
         ([PLAY, "tolerances.over.contact.clearance_mm.normal=0"], ["greater than 0"]),
-        (["tolerances.over.scene.center_distance_error_mm.normal=1"], ["give", "nominal value"]),
+        (["tolerances.over.contact.friction.kinetic.normal=1"], ["give", "nominal value"]),
+        (
+            ["tolerances.over.centre_distance.normal=0.01"],
+            ["mean `scene.center_distance_error_mm`"],
+        ),
+        (["tolerances.over.friction.normal=0.01"], ["mean `contact.friction.kinetic`"]),
         (["tolerances.over.solver.rtol.normal=1"], ["solver.rtol", "does not scatter"]),
         (["tolerances.over.profile.lobes.normal=1"], ["profile.lobes", "design parameters"]),
         (["tolerances.over.contact.smoothing_mm.normal=1"], ["does not scatter"]),
@@ -92,6 +99,17 @@ def test_refusals_name_the_key(overrides, words):
         assert word in message
 
 
+@pytest.mark.parametrize("key", ["center_distance_error_mm", "phase_error_mrad"])
+def test_errors_of_mounting_scatter_about_zero(key):
+    """Also where the config does not give them; one that it gives keeps its value."""
+    width = f"tolerances.over.scene.{key}.uniform=0.02"
+    absent, given = config_of(width), config_of(width, f"scene.{key}=0.1")
+    assert [one.nominal for one in absent.scatters] == [0.0]
+    assert [one.nominal for one in given.scatters] == [0.1]
+    assert getattr(absent.scene, key) == 0.0
+    assert getattr(config_of(PLAY).scene, key) is None
+
+
 def test_quantiles_agree_with_scipy():
     levels = np.linspace(0.001, 0.999, 41)
     clearance, backlash, load_, _ = config_of(*SPREAD).scatters
@@ -108,8 +126,9 @@ def test_quantiles_agree_with_scipy():
 
 
 def test_samples_have_the_statistics_of_their_distributions():
-    """Mean and standard deviation: a Sobol sample of 1024 within 2 %, a random one within four
-    standard errors. The same seed gives the same sample."""
+    """Mean and standard deviation are right, and the same seed gives the same sample.
+
+    A Sobol sample of 1024 is within 2 %, a random one within four standard errors."""
     config = config_of(*SPREAD)
     widths = np.array([one.width for one in config.scatters])
     sigmas = widths * np.array([1, 1 / np.sqrt(3), 1 / np.sqrt(6), 1])
@@ -128,7 +147,7 @@ def test_samples_have_the_statistics_of_their_distributions():
 
 @pytest.mark.parametrize("file", [CIC, "configs/pump.yaml"])
 def test_shifted_scenes_are_the_scenes_of_moved_configs(file):
-    """Every number that may scatter, moved by 1 %: as in the scene that its config gives."""
+    """Each value that may scatter, moved by 1 %, gives the scene of the moved config."""
     config = config_of(PLAY, file=file)
     keys = [key for key, value in scatterable(config).items() if value]
     keys = [key for key in keys if not key.startswith("profile.")]
@@ -148,14 +167,14 @@ def test_shifted_scenes_are_the_scenes_of_moved_configs(file):
 
 @pytest.fixture(scope="module")
 def spread():
-    """Evaluator over three scenes, and its evaluation of the own design."""
+    """Return an evaluator over three scenes, and its evaluation of the own design."""
     config = config_of(*SPREAD, "solver.rtol=1e-10", "tolerances.samples=3")
     evaluator = ToleranceEvaluator.of(config, Evaluator.of(config))
     return evaluator, evaluator(series=False)
 
 
 def test_parts_are_the_evaluations_of_moved_configs(spread):
-    """Each scene from rest is what an evaluator of that scene's config finds, by one program."""
+    """Each scene, started from rest, equals the evaluation of its config, by one program."""
     evaluator, found = spread
     before = programs()
     assert found.status is Status.PERIODIC
@@ -199,7 +218,7 @@ def test_scenes_begin_on_their_own_orbits(spread, monkeypatch):
 
 @dataclasses.dataclass(frozen=True)
 class Told(Evaluator):
-    """An evaluator whose force is the clearance in µm; it does not settle above 12 µm."""
+    """Stand in for an evaluator: its force is the clearance in µm, and fails above 12 µm."""
 
     def fit(self, design=None, start=None, series=True):
         clearance = 1e6 * float(self.scene.clearance)
@@ -214,7 +233,9 @@ def told(*overrides):
 
 
 def test_a_scene_without_steady_state_is_a_status():
-    """Status and numbers of the first such scene, how many there are, no gradient, no state."""
+    """The status names the first scene that does not settle, and how many do not.
+
+    There is neither gradient nor state."""
     config, single = told(CLEARANCE, "tolerances.samples=16")
     found = ToleranceEvaluator.of(config, single)()
     lost = [p for p in found.samples if not p.evaluation.usable]
@@ -231,7 +252,9 @@ def test_a_scene_without_steady_state_is_a_status():
 
 
 def test_scatter_over_several_speeds():
-    """Each scene at every speed; methods that return another evaluator keep the sample."""
+    """Each scene is evaluated at every speed.
+
+    Methods that return another evaluator keep the sample."""
     narrow = "tolerances.over.contact.clearance_mm.uniform=0.001"
     config, single = told(narrow, "objective.speeds_rpm=[2000, 3000]", "tolerances.samples=2")
     evaluator = ToleranceEvaluator.of(config, SpeedsEvaluator(single))

@@ -1,5 +1,6 @@
-"""Environment variables and machines: what is ignored, what is refused, what works."""
+"""Environment variables and machines: what is ignored, refused, or works."""
 
+import ast
 import json
 import os
 import re
@@ -64,7 +65,9 @@ def command(name, output, **variables):
 
 
 def test_a_command_computes_the_same_whatever_the_environment_says(tmp_path):
-    """All at once; what would change numbers or stop the run is named in a line on stderr."""
+    """With all variables at once, results stay the same.
+
+    Variables that would change numbers or stop the run are named in a line on stderr."""
     answers, tables = [], []
     for name, variables in {"plain": {}, "odd": SET_ASIDE | HARMLESS}.items():
         done = command("simulate", tmp_path / name, **variables)
@@ -124,11 +127,14 @@ def test_flags_of_xla_are_tried_in_a_process_of_their_own(monkeypatch, flags, wo
 
 
 def test_flags_that_work_are_tried_once(monkeypatch):
-    """Processes started from this one do not try them again; without flags nothing is tried."""
+    """Child processes do not try the flags again; without flags nothing is tried."""
     flags = "--xla_cpu_enable_fast_math=false --xla_cpu_multi_thread_eigen=false"
     monkeypatch.delenv(environment._CHECKED, raising=False)
     monkeypatch.setenv("XLA_FLAGS", flags)
     environment._check_flags(flags)
+    environment.use_compiled_loops()
+    assert os.environ["XLA_FLAGS"] == flags  # XLA has read its flags already
+    monkeypatch.setattr(environment, "_started", lambda: False)
     environment.use_compiled_loops()
     assert environment._LOOPS in os.environ["XLA_FLAGS"]
 
@@ -144,6 +150,29 @@ def test_flags_that_work_are_tried_once(monkeypatch):
         environment.use_float64()
     with pytest.raises(AssertionError):
         environment._check_flags("--xla_dump_to=elsewhere")
+
+
+def test_loops_are_compiled_from_python_without_a_call():
+    """The flag is set before JAX computes, not on import, and not where it would come too late."""
+    script = """
+import os, jax, rootsopt
+found = [os.environ.get("XLA_FLAGS", "")]
+if {late}: jax.numpy.ones(1)
+rootsopt.Status
+print(found + [os.environ.get("XLA_FLAGS", "")])
+"""
+    variables = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    for late in (False, True):
+        done = subprocess.run(
+            [sys.executable, "-c", script.format(late=late)],
+            env=variables,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        before, after = ast.literal_eval(done.stdout)
+        assert before == ""
+        assert (environment._LOOPS in after) is not late
 
 
 def test_settings_of_a_python_session_are_put_right(monkeypatch, capsys):
@@ -164,7 +193,7 @@ def test_settings_of_a_python_session_are_put_right(monkeypatch, capsys):
 
 
 class Machine:
-    """Stands in for JAX on a machine with one platform beside the CPU."""
+    """Stand in for JAX on a machine with one platform beside the CPU."""
 
     def __init__(self, platform):
         self.platform = platform

@@ -1,4 +1,4 @@
-"""Compiled programs: called, prepared, kept between processes and thrown away."""
+"""Compiled programs are called, prepared, kept between processes and deleted."""
 
 import importlib
 import os
@@ -41,19 +41,21 @@ TRACED = []
 
 
 def scaled(factor, numbers, name):
-    """A function of a module, arrays and something static."""
+    """Stand in for a program: arrays and a static argument."""
     TRACED.append(name)
     return Answer({"sum": jnp.sum(factor.value * numbers**factor.power)}, name)
 
 
 def solved(matrix):
-    """Needs LAPACK, which is set up when a program is lowered."""
+    """Stand in for a program that needs LAPACK, which is set up when it is lowered."""
     return jnp.linalg.solve(matrix, matrix[0])
 
 
 @pytest.fixture(autouse=True)
 def traced(monkeypatch, tmp_path):
-    """The traces of `scaled`, from none on; no programs are kept, and the key is the test's own."""
+    """Return the list of traces of `scaled`, empty at first.
+
+    No programs are kept, and the key is the test's own."""
     monkeypatch.setattr(programs, "_store", None)
     monkeypatch.setattr(store, "key_folder", lambda: tmp_path / "state")
     TRACED.clear()
@@ -120,7 +122,7 @@ def test_a_failure_is_raised_by_the_call_and_not_remembered():
 
 
 def test_kept_programs_are_found_without_tracing(tmp_path, traced):
-    """Another process is stood in for by another `Program` of the same function."""
+    """Another process, here another `Program` of the same function, finds a kept program."""
     programs.keep_in(tmp_path / "new" / "folder")
     first = ask(Program(scaled))
     assert len(list((tmp_path / "new" / "folder").iterdir())) == 1
@@ -135,7 +137,7 @@ def test_kept_programs_are_found_without_tracing(tmp_path, traced):
 
 @pytest.fixture
 def folder(tmp_path):
-    """The folder that programs are kept in from now on."""
+    """Return the folder in which programs are kept from now on."""
     programs.keep_in(tmp_path / "cache")
     return tmp_path / "cache"
 
@@ -154,7 +156,7 @@ def test_a_damaged_or_unwritable_cache_is_no_error(folder, traced):
 
 
 class Bomb:
-    """Notes that it was unpickled."""
+    """Record that it was unpickled."""
 
     went_off = False
 
@@ -164,7 +166,7 @@ class Bomb:
 
 @pytest.mark.parametrize("signed", ["not", "with another key", "for another program"])
 def test_what_is_not_ours_is_never_unpickled(folder, traced, monkeypatch, tmp_path, signed):
-    """What others put into the folder is compiled anew."""
+    """Programs that others put into the folder are compiled anew."""
     ask(Program(scaled))
     (file,) = folder.iterdir()
     bomb = zlib.compress(pickle.dumps(Bomb()))
@@ -186,7 +188,7 @@ def test_what_is_not_ours_is_never_unpickled(folder, traced, monkeypatch, tmp_pa
 
 
 def test_an_exchanged_program_is_compiled_anew(folder, traced):
-    """Whole and signed, but of another program: its answer would be another one."""
+    """A signed file of another program under this name is compiled anew."""
     ask(Program(scaled), power=2)
     (second,) = folder.iterdir()
     ask(Program(scaled), power=3)
@@ -212,7 +214,7 @@ def test_a_cache_others_may_write_to_is_said_once_and_not_used(folder, traced, m
 
 
 def test_a_cache_that_cannot_be_used_is_not_spoken_of(traced, monkeypatch, capsys, tmp_path):
-    """A file in the folder's place, a full path, or a cache that is switched off."""
+    """No message if the folder is a file, cannot be written, or the cache is off."""
     (tmp_path / "file").touch()
     for choice in (tmp_path / "file", tmp_path / "file" / "below", "off", "OFF", "0", "no"):
         monkeypatch.setenv("ROOTSOPT_CACHE", str(choice))
@@ -224,7 +226,9 @@ def test_a_cache_that_cannot_be_used_is_not_spoken_of(traced, monkeypatch, capsy
 
 
 def test_programs_called_from_python_are_kept_without_being_asked(traced, monkeypatch, tmp_path):
-    """In the folder that a command would use, unless the environment says otherwise."""
+    """Programs called from Python are kept in the commands' folder.
+
+    The environment may say otherwise."""
     for choice, kept in ((str(tmp_path / "cache"), 1), ("off", 0)):
         monkeypatch.setattr(programs, "_chosen", False)
         monkeypatch.setenv("ROOTSOPT_CACHE", choice)
@@ -244,7 +248,9 @@ def test_the_cache_may_be_named_from_the_current_folder(traced, monkeypatch, tmp
 
 
 def test_programs_that_call_out_are_not_kept(folder):
-    """Loaded without being lowered they would call what has not been set up."""
+    """Programs that call library functions are not kept.
+
+    Loaded without being lowered, they would call functions that are not set up."""
     np.testing.assert_allclose(Program(solved)(jnp.eye(2) * 2), [1, 0])
     assert not list(folder.iterdir())
 
@@ -262,7 +268,9 @@ def test_the_oldest_programs_give_way(folder, monkeypatch):
 
 
 def place():
-    """Name and purpose of a program in the store; its arguments have no precision of their own."""
+    """Return name and purpose of a program in the store.
+
+    Its arguments are integers, so that the precision changes nothing in them."""
     _, kind = programs._split((Factor(jnp.asarray(2, "int8"), 2), np.ones(3, "int8"), "a"))
     return Program(scaled)._place(kind)[1:]
 
@@ -292,7 +300,7 @@ def renamed_file(monkeypatch, tmp_path):
 
 
 def merged_files(monkeypatch, tmp_path):
-    """Two files that read as one."""
+    """Merge two source files into one of the same text; return the place before that."""
     (tmp_path / "room").mkdir()
     first, second = tmp_path / "room" / "a.py", tmp_path / "room" / "b.py"
     first.write_text("x\n")
@@ -337,7 +345,9 @@ def machine(monkeypatch, _):
 
 
 def processor(monkeypatch, _):
-    """Without an instruction: a program that has it would end the process."""
+    """Remove an instruction from the processor's description; return the place before that.
+
+    A kept program with that instruction would end the process."""
     before, found = place(), Path.read_text
     programs._machine.cache_clear()
 
@@ -380,7 +390,9 @@ CHANGES = {
 
 @pytest.mark.parametrize("what", CHANGES)
 def test_a_program_is_another_after_a_change(what, folder, monkeypatch, tmp_path):
-    """Of anything that its result depends on; back again it is found."""
+    """A change of anything that the result depends on gives another program.
+
+    After the change is undone, the first program is found again."""
     caches = programs._package_digest, programs._machine, programs._versions
     first = place()
     assert place() == first
@@ -399,7 +411,7 @@ def test_a_program_is_another_after_a_change(what, folder, monkeypatch, tmp_path
 
 
 def test_a_program_of_sources_elsewhere_follows_them(folder, monkeypatch, tmp_path):
-    """A user's own function or part of a scene that was changed is not the one that was kept."""
+    """A changed function or scene part of the user is compiled again."""
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     answers = []
@@ -425,7 +437,9 @@ def test_a_program_of_sources_elsewhere_follows_them(folder, monkeypatch, tmp_pa
 
 
 def test_programs_follow_the_files_of_families_from_outside(folder, monkeypatch, tmp_path):
-    """And what these import from their folder: a name in a config says nothing of either."""
+    """Changed files of outside families, and files that they import, are compiled again.
+
+    A name in a config shows neither."""
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "own_helper.py").write_text("SIZE = 1\n")
     (tmp_path / "own_family.py").write_text(

@@ -1,4 +1,4 @@
-"""Signed files of compiled programs: who may have a hand in them, damage, eviction, processes."""
+"""Signed files of compiled programs: permissions, damage, eviction, processes."""
 
 import os
 import stat
@@ -20,7 +20,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="owners and permissions of
 
 @pytest.fixture(autouse=True)
 def key_folder(tmp_path, monkeypatch):
-    """A state folder of the test's own, which holds the key."""
+    """Return a state folder of the test's own, which holds the key."""
     folder = tmp_path / "state"
     monkeypatch.setattr(store, "key_folder", lambda: folder)
     return folder
@@ -28,7 +28,7 @@ def key_folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def kept(tmp_path):
-    """A store with one entry, and the file that holds it."""
+    """Return a store with one entry, and the file that holds it."""
     made = Store(tmp_path / "cache")
     made.write("a", "for a", DATA)
     (file,) = (tmp_path / "cache").iterdir()
@@ -73,7 +73,7 @@ def test_a_damaged_entry_is_none(kept, how):
 
 
 def test_an_exchanged_entry_is_none(kept):
-    """Under another name, or made for something else, it is not what was asked for."""
+    """An entry under another name, or made for another purpose, is not returned."""
     made, file = kept
     made.write("b", "for b", DATA)
     other = file.with_name("b.program")
@@ -85,8 +85,9 @@ def test_an_exchanged_entry_is_none(kept):
 
 @posix
 def test_only_plain_files_of_the_users_own_are_read(kept, monkeypatch, tmp_path):
-    """Links, pipes and folders in an entry's place neither count nor hold up, nor do files that
-    others could write to."""
+    """Links, pipes and folders in an entry's place are ignored and do not block.
+
+    So are files that others can write to."""
     made, file = kept
     whole = file.read_bytes()
     for mode in (0o620, 0o602, 0o666):
@@ -139,7 +140,7 @@ def test_a_folder_others_may_write_to_is_refused(tmp_path, mode):
 
 @posix
 def test_a_folder_others_may_exchange_is_refused(tmp_path):
-    """They may, if they can write to a folder above it; the sticky bit takes that from them."""
+    """A folder is refused if others can write to a folder above it without a sticky bit."""
     above = tmp_path / "above"
     above.mkdir()
     folder = above / "between" / "cache"
@@ -164,7 +165,7 @@ def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
 @posix
 @pytest.mark.skipif(os.name == "posix" and os.geteuid() != 0, reason="only root gives files away")
 def test_a_folder_in_one_of_another_user_is_refused(tmp_path):
-    """Its owner can exchange what is in it."""
+    """A folder inside another user's is refused, because its owner can replace it."""
     above = tmp_path / "above"
     (above / "cache").mkdir(parents=True)
     os.chown(above, 12345, 12345)
@@ -184,7 +185,7 @@ def test_a_folder_that_cannot_be_used_is_an_os_error(tmp_path):
 
 
 def test_the_key_is_secret_and_lies_elsewhere(kept, key_folder, tmp_path):
-    """With another key, entries are none, and are replaced."""
+    """With another key, entries are not read, and are replaced."""
     (key,) = key_folder.iterdir()
     assert len(key.read_bytes()) == 32
     if os.name == "posix":
@@ -227,7 +228,8 @@ def test_an_unfit_key_is_replaced(kept, key_folder, tmp_path, how):
 
 @posix
 def test_without_a_key_nothing_is_kept(tmp_path, key_folder, monkeypatch):
-    """Nor where others may write beside it, or the state folder cannot be made."""
+    """Nothing is kept without a key, beside files that others can write, or without a state
+    folder."""
     key_folder.mkdir()
     key_folder.chmod(0o777)
     assert "key" in refusal(tmp_path / "cache")
@@ -243,7 +245,7 @@ def test_without_a_key_nothing_is_kept(tmp_path, key_folder, monkeypatch):
 
 
 def at_once(number, work):
-    """Run `work(k)` in so many threads that start together; the results."""
+    """Return the results of `work(k)`, run in `number` threads that start together."""
     gate, results = threading.Barrier(number), [None] * number
 
     def one(k):
@@ -290,7 +292,7 @@ def make_older(folder):
 
 @posix
 def test_unfinished_files_of_dead_processes_are_removed(tmp_path, key_folder):
-    """Those of living ones stay, and so does what is not ours."""
+    """Unfinished files of living processes stay, and so do other files."""
     Store(tmp_path / "cache")
     script = f"""
 import os, sys
@@ -323,7 +325,9 @@ with folder.unfinished("a.program", b"half"):
 
 
 def test_the_entries_unused_for_longest_give_way(kept, monkeypatch, tmp_path):
-    """Being read counts as use; what else lies in the folder, older and larger, is left alone."""
+    """The entries unused for longest are deleted; reading counts as use.
+
+    Other files in the folder, older and larger, are left alone."""
     made, file = kept
     size = file.stat().st_size
     other = file.with_name("of the user")
@@ -354,7 +358,7 @@ def test_entries_may_disappear_while_others_are_counted(kept, monkeypatch):
 
 
 def test_a_system_without_owners_and_open_folders(tmp_path, monkeypatch):
-    """As Windows: no user numbers, no descriptors of folders, no locks, no links of that kind."""
+    """The store works as on Windows: without user ids, folder descriptors, locks and such links."""
     monkeypatch.setattr(store, "_HAS_OWNERS", False)
     monkeypatch.setattr(store, "_IN_FOLDER", False)
     monkeypatch.setattr(store, "fcntl", None)

@@ -7,7 +7,7 @@ from rootsopt.runtime.threads import on_all_cores
 
 
 def test_work_is_divided_among_the_cores():
-    """Every row is done once and comes out in its place, whatever the shape of a row."""
+    """Every row is computed once and is returned in its place, whatever its shape."""
     rng = np.random.default_rng(0)
     for count in (1, 2, 5, 8):
         designs, states = jnp.asarray(rng.normal(size=(count, 3))), jnp.arange(float(count))

@@ -1,8 +1,7 @@
-"""Every precision with every contact, method and way to the gradient gives a sound result.
+"""Each precision gives a sound result with each contact, method and form of gradient.
 
-The usual suite compiles each contact and each method in either precision by itself, and runs one
-whole command in single precision; the whole grid is long.
-"""
+The usual suite compiles each contact and each method in either precision by itself. It runs one
+whole command in single precision; the whole grid is in long runs."""
 
 import dataclasses
 import json
@@ -29,14 +28,18 @@ CIC = "configs/cic.yaml"
 PRECISIONS = ("float64", "float32")
 CONTACTS = ("search", "map", "linear", "nodes")
 TIGHT = {"float64": 1e-6, "float32": 1e-3}
-"""Relative difference of the forces from those by tsit5 in double precision, with the same
+"""Relative difference allowed from the forces by tsit5 in double precision, with the same
 contact."""
 SLOPES = {"float64": 1e-3, "float32": 0.05}
-"""The same of the gradient of the mean, relative to its greatest component."""
+"""Relative difference allowed of the mean's gradient, as a share of its greatest component."""
 NODES = 5e-3
-"""Relative difference of mean and RMS of contact by nodes: the force has a step at every node."""
+"""Relative difference allowed of mean and RMS of contact by nodes.
+
+The force has a step at every node."""
 NODES_PEAK = 0.03
-"""The same of the peak, which may lie on a single step. It is the error of this contact's peak."""
+"""Relative difference allowed of the peak of contact by nodes.
+
+The peak may lie on a single step, which is the error of this contact's peak."""
 
 
 def config_of(precision, contact="search", method="tsit5", *overrides):
@@ -62,7 +65,8 @@ def series_of(precision, contact):
 def test_series_of_every_contact(contact):
     """Times are double whatever the states are, and late times lose nothing in single precision."""
     single, double = (series_of(precision, contact) for precision in reversed(PRECISIONS))
-    assert all(getattr(single, f.name).dtype == np.float64 for f in dataclasses.fields(single))
+    values = [getattr(single, field.name) for field in dataclasses.fields(single)]
+    assert all(value.dtype == np.float64 for value in values if value is not None)
     assert np.all(double.force > 0)
     # The gap is known to some 3 nm where it is searched for, of a depth of micrometres.
     np.testing.assert_allclose(single.force, double.force, rtol=0.01)
@@ -74,7 +78,7 @@ def test_series_of_every_contact(contact):
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_takes_states_of_either_precision(method, precision):
-    """Over two mesh periods of the linear contact, which compiles quickest."""
+    """Each method works over two mesh periods of the linear contact, the fastest to compile."""
     pair = pair_of(config_of(precision, "linear"))
     dtype = pair.angle_scale.dtype
     how = Integrator(method, jnp.asarray(1e-6), 4096)
@@ -85,7 +89,7 @@ def test_every_method_takes_states_of_either_precision(method, precision):
 
 
 def reference():
-    """State after two mesh periods, by dopri8 at a tight tolerance."""
+    """Return the state after two mesh periods, by dopri8 at a tight tolerance."""
     if not _KNOWN:
         pair = pair_of(config_of("float64", "linear"))
         how = Integrator("dopri8", jnp.asarray(1e-10), 4096)
@@ -112,8 +116,10 @@ def test_a_whole_command_in_single_precision(tmp_path):
 
 
 def test_nodes_give_forces_without_a_gradient():
-    """At their own default tolerance, near the forces of the search; the message says so. Its
-    derivatives in Python are NaN, and an optimisation is refused before it simulates anything."""
+    """Contact by nodes gives forces near those of the search, at its own tolerance.
+
+    A message says so. Derivatives in Python are NaN, and an optimisation is refused before it
+    simulates anything."""
     config = config_of("float64", "nodes")
     assert config.solver.rtol == config.solver.transient_rtol == 3e-5
     given = config_of("float64", "nodes", "tsit5", "solver.rtol=1e-6")
@@ -144,7 +150,7 @@ def test_derivatives_by_nodes_are_not_numbers():
 
 @pytest.fixture(scope="module")
 def truths():
-    """Evaluations by tsit5 in double precision, by contact."""
+    """Return evaluations by tsit5 in double precision, by contact."""
     found: dict[str, object] = {}
 
     def truth(contact):
@@ -161,7 +167,7 @@ def truths():
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("contact", [*CONTACTS, "auto"])
 def test_grid(contact, method, precision, gradient, truths):
-    """Each agrees with tsit5 in double precision."""
+    """Each combination agrees with tsit5 in double precision."""
     config = config_of(precision, contact, method, f"solver.gradient={gradient}")
     config, _ = choice.resolve(config)
     found = Evaluator.of(config)()

@@ -1,5 +1,7 @@
-"""A scene as the sum of its parts: forces and motion against Newton's laws written anew
-(`planar`), energy, and what an absent part costs."""
+"""A scene is the sum of its parts.
+
+Forces and motion are compared with Newton's laws written independently (`planar`). Energy is
+balanced, and an absent part costs nothing."""
 
 import diffrax
 import equinox as eqx
@@ -29,7 +31,9 @@ PARTS = {
 ALL = [override for part in PARTS.values() for override in part]
 SHARE = 0.35
 WITHIN = "profile.involute_length_mm=8.5"
-"""Past the longest involute two points of a flank mesh at once, which `planar` has no order for."""
+"""Override with an involute short enough for `planar`.
+
+Past the longest involute, two points of a flank mesh at once, and `planar` cannot order them."""
 
 
 @eqx.filter_jit
@@ -43,7 +47,7 @@ def pair_of(overrides, family="cic"):
 
 
 def planar_of(pair, config):
-    """The same scene in plain coordinates."""
+    """Return the same scene in plain coordinates."""
     mass = None if pair.supports is None else float(pair.supports.mass)
     gas = None
     if config.scene.load.pressure_difference_Pa is not None:
@@ -53,7 +57,7 @@ def planar_of(pair, config):
 
 
 def plain(pair, tau, state):
-    """The state of `planar` for rotation `tau` and a scaled state."""
+    """Return the state of `planar` for rotation `tau` and a scaled state."""
     motion = pair.motion(jnp.asarray(tau), jnp.asarray(state))
     positions = [[motion.phi, motion.phi + motion.relative], jnp.ravel(motion.shift)]
     rates = [[motion.speed, motion.speed + motion.rate], jnp.ravel(motion.drift)]
@@ -67,8 +71,10 @@ def contacts(pair, tau, states):
 
 @pytest.mark.parametrize("family", ["cic", "ee"])
 def test_forces_of_all_parts_are_newtons(family):
-    """Torques on both rotors, force on the axes and contact force at random states with displaced
-    axes, wider and closer than nominal: flanks, tips and roots that touch."""
+    """Forces and torques agree with `planar` at random states with displaced axes.
+
+    They are torques on both rotors, force on the axes and contact force. The distances are wider
+    and closer than nominal, and flanks, tips and roots touch."""
     # Rounding of the geometry is some 1e-17 m of a depth of 1e-6 m.
     for error in (0.02, -0.02):
         more = [f"scene.center_distance_error_mm={error}", *([WITHIN] * (family == "cic"))]
@@ -94,8 +100,9 @@ def test_forces_of_all_parts_are_newtons(family):
 
 
 def test_motion_of_all_parts_is_scipys():
-    """Through an impact, a third of a mesh period of rotation, with every part on: all states
-    against DOP853."""
+    """With every part on, all states agree with DOP853 through an impact.
+
+    The motion covers a third of a mesh period of rotation."""
     pair, config = pair_of([*ALL, WITHIN])
     reference = planar_of(pair, config)
     start = np.array([-0.6, 0.0, 0.0, 0.1, 0.0, -0.1, 0.05, 0.0, 0.0, 0.0, 0.0])
@@ -125,13 +132,12 @@ def test_motion_of_all_parts_is_scipys():
 
 
 def test_energy_balance_with_all_parts():
-    """Over a mesh period: the change of kinetic and elastic energy is the work of motor and gas
-    less what flanks, friction, gear and bearings take, to 1e-8 of that work.
+    """The change of energy over a mesh period is the work of all parts, to 1e-8.
 
-    The law of contact and gear stand as they are, unrounded, so that their energies are closed
-    forms. The rate of penetration is the derivative of the penetration along the motion, not the
-    package's own closing speed.
-    """
+    The change of kinetic and elastic energy is the work of motor and gas, less the losses in
+    flanks, friction, gear and bearings. The laws of contact and gear are unrounded, so that their
+    energies are closed forms. The rate of penetration is the derivative of the penetration along
+    the motion, not the package's own closing speed."""
     pair, _ = pair_of([*ALL, WITHIN, "contact.smoothing_mm=0"])
     law, gear, supports, drive = pair.law, pair.gear, pair.supports, pair.drive
     undamped = eqx.tree_at(lambda law: law.damping, law, jnp.zeros(()))
@@ -208,7 +214,7 @@ def equations(jaxpr):
 
 
 def size(overrides):
-    """States, equations and numbers of a scene's right-hand side."""
+    """Return the numbers of states, equations and constants of a scene's right-hand side."""
     config = load("configs/cic.yaml", overrides)
     pair = eqx.filter_eval_shape(Scene.pair, Scene.from_config(config), design_vector(config))
     numbers, static = eqx.partition(pair, lambda x: isinstance(x, jax.ShapeDtypeStruct))
@@ -223,8 +229,9 @@ STATES = {"motor": 3, "supports": 10}
 
 @pytest.mark.parametrize("part", PARTS)
 def test_an_absent_part_costs_nothing(part):
-    """A part adds its states, equations and numbers to the smallest program; without it, none of
-    them is there: whatever else is on, leaving it out makes all three smaller or equal."""
+    """Leaving a part out makes the program smaller or equal in all three sizes.
+
+    A part adds its states, equations and constants to the smallest program."""
     states, length, numbers = size([])
     assert states == 2
     more = size(PARTS[part])
@@ -241,7 +248,7 @@ def test_an_absent_part_costs_nothing(part):
 
 
 def test_orbit_and_gradient_of_all_parts():
-    """Eleven states: the orbit closes, and its gradient is that of differences."""
+    """With all parts, eleven states, the orbit closes, and its gradient is that of differences."""
     config = load("configs/cic.yaml", [*ALL, WITHIN, "solver.rtol=1e-10"])
     evaluator = Evaluator.of(config)
     found = evaluator(series=True)

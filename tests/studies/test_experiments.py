@@ -1,4 +1,4 @@
-"""Studies run, write their files, and give sane numbers; with `--quick` throughout."""
+"""Studies, run with `--quick`, write their files and give sane numbers."""
 
 import csv
 import json
@@ -29,7 +29,7 @@ PNG = b"\x89PNG"
 
 @pytest.fixture(scope="module")
 def programs(tmp_path_factory):
-    """Environment in which the studies keep their compiled programs in one place."""
+    """Return an environment in which the studies share a folder of compiled programs."""
     return os.environ | {
         "JAX_PLATFORMS": "cpu",
         "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("programs")),
@@ -88,7 +88,7 @@ def test_gradients(tmp_path, programs):
 
 
 def test_gradients_that_are_off_are_told():
-    """A gradient beyond its check, and a tighter tolerance that does worse, break a promise."""
+    """A gradient with too great an error fails, and so does a tighter tolerance that errs more."""
     good = {"scene": "one", "period": 1, "status": "periodic", "gradient_disagreement": 1e-6}
     good |= {"mean_force_N_error": 1e-6, "peak_force_N_error": 1e-6}
     rows = [good | {"rtol": rtol} for rtol in gradients.TOLERANCES]
@@ -102,7 +102,7 @@ def test_gradients_that_are_off_are_told():
 
 @pytest.mark.long
 def test_smoothing(tmp_path, programs):
-    """The bias of the default is below its limit, and grows with the smoothing length."""
+    """The default's bias is below its limit, and grows with the smoothing length."""
     run("smoothing", tmp_path, programs)
     summary = json.loads((tmp_path / "smoothing.json").read_text())["cic"]
     assert summary["settled"] >= 5
@@ -115,7 +115,9 @@ def test_smoothing(tmp_path, programs):
 
 @pytest.mark.long
 def test_tolerances(tmp_path, programs):
-    """All designs in every fresh scene; the robust optimum is no worse over the search's sample."""
+    """All designs are evaluated in every fresh scene.
+
+    The robust optimum is no worse over the search's sample."""
     run("tolerances", tmp_path, programs, "--case", "shipped")
     rows = rows_of(tmp_path / "tolerances.csv")
     assert [row["design"] for row in rows] == ["baseline", "nominal", "robust"]
@@ -128,7 +130,9 @@ def test_tolerances(tmp_path, programs):
 
 @pytest.mark.long
 def test_speed(tmp_path):
-    """The slowest speed is as good as standstill; resonances lie where the harmonics meet them."""
+    """The slowest speed gives nearly the forces at standstill.
+
+    Resonances lie where a harmonic of the mesh frequency is the mode's frequency."""
     run("speed", tmp_path, os.environ | {"JAX_PLATFORMS": "cpu"})
     rows = rows_of(tmp_path / "speed.csv")
     assert {row["status"] for row in rows} == {"periodic"}
@@ -153,7 +157,9 @@ def test_speed(tmp_path):
 
 @pytest.mark.long
 def test_extremes(tmp_path, programs):
-    """Every scene has a named outcome, results are finite, and SciPy finds those looked at."""
+    """Every scene has a named outcome, and results are finite.
+
+    SciPy finds the same results in the scenes chosen for it."""
     run("extremes", tmp_path, programs)
     rows = rows_of(tmp_path / "extremes.csv")
     assert len(rows) == 40
@@ -196,13 +202,36 @@ def test_benchmark(tmp_path, programs):
 
 @pytest.mark.long
 def test_parts(tmp_path, programs):
-    """Every part costs something, and the smallest scene least."""
+    """Every part takes time, and the smallest scene the least."""
     run("parts", tmp_path, programs)
     first, *others = rows_of(tmp_path / "parts.csv")
     assert first["states"] == "2"
     assert all(int(row["equations"]) > int(first["equations"]) for row in others)
     assert others[-1]["states"] == "11"
     assert is_picture(tmp_path / "parts.png")
+
+
+@pytest.mark.long
+def test_sweeps(tmp_path, programs):
+    """Points arrive at some rate, over processes too."""
+    run("sweeps", tmp_path, programs)
+    for name in ("sweeps.csv", "sweeps_collector.csv"):
+        rows = rows_of(tmp_path / name)
+        assert [row["way"] for row in rows] == ["this process", "1 worker"]
+        assert min(numbers(rows, "points_per_second")) > 0
+    assert is_picture(tmp_path / "sweeps.png")
+
+
+@pytest.mark.long
+def test_twist(tmp_path, programs):
+    """A twist evens the flow by its closed form, and lowers the peak of the force."""
+    run("twist", tmp_path, programs)
+    straight, turned = rows_of(tmp_path / "twist.csv")
+    assert float(straight["flow_ripple"]) == pytest.approx(2 / 13)
+    assert float(turned["flow_ripple"]) == pytest.approx(2 / 13 * 2 / np.pi)
+    assert float(turned["peak_force_N"]) < float(straight["peak_force_N"])
+    assert float(turned["axial_force_max_N"]) > 1 > float(straight["axial_force_max_N"])
+    assert is_picture(tmp_path / "twist.png")
 
 
 @pytest.mark.long
@@ -227,7 +256,7 @@ def test_paper(tmp_path, programs):
 
 
 def test_paper_by_scipy():
-    """Another tool finds the paper's forces in the shipped scene of the CIC pair."""
+    """SciPy finds the paper's forces in the shipped scene of the CIC pair."""
     config = load("configs/paper_cic.yaml")
     found = ScipyNodes(
         engines.Scene.of(config), nodes=400, rtol=1e-5, settle=10, window=2
@@ -237,14 +266,14 @@ def test_paper_by_scipy():
 
 
 def test_paper_scene_is_shared():
-    """Both pairs stand in one scene."""
+    """Both pairs have the same scene."""
     cic, ee = (load(f"configs/paper_{family}.yaml").model_dump() for family in ("cic", "ee"))
     assert cic.pop("profile") != ee.pop("profile")
     assert cic == ee
 
 
 def test_pair_of_quantities():
-    """What is differentiated by the quantities is the pair of the config with these values."""
+    """The pair differentiated with respect to the quantities is that of the config with them."""
     values = np.array([123.0, 4.5, 6.7e4, 0.21, 0.43, 0.065])
     config = config_of("ee", values, "solver.fidelity=linear")
     design = design_vector(config)
@@ -257,8 +286,9 @@ def test_pair_of_quantities():
 
 
 def test_polished():
-    """Gauss-Newton steps solve for forces that are powers of the quantities, inside their ranges
-    and with what is held left alone."""
+    """Gauss-Newton steps find the quantities for forces that are powers of them.
+
+    The quantities stay in their ranges, and those held stay as they are."""
     powers = np.random.default_rng(3).normal(size=(4, 6))
     start = np.array([100.0, 2.0, 2e4, 0.2, 0.3, 0.1])
 
@@ -278,7 +308,7 @@ def test_polished():
 
 @pytest.mark.long
 def test_paper_search(tmp_path, programs):
-    """A generation of a search simulates all its scenes, within the box that was asked for."""
+    """A generation of a search simulates all its scenes inside the given box."""
     run("paper", tmp_path, programs, "--search", "--seed", "1", "--least-clearance", "0.1")
     rows = rows_of(tmp_path / "paper_search.csv")
     record = json.loads((tmp_path / "paper_search.json").read_text())
@@ -332,7 +362,7 @@ def test_measured(tmp_path, programs):
 
 @pytest.mark.long
 def test_freeform(tmp_path, programs):
-    """Better than where it began, by the figures of both designs."""
+    """The optimum is better than the start, by the figures of both designs."""
     run("freeform", tmp_path, programs)
     designs = json.loads((tmp_path / "freeform.json").read_text())["designs"]
     assert designs["free form"]["objective"] < designs["best CIC"]["objective"] < 1
@@ -344,7 +374,9 @@ def test_freeform(tmp_path, programs):
 
 @pytest.mark.long
 def test_families(tmp_path, programs):
-    """One housing for all: bore and area efficiency as the reference's, forces and ranks told."""
+    """All families share one housing, and the reference's bore and area efficiency.
+
+    Forces and ranks are in the output."""
     out = run("families", tmp_path, programs)
     rows = {row["family"]: row for row in rows_of(tmp_path / "families.csv")}
     assert set(rows) == {"cic", "arc", "free_form"}

@@ -1,4 +1,4 @@
-"""What `make mutants` changes is still there to be changed."""
+"""The texts that `make mutants` changes are still in the sources."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_mistakes_made_by_hand_can_still_be_made():
-    """Each text occurs once, what replaces it is Python, and the test named is there."""
+    """Each text occurs once, its replacement is valid Python, and the named test exists."""
     mistakes = by_hand(ROOT)
     assert len({one.key for one in mistakes}) == len(mistakes) >= 16
     for one in mistakes:
@@ -24,7 +24,7 @@ def test_mistakes_made_by_hand_can_still_be_made():
 
 
 def test_every_numerical_module_has_its_tests():
-    """Its tests are named in `tests/mutants/rooms.py`, and they exist."""
+    """The tests of each module are named in `tests/mutants/rooms.py` and exist."""
     assert set(modules(ROOT)) == set(ROOMS)
     assert all((ROOT / test).exists() for tests in ROOMS.values() for test in tests)
 
@@ -37,7 +37,9 @@ def test_equivalent_mutants_can_still_be_made():
 
 
 def test_choice_of_mutants():
-    """It depends on the seed alone, has every size asked for, and leaves out what is equivalent."""
+    """The choice depends on the seed alone and has the requested size.
+
+    Equivalent mutants are left out."""
     pytest.importorskip("cosmic_ray")
     from tests.mutants.candidates import chosen
 

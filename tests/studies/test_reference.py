@@ -1,4 +1,4 @@
-"""Results are those kept in `tests/reference`: a few of them always, all in long runs."""
+"""Results equal those stored in `tests/reference`: a few always, all in long runs."""
 
 import copy
 import json
@@ -18,7 +18,7 @@ def results():
 
 
 def agrees(case, results):
-    """Assert that a case gives what is kept of it."""
+    """Assert that a case gives its stored results."""
     if case.name not in results:
         pytest.skip("nothing is kept of it: python -m tests.reference --write --missing")
     off, allowed = check(case, results)
@@ -37,7 +37,7 @@ def test_every_result_is_as_kept(case, results):
 
 
 def test_results_are_kept_with_their_configs(results):
-    """Each once, strict JSON, and no path of a machine."""
+    """Each case is stored once, in strict JSON, without a path of a machine."""
     names = [case.name for case in CASES]
     assert len(set(names)) == len(names)
     assert list(results) == [name for name in names if name in results]
@@ -51,7 +51,7 @@ def test_results_are_kept_with_their_configs(results):
 
 
 def test_every_family_occurs():
-    """And every contact."""
+    """Every family and every contact occurs in the cases."""
     text = " ".join(" ".join(case.overrides) for case in CASES)
     assert {family for family in FAMILY_KEYS if f"family: {family}," not in text} <= OF_CONFIGS
     assert all(f"solver.fidelity={one}" in text for one in ("map", "linear", "nodes", "auto"))
@@ -62,7 +62,7 @@ OF_CONFIGS = {"cic", "ee", "free_form"}
 
 
 def test_every_status_occurs(results):
-    """Periods 1, 2, 3 and more too."""
+    """Every status occurs, and so do periods of 1, 2, 3 and more."""
     if missing := [case.name for case in CASES if case.name not in results]:
         pytest.skip(f"not kept: {', '.join(missing)}: python -m tests.reference --write --missing")
     statuses = {found["status"] for found in results.values()}
@@ -87,7 +87,9 @@ STATUSES = {
 
 
 def test_a_changed_number_is_noticed(results):
-    """Twice as far off as is allowed, in every quantity of a result, and other words."""
+    """A difference of twice the allowed one is found in every quantity.
+
+    Other words are found too."""
     result = results["cic"]
     allowed = limits(result)
     assert max(allowed.values()) < 1e-5

@@ -1,4 +1,4 @@
-"""Studies stand in folders of one shape, are all listed, and do not depend on each other."""
+"""All studies are listed, have the same files, and do not depend on each other."""
 
 import ast
 import importlib
@@ -14,9 +14,9 @@ EXPERIMENTS = ROOT / "experiments"
 STUDIES = sorted(path.name for path in EXPERIMENTS.glob("[!_.]*") if path.is_dir())
 FILES = {"study.py", "figures.py", "__main__.py"}
 LONGEST = 400
-"""Lines of study.py and its further modules up to which they are one file."""
-FROM_COMMANDS = {"basins", "families", "force", "pareto"}
-"""Figures of the docs pages that commands make, and no study."""
+"""Number of lines of study.py and its further modules up to which they are one file."""
+FROM_COMMANDS = {"basins", "drawing", "force", "pareto", "report", "sweep"}
+"""Figures of the docs pages that commands make, not studies."""
 
 
 def tree_of(study, name):
@@ -45,7 +45,9 @@ def test_there_are_studies():
 
 @pytest.mark.parametrize("study", STUDIES)
 def test_files(study):
-    """The same three files; further modules only where study.py would be too long."""
+    """Each study has the same three files.
+
+    It has further modules only where study.py would be too long."""
     folder = EXPERIMENTS / study
     names = {path.name for path in folder.iterdir() if path.name != "__pycache__"}
     assert names >= FILES
@@ -77,13 +79,13 @@ def test_no_study_imports_another(folder):
 
 
 def test_imports_need_no_exception():
-    """Nothing is computed on import, so that no import must wait for double precision."""
+    """Nothing is computed on import, so that no import depends on double precision."""
     for path in modules_of(EXPERIMENTS):
         assert "noqa" not in path.read_text(), path
 
 
 def test_readme_lists_the_studies():
-    """A row for each study: its question, its command, pages that exist, and its minutes."""
+    """Each study has a row: its question, its command, existing pages, and its minutes."""
     text = (EXPERIMENTS / "README.md").read_text()
     rows = re.findall(r"^\| (.+) \| `(.+)` \| (.+) \| (.+) \|$", text, re.M)
     assert [command for _, command, *_ in rows] == [f"python -m experiments.{s}" for s in STUDIES]

@@ -1,4 +1,6 @@
-"""Fronts of two and three terms: against independent searches, domination, gaps, rates, files."""
+"""Fronts of two and three terms.
+
+They are compared with independent searches; domination, gaps, rates and files are checked."""
 
 import functools
 import itertools
@@ -55,7 +57,7 @@ bound. An involute length other than 5 mm makes all of them worse."""
 
 
 class MadeUp(rootsopt.Term):
-    """A function of a and b, by name, plus a penalty on other lengths than 5 mm."""
+    """Define a term as a function of a and b, plus a penalty on lengths other than 5 mm."""
 
     kind: str = eqx.field(static=True)
 
@@ -70,13 +72,16 @@ def _concave(a, b):
 
 
 def _stepped(a, b):
-    """Two branches: a hill before a step makes designs there worse than those left of it."""
+    """Return a term with a hill before a step: designs on the hill are worse than those left of
+    it."""
     fall = 0.6 / (1 + jnp.exp(-(a - 0.6) * 40))
     return 2 - 0.4 * a - fall + 0.5 * jnp.exp(-(((a - 0.45) / 0.12) ** 2)) + b
 
 
 def _two_wells(a, b):
-    """The better one of two wells changes at a = 1/2: terms go on, designs jump."""
+    """Return the better of two wells, which changes at a = 1/2.
+
+    The term is continuous there, and the best design jumps."""
     return 3 - a + 40 * (b - 0.1) ** 2 * (b - 0.9) ** 2 + 0.4 * (a - 0.5) * (b - 0.5)
 
 
@@ -91,7 +96,7 @@ MADE_UP = {
 
 @pytest.fixture(scope="module", autouse=True)
 def few():
-    """Fewer starts and screened designs than a user gets."""
+    """Return fewer starts and screened designs than the defaults."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trace, "_CHEAP_STARTS", 3)
         patch.setattr(trace, "_CHEAP_SCREENING", 24)
@@ -100,7 +105,7 @@ def few():
 
 @pytest.fixture
 def registered():
-    """A function that registers the terms `first` and `second` for one test."""
+    """Return a function that registers the terms `first` and `second` for one test."""
 
     def add(second: str, first: str = "first") -> None:
         register_term("first", MadeUp(first))
@@ -117,25 +122,27 @@ def config(*overrides):
 
 @pytest.fixture(scope="module")
 def front():
-    """A front of geometry alone: nothing is simulated."""
+    """Return a front of geometry alone; nothing is simulated."""
     return pareto_front(config(RADIUS, "pareto.points=5"))
 
 
 def _signed(front, points):
-    """Values (n, k) of the terms of which less is better."""
+    """Return values (n, k) of the terms, signed so that less is better."""
     signs = [aim.sign for aim in front.aims]
     return np.array([[*point.terms.values()] for point in points]) * signs
 
 
 def _shapes(designs, settings):
-    """Geometry of many designs, and whether each meets the seal width."""
+    """Return the geometry of many designs, and whether each meets the seal width."""
     scene = Scene.from_config(settings)
     many = jax.vmap(lambda design: geometry(scene.profile(design)))
     return jax.jit(many)(jnp.asarray(designs))
 
 
 def _random_designs(count):
-    """Valid designs within the default bounds: pressure angle, involute length, tip arc angle."""
+    """Return valid designs within the default bounds.
+
+    Columns: pressure angle, involute length, tip arc angle."""
     shares = np.random.default_rng(0).uniform(size=(count, 3))
     angle, land = 25 + 20 * shares[:, 0], 0.5 + 7.5 * shares[:, 2]
     # The longest involute of three lobes, with the pitch radius of 33 mm.
@@ -144,8 +151,10 @@ def _random_designs(count):
 
 
 def test_front_of_geometry_is_that_of_another_search(front):
-    """For area efficiencies of the front, SciPy's COBYLA finds the least outer radius without
-    gradients, from starts of its own."""
+    """SciPy's COBYLA finds the same front.
+
+    For area efficiencies of the front it finds the least outer radius without gradients, from
+    starts of its own."""
     scene = Scene.from_config(config())
     low, high = np.array([25.0, 0.1, 0.5]), np.array([45.0, 1.0, 8.0])
     compiled = jax.jit(lambda design: geometry(scene.profile(design)))
@@ -184,7 +193,7 @@ def test_front_of_geometry_is_that_of_another_search(front):
 
 
 def test_no_design_dominates_the_front(front):
-    """Among many random designs, none that meets the constraints is better in both terms."""
+    """No random design that meets the constraints is better in both terms."""
     found = _shapes(_random_designs(4_000), config())
     valid = (np.asarray(found.seal_width) >= 2e-3) & (np.asarray(found.undercut_margin) >= 0)
     radius, efficiency = 1e3 * np.asarray(found.outer_radius), np.asarray(found.area_efficiency)
@@ -255,7 +264,7 @@ def test_gap_is_that_of_a_dense_grid(registered):
 
 
 def test_jump_of_the_designs_is_recognised(registered):
-    """The terms go on where the better one of two wells changes, but the designs do not."""
+    """A jump of the designs is found where the better of two wells changes."""
     registered("wells")
     front = pareto_front(config(*ANGLES, "pareto.points=7"))
     (gap,) = front.gaps
@@ -313,7 +322,7 @@ def test_terms_without_conflict_have_one_best_design(registered):
 
 
 def test_senses():
-    """Of a name on its own, and of the config."""
+    """The sense is read from a name on its own, and from the config."""
     given = "pareto.terms=[area_mm2, seal_width_mm, rms_force_N]"
     assert [aim.sign for aim in aims_of(config(given))] == [1, -1, 1]
     turned = config(given, "pareto.senses={seal_width_mm: min, area_mm2: max}")
@@ -409,7 +418,7 @@ def test_only_terms_that_read_forces_need_a_simulation():
 
 
 def test_peaks_are_branches_of_one_group():
-    """The scaled maximum of a corner: two equal peaks share the weight of their term."""
+    """At a corner of the scaled maximum, two equal peaks share the weight of their term."""
     peaks = Group(np.array([[0.0, 0.2], [0.0, 0.7]]), np.array([4.0, 4.0]), np.eye(2))
     other = Group(np.array([[1.0, 0.0]]), np.array([3.0]), np.array([[-1.0, -1.0]]))
     point = np.array([0.5, 0.5])
@@ -425,7 +434,9 @@ def test_peaks_are_branches_of_one_group():
 
 
 def test_a_point_divides_neighbours_if_it_lies_between_them():
-    """Not at an end, and not farther from one of them than they are apart."""
+    """A point divides neighbours if it lies between them.
+
+    It does not at an end, or farther from one of them than they are apart."""
     one, other = np.array([0.0, 1.0]), np.array([1.0, 0.0])
     edge = gaps.measured((0, 1), np.stack([one, other]), np.zeros((2, 3)))
     assert edge.distance == pytest.approx(2**0.5)

@@ -122,8 +122,8 @@ def _checkpoint(config: Config, options: argparse.Namespace, folder: RunFolder):
     older = None if options.resume else set_aside(path)
     if older is not None:
         say(
-            f"an interrupted run has left a checkpoint, which is now {str(older)!r} and goes when "
-            f"this run has ended; to go on with the interrupted run, stop this one, move the file "
+            f"an interrupted run has left a checkpoint, which is now {str(older)!r} and is deleted "
+            f"when this run ends; to go on with the interrupted run, stop this one, move the file "
             f"back to {path.name!r}, and add `--resume`"
         )
     header = {"config": config.model_dump(mode="json"), "versions": files.versions()}

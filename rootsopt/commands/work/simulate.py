@@ -12,6 +12,7 @@ from rootsopt.figures import runs
 from rootsopt.measured import report as outline_report
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
+from rootsopt.pump.sheet import record_of
 from rootsopt.response.choice import resolve
 from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.speeds import alone
@@ -32,6 +33,9 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     if evaluation.series is not None:
         folder.write_csv("response_design.csv", files.response_columns(evaluation.series))
     data = evaluation.record() | choice | outline_report.record(config)
+    weighed = config.pump is not None or config.scene.bearings is not None
+    if weighed:
+        data["pump"] = record_of(config, [*evaluation.design.values()])
     folder.write_json("result.json", data | {"versions": files.versions()})
     write_simulated(folder, config, formats, evaluation)
     if not options.no_figures:
@@ -39,6 +43,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     def show(out: Console) -> None:
         out.print(tables.evaluation_table(evaluation))
+        if weighed:
+            out.print(tables.pump_table({"value": data}))
         outline_report.say(config, out)
 
     return cli.Outcome(cli.OK if evaluation.usable else cli.NO_RESULT, show)

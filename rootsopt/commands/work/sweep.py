@@ -9,6 +9,7 @@ from rich.progress import Progress
 
 from rootsopt.commands import cli
 from rootsopt.config import Config
+from rootsopt.errors import InputError
 from rootsopt.figures.speeds import speed_figure
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
@@ -21,7 +22,13 @@ from rootsopt.scene import check_geometry, design_keys, design_vector
 def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
     """Run `rootsopt sweep`: simulate the design at all speeds, and write files into `folder`.
 
-    Return the `Outcome`. Raises `InputError` if the config is invalid."""
+    With `--over` or `--tolerances`, sweep any keys instead. Return the `Outcome`. Raises
+    `InputError` if the config is invalid."""
+    if options.over or options.tolerances is not None:
+        from rootsopt.commands.work import over  # xarray and its figures take time to import.
+
+        return over.body(config, options, folder)
+    refuse_options(options)
     check_geometry(config)
     with _progress(Console(stderr=True)) as progress:
         config, choice = resolve(config)
@@ -51,6 +58,17 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     usable = any(part.evaluation.usable for part in parts)
     return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)
+
+
+def refuse_options(options: argparse.Namespace) -> None:
+    """Raise `InputError` if an option for `--over` is given without it."""
+    names = "zip", "zip_keys", "sample", "sobol", "seed", "data", "workers", "scheduler", "resume"
+    for name in names:
+        if getattr(options, name) not in (None, False, []):
+            raise InputError(
+                f"`--{name.replace('_', '-')}` needs keys to sweep; add `--over KEY=VALUES`, as in "
+                "--over scene.speed_rpm=300:6000:39"
+            )
 
 
 @contextlib.contextmanager

@@ -1,2 +1,2 @@
-"""Periodic orbits by collocation: all instants are solved for at once, on elements that end at
-events."""
+"""Periodic orbits by collocation: one system of equations for all instants of the orbit, on
+elements that end at events."""

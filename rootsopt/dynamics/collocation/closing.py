@@ -23,17 +23,17 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.contact.search import SearchContact
 from rootsopt.dynamics.collocation.blocks import BLOCK
 from rootsopt.dynamics.collocation.elements import Elements
-from rootsopt.dynamics.collocation.equation import Equation
+from rootsopt.dynamics.collocation.equation import CollocatedEquation
 from rootsopt.dynamics.collocation.events import Events, found_events, look, rooted
-from rootsopt.dynamics.collocation.forces import Found, response
+from rootsopt.dynamics.collocation.forces import OrbitForces, response
 from rootsopt.dynamics.collocation.mesh import aligned, counted, needed
 from rootsopt.dynamics.collocation.newton import newton
 from rootsopt.dynamics.orbit import choose
 from rootsopt.dynamics.pair import RotorPair
 
 _FIRST, _EVENT = 20, 1
-"""Number of elements of the first mesh that is aligned with events: per mesh period, and in
-addition per event."""
+"""Number of elements of the first mesh that is aligned with events: per mesh period, plus per
+event."""
 _FINER = 1.4
 """Factor by which the number of elements grows when the mesh is refined."""
 _MOST = 96
@@ -46,8 +46,7 @@ _TURNS = 24
 _CORRECTED = 1e-6
 """Last correction of the states (scaled) above which an orbit is rejected."""
 _FAILURES = 4
-"""Number of times that Newton's method does not converge, above which the search for the orbit
-fails."""
+"""Number of failures of Newton's method above which the search for the orbit fails."""
 _SMALL = 3e-9
 """Newton step (scaled) below which Newton's method stops. The step after it would be smaller by
 orders of magnitude, since convergence is quadratic."""
@@ -67,7 +66,7 @@ class Closed(NamedTuple):
     mesh was solved.
     """
 
-    found: Found
+    found: OrbitForces
     error: Float[Array, ""]
     drift: Float[Array, ""]
     sound: Bool[Array, ""]
@@ -99,8 +98,8 @@ class _Loop(NamedTuple):
 def supported(pair: RotorPair) -> bool:
     """Return whether collocation can close orbits of `pair`.
 
-    The contact must be a `SearchContact` of flanks that are not wavy (`Profile.wavy`), and every
-    flag of contact law and parts needs a margin (see `Margins`)."""
+    The contact must be a `SearchContact` of flanks that are not wavy (`Profile.wavy`). Every flag
+    of contact law and parts needs a margin (see `Margins`)."""
     owners = [pair.law, *pair.all_parts]
     names = [("margins", "switches"), ("drag_margins", "drag_switches")]
     known = all(
@@ -114,10 +113,9 @@ def supported(pair: RotorPair) -> bool:
 
 
 def _newer(kind: type, margin: str, flag: str) -> bool:
-    """Return whether the method `margin` of the class `kind` takes its method `flag` into account.
+    """Return whether the method `margin` of the class `kind` matches its method `flag`.
 
-    That is so if `margin` is defined in the same class as `flag`, or in a subclass of that
-    class."""
+    It does if `margin` is defined in the same class as `flag`, or in a subclass of that class."""
     order = list(kind.__mro__)
     places = [
         next(k for k, base in enumerate(order) if name in vars(base)) for name in (margin, flag)
@@ -134,8 +132,8 @@ def sizes(periods: int) -> tuple[int, int]:
 
 
 def first_elements(period: Int[Array, ""]) -> Int[Array, ""]:
-    """Return the number of elements for an orbit of `period` mesh periods before its events are
-    known."""
+    """Return the number of elements before events are known, for an orbit of `period` mesh
+    periods."""
     return jnp.asarray(2 * _FIRST * period)
 
 
@@ -145,7 +143,7 @@ class _Closer(eqx.Module):
     `frozen`: the pair of `equation`, treated as constant by JAX. The other fields are arguments of
     `close`."""
 
-    equation: Equation
+    equation: CollocatedEquation
     frozen: RotorPair
     tangents: Any
     tolerance: Float[Array, ""]
@@ -193,12 +191,13 @@ class _Closer(eqx.Module):
         return now._replace(elements=new, fits=jnp.ones((), bool), solved=jnp.zeros((), bool))
 
     def solve(self, now: _Loop, seen) -> _Loop:
-        """Return the loop's state after Newton's method on the present mesh; `seen`: flags along
-        the motion."""
+        """Return the loop's state after Newton's method on the present mesh.
+
+        `seen`: flags along the motion."""
         got = newton(self.equation, rooted(now.elements, seen), jnp.asarray(_SMALL))
         good = got.size <= 10 * _SMALL
         closed = now.closed._replace(steps=now.closed.steps + got.turns)
-        # A step that leads out of the mesh's events is tried again with those found on its way.
+        # After a failure, the loop finds the events of the last motion and tries again.
         failures = now.failures + ~good
         return now._replace(
             closed=closed,
@@ -210,15 +209,16 @@ class _Closer(eqx.Module):
         )
 
     def keep(self, now: _Loop, events: Events) -> _Loop:
-        """Return the loop's state with the forces, derivatives and errors of an orbit whose flags
-        agree."""
+        """Return the loop's state with the forces, derivatives and errors of the present orbit.
+
+        The flags along the orbit must change exactly at the `events` of its mesh."""
         found = response(self.equation, now.elements, now.force, self.tangents)
         error, drift = _differences(now.closed.found, found)
         first = now.meshes == 0
         error, drift = (jnp.where(first, jnp.inf, x / _GAIN) for x in (error, drift))
         full = now.elements.mesh.used >= now.elements.state.shape[0] - 1
-        # Newton's method has converged: a large correction, or none, comes from a margin that is
-        # not regular at its event.
+        # Newton's method has converged, so the correction must be small. It is large or NaN where
+        # the time derivative of a margin vanishes at its event.
         good = found.correction < _CORRECTED
         kept = now.closed
         closed = kept._replace(
@@ -237,7 +237,7 @@ class _Closer(eqx.Module):
 
 
 def close(
-    equation: Equation,
+    equation: CollocatedEquation,
     tangents: Any,
     elements: Elements,
     tolerance: Float[Array, ""],
@@ -258,7 +258,7 @@ def close(
     return lax.while_loop(go_on, lambda now: closer.turn(now), start).closed
 
 
-def _differences(before: Found, after: Found):
+def _differences(before: OrbitForces, after: OrbitForces):
     """Return two relative differences between the results on two meshes.
 
     The first is the largest difference in mean, RMS and peak force, the second that in their
@@ -276,10 +276,10 @@ def _differences(before: Found, after: Found):
     return error, drift
 
 
-def _nothing(equation: Equation, tangents: Any, elements: Elements) -> Closed:
+def _nothing(equation: CollocatedEquation, tangents: Any, elements: Elements) -> Closed:
     """Return the result before the first iteration: zeros, with infinite errors."""
     shape = jax.eval_shape(lambda: response(equation, elements, elements.slopes[..., 0], tangents))
-    empty: Found = jax.tree.map(lambda x: jnp.full(x.shape, 0, x.dtype), shape)
+    empty: OrbitForces = jax.tree.map(lambda x: jnp.full(x.shape, 0, x.dtype), shape)
     infinite, zero = jnp.asarray(jnp.inf), jnp.zeros((), int)
     no = jnp.zeros((), bool)
     return Closed(empty, infinite, infinite, no, zero, zero, zero)

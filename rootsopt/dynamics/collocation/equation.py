@@ -17,9 +17,9 @@ class Point(NamedTuple):
     """The equation of motion at one instant, as r = n + q + 1 values.
 
     `values` (r,): derivatives of the n scaled states with respect to time (mesh periods), q
-    integrands (see `Equation`), and one margin (see `Margins`); `slopes` (r, 1 + n): derivatives of
-    `values` with respect to time and state; `roots` (sides, 2): improved `NearContact.roots`;
-    `force`: contact force (N); `depth`: penetration (m).
+    integrands (see `CollocatedEquation`), and one margin (see `Margins`); `slopes` (r, 1 + n):
+    derivatives of `values` with respect to time and state; `roots` (sides, 2): improved
+    `NearContact.roots`; `force`: contact force (N); `depth`: penetration (m).
     """
 
     values: Float[Array, " r"]
@@ -29,7 +29,7 @@ class Point(NamedTuple):
     depth: Float[Array, ""]
 
 
-class Equation(eqx.Module):
+class CollocatedEquation(eqx.Module):
     """The equation of motion of a `pair`, together with the integrands of `measures`.
 
     Forces in the integrands are in units of `pair.force_scale`. If rotor 1 is free, the integrands
@@ -60,8 +60,7 @@ class Equation(eqx.Module):
         return eqx.tree_at(lambda p: p.contact, pair, NearContact(pair.contact.pair, roots))
 
     def evaluated(self, dynamic, static, tau, state, roots, which):
-        """Return `Point.values`, and the tuple (roots, force, depth) with the other fields of
-        `Point`.
+        """Return `Point.values`, and the tuple (roots, force, depth) of other `Point` fields.
 
         `dynamic`, `static`: the pair's floating-point arrays, and the rest of the pair. For the
         other arguments, see `point`."""
@@ -93,10 +92,10 @@ class Equation(eqx.Module):
         roots: Float[Array, "sides 2"],
         which: Int[Array, ""],
     ) -> Point:
-        """Return the equation and its derivatives at the time `tau` (mesh periods) and the scaled
-        `state`.
+        """Return the equation and its derivatives at one instant.
 
-        `roots` (sides, 2): `NearContact.roots`; `which`: index of the margin to evaluate."""
+        `tau`: time (mesh periods); `state` (n,): scaled; `roots` (sides, 2): `NearContact.roots`;
+        `which`: index of the margin to evaluate."""
         dynamic, static = eqx.partition(self.pair, eqx.is_inexact_array)
 
         def value(place):
@@ -115,11 +114,10 @@ class Equation(eqx.Module):
         which: Int[Array, ""],
         tangents: Any,
     ) -> tuple[Point, Float[Array, "r d"]]:
-        """Return `point`, and the derivatives of `Point.values` along d directions of the pair's
-        parameters.
+        """Return the result of `point`, and derivatives of `Point.values` along d directions.
 
-        `tangents`: directions, stacked along a leading axis. For the other arguments, see
-        `point`."""
+        `tangents`: directions of the pair's parameters, stacked along a leading axis. For the other
+        arguments, see `point`."""
         dynamic, static = eqx.partition(self.pair, eqx.is_inexact_array)
         moved = eqx.filter(tangents, eqx.is_inexact_array)
 

@@ -20,18 +20,18 @@ from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.pair import RotorPair
 
 _ASIDE = 2e-7, 0.02
-"""Distance from an element's end, before and after it, at which flags are evaluated. The first
-number (mesh periods) or, if that is smaller, the second number times the length of the shorter
-adjacent element."""
+"""Distance from an element's end, before and after it, at which flags are evaluated. It is the
+smaller of two: the first number (mesh periods), and the second number times the length of the
+shorter adjacent element."""
 _HALVINGS = 30
 """Number of bisections that locate an event."""
 _SAME = 3e-9
-"""Time (mesh periods) between two events up to which they are merged into one."""
+"""Time (mesh periods) between two events below which they are merged into one."""
 _CHANGES = 384
 """Number of new flag changes along a motion above which the search for its orbit fails."""
 
 
-class Look(NamedTuple):
+class FlagScan(NamedTuple):
     """Flags along a motion, at p instants in order of time.
 
     `tau` (p,): times (mesh periods); `flags` (p, f): the f flags of the equation; `counts` (p, f):
@@ -67,22 +67,22 @@ class Events(NamedTuple):
 
 
 def flags_at(pair: RotorPair, tau, state):
-    """Return the flags (f,) of the equation at the time `tau` (mesh periods) and the scaled
-    `state`.
+    """Return the flags (f,) of the equation, and three further results.
 
-    Also return whether each flag matters (f,), the normal angles ν2 (rad) of the closest approach
-    (sides,), and whether the flanks transmit a force (sides,)."""
+    These are: whether each flag matters (f,); the normal angles ν2 (rad) of the closest approach
+    (sides,); whether the flanks transmit a force (sides,). `tau`: time (mesh periods); `state`
+    (n,): scaled."""
     found = pair.margins(tau, state)
     roots = jnp.stack([place.normal2 for place in found.places])
     return found.values > 0, found.counts, roots, found.pushes
 
 
 def ranks(pair: RotorPair) -> list[int]:
-    """Return the rank of each margin. If several flags change at one instant, the margin with the
-    least rank determines the event.
+    """Return the rank of each margin.
 
-    Margins that do not depend on the contact have rank 0, since their zeros are known best. Rank 1
-    is the change to the other minimum of the gap next to a cusp, because other flags change with
+    If several flags change at one instant, the margin with the least rank determines the event.
+    Margins that do not depend on the contact have rank 0, since their zeros are most accurate. Rank
+    1 is the change to the other minimum of the gap next to a cusp, because other flags change with
     it. The rank -1 marks a flag whose change is not an event by itself. All other margins have
     greater ranks, in their order."""
     assert isinstance(pair.contact, SearchContact)
@@ -106,7 +106,7 @@ def ranks(pair: RotorPair) -> list[int]:
     return both + [0] * (total - len(both))
 
 
-def look(pair: RotorPair, elements: Elements) -> Look:
+def look(pair: RotorPair, elements: Elements) -> FlagScan:
     """Evaluate the flags at the Gauss points and on both sides of the end of each element."""
     mesh = elements.mesh
     tau, state = elements.places
@@ -124,10 +124,10 @@ def look(pair: RotorPair, elements: Elements) -> Look:
     width = flags.shape[-1]
     total = mesh.used * tau.shape[1]
     flags, counts = flags.reshape(-1, width), counts.reshape(-1, width)
-    return Look(tau.ravel(), flags, counts, roots, pushes, total)
+    return FlagScan(tau.ravel(), flags, counts, roots, pushes, total)
 
 
-def rooted(elements: Elements, seen: Look) -> Elements:
+def rooted(elements: Elements, seen: FlagScan) -> Elements:
     """Return `elements` with `roots` from `seen`, the result of `look`.
 
     At the end of an element, the first root belongs to the side of the end on which the flanks
@@ -156,7 +156,7 @@ class _Compared(NamedTuple):
     kept: Bool[Array, " p"]
 
 
-def _compared(pair: RotorPair, elements: Elements, seen: Look) -> _Compared:
+def _compared(pair: RotorPair, elements: Elements, seen: FlagScan) -> _Compared:
     """Compare the flags `seen` along the motion `elements` with the events of its mesh."""
     mesh = elements.mesh
     places = seen.tau.shape[0]
@@ -167,7 +167,7 @@ def _compared(pair: RotorPair, elements: Elements, seen: Look) -> _Compared:
     later = jnp.where(number + 1 < seen.total, seen.tau[after], seen.tau[0] + mesh.period)
     differ = (seen.flags != seen.flags[after]) & (seen.counts | seen.counts[after]) & (rank >= 0)
     differ &= (number < seen.total)[:, None]
-    # The places on both sides of an element's end that is an event of the mesh.
+    # Find the instants on both sides of an element's end that is an event of the mesh.
     element, inside = number // per, number % per
     ends_at = jnp.where(mesh.last, mesh.interval + 1, mesh.times.shape[0] - 1)[element]
     real = mesh.last[element] & (mesh.times[ends_at] < mesh.times[-1]) & (element < mesh.used)
@@ -178,13 +178,13 @@ def _compared(pair: RotorPair, elements: Elements, seen: Look) -> _Compared:
     return _Compared(differ & ~kept[:, None], later, ends_at, declared, kept)
 
 
-def agrees(pair: RotorPair, elements: Elements, seen: Look) -> Bool[Array, ""]:
+def agrees(pair: RotorPair, elements: Elements, seen: FlagScan) -> Bool[Array, ""]:
     """Return whether the flags `seen` along `elements` change exactly at the events of the mesh."""
     found = _compared(pair, elements, seen)
     return ~jnp.any(found.fresh) & ~jnp.any(found.declared & ~found.kept)
 
 
-def found_events(pair: RotorPair, elements: Elements, seen: Look, room: int) -> Events:
+def found_events(pair: RotorPair, elements: Elements, seen: FlagScan, room: int) -> Events:
     """Return the events of the motion `elements`, whose flags are `seen`.
 
     `room`: size m of the returned arrays."""

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements
-from rootsopt.dynamics.collocation.equation import Equation, Point
+from rootsopt.dynamics.collocation.equation import CollocatedEquation, Point
 from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.collocation.newton import lines
 from rootsopt.dynamics.collocation.system import (
@@ -53,7 +53,7 @@ class Peak(NamedTuple):
     force: Float[Array, ""]
 
 
-class Found(NamedTuple):
+class OrbitForces(NamedTuple):
     """Results of a closed orbit, with derivatives along d directions of the parameters.
 
     `elements`: the orbit after a last correction; `response` (r,): mean (N), mean square (N²), peak
@@ -76,10 +76,10 @@ class Found(NamedTuple):
 
 
 def _inside(elements: Elements, k: Any, share: Any) -> tuple[Array, Array, Array]:
-    """Return time (mesh periods), scaled state and `NearContact.roots` at the fraction `share` of
-    element `k`.
+    """Return time (mesh periods), scaled state and `NearContact.roots` inside element `k`.
 
-    The roots come from the polynomial through those at the Gauss points."""
+    `share`: position in the element, from 0 (start) to 1 (end). The roots come from the polynomial
+    through those at the Gauss points."""
     begin, length = elements.mesh.ends[0][k], elements.mesh.lengths[k]
     rise = jnp.sum(GAUSS.integrated(share)[:, None] * elements.slopes[k], axis=0)
     weights = GAUSS.lagrange(share)
@@ -87,7 +87,9 @@ def _inside(elements: Elements, k: Any, share: Any) -> tuple[Array, Array, Array
     return begin + length * share, elements.state[k] + length * rise, roots
 
 
-def located_peak(equation: Equation, elements: Elements, force: Float[Array, "e s"]) -> Peak:
+def located_peak(
+    equation: CollocatedEquation, elements: Elements, force: Float[Array, "e s"]
+) -> Peak:
     """Return the greatest contact force of the orbit `elements`.
 
     `force` (e, s): contact force (N) at the Gauss points. Inside an element the force is smooth.
@@ -115,7 +117,8 @@ def located_peak(equation: Equation, elements: Elements, force: Float[Array, "e 
         first = jax.vmap(lambda k, places: jax.vmap(lambda x: _inside(elements, k, x)[2])(places))
         poor = number < _POOR
         begun = jnp.where(poor, first(rivals, tried), roots[:, None])
-        # Polynomials through the roots are poor near the ends: the first step only mends them.
+        # The polynomial through the roots is inaccurate near the element's ends. The first
+        # evaluations of an instant therefore only improve its roots.
         forces, new = lax.fori_loop(
             0,
             jnp.where(poor, _MENDED, 1),
@@ -134,7 +137,9 @@ def located_peak(equation: Equation, elements: Elements, force: Float[Array, "e 
 
 
 @eqx.filter_jit
-def response(equation: Equation, elements: Elements, force: Any, tangents: Any) -> Found:
+def response(
+    equation: CollocatedEquation, elements: Elements, force: Any, tangents: Any
+) -> OrbitForces:
     """Return the forces of the closed orbit `elements` and their derivatives.
 
     `force` (e, s): contact force (N) at the Gauss points; `tangents`: d directions of the pair's
@@ -143,7 +148,7 @@ def response(equation: Equation, elements: Elements, force: Any, tangents: Any) 
     mesh = elements.mesh
     count, inside = elements.state.shape[1], len(GAUSS.nodes)
     peak = located_peak(equation, elements, force)
-    # The peak is one more place, evaluated with the others.
+    # Append the peak to the instants, to evaluate the equation at all of them in one call.
     tau, state = elements.places
     at_peak = _inside(elements, peak.element, peak.share)
     extra = mesh.used
@@ -182,7 +187,7 @@ def response(equation: Equation, elements: Elements, force: Any, tangents: Any) 
         points.roots.at[extra].set(elements.roots[extra]),
     )
     used = (jnp.arange(tau.shape[0]) < mesh.used)[:, None]
-    return Found(
+    return OrbitForces(
         elements=corrected,
         response=values,
         sensitivity=slopes[:, 1:],
@@ -195,11 +200,11 @@ def response(equation: Equation, elements: Elements, force: Any, tangents: Any) 
     )
 
 
-def _averages(equation: Equation, elements: Elements, points: Point, along, step: Step):
+def _averages(equation: CollocatedEquation, elements: Elements, points: Point, along, step: Step):
     """Return the averages of the integrands over the orbit, and their changes (averages, columns).
 
-    `points`, `along`: results of `Equation.along` at the Gauss points; `step`: solution of the
-    linear equations, one column per direction."""
+    `points`, `along`: results of `CollocatedEquation.along` at the Gauss points; `step`: solution
+    of the linear equations, one column per direction."""
     mesh = elements.mesh
     count, inside = elements.state.shape[1], len(GAUSS.nodes)
     rates = slice(count, count + equation.rates)
@@ -223,10 +228,13 @@ def _averages(equation: Equation, elements: Elements, points: Point, along, step
     return kept, (moved[:-1] - kept[:, None] * moved[-1]) / duration
 
 
-def _height(equation: Equation, elements: Elements, step: Step, peak: Peak, evaluated: Any):
+def _height(
+    equation: CollocatedEquation, elements: Elements, step: Step, peak: Peak, evaluated: Any
+):
     """Return the peak force (N), and its changes for all columns of `step`.
 
-    `evaluated`: results of `Equation.along`; those at the peak follow the elements in use."""
+    `evaluated`: results of `CollocatedEquation.along`; those at the peak follow the elements in
+    use."""
     points, along = evaluated
     mesh, extra = elements.mesh, elements.mesh.used
     count, k = elements.state.shape[1], peak.element

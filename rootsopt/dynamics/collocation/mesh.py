@@ -26,7 +26,7 @@ def shared(
     periods, and desired number of elements up to each time (p,), in any unit; `capacity`: size of
     the arrays for elements. Each interval between events has at least one element."""
     place, wanted = density
-    # A floor, so that no part of the period is left to one long element.
+    # The floor keeps elements short where the desired density is almost zero.
     even = (place - place[0]) / (place[-1] - place[0])
     total = wanted[-1] - wanted[0]
     wanted = (wanted - wanted[0]) / jnp.where(total > 0, total, 1.0) + _FLOOR * even
@@ -128,7 +128,8 @@ def aligned(
     times, which = events
     real = times < jnp.inf
     fresh = old.times[0] == 0
-    # The longest interval between events, on the circle.
+    # Find the longest interval between events. The period is a circle: the last event is followed
+    # by the first.
     place = jnp.where(real, jnp.mod(times, length), jnp.inf)
     order = jnp.argsort(place)
     place = place[order]
@@ -140,7 +141,7 @@ def aligned(
     widest = jnp.argmax(gap)
     middle = jnp.mod(place[widest] + gap[widest] / 2, length)
     middle = jnp.where(count > 0, middle, 0.37 * length)
-    # Away from φ1 = 0 as well, which is an end of its own.
+    # Keep the new start away from φ1 = 0 too, because an element ends there.
     near = jnp.minimum(middle, length - middle) < 1e-3
     middle = jnp.where(near, jnp.mod(middle + gap[widest] / 4 + 2e-3, length), middle)
     begin = jnp.where(fresh, middle, old.times[0])

@@ -9,8 +9,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.closing import close, first_elements, sizes
-from rootsopt.dynamics.collocation.equation import Equation
-from rootsopt.dynamics.collocation.forces import Found
+from rootsopt.dynamics.collocation.equation import CollocatedEquation
+from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.mesh import roughness
 from rootsopt.dynamics.collocation.nearby import Known, close_near
 from rootsopt.dynamics.collocation.sampled import as_flow
@@ -35,8 +35,9 @@ _REPEATS = 1e-6
 orbit is rejected. Its true period is then shorter."""
 _MISS = 1e4, 1e-4
 """Scaled difference between the start and the end of an integration from the orbit's state, above
-which the orbit is rejected. The limit is the first number (tolerances), but at least the second,
-multiplied by the greatest entries of the state and of the monodromy matrix, where they exceed 1."""
+which the orbit is rejected. The limit is the first number (tolerances), but at least the second.
+It is multiplied by the greatest entries of the state and of the monodromy matrix, where they exceed
+1."""
 _APART = 1e4, 1e-4
 """Relative difference between the forces of the orbit and of an integration from its state, above
 which the orbit is rejected. The limit is the first number (tolerances), but at least the second."""
@@ -49,7 +50,7 @@ class Collocated(NamedTuple):
     `residual` is the last correction, inf if the orbit is not sound. `sound`: whether Newton's
     method has converged on a mesh that ends at the orbit's events; otherwise the orbit has no
     meaning. `verified`: whether the orbit is sound and accurate, and the integration confirms it.
-    `known`: the orbit as a start for those of similar pairs.
+    `known`: the orbit in the form from which orbits of similar pairs can be closed.
     """
 
     orbit: Orbit
@@ -84,7 +85,7 @@ def collocated(
         sizes(longest),
     )
     tolerance = integrator.tolerance(state.dtype)
-    equation = Equation(pair, measures, pair.force_scale)
+    equation = CollocatedEquation(pair, measures, pair.force_scale)
     closed = close(equation, tangents, elements, _ACCURACY * tolerance)
     found = closed.found
     length, peak = period.astype(state.dtype), found.response[2]
@@ -98,7 +99,7 @@ def collocated(
     far, unequal = (jnp.maximum(factor * tolerance, least) for factor, least in (_MISS, _APART))
     verified = closed.sound & out.solved & (miss <= far * size * gain) & (apart <= unequal)
     verified &= closed.error <= _UNREFINED * _ACCURACY * tolerance
-    # The transient may have taken a whole number of periods for one.
+    # The transient may have mistaken several periods of the orbit for one.
     verified &= ~_repeats(found, period, longest)
     residual = jnp.where(closed.sound, found.correction, jnp.inf)
     orbit = _as_orbit(found, _with_forces(out, found), residual, closed.drift, closed.steps)
@@ -106,7 +107,7 @@ def collocated(
     return Collocated(orbit, closed.sound, verified, known)
 
 
-def _repeats(found: Found, period: Int[Array, ""], longest: int) -> Bool[Array, ""]:
+def _repeats(found: OrbitForces, period: Int[Array, ""], longest: int) -> Bool[Array, ""]:
     """Return whether the orbit repeats after a fraction of its `period` (mesh periods).
 
     `longest`: longest period of an orbit (mesh periods)."""
@@ -129,7 +130,7 @@ def near_orbit(
     `start`: the known orbit, and its pair; `integrator`: sets accuracy and room for steps; for the
     other arguments, see `collocated`."""
     unit = lax.stop_gradient(pair.force_scale)
-    near = close_near(Equation(pair, measures, unit), tangents, *start)
+    near = close_near(CollocatedEquation(pair, measures, unit), tangents, *start)
     found, drift, sound = near.found, near.known.drift, near.known.sound
     tolerance = integrator.tolerance(found.state.dtype)
     verified = sound & (near.known.error <= _UNREFINED * _ACCURACY * tolerance)
@@ -142,7 +143,7 @@ def near_orbit(
     return Collocated(orbit, sound, verified & out.solved, near.known)
 
 
-def _as_orbit(found: Found, out: Flow, residual, drift, steps) -> Orbit:
+def _as_orbit(found: OrbitForces, out: Flow, residual, drift, steps) -> Orbit:
     """Return an orbit found by collocation.
 
     `out`: its flow over one period; `residual`: its residual; `drift`: estimated error of its
@@ -164,9 +165,10 @@ def _as_orbit(found: Found, out: Flow, residual, drift, steps) -> Orbit:
     )
 
 
-def _with_forces(out: Flow, found: Found) -> Flow:
-    """Return the flow `out` with the forces of the orbit `found`, and with zeros for the
-    derivatives."""
+def _with_forces(out: Flow, found: OrbitForces) -> Flow:
+    """Return the flow `out` with the forces of the orbit `found`.
+
+    The derivatives of the flow are replaced with zeros."""
     response = found.response
     rows = found.state.shape[0] + response.shape[0]
     columns = found.state.shape[0] + found.moved.shape[1]

@@ -2,13 +2,14 @@
 
 The orbit of a neighbouring design or scene has nearly the same motion, and its events in the same
 order. A step along the tangent of the family of orbits leads from one to the other, and Newton's
-method corrects it, on the same mesh. Afterwards the flags are evaluated along the
-new orbit, with a search for the contact. If they do not change exactly at the events of the mesh,
-or if another check fails, the orbit is not accepted.
+method corrects it, on the same mesh. Afterwards the flags are evaluated along the new orbit, with a
+search for the contact. If they do not change exactly at the events of the mesh, or if another check
+fails, the orbit is not accepted.
 
-The error is estimated without a second mesh. The estimate of the orbit that was solved on two
-meshes is multiplied by the growth of the elements' highest coefficients since then. These fall with
-the fourth power of the elements' length, the error of the forces with the eighth.
+The error is estimated without a second mesh, from the estimate of the orbit that was solved on two
+meshes. That estimate is multiplied by the growth of the elements' highest coefficients since then.
+These coefficients fall with the fourth power of the elements' length, the error of the forces with
+the eighth.
 """
 
 from typing import Any, NamedTuple
@@ -21,9 +22,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.closing import sizes
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
-from rootsopt.dynamics.collocation.equation import Equation
-from rootsopt.dynamics.collocation.events import Look, agrees, look
-from rootsopt.dynamics.collocation.forces import Found, response
+from rootsopt.dynamics.collocation.equation import CollocatedEquation
+from rootsopt.dynamics.collocation.events import FlagScan, agrees, look
+from rootsopt.dynamics.collocation.forces import OrbitForces, response
 from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.collocation.mesh import roughness
 from rootsopt.dynamics.collocation.newton import newton
@@ -34,8 +35,8 @@ _STEP, _LAST = 1e-5, 1e-6
 an orbit is rejected. This correction is made together with the derivatives. It is usually smaller
 by orders of magnitude, since convergence is quadratic."""
 _FAR = 1e-6
-"""Distance (rad) between the contact's root carried along and that found by a search, where the
-flanks push, above which an orbit is rejected."""
+"""Difference (rad) between the contact's normal angle in the solved orbit and that found by a
+search, above which an orbit is rejected. Only instants at which the flanks push count."""
 
 
 class Known(NamedTuple):
@@ -85,12 +86,14 @@ class Near(NamedTuple):
     Newton steps. `known.sound`: whether the orbit is accepted; if not, the other fields have no
     meaning."""
 
-    found: Found
+    found: OrbitForces
     known: Known
     steps: Int[Array, ""]
 
 
-def close_near(equation: Equation, tangents: Any, known: Known, neighbour: RotorPair) -> Near:
+def close_near(
+    equation: CollocatedEquation, tangents: Any, known: Known, neighbour: RotorPair
+) -> Near:
     """Close the orbit near the `known` one of a similar pair.
 
     `equation` of the new pair; `tangents`: directions of its parameters along which to
@@ -108,10 +111,10 @@ def close_near(equation: Equation, tangents: Any, known: Known, neighbour: Rotor
 
 
 def trimmed(known: Known, period: int) -> Known | None:
-    """Return the orbit `known` with arrays as large as those of orbits of `period` mesh periods.
+    """Return the orbit `known` in arrays of the usual size for `period` mesh periods.
 
-    All such orbits then share one program. The result is `None` if they have no room for the orbit.
-    The arrays are those of NumPy."""
+    All orbits of this period then share one program. The result is `None` if the orbit needs more
+    room. The arrays are those of NumPy."""
     room, times = sizes(period)
     mesh, *parts = jax.tree.map(np.asarray, known.elements)
     anchors, interval = mesh.times[:times], np.minimum(mesh.interval[:room], times - 2)
@@ -123,10 +126,11 @@ def trimmed(known: Known, period: int) -> Known | None:
     return Known(Elements(Mesh(*arrays), *(part[:room] for part in parts)), *rest)
 
 
-def _apart(elements: Elements, seen: Look) -> Float[Array, ""]:
-    """Return the greatest distance (rad) between the roots of `elements` and those of a search.
+def _apart(elements: Elements, seen: FlagScan) -> Float[Array, ""]:
+    """Return the greatest difference (rad) between the roots of `elements` and those of a search.
 
-    Only Gauss points at which the flanks push count. `seen`: result of `look`."""
+    Roots are normal angles of the closest approach. Only Gauss points at which the flanks push
+    count. `seen`: result of `look`."""
     inside = len(GAUSS.nodes)
     used = jnp.arange(elements.state.shape[0]) < elements.mesh.used
     counts = seen.pushes[:, :inside] & used[:, None, None]

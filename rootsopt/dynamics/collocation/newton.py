@@ -1,5 +1,4 @@
-"""Newton's method for an orbit and the times of its events. The sequence of events stays the
-same."""
+"""Newton's method for an orbit and the times of its events, whose sequence stays the same."""
 
 from typing import NamedTuple
 
@@ -11,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements
-from rootsopt.dynamics.collocation.equation import Equation, Point
+from rootsopt.dynamics.collocation.equation import CollocatedEquation, Point
 from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.collocation.system import (
     Columns,
@@ -45,7 +44,7 @@ class Converged(NamedTuple):
     force: Float[Array, "e s"]
 
 
-def evaluated(equation: Equation, elements: Elements) -> Point:
+def evaluated(equation: CollocatedEquation, elements: Elements) -> Point:
     """Return the equation at the Gauss points and the end of each element.
 
     All fields of the result have the leading axes (e, s + 1)."""
@@ -74,7 +73,7 @@ def solved_step(elements: Elements, found: Lines, columns: Columns) -> Step:
 
 
 def newton(
-    equation: Equation,
+    equation: CollocatedEquation,
     elements: Elements,
     tolerance: Float[Array, ""],
     neighbour: RotorPair | None = None,
@@ -87,7 +86,7 @@ def newton(
     the flanks have moved."""
 
     def go_on(now):
-        return (now.turns < _TURNS) & (now.size > tolerance)  # Ends at NaN.
+        return (now.turns < _TURNS) & (now.size > tolerance)  # A size of NaN also ends the loop.
 
     def turn(now):
         at = now.elements
@@ -107,12 +106,12 @@ def newton(
 
 
 def _along(
-    equation: Equation, elements: Elements, neighbour: RotorPair, first: Bool[Array, ""]
+    equation: CollocatedEquation, elements: Elements, neighbour: RotorPair, first: Bool[Array, ""]
 ) -> tuple[Point, Lines]:
-    """Return the equation along `elements`, and linearised.
+    """Return the equation along `elements`, and its linearisation.
 
-    If this is the `first` step, the equation is that of the pair `neighbour`, and its change to the
-    equation's pair is added to what the step has to correct."""
+    In the `first` step, the equation is that of the pair `neighbour`. The residual of the
+    linearisation then also contains the change from this pair to that of `equation`."""
     new, static = eqx.partition(equation.pair, eqx.is_inexact_array)
     old = eqx.filter(neighbour, eqx.is_inexact_array)
     change = jax.tree.map(lambda x, y: jnp.where(first, x - y, 0.0)[None], new, old)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rootsopt.dynamics.collocation.elements import Elements
-from rootsopt.dynamics.collocation.forces import Found, origin
+from rootsopt.dynamics.collocation.forces import OrbitForces, origin
 from rootsopt.dynamics.flow import Flow
 
 _PARTS = 4
@@ -13,7 +13,7 @@ _PARTS = 4
 the elements is then at least as accurate as the element."""
 
 
-def as_flow(found: Found, samples: int, steps: int) -> Flow:
+def as_flow(found: OrbitForces, samples: int, steps: int) -> Flow:
     """Return the orbit `found` as a `Flow` over its period, with zeros for the derivatives.
 
     `samples`: number of uniform samples of the state; `steps`: room for steps. Each element is

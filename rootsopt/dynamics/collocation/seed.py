@@ -20,12 +20,12 @@ def seeded(
     used: Int[Array, ""],
     sizes: tuple[int, int],
 ) -> tuple[Elements, Bool[Array, ""]]:
-    """Return the motion from the scaled `state` at φ1 = 0 over `period` mesh periods, and whether
-    the solver succeeded.
+    """Return the motion from a scaled `state` over `period` mesh periods, and the solver's success.
 
-    `used`: number of elements; `sizes`: sizes of the arrays for elements and for times. All
-    elements cover the same number of solver steps, so that they are short where the integrator's
-    steps are short. The mesh has no events, and `Elements.roots` are 0."""
+    The motion starts at φ1 = 0. `used`: number of elements; `sizes`: sizes of the arrays for
+    elements and for times. All elements cover the same number of solver steps, so that they are
+    short where the integrator's steps are short. The mesh has no events, and `Elements.roots` are
+    0."""
     dtype = state.dtype
     length = period.astype(dtype)
     capacity, room = sizes
@@ -71,8 +71,9 @@ def seeded(
     )
 
     def motion(tau):
-        """Return states and slopes at the times `tau`, from the cubic through both ends of a solver
-        step."""
+        """Return states and slopes at the times `tau` (mesh periods).
+
+        They come from the cubic through both ends of a solver step."""
         k = jnp.clip(jnp.searchsorted(times, tau, side="right") - 1, 0, steps - 1)
         step = (times[k + 1] - times[k])[..., None]
         x = (tau - times[k])[..., None] / step

@@ -43,8 +43,7 @@ class Lines(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """Right-hand sides of the linear equations, one in each of k columns (e, s and n as in
-    `Lines`).
+    """Right-hand sides of the linear equations in k columns (e, s and n as in `Lines`).
 
     `slope` (e, s, n, k): change of the equation at the Gauss points; `gap` (e, n, k): state at the
     end of each element minus that at the start of the next; `margin` (e, k): change of the margin
@@ -141,11 +140,11 @@ def _condensed(
 
 
 def _eliminated(system: Float[Array, "e m c"]) -> Float[Array, "e m k"]:
-    """Return the solutions of e small systems, each with its matrix and right-hand sides side by
-    side.
+    """Return the solutions of e small linear systems.
 
-    The method is Gauss-Jordan elimination without pivoting. On short elements the matrices are
-    close to the identity."""
+    `system` (e, m, c): each matrix, followed by its right-hand sides as further columns. The method
+    is Gauss-Jordan elimination without pivoting. On short elements the matrices are close to the
+    identity."""
     size = system.shape[1]
     place = jnp.arange(size)
 
@@ -172,9 +171,10 @@ def chained(elements: Elements, lines: Lines, columns: Columns, parts: Condensed
     pushed = jnp.pad(columns.margin, ((0, 0), (states, 0)))
 
     def along(carry, k):
-        """Return `carry` for the next element; then, for element k, the first two entries of
-        `carry`, and the shift of the interval's end (0 unless the element is the last of its
-        interval).
+        """Return `carry` for the next element, and three results for element k.
+
+        These are the first two entries of `carry` and the shift of the interval's end, which is 0
+        unless the element is the last of its interval.
 
         `carry`: change of the state at the start of element k if the interval's end stays;
         derivative of this change with respect to the shift of that end; shift of the interval's

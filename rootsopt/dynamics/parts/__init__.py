@@ -4,15 +4,18 @@ from rootsopt.dynamics.parts.base import Context, Loads, Motion, Own, Part, Unit
 from rootsopt.dynamics.parts.drive import Drive, MotorDrive, PrescribedDrive
 from rootsopt.dynamics.parts.friction import Friction
 from rootsopt.dynamics.parts.gear import TimingGear
-from rootsopt.dynamics.parts.load import ConstantLoad, GasLoad, Load
+from rootsopt.dynamics.parts.load import ConstantLoad, GasLoad, Load, TwistedLoad
+from rootsopt.dynamics.parts.resultants import AxisLoads, GasResultant
 from rootsopt.dynamics.parts.supports import Supports
 
 __all__ = [
+    "AxisLoads",
     "ConstantLoad",
     "Context",
     "Drive",
     "Friction",
     "GasLoad",
+    "GasResultant",
     "Load",
     "Loads",
     "Motion",
@@ -22,5 +25,6 @@ __all__ = [
     "PrescribedDrive",
     "Supports",
     "TimingGear",
+    "TwistedLoad",
     "Units",
 ]

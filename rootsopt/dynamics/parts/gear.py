@@ -13,9 +13,9 @@ class TimingGear(Part):
     The torque is zero while ε differs from `offset` by at most `half_backlash` (rad). Beyond that,
     it is `stiffness` (N·m/rad) times the excess plus `damping` (N·m·s/rad) times dε/dt. The torque
     sets in smoothly over the first `rounding` (rad) of the excess. The rounding preserves integrals
-    over ε: a motion through the rounding loses the same energy to the spring, and the same momentum
-    to the damper, as at a sharp edge. `offset` (rad): ε at the middle of the backlash, for a gear
-    mounted out of phase; None: 0.
+    over ε. The spring therefore takes the same energy from a motion through the rounding, and the
+    damper the same momentum, as at a sharp edge. `offset` (rad): ε at the middle of the backlash,
+    for a gear mounted out of phase; None: 0.
     """
 
     stiffness: Float[Array, ""]

@@ -1,8 +1,10 @@
 """Loads: the parts that oppose the rotation."""
 
 import abc
+from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -10,7 +12,7 @@ from rootsopt.contact.impact import smooth_step
 from rootsopt.dynamics.parts.base import Part
 from rootsopt.profiles.base import Profile
 
-_BRIEF = 0.01
+BRIEF = 0.01
 """Minimum roll angle (rad) over which the seal crosses one flank segment."""
 
 
@@ -76,7 +78,7 @@ class GasLoad(Load):
     Averaged over a turn, the torques on both rotors together equal the displaced volume times Δp /
     2π. This is exact unless a whole tip arc meshes at one instant (as on a CIC profile whose
     involute has its greatest length). There ρ jumps, and the jump is spread over the roll angle
-    `_BRIEF`, for two reasons. The real pressure does not jump at a wide gap. Besides, the
+    `BRIEF`, for two reasons. The real pressure does not jump at a wide gap. Besides, the
     derivatives of a jump that moves with the design would need separate treatment.
 
     `pressure_length` (N/m): pressure difference Δp (Pa) times the rotor's length L (m); `profile`
@@ -118,18 +120,7 @@ class GasLoad(Load):
             across = profile.pitch_radius * jnp.cos(normal - profile.roll_angle(normal))
             return self.outer_radius**2 - (profile.pitch_radius**2 + s**2 + lead * 2 * s * across)
 
-        normal = profile.normal_at(addendum)
-        squares = vane(normal)
-        for segment in profile.segments():
-            if segment.land:
-                continue
-            begin, end = profile.roll_angle(jnp.stack([segment.start, segment.stop]))
-            share = _spread_share(addendum, begin, end)
-            before = vane(jnp.where(addendum < jnp.minimum(begin, end), normal, segment.start))
-            after = vane(jnp.where(addendum > end, normal, segment.stop))
-            spread = before + smooth_step(share) * (after - before)
-            brief = (end - begin < _BRIEF) & (share > 0) & (share < 1)
-            squares = jnp.where(brief, spread, squares)
+        squares = over_segments(profile, addendum, vane)
         return self.pressure_length / 2 * squares
 
     def switches(self, motion, own) -> Bool[Array, " s"]:
@@ -147,16 +138,72 @@ class GasLoad(Load):
             if not segment.land:
                 begin, end = self.profile.roll_angle(jnp.stack([segment.start, segment.stop]))
                 share = _spread_share(addendum, begin, end)
-                brief = end - begin < _BRIEF
+                brief = end - begin < BRIEF
                 passed += [jnp.where(brief, edge, 1.0) for edge in (share, share - 1)]
         return jnp.stack([jnp.sin(phi * self.profile.lobes), roll - half, *passed])
+
+
+def over_segments(
+    profile: Profile,
+    addendum: Float[Array, ""],
+    value: Callable[[Float[Array, ""]], Float[Array, "*v"]],
+) -> Float[Array, "*v"]:
+    """Return the `value` at the normal angle (rad) of the addendum point that touches.
+
+    `addendum`: roll angle (rad) of this point. Where a whole segment touches within the roll angle
+    `BRIEF`, the values at its ends are blended over that angle."""
+    normal = profile.normal_at(addendum)
+    found = value(normal)
+    for segment in profile.segments():
+        if segment.land:
+            continue
+        begin, end = profile.roll_angle(jnp.stack([segment.start, segment.stop]))
+        share = _spread_share(addendum, begin, end)
+        before = value(jnp.where(addendum < jnp.minimum(begin, end), normal, segment.start))
+        after = value(jnp.where(addendum > end, normal, segment.stop))
+        spread = before + smooth_step(share) * (after - before)
+        brief = (end - begin < BRIEF) & (share > 0) & (share < 1)
+        found = jnp.where(brief, spread, found)
+    return found
+
+
+class TwistedLoad(Load):
+    """The mean of a load over the slices of twisted rotors.
+
+    `section`: the load of rotors that are straight; `offsets` (n,) in rad and `weights` (n,): see
+    `rootsopt.contact.gap.Slices`. The mean over a mesh period is that of the section."""
+
+    section: Load
+    offsets: Float[Array, " n"]
+    weights: Float[Array, " n"]
+
+    @property
+    def torque(self) -> Float[Array, ""]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.section.torque
+
+    @property
+    def total(self):
+        return self.section.total
+
+    def torque1(self, phi):
+        each = jax.vmap(self.section.torque1)(phi + self.offsets)
+        return None if each is None else jnp.dot(self.weights, each)
+
+    def torque2(self, phi):
+        return jnp.dot(self.weights, jax.vmap(self.section.torque2)(phi + self.offsets))
+
+    def switches(self, motion, own) -> Bool[Array, " s"]:
+        def of_slice(offset):
+            return self.section.switches(motion._replace(phi=motion.phi + offset), own)
+
+        return jax.vmap(of_slice)(self.offsets).ravel()
 
 
 def _spread_share(addendum, begin, end):
     """Return the fraction of a spread jump's roll angle that lies before `addendum`: 0 at its
     start, 1 at its end.
 
-    The jump is spread over the roll angle `_BRIEF`, centred midway between `begin` and `end`, the
+    The jump is spread over the roll angle `BRIEF`, centred midway between `begin` and `end`, the
     roll angles at the ends of a flank segment. `addendum`: roll angle of the addendum point in
     contact. All angles are in rad. Outside the jump, the fraction is negative or exceeds 1."""
-    return (addendum - (begin + end - _BRIEF) / 2) / _BRIEF
+    return (addendum - (begin + end - BRIEF) / 2) / BRIEF

@@ -1,4 +1,4 @@
-"""Gauss rule, elements and meshes."""
+"""Tests of the Gauss rule, elements and meshes."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,7 @@ ROOM = 32
 
 
 def _elements(function, slope, edges, start=0.0):
-    """Elements on fixed edges whose motion is a known function."""
+    """Return elements on fixed edges whose motion is a known function."""
     edges = np.asarray(edges)
     count = len(edges) - 1
     length = edges[-1] - edges[0]
@@ -37,7 +37,7 @@ def _wave(edges):
 
 
 def test_rule_integrates_polynomials():
-    """Slopes of degree 3 give the quartic exactly; weights are exact up to degree 7."""
+    """Slopes of degree 3 give the quartic exactly; the weights are exact up to degree 7."""
     for degree in range(POINTS):
         slopes = GAUSS.nodes**degree
         shares = jnp.linspace(0, 1, 7)
@@ -56,7 +56,8 @@ def test_motion_is_that_of_the_polynomials():
 
 
 def test_motion_moves_to_another_mesh():
-    """Elements aligned with events begin at them, start away from them, and keep the motion."""
+    """Elements aligned with events begin at the events, start away from them, and keep the
+    motion."""
     elements = _wave(np.linspace(0, 1, 17))
     events = jnp.full(8, jnp.inf).at[:3].set(jnp.asarray([0.1, 0.1004, 0.62]))
     which = jnp.full(8, -1).at[:3].set(jnp.asarray([4, 5, 6]))
@@ -78,7 +79,7 @@ def test_motion_moves_to_another_mesh():
 
 
 def test_elements_crowd_where_they_are_needed():
-    """A motion that is nearly still except in one tenth has most of its elements there."""
+    """If a motion changes only in a tenth of the period, most elements are there."""
 
     def function(t):
         return jnp.tanh(60 * (t - 0.45))

@@ -1,4 +1,4 @@
-"""Orbits closed by collocation against orbits closed by shooting, which shares no code with it."""
+"""Tests of orbits closed by collocation against orbits closed by shooting, which shares no code."""
 
 import dataclasses
 
@@ -76,7 +76,8 @@ def test_collocation_agrees_with_shooting(name, overrides, period):
 
 
 def test_program_has_the_shapes_of_shooting():
-    """`auto` holds both in one program; their results must have one structure."""
+    """The results of both methods have the same structure, because `auto` has both in one
+    program."""
     config = rootsopt.load_config("configs/cic.yaml", ["solver.orbit=auto"])
     scene = Scene.from_config(config)
     design = jnp.asarray(config.design, float)
@@ -85,7 +86,7 @@ def test_program_has_the_shapes_of_shooting():
 
 
 class _Flagged(Part):
-    """A part with a flag and no margin."""
+    """A part with a flag but no margin."""
 
     def switches(self, motion, own):
         del own
@@ -93,7 +94,7 @@ class _Flagged(Part):
 
 
 class _Law(ContactLaw):
-    """A law whose one flag is that of the base class."""
+    """A law whose only flag is that of the base class."""
 
     exponent: jax.Array
 

@@ -1,4 +1,4 @@
-"""Orbits closed from those of neighbouring pairs."""
+"""Tests of orbits closed from those of neighbouring pairs."""
 
 import dataclasses
 
@@ -11,13 +11,13 @@ import pytest
 import rootsopt
 from rootsopt.dynamics.collocation.closing import sizes
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
-from rootsopt.dynamics.collocation.forces import Found, Peak
+from rootsopt.dynamics.collocation.forces import OrbitForces, Peak
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.collocation.mesh import roughness
 from rootsopt.dynamics.collocation.nearby import Known, trimmed
 from rootsopt.dynamics.collocation.sampled import as_flow
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.orbits import Orbits
+from rootsopt.response.orbits import OrbitStore
 from rootsopt.scene import Scene
 from rootsopt.status import Status
 
@@ -26,7 +26,7 @@ TURN = 2 * np.pi / PERIOD
 
 
 def _known(room=(48, 51)):
-    """A sine over two mesh periods on equal elements, from τ = 0.3, with an end at τ = 2."""
+    """Return a sine over two mesh periods on equal elements, from τ = 0.3, with an end at τ = 2."""
     elements, times = room
     edges = np.concatenate([np.linspace(BEGIN, 2.0, 8), [2.1, 2.2, BEGIN + PERIOD]])
     filled = np.arange(elements) < USED
@@ -54,10 +54,10 @@ def _known(room=(48, 51)):
 
 
 def test_orbit_sampled_as_steps_is_the_motion_over_one_period():
-    """Steps begin at φ1 = 0, although the mesh does not, and end after exactly one period."""
+    """Steps begin at φ1 = 0 even if the mesh does not, and end after exactly one period."""
     elements = _known().elements
     nothing = jnp.zeros(())
-    found = Found(
+    found = OrbitForces(
         elements=elements,
         response=jnp.arange(3.0),
         sensitivity=jnp.zeros((3, 2)),
@@ -102,7 +102,7 @@ def test_known_orbit_is_cut_to_the_size_of_its_period():
 
 def test_memory_finds_an_orbit_by_its_state_and_forgets_the_oldest(monkeypatch):
     monkeypatch.setattr("rootsopt.response.orbits._MOST", 2)
-    memory, known = Orbits(), _known(sizes(8))
+    memory, known = OrbitStore(), _known(sizes(8))
     config = rootsopt.load_config("configs/cic.yaml")
     design = jnp.asarray(config.design, float)
     pair = eqx.filter_eval_shape(Scene.pair, Scene.from_config(config), design)
@@ -122,10 +122,12 @@ def test_memory_finds_an_orbit_by_its_state_and_forgets_the_oldest(monkeypatch):
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["cic", "ee"])
 def test_orbit_from_a_neighbour_is_that_from_rest(name):
-    """Close by, both ways agree; farther away, where events come and go, the usual way is taken."""
+    """For close neighbours, both orbits agree.
+
+    For farther ones, where events appear or vanish, the orbit is closed in the usual way."""
     config = rootsopt.load_config(f"configs/{name}.yaml", ["solver.orbit=collocation"])
     evaluator = Evaluator.of(config).with_maxima()
-    fresh = dataclasses.replace(evaluator, orbits=Orbits())
+    fresh = dataclasses.replace(evaluator, orbits=OrbitStore())
     base = evaluator(series=False)
     assert "from_neighbour" not in base.statistics
     moved = evaluator.at_speed(config.scene.speed_rpm * 1.003)

@@ -1,4 +1,4 @@
-"""The condensed linear equations against a dense solution of the same equations."""
+"""Tests of the condensed linear equations against a dense solution of the same equations."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from rootsopt.dynamics.collocation.system import Columns, Lines, chained, conden
 
 STATES, POINTS = 3, 4
 TIMES = np.array([0.2, 0.5, 0.9, 1.2, 1.2])
-"""Start, an event, a fixed time, the end twice."""
+"""Times of the mesh: start, an event, a fixed time, and the end twice."""
 WHICH = np.array([-1, 0, -1, -1, -1])
 INTERVAL = np.array([0, 0, 1, 2, 2, 3])
 LEFT = np.array([0, 0.3, 0, 0, 0.6, 1.0])
@@ -19,7 +19,7 @@ USED = 5
 
 
 def _equation(tau, z):
-    """A smooth equation with strong coupling."""
+    """Return the slope of a smooth equation with strong coupling."""
     a = jnp.array([[0.0, 1.0, 0.2], [-3.0, -0.4, 0.5], [0.3, 0.1, -1.0]])
     return a @ z + 0.3 * jnp.sin(z) + jnp.stack([0.0, jnp.cos(2 * jnp.pi * tau), tau])
 
@@ -35,7 +35,7 @@ def _elements(times, state, slopes):
 
 
 def _misses(unknown):
-    """The equations of the used elements, written out one by one."""
+    """Return the residuals of the equations of the used elements, written one by one."""
     z = unknown[: USED * STATES].reshape(USED, STATES)
     k = unknown[USED * STATES : USED * STATES * (POINTS + 1)].reshape(USED, POINTS, STATES)
     times = jnp.asarray(TIMES).at[1].set(unknown[-1])

@@ -1,0 +1,105 @@
+"""`rootsopt --completion SHELL`: a script that completes commands, options and config keys."""
+
+import argparse
+import importlib
+import importlib.util
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rootsopt.config import Config
+from rootsopt.config.explain import all_keys
+from rootsopt.config.shipped import shipped
+from rootsopt.errors import InputError
+
+SHELLS = "bash", "zsh"
+"""Shells for which there is a script."""
+_KEYS, _CONFIGS = "_rootsopt_keys", "_rootsopt_configs"
+_NO_SPACE = """
+_rootsopt() {
+  _shtab_rootsopt "$@"
+  [[ ${COMPREPLY[0]} == *= ]] && compopt -o nospace 2>/dev/null
+  return 0
+}
+complete -o bashdefault -F _rootsopt rootsopt"""
+"""End of the bash script: no blank after a key, because its value follows."""
+
+
+def script(shell: str, commands: Iterable[str]) -> str:
+    """Return the completion script for a `shell`.
+
+    `commands`: names of the commands. The options of each are those that `rootsopt.commands.cli`
+    gives every command, and those that the function `options` of its module adds, if there is one.
+
+    Raises `InputError` for an unknown shell, or if shtab is not installed."""
+    if shell not in SHELLS:
+        raise InputError(f"`--completion` must be {' or '.join(SHELLS)}, but is {shell!r}")
+    if importlib.util.find_spec("shtab") is None:
+        raise InputError(
+            "`--completion` needs shtab; install it with `pip install 'rootsopt[completion]'`"
+        )
+    import shtab
+
+    whole = argparse.ArgumentParser(prog="rootsopt")
+    whole.add_argument("--version", action="store_true", help="print the version")
+    tree = whole.add_subparsers()
+    for name in commands:
+        parent = command_parser(name)
+        _complete(parent, shtab.FILE, shtab.DIRECTORY)
+        tree.add_parser(name, help=parent.description, parents=[parent], add_help=False)
+    # shtab takes a preamble per shell; its annotation names only text.
+    text = shtab.complete(whole, shell, preamble=_preamble())  # type: ignore[arg-type]
+    return f"{text}\n{_NO_SPACE}" if shell == "bash" else text
+
+
+def command_parser(name: str) -> argparse.ArgumentParser:
+    """Return the parser of the command `name`, with its own options."""
+    from rootsopt.commands import cli
+
+    module: Any = importlib.import_module(f"rootsopt.commands.{name}")
+    found = cli.parser(name, module.PURPOSE)
+    getattr(module, "options", lambda parser: None)(found)
+    return found
+
+
+def _complete(parser: argparse.ArgumentParser, file: Mapping, folder: Mapping) -> None:
+    """Say how the values of the arguments are completed.
+
+    `file`, `folder`: shtab's functions for files and folders, by shell."""
+    ways = {
+        "config": {"bash": _CONFIGS, "zsh": f"_alternative 'c:config:({_words(shipped())})' "
+                   "'f:file:_files'"},
+        "output": folder,
+        "imports": file,
+        "overrides": {"bash": _KEYS, "zsh": f"({_words(_keys())})"},
+        "over": {"bash": _KEYS, "zsh": f"({_words(_keys())})"},
+    }  # fmt: skip
+    for action in parser._actions:
+        if action.dest in ways:
+            action.complete = ways[action.dest]  # type: ignore[attr-defined]
+
+
+def _keys() -> list[str]:
+    return [f"{key}=" for key in all_keys(Config)]
+
+
+def _words(words: Iterable[str]) -> str:
+    return " ".join(words)
+
+
+def _preamble() -> dict[str, str]:
+    """Return the functions of the bash script that list keys and configs."""
+    keys, configs = _words(_keys()), _words(shipped())
+    return {
+        "bash": f"""
+{_KEYS}() {{
+  compgen -W "{keys}" -- "$1"
+}}
+{_CONFIGS}() {{
+  compgen -W "{configs}" -- "$1"
+  compgen -f -- "$1"
+}}
+"""
+    }
+
+
+__all__ = ["SHELLS", "command_parser", "script"]

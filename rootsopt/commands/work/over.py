@@ -1,0 +1,125 @@
+"""The work of `rootsopt sweep --over` and `--tolerances`: a sweep over any keys."""
+
+import argparse
+import time
+from contextlib import closing
+from typing import Any
+
+from rich.console import Console
+
+from rootsopt.commands import cli, door
+from rootsopt.commands.work.searching import progress_bar
+from rootsopt.config import Config
+from rootsopt.errors import InputError
+from rootsopt.figures.sweep import sweep_figure
+from rootsopt.optimize.checkpoint import aside, set_aside
+from rootsopt.output import datasets, files, sweeps
+from rootsopt.output.runs import RunFolder
+from rootsopt.runtime.environment import say
+from rootsopt.status import Status
+from rootsopt.sweeps.axes import parse_over
+from rootsopt.sweeps.journal import Journal
+from rootsopt.sweeps.plan import Plan, plan_of, scattered
+from rootsopt.sweeps.scenes import checked, complete, header, runner
+from rootsopt.sweeps.table import dataset_of
+
+_DATA = "sweep.nc"
+_FIRST = "compiling and simulating"
+_PROMISE = "keeping the points that are done and writing the files"
+
+
+def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
+    """Run `rootsopt sweep --over`: simulate all points, and write files into `folder`.
+
+    Return the `Outcome`. Raises `InputError` if a key, a value or an option is not valid."""
+    began = time.perf_counter()
+    name = _DATA if options.data is None else options.data
+    datasets.check_name(name)
+    config, plan = _points(config, options)
+    plan = checked(config, plan)
+    run = runner(options.workers, options.scheduler, options.imports, not options.no_cache)
+    with (
+        closing(_journal(config, plan, options, folder)) as journal,
+        door.patience(_PROMISE) as stop,
+        progress_bar(Console(stderr=True), _FIRST, "simulating", "points") as progress,
+    ):
+        known = len(journal.rows)
+        records = complete(config, plan, run, journal, progress or _silent, stop)
+    done = len(records) == plan.count
+    seconds = time.perf_counter() - began
+    dataset = dataset_of(config, plan, records)
+    files.write_config(folder, config)
+    folder.write_csv("sweep.csv", files.row_columns(sweeps.rows_of(plan, records)))
+    datasets.write_dataset(folder, name, dataset)
+    statistics: dict[str, Any] = {"seconds": seconds, "resumed_points": known}
+    statistics["points_per_second"] = (len(records) - known) / seconds
+    record = sweeps.summary(plan, records) | {"data": name, "statistics": statistics}
+    folder.write_json("result.json", record | {"versions": files.versions()})
+    if not options.no_figures:
+        sweep_figure(folder, plan, dataset)
+    if done:
+        for spent in (folder.checkpoint, aside(folder.checkpoint)):
+            folder.remove_afterwards(spent)
+    else:
+        folder.overwrite = False  # An earlier result is more valuable than this one.
+
+    def show(out: Console) -> None:
+        out.print(sweeps.shown(plan, records, dataset))
+        out.print(f"{record['status']}: {record['message']}", soft_wrap=True, markup=False)
+        rate = statistics["points_per_second"]
+        out.print(f"{len(records) - known} points in {seconds:.1f} s, {rate:.3g} per second")
+
+    usable = done and any(Status[row["status"].upper()].usable for row in records.values())
+    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)
+
+
+def _points(config: Config, options: argparse.Namespace) -> tuple[Config, Plan]:
+    """Return the config of all that is not swept, and the points of the sweep."""
+    if options.tolerances is not None:
+        for name in ("over", "zip", "zip_keys", "sample", "sobol", "seed"):
+            if getattr(options, name) not in (None, False, []):
+                raise InputError(
+                    f"`--tolerances` draws all points, so that `--{name.replace('_', '-')}` has no "
+                    "effect; remove one of them"
+                )
+        return scattered(config, options.tolerances)
+    return config, _plan(options)
+
+
+def _plan(options: argparse.Namespace) -> Plan:
+    axes = {}
+    for text in options.over:
+        key, axis = parse_over(text)
+        if key in axes:
+            raise InputError(f"`--over {key}=...` is given twice; write all its values in one list")
+        axes[key] = axis
+    groups = [[key.strip() for key in text.split(",")] for text in options.zip_keys]
+    if options.zip and groups:
+        raise InputError("`--zip` zips all keys, so that `--zip-keys` has no effect; remove one")
+    seeded = options.sample is not None or options.sobol is not None
+    if options.seed is not None and not seeded:
+        raise InputError("`--seed` is for samples; add `--sample N` or `--sobol N`, or remove it")
+    seed = 0 if options.seed is None else options.seed
+    return plan_of(axes, options.zip or groups, options.sample, options.sobol, seed)
+
+
+def _journal(config: Config, plan: Plan, options: argparse.Namespace, folder: RunFolder) -> Journal:
+    """Return the journal of this run, beside the result folder.
+
+    Without `--resume`, the journal of an interrupted run is moved aside until a run has ended."""
+    path = folder.checkpoint
+    older = None if options.resume else set_aside(path)
+    if older is not None:
+        say(
+            f"an interrupted run has left its points, which are now in {str(older)!r} until this "
+            "run has ended; to go on with that run, stop this one, move the file back to "
+            f"{path.name!r}, and add `--resume`"
+        )
+    return Journal(path, header(config, plan, options.imports), options.resume)
+
+
+def _silent(done: int, expected: int) -> None:
+    """Take the place of a progress bar where none is shown."""
+
+
+__all__ = ["body"]

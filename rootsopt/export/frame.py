@@ -1,0 +1,164 @@
+"""Dimensions, title block and table of coordinates of a DXF drawing."""
+
+from typing import Any
+
+import numpy as np
+
+from rootsopt.export.coordinates import coordinates, widest
+from rootsopt.export.drawing import Drawing
+
+CIRCLES, DIMENSIONS, TITLE, TABLE = "CIRCLES", "DIMENSIONS", "TITLE_BLOCK", "TABLE"
+"""Names of the DXF layers: outer and root circle, dimensions, title block, coordinates."""
+STYLES = {
+    CIRCLES: (8, "PHANTOM", 13),
+    DIMENSIONS: (3, "CONTINUOUS", 18),
+    TITLE: (7, "CONTINUOUS", 25),
+    TABLE: (8, "CONTINUOUS", 13),
+}
+"""Colour index of AutoCAD, line type, line width (1/100 mm) of each layer."""
+STYLE = "ROTOR"
+"""Name of the dimension style."""
+_ROWS = 19
+"""Number of points from tip to root in the table of the drawing."""
+_LETTER = 0.9
+"""Width of a letter as a fraction of its height, with room to spare."""
+
+
+def add_style(document: Any, drawing: Drawing) -> None:
+    """Add the dimension style to a `document` of ezdxf: sizes that suit the rotor, 0.001 mm."""
+    height = letter(drawing)
+    document.dimstyles.add(
+        STYLE,
+        dxfattribs={
+            "dimtxt": height, "dimasz": 0.9 * height, "dimexo": 0.4 * height,
+            "dimexe": 0.6 * height, "dimgap": 0.4 * height, "dimtad": 1, "dimdec": 3,
+            "dimzin": 8, "dimdsep": ord("."), "dimlunit": 2, "dimtih": 0, "dimtoh": 0,
+            "dimclrt": 7, "dimtxsty": "Standard",
+        },
+    )  # fmt: skip
+
+
+def letter(drawing: Drawing) -> float:
+    """Return the height (mm) of the drawing's letters, which grow with the rotor."""
+    return drawing.outer_radius / 26
+
+
+def add_dimensions(space: Any, drawing: Drawing) -> None:
+    """Add the dimensions of the rotor: diameters of outer, pitch and root circle and bore, and the
+    width of a lobe.
+
+    `space`: modelspace of ezdxf."""
+    outer = drawing.outer_radius
+    for radius in (outer, drawing.root_radius):
+        space.add_circle((0, 0), radius, dxfattribs={"layer": CIRCLES})
+    radii = {"outer": outer, "pitch": drawing.pitch_radius, "root": drawing.root_radius}
+    if drawing.bore is not None:
+        radii["bore"] = drawing.bore / 2
+    for row, (name, radius) in enumerate(reversed(radii.items())):
+        # One below the other on the left, the smallest nearest to the rotor.
+        left = -1.3 * outer - 4.2 * letter(drawing) * row
+        space.add_linear_dim(
+            base=(left, 0), p1=(0, -radius), p2=(0, radius), angle=90, text=f"%%c<> {name}",
+            dimstyle=STYLE, dxfattribs={"layer": DIMENSIONS},
+        ).render()  # fmt: skip
+    point = widest(drawing.pieces, drawing.lobes)
+    space.add_linear_dim(
+        base=(1.25 * outer, 0), p1=(point.real, -point.imag), p2=(point.real, point.imag),
+        angle=90, text="<> lobe", dimstyle=STYLE, dxfattribs={"layer": DIMENSIONS},
+    ).render()  # fmt: skip
+
+
+def add_title_block(space: Any, drawing: Drawing) -> None:
+    """Add the title block below the rotor, with the notes beside it, and the border of the sheet.
+
+    `space`: modelspace of ezdxf."""
+    outer, height = drawing.outer_radius, letter(drawing)
+    left, right, top = edges(drawing)
+    row = 1.9 * height
+    count = max(len(drawing.block), len(drawing.notes) + 1)
+    upper = -1.3 * outer
+    bottom = upper - row * count
+    split = right - (_wide(drawing) + 1) * height
+    names = max(len(name) for name, _ in drawing.block) * _LETTER * height + height
+    frame = {"layer": TITLE}
+    corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
+    space.add_lwpolyline(corners, close=True, dxfattribs=frame)
+    space.add_line((left, upper), (right, upper), dxfattribs=frame)
+    space.add_line((split, upper), (split, bottom), dxfattribs=frame)
+    space.add_line((split + names, upper), (split + names, bottom), dxfattribs=frame)
+    for k, (name, text) in enumerate(drawing.block):
+        y = upper - row * (k + 1)
+        if k + 1 < count:
+            space.add_line((split, y), (right, y), dxfattribs=frame)
+        for x, words in ((split, name), (split + names, text)):
+            place = x + 0.5 * height, y + 0.45 * height
+            attributes = {"layer": TITLE}
+            space.add_text(plain(words), height=height, dxfattribs=attributes).set_placement(place)
+
+
+def add_table(space: Any, drawing: Drawing) -> None:
+    """Add a table of points from the tip to the root, at the right of the rotor.
+
+    The other flank is the mirror image. `space`: modelspace of ezdxf."""
+    found = coordinates(drawing.pieces, drawing.lobes, 2 * _ROWS - 1)
+    half = np.linspace(0.0, found.along[-1], _ROWS)
+    kept = [int(np.argmin(np.abs(found.along - place))) for place in half]
+    columns = found.columns()
+    names = "x_mm", "y_mm", "radius_mm", "normal_deg"
+    height = 0.8 * letter(drawing)
+    wide, row = 11 * _LETTER * height, 1.85 * height
+    right, top = edges(drawing)[1:]
+    left = right - 4.6 * wide
+    heads = ["no.", "x", "y", "radius", "normal, deg"]
+    rows = [heads, *([str(k), *(f"{round(columns[name][i], 4) + 0.0:.4f}" for name in names)]
+                     for k, i in enumerate(kept))]  # fmt: skip
+    title = "Half a lobe, tip to root (all points: rotor_points.csv)"
+    attributes = {"layer": TABLE}
+    place = left, top - 1.6 * height
+    space.add_text(title, height=height, dxfattribs=attributes).set_placement(place)
+    for k, cells in enumerate(rows):
+        y = top - 2.4 * height - row * (k + 1) - (0.4 * height if k else 0)
+        for column, text in enumerate(cells):
+            x = left + (0.5 * wide if column == 0 else (column + 0.5) * wide)
+            put = space.add_text(text, height=height, dxfattribs=attributes)
+            put.set_placement((x, y), align=_right())
+        if k == 0:
+            line = y - 0.5 * height
+            space.add_line((left, line), (right, line), dxfattribs=attributes)
+
+
+def _right() -> Any:
+    from ezdxf.enums import TextEntityAlignment
+
+    return TextEntityAlignment.RIGHT
+
+
+def edges(drawing: Drawing) -> tuple[float, float, float]:
+    """Return the left, right and top edge of the sheet (mm)."""
+    outer, height = drawing.outer_radius, letter(drawing)
+    left = -1.3 * outer - 4.2 * height * 4
+    right = 1.5 * outer + 4.7 * 11 * _LETTER * 0.8 * height
+    notes = max(map(len, drawing.notes)) * _LETTER * height
+    return left, max(right, left + notes + (_wide(drawing) + 2) * height), 1.3 * outer
+
+
+def _wide(drawing: Drawing) -> float:
+    """Return the width of the title block, in heights of its letters."""
+    return _LETTER * sum(max(len(row[k]) for row in drawing.block) for k in (0, 1)) + 2
+
+
+def plain(text: str) -> str:
+    """Return a text without the codes that CAD programs replace (`%%c`, `^J`)."""
+    return text.replace("%%", "% %").replace("^", "^ ")
+
+
+__all__ = [
+    "STYLES",
+    "add_dimensions",
+    "add_style",
+    "add_table",
+    "add_title_block",
+    "edges",
+    "letter",
+    "plain",
+]

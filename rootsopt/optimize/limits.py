@@ -1,0 +1,158 @@
+"""Limits of any quantity (`constraints.terms`): as constraints of the geometry, or of the motion.
+
+A term that does not read forces becomes a `Constraint` of the design space. It costs no
+simulation, and designs are moved onto it. A force, or a term that reads forces, becomes a
+`ForceLimit`, which an evaluation satisfies or not."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from rootsopt.config import Config
+from rootsopt.design.space import Constraint
+from rootsopt.errors import InputError
+from rootsopt.response.reporting import in_words, is_force, reporting, unit_in
+from rootsopt.response.terms import Forces, Term, needs_forces, terms_of
+from rootsopt.scene import Scene
+
+LIMITS = "constraints.terms"
+"""Config key that names the limited quantities."""
+PEAK = "peak_force_N"
+"""Key of the peak force in a response: the greatest of several local maxima of the force."""
+
+
+class TermConstraint(Constraint):
+    """A constraint on a `term` that does not read forces; its unit is that of the term."""
+
+    term: Term = eqx.field(kw_only=True)
+
+    def slack_of(self, scene, profile, shape, found):
+        del found
+        nothing = Forces(*[jnp.asarray(jnp.nan)] * 3)
+        return self.scaled(self.term.value(scene, profile, shape, nothing))
+
+
+class ForceLimit(NamedTuple):
+    """A limit that depends on forces: value ≤ `limit` for a `ceiling`, else value ≥ `limit`.
+
+    `key`: name of the quantity in a response."""
+
+    key: str
+    ceiling: bool
+    limit: float
+
+    @property
+    def name(self) -> str:
+        """Name of the quantity in words."""
+        return in_words(self.key)
+
+    @property
+    def unit(self) -> str:
+        """Unit of the quantity, empty if its name does not tell it."""
+        return unit_in(self.key)
+
+    @property
+    def sense(self) -> str:
+        """Relation between value and limit."""
+        return "<=" if self.ceiling else ">="
+
+    @property
+    def sign(self) -> float:
+        """+1 if `limit` is a greatest value, -1 if it is a least value."""
+        return 1.0 if self.ceiling else -1.0
+
+    @property
+    def scale(self) -> float:
+        """Divisor that brings the distance from the limit to the order of one."""
+        return scale_of(self.limit)
+
+    @property
+    def cornered(self) -> bool:
+        """Whether all local maxima of the force must stay below the limit."""
+        return self.ceiling and self.key == PEAK
+
+    def excess(self, value):
+        """Return how far values exceed the limit, divided by `scale`; ≤ 0 if they satisfy it."""
+        return self.sign * (value - self.limit) / self.scale
+
+
+def scale_of(limit: float) -> float:
+    """Return the magnitude of a `limit`, 1 if it is 0."""
+    return abs(limit) or 1.0
+
+
+def limited(config: Config) -> Config:
+    """Return a copy of a `config` whose evaluations report all quantities of `constraints.terms`.
+
+    Raises `InputError` for a name of no quantity."""
+    names = [*config.constraints.terms]
+    terms_of([name for name in names if not is_force(config, name, LIMITS)], LIMITS)
+    return reporting(config, names, LIMITS) if names else config
+
+
+def depends_on_forces(config: Config, scene: Scene, name: str, key: str) -> bool:
+    """Return whether the quantity `name` is a force, or a term that reads forces.
+
+    `key`: config key that holds the name. Raises `InputError` if no quantity has this name."""
+    if is_force(config, name, key):
+        return True
+    (term,) = terms_of([name], key)
+    return needs_forces(scene, term, jnp.asarray(np.asarray(config.design, np.float64)))
+
+
+def term_constraints(config: Config, scene: Scene) -> tuple[TermConstraint, ...]:
+    """Return the constraints on those quantities of `constraints.terms` that read no forces."""
+    found = []
+    for name, ceiling, limit in _sides(config):
+        if depends_on_forces(config, scene, name, LIMITS):
+            continue
+        (term,) = terms_of([name], LIMITS)
+        row = in_words(name), name, unit_in(name), jnp.asarray(limit), scale_of(limit), 1.0
+        found.append(TermConstraint(*row, ceiling=ceiling, term=term))
+    return tuple(found)
+
+
+def force_limits(config: Config, scene: Scene) -> tuple[ForceLimit, ...]:
+    """Return the limits on those quantities of `constraints.terms` that depend on forces.
+
+    Raises `InputError` if such limits do not suit the objective or the method of the search."""
+    found = tuple(
+        ForceLimit(name, ceiling, limit)
+        for name, ceiling, limit in _sides(config)
+        if depends_on_forces(config, scene, name, LIMITS)
+    )
+    if found and config.objective.motion == "ensemble":
+        raise InputError(
+            f"`{LIMITS}` must not limit forces for `objective.motion` ensemble, but limits "
+            f"{found[0].key}: averages have noise; give it a weight in `objective`, or choose "
+            "another motion"
+        )
+    if found and config.optimizer.method not in ("auto", "slsqp"):
+        raise InputError(
+            f"`optimizer.method` must be auto or slsqp to limit {found[0].key} under `{LIMITS}`, "
+            f"but is {config.optimizer.method}; set it to auto"
+        )
+    return found
+
+
+def _sides(config: Config):
+    """Yield (name, whether it is a ceiling, limit) for each floor and ceiling."""
+    for name, one in config.constraints.terms.items():
+        for side in ("max", "min"):
+            if side in one:
+                yield name, side == "max", float(one[side])
+
+
+__all__ = [
+    "LIMITS",
+    "PEAK",
+    "ForceLimit",
+    "TermConstraint",
+    "depends_on_forces",
+    "force_limits",
+    "limited",
+    "scale_of",
+    "term_constraints",
+]

@@ -1,0 +1,343 @@
+"""Loads on the bearings along a motion: of flanks, gas, timing gear and weight.
+
+A rotor's bearings sit at z = ±(L/2 + a), the timing gear at z = L/2 + g. `docs/bearings.md` derives
+the formulas.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from rootsopt.dynamics.flow import Equation
+from rootsopt.dynamics.integrator import Integrator
+from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.orbit import Orbit
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.parts import AxisLoads
+from rootsopt.dynamics.parts.resultants import MIRROR
+from rootsopt.dynamics.switches import with_switches
+from rootsopt.dynamics.tangent import linearized
+from rootsopt.pump.bearings import equivalent_load
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene
+from rootsopt.scene.build import along
+
+_CHUNK = 32
+"""Number of steps linearised together, as arrays."""
+_LONGEST = 8
+"""Longest orbit (mesh periods)."""
+_EVEN = 128
+"""Least number of pieces per mesh period."""
+_ASIDE = 1e-9
+"""Half the length (mesh periods) of the piece around an instant at which a load jumps."""
+POSES = 720
+"""Number of angles of rotor 1, over a mesh period, for loads without a motion."""
+
+
+class BearingLoads(NamedTuple):
+    """Loads on the bearings at one or several instants.
+
+    `radial` (rotor, bearing, x and y): load (N) on each bearing, that at the timing gear's end
+    first. `axial` (rotor): force (N) on a rotor along +z, from flanks and gas. `tilting` (rotor, x
+    and y): moment (N·m) of flanks and gas about the middle of a rotor. Rotor 1 turns from x to y,
+    about +z."""
+
+    radial: Float[Array, "*n rotor bearing xy"]
+    axial: Float[Array, "*n rotor"]
+    tilting: Float[Array, "*n rotor xy"]
+
+    @property
+    def sizes(self) -> Float[Array, "*n 4"]:
+        """Magnitudes (N) of the loads on the four bearings, those of rotor 1 first."""
+        size = jnp.sqrt(jnp.sum(self.radial**2, axis=-1))
+        return size.reshape(*size.shape[:-2], 4)
+
+
+class BearingSet(eqx.Module):
+    """A pair with its bearings, ready to compute their loads.
+
+    `pair`; `loads`: forces beside the flanks' push; `length` (m) of the rotors; `twist` (rad) over
+    it, `None` for straight rotors; `bearing`, `gear` (m): distance of each bearing and of the gear
+    from the middle; `exponent` of the equivalent load."""
+
+    pair: RotorPair
+    loads: AxisLoads
+    length: Float[Array, ""]
+    twist: Float[Array, ""] | None
+    bearing: Float[Array, ""]
+    gear: Float[Array, ""]
+    exponent: float = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, scene: Scene, design: Float[Array, " d"]) -> "BearingSet":
+        """Return the set of a `design` (d,) in config units; the scene must have `bearings`."""
+        pair, shape = scene.pair_and_shape(design)
+        found, half = scene.bearings, scene.length / 2
+        assert found is not None
+        loads = scene.axis_loads(found, pair.load, pair.gear, scene.mass(shape))
+        ends = half + found.distance, half + found.gear_distance
+        return cls(pair, loads, scene.length, scene.helix, *ends, found.exponent)
+
+    def at(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> BearingLoads:
+        """Return the loads at rotation `tau` (mesh periods) and scaled `state`.
+
+        Elastic supports carry the load that moves them; rigid bearings carry all forces."""
+        pair = self.pair
+        motion = pair.motion(tau, state)
+        pushes = pair.pushes(motion)
+        slices = pair.contact.slices
+        places = np.zeros(1) if slices is None else slices.places
+        forces, moments, axial = self._from_flanks(pushes, self.length * jnp.asarray(places))
+        more = self._from_gas(motion.phi)
+        forces, moments, axial = (
+            a + b for a, b in zip((forces, moments, axial), more, strict=True)
+        )
+        tilting = jnp.stack([-moments[:, 1], moments[:, 0]], axis=1)
+        teeth = self.loads.gear_force(motion)
+        teeth = jnp.stack([-teeth, teeth])
+        forces, moments = forces + teeth, moments + self.gear * teeth
+        if self.loads.weight is not None:
+            forces = forces - self.loads.weight * np.array([[0.0, 1.0], [0.0, 1.0]])
+        for part, own in zip(pair.all_parts, pair.own_states(state), strict=True):
+            if part.displaces:
+                carried = part.force_on_axes(motion, own)
+                assert carried is not None
+                forces = -carried
+        share = moments / (2 * self.bearing)
+        radial = jnp.stack([forces / 2 + share, forces / 2 - share], axis=1)
+        return BearingLoads(radial, axial, tilting)
+
+    def _from_flanks(self, pushes, heights):
+        """Return forces and first moments (rotor, x and y) and axial forces (rotor) of flanks.
+
+        `heights` (slices,): z of the slices (m). The first moment is ∫ z dF, plus what an axial
+        force aside from the axis adds: its moment is that of the force -P A at the height 1."""
+        axis = jnp.stack([2 * self.loads.radius, jnp.zeros_like(self.loads.radius)])
+        place = jnp.stack([pushes.place, pushes.place - axis], axis=2)
+        forces = jnp.stack([-pushes.force, pushes.force], axis=2)
+        axial = jnp.zeros_like(pushes.torque)
+        if self.twist is not None:
+            axial = -self.twist / self.length * pushes.torque
+        first = heights[:, None, None, None] * forces - place * axial[..., None]
+        return forces.sum((0, 1)), first.sum((0, 1)), axial.sum((0, 1))
+
+    def _from_gas(self, phi):
+        """Return the same as `_from_flanks` for the gas, at φ1 = `phi` (rad).
+
+        The axial force of the gas is taken to act at the middle of the chord."""
+        gas = self.loads.gas
+        if gas is None:
+            return jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros(2)
+        forces = gas.slice_forces(phi)
+        heights = self.length * jnp.asarray(gas.places)
+        first, axial = heights[:, None, None] * forces, jnp.zeros(forces.shape[:2])
+        if self.twist is not None:
+            contact, tip = gas.chords(phi)
+            against = jnp.sum(tip**2 - contact**2, axis=-1) / 2
+            weights = jnp.asarray(gas.weights)[:, None]
+            axial = self.twist / self.length * gas.pressure_length * weights * against
+            middle = (contact + tip) / 2 * np.stack([np.ones(2), MIRROR])
+            first = first - middle * axial[..., None]
+        return forces.sum(0), first.sum(0), axial.sum(0)
+
+
+class OrbitLoads(NamedTuple):
+    """Loads on the bearings over a closed orbit.
+
+    `equivalent` (4,): equivalent dynamic load (N) of every bearing, those of rotor 1 first;
+    `slopes` (4, d): its derivatives along the orbit's directions; `series`: loads at the orbit's
+    samples; `greatest` (4,): greatest load (N) of every bearing, among the samples."""
+
+    equivalent: Float[Array, "4"]
+    slopes: Float[Array, "4 d"]
+    series: BearingLoads
+    greatest: Float[Array, "4"]
+
+
+class _LoadEquation(Equation):
+    """The equation of motion with the integrals of the bearing loads to the power of the exponent.
+
+    `dynamic` holds the arrays of a `BearingSet`, and `static` the rest of it."""
+
+    def pair(self, dynamic) -> RotorPair:
+        return eqx.combine(dynamic, self.static).pair
+
+    def rates(self, tau, state, contact, dynamic):
+        del contact
+        bearings = eqx.combine(dynamic, self.static)
+        size = bearings.at(tau, state).sizes / self.force_unit
+        # The root of a load that vanishes has no derivative.
+        pushed = size > 0
+        return jnp.where(pushed, jnp.where(pushed, size, 1.0) ** bearings.exponent, 0.0)
+
+
+class _Pieces(NamedTuple):
+    """Pieces of an orbit's steps, in order of time.
+
+    `begin`, `end`: of each piece (mesh periods; `end` is inf beyond the last); `step`: index of the
+    step that holds it; `first`: start of this step; `last`: whether the piece ends the step."""
+
+    begin: Float[Array, " pieces"]
+    end: Float[Array, " pieces"]
+    step: Int[Array, " pieces"]
+    first: Float[Array, " pieces"]
+    last: Bool[Array, " pieces"]
+
+
+def _pieces(
+    grid: Float[Array, " steps"], ends: Float[Array, " steps"], corners: Float[Array, " k"], period
+) -> _Pieces:
+    """Return the steps of `grid` (mesh periods), divided at `ends` and at the `corners` of loads.
+
+    `ends`: further ends, unused ones inf; `corners` (k,): in one mesh period; `period` of the orbit
+    (mesh periods). Each corner lies in a short piece, so that no load is evaluated right at a jump.
+    The steps are as long as the motion allows; a load to the power of the exponent needs shorter
+    ones."""
+    turns = jnp.arange(_LONGEST, dtype=grid.dtype)[:, None, None]
+    sides = _ASIDE * jnp.array([-1.0, 1.0], grid.dtype)[:, None]
+    even = jnp.arange(_EVEN, dtype=grid.dtype) / _EVEN
+    added = jnp.append(jnp.mod(corners + sides, 1.0), even) + turns[..., 0]
+    added = jnp.where(added < period, added, jnp.inf).ravel()
+    end = jnp.sort(jnp.concatenate([grid, ends, lax.stop_gradient(added).astype(grid.dtype)]))
+    begin = jnp.concatenate([jnp.zeros_like(end[:1]), end[:-1]])
+    starts = jnp.concatenate([jnp.zeros_like(grid[:1]), grid[:-1]])
+    used = jnp.sum(grid < jnp.inf)
+    step = jnp.clip(jnp.searchsorted(grid, end), 0, used - 1)
+    # A corner beyond the last step, by rounding.
+    end = jnp.where(end > grid[used - 1], jnp.inf, end)
+    # An end may be there twice; the step ends once.
+    return _Pieces(begin, end, step, starts[step], (end == grid[step]) & (begin < end))
+
+
+def loads_corners(bearings: BearingSet) -> Float[Array, " k"]:
+    """Return the times (mesh periods, from 0 to 1) at which the gas forces are not smooth."""
+    gas = bearings.loads.gas
+    if gas is None:
+        return jnp.zeros(0)
+    return gas.corners() * bearings.pair.lobes / (2 * jnp.pi)
+
+
+@Program
+def orbit_loads(
+    scene: Scene,
+    design: Float[Array, " d"],
+    orbit: Orbit,
+    period: Int[Array, ""],
+    integrator: Integrator,
+) -> OrbitLoads:
+    """Return the bearing loads over a closed `orbit` of `period` mesh periods.
+
+    `design` (d,): in config units, the one of the orbit; `integrator`: that of the orbit. The
+    derivatives follow the family of orbits, with respect to the design. The steps of the orbit are
+    linearised once more, with the loads as further integrals."""
+
+    # Orbits in single precision are evaluated in double, like the pair before it is converted.
+    scene = dataclasses.replace(scene, precision="float64")
+    orbit = jax.tree.map(lambda x: x.astype(float) if eqx.is_inexact_array(x) else x, orbit)
+
+    def build(design):
+        return BearingSet.of(scene, design), jnp.zeros(())
+
+    bearings, tangents, _ = along(build, design, jnp.eye(design.shape[0]))
+    pair = bearings.pair
+    dtype, count = orbit.state.dtype, orbit.state.shape[0]
+    dynamic, static = eqx.partition(bearings, eqx.is_inexact_array)
+    moved = eqx.filter(tangents, eqx.is_inexact_array)
+    unit = lax.stop_gradient(pair.force_scale)
+    # As many integrals as bearings: mean, mean square and one line make four.
+    room = Measures(orders=np.ones(1))
+    equation = _LoadEquation(
+        static, room, unit, jnp.ones_like(unit), count, integrator.solver(dtype)
+    )
+    # The loads have corners that the motion does not have, as where the gear's torque changes sign.
+    marked = dataclasses.replace(pair, parts=(*pair.parts, bearings.loads))
+    tolerance = integrator.tolerance(dtype)
+    ends = with_switches(
+        lax.stop_gradient(marked), orbit.flow, period.astype(dtype), tolerance, orbit.flow.grid
+    )
+    pieces = _pieces(orbit.flow.grid, ends, loads_corners(bearings), period)
+    before = jnp.concatenate([orbit.state[None], orbit.flow.corners[:-1]])
+    taken, lanes = jnp.sum(pieces.end < jnp.inf), jnp.arange(_CHUNK)
+
+    def linear_piece(k):
+        of = pieces.step[k]
+        times = jnp.stack([pieces.first[k], pieces.begin[k]])
+        times = times, jnp.append(times[1:], pieces.end[k])
+
+        def run(y, dynamic):
+            def part(y, between):
+                # Only the second part counts in the integrals.
+                start = equation.start(y[:count], pair.free)
+                return equation.advanced(between[0], between[1], start, dynamic)[0], None
+
+            return lax.scan(part, y, times)[0]
+
+        return linearized(run, equation.start(before[of], pair.free), dynamic, moved, count)
+
+    def advance(carry, job):
+        moved, total, slopes = carry
+        wanted, last, found = job
+        after = found.by_state @ moved + found.by_parameters
+        new = total + found.value[count:], slopes + after[count:]
+        total, slopes = jax.tree.map(lambda x, y: jnp.where(wanted, x, y), new, (total, slopes))
+        return (jnp.where(wanted & last, after[:count], moved), total, slopes), None
+
+    def chunk(carry):
+        number, sums = carry
+        place = number * _CHUNK + lanes
+        at = jnp.minimum(place, taken - 1)
+        found = jax.vmap(linear_piece)(at)
+        sums, _ = lax.scan(advance, sums, (place < taken, pieces.last[at], found))
+        return number + 1, sums
+
+    size = room.count + pair.free
+    start = orbit.moved, jnp.zeros(size, dtype), jnp.zeros((size, orbit.moved.shape[1]), dtype)
+    begin = jnp.zeros((), int), start
+    _, (_, total, slopes) = lax.while_loop(lambda now: now[0] * _CHUNK < taken, chunk, begin)
+    duration, drift = period.astype(dtype), jnp.zeros(orbit.moved.shape[1], dtype)
+    if pair.free:
+        duration, drift = total[-1], slopes[-1]
+    mean = total[:4] / duration
+    slopes = (slopes[:4] - mean[:, None] * drift) / duration
+    root = 1 / bearings.exponent
+    equivalent = unit * mean**root
+    factor = equivalent * root / jnp.where(mean > 0, mean, jnp.inf)
+    samples = orbit.flow.states.shape[0]
+    tau = period * jnp.arange(samples, dtype=dtype) / samples
+    series = lax.map(lambda at: bearings.at(*at), (tau, orbit.flow.states))
+    greatest = jnp.max(series.sizes, axis=0)
+    return OrbitLoads(equivalent, factor[:, None] * slopes, series, greatest)
+
+
+@Program
+def static_loads(scene: Scene, design: Float[Array, " d"]) -> tuple[Array, Array]:
+    """Return (equivalent, greatest) loads (4,) in N of the bearings if the gear carries the load.
+
+    The flanks do not touch, and nothing oscillates. `design` (d,): in config units."""
+    bearings = BearingSet.of(scene, design)
+    pair, loads = bearings.pair, bearings.loads
+
+    def size(phi):
+        forces, first, _ = bearings._from_gas(phi)
+        across = pair.load.torque2(phi) / loads.radius
+        teeth = jnp.stack([jnp.abs(across) * jnp.tan(loads.tooth_angle), across])
+        teeth = jnp.stack([-teeth, teeth]) if pair.gear is not None else jnp.zeros((2, 2))
+        forces, first = forces + teeth, first + bearings.gear * teeth
+        if loads.weight is not None:
+            forces = forces - loads.weight * np.array([[0.0, 1.0], [0.0, 1.0]])
+        share = first / (2 * bearings.bearing)
+        radial = jnp.stack([forces / 2 + share, forces / 2 - share], axis=1)
+        return BearingLoads(radial, jnp.zeros(2), first).sizes
+
+    phi = 2 * jnp.pi / pair.lobes * (jnp.arange(POSES) + 0.5) / POSES
+    sizes = jax.vmap(size)(phi)
+    return equivalent_load(sizes.T, bearings.exponent), jnp.max(sizes, axis=0)
+
+
+__all__ = ["BearingLoads", "BearingSet", "OrbitLoads", "orbit_loads", "static_loads"]

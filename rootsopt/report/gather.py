@@ -1,0 +1,165 @@
+"""Reads the files of a run back, as the report shows them."""
+
+import csv
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rootsopt.config import Config, load
+from rootsopt.output.files import ResultFolder
+from rootsopt.output.fronts import design_file
+from rootsopt.response.evaluation import Series
+
+_COLUMNS = {
+    "time": "time_s",
+    "rotation": "rotation_deg",
+    "relative": "relative_rotation_rad",
+    "rate": "relative_speed_rad_s",
+    "drive_force": "drive_flank_force_N",
+    "coast_force": "coast_flank_force_N",
+}
+"""Columns of `response_*.csv`, by field of `Series`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One design, or one motion of it, that a report shows.
+
+    `name`: name in the report; `config`: config of its family; `design`: parameters in config
+    units; `record`: its entry in the result file, empty if it has none; `series`: simulated motion,
+    None if there is none. `series.depth` is NaN, because files do not hold it.
+    """
+
+    name: str
+    config: Config
+    design: dict[str, float]
+    record: Mapping[str, Any]
+    series: Series | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A run as its files describe it.
+
+    `command`: name of the command; `source`: config as the user named it; `path`: final path of
+    the result folder; `config`: resolved config, with its YAML as `yaml`; `result`: content of the
+    result file; `cases`: designs and motions; `rows`: rows of a sweep's table, one per scene;
+    `figures`: content of each PNG file by name; `usable`: whether the run ended with a usable
+    result (exit code 0)."""
+
+    command: str
+    source: str
+    path: Path
+    config: Config
+    yaml: str
+    result: Mapping[str, Any]
+    cases: tuple[Case, ...]
+    rows: tuple[dict[str, Any], ...]
+    figures: Mapping[str, bytes]
+    usable: bool
+
+    @classmethod
+    def of(
+        cls, folder: ResultFolder, result: Mapping[str, Any], source: str, usable: bool
+    ) -> "Run":
+        """Read the run whose files lie in `folder`.
+
+        `result`: content of the result file, which may not be written yet; `source`, `usable`: as
+        in the class. Raises `InputError` if a config in the folder cannot be read."""
+        place = folder.place
+        config = load(place / "config.yaml")
+        pictures = sorted((place / "figures").glob("*.png"))
+        return cls(
+            command=str(result.get("run", {}).get("command", "")),
+            source=source,
+            path=folder.path,
+            config=config,
+            yaml=(place / "config.yaml").read_text("utf-8"),
+            result=result,
+            cases=tuple(_cases(place, config, result)),
+            rows=tuple(_rows(place / "sweep.csv")),
+            figures={path.name: path.read_bytes() for path in pictures},
+            usable=usable,
+        )
+
+
+def _cases(place: Path, config: Config, result: Mapping[str, Any]) -> Iterator[Case]:
+    """Yield the designs or motions of a result; at least the config's own design."""
+    found = False
+    for case in _listed(place, config, result):
+        found = True
+        yield case
+    if not found:
+        record = result if isinstance(result.get("design"), Mapping) else {}
+        own = dict(zip(config.design_keys, map(float, config.design), strict=True))
+        design = dict(record.get("design", own))
+        yield Case("design", config, design, record, _series(place, "design"))
+
+
+def _listed(place: Path, config: Config, result: Mapping[str, Any]) -> Iterator[Case]:
+    """Yield the designs or motions that a result lists by name or number."""
+    names = {"baseline": "baseline", "optimized": "optimised"}
+    for key, name in names.items():
+        record = result.get(key)
+        if not isinstance(record, Mapping) or not isinstance(record.get("design"), Mapping):
+            continue
+        file = place / f"{key}.yaml"
+        own = load(file) if file.exists() else config
+        yield Case(name, own, dict(record["design"]), record, _series(place, key))
+    for number, record in enumerate(result.get("attractors") or (), start=1):
+        series = _series(place, str(number))
+        yield Case(f"motion {number}", config, dict(record["design"]), record, series)
+    for record in result.get("points") or ():
+        own = load(place / design_file(record["point"]))
+        yield Case(f"point {record['point']}", own, dict(record["design"]), record, None)
+
+
+def _rows(file: Path) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a table, with numbers as numbers and None for empty cells."""
+    if not file.exists():
+        return
+    with file.open(encoding="utf-8", newline="") as lines:
+        for row in csv.DictReader(lines):
+            yield {key: _read(text) for key, text in row.items()}
+
+
+def _read(text: str) -> Any:
+    """Return the value of a cell: a number, None if it is empty or not finite, or its text."""
+    try:
+        found = float(text)
+    except ValueError:
+        return text or None
+    if text.isdecimal():
+        return int(text)
+    return found if math.isfinite(found) else None
+
+
+def _series(place: Path, name: str) -> Series | None:
+    """Return the motion in `response_NAME.csv`, or None if there is no such file."""
+    file = place / f"response_{name}.csv"
+    if not file.exists():
+        return None
+    with file.open(encoding="utf-8") as lines:
+        heads = lines.readline().strip().split(",")
+        table = np.loadtxt(lines, delimiter=",", ndmin=2)
+    values = {field: table[:, heads.index(column)] for field, column in _COLUMNS.items()}
+    values["rotation"] = np.radians(values["rotation"])
+    return Series(**values, depth=np.full(len(table), np.nan))
+
+
+def varied(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the keys of the quantities that vary between scenes, a number first.
+
+    They stand before the forces in each row."""
+    keys = list(itertools.takewhile(lambda key: not key.endswith("_force_N"), rows[0]))
+    kept = [key for key in keys if key not in ("status", "point", "message")]
+    varied = [key for key in kept if len({row.get(key) for row in rows}) > 1] or kept[:1]
+    return sorted(varied, key=lambda key: not isinstance(rows[0].get(key), int | float))
+
+
+__all__ = ["Case", "Run", "varied"]

@@ -1,0 +1,136 @@
+"""Makes the report of a run: one HTML file that opens without a network.
+
+The page is a Jinja2 template, and plotly's script is part of it. Everything that comes from a
+config or a result is escaped."""
+
+import base64
+import datetime
+import re
+from pathlib import Path
+from typing import Any
+
+import rootsopt
+from rootsopt.output.labels import in_words
+from rootsopt.report import blocks, charts, optimum, wording
+from rootsopt.report.blocks import Block
+from rootsopt.report.gather import Run
+from rootsopt.report.meshing import animations
+
+_TEMPLATE = Path(__file__).with_name("template")
+_CAPTIONS = {
+    "profiles.png": "Rotor profile, and its flank",
+    "meshing.png": "The pair at six rotations of one lobe pitch",
+    "conjugacy.png": "Gap between the flanks of the outline in perfect rolling",
+    "force.png": "Contact force over time",
+    "spectrum.png": "Spectrum of the contact force",
+    "comparison.png": "Forces together, and departure of the flanks",
+    "history.png": "Objective and design over the search",
+    "optimum.png": "Certificate: residual, prices of the limits, starts",
+    "speeds.png": "Contact force over speed",
+    "basins.png": "Initial states and the motion that each leads to",
+    "front.png": "Best compromises",
+    "tolerances.png": "Forces in fresh scenes that scatter",
+}
+"""Captions of the figures by file name; other figures are named after their file."""
+_CODE = re.compile(r"`([^`]*)`")
+
+
+def report_text(run: Run) -> str:
+    """Return the HTML of the report of a `run`. Characters that UTF-8 lacks become `?`."""
+    import jinja2
+    import markupsafe
+    from plotly import offline
+
+    def coded(text: str) -> markupsafe.Markup:
+        """Return a sentence with `commands` set as code."""
+        return markupsafe.Markup(_CODE.sub(r"<code>\1</code>", str(markupsafe.escape(text))))
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_TEMPLATE),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["coded"] = coded
+    drawn = _charts(run)
+    animation = animations(run.cases)
+    text = environment.get_template("page.html.j2").render(
+        title=wording.title(run),
+        run=run,
+        command_line=f"rootsopt {run.command} {run.source}",
+        version=rootsopt.__version__,
+        day=datetime.date.today().isoformat(),
+        status=blocks.status_cell(str(run.result.get("status", ""))),
+        asked=wording.asked(run),
+        came_out=wording.came_out(run),
+        what_next=wording.what_next(run),
+        conflict=optimum.conflict_block(run),
+        sections=_sections(run),
+        charts=drawn,
+        animation=animation,
+        data={"charts": [one["figure"] for one in drawn], "animation": animation},
+        figures=[
+            {
+                "caption": _CAPTIONS.get(name, in_words(name.removesuffix(".png")).capitalize()),
+                "data": base64.b64encode(data).decode(),
+            }
+            for name, data in run.figures.items()
+        ],
+        statuses=blocks.status_block(run),
+        effort=blocks.statistics_block(run),
+        style=markupsafe.Markup((_TEMPLATE / "page.css").read_text("utf-8")),
+        script=markupsafe.Markup((_TEMPLATE / "page.js").read_text("utf-8")),
+        plotly=markupsafe.Markup(offline.get_plotlyjs()) if drawn else "",
+    )
+    return text.encode("utf-8", "replace").decode("utf-8")
+
+
+def _sections(run: Run) -> list[tuple[str, str, list[Block]]]:
+    """Return (anchor, title, tables) of each section that has tables."""
+    front, likeness = blocks.front_block(run), blocks.likeness_block(run)
+    sections = [
+        ("front", "Best compromises", [front]),
+        ("motions", "Coexisting motions", [blocks.attractor_block(run)]),
+        ("numbers", "Numbers", [blocks.result_block(run), *blocks.gradient_blocks(run)]),
+        ("scenes", "Scenes", blocks.speeds_blocks(run)),
+        (
+            "certificate",
+            "Certificate of the optimum",
+            [optimum.constraint_block(run), *optimum.certificate_blocks(run)],
+        ),
+        ("tolerances", "Tolerances", optimum.tolerance_blocks(run)),
+        ("pump", "Pump sheet", [blocks.pump_block(run)]),
+        ("likeness", "Resemblance", [likeness]),
+    ]
+    kept = [(anchor, name, [one for one in tables if one]) for anchor, name, tables in sections]
+    return [section for section in kept if section[2]]
+
+
+def _charts(run: Run) -> list[dict[str, Any]]:
+    """Return the interactive charts of a run: title, explanation, and plotly's figure."""
+    found = []
+
+    def add(title: str, note: str, figure: dict[str, Any] | None) -> None:
+        if figure is not None:
+            found.append({"title": title, "note": note, "figure": figure})
+
+    for title, figure in charts.front_charts(run):
+        add(title, "Hover over a point to see its design.", figure)
+    add(
+        "Contact force over time",
+        "Hover for values, drag to zoom, double-click to zoom out. A click moves the rotors below "
+        "to that time.",
+        charts.force_chart(run.cases),
+    )
+    add(
+        "Spectrum of the contact force",
+        "The mean is left out. A click on a name hides or shows its lines.",
+        charts.spectrum_chart(run.cases),
+    )
+    chart = charts.scenes_chart(blocks.scene_rows(run))
+    add("Contact force in each scene", "A cross: no steady state.", chart)
+    return found
+
+
+__all__ = ["report_text"]

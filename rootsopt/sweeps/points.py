@@ -1,0 +1,125 @@
+"""One point of a sweep: its config, its evaluation, and the record that is kept of it."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rootsopt.config import Config
+from rootsopt.config.families import families, family_of, find_installed, parameters
+from rootsopt.config.section import bare
+from rootsopt.config.words import sentence
+from rootsopt.errors import InputError
+from rootsopt.response.choice import resolve
+from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.evaluators import evaluator_for
+from rootsopt.response.together import evaluate_together
+from rootsopt.response.wrapper import Evaluates
+from rootsopt.scene import check_geometry
+from rootsopt.status import Status
+
+Row = dict[str, Any]
+"""Record of one point, as plain values: `status` (label), `message`, `response`, `gradient`,
+`steady_state`, `geometry`. Dictionaries are empty where nothing is known."""
+_FAMILY, _OUTLINE = "profile.family", "profile.outline_file"
+
+
+def prepared(key: str, value: Any) -> Any:
+    """Return a value of an axis as a config needs it.
+
+    The path of an outline file becomes absolute: workers may run in another folder. A family that
+    an installed package offers is loaded."""
+    if not isinstance(value, str):
+        return value
+    if key == _OUTLINE:
+        return str(Path(value).absolute())
+    if key == _FAMILY and bare(value) not in map(bare, families()):
+        find_installed(value)
+    return value
+
+
+def configured(config: Config, values: Mapping[str, Any]) -> Config:
+    """Return the `config` of a point, with `values` by dotted key.
+
+    If the values change the family, parameters of other families are left out, both those of the
+    config and those among the values. Raises `InputError` if the values do not fit each other."""
+    given = dict(values)
+    name = given.get(_FAMILY)
+    word = {bare(known): known for known in families()}.get(bare(str(name)), "")
+    if word:
+        family = family_of(word)
+        foreign = [key for key in parameters() if key not in family.keys]
+        if family.maker is not None:
+            foreign += ["outline_file", "outline_smoothing_mm", "outline_center", "outline_unit"]
+        given |= {f"profile.{key}": None for key in foreign}
+    return config.replaced(given)
+
+
+def simulated(config: Config, values: Mapping[str, Any]) -> Row:
+    """Return the record of the point with these `values`, whatever happens there.
+
+    A config that is not valid, and an error of the program, are statuses."""
+    try:
+        return row_of(_evaluator(config, values)(series=False))
+    except Exception as error:
+        return _lost_by(error)
+
+
+def _evaluator(config: Config, values: Mapping[str, Any]) -> Evaluates:
+    """Return the evaluator of a point. Raises `InputError` if its config is not valid."""
+    one = configured(config, values)
+    check_geometry(one)
+    return evaluator_for(resolve(one)[0])
+
+
+def _lost_by(error: Exception) -> Row:
+    """Return the record of a point that ended with an error."""
+    if isinstance(error, InputError):
+        return lost(Status.INVALID, str(error))
+    return lost(Status.FAILED, f"{type(error).__name__}: {error}")
+
+
+def simulated_together(config: Config, points: Sequence[Mapping[str, Any]]) -> list[Row]:
+    """Return the records of several points, each given as values by dotted key.
+
+    Points of the same structure are simulated as one batch."""
+    rows: dict[int, Row] = {}
+    batch: dict[int, Evaluator] = {}
+    for number, values in enumerate(points):
+        try:
+            evaluator = _evaluator(config, values)
+        except Exception as error:
+            rows[number] = _lost_by(error)
+            continue
+        if isinstance(evaluator, Evaluator):
+            batch[number] = evaluator
+    try:
+        found = evaluate_together([*batch.values()])
+        rows |= {n: row_of(one) for n, one in zip(batch, found, strict=True)}
+    except Exception:
+        batch.clear()  # For example too little memory: one by one then.
+    return [
+        rows[number] if number in rows else simulated(config, values)
+        for number, values in enumerate(points)
+    ]
+
+
+def row_of(evaluation: Evaluation) -> Row:
+    """Return the record of an evaluation, without its series and statistics."""
+    return {
+        "status": evaluation.status.label,
+        "message": evaluation.message,
+        "response": evaluation.response,
+        "gradient": evaluation.gradient,
+        "steady_state": evaluation.steady_state,
+        "geometry": evaluation.geometry,
+    }
+
+
+def lost(status: Status, why: str = "") -> Row:
+    """Return the record of a point without an evaluation; `why`: what happened there."""
+    message = f"{status.value} {sentence(why)}" if why else status.value
+    none: Row = {name: {} for name in ("response", "gradient", "steady_state", "geometry")}
+    return {"status": status.label, "message": message, **none}
+
+
+__all__ = ["Row", "configured", "lost", "prepared", "row_of", "simulated", "simulated_together"]

@@ -1,0 +1,70 @@
+"""`rootsopt --completion`: the script names every command, option and key, and bash runs it."""
+
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from rootsopt.commands import completion
+from rootsopt.commands.console import COMMANDS, main
+
+pytest.importorskip("shtab")
+
+
+@pytest.fixture(scope="module")
+def bash():
+    return completion.script("bash", COMMANDS)
+
+
+def completed(script, words):
+    """Return what bash offers for the last of `words`."""
+    shell = shutil.which("bash")
+    if shell is None:
+        pytest.skip("bash is not installed")
+    given = " ".join(f"'{word}'" for word in words)
+    code = f"COMP_WORDS=({given}); COMP_CWORD={len(words) - 1}; _rootsopt 2>/dev/null; "
+    code += 'printf "%s\\n" "${COMPREPLY[@]}"'
+    run = [shell, "--norc", "-c", f"{script}\n{code}"]
+    done = subprocess.run(run, capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
+def test_commands_options_and_keys_are_completed(bash):
+    assert completed(bash, ["rootsopt", "si"]) == ["simulate"]
+    assert completed(bash, ["rootsopt", "optimize", "--res"]) == ["--resume"]
+    assert completed(bash, ["rootsopt", "simulate", "--set", "scene.timing_gear.b"]) == [
+        "scene.timing_gear.backlash_mm="
+    ]
+    assert completed(bash, ["rootsopt", "simulate", "ci"])[0] == "cic"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_of_the_help_is_in_the_script(command, bash):
+    """The script has a command's own options, not only those that all commands share."""
+    run = [sys.executable, "-m", f"rootsopt.{command}", "--help"]
+    done = subprocess.run(run, capture_output=True, text=True, check=True)
+    wanted = set(re.findall(r"^  (?:-\w[^,]*, )?(--[\w-]+)", done.stdout, re.M)) - {"--help"}
+    assert {"--set", "--report"} <= wanted
+    (line,) = re.findall(rf"^_shtab_rootsopt_{command}_option_strings=\((.*?)\)$", bash, re.M)
+    assert wanted <= {word.strip("'") for word in line.split()}
+
+
+def test_zsh_has_a_script():
+    text = completion.script("zsh", COMMANDS)
+    assert text.startswith("#compdef rootsopt")
+    assert "scene.timing_gear.backlash_mm=" in text
+
+
+def test_unknown_shell_and_missing_library(monkeypatch, capsys):
+    assert main(["--completion", "tcsh"]) == 2
+    assert "bash or zsh" in capsys.readouterr().err
+    monkeypatch.setattr(completion.importlib.util, "find_spec", lambda name: None)
+    assert main(["--completion", "bash"]) == 2
+    assert "rootsopt[completion]" in capsys.readouterr().err
+
+
+def test_help_mentions_it(capsys):
+    assert main(["--help"]) == 0
+    assert "--completion bash" in capsys.readouterr().out

@@ -1,0 +1,146 @@
+"""`rootsopt sweep --over`: files, exit codes, and going on after a kill."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+
+from rootsopt.commands.sweep import main
+from rootsopt.sweeps import points
+
+ROOT = Path(__file__).parents[2]
+WORKERS = ROOT / "tests" / "sweeps" / "workers.py"
+SPEEDS, FAMILIES = "--over=scene.speed_rpm=1000:2000:2", "--over=profile.family=cic,arc"
+
+
+@pytest.fixture(scope="module")
+def run_once(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sweep") / "run"
+    code = main(["cic", SPEEDS, FAMILIES, "-o", str(folder)])
+    return code, folder
+
+
+def test_files_of_a_sweep(run_once):
+    code, folder = run_once
+    assert code == 0
+    result = json.loads((folder / "result.json").read_text())
+    assert result["statuses"] == {"periodic": 2, "invalid": 2}
+    assert result["status"] == "periodic"
+    assert result["sweep"]["dimensions"]["profile.family"] == {"profile.family": ["cic", "arc"]}
+    assert result["message"].startswith("2 of 4 points")
+    assert {"sweep.nc", "sweep.csv", "figures/sweep.png"} < {*result["run"]["files"]}
+    found = xarray.load_dataset(folder / "sweep.nc", engine="h5netcdf")
+    assert found.mean_force_N.dims == ("scene.speed_rpm", "profile.family")
+    assert found.status.values.tolist() == [["periodic", "invalid"]] * 2
+    assert found.attrs["Conventions"] == "CF-1.11"
+    with open(folder / "sweep.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] for row in rows] == found.status.values.ravel().tolist()
+    assert float(rows[2]["mean_force_N"]) == pytest.approx(float(found.mean_force_N[1, 0]))
+    assert not (folder.parent / ".run.checkpoint").exists()
+
+
+def broken(config):
+    raise points.InputError(f"at {config.scene.speed_rpm:g}")
+
+
+@pytest.mark.parametrize("name", ["sweep.nc", "sweep.zarr"])
+def test_formats_hold_the_same(name, tmp_path, monkeypatch):
+    """Texts, nulls, samples and their seed are read back; nothing usable gives exit code 3."""
+    monkeypatch.setattr(points, "check_geometry", broken)
+    axes = "--over=rotor.bore_mm=null,10", "--over=scene.speed_rpm=100:6000"
+    options = ["--sobol=4", "--seed=5", f"--data={name}", "--no-figures"]
+    assert main(["cic", *axes, *options, "-o", str(tmp_path / "run")]) == 3
+    engine = "h5netcdf" if name.endswith(".nc") else "zarr"
+    with xarray.open_dataset(tmp_path / "run" / name, engine=engine) as found:
+        assert sorted(found["rotor.bore_mm"].values.tolist()) == ["10", "10", "null", "null"]
+        assert found.sizes["sample"] == 4
+        assert (found.attrs["method"], found.attrs["seed"]) == ("sobol", 5)
+        assert np.isnan(found.mean_force_N.values).all()
+        assert found.mean_force_N.attrs["units"] == "N"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--zip"], "add `--over"),
+        (["--workers=2"], "add `--over"),
+        (["--resume"], "add `--over"),
+        (["--over=scene.sped_rpm=1,2"], "did you mean `scene.speed_rpm`"),
+        ([SPEEDS, "--over=scene.speed_rpm=3"], "given twice"),
+        ([SPEEDS, "--seed=1"], "--sample N"),
+        ([SPEEDS, "--zip", "--zip-keys=a,b"], "remove one"),
+        ([SPEEDS, "--data=../x.nc"], "--data"),
+        ([SPEEDS, "--data=x.csv"], "sweep.zarr"),
+        ([SPEEDS, "--resume"], "there is no"),
+        ([SPEEDS, "--tolerances=4"], "remove one"),
+        (["--tolerances=4"], "section `tolerances`"),
+        ([SPEEDS, "--workers=0"], "from 1"),
+    ],
+)
+def test_refused_in_one_sentence(options, words, tmp_path, capsys):
+    assert main(["cic", *options, "-o", str(tmp_path / "run")]) == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert told.count("\n") == 1
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("package", "data", "advice"),
+    [("h5netcdf", "a.nc", "pip install 'rootsopt'"), ("zarr", "a.zarr", "'rootsopt[zarr]'")],
+)
+def test_missing_package_is_named(package, data, advice, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    assert main(["cic", SPEEDS, f"--data={data}", "-o", str(tmp_path / "run")]) == 2
+    told = capsys.readouterr().err
+    assert package in told
+    assert advice in told
+
+
+def arguments(folder):
+    """Of a sweep of 30 points, which need no simulation if `TEST_SECONDS` is set."""
+    speeds = "--over=scene.speed_rpm=100:3000:30"
+    return ["cic", speeds, f"--import={WORKERS}", "--no-figures", "-o", str(folder)]
+
+
+def started(folder):
+    """The sweep in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "rootsopt.sweep", *arguments(folder)],
+        cwd=ROOT,
+        env=os.environ | {"TEST_SECONDS": "0.1", "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.DEVNULL,
+    )
+
+
+def test_killed_sweep_goes_on(tmp_path, capsys, monkeypatch):
+    """After kill -9, `--resume` ends with all points; another config is refused."""
+    folder, kept = tmp_path / "run", tmp_path / ".run.checkpoint"
+    process = started(folder)
+    while not (kept.exists() and kept.read_bytes().count(b"\n") > 4):
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    before = kept.read_bytes()
+    assert 4 < before.count(b"\n") < 31
+    assert main([*arguments(folder), "--resume", "--set=scene.load.torque_N_m=9"]) == 2
+    assert "load: torque_N_m (then 4.775, now 9" in capsys.readouterr().err
+    assert kept.read_bytes() == before
+    monkeypatch.setattr(points, "check_geometry", broken)
+    assert main([*arguments(folder), "--resume"]) == 3
+    result = json.loads((folder / "result.json").read_text())
+    assert result["statuses"] == {"invalid": 30}
+    assert result["statistics"]["resumed_points"] == len(before.splitlines(True)) - 1
+    messages = xarray.load_dataset(folder / "sweep.nc").message.values
+    assert [text.split()[-1] for text in messages] == [str(100 * k) for k in range(1, 31)]
+    assert not kept.exists()

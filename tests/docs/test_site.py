@@ -1,0 +1,86 @@
+"""The site builds without a warning, reads without a network, and its reference is complete."""
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+import rootsopt
+from rootsopt.commands.console import COMMANDS
+from rootsopt.config import Config
+from rootsopt.config.explain import describe, keys_of
+from rootsopt.status import Status
+from tests.docs.blocks import DOCS, ROOT
+
+REFERENCE = DOCS / "reference"
+
+
+def test_reference_names_every_section_command_and_public_name():
+    sections = re.findall(r"\{config-keys\} (\w+)", (REFERENCE / "config.md").read_text())
+    assert sections == list(Config.model_fields)
+    commands = re.findall(r"\{command-options\} (\w+)", (REFERENCE / "commands.md").read_text())
+    assert commands == list(COMMANDS)
+    text = (REFERENCE / "python.md").read_text()
+    names = re.findall(r"^\.\. auto\w+:: (?:\w+\.)*(\w+)$", text, re.M)
+    assert sorted(names) == sorted({*rootsopt.__all__} - {"__version__"})
+
+
+def test_help_and_reference_have_one_source():
+    lines = describe(Config).splitlines()
+    keys = keys_of(Config)
+    assert len(lines) == len(keys) > 100
+    for line, key in zip(lines, keys, strict=True):
+        assert line.split()[0] == key.name
+        for text in (key.meaning, key.unit, key.choices, key.range, key.default):
+            assert text in line
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """Folder of the site, built strictly, without running the notebooks."""
+    pytest.importorskip("sphinx")
+    pytest.importorskip("myst_nb")
+    folder = tmp_path_factory.mktemp("site")
+    build = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html"]
+    build += ["-D", "nb_execution_mode=off", "-d", str(folder / "trees")]
+    done = subprocess.run(
+        [*build, str(DOCS), str(folder / "html")],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=900,
+    )
+    assert done.returncode == 0, done.stderr
+    return folder / "html"
+
+
+def test_site_reads_without_a_network(site):
+    """Scripts, styles, pictures and formulas are files of the site, or part of the page."""
+    for page in site.rglob("*.html"):
+        text = page.read_text()
+        loaded = re.findall(r"<(?:script|img|iframe)\b[^>]*?\bsrc=\"([^\"]+)\"", text)
+        loaded += re.findall(r"<link\b[^>]*?\brel=\"stylesheet\"[^>]*?\bhref=\"([^\"]+)\"", text)
+        for file in loaded:
+            assert not re.match(r"(https?:)?//", file), f"{page.name} loads {file}"
+    theory = (site / "theory.html").read_text()
+    assert theory.count("<math ") >= 10
+    assert r"\frac" not in theory
+
+
+def test_reference_holds_what_help_prints(site):
+    config = (site / "reference" / "config.html").read_text()
+    for key in keys_of(Config):
+        assert f'id="key-{key.name.replace(".", "-")}"' in config, key.name
+    page = (site / "reference" / "commands.html").read_text()
+    commands = " ".join(re.sub(r"</?span[^>]*>", "", page).split())
+    for option in ("--set KEY=VALUE", "--over", "--resume", "--export LIST"):
+        assert option in commands
+    for status in Status:
+        assert f">{status.label}<" in commands, status
+    names = (site / "reference" / "python.html").read_text()
+    for name in {*rootsopt.__all__} - {"__version__", "COMPILER_OPTIONS"}:
+        assert f'id="rootsopt.{name}"' in names, name

@@ -1,0 +1,172 @@
+"""Twisted rotors: against sections averaged by another rule, virtual work, and differences."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rootsopt
+from rootsopt import InputError, Scene, Status
+from rootsopt.contact.search import SearchContact
+from rootsopt.contact.twisted import TwistedContact, slices_of
+from rootsopt.dynamics.parts import TwistedLoad
+from rootsopt.dynamics.steady import steady_motion
+from rootsopt.runtime.programs import Program
+from rootsopt.scene.build import along
+from rootsopt.scene.slicing import MOST, sliced_mean, slices_needed
+
+TIGHT = "solver.rtol=1e-11", "solver.transient_rtol=1e-8"
+PHI, DEPTHS = np.linspace(0, 2 * np.pi / 3, 1200, endpoint=False), (2e-4, -3e-4)
+
+
+def scene_of(name: str, *changes: str) -> tuple[Scene, np.ndarray]:
+    config = rootsopt.load_config(name, changes)
+    return Scene.from_config(config), config.design
+
+
+@eqx.filter_jit
+def forces(pair, phi, relative):
+    rate = jnp.asarray(0.3)
+    return jax.lax.map(lambda x: pair.contact_force(x, relative, rate), phi)
+
+
+@pytest.fixture(scope="module")
+def straight():
+    """Contact of straight EE rotors over a mesh period, for a drive and a coast contact."""
+    scene, design = scene_of("ee")
+    pair = scene.pair(jnp.asarray(design))
+    return pair, [forces(pair, PHI, jnp.asarray(-depth)) for depth in DEPTHS]
+
+
+def twisted(pair, twist, count):
+    return dataclasses.replace(
+        pair, contact=TwistedContact(pair.contact, jnp.asarray(twist), count)
+    )
+
+
+def test_slices_are_means_over_sections(straight):
+    """Gauss points against equally many degrees of a midpoint rule; error falls as n grows."""
+    pair, sections = straight
+    twist, at = np.radians(25.0), slice(None, None, 60)
+    offsets = twist * ((np.arange(600) + 0.5) / 600 - 0.5)
+    for depth, section in zip(DEPTHS, sections, strict=True):
+        errors = []
+        for count in (2, 4, 8):
+            found = forces(twisted(pair, twist, count), PHI[at], jnp.asarray(-depth))
+            gaps = []
+            for name in ("drive", "coast", "torque1", "torque2", "lever1"):
+                expected = sliced_mean(np.asarray(getattr(section, name)), offsets, 3)[at]
+                away = np.abs(np.asarray(getattr(found, name)) - expected)
+                gaps.append(np.max(away) / max(np.max(np.abs(expected)), 1e-9))
+            errors.append(gaps)
+        worst = np.max(np.asarray(errors)[:, :4], axis=1)
+        assert worst[1] < worst[0] / 4
+        assert worst[2] < worst[1] / 4
+        assert worst[2] < 2e-3
+    # Depth is that of the deepest slice.
+    deepest = forces(twisted(pair, twist, 8), PHI[:1], jnp.asarray(-DEPTHS[0])).depth
+    places = np.asarray(slices_of(jnp.asarray(twist), 8).offsets)
+    each = np.interp(places, PHI - PHI[600], np.roll(np.asarray(sections[0].depth), 600))
+    np.testing.assert_allclose(deepest, np.max(each), rtol=1e-4)
+
+
+def test_no_twist_is_straight(straight):
+    """To rounding; and a config without twist has no slices at all."""
+    pair, sections = straight
+    at = slice(None, None, 100)
+    for depth, section in zip(DEPTHS, sections, strict=True):
+        found = forces(twisted(pair, 0.0, 3), PHI[at], jnp.asarray(-depth))
+        for name in ("drive", "coast", "torque1", "torque2", "depth", "closing", "lever1"):
+            one = np.asarray(getattr(section, name))[at]
+            # The rounding of a gap of flanks 33 mm away, in penetrations of some micrometres.
+            np.testing.assert_allclose(getattr(found, name), one, rtol=1e-10, atol=1e-10)
+    assert isinstance(pair.contact, SearchContact)
+    assert pair.contact.slices is None
+    with_gas = scene_of("ee", "scene.load={pressure_difference_Pa: 5e4}", "rotor.helix_deg=0")
+    assert not isinstance(with_gas[0].pair(jnp.asarray(with_gas[1])).load, TwistedLoad)
+
+
+def test_contact_comes_from_a_potential(straight):
+    """Without damping, the torques do the work that the slices' springs store."""
+    pair, _ = straight
+    pair = twisted(eqx.tree_at(lambda p: p.law.damping, pair, jnp.zeros(())), 0.6, 4)
+
+    # Around a closed path in (φ1, ε), with both sides in contact.
+    turn = 2 * np.pi * (np.arange(4000) + 0.5) / 4000
+    path = jnp.stack([0.4 + 0.3 * np.cos(turn), -3e-4 + 4e-4 * np.sin(turn)], axis=1)
+    moves = 2 * np.pi / 4000 * np.stack([-0.3 * np.sin(turn), 4e-4 * np.cos(turn)], axis=1)
+
+    @jax.jit
+    def around(path, moves):
+        def power(both):
+            pose, move = both
+            found = pair.contact_force(pose[0], pose[1], jnp.zeros(()))
+            return found.torque1 * move[0] + found.torque2 * (move[0] + move[1])
+
+        return jax.lax.map(power, (path, moves))
+
+    done = np.asarray(around(path, jnp.asarray(moves)))
+    assert abs(np.sum(done)) < 1e-4 * np.sum(np.abs(done))
+
+
+def test_gas_torque_is_the_mean_over_sections():
+    changes = ("scene.load={pressure_difference_Pa: 5e4}",)
+    straight, design = scene_of("ee", *changes)
+    turned, _ = scene_of("ee", *changes, "rotor.helix_deg=50", "solver.slices=12")
+    one, other = (s.pair(jnp.asarray(design)).load for s in (straight, turned))
+    angles = PHI[::4]
+    section = np.asarray(jax.vmap(one.torque2)(angles))
+    offsets = np.radians(50) * ((np.arange(500) + 0.5) / 500 - 0.5)
+    expected = sliced_mean(section, offsets, 3)
+    np.testing.assert_allclose(jax.vmap(other.torque2)(angles), expected, rtol=2e-3)
+    assert float(other.torque) == pytest.approx(np.mean(section), rel=1e-4)
+
+
+def test_number_of_slices_follows_the_error():
+    scene, design = scene_of("ee")
+    profile = scene.profile(jnp.asarray(design))
+    fixed = profile, scene.law, scene.clearance, jnp.asarray(scene.static_depth)
+    counts = [slices_needed(*fixed, np.radians(60), error) for error in (0.1, 1e-2, 1e-3)]
+    assert counts == sorted(counts)
+    assert 2 <= counts[0] < counts[2] < MOST
+    assert slices_needed(*fixed, np.radians(10), 1e-2) <= counts[1]
+    assert scene_of("ee", "rotor.helix_deg=60")[0].slices == counts[1]
+    assert scene_of("ee", "rotor.helix_deg=60", "solver.slices=5")[0].slices == 5
+
+
+@pytest.mark.parametrize("fidelity", ["linear", "nodes", "map"])
+def test_other_contacts_are_refused_by_name(fidelity):
+    with pytest.raises(InputError, match=r"must be search \(or auto\) with `rotor.helix_deg`"):
+        scene_of("ee", "rotor.helix_deg=60", f"solver.fidelity={fidelity}")
+    scene, design = scene_of("ee", "rotor.helix_deg=60", "solver.slices=2")
+    other = dataclasses.replace(scene, fidelity=fidelity)
+    with pytest.raises(InputError, match=f"must be search for twisted .* but is {fidelity}"):
+        other.pair(jnp.asarray(design))
+
+
+@pytest.mark.long
+def test_gradients_against_differences():
+    """EE at 25°: the contact jumps between two minima, one slice after the other."""
+    scene, design = scene_of("ee", *TIGHT, "rotor.helix_deg=25", "solver.slices=3")
+    motion, start = Program(steady_motion), np.zeros(2)
+
+    def found(helix):
+        def build(helix):
+            return dataclasses.replace(scene, helix=helix).pair_and_shape(jnp.asarray(design))
+
+        pair, tangents, _ = along(build, jnp.asarray(helix), jnp.ones(1))
+        made = motion(pair, tangents, start, scene.pitch_radius, scene.solver)
+        assert Status.of(made.status) is Status.PERIODIC
+        return np.asarray(made.orbit.response), np.asarray(made.orbit.sensitivity)[:, 0]
+
+    def difference(step):
+        ahead, behind = (found(float(scene.helix) + sign * step)[0] for sign in (1, -1))
+        return (ahead - behind) / (2 * step)
+
+    # The error of a difference falls with the square of the step: combine two. Such combinations
+    # of other steps differ from this one by up to 4e-5.
+    expected = (4 * difference(5e-4) - difference(1e-3)) / 3
+    np.testing.assert_allclose(found(float(scene.helix))[1], expected, rtol=5e-5)

@@ -1,0 +1,195 @@
+"""Limits of any quantity: as constraints of the design space, and as walls of the search."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rootsopt.config import parse
+from rootsopt.dynamics.maxima import Maxima
+from rootsopt.errors import InputError
+from rootsopt.optimize.infeasible import explain
+from rootsopt.optimize.limits import TermConstraint, force_limits, limited, term_constraints
+from rootsopt.optimize.local import Local
+from rootsopt.optimize.problem import Problem
+from rootsopt.optimize.search import Search
+from rootsopt.profiles import geometry
+from rootsopt.pump import flow
+from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation
+from rootsopt.response.terms import Term, _terms, register_term
+from rootsopt.scene import Scene
+from rootsopt.status import Status
+from tests.optimize.test_optimize import SCENE, baseline
+
+PEAK = "constraints.terms.peak_force_N.max="
+
+
+def config(*overrides):
+    return parse(SCENE, overrides)
+
+
+def problem_of(*overrides):
+    settings = limited(config(*overrides))
+    return Problem.of(settings, Scene.from_config(settings), baseline(settings))
+
+
+def evaluation(mean=50.0, peak=200.0, maxima=None):
+    """An evaluation with made-up forces and slopes, by which the limits are judged."""
+    slope = {"pressure_angle_deg": 1.0, "involute_length_mm": 2.0, "tip_arc_angle_deg": -1.0}
+    return dataclasses.replace(
+        baseline(config()),
+        response={"mean_force_N": mean, "peak_force_N": peak, "rms_force_N": 80.0},
+        gradient=dict.fromkeys(("mean_force_N", "peak_force_N", "rms_force_N"), slope),
+        steady_state={"period": 2},
+        maxima=maxima,
+    )
+
+
+class _Width(Term):
+    """Ten times the outer radius (mm), as a term from outside."""
+
+    def value(self, scene, profile, shape, forces):
+        del scene, profile, forces
+        return 1e4 * shape.outer_radius
+
+
+class _Ratio(Term):
+    """Peak force over mean force, as a term from outside."""
+
+    def value(self, scene, profile, shape, forces):
+        del scene, profile, shape
+        return forces.peak / forces.mean
+
+
+@pytest.fixture
+def registered():
+    """Two terms from outside, for the duration of a test."""
+    register_term("width", _Width())
+    register_term("ratio", _Ratio())
+    yield
+    del _terms["width"], _terms["ratio"]
+
+
+def test_terms_without_forces_are_constraints_of_the_geometry(registered):
+    """Their slacks are those of the formulas, and projection moves designs onto them."""
+    problem = problem_of(
+        "constraints.terms.displaced_volume_cm3.min=400", "constraints.terms.width.max=452",
+        "constraints.terms.ratio.max=3",
+    )  # fmt: skip
+    assert [one.key for one in problem.limits] == ["ratio"]
+    terms = [c for c in problem.space.constraints if isinstance(c, TermConstraint)]
+    assert [(c.name, c.unit, c.ceiling) for c in terms] == [
+        ("displaced volume", "cm³", False), ("width", "", True)]  # fmt: skip
+    point = np.array([0.3, 0.6, 0.4])
+    scene = problem.space.scene
+    shape = geometry(scene.profile(problem.design(point)))
+    volume = 1e6 * float(flow.displaced_volume(shape, scene.length))
+    expected = [(volume - 400) / 400, (452 - 1e4 * float(shape.outer_radius)) / 452]
+    np.testing.assert_allclose(problem.look(point)[2][-2:], expected, rtol=1e-9)
+    outside = np.array([0.1, 0.9, 0.2])
+    assert not problem.feasible(outside)
+    moved = problem.project(outside)
+    assert problem.feasible(moved)
+
+
+def test_forces_are_limited_at_every_speed_that_counts():
+    """One branch per speed and local maximum, with scaled slopes; the worst one is the excess."""
+    problem = problem_of(PEAK + "180", "constraints.terms.mean_force_N.min=40")
+    settings = problem.config
+    peaks = Maxima(np.array([0.5, 1.5]), np.array([190.0, 200.0]), np.ones((2, 3)))
+    slow, fast, unused = evaluation(60.0, 200.0, peaks), evaluation(30.0, 150.0), evaluation(1.0)
+    parts = AtSpeed(2000.0, 0.5, slow), AtSpeed(3000.0, 0.5, fast), AtSpeed(4000.0, 0.0, unused)
+    fields = {f.name: getattr(slow, f.name) for f in dataclasses.fields(slow)}
+    whole = SpeedsEvaluation(**fields, parts=parts)
+    jacobian = np.diag([1.0, 2.0, 3.0])
+    high, low = problem.walls(whole, jacobian)
+    np.testing.assert_allclose(high.values, np.array([10, 20, -30]) / 180)
+    np.testing.assert_allclose(high.tags, [[0, 0.25], [0, 0.75], [1, 0]])
+    np.testing.assert_allclose(high.slopes[0], np.array([1.0, 2.0, 3.0]) / 180)
+    np.testing.assert_allclose(low.values, np.array([-20, 10]) / 40)
+    np.testing.assert_allclose(low.slopes[1], -np.array([1.0, 4.0, -3.0]) / 40)
+    assert problem.excess(whole) == pytest.approx(0.25)
+    ceiling, floor = force_limits(settings, problem.space.scene)
+    assert (problem.worst(whole, ceiling), problem.worst(whole, floor)) == (200.0, 30.0)
+    assert not problem.keeps_limits(whole)
+    assert problem.keeps_limits(evaluation(45.0, 170.0))
+    assert problem_of().excess(whole) == 0.0
+
+
+def test_absent_limits_add_nothing():
+    settings = config()
+    assert limited(settings) is settings
+    scene = Scene.from_config(settings)
+    assert term_constraints(settings, scene) == force_limits(settings, scene) == ()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["constraints.terms.peak_force.max=1"], r"constraints\.terms.*peak_force"),
+        (["constraints.terms.mean_force_N={}"], "min.*max"),
+        (["constraints.terms.mean_force_N={min: 3, max: 2}"], "greater than"),
+        (["constraints.terms.line_02_force_N.max=1"], "line_ORDER"),
+        ([PEAK + "1", "optimizer.method=adam"], r"optimizer\.method"),
+        ([PEAK + "1", "objective.motion=ensemble"], "ensemble"),
+        (["constraints.terms.mean_force_N.most=3"], "most"),
+        (["constraints.terms.mean_force_N.max=.nan"], "constraints"),
+    ],
+)
+def test_refused_limits(overrides, words):
+    with pytest.raises(InputError, match=words):
+        problem_of(*overrides)
+
+
+def test_limits_of_forces_in_conflict_are_explained():
+    """A mean force 200 - 100 x that must be at most 130 N, and a peak 100 + 100 x of at most 150 N.
+    By hand, the least violation lies where both are exceeded by the same share."""
+    problem = problem_of(PEAK + "150", "constraints.terms.mean_force_N.max=130")
+
+    def look(point):
+        share = point[0]
+        found = evaluation(100 * (2 - share), 100 * (1 + share))
+        walls = []
+        for limit, row in zip(problem.limits, (100.0, -100.0), strict=True):
+            slope = np.array([[row, 0.0, 0.0]]) / limit.scale
+            (wall,) = [w for w, one in zip(problem.walls(found, np.eye(3)), problem.limits,
+                                           strict=True) if one is limit]  # fmt: skip
+            walls.append(wall._replace(slopes=slope))
+        return Local(0.0, np.zeros(3), (), *problem.look(point)[2:], tuple(walls))
+
+    start = problem.project(np.full(3, 0.5))
+    found = explain(problem, [start], look)
+    excess = found.violation
+    share = found.design["pressure_angle_deg"]
+    by_name = {one.name: one for one in found.conflicts}
+    assert by_name.keys() == {"peak force", "mean force"}
+    peak, mean = by_name["peak force"], by_name["mean force"]
+    assert peak.together == pytest.approx(150 * (1 + excess), rel=1e-6)
+    assert mean.together == pytest.approx(130 * (1 + excess), rel=1e-6)
+    # 130 (1 + v) + 150 (1 + v) = 300, whatever the share.
+    assert excess == pytest.approx(300 / 280 - 1, rel=1e-5)
+    assert (peak.alone, mean.alone) == pytest.approx((170, 150), rel=1e-5)
+    assert "peak force <= 150 N (possible with the others: 170 N)" in found.message
+    assert share > 0
+
+
+@pytest.mark.long
+def test_prices_of_limits_by_solving_again():
+    """The mean force under a ceiling of the peak: met, certified, and its multiplier is the slope
+    of the optimum between two limits (trapezoidal rule)."""
+    few = "optimizer.screening=4", "optimizer.starts=1", "objective.peak_weight=0"
+    free = Search(config(*few)).run()
+    top = free.optimized.response["peak_force_N"]
+
+    def at(ceiling):
+        found = Search(config(*few, f"{PEAK}{ceiling}")).run()
+        assert found.status is Status.PERIODIC
+        (row,) = [row for row in found.constraints if row["name"] == "peak force"]
+        assert row["optimized"] == pytest.approx(ceiling, rel=1e-5)
+        assert row["unit"] == "N"
+        return found.problem.objective(found.optimized), row["multiplier"]
+
+    (low, first), (high, second) = at(0.97 * top), at(0.972 * top)
+    assert free.problem.objective(free.optimized) < high < low
+    slope = (high - low) / (0.002 * top)
+    assert slope == pytest.approx((first + second) / 2, rel=0.02)

@@ -1,0 +1,82 @@
+"""Figures and terminal tables of sweeps: statuses are visible in every kind."""
+
+import pytest
+from rich.console import Console
+
+from rootsopt.config import load
+from rootsopt.figures import sweep as drawing
+from rootsopt.output.files import ResultFolder
+from rootsopt.output.sweeps import outcome, rows_of, shown, summary
+from rootsopt.status import Status
+from rootsopt.sweeps.plan import plan_of
+from rootsopt.sweeps.points import lost
+from rootsopt.sweeps.table import dataset_of
+
+SPEED, PLAY = "scene.speed_rpm", "scene.timing_gear.backlash_mm"
+CYCLE = (Status.PERIODIC, Status.PERIODIC, Status.CHAOTIC, Status.INVALID, Status.PASSED_THROUGH)
+
+
+def made(axes, **options):
+    """A sweep whose points have the statuses of `CYCLE` in turn."""
+    plan, rows = plan_of(axes, **options), {}
+    for number in range(plan.count):
+        status = CYCLE[number % len(CYCLE)]
+        known = status in (Status.PERIODIC, Status.CHAOTIC)
+        forces = {"mean_force_N": 10.0 + number, "peak_force_N": 30.0 + number}
+        rows[number] = lost(status) | {"response": forces if known else {}}
+    return plan, rows, dataset_of(load("cic"), plan, rows)
+
+
+@pytest.mark.parametrize(
+    ("axes", "options", "panels"),
+    [
+        ({SPEED: "300:6000:39"}, {}, 2),
+        ({SPEED: "1"}, {}, 2),
+        ({"profile.family": "cic,ee,arc,ellipse"}, {}, 2),
+        ({SPEED: "300:6000:12", PLAY: "0.1,0.2"}, {}, 2),
+        ({"profile.family": "cic,ee", SPEED: "300:6000:12"}, {}, 2),
+        ({SPEED: "300:6000:9", PLAY: "0.05:0.2:8"}, {}, 4),  # with colour bars
+        ({SPEED: "300:6000", PLAY: "0.05:0.2"}, {"sobol": 16}, 4),
+        ({SPEED: "1,2,3", PLAY: "1,2,3"}, {"zipped": True}, 4),
+    ],
+)
+def test_statuses_are_in_every_figure(axes, options, panels, tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr(ResultFolder, "write_figure", lambda _, name, figure: kept.append(figure))
+    plan, _, data = made(axes, **options)
+    names = drawing.sweep_figure(ResultFolder(tmp_path), plan, data)
+    assert names == ["figures/sweep.png"]
+    (figure,) = kept
+    assert len(figure.axes) == panels
+    found = {str(label).replace("_", " ") for label in data.status.values.ravel()}
+    entries = [text.get_text() for one in figure.legends for text in one.get_texts()]
+    for label in found - ({"periodic"} if panels == 4 else set()):
+        assert any(entry.startswith(label) for entry in entries)
+
+
+def test_no_figure_over_three_keys(tmp_path):
+    plan, _, data = made({SPEED: "1,2", PLAY: "1,2", "rotor.length_mm": "1,2"})
+    assert drawing.sweep_figure(ResultFolder(tmp_path), plan, data) == []
+    assert not any(tmp_path.rglob("*.png"))
+
+
+def test_rows_and_outcome():
+    plan, rows, data = made({SPEED: "1:5:5"})
+    table = rows_of(plan, rows)
+    assert [row[SPEED] for row in table] == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert [row["mean_force_N"] for row in table] == [10.0, 11.0, 12.0, None, None]
+    assert outcome(plan, rows)[0] is Status.PERIODIC
+    assert outcome(plan, {3: rows[3], 4: rows[4]})[0] is Status.INTERRUPTED
+    worst = {number: rows[3] for number in range(5)}
+    assert outcome(plan, worst)[0] is Status.INVALID
+    part = {0: rows[0]}
+    assert summary(plan, part)["statuses"] == {"periodic": 1, "not_simulated": 4}
+    console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(shown(plan, rows, data))
+    text = console.export_text()
+    for status in CYCLE:
+        assert status.label in text
+    low = next(line for line in text.splitlines() if "mean force" in line)
+    assert "10.000" in low
+    assert "11.000" in low
+    assert "12.000" not in low  # The chaotic point is not usable.

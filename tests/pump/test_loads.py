@@ -1,0 +1,235 @@
+"""Bearing loads against virtual work, statics, momentum and differences."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rootsopt
+from rootsopt import InputError, Scene
+from rootsopt.config.units import DEG
+from rootsopt.output.files import response_columns
+from rootsopt.profiles import geometry
+from rootsopt.pump import bearings as formulas
+from rootsopt.pump.loads import BearingSet, orbit_loads, static_loads
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.terms import Forces, needs_forces, terms_of
+from rootsopt.scene.bearings import GRAVITY
+from rootsopt.status import Status
+
+GAS, BEARINGS = "scene.load={pressure_difference_Pa: 5e4}", "scene.bearings={weight: true}"
+SUPPORTS = "scene.supports={stiffness_N_per_mm: 2e4, damping_N_s_per_mm: 5}"
+
+
+def scene_of(*changes: str) -> tuple[Scene, jnp.ndarray]:
+    config = rootsopt.load_config("cic", changes)
+    return Scene.from_config(config), jnp.asarray(config.design)
+
+
+@pytest.fixture(scope="module")
+def twisted():
+    """Twisted rotors in some poses: loads, and the flanks' forces in every slice."""
+    scene, design = scene_of(GAS, BEARINGS, "rotor.helix_deg=50", "solver.slices=4")
+    bearings = BearingSet.of(scene, design)
+    pair = bearings.pair
+
+    @jax.jit
+    def at(tau, state):
+        motion = pair.motion(tau, state)
+        return bearings.at(tau, state), pair.pushes(motion), pair.contact_at(tau, state), motion
+
+    poses = [(0.13, 0.4), (0.31, -0.9), (0.62, 1.1), (0.9, -0.6)]
+    found = [at(jnp.asarray(t), jnp.asarray([x, 0.3])) for t, x in poses]
+    return scene, bearings, found
+
+
+def test_push_acts_on_its_line(twisted):
+    """The moment of the force at its place is the torque, on either rotor."""
+    _, bearings, found = twisted
+    for _, pushes, contact, _ in found:
+        force, place = (np.asarray(x) @ [1, 1j] for x in (pushes.force, pushes.place))
+        axis = 2 * float(bearings.loads.radius)
+        on_1 = (np.conj(place) * -force).imag
+        # Rotor 2 turns clockwise.
+        on_2 = -(np.conj(place - axis) * force).imag
+        np.testing.assert_allclose(on_1, pushes.torque[..., 0], rtol=1e-9, atol=1e-12)
+        # To first order in the penetration: the force is one, its places on the rotors are two.
+        np.testing.assert_allclose(on_2, pushes.torque[..., 1], rtol=1e-2, atol=1e-9)
+        assert np.sum(np.abs(force)) == pytest.approx(float(contact.total), rel=1e-12)
+        assert np.sum(pushes.torque[..., 1]) == pytest.approx(float(contact.torque2), rel=1e-12)
+
+
+def test_axial_force_does_the_work_of_a_shift(twisted):
+    """A shift of rotor 1 along its axis turns each of its sections: the energy of the slices."""
+    scene, bearings, found = twisted
+    pair = dataclasses.replace(bearings.pair, contact=bearings.pair.contact.section)
+    slices, length = bearings.pair.contact.slices, float(bearings.length)
+
+    def depth(phi, other):
+        return pair.contact_force(phi, other - phi, jnp.zeros(())).depth
+
+    depth = jax.jit(jax.vmap(depth))
+    contact_only = eqx.tree_at(lambda s: s.loads.gas, bearings, None, is_leaf=lambda x: x is None)
+    for _, pushes, _, motion in found:
+        sections = np.asarray(motion.phi + slices.offsets)
+        others = sections + float(motion.relative)
+        step = 1e-6
+        turned = step * float(slices.twist) / length
+        slope = (depth(sections - turned, others) - depth(sections + turned, others)) / (2 * step)
+        size = np.linalg.norm(np.asarray(pushes.force)[:, 0], axis=-1)
+        axial = contact_only._from_flanks(pushes, jnp.zeros(4))[2]
+        assert float(axial[0]) == pytest.approx(-np.sum(size * np.asarray(slope)), rel=1e-6)
+        # What one rotor feels, the other feels in the opposite sense, but for the penetration.
+        assert float(axial[1]) == pytest.approx(-float(axial[0]), rel=2e-2)
+    assert scene.straight is False
+
+
+def test_bearings_balance_all_forces(twisted):
+    """Sum and moments of the bearing loads, from the forces one by one."""
+    scene, bearings, found = twisted
+    gas, loads = bearings.loads.gas, bearings.loads
+    length, slices = float(bearings.length), gas.slices
+    heights = length * np.asarray(slices.places)
+    mirror = np.stack([np.ones(2), [-1, 1]])
+    for out, pushes, _, motion in found:
+        pressed = np.asarray(gas.slice_forces(motion.phi))
+        torque = float(loads.gear(motion.relative, motion.rate))
+        teeth = complex(formulas.gear_force(jnp.asarray(-torque), loads.radius, loads.tooth_angle))
+        teeth = np.array([[-teeth.real, -teeth.imag], [teeth.real, teeth.imag]])
+        force = np.asarray(pushes.force).sum(1)
+        flank = np.stack([-force, force], axis=1)
+        weight = np.array([0, -float(loads.weight)])
+        total = (flank + pressed).sum(0) + teeth + weight
+        np.testing.assert_allclose(np.asarray(out.radial).sum(1), total, rtol=1e-9)
+        place = np.asarray(pushes.place)[:, 0]
+        places = np.stack([place, place - [2 * float(loads.radius), 0]], axis=1)
+        contact, tip = (np.asarray(x) * mirror for x in gas.chords(motion.phi))
+        rate = float(slices.twist) / length
+        axial = -rate * np.asarray(pushes.torque)[:, 0]
+        against = (np.sum(tip**2, -1) - np.sum(contact**2, -1)) / 2
+        across = rate * float(gas.pressure_length) * np.asarray(slices.weights)[:, None] * against
+        np.testing.assert_allclose(out.axial, (axial + across).sum(0), rtol=1e-9)
+        # Moments about the middle: r x F, with all three components of each force.
+        moment = np.zeros((2, 3))
+        for k, z in enumerate(heights):
+            for rotor in range(2):
+                for at, push, along in (
+                    (places[k, rotor], flank[k, rotor], axial[k, rotor]),
+                    ((contact + tip)[k, rotor] / 2, pressed[k, rotor], across[k, rotor]),
+                ):
+                    moment[rotor] += np.cross([*at, z], [*push, along])
+        np.testing.assert_allclose(out.tilting, moment[:, :2], rtol=1e-9, atol=1e-12)
+        for rotor in range(2):
+            moment[rotor] += np.cross([0, 0, float(bearings.gear)], [*teeth[rotor], 0])
+            ends = np.array([1, -1]) * float(bearings.bearing)
+            carried = sum(
+                np.cross([0, 0, z], [*x, 0])
+                for z, x in zip(ends, np.asarray(out.radial)[rotor], strict=True)
+            )
+            np.testing.assert_allclose(carried[:2], moment[rotor, :2], rtol=1e-9, atol=1e-12)
+    assert float(bearings.bearing) == pytest.approx(0.07)
+    assert float(bearings.gear) == pytest.approx(0.1)
+    area = float(geometry(scene.profile(jnp.asarray([36.43, 9.0, 4.0]))).area)
+    assert float(loads.weight) == pytest.approx(GRAVITY * 7800 * 0.1 * area)
+
+
+def test_pockets_of_twisted_rotors_open_at_once():
+    """At the leading end: all tips of a pocket jump back together, on either rotor."""
+    scene, design = scene_of(GAS, BEARINGS, "rotor.helix_deg=-50", "solver.slices=4")
+    gas = BearingSet.of(scene, design).loads.gas
+    phi = np.linspace(0, 2 * np.pi / 3, 2001)
+    tips = np.asarray(jax.jit(jax.vmap(lambda x: gas.chords(x)[1]))(phi)) @ [1, 1j]
+    back = np.angle(tips[1:] / tips[:-1]) < -1
+    assert np.array_equal(back.sum(0), np.ones((4, 2)))
+    assert np.array_equal(back, np.repeat(back[:, :1], 4, axis=1))
+    for rotor in range(2):
+        k = int(np.argmax(back[:, 0, rotor]))
+        ends = np.angle(tips[k, :, rotor]) - np.asarray(gas.slices.offsets)
+        # The end that leads by half the twist is at the lowest point.
+        np.testing.assert_allclose(ends + 25 * DEG, -np.pi / 2, atol=2e-3)
+        assert np.min(np.abs(np.mod(np.asarray(gas.corners()) - phi[k], 2 * np.pi / 3))) < 2e-3
+
+
+def test_static_loads():
+    """Gear and gas alone, from the formulas; more weight, more load."""
+    scene, design = scene_of(GAS, "scene.bearings={bearing_distance_mm: 0, kind: ball}")
+    bearings = BearingSet.of(scene, design)
+    phi = 2 * np.pi / 3 * (np.arange(720) + 0.5) / 720
+    gas = bearings.loads.gas
+    forces = np.asarray(jax.vmap(gas.slice_forces)(phi))[:, 0] @ [1, 1j]
+    torque = np.asarray(jax.vmap(bearings.pair.load.torque2)(phi))
+    teeth = np.asarray(formulas.gear_force(*map(jnp.asarray, (torque, 0.033, np.radians(20.0)))))
+    # Half of the gas, and the gear 50 mm beyond a bearing of two that are 100 mm apart.
+    each = [forces.T[0] / 2 - 1.5 * teeth, forces.T[0] / 2 + 0.5 * teeth]
+    each += [forces.T[1] / 2 + 1.5 * teeth, forces.T[1] / 2 - 0.5 * teeth]
+    equivalent, greatest = static_loads(scene, design)
+    np.testing.assert_allclose(greatest, np.max(np.abs(each), axis=1), rtol=1e-9)
+    expected = np.mean(np.abs(each) ** 3, axis=1) ** (1 / 3)
+    np.testing.assert_allclose(equivalent, expected, rtol=1e-9)
+
+
+def test_term_needs_bearings():
+    (term,), (scene, design) = terms_of(["bearing_load_equivalent_N"]), scene_of()
+    profile = scene.profile(design)
+    values = profile, geometry(profile), Forces(*map(jnp.asarray, (1.0, 2.0, 3.0)))
+    with pytest.raises(InputError, match=r"needs the section `scene.bearings`"):
+        term.value(scene, *values)
+    assert needs_forces(scene_of(BEARINGS)[0], term, design)
+    with pytest.raises(InputError, match=r"must be search .* with `scene.bearings`"):
+        rootsopt.load_config("cic", [BEARINGS, "solver.fidelity=map"])
+
+
+@pytest.mark.long
+def test_gradient_of_the_equivalent_load():
+    config = rootsopt.load_config("cic", [GAS, BEARINGS, "solver.rtol=1e-10"])
+    design, step = config.design, np.array([1e-3, 0, 0])
+    ahead, here, behind = (rootsopt.evaluate(config, design + k * step) for k in (1, 0, -1))
+    name = "bearing_load_equivalent_N"
+    slope = here.gradient[name]["pressure_angle_deg"]
+    assert slope == pytest.approx((ahead.response[name] - behind.response[name]) / 2e-3, rel=1e-5)
+    # The integral against the samples of the series.
+    columns = response_columns(here.series)
+    each = [x for key, x in columns.items() if key.startswith("bearing_")]
+    assert len(each) == 4
+    means = [np.mean(x ** (10 / 3)) ** 0.3 for x in each]
+    assert here.response[name] == pytest.approx(max(means), rel=1e-3)
+    assert here.response["bearing_load_max_N"] == np.max(each)
+
+
+@pytest.mark.long
+def test_work_and_momentum_of_elastic_bearings():
+    """Over a closed orbit no work is left, and the axes gain no momentum."""
+    scene, design = scene_of(GAS, BEARINGS, SUPPORTS)
+    evaluator = Evaluator(rootsopt.load_config("cic", [GAS, BEARINGS, SUPPORTS]), scene)
+    pair, tangents, _ = scene.pair_and_tangents(design)
+    found = evaluator.motion(pair, tangents, np.zeros(pair.states))
+    assert Status.of(found.status) is Status.PERIODIC
+    loads = orbit_loads(
+        scene, design, found.orbit, jnp.asarray(int(found.period)), scene.solver.orbit
+    )
+    states = found.orbit.flow.states
+    tau = int(found.period) * np.arange(len(states)) / len(states)
+
+    @jax.jit
+    def seen(tau, state):
+        motion, contact = pair.motion(tau, state), pair.contact_at(tau, state)
+        gear, gas = pair.gear(motion.relative, motion.rate), pair.load.torque2(motion.phi)
+        others = pair.parts[-1].force_on_axes(motion, np.zeros(0))
+        pushed = jnp.stack([-contact.push, contact.push]) + others
+        speed2 = motion.speed + motion.rate
+        return pushed, motion.drift, contact.torque2 * speed2, -gear * speed2, -gas * speed2
+
+    pushed, drift, *powers = map(np.asarray, jax.lax.map(lambda x: seen(*x), (tau, states)))
+    carried = np.asarray(loads.series.radial).sum(2)
+    # A sum over samples misplaces a jump, where a pocket opens, by up to a sample.
+    jump = np.max(np.abs(np.diff(pushed, axis=0))) / len(states)
+    assert jump < 2e-3 * np.mean(np.abs(pushed))
+    np.testing.assert_allclose(carried.mean(0), pushed.mean(0), rtol=0, atol=jump)
+    powers.append(np.sum((pushed - carried) * drift, axis=(1, 2)))
+    gross = np.mean(np.abs(powers), axis=1)
+    # Evenly spaced samples resolve short impacts, and jumps, to some 1e-4 of the greatest power.
+    assert abs(np.mean(np.sum(powers, axis=0))) < 3e-4 * np.max(gross)
+    assert gross[-1] > 1e-3 * np.max(gross)

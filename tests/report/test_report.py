@@ -1,0 +1,453 @@
+"""The report: its content, the escaping of text, and its behaviour in a browser."""
+
+import dataclasses
+import html as entities
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rootsopt import report
+from rootsopt.commands import pareto, profile
+from rootsopt.config import load
+from rootsopt.output.files import ResultFolder, response_columns
+from rootsopt.report import charts
+from rootsopt.report.gather import Run
+from rootsopt.report.html import report_text
+from rootsopt.report.names import label
+from rootsopt.response.evaluation import Series
+from rootsopt.status import Status
+
+pytest.importorskip("jinja2")
+pytest.importorskip("plotly")
+ROOT = Path(__file__).parents[2]
+CIC = str(ROOT / "configs" / "cic.yaml")
+HOSTILE = '</script><script>document.title = "taken"</script><b>&amp;'
+SAMPLES, PITCHES = 240, 3
+
+
+def motion():
+    """Return three mesh periods with a known force on the drive flank and none on the other.
+
+    The force is 50 + 30 cos(2 t) + 20 cos(5 t), with t from 0 to 2 π over one period."""
+    share = np.arange(SAMPLES) * PITCHES / SAMPLES
+    phase = 2 * np.pi * share
+    force = 50 + 30 * np.cos(2 * phase) + 20 * np.cos(5 * phase)
+    none = np.zeros(SAMPLES)
+    period = 60 / 3000 / 3
+    return Series(period * share, phase / 3, none - 1e-3, none, force, none, none)
+
+
+def run_of(place, result, series=None, source="cic", usable=True):
+    """Return a run whose files lie in `place`."""
+    folder = ResultFolder(place)
+    folder.write_text("config.yaml", load(CIC).to_yaml())
+    if series is not None:
+        folder.write_csv("response_design.csv", response_columns(series))
+    return Run.of(folder, result, source, usable)
+
+
+def result_of(command="simulate", **more):
+    design = dict(zip(load(CIC).design_keys, map(float, load(CIC).design), strict=True))
+    response = {"mean_force_N": 50.0, "peak_force_N": 100.0, "rms_force_N": 56.0}
+    steady = {"kind": "periodic", "period": 1, "floquet_multiplier": 0.1, "residual": 1e-12}
+    slopes = {"mean_force_N": dict.fromkeys(design, 1.5)}
+    slopes["peak_force_N"] = dict(zip(design, (-7.0, 2.0, 1.0), strict=True))
+    known = {"design": design, "geometry": {"outer_radius_mm": 45.1}, "response": response}
+    known |= {"gradient": slopes, "steady_state": steady, "statistics": {"seconds": 1.0}}
+    known |= {"status": "periodic", "message": Status.PERIODIC.value}
+    return known | {"versions": {"numpy": "2"}, "run": {"command": command}} | more
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """Return a run with a motion, whose command line and status name are hostile."""
+    place = tmp_path_factory.mktemp("run")
+    figures = place / "figures"
+    figures.mkdir()
+    (figures / "force.png").write_bytes(b"\x89PNG")
+    return run_of(place, result_of(message=HOSTILE), motion(), source=HOSTILE)
+
+
+@pytest.fixture(scope="module")
+def page(simulated):
+    return report_text(simulated)
+
+
+def words_of(page):
+    """Return the page's text, without scripts, styles and tags."""
+    bare = re.sub(r"<(script|style).*?</\1>|</?code>", "", page, flags=re.S)
+    return " ".join(entities.unescape(re.sub(r"<[^>]*>", " ", bare)).split())
+
+
+def data_of(page):
+    (found,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)
+    return json.loads(found)
+
+
+def test_page_opens_without_a_network(page):
+    """Nothing is loaded, and the page forbids its own scripts to load anything."""
+    markup = re.sub(r"<script>.*?</script>", "", page, flags=re.S)
+    assert not re.search(r"<(script|link|iframe)[^>]*(src|href)=", markup)
+    sources = re.findall(r'src="([^"]{0,30})', markup)
+    assert sources
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert "default-src 'none'" in markup
+
+
+def test_text_of_a_run_is_no_markup(page):
+    assert HOSTILE not in page
+    assert page.count("<script") == page.count("</script>") == 3
+    assert words_of(page).count('document.title = "taken"') >= 2
+
+
+def test_page_says_what_came_out_and_what_every_status_means(page):
+    text = words_of(page)
+    for words in (
+        "mean of 50 N and a peak of 100 N, 2 times the mean",
+        "Raising the pressure angle by 1° lowers the peak force by 7 N.",
+        "The motion repeats every mesh period.",
+        "timing gear with 0.1 mm backlash",
+        "backlash_mm: 0.1",
+    ):
+        assert words in text
+    for status in Status:
+        assert status.label.replace("_", " ") in text
+        assert re.sub("[`]", "", status.value) in text
+
+
+def test_spectrum_has_the_lines_of_the_motion(page):
+    """The spectrum has 30 N and 20 N at 2 and 5 times the mesh frequency, 150 Hz."""
+    stems, marks = data_of(page)["charts"][1]["data"]
+    assert stems["mode"] == "lines"
+    lines = dict(zip(marks["x"], marks["y"], strict=True))
+    assert lines[2] == pytest.approx(30, rel=1e-5)
+    assert lines[5] == pytest.approx(20, rel=1e-5)
+    assert sum(lines.values()) == pytest.approx(50, rel=1e-4)
+    assert marks["customdata"][marks["x"].index(2)] == "300"
+
+
+def test_animation_shows_forces_and_turns_one_period(page):
+    animation = data_of(page)["animation"]
+    (case,), (rotor,) = animation["cases"], animation["rotors"]
+    assert rotor["lobes"] == 3
+    assert rotor["outer"] == pytest.approx(45.1029, abs=1e-3)
+    assert len(case["rotation"]) == len(case["forces"][0]) == len(case["time"]) == 40
+    assert case["rotation"][-1] - case["rotation"][0] == pytest.approx(117, abs=2)
+    assert max(case["forces"][0]) == pytest.approx(100, rel=1e-3)
+    assert set(case["forces"][1]) == {0}
+    assert case["relative"][0] == pytest.approx(-1)
+
+
+def test_contacts_lie_on_both_outlines(page):
+    """Contacts of the drive flank lie within the outline's range of radii, up to rounding.
+
+    Their normals are unit vectors."""
+    animation = data_of(page)["animation"]
+    contact = animation["cases"][0]["contacts"][0]
+    outer, pitch = animation["rotors"][0]["outer"], 33.0
+    for k in np.flatnonzero(contact["present"]):
+        point = complex(contact["x"][k], contact["y"][k])
+        assert 2 * pitch - outer - 1e-3 <= abs(point) <= outer + 1e-3
+        assert abs(complex(contact["nx"][k], contact["ny"][k])) == pytest.approx(1, abs=1e-4)
+
+
+def test_keys_are_named_by_their_last_part():
+    assert label("scene.timing_gear.backlash_mm") == "backlash (mm)"
+    assert label("line_1.5_force_N") == "line at 1.5 × mesh frequency (N)"
+
+
+def test_long_motions_keep_their_peak():
+    series = motion()
+    force = np.tile(series.drive_force, 100)
+    force[12345] = 1e4
+    shown = charts._thinned(force, 600)
+    assert len(shown) <= 602
+    assert 12345 in shown
+    assert shown[0] == 0
+    assert shown[-1] == len(force) - 1
+    assert force[shown].min() == force.min()
+
+
+def test_run_without_a_result_says_why(tmp_path):
+    """A run with exit code 3 shows the reason and the advice, and no empty charts."""
+    status = Status.PASSED_THROUGH
+    bare = {"response": {}, "gradient": {}, "steady_state": {"kind": "transient"}}
+    given = result_of(status=status.label, message=status.value, **bare)
+    page = report_text(run_of(tmp_path, given, usable=False))
+    text = words_of(page)
+    assert "Passed through: The lobes passed through each other" in text
+    assert "What to do next Add a scene.timing_gear" in text
+    assert "✗" not in text  # drawn by the style, not read out twice
+    data = data_of(page)
+    assert data["charts"] == []
+    assert data["animation"]["cases"][0]["forces"] is None
+    assert "Plotly.newPlot" in page  # own script, without the library
+    assert len(page) < 1e6
+
+
+def test_names_that_are_no_text_are_shown(tmp_path):
+    """The page shows file names that UTF-8 cannot hold, and scenes without a gear."""
+    config = load(CIC, ["scene.timing_gear=null", "contact.friction={}"])
+    folder = ResultFolder(tmp_path)
+    folder.write_text("config.yaml", config.to_yaml())
+    page = report_text(Run.of(folder, result_of(), "caf\udce9.yaml", True))
+    assert "caf?.yaml" in words_of(page)
+    assert "with friction between the flanks, without a timing gear" in words_of(page)
+
+
+def test_stopped_run_has_a_report(tmp_path):
+    """A run stopped before anything was known has neither design nor numbers."""
+    given = {"baseline": None, "optimized": None, "status": "interrupted", "versions": {}}
+    given |= {"message": "Stopped.", "run": {"command": "optimize"}}
+    text = words_of(report_text(run_of(tmp_path, given, usable=False)))
+    assert "Interrupted: Stopped." in text
+
+
+def test_optimum_is_reported_in_the_users_words(tmp_path):
+    """The page shows prices of the limits, certificate, change against the baseline, pump sheet."""
+    before = result_of()
+    after = result_of(response={"mean_force_N": 40.0, "peak_force_N": 70.0, "rms_force_N": 45.0})
+    for record in (before, after):
+        record["pump"] = {"displaced_volume_cm3": 541.7, "flow_lines": [0.08, 0.01]}
+    limit = {"name": "area_efficiency", "sense": ">=", "limit": 0.43, "unit": "", "baseline": 0.44,
+             "optimized": 0.43, "satisfied": True, "active": True, "multiplier": 2.0,
+             "relaxed_by": -0.01, "relaxed_objective_percent": -2.63}  # fmt: skip
+    optimality = {
+        "converged": True, "reason": "converged", "message": "The first-order conditions hold.",
+        "residual": 2e-11, "required_residual": 1e-4, "violation": 0.0, "method": "slsqp",
+        "held_by": [], "optima": [{"objective": 0.8, "found": 2, "design": {}}],
+        "starts": [{"start": 0, "reason": "converged", "evaluations": 9, "objective": 0.8}],
+        "unseen": {"share_of_starts": 1.0},
+    }  # fmt: skip
+    given = {"baseline": before, "optimized": after, "improvement": {"objective": 0.2},
+             "constraints": [limit], "optimality": optimality, "status": "periodic",
+             "message": "Found.", "run": {"command": "optimize"}}  # fmt: skip
+    text = words_of(report_text(run_of(tmp_path, given)))
+    for words in (
+        "The objective is 20 % below the baseline's.",
+        "The peak force goes from 100 N to 70 N: 30 % less.",
+        "relaxed by 0.01, it lowers the objective by 2.63 %",
+        "area efficiency ≥ 0.43",
+        "−2.63 % for −0.01",
+        "residual 2 × 10⁻¹¹, at most 0.0001 required",
+        "About 100 % of further starts",
+        "displaced volume (cm³) 541.70 541.70 0.00 %",
+        "flow lines 0.080000, 0.010000",
+    ):
+        assert words in text
+
+
+def test_robust_optimum_is_compared_in_fresh_scenes(tmp_path):
+    numbers = {"mean": 0.8, "sigma": 0.1}
+    one = {"scenes": 100, "failed_share": 0.02, "objective": numbers, "mean_force_N": numbers}
+    one |= {"peak_force_N": {"mean": None, "sigma": 3.0}}
+    other = one | {"objective": {"mean": 1.0, "sigma": 0.2}}
+    given = {"baseline": result_of(), "optimized": result_of(), "status": "periodic",
+             "robustness": {"fresh": {"baseline": other, "robust": one}},
+             "run": {"command": "optimize"}}  # fmt: skip
+    over = "tolerances.over={contact.clearance_mm: {normal: 0.002}}"
+    folder = ResultFolder(tmp_path)
+    folder.write_text("config.yaml", load(CIC, ["contact.clearance_mm=0.01", over]).to_yaml())
+    text = words_of(report_text(Run.of(folder, given, "cic", True)))
+    assert "best while these scatter: contact.clearance_mm." in text
+    assert "Mean objective in 100 fresh scenes that scatter: baseline 1, robust 0.8." in text
+    assert "sigma – –" in text or "mean – –" in text
+    assert "without a usable motion 2 % 2 %" in text
+
+
+def test_sweep_over_two_quantities(tmp_path):
+    """One line per value of the second quantity; scenes without a steady state are crosses."""
+    rows = [
+        {"scene.speed_rpm": speed, "scene.timing_gear.backlash_mm": play, "mean_force_N": 10.0,
+         "peak_force_N": speed * play, "status": "chaotic" if speed > 2000 else "periodic"}
+        for play in (0.1, 0.2) for speed in (1000.0, 3000.0, 2000.0)
+    ]  # fmt: skip
+    rows[0] |= {"mean_force_N": None, "peak_force_N": None, "status": "passed_through"}
+    ResultFolder(tmp_path).write_csv(
+        "sweep.csv", {key: np.array([row[key] for row in rows], object) for key in rows[0]}
+    )
+    run = run_of(tmp_path, result_of("sweep", status="chaotic"))
+    page = report_text(run)
+    traces = data_of(page)["charts"][0]["data"]
+    assert [len(trace["x"]) for trace in traces] == [2, 2, 3, 3]
+    assert traces[3]["x"] == [1000, 2000, 3000]
+    assert traces[3]["y"] == pytest.approx([200, 400, 600])
+    assert traces[3]["marker"]["symbol"] == ["circle", "circle", "x"]
+    assert "backlash (mm) 0.2" in traces[3]["name"]
+    assert "3 of 6 scenes have a steady state." in words_of(page)
+
+
+@pytest.fixture(scope="module")
+def front(tmp_path_factory):
+    """Return a run with an infeasible front: exit code 3, with a report."""
+    place = tmp_path_factory.mktemp("front") / "run"
+    given = ["--set", "pareto.terms=[outer_radius_mm, area_efficiency]", "--set", "pareto.points=3"]
+    given += ["--set", "constraints={area_efficiency_min: 0.48, seal_width_min_mm: 25}"]
+    assert pareto.main([CIC, "-o", str(place), "--report", *given]) == 3
+    return place
+
+
+def test_command_writes_a_report_of_a_run_without_a_result(front):
+    result = json.loads((front / "result.json").read_text())
+    assert report.REPORT in result["run"]["files"]
+    text = words_of((front / report.REPORT).read_text("utf-8"))
+    assert "Infeasible: " in text
+    assert "Constraints in conflict" in text
+    assert "seal width ≥ 25 mm" in text
+
+
+def test_report_needs_its_libraries(tmp_path, monkeypatch, capsys):
+    """Without its libraries, the command ends before it computes, and says what to install."""
+    monkeypatch.setattr(report.importlib.util, "find_spec", lambda name: None)
+    assert profile.main([CIC, "-o", str(tmp_path / "run"), "--report"]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "rootsopt[pages]" in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_failing_report_does_not_lose_the_run(tmp_path, monkeypatch, capfd):
+    from rootsopt.report import html
+
+    def fail(run):
+        raise RuntimeError("no idea")
+
+    monkeypatch.setattr(html, "report_text", fail)
+    given = [CIC, "-o", str(tmp_path / "run"), "--report", "--no-figures", "--export", "none"]
+    assert profile.main(given) == 0
+    assert "no idea" in capfd.readouterr().err
+    assert (tmp_path / "run" / "result.json").exists()
+    assert not (tmp_path / "run" / report.REPORT).exists()
+
+
+def test_nothing_is_loaded_without_the_option():
+    code = (
+        "import sys; from rootsopt.commands import cli; cli.parser('profile', '');"
+        "import rootsopt.commands.work.profile; print([name for name in sys.modules"
+        " if name.split('.')[0] in ('jinja2', 'plotly') or name.startswith('rootsopt.report.')])"
+    )
+    run = [sys.executable, "-c", code]
+    done = subprocess.run(run, capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.strip() == "[]"
+
+
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chromium-headless-shell")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Return a function (page, options) → (standard output, console messages) of Chromium.
+
+    It runs headless with scripts, without a network and without a display."""
+    found = next(filter(None, map(shutil.which, _BROWSERS)), None)
+    if found is None:
+        pytest.skip(f"no headless browser is installed: none of {', '.join(_BROWSERS)}")
+
+    def run(file, *options):
+        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"]
+        flags += ["--virtual-time-budget=8000", "--window-size=1280,900", *options]
+        command = [found, *flags, file.as_uri()]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+        told = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+        return done.stdout, told
+
+    return run
+
+
+# A headless browser draws frames when it likes, so the page's frames are driven by a timer here.
+_PROBE = """
+<script>
+window.requestAnimationFrame = step => setTimeout(() => step(performance.now()), 16);
+window.cancelAnimationFrame = clearTimeout;
+window.addEventListener("load", () => {
+  const seen = {};
+  const pose = () => [...document.querySelectorAll("#pair .rotor")].map(one =>
+    one.getAttribute("transform"));
+  const slider = document.getElementById("frame");
+  const turn = value => { slider.value = value; slider.dispatchEvent(new Event("input")); };
+  turn(0);
+  seen.first = pose();
+  turn(10);
+  seen.second = pose();
+  seen.cursor = document.getElementById("chart-0").layout.shapes[0].x0;
+  seen.dots = [...document.querySelectorAll("#pair .contact")].map(one =>
+    one.getAttribute("visibility"));
+  document.getElementById("play").click();
+  const clicked = performance.now();
+  const wait = () => {
+    seen.played = pose();
+    const still = JSON.stringify(seen.played) === JSON.stringify(seen.second);
+    if (still && performance.now() - clicked < 5000) { setTimeout(wait, 50); return; }
+    document.getElementById("play").click();
+    seen.plots = document.querySelectorAll(".plot .main-svg").length;
+    seen.wide = document.documentElement.scrollWidth;
+    const out = document.createElement("pre");
+    out.id = "seen";
+    out.textContent = JSON.stringify(seen);
+    document.body.append(out);
+  };
+  wait();
+});
+</script>
+"""
+
+
+@pytest.mark.parametrize("width", [1280, 800])
+def test_slider_moves_the_rotors_in_a_browser(browser, page, tmp_path, width):
+    """Slider and button turn both rotors, in opposite senses.
+
+    There is no message on the console, and nothing is wider than the window."""
+    file = tmp_path / "page.html"
+    file.write_text(page.replace("</body>", _PROBE + "</body>"), "utf-8")
+    out, told = browser(file, f"--window-size={width},900", "--dump-dom")
+    assert told == []
+    (found,) = re.findall(r'<pre id="seen">(.*?)</pre>', out)
+    seen = json.loads(entities.unescape(found))
+    turns = {
+        name: [float(re.findall(r"rotate\((.*?)\)", pose)[0]) for pose in seen[name]]
+        for name in ("first", "second", "played")
+    }
+    one, two = np.subtract(turns["second"], turns["first"])
+    assert one == pytest.approx(-30, abs=1.6)  # a quarter of a pitch; SVG's y axis points down
+    assert two == pytest.approx(one, abs=1e-6)
+    assert seen["second"][1].startswith("translate(66) scale(-1 1)")
+    assert turns["played"][0] != turns["second"][0]
+    assert seen["dots"] == ["visible", "hidden"]
+    assert seen["cursor"] == pytest.approx(1.75, abs=0.1)
+    assert seen["plots"] >= 2
+    assert seen["wide"] <= width
+    assert "<title>taken</title>" not in out
+
+
+def test_console_messages_are_noticed(browser, tmp_path):
+    file = tmp_path / "bad.html"
+    file.write_text("<script>undefined_name()</script>", "utf-8")
+    assert "undefined_name" in "".join(browser(file, "--dump-dom")[1])
+
+
+def test_page_prints(browser, page, tmp_path):
+    """The page prints as a PDF of several pages, with charts."""
+    file, printed = tmp_path / "page.html", tmp_path / "page.pdf"
+    file.write_text(page, "utf-8")
+    _, told = browser(file, f"--print-to-pdf={printed}")
+    assert told == []
+    content = printed.read_bytes()
+    assert content.startswith(b"%PDF")
+    assert len(re.findall(rb"/Type\s*/Page\b", content)) >= 4
+
+
+def test_cases_share_a_rotor(simulated):
+    """Two motions of one design are drawn with one outline."""
+    from rootsopt.report.meshing import animations
+
+    other = dataclasses.replace(simulated.cases[0], name="motion 2", series=None)
+    found = animations([simulated.cases[0], other])
+    assert found is not None
+    assert len(found["rotors"]) == 1
+    assert [case["rotor"] for case in found["cases"]] == [0, 0]
+    assert found["cases"][1]["forces"] is None

@@ -1,0 +1,93 @@
+"""Scenes evaluated as one batch are those evaluated one by one."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rootsopt
+from rootsopt.response import together
+from rootsopt.response.evaluation import Evaluator, _motion
+from rootsopt.sweeps import local
+from rootsopt.sweeps.plan import plan_of
+from rootsopt.sweeps.points import simulated, simulated_together
+
+SPEED, LOAD, ANGLE = "scene.speed_rpm", "scene.load.torque_N_m", "profile.pressure_angle_deg"
+POINTS = [{SPEED: 2000.0}, {ANGLE: 5.0}, {SPEED: 3000.0}, {LOAD: 3000.0}]
+
+
+@pytest.fixture(scope="module")
+def config() -> rootsopt.Config:
+    return rootsopt.load_config("cic")
+
+
+@pytest.fixture
+def in_turn(monkeypatch):
+    """Replace the batch, which takes minutes to compile, by its motions one by one.
+
+    The fixture is a list of the sizes of all batches."""
+    sizes = []
+
+    def motions(arrays, others):
+        count = len(jax.tree.leaves(arrays)[0])
+        sizes.append(count)
+        rows = [jax.tree.map(lambda x, k=k: x[k], arrays) for k in range(count)]
+        found = [_motion(*eqx.combine(row, others)) for row in rows]
+        return jax.tree.map(lambda *x: jnp.stack(x), *found)
+
+    monkeypatch.setattr(together, "_motions", motions)
+    return sizes
+
+
+def test_points_keep_their_places(config, in_turn):
+    """One batch for all points of the same structure, whatever becomes of them."""
+    found = simulated_together(config, POINTS)
+    assert in_turn == [3]
+    assert [row["status"] for row in found] == ["periodic", "invalid", "periodic", "passed_through"]
+    alone = [simulated(config, values) for values in POINTS]
+    assert found == alone
+
+
+def test_structures_are_told_apart(config):
+    """Other numbers make the same batch, other choices another one."""
+    keys = {"solver.max_orbit_periods": 4}, {SPEED: 2000.0}, {"scene.timing_gear": None}
+    kinds = []
+    for one in (config, *(config.replaced(key) for key in keys)):
+        solver, gear = Evaluator.of(one).scene.solver, Evaluator.of(one).scene.gear
+        kinds.append(together._kind(*eqx.partition((solver, gear), eqx.is_array)))
+    assert kinds[2] == kinds[0]
+    assert len({*kinds}) == 3
+
+
+def test_a_batch_that_fails_is_done_one_by_one(config, monkeypatch):
+    def broken(evaluators):
+        raise MemoryError
+
+    monkeypatch.setattr("rootsopt.sweeps.points.evaluate_together", broken)
+    found = simulated_together(config, POINTS[:1])
+    assert found == [simulated(config, POINTS[0])]
+
+
+def test_accelerators_take_batches(config, monkeypatch):
+    asked = []
+    monkeypatch.setattr(local, "pays", lambda: True)
+    monkeypatch.setattr(local, "_BATCH", 2)
+    monkeypatch.setattr(local, "simulated_together", lambda _, some: asked.append(some) or some)
+    plan = plan_of({SPEED: [1.0, 2.0, 3.0]})
+    stop = local.threading.Event()
+    found = [one for some in local.in_process(config, plan, range(3), stop) for one in some]
+    assert found == [(number, {SPEED: number + 1.0}) for number in range(3)]
+    assert [len(some) for some in asked] == [2, 1]
+
+
+@pytest.mark.long
+def test_arrays_of_scenes_agree_with_single_ones(config):
+    found = simulated_together(config, POINTS)
+    for row, values in zip(found, POINTS, strict=True):
+        alone = simulated(config, values)
+        assert row["status"] == alone["status"]
+        for name, force in alone["response"].items():
+            assert row["response"][name] == pytest.approx(force, rel=1e-7)
+            slopes = [[*one["gradient"][name].values()] for one in (row, alone)]
+            np.testing.assert_allclose(*slopes, rtol=1e-5)
