@@ -91,6 +91,29 @@ def local_maxima(
     return Maxima(times[order], values[order], slopes[order])
 
 
+def prepare_maxima(
+    pair: RotorPair, tangents: RotorPair, orbit: Orbit, integrator: Integrator
+) -> None:
+    """Compile the programs of `local_maxima` in the background, for arguments of the same kind.
+
+    In the arguments, `jax.ShapeDtypeStruct` may replace arrays."""
+
+    def like(*shape: int, dtype: Any = float) -> Any:
+        return jax.ShapeDtypeStruct(shape, dtype)
+
+    grid, flow = orbit.flow.grid, orbit.flow
+    steps: Any = Steps(grid, grid, flow.corners, flow.corners, like(dtype=int))
+    times = like(_room(flow.states.shape[0], grid.shape[0]))
+    padded, noise = like(MOST + _BESIDES), like(dtype=flow.depth.dtype)
+    _differentiated.prepare(pair, tangents, orbit, padded, noise, integrator)
+    _forces.prepare(pair, flow.states, steps, times, like(), like(dtype=int))
+
+
+def _room(samples: int, steps: int) -> int:
+    """Return the number of times that one call of `_forces` takes at most in the first scan."""
+    return samples + steps + 1
+
+
 def _steps(orbit: Orbit) -> Steps:
     """Return the solver steps of a closed orbit."""
     grid, after = np.asarray(orbit.flow.grid), np.asarray(orbit.flow.corners)
@@ -110,7 +133,7 @@ def _located(
     width = length / states.shape[0]
     ends = np.asarray(steps.ends)[: int(steps.count)]
     places = np.unique(np.concatenate([width * np.arange(states.shape[0]), ends, [length]]))
-    room = states.shape[0] + steps.ends.shape[0] + 1
+    room = _room(states.shape[0], steps.ends.shape[0])
 
     def force(times):
         padded = np.resize(np.ravel(times), max(room, np.size(times)))
@@ -325,4 +348,4 @@ def _along(kept: _Pieces, start: Float[Array, "n d"], taken: Int[Array, ""]) -> 
     return lax.fori_loop(0, taken, advance, (start, found))[1]
 
 
-__all__ = ["MOST", "Maxima", "candidates", "local_maxima", "shoulders"]
+__all__ = ["MOST", "Maxima", "candidates", "local_maxima", "prepare_maxima", "shoulders"]

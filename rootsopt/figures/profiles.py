@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from numpy.typing import NDArray
 
 from rootsopt.contact.nodes import place_pair
@@ -78,7 +79,8 @@ def plot_meshing(
         pair = place_pair(np.asarray(outline_mm), lobes, center, turn, turn)
         names = "rotor 1 ↺", "rotor 2 ↻"
         for points, color, x, name in zip(pair, (SKY, ORANGE), (0, center), names, strict=True):
-            ax.fill(*points.T, facecolor=color, alpha=0.75, edgecolor="black", linewidth=0.8)
+            look = {"facecolor": color, "alpha": 0.75, "edgecolor": "black", "linewidth": 0.8}
+            ax.add_collection(PolyCollection([points], **look))  # `fill` takes ten times as long.
             _circle(ax, (x, 0), pitch_radius_mm)
             ax.plot(x, 0, "o", color="black", markersize=4)
             ax.annotate(name, (x, 0), (0, 7), textcoords="offset points", ha="center")

@@ -71,6 +71,20 @@ def _ranges(space: Space, design):
 _slacks_of = Program(Space.slacks_of)
 
 
+def needs_maxima(config: Config, limits: Sequence[ForceLimit]) -> bool:
+    """Return whether evaluations need all local maxima of the force.
+
+    They do if the objective of `config` contains the peak force of single motions, or if one of its
+    `limits` is a ceiling of this force."""
+    cornered = PEAK in objective_weights(config) or any(one.cornered for one in limits)
+    return cornered and _of_motions(config)
+
+
+def _of_motions(config: Config) -> bool:
+    """Return whether the objective contains forces of single motions, not averages over many."""
+    return config.objective.motion in ("reached", "worst")
+
+
 @dataclasses.dataclass(frozen=True)
 class Problem:
     """The design problem of a config, relative to its evaluated baseline.
@@ -248,8 +262,7 @@ class Problem:
     @property
     def with_maxima(self) -> bool:
         """Whether an evaluation needs all local maxima of the force."""
-        motions = self.config.objective.motion in ("reached", "worst")
-        return self.cornered or (motions and any(one.cornered for one in self.limits))
+        return needs_maxima(self.config, self.limits)
 
     def keeps_limits(self, evaluation: Evaluation) -> bool:
         """Return whether an evaluated design satisfies all of `constraints.terms`."""
@@ -291,10 +304,7 @@ class Problem:
     @property
     def cornered(self) -> bool:
         """Whether the objective contains the peak force of single motions, which has corners."""
-        return PEAK in objective_weights(self.config) and self.config.objective.motion in (
-            "reached",
-            "worst",
-        )
+        return PEAK in objective_weights(self.config) and _of_motions(self.config)
 
     def _branches(self, evaluation: Evaluation, baseline: Evaluation, number: int) -> Group:
         """Return the objective at one speed as branches, with gradients in config units.

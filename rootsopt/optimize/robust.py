@@ -145,10 +145,6 @@ class RobustSearch(Search):
         self.exact = ToleranceEvaluator.of(config, self.exact)
         self._shares: dict[int, NDArray[np.float64]] = {}
 
-    def _warm(self, baseline: Evaluation) -> None:
-        """Do nothing: the first stage has compiled all programs."""
-        del baseline
-
     def _problem(self, scene: Scene, baseline: Evaluation) -> Problem:
         return RobustProblem.of(self.config, scene, baseline)
 

@@ -30,10 +30,10 @@ from rootsopt.optimize.beginning import Beginning, beginning
 from rootsopt.optimize.certificate import Certificate, certify
 from rootsopt.optimize.checkpoint import Checkpoint
 from rootsopt.optimize.infeasible import Infeasible, explain
-from rootsopt.optimize.limits import limited
+from rootsopt.optimize.limits import force_limits, limited
 from rootsopt.optimize.local import Local, Look
 from rootsopt.optimize.optimality import RESIDUAL, Optimality, StartOutcome
-from rootsopt.optimize.problem import FEASIBLE, Problem
+from rootsopt.optimize.problem import FEASIBLE, Problem, needs_maxima
 from rootsopt.optimize.sqp import Found, Stops, descend
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.evaluators import evaluator_for
@@ -261,7 +261,8 @@ class Search:
         return dataclasses.replace(self._run(), beginning=self.beginning)
 
     def _run(self) -> Optimization:
-        exact = self.exact.prepare(design_vector(self.config))
+        maxima = needs_maxima(self.config, force_limits(self.config, self.exact.scene))
+        exact = self.exact.prepare(design_vector(self.config), maxima=maxima)
         Space.of(self.config, exact.scene, 0.0).prepare()
         exact, first = exact.fit()
         baseline = first
@@ -281,8 +282,6 @@ class Search:
         # Sequential quadratic programming needs more accurate gradients than a descent.
         self.sharp = self.exact.surveying()
         self._baseline = baseline
-        if self.problem.with_maxima and self.method == "slsqp":
-            self._warm(first)
         start = self.problem.point(list(first.design.values()))
         points = self._feasible(start)
         if not points:
@@ -318,11 +317,6 @@ class Search:
         settled = self.problem, baseline, optimized, rows, verification
         optimality = None if optimized is None else self._optimality(optimized, trials)
         return Optimization(*settled, self.stop.is_set(), optimality)
-
-    def _warm(self, baseline: Evaluation) -> None:
-        """Compile the programs for local maxima of the force, in the background."""
-        again = list(baseline.design.values()), baseline.state, False
-        threading.Thread(target=self.sharp, args=again, daemon=True).start()
 
     def _problem(self, scene: Scene, baseline: Evaluation) -> Problem:
         """Return the design problem, given the scene and the evaluated `baseline`."""

@@ -13,7 +13,7 @@ import os
 import secrets
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +24,7 @@ from rootsopt.output import disk
 from rootsopt.runtime.versions import versions as versions
 
 if TYPE_CHECKING:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     from rootsopt.config import Config
@@ -115,9 +116,12 @@ class ResultFolder:
     def write_figure(self, name: str, figure: "Figure") -> Path:
         """Write a matplotlib figure as PNG to the file `name`; return the file's path.
 
-        Raises `InputError` if the file cannot be written."""
-        image = io.BytesIO()
-        figure.savefig(image, format="png", dpi=DPI)
+        `figure` has a canvas of the Agg backend, as those of `figures.style.figure` have; its
+        resolution is changed. Raises `InputError` if the file cannot be written."""
+        image, canvas = io.BytesIO(), cast("FigureCanvasAgg", figure.canvas)
+        # `savefig` would lay out and draw everything twice.
+        figure.set_dpi(DPI)
+        canvas.print_png(image)
         return self.write_bytes(name, image.getvalue())
 
 

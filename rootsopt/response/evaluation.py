@@ -18,7 +18,7 @@ from rootsopt.contact.size import size_map
 from rootsopt.dynamics.collocation.closing import sizes
 from rootsopt.dynamics.collocation.nearby import Known
 from rootsopt.dynamics.integrator import Integrator
-from rootsopt.dynamics.maxima import Maxima, local_maxima
+from rootsopt.dynamics.maxima import Maxima, local_maxima, prepare_maxima
 from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
 from rootsopt.dynamics.orbit import Orbit, reverse_sensitivity
 from rootsopt.dynamics.pair import RotorPair
@@ -294,24 +294,34 @@ class Evaluator:
         """Return the rotor pair of `design` (config units)."""
         return _build(self.scene, jnp.asarray(design))[0]
 
-    def prepare(self, design: ArrayLike | None = None, series: bool = True) -> "Evaluator":
+    def prepare(
+        self, design: ArrayLike | None = None, series: bool = True, maxima: bool = False
+    ) -> "Evaluator":
         """Compile the programs for evaluating `design` (config units) in the background.
 
-        `series`: whether the evaluations will compute the series. Return another evaluator, with a
-        contact map sized for the design."""
+        `series`: whether the evaluations will compute the series; `maxima`: whether evaluators
+        `with_maxima` will follow. Return another evaluator, with a contact map sized for the
+        design."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now = self._sized(design)
         pair, tangents, _ = _build.result_shape(now.scene, design)
         dtype = pair.angle_scale.dtype
         state = jax.ShapeDtypeStruct((pair.states,), dtype)
+
+        solver = now.scene.solver
+
+        def then(found: Steady) -> None:
+            if maxima or self.maxima:
+                prepare_maxima(pair, tangents, found.orbit, solver.orbit)
+
         # The slowest compilation starts first.
-        _motion.prepare(pair, tangents, state, now.scene.pitch_radius, now.scene.solver)
+        _motion.prepare(pair, tangents, state, now.scene.pitch_radius, solver, then=then)
         _build.prepare(now.scene, design)
-        if not series and collocates(pair, now.scene.solver):
+        if not series and collocates(pair, solver):
             known = Known.empty(sizes(1), pair.states, 1 + pair.two_sided)
-            _near.prepare(pair, tangents, (known, pair), now.scene.pitch_radius, now.scene.solver)
+            _near.prepare(pair, tangents, (known, pair), now.scene.pitch_radius, solver)
         if series:
-            count = pair.lobes * now.scene.solver.samples
+            count = pair.lobes * solver.samples
             times = jax.ShapeDtypeStruct((count,), float)
             _contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, pair.states), dtype))
         return now

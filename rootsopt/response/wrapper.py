@@ -46,11 +46,12 @@ class Evaluates(Protocol):
         Arguments: see `__call__`."""
         ...
 
-    def prepare(self, design: Any = None, series: bool = True) -> "Evaluates":
+    def prepare(self, design: Any = None, series: bool = True, maxima: bool = False) -> "Evaluates":
         """Compile the programs for evaluating `design` (d,), in config units, in the background.
 
-        `series`: whether the evaluations will compute the series. Return another evaluator, with a
-        contact map sized for `design`."""
+        `series`: whether the evaluations will compute the series; `maxima`: whether evaluators
+        `with_maxima` will follow. Return another evaluator, with a contact map sized for
+        `design`."""
         ...
 
     def pair(self, design: ArrayLike) -> RotorPair:
@@ -128,11 +129,11 @@ class Wrapper:
         """Return the rotor pair of `design` (config units)."""
         return self.single.pair(design)
 
-    def prepare(self: W, design=None, series=True) -> W:
+    def prepare(self: W, design=None, series=True, maxima=False) -> W:
         """Compile the programs for evaluating a design in the background.
 
         Return another evaluator, sized for the design. Arguments: see `Evaluates.prepare`."""
-        return self._around(self.single.prepare(design, series))
+        return self._around(self.single.prepare(design, series, maxima))
 
     def at_speed(self: W, speed_rpm: float) -> W:
         """Return another evaluator at the speed `speed_rpm`."""

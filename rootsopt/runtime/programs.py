@@ -144,15 +144,19 @@ class Program:
         results = iter(made.call(*leaves))
         return jax.tree.map(lambda x: next(results) if _is_array(x) else x, made.result_shape)
 
-    def prepare(self, *args: Any) -> None:
+    def prepare(self, *args: Any, then: Callable[[Any], None] | None = None) -> None:
         """Compile the function in the background for arguments of the same kind as `args`.
 
         In `args`, `jax.ShapeDtypeStruct` may replace an array. If compilation fails, the call that
-        needs the program raises the error."""
+        needs the program raises the error.
+
+        `then` is called in the background with `result_shape(*args)` as soon as the function has
+        been traced, before it is compiled. It can prepare programs that take the result. It is not
+        called if the program has been requested before, and its errors are ignored."""
         _, kind = _split(args)
         future, new = self._future(kind)
         if new:
-            threading.Thread(target=self._make, args=(future, kind)).start()
+            threading.Thread(target=self._make, args=(future, kind, then)).start()
 
     def result_shape(self, *args: Any) -> Any:
         """Return the result for `args` with `jax.ShapeDtypeStruct` in place of arrays.
@@ -175,16 +179,30 @@ class Program:
             new = kind not in self._made
             return self._made.setdefault(kind, Future()), new
 
-    def _make(self, future: Future[_Made], kind: _Kind) -> None:
+    def _make(
+        self, future: Future[_Made], kind: _Kind, then: Callable[[Any], None] | None = None
+    ) -> None:
+        def outlined(result_shape: Any) -> None:
+            if then is not None:
+                with contextlib.suppress(Exception):
+                    then(result_shape)
+
         try:
             place = self._place(kind)
-            future.set_result(_loaded(place) or self._compiled(kind, place))
+            made = _loaded(place)
+            if made is not None:
+                future.set_result(made)
+                outlined(made.result_shape)
+                return
+            future.set_result(self._compiled(kind, place, outlined))
         except BaseException as error:
             with self._lock:
                 del self._made[kind]
             future.set_exception(error)
 
-    def _compiled(self, kind: _Kind, place: "_Place | None") -> _Made:
+    def _compiled(
+        self, kind: _Kind, place: "_Place | None", outlined: Callable[[Any], None]
+    ) -> _Made:
         outlines = []
 
         def flat(*arrays):
@@ -196,6 +214,7 @@ class Program:
         structs = [jax.ShapeDtypeStruct(s[0], np.dtype(s[1])) for s in kind.shapes if s]
         with _tracing, _without_collection():
             lowered = jax.jit(flat).lower(*structs)
+        outlined(outlines[-1])
         made = _Made(_finished(lowered), outlines[-1])
         if place is not None:
             # A program that cannot be cached can still be used.

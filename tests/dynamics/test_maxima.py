@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from rootsopt import load_config
+from rootsopt.dynamics import maxima
 from rootsopt.dynamics.maxima import candidates, shoulders
 from rootsopt.dynamics.orbit import SAMPLES
+from rootsopt.response import evaluation
 from rootsopt.response.evaluation import Evaluator
 
 _STEP = 2e-4
@@ -61,6 +63,18 @@ def test_without_request_there_are_none(evaluator):
     assert plain.with_maxima().maxima
 
 
+def test_prepared_programs_are_those_that_are_called(evaluator, found):
+    """Programs prepared from shapes alone, before there is an orbit, are the ones used later."""
+    scene = evaluator.scene
+    pair, tangents, _ = evaluator.assembled()
+    start = pair, tangents, found.state, scene.pitch_radius, scene.solver
+    orbit = evaluation._motion.result_shape(*start).orbit
+    programs = maxima._forces, maxima._differentiated
+    called = [set(program._made) for program in programs]
+    maxima.prepare_maxima(pair, tangents, orbit, scene.solver.orbit)
+    assert [set(program._made) for program in programs] == called
+
+
 def test_candidates_are_told_apart():
     """Three maxima, one of them at the seam, are distinguished from ripple on a plateau."""
     places = np.linspace(0, 1, 201)
@@ -79,8 +93,8 @@ def test_candidates_are_told_apart():
 def test_shoulder_is_found_before_it_is_a_maximum():
     """A bump on a slope is a shoulder while the force rises there, and a maximum later."""
     x = np.arange(400) / 400
-    for height, maxima in ((0.02, 1), (0.03, 2)):
+    for height, expected in ((0.02, 1), (0.03, 2)):
         force = 10 + np.cos(2 * np.pi * x) * 0.08 + height * np.exp(-(((x - 0.8) / 0.04) ** 2))
         places, closed = np.append(x, 1.0), np.append(force, force[0])
-        assert len(candidates(places, closed)[0]) == maxima
-        assert len(shoulders(force)) == (1 if maxima == 1 else 0)
+        assert len(candidates(places, closed)[0]) == expected
+        assert len(shoulders(force)) == (1 if expected == 1 else 0)

@@ -102,6 +102,23 @@ def test_prepared_programs_are_ready_when_called(traced):
     assert len(traced) == 1
 
 
+def test_shape_of_the_result_is_told_before_the_program_is_compiled(traced, monkeypatch):
+    """What follows knows the shape while the program is compiled; its own failures are ignored."""
+    told, began = [], threading.Event()
+    monkeypatch.setattr(programs, "_finished", lambda lowered: began.wait(60) and lowered.compile())
+
+    def then(shape):
+        told.append(shape)
+        began.set()
+        raise ValueError("ignored")
+
+    program = Program(scaled)
+    arguments = Factor(jnp.asarray(2.0), 3), np.ones(3), "a"
+    program.prepare(*arguments, then=then)
+    found = program(*arguments)
+    assert [one.total["sum"].shape for one in told] == [found.total["sum"].shape]
+
+
 def test_a_failure_is_raised_by_the_call_and_not_remembered():
     fails = [True]
 
