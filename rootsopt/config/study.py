@@ -78,9 +78,10 @@ class SolverConfig(Section):
         8, description="longest periodic orbit to find, in mesh periods"
     )
     orbit: Literal["collocation", "shooting", "auto"] = Field(
-        "shooting",
+        "auto",
         description="how periodic orbits are closed: by shooting, by collocation aligned with "
-        "contact events, or auto: collocation and, where it fails, shooting",
+        "contact events, or auto: in searches by collocation from the orbit of a neighbouring "
+        "design, otherwise by shooting",
     )
     gradient: Literal["forward", "reverse"] = Field(
         "forward", description="differentiation mode; both give the same gradient"

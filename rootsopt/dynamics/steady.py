@@ -15,9 +15,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.closing import sizes, supported
+from rootsopt.dynamics.collocation.closing import supported
+from rootsopt.dynamics.collocation.known import Known
+from rootsopt.dynamics.collocation.mesh import sizes
 from rootsopt.dynamics.collocation.motion import Collocated, collocated, near_orbit
-from rootsopt.dynamics.collocation.nearby import Known
+from rootsopt.dynamics.collocation.seed import from_steps
 from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
@@ -58,8 +60,9 @@ class Solver(eqx.Module):
     compare the derivatives with those on halved steps; `attempts`: maximum number of attempts;
     `windows`: length of a window (mesh periods), a multiple of 16; 0: no window.
 
-    `closing`: how orbits are closed: `shooting`, `collocation`, or `auto` (collocation, and
-    shooting if it fails). Only shooting closes orbits of pairs that collocation does not support.
+    `closing`: how orbits are closed: by `shooting`, by `collocation`, or `auto` (by collocation from
+    the orbit of a similar pair, otherwise by shooting). Only shooting closes orbits of pairs that
+    collocation does not support.
     """
 
     transient: Integrator
@@ -499,14 +502,16 @@ def steady_motion(
 
     if not collocates(pair, solver):
         return shooting()
-    found = attempts.collocated(state)
-    if solver.closing == "collocation":
-        return found
-    return lax.cond(found.status == Status.PERIODIC.code, lambda: found, shooting)
+    return attempts.collocated(state)
 
 
 def collocates(pair: RotorPair, solver: Solver) -> bool:
-    """Return whether orbits of `pair` are closed by collocation with these settings."""
+    """Return whether the orbits of `pair` that a state leads to are closed by collocation."""
+    return solver.closing == "collocation" and continues(pair, solver)
+
+
+def continues(pair: RotorPair, solver: Solver) -> bool:
+    """Return whether orbits of `pair` can be closed from those of similar pairs (`near_motion`)."""
     return solver.closing != "shooting" and solver.precision == "float64" and supported(pair)
 
 
@@ -522,9 +527,21 @@ def near_motion(
     `start`: this orbit, and its pair.
 
     The result continues the motion of the similar pair without a transient, and must be stable. The
-    status is NOT_SETTLED if the orbit is not accepted (see `collocation.nearby`); call
-    `steady_motion` in that case. Collocation must support the pair. For the other arguments, see
+    status is NOT_SETTLED if the orbit is not accepted; call `steady_motion` in that case. Collocation must support the pair. For the other arguments, see
     `steady_motion`.
     """
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     return _Attempts(pair, tangents, solver, radius).near(*start)
+
+
+def seed(
+    pair: RotorPair,
+    state: Float[Array, " n"],
+    taken: tuple[Float[Array, " steps"], Float[Array, "steps n"]],
+    period: Int[Array, ""],
+    longest: int,
+) -> Known:
+    """Return an orbit of `pair` that was closed by shooting, as a start for `near_motion`.
+
+    Arguments: see `collocation.seed.from_steps`."""
+    return Known.unaligned(from_steps(pair, state, taken, period, longest))

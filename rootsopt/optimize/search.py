@@ -262,7 +262,8 @@ class Search:
 
     def _run(self) -> Optimization:
         maxima = needs_maxima(self.config, force_limits(self.config, self.exact.scene))
-        exact = self.exact.prepare(design_vector(self.config), maxima=maxima)
+        follows = self.method == "slsqp"
+        exact = self.exact.prepare(design_vector(self.config), maxima=maxima, neighbours=follows)
         Space.of(self.config, exact.scene, 0.0).prepare()
         exact, first = exact.fit()
         baseline = first
@@ -523,7 +524,8 @@ class Search:
             if self.checkpoint is not None:
                 self.checkpoint.add(key, point, evaluation)
         else:
-            evaluation = kept
+            evaluation, design = kept, self.problem.design(point)
+            evaluator.recall(kept, lambda: evaluator(design, start=orbit, series=False), orbit)
         objective = self.problem.objective(evaluation)
         feasible, excess = self.problem.feasible(point), self.problem.excess(evaluation)
         local = None

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -15,8 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from rootsopt.config import Config
 from rootsopt.config.units import MM, RPM
 from rootsopt.contact.size import size_map
-from rootsopt.dynamics.collocation.closing import sizes
-from rootsopt.dynamics.collocation.nearby import Known
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.maxima import Maxima, local_maxima, prepare_maxima
 from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
@@ -26,15 +24,14 @@ from rootsopt.dynamics.settle import BLOCK
 from rootsopt.dynamics.steady import (
     CLOSED,
     Steady,
-    collocates,
-    near_motion,
     steady_motion,
     window_status,
 )
 from rootsopt.dynamics.window import Window, lyapunov
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import OrbitLoads, orbit_loads
-from rootsopt.response.orbits import OrbitStore
+from rootsopt.response import orbits
+from rootsopt.response.orbits import Built, OrbitStore
 from rootsopt.response.terms import EQUIVALENT, terms_of, values_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_keys, design_vector
@@ -120,6 +117,10 @@ class Evaluation:
         from rootsopt.response.dataset import dataset
 
         return dataset(self)
+
+    def motions(self) -> list[NDArray[np.float64]]:
+        """Return the scaled states (n,) at φ1 = 0 of all known orbits of the evaluation."""
+        return [] if self.state is None else list(np.atleast_2d(self.state))
 
     def record(self) -> dict[str, Any]:
         """Return the record for the result file."""
@@ -255,7 +256,8 @@ class Evaluator:
             dtype = pair.angle_scale.dtype
             state = np.zeros(pair.states, dtype) if start is None else np.asarray(start, dtype)
             # An orbit that is reported with its series is closed anew, and confirmed.
-            found = None if series else now._near(pair, tangents, start)
+            built = Built(pair, tangents, now.scene.pitch_radius, now.scene.solver)
+            found = None if series else self.orbits.near(built, start)
             if found is None:
                 found = jax.device_get(now.motion(pair, tangents, state))
             other = now._refitted(pair, found)
@@ -263,7 +265,7 @@ class Evaluator:
                 break
             if float(other.scene.deepest) < float(now.scene.deepest):
                 other = other._sized(design)
-        self.orbits.keep(found, pair)
+        self.orbits.keep(found, built)
         report = now._report(design, (pair, shape), found, began, series)
         if self.maxima and report.usable:
             integrator = now.scene.solver.orbit
@@ -271,37 +273,37 @@ class Evaluator:
             report = dataclasses.replace(report, maxima=maxima)
         return now, report
 
+    def recall(
+        self, evaluation: Evaluation, again: Callable[[], Any], start: NDArray[np.float64] | None
+    ) -> None:
+        """Remember how to compute an `evaluation` of a former process, with its orbits.
+
+        Neighbouring designs can then start on these orbits. `again` repeats the evaluation with an
+        evaluator made from this one; `start`: its argument `start`."""
+        self.orbits.recall(evaluation.motions(), again, start)
+
     def motion(self, pair: RotorPair, tangents: RotorPair, state) -> Steady:
         """Return the steady motion of `pair` that the scaled `state` (n,) leads to, with its
         derivatives along `tangents`."""
         return _motion(pair, tangents, state, self.scene.pitch_radius, self.scene.solver)
-
-    def _near(self, pair: RotorPair, tangents: RotorPair, start) -> Steady | None:
-        """Return the motion of `pair` near the known orbit that begins at `start`.
-
-        The result is None if there is no such orbit, or if the motion is not accepted."""
-        known = self.orbits.near(start)
-        if known is None or not collocates(pair, self.scene.solver):
-            return None
-        if jax.tree.structure(known[1]) != jax.tree.structure(pair):
-            return None
-        scene = self.scene
-        found = _near(pair, tangents, known, scene.pitch_radius, scene.solver)
-        found = jax.device_get(found)
-        return found if Status.of(found.status) is Status.PERIODIC else None
 
     def pair(self, design: ArrayLike) -> RotorPair:
         """Return the rotor pair of `design` (config units)."""
         return _build(self.scene, jnp.asarray(design))[0]
 
     def prepare(
-        self, design: ArrayLike | None = None, series: bool = True, maxima: bool = False
+        self,
+        design: ArrayLike | None = None,
+        series: bool = True,
+        maxima: bool = False,
+        neighbours: bool = False,
     ) -> "Evaluator":
         """Compile the programs for evaluating `design` (config units) in the background.
 
         `series`: whether the evaluations will compute the series; `maxima`: whether evaluators
-        `with_maxima` will follow. Return another evaluator, with a contact map sized for the
-        design."""
+        `with_maxima` will follow; `neighbours`: whether evaluations without series will follow that
+        start on the orbits of their neighbours. Return another evaluator, with a contact map sized
+        for the design."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now = self._sized(design)
         pair, tangents, _ = _build.result_shape(now.scene, design)
@@ -317,9 +319,9 @@ class Evaluator:
         # The slowest compilation starts first.
         _motion.prepare(pair, tangents, state, now.scene.pitch_radius, solver, then=then)
         _build.prepare(now.scene, design)
-        if not series and collocates(pair, solver):
-            known = Known.empty(sizes(1), pair.states, 1 + pair.two_sided)
-            _near.prepare(pair, tangents, (known, pair), now.scene.pitch_radius, solver)
+        built = Built(pair, tangents, now.scene.pitch_radius, solver)
+        if neighbours and built.continues:
+            orbits.prepare(built)
         if series:
             count = pair.lobes * solver.samples
             times = jax.ShapeDtypeStruct((count,), float)
@@ -616,7 +618,6 @@ def geometry_record(scene: Scene, shape: Geometry) -> dict[str, float]:
 
 _build = Program(Scene.pair_and_tangents)
 _motion = Program(steady_motion)
-_near = Program(near_motion)
 lyapunov_program = Program(lyapunov)
 unsettled_status = Program(window_status)
 

@@ -2,69 +2,215 @@
 
 import threading
 from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.dynamics.collocation.nearby import Known, trimmed
+from rootsopt.dynamics.collocation.known import Known, trimmed
+from rootsopt.dynamics.collocation.mesh import sizes
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import Steady
+from rootsopt.dynamics.steady import Solver, Steady, continues, near_motion, seed
+from rootsopt.runtime.programs import Program
 from rootsopt.status import Status
 
-_MOST = 512
+_MOST = 4096
 """Number of orbits above which the least recently used one is forgotten."""
+_SAME = 1e-4
+"""Relative difference between the forces of an orbit closed by shooting and those of the same orbit
+closed by collocation, above which the latter is not used."""
+
+
+class Built(NamedTuple):
+    """A rotor pair and everything on which its motion depends.
+
+    `pair`; `tangents`: directions along which to differentiate; `radius`: pitch radius (m);
+    `solver`: settings.
+    """
+
+    pair: RotorPair
+    tangents: RotorPair
+    radius: Any
+    solver: Solver
+
+    @property
+    def continues(self) -> bool:
+        """Whether its orbit can be closed from that of a similar pair."""
+        return continues(self.pair, self.solver)
+
+
+class _Closed(NamedTuple):
+    """An orbit as it was closed.
+
+    `state`: scaled, at φ1 = 0; `period` (mesh periods); `forces` (3,): mean (N), mean square (N²)
+    and peak (N); `steps`: ends of the solver's steps (mesh periods) and the scaled states there, if
+    the orbit was closed by shooting; `known`: the orbit, if it was closed by collocation.
+    """
+
+    state: NDArray[np.float64]
+    period: int
+    forces: NDArray[np.float64]
+    steps: tuple[NDArray[np.float64], NDArray[np.float64]] | None
+    known: Known | None
+
+    @classmethod
+    def of(cls, found: Steady) -> "_Closed":
+        """Return the orbit of a periodic motion."""
+        orbit, period = found.orbit, int(found.period)
+        first = np.asarray(orbit.state), period, np.asarray(orbit.response[:3])
+        if bool(found.collocated):
+            known = found.known
+            assert known is not None
+            return cls(*first, None, trimmed(known, period) if bool(known.sound) else None)
+        grid, corners = np.asarray(orbit.flow.grid), np.asarray(orbit.flow.corners)
+        # Few sizes of these arrays, so that few programs are compiled.
+        room = 512
+        while room < min(np.sum(np.isfinite(grid)), len(grid)):
+            room *= 2
+        return cls(*first, (grid[:room].copy(), corners[:room].copy()), None)
+
+
+class _Recipe(NamedTuple):
+    """How to compute an orbit: the evaluation `again`, which begins on the orbits `parents`."""
+
+    again: Callable[[], Any]
+    parents: tuple[bytes, ...]
 
 
 class OrbitStore:
-    """Orbits closed by collocation, found again by their state at φ1 = 0.
+    """Closed orbits, found again by their state at φ1 = 0.
 
     An evaluation passes on the state of its orbit as `start` for neighbouring evaluations. With
-    this state, they find the whole orbit here. Threads can share an instance. Results do not depend
-    on it: an orbit that is not stored is closed from its state, which takes longer.
+    this state, they find the whole orbit here. An orbit that was closed by shooting is closed by
+    collocation when a neighbour asks for it. Threads can share an instance.
     """
 
     def __init__(self) -> None:
-        self._known: OrderedDict[bytes, tuple[Known, RotorPair]] = OrderedDict()
-        self._lock = threading.Lock()
+        self._found: OrderedDict[bytes, tuple[_Closed, Built] | _Recipe] = OrderedDict()
+        self._known: dict[bytes, Known | None] = {}
+        self._lock = threading.RLock()
 
     def __len__(self) -> int:
-        return len(self._known)
+        return len(self._found)
 
-    def near(self, state: NDArray[np.float64] | None) -> tuple[Known, RotorPair] | None:
-        """Return the orbit with this scaled `state` (n,) at φ1 = 0, and its pair.
+    def near(self, built: Built, state: NDArray[np.float64] | None) -> Steady | None:
+        """Return the motion of `built` near the known orbit with this scaled `state` at φ1 = 0.
 
-        The result is `None` if no such orbit is known."""
-        if state is None:
+        The result is `None` if there is no such orbit, or if the motion is not accepted."""
+        if state is None or not built.continues:
             return None
         with self._lock:
-            found = self._known.get(_key(state))
-            if found is not None:
-                self._known.move_to_end(_key(state))
+            found = self._recalled(_key(state))
+            known = None if found is None else self._adopted(_key(state), *found)
+        if found is None or known is None:
+            return None
+        if jax.tree.structure(found[1].pair) != jax.tree.structure(built.pair):
+            return None
+        motion = _closed(built, known, found[1].pair)
+        return motion if Status.of(motion.status) is Status.PERIODIC else None
+
+    def keep(self, found: Steady, built: Built) -> None:
+        """Remember the orbit of the motion `found` of `built`, if it is periodic."""
+        if Status.of(found.status) is Status.PERIODIC and built.continues:
+            self._keep(_key(found.orbit.state), (_Closed.of(found), built))
+
+    def recall(
+        self,
+        states: Iterable[NDArray[np.float64]],
+        again: Callable[[], Any],
+        start: NDArray[np.float64] | None,
+    ) -> None:
+        """Remember how to compute orbits that have these scaled `states` at φ1 = 0.
+
+        `again` is called if a neighbour asks for one of them. It must compute these very orbits,
+        with an evaluator that uses this memory. `start`: argument `start` of that evaluation."""
+        recipe = _Recipe(again, () if start is None else tuple(map(_key, _rows(start))))
+        for state in states:
+            self._keep(_key(state), recipe)
+
+    def _keep(self, key: bytes, entry: Any) -> None:
+        with self._lock:
+            self._found[key] = entry
+            self._found.move_to_end(key)
+            self._known.pop(key, None)
+            while len(self._found) > _MOST:
+                self._known.pop(self._found.popitem(last=False)[0], None)
+
+    def _recalled(self, key: bytes) -> tuple[_Closed, Built] | None:
+        """Return the orbit stored under `key`, and its pair."""
+        # The orbits from which these orbits were closed come first. A loop, because there may be
+        # hundreds.
+        waiting = [key]
+        while waiting:
+            found = self._found.get(waiting[-1])
+            if not isinstance(found, _Recipe):
+                waiting.pop()
+                continue
+            before = [k for k in found.parents if isinstance(self._found.get(k), _Recipe)]
+            if before and before[0] not in waiting:
+                waiting.append(before[0])
+                continue
+            del self._found[waiting.pop()]
+            found.again()
+        found = self._found.get(key)
+        if found is None or isinstance(found, _Recipe):
+            return None
+        self._found.move_to_end(key)
         return found
 
-    def keep(self, found: Steady, pair: RotorPair) -> None:
-        """Remember the orbit of the motion `found` of `pair`, if it was closed by collocation."""
-        if found.known is None or Status.of(found.status) is not Status.PERIODIC:
-            return
-        if bool(found.collocated):
-            state = np.asarray(found.orbit.state)
-            self.store(state, found.known, int(found.period), pair)
+    def _adopted(self, key: bytes, found: _Closed, built: Built) -> Known | None:
+        """Return the orbit `found` of `built` as one closed by collocation, or `None`."""
+        if key not in self._known:
+            self._known[key] = _adopted(found, built)
+        return self._known[key]
 
-    def store(self, state: NDArray[np.float64], known: Known, period: int, pair: RotorPair) -> None:
-        """Remember the orbit `known` of a `pair`, with `period` mesh periods, if it is sound.
 
-        `state` (n,): its scaled state at φ1 = 0."""
-        cut = trimmed(known, period) if bool(known.sound) else None
-        if cut is None:
-            return
-        with self._lock:
-            self._known[_key(state)] = cut, pair
-            while len(self._known) > _MOST:
-                self._known.popitem(last=False)
+def _adopted(found: _Closed, built: Built) -> Known | None:
+    """Return the orbit `found` of `built` as one closed by collocation.
+
+    The result is `None` if it cannot be closed, or if the forces of both orbits differ."""
+    if found.steps is None:
+        return found.known
+    period = np.asarray(found.period)
+    start = jax.device_get(_seed(built.pair, found.state, found.steps, period, found.period))
+    motion = _closed(built, start, built.pair)
+    if Status.of(motion.status) is not Status.PERIODIC:
+        return None
+    forces = np.asarray(motion.orbit.response[:3])
+    same = np.abs(forces - found.forces) <= _SAME * np.abs(found.forces)
+    return trimmed(motion.known, found.period) if np.all(same) else None
+
+
+def _closed(built: Built, known: Known, neighbour: RotorPair) -> Steady:
+    """Return the motion of `built` near the `known` orbit of the pair `neighbour`."""
+    start = known, neighbour
+    return jax.device_get(_near(built.pair, built.tangents, start, built.radius, built.solver))
+
+
+def prepare(built: Built) -> None:
+    """Compile the programs for orbits of one mesh period in the background.
+
+    In `built`, `jax.ShapeDtypeStruct` may replace arrays."""
+    known = Known.empty(sizes(1), built.pair.states, 1 + built.pair.two_sided)
+    _near.prepare(built.pair, built.tangents, (known, built.pair), built.radius, built.solver)
+
+
+def _rows(start: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return the scaled states in the argument `start` of an evaluation.
+
+    In that of several motions, an index precedes the state in each row: both readings are
+    returned."""
+    rows = np.atleast_2d(np.asarray(start, np.float64))
+    return [*rows, *rows[:, 1:]]
 
 
 def _key(state) -> bytes:
     return np.ascontiguousarray(state, np.float64).tobytes()
 
 
-__all__ = ["OrbitStore"]
+_near = Program(near_motion)
+_seed = Program(seed)
+
+__all__ = ["Built", "OrbitStore", "prepare"]

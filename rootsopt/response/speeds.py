@@ -59,6 +59,9 @@ class SpeedsEvaluation(Evaluation):
 
     parts: tuple[AtSpeed, ...] = ()
 
+    def motions(self) -> list[NDArray[np.float64]]:
+        return [state for part in self.parts for state in part.evaluation.motions()]
+
     def record(self) -> dict[str, Any]:
         return super().record() | {
             "speeds": [part.row() | {"share": part.share} for part in self.parts]

@@ -61,6 +61,9 @@ class ToleranceEvaluation(Evaluation):
         """Evaluations in the scenes of the sample, without the nominal scene."""
         return self.parts[1:]
 
+    def motions(self) -> list[NDArray[np.float64]]:
+        return [state for part in self.parts for state in part.evaluation.motions()]
+
     def record(self) -> dict[str, Any]:
         own = {"status": self.status.label, "message": self.message}
         rows = [part.row() for part in self.samples]

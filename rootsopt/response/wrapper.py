@@ -46,12 +46,23 @@ class Evaluates(Protocol):
         Arguments: see `__call__`."""
         ...
 
-    def prepare(self, design: Any = None, series: bool = True, maxima: bool = False) -> "Evaluates":
+    def prepare(
+        self,
+        design: Any = None,
+        series: bool = True,
+        maxima: bool = False,
+        neighbours: bool = False,
+    ) -> "Evaluates":
         """Compile the programs for evaluating `design` (d,), in config units, in the background.
 
         `series`: whether the evaluations will compute the series; `maxima`: whether evaluators
-        `with_maxima` will follow. Return another evaluator, with a contact map sized for
-        `design`."""
+        `with_maxima` will follow; `neighbours`: whether evaluations without series will follow that
+        start on the orbits of their neighbours. Return another evaluator, with a contact map sized
+        for `design`."""
+        ...
+
+    def recall(self, evaluation: Evaluation, again: Callable[[], Any], start: Any) -> None:
+        """Remember how to compute an `evaluation`. Arguments: see `Evaluator.recall`."""
         ...
 
     def pair(self, design: ArrayLike) -> RotorPair:
@@ -125,15 +136,19 @@ class Wrapper:
         Arguments: see `Evaluates.__call__`."""
         raise NotImplementedError
 
+    def recall(self, evaluation, again, start) -> None:
+        """Remember how to compute an `evaluation`. Arguments: see `Evaluator.recall`."""
+        self.single.recall(evaluation, again, start)
+
     def pair(self, design: ArrayLike) -> RotorPair:
         """Return the rotor pair of `design` (config units)."""
         return self.single.pair(design)
 
-    def prepare(self: W, design=None, series=True, maxima=False) -> W:
+    def prepare(self: W, design=None, series=True, maxima=False, neighbours=False) -> W:
         """Compile the programs for evaluating a design in the background.
 
         Return another evaluator, sized for the design. Arguments: see `Evaluates.prepare`."""
-        return self._around(self.single.prepare(design, series, maxima))
+        return self._around(self.single.prepare(design, series, maxima, neighbours))
 
     def at_speed(self: W, speed_rpm: float) -> W:
         """Return another evaluator at the speed `speed_rpm`."""

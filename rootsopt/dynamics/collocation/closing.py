@@ -21,12 +21,19 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.search import SearchContact
-from rootsopt.dynamics.collocation.blocks import BLOCK
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation
-from rootsopt.dynamics.collocation.events import Events, found_events, look, rooted
+from rootsopt.dynamics.collocation.events import (
+    FlagScan,
+    agrees,
+    apart,
+    found_events,
+    look,
+    rooted,
+)
 from rootsopt.dynamics.collocation.forces import OrbitForces, response
-from rootsopt.dynamics.collocation.mesh import aligned, counted, needed
+from rootsopt.dynamics.collocation.known import Known
+from rootsopt.dynamics.collocation.mesh import aligned, counted, needed, roughness
 from rootsopt.dynamics.collocation.newton import newton
 from rootsopt.dynamics.orbit import choose
 from rootsopt.dynamics.pair import RotorPair
@@ -36,20 +43,19 @@ _FIRST, _EVENT = 20, 1
 event."""
 _FINER = 1.4
 """Factor by which the number of elements grows when the mesh is refined."""
-_MOST = 96
-"""Maximum number of elements per mesh period."""
-_TIMES = 48
-"""Number of events per mesh period, on average over the orbit, above which the search for the orbit
-fails."""
 _TURNS = 24
 """Maximum number of iterations of the loop."""
 _CORRECTED = 1e-6
 """Last correction of the states (scaled) above which an orbit is rejected."""
 _FAILURES = 4
 """Number of failures of Newton's method above which the search for the orbit fails."""
-_SMALL = 3e-9
-"""Newton step (scaled) below which Newton's method stops. The step after it would be smaller by
-orders of magnitude, since convergence is quadratic."""
+_SMALL = 1e-5, 3e-9
+"""Newton step (scaled) below which Newton's method stops: from a similar pair's orbit on the same
+mesh, and otherwise. The step after it would be smaller by orders of magnitude, since convergence is
+quadratic. It is made together with the derivatives."""
+_FAR = 1e-6
+"""Difference (rad) between the contact's normal angle in the solved orbit and that found by a
+search, above which the orbit is solved again from the latter."""
 _GAIN = 10.0
 """Factor by which the difference between the results on two meshes is divided to estimate the error
 on the finer mesh. In theory the error falls by the larger factor 1.4⁸."""
@@ -58,19 +64,19 @@ on the finer mesh. In theory the error falls by the larger factor 1.4⁸."""
 class Closed(NamedTuple):
     """A closed orbit.
 
-    `found`: its forces and derivatives; `error`: estimated relative error of the forces, the
-    largest of mean, RMS and peak; `drift`: estimated error of their derivatives, relative to the
-    largest derivative of the same force; `sound`: whether Newton's method has converged and the
-    flags agree with the events of the mesh; `events`: number of events; `turns`: number of
-    iterations of the loop; `steps`: number of Newton steps. `error` and `drift` are inf if only one
-    mesh was solved.
+    `found`: its forces and derivatives; `roughness`: that of its elements (`mesh.roughness`), for
+    which the errors hold; `error`: estimated relative error of the forces, the largest of mean, RMS
+    and peak; `drift`: estimated error of their derivatives, relative to the largest derivative of
+    the same force; `sound`: whether Newton's method has converged and the flags agree with the
+    events of the mesh; `turns`: number of iterations of the loop; `steps`: number of Newton steps.
+    `error` and `drift` are inf if they are not known.
     """
 
     found: OrbitForces
+    roughness: Float[Array, ""]
     error: Float[Array, ""]
     drift: Float[Array, ""]
     sound: Bool[Array, ""]
-    events: Int[Array, ""]
     turns: Int[Array, ""]
     steps: Int[Array, ""]
 
@@ -79,7 +85,8 @@ class _Loop(NamedTuple):
     """State of the loop.
 
     `closed`: result so far; `elements`: motion for the next iteration; `force` (e, s): contact
-    force (N) at the Gauss points; `fits`: whether the elements end at events; `solved`: whether
+    force (N) at the Gauss points; `trusted`: whether the motion is the orbit of a similar pair,
+    whose flags need not be evaluated; `fits`: whether the elements end at events; `solved`: whether
     Newton's method has converged on these elements; `failures`: number of times that it has not
     converged; `meshes`: number of meshes on which the orbit has been solved; `over`: whether the
     loop ends.
@@ -88,6 +95,7 @@ class _Loop(NamedTuple):
     closed: Closed
     elements: Elements
     force: Float[Array, "e s"]
+    trusted: Bool[Array, ""]
     fits: Bool[Array, ""]
     solved: Bool[Array, ""]
     failures: Int[Array, ""]
@@ -123,14 +131,6 @@ def _newer(kind: type, margin: str, flag: str) -> bool:
     return places[0] <= places[1]
 
 
-def sizes(periods: int) -> tuple[int, int]:
-    """Return the sizes of the arrays of a mesh, for its elements and for its times.
-
-    They are large enough for orbits of up to `periods` mesh periods."""
-    elements = -(-(periods * _MOST) // BLOCK) * BLOCK
-    return elements, periods * _TIMES + 3
-
-
 def first_elements(period: Int[Array, ""]) -> Int[Array, ""]:
     """Return the number of elements before events are known, for an orbit of `period` mesh
     periods."""
@@ -146,41 +146,45 @@ class _Closer(eqx.Module):
     equation: CollocatedEquation
     frozen: RotorPair
     tangents: Any
+    known: Known
+    neighbour: RotorPair
     tolerance: Float[Array, ""]
 
-    def start(self, elements: Elements, known: Bool[Array, ""]) -> _Loop:
-        """Return the initial state of the loop for the motion `elements`.
-
-        `known`: whether the elements end at events."""
+    def start(self) -> _Loop:
+        """Return the initial state of the loop."""
+        known, elements = self.known, self.known.elements
         nothing = _nothing(self.equation, self.tangents, elements)
         no, zero = jnp.zeros((), bool), jnp.zeros((), int)
-        return _Loop(nothing, elements, elements.slopes[..., 0], known, no, zero, zero, no)
+        begun = known.aligned, known.aligned, no, zero, zero, no
+        return _Loop(nothing, elements, elements.slopes[..., 0], *begun)
 
     def turn(self, now: _Loop) -> _Loop:
         """Evaluate the flags along the motion, and return the loop's state after one iteration.
 
         Depending on the flags, the iteration solves for the orbit, stores its forces or changes the
         mesh."""
-        seen = look(self.frozen, now.elements)
-        events = found_events(self.frozen, now.elements, seen, now.elements.mesh.times.shape[0])
-        agree = now.fits & (events.new == 0) & (events.gone == 0)
-        done = agree & now.solved
+        shape = jax.eval_shape(lambda: look(self.frozen, now.elements))
+        empty: FlagScan = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
+        seen = lax.cond(now.trusted, lambda: empty, lambda: look(self.frozen, now.elements))
+        agree = now.trusted | (now.fits & agrees(self.frozen, now.elements, seen))
+        done = agree & now.solved & (apart(now.elements, seen) <= _FAR)
         new = lax.cond(
             agree,
-            lambda: lax.cond(
-                now.solved, lambda: self.keep(now, events), lambda: self.solve(now, seen)
-            ),
+            lambda: lax.cond(done, lambda: self.keep(now), lambda: self.solve(now, seen)),
             lambda: now,
         )
-        over = new.over | ~events.fits
-        new = lax.cond((done | ~agree) & ~over, lambda: self.align(new, events, done), lambda: new)
+        new = lax.cond(
+            (done | ~agree) & ~new.over, lambda: self.align(new, seen, done), lambda: new
+        )
         closed = new.closed._replace(turns=now.closed.turns + 1)
-        return new._replace(closed=closed, over=over)
+        return new._replace(closed=closed, trusted=jnp.zeros((), bool))
 
-    def align(self, now: _Loop, events: Events, finer) -> _Loop:
-        """Return the loop's state with the motion on a mesh that ends at `events`.
+    def align(self, now: _Loop, seen: FlagScan, finer) -> _Loop:
+        """Return the loop's state with the motion on a mesh that ends at its events.
 
-        `finer`: whether the new mesh has more elements than the old one."""
+        `seen`: flags along the motion; `finer`: whether the new mesh has more elements than the old
+        one."""
+        events = found_events(self.frozen, now.elements, seen, now.elements.mesh.times.shape[0])
         taken = now.elements.mesh.used
         first = taken // 2 + _EVENT * events.count
         used = jnp.where(now.fits, jnp.where(finer, (_FINER * taken).astype(int), taken), first)
@@ -188,14 +192,18 @@ class _Closer(eqx.Module):
         (place, wanted), (spot, number) = needed(now.elements), counted(now.elements)
         density = jnp.where(now.fits, place, spot), jnp.where(now.fits, wanted, number)
         new = aligned(now.elements, (events.times, events.which), density, used)
-        return now._replace(elements=new, fits=jnp.ones((), bool), solved=jnp.zeros((), bool))
+        yes = jnp.ones((), bool)
+        return now._replace(elements=new, fits=yes, solved=~yes, over=~events.fits)
 
-    def solve(self, now: _Loop, seen) -> _Loop:
+    def solve(self, now: _Loop, seen: FlagScan) -> _Loop:
         """Return the loop's state after Newton's method on the present mesh.
 
         `seen`: flags along the motion."""
-        got = newton(self.equation, rooted(now.elements, seen), jnp.asarray(_SMALL))
-        good = got.size <= 10 * _SMALL
+        given = rooted(now.elements, seen).roots
+        begun = now.elements._replace(roots=jnp.where(now.trusted, now.elements.roots, given))
+        limit = jnp.where(now.trusted, *_SMALL)
+        got = newton(self.equation, begun, limit, self.neighbour, now.trusted)
+        good = got.size <= 10 * limit
         closed = now.closed._replace(steps=now.closed.steps + got.turns)
         # After a failure, the loop finds the events of the last motion and tries again.
         failures = now.failures + ~good
@@ -208,25 +216,35 @@ class _Closer(eqx.Module):
             over=~jnp.isfinite(got.size) | (failures > _FAILURES),
         )
 
-    def keep(self, now: _Loop, events: Events) -> _Loop:
+    def keep(self, now: _Loop) -> _Loop:
         """Return the loop's state with the forces, derivatives and errors of the present orbit.
 
-        The flags along the orbit must change exactly at the `events` of its mesh."""
+        The flags along the orbit must change exactly at the events of its mesh."""
         found = response(self.equation, now.elements, now.force, self.tangents)
-        error, drift = _differences(now.closed.found, found)
+        size = roughness(found.elements)
+        # On the first mesh, the errors are estimated from those of the known orbit.
+        growth = jnp.maximum(size / self.known.roughness, 1.0) ** 2
         first = now.meshes == 0
-        error, drift = (jnp.where(first, jnp.inf, x / _GAIN) for x in (error, drift))
+        error, drift = (
+            jnp.where(first, known * growth, x / _GAIN)
+            for known, x in zip(
+                (self.known.error, self.known.drift),
+                _differences(now.closed.found, found),
+                strict=True,
+            )
+        )
         full = now.elements.mesh.used >= now.elements.state.shape[0] - 1
         # Newton's method has converged, so the correction must be small. It is large or NaN where
         # the time derivative of a margin vanishes at its event.
         good = found.correction < _CORRECTED
+        size = jnp.where(first, jnp.maximum(size, self.known.roughness), size)
         kept = now.closed
         closed = kept._replace(
             found=choose(good, found, kept.found),
+            roughness=jnp.where(good, size, kept.roughness),
             error=jnp.where(good, error, kept.error),
             drift=jnp.where(good, drift, kept.drift),
             sound=kept.sound | good,
-            events=jnp.where(good, events.count, kept.events),
         )
         return now._replace(
             closed=closed,
@@ -239,23 +257,26 @@ class _Closer(eqx.Module):
 def close(
     equation: CollocatedEquation,
     tangents: Any,
-    elements: Elements,
+    known: Known,
+    neighbour: RotorPair,
     tolerance: Float[Array, ""],
-    known: Bool[Array, ""] | bool = False,
 ) -> Closed:
-    """Close the orbit near the motion `elements`, and compute its forces and their derivatives.
+    """Close the orbit near a `known` one, and compute its forces and their derivatives.
 
     `tangents`: d directions of the pair's parameters along which to differentiate, stacked along a
-    leading axis; `tolerance`: relative error of the forces to reach. If it is inf, the orbit is
-    solved on one mesh only, without an error estimate. `known`: whether the elements end at events,
-    as those of an orbit of a similar pair do."""
-    closer = _Closer(equation, lax.stop_gradient(equation.pair), tangents, tolerance)
+    leading axis; `neighbour`: pair whose orbit is the known one; `tolerance`: relative error of the
+    forces to reach. If the mesh of the known orbit is aligned with events, the new one is solved on
+    it, and its error follows from the known one. Otherwise, and if the events are others or the
+    error is too large, the mesh is changed until flags and events agree and the error is small
+    enough."""
+    closer = _Closer(
+        equation, lax.stop_gradient(equation.pair), tangents, known, neighbour, tolerance
+    )
 
     def go_on(now: _Loop) -> Bool[Array, ""]:
         return ~now.over & (now.closed.turns < _TURNS)
 
-    start = closer.start(elements, jnp.asarray(known))
-    return lax.while_loop(go_on, lambda now: closer.turn(now), start).closed
+    return lax.while_loop(go_on, lambda now: closer.turn(now), closer.start()).closed
 
 
 def _differences(before: OrbitForces, after: OrbitForces):
@@ -282,7 +303,7 @@ def _nothing(equation: CollocatedEquation, tangents: Any, elements: Elements) ->
     empty: OrbitForces = jax.tree.map(lambda x: jnp.full(x.shape, 0, x.dtype), shape)
     infinite, zero = jnp.asarray(jnp.inf), jnp.zeros((), int)
     no = jnp.zeros((), bool)
-    return Closed(empty, infinite, infinite, no, zero, zero, zero)
+    return Closed(empty, jnp.ones(()), infinite, infinite, no, zero, zero)
 
 
-__all__ = ["Closed", "close", "first_elements", "sizes", "supported"]
+__all__ = ["Closed", "close", "first_elements", "supported"]

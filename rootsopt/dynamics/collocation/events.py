@@ -8,6 +8,7 @@ known (`NearContact`). Events inside elements are located by bisection.
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -106,6 +107,7 @@ def ranks(pair: RotorPair) -> list[int]:
     return both + [0] * (total - len(both))
 
 
+@eqx.filter_jit
 def look(pair: RotorPair, elements: Elements) -> FlagScan:
     """Evaluate the flags at the Gauss points and on both sides of the end of each element."""
     mesh = elements.mesh
@@ -139,6 +141,18 @@ def rooted(elements: Elements, seen: FlagScan) -> Elements:
     ends = jnp.stack([own, seen.roots[:, inside + 1]], axis=-1)
     points = jnp.repeat(seen.roots[:, :inside, :, None], 2, axis=-1)
     return elements._replace(roots=jnp.concatenate([points, ends[:, None]], axis=1))
+
+
+def apart(elements: Elements, seen: FlagScan) -> Float[Array, ""]:
+    """Return the greatest difference (rad) between the roots of `elements` and those of a search.
+
+    Roots are normal angles of the closest approach. Only Gauss points at which the flanks push
+    count. `seen`: result of `look`."""
+    inside = len(GAUSS.nodes)
+    used = jnp.arange(elements.state.shape[0]) < elements.mesh.used
+    counts = seen.pushes[:, :inside] & used[:, None, None]
+    away = jnp.abs(elements.roots[:, :inside, :, 0] - seen.roots[:, :inside])
+    return jnp.max(jnp.where(counts, away, 0.0))
 
 
 class _Compared(NamedTuple):

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from rootsopt.dynamics.collocation.blocks import BLOCK
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.events import _SAME
 from rootsopt.dynamics.collocation.gauss import GAUSS
@@ -10,6 +11,21 @@ from rootsopt.dynamics.collocation.gauss import GAUSS
 _FLOOR = 0.15
 """Density of elements that is added everywhere, as a fraction of the mean density. It limits the
 length of elements."""
+
+
+_MOST = 96
+"""Maximum number of elements per mesh period."""
+_TIMES = 48
+"""Number of events per mesh period, on average over the orbit, above which the search for the orbit
+fails."""
+
+
+def sizes(periods: int) -> tuple[int, int]:
+    """Return the sizes of the arrays of a mesh, for its elements and for its times.
+
+    They are large enough for orbits of up to `periods` mesh periods."""
+    elements = -(-(periods * _MOST) // BLOCK) * BLOCK
+    return elements, periods * _TIMES + 3
 
 
 def shared(

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.closing import close, first_elements, sizes
+from rootsopt.dynamics.collocation.closing import Closed, close, first_elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation
 from rootsopt.dynamics.collocation.forces import OrbitForces
-from rootsopt.dynamics.collocation.mesh import roughness
-from rootsopt.dynamics.collocation.nearby import Known, close_near
+from rootsopt.dynamics.collocation.known import Known
+from rootsopt.dynamics.collocation.mesh import sizes
 from rootsopt.dynamics.collocation.sampled import as_flow
 from rootsopt.dynamics.collocation.seed import seeded
 from rootsopt.dynamics.flow import Flow, flow
@@ -86,7 +86,8 @@ def collocated(
     )
     tolerance = integrator.tolerance(state.dtype)
     equation = CollocatedEquation(pair, measures, pair.force_scale)
-    closed = close(equation, tangents, elements, _ACCURACY * tolerance)
+    start = Known.unaligned(elements)
+    closed = close(equation, tangents, start, pair, _ACCURACY * tolerance)
     found = closed.found
     length, peak = period.astype(state.dtype), found.response[2]
     top = jnp.where(peak > 0, peak, pair.force_scale)
@@ -103,8 +104,7 @@ def collocated(
     verified &= ~_repeats(found, period, longest)
     residual = jnp.where(closed.sound, found.correction, jnp.inf)
     orbit = _as_orbit(found, _with_forces(out, found), residual, closed.drift, closed.steps)
-    known = Known(found.elements, roughness(found.elements), closed.error, closed.drift, verified)
-    return Collocated(orbit, closed.sound, verified, known)
+    return Collocated(orbit, closed.sound, verified, _known(closed, verified))
 
 
 def _repeats(found: OrbitForces, period: Int[Array, ""], longest: int) -> Bool[Array, ""]:
@@ -129,18 +129,26 @@ def near_orbit(
 
     `start`: the known orbit, and its pair; `integrator`: sets accuracy and room for steps; for the
     other arguments, see `collocated`."""
-    unit = lax.stop_gradient(pair.force_scale)
-    near = close_near(CollocatedEquation(pair, measures, unit), tangents, *start)
-    found, drift, sound = near.found, near.known.drift, near.known.sound
-    tolerance = integrator.tolerance(found.state.dtype)
-    verified = sound & (near.known.error <= _UNREFINED * _ACCURACY * tolerance)
+    known, neighbour = start
+    tolerance = integrator.tolerance(pair.angle_scale.dtype)
+    equation = CollocatedEquation(pair, measures, lax.stop_gradient(pair.force_scale))
+    closed = close(equation, tangents, known, neighbour, _ACCURACY * tolerance)
+    found, sound = closed.found, closed.sound & known.sound
+    verified = sound & (closed.error <= _UNREFINED * _ACCURACY * tolerance)
     period = jnp.round(found.elements.mesh.period).astype(int)
     verified &= ~_repeats(found, period, sizes_of[1])
     # Newton's method converges quadratically: what is left is far below the last correction.
     residual = jnp.where(sound, found.correction**2, jnp.inf)
     out = as_flow(found, sizes_of[0], integrator.max_steps)
-    orbit = _as_orbit(found, out, residual, drift, near.steps)
-    return Collocated(orbit, sound, verified & out.solved, near.known)
+    orbit = _as_orbit(found, out, residual, closed.drift, closed.steps)
+    return Collocated(orbit, sound, verified & out.solved, _known(closed, verified))
+
+
+def _known(closed: Closed, verified: Bool[Array, ""]) -> Known:
+    """Return the orbit `closed` in the form from which orbits of similar pairs can be closed."""
+    yes = jnp.ones((), bool)
+    errors = closed.roughness, closed.error, closed.drift
+    return Known(closed.found.elements, *errors, verified, yes)
 
 
 def _as_orbit(found: OrbitForces, out: Flow, residual, drift, steps) -> Orbit:

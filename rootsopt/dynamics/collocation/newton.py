@@ -28,6 +28,10 @@ _ROOM = 0.7
 """Greatest fraction of an interval's length by which one step may shorten the interval."""
 _LONGEST = 1.0
 """Change of a state (scaled) above which a Newton step is shortened."""
+_WAY = 1e-3
+"""Fraction of the way to the new pair over which the predictor takes its difference."""
+_TURNED = 0.1
+"""Change of a root (rad) above which it is limited to this value."""
 
 
 class Converged(NamedTuple):
@@ -76,27 +80,28 @@ def newton(
     equation: CollocatedEquation,
     elements: Elements,
     tolerance: Float[Array, ""],
-    neighbour: RotorPair | None = None,
+    neighbour: RotorPair,
+    predict: Bool[Array, ""],
 ) -> Converged:
     """Solve for the orbit near `elements`, until the last step is at most `tolerance` (scaled).
 
-    `neighbour`: pair of which `elements` is an orbit, if it is a similar pair. The first step
-    is then along the tangent of the family of orbits that leads to the equation's pair
-    (predictor). Newton's first step would be evaluated at penetrations of the wrong size, since
-    the flanks have moved."""
+    `predict`: whether `elements` is an orbit of the similar pair `neighbour`. The first step is
+    then along the tangent of the family of orbits that leads to the equation's pair (predictor).
+    Newton's first step would be evaluated at penetrations of the wrong size, since the flanks have
+    moved. The tangent is Newton's step for a pair a small way (`_WAY`) towards the new one,
+    divided by this way."""
 
     def go_on(now):
         return (now.turns < _TURNS) & (now.size > tolerance)  # A size of NaN also ends the loop.
 
     def turn(now):
         at = now.elements
-        if neighbour is None:
-            points = evaluated(equation, at)
-            found = lines(at, points)
-        else:
-            points, found = _along(equation, at, neighbour, now.turns == 0)
-        step = solved_step(at, found, own_column(at, found))
-        moved, size = advanced(at, step, points.roots)
+        way = jnp.where(predict & (now.turns == 0), _WAY, 1.0)
+        points = evaluated(between(equation, neighbour, way), at)
+        found = lines(at, points)
+        own = jax.tree.map(lambda x: x / way, own_column(at, found))
+        roots = at.roots + jnp.clip((points.roots - at.roots) / way, -_TURNED, _TURNED)
+        moved, size = advanced(at, solved_step(at, found, own), roots)
         return Converged(moved, size, now.turns + 1, points.force[:, : len(GAUSS.nodes)])
 
     force = jnp.zeros(elements.slopes.shape[:2], elements.state.dtype)
@@ -105,32 +110,14 @@ def newton(
     return lax.while_loop(go_on, turn, start)
 
 
-def _along(
-    equation: CollocatedEquation, elements: Elements, neighbour: RotorPair, first: Bool[Array, ""]
-) -> tuple[Point, Lines]:
-    """Return the equation along `elements`, and its linearisation.
-
-    In the `first` step, the equation is that of the pair `neighbour`. The residual of the
-    linearisation then also contains the change from this pair to that of `equation`."""
+def between(
+    equation: CollocatedEquation, neighbour: RotorPair, way: Float[Array, ""]
+) -> CollocatedEquation:
+    """Return `equation` for a pair between `neighbour` (`way` = 0) and its own pair (1)."""
     new, static = eqx.partition(equation.pair, eqx.is_inexact_array)
     old = eqx.filter(neighbour, eqx.is_inexact_array)
-    change = jax.tree.map(lambda x, y: jnp.where(first, x - y, 0.0)[None], new, old)
-    here = eqx.combine(jax.tree.map(lambda x, y: jnp.where(first, y, x), new, old), static)
-    own = eqx.tree_at(lambda e: e.pair, equation, here)
-    mesh = elements.mesh
-    tau, state = elements.places
-    which = jnp.maximum(mesh.which[mesh.interval + 1], 0)
-
-    def both(tau, state, roots, which):
-        return own.along(tau, state, roots, which, change)
-
-    each = jax.vmap(jax.vmap(both, (0, 0, 0, None)))
-    points, along = in_blocks(each, mesh.used, tau, state, elements.roots, which)
-    found, (count, inside) = lines(elements, points), (state.shape[-1], len(GAUSS.nodes))
-    return points, found._replace(
-        miss=found.miss + along[:, :inside, :count, 0],
-        margin=found.margin + along[:, inside, -1, 0],
-    )
+    here = jax.tree.map(lambda x, y: jnp.where(way == 1, x, y + way * (x - y)), new, old)
+    return eqx.tree_at(lambda e: e.pair, equation, eqx.combine(here, static))
 
 
 def advanced(

@@ -2,23 +2,20 @@
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import rootsopt
-from rootsopt.dynamics.collocation.closing import sizes
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.forces import OrbitForces, Peak
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
-from rootsopt.dynamics.collocation.mesh import roughness
-from rootsopt.dynamics.collocation.nearby import Known, trimmed
+from rootsopt.dynamics.collocation.known import Known, trimmed
+from rootsopt.dynamics.collocation.mesh import roughness, sizes
 from rootsopt.dynamics.collocation.sampled import as_flow
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.orbits import OrbitStore
-from rootsopt.scene import Scene
+from rootsopt.response.orbits import Built, OrbitStore, _Closed, _key
 from rootsopt.status import Status
 
 PERIOD, BEGIN, USED = 2, 0.3, 10
@@ -50,7 +47,8 @@ def _known(room=(48, 51)):
         jnp.zeros((elements, POINTS + 1, 1, 2)),
     )
     one = jnp.ones(())
-    return Known(motion, one, one, one, jnp.ones((), bool))
+    yes = jnp.ones((), bool)
+    return Known(motion, one, one, one, yes, yes)
 
 
 def test_orbit_sampled_as_steps_is_the_motion_over_one_period():
@@ -100,49 +98,70 @@ def test_known_orbit_is_cut_to_the_size_of_its_period():
     assert trimmed(many, 1) is None
 
 
-def test_memory_finds_an_orbit_by_its_state_and_forgets_the_oldest(monkeypatch):
+def _entry(state):
+    """Return an entry of the memory for an orbit with this state."""
+    built = Built(None, None, None, None)  # pyright: ignore[reportArgumentType]
+    return _Closed(state, PERIOD, np.ones(3), None, _known(sizes(8))), built
+
+
+def test_memory_forgets_the_least_recently_used_orbit(monkeypatch):
     monkeypatch.setattr("rootsopt.response.orbits._MOST", 2)
-    memory, known = OrbitStore(), _known(sizes(8))
-    config = rootsopt.load_config("configs/cic.yaml")
-    design = jnp.asarray(config.design, float)
-    pair = eqx.filter_eval_shape(Scene.pair, Scene.from_config(config), design)
-    memory.store(np.array([0.25]), known, PERIOD, pair)
-    memory.store(np.array([0.5]), known._replace(sound=jnp.zeros((), bool)), PERIOD, pair)
-    assert len(memory) == 1
-    assert memory.near(np.array([0.25])) is not None
-    assert memory.near(np.array([0.26])) is None
-    assert memory.near(None) is None
-    memory.store(np.array([0.5]), known, PERIOD, pair)
-    memory.near(np.array([0.25]))
-    memory.store(np.array([0.75]), known, PERIOD, pair)
-    assert memory.near(np.array([0.5])) is None
-    assert memory.near(np.array([0.25])) is not None
+    memory = OrbitStore()
+    first, second, third = (np.array([x]) for x in (0.25, 0.5, 0.75))
+    memory._keep(_key(first), _entry(first))
+    memory._keep(_key(second), _entry(second))
+    assert memory._recalled(_key(np.array([0.26]))) is None
+    assert memory._recalled(_key(first)) is not None
+    memory._keep(_key(third), _entry(third))
+    assert len(memory) == 2
+    assert memory._recalled(_key(second)) is None
+    assert memory._recalled(_key(first)) is not None
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["cic", "ee"])
-def test_orbit_from_a_neighbour_is_that_from_rest(name):
-    """For close neighbours, both orbits agree.
+def test_orbits_of_a_former_process_are_computed_when_asked_for():
+    """Each orbit begins on the one before, of which there may be more than Python's stack has room
+    for; an orbit that nobody asks for is not computed."""
+    memory, made = OrbitStore(), []
+    states = [np.array([0.1, float(k)]) for k in range(2000)]
 
-    For farther ones, where events appear or vanish, the orbit is closed in the usual way."""
-    config = rootsopt.load_config(f"configs/{name}.yaml", ["solver.orbit=collocation"])
-    evaluator = Evaluator.of(config).with_maxima()
+    def again(number):
+        def compute():
+            made.append(number)
+            memory._keep(_key(states[number]), _entry(states[number]))
+
+        return compute
+
+    for number, state in enumerate(states):
+        # As the `state` of several motions has it: an index before each state.
+        start = None if number == 0 else np.array([[7.0, *states[number - 1]]])
+        memory.recall([state], again(number), start)
+    assert memory._recalled(_key(states[1500])) is not None
+    assert made == list(range(1501))
+
+
+@pytest.mark.parametrize("name", ["cic", pytest.param("ee", marks=pytest.mark.long)])
+def test_orbit_from_a_neighbour_is_that_by_shooting(name):
+    """The neighbour was closed by shooting, too. At half the speed, other events occur."""
+    config = rootsopt.load_config(f"configs/{name}.yaml")
+    assert config.solver.orbit == "auto"
+    evaluator = Evaluator.of(config)
     fresh = dataclasses.replace(evaluator, orbits=OrbitStore())
     base = evaluator(series=False)
     assert "from_neighbour" not in base.statistics
-    moved = evaluator.at_speed(config.scene.speed_rpm * 1.003)
-    near = moved(start=base.state, series=False)
-    usual = fresh.at_speed(config.scene.speed_rpm * 1.003)(start=base.state, series=False)
-    assert near.statistics["from_neighbour"] == 1
-    assert "from_neighbour" not in usual.statistics
-    assert near.status is usual.status is Status.PERIODIC
-    for force, value in usual.response.items():
-        np.testing.assert_allclose(near.response[force], value, rtol=2e-6)
-        slopes = np.array([list(one.gradient[force].values()) for one in (near, usual)])
-        most = np.max(np.abs(slopes))
-        np.testing.assert_allclose(slopes[0], slopes[1], rtol=0, atol=1e-3 * most)
-    assert near.maxima is not None
-    assert usual.maxima is not None
-    np.testing.assert_allclose(near.maxima.forces[:2], usual.maxima.forces[:2], rtol=1e-5)
-    far = evaluator.at_speed(config.scene.speed_rpm * 0.5)(start=base.state, series=False)
-    assert "from_neighbour" not in far.statistics
+    for factor, slack in ((1.003, 1e-3), (0.5, 1e-2)):
+        moved = evaluator.at_speed(config.scene.speed_rpm * factor)
+        near = moved(start=base.state, series=False)
+        usual = fresh.at_speed(config.scene.speed_rpm * factor)(start=base.state, series=False)
+        assert "from_neighbour" not in usual.statistics
+        assert near.status is usual.status is Status.PERIODIC
+        if factor > 1:
+            assert near.statistics["from_neighbour"] == 1
+        for force, value in usual.response.items():
+            np.testing.assert_allclose(near.response[force], value, rtol=2e-6)
+            slopes = np.array([list(one.gradient[force].values()) for one in (near, usual)])
+            most = np.max(np.abs(slopes))
+            np.testing.assert_allclose(slopes[0], slopes[1], rtol=0, atol=slack * most)
+    # A chain of neighbours begins on an orbit that was closed by collocation.
+    again = evaluator.at_speed(config.scene.speed_rpm * 1.006)
+    near = evaluator.at_speed(config.scene.speed_rpm * 1.003)(start=base.state, series=False)
+    assert again(start=near.state, series=False).statistics["from_neighbour"] == 1
