@@ -60,9 +60,9 @@ class Solver(eqx.Module):
     compare the derivatives with those on halved steps; `attempts`: maximum number of attempts;
     `windows`: length of a window (mesh periods), a multiple of 16; 0: no window.
 
-    `closing`: how orbits are closed: by `shooting`, by `collocation`, or `auto` (by collocation from
-    the orbit of a similar pair, otherwise by shooting). Only shooting closes orbits of pairs that
-    collocation does not support.
+    `closing`: how orbits are closed: by `shooting`, by `collocation`, or `auto` (by collocation
+    from the orbit of a similar pair, otherwise by shooting). Only shooting closes orbits of pairs
+    that collocation does not support.
     """
 
     transient: Integrator
@@ -527,8 +527,8 @@ def near_motion(
     `start`: this orbit, and its pair.
 
     The result continues the motion of the similar pair without a transient, and must be stable. The
-    status is NOT_SETTLED if the orbit is not accepted; call `steady_motion` in that case. Collocation must support the pair. For the other arguments, see
-    `steady_motion`.
+    status is NOT_SETTLED if the orbit is not accepted; call `steady_motion` in that case.
+    Collocation must support the pair. For the other arguments, see `steady_motion`.
     """
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     return _Attempts(pair, tangents, solver, radius).near(*start)

@@ -142,7 +142,7 @@ class RobustSearch(Search):
         super().__init__(config, progress, stop, checkpoint)
         self.nominal, self.first = nominal, self.settings.starts
         self.settings = self.settings.model_copy(update={"screening": 0})
-        self.exact = ToleranceEvaluator.of(config, self.exact)
+        self.exact = ToleranceEvaluator.of(config, self.exact.from_neighbours())
         self._shares: dict[int, NDArray[np.float64]] = {}
 
     def _problem(self, scene: Scene, baseline: Evaluation) -> Problem:

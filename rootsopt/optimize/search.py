@@ -262,8 +262,7 @@ class Search:
 
     def _run(self) -> Optimization:
         maxima = needs_maxima(self.config, force_limits(self.config, self.exact.scene))
-        follows = self.method == "slsqp"
-        exact = self.exact.prepare(design_vector(self.config), maxima=maxima, neighbours=follows)
+        exact = self.exact.prepare(design_vector(self.config), maxima=maxima)
         Space.of(self.config, exact.scene, 0.0).prepare()
         exact, first = exact.fit()
         baseline = first

@@ -126,12 +126,10 @@ class EnsembleEvaluator(Wrapper):
         config = self.config.model_copy(update={"ensemble": ensemble})
         return self._around(dataclasses.replace(self.single, config=config, survey=False))
 
-    def prepare(
-        self, design=None, series=True, maxima=False, neighbours=False
-    ) -> "EnsembleEvaluator":
+    def prepare(self, design=None, series=True, maxima=False) -> "EnsembleEvaluator":
         """Compile the programs for evaluating `design` (config units) in the background.
 
-        The other arguments have no effect. Return another evaluator, with a contact map sized
+        `series` and `maxima` have no effect. Return another evaluator, with a contact map sized
         for the design."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now = self._around(self.single._sized(design))

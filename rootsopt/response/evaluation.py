@@ -147,7 +147,7 @@ class Evaluator:
     `reference`: response by which forces are divided when coexisting motions are compared;
     `fitted`: whether the contact map has been fitted to a motion; `map_error`: error of the contact
     map, relative to the static penetration, NaN if unknown; `maxima`: whether to compute all local
-    maxima of the force, with their gradients; `orbits`: orbits known from former evaluations, which
+    maxima of the force, with their gradients; `neighbours`: see `from_neighbours`; `orbits`: orbits known from former evaluations, which
     all evaluators made from this one share.
     """
 
@@ -158,6 +158,7 @@ class Evaluator:
     fitted: bool = False
     map_error: float = float("nan")
     maxima: bool = False
+    neighbours: bool = False
     orbits: OrbitStore = dataclasses.field(default_factory=OrbitStore, compare=False, repr=False)
 
     @classmethod
@@ -213,6 +214,13 @@ class Evaluator:
         """Return another evaluator that adds all local maxima of the force to an evaluation."""
         return dataclasses.replace(self, maxima=True)
 
+    def from_neighbours(self) -> "Evaluator":
+        """Return another evaluator, for hundreds of evaluations that begin on neighbours' orbits.
+
+        With `solver.orbit` `auto`, it closes these orbits by collocation. That takes a tenth of the
+        time, and another program that takes as long to compile as a hundred evaluations."""
+        return dataclasses.replace(self, neighbours=True)
+
     def without_gradient(self) -> "Evaluator":
         """Return this evaluator unchanged, since its gradient takes little time.
 
@@ -257,7 +265,10 @@ class Evaluator:
             state = np.zeros(pair.states, dtype) if start is None else np.asarray(start, dtype)
             # An orbit that is reported with its series is closed anew, and confirmed.
             built = Built(pair, tangents, now.scene.pitch_radius, now.scene.solver)
-            found = None if series else self.orbits.near(built, start)
+            # An orbit that is reported with its series is closed anew, and confirmed.
+            found = None
+            if now._continues(built) and not series:
+                found = self.orbits.near(built, start)
             if found is None:
                 found = jax.device_get(now.motion(pair, tangents, state))
             other = now._refitted(pair, found)
@@ -265,13 +276,19 @@ class Evaluator:
                 break
             if float(other.scene.deepest) < float(now.scene.deepest):
                 other = other._sized(design)
-        self.orbits.keep(found, built)
+        if now._continues(built):
+            self.orbits.keep(found, built)
         report = now._report(design, (pair, shape), found, began, series)
         if self.maxima and report.usable:
             integrator = now.scene.solver.orbit
             maxima = local_maxima(pair, tangents, found.orbit, int(found.period), integrator)
             report = dataclasses.replace(report, maxima=maxima)
         return now, report
+
+    def _continues(self, built: Built) -> bool:
+        """Return whether to close orbits of `built` by collocation from those of neighbours."""
+        wanted = self.neighbours or self.scene.solver.closing == "collocation"
+        return wanted and built.continues
 
     def recall(
         self, evaluation: Evaluation, again: Callable[[], Any], start: NDArray[np.float64] | None
@@ -292,18 +309,13 @@ class Evaluator:
         return _build(self.scene, jnp.asarray(design))[0]
 
     def prepare(
-        self,
-        design: ArrayLike | None = None,
-        series: bool = True,
-        maxima: bool = False,
-        neighbours: bool = False,
+        self, design: ArrayLike | None = None, series: bool = True, maxima: bool = False
     ) -> "Evaluator":
         """Compile the programs for evaluating `design` (config units) in the background.
 
         `series`: whether the evaluations will compute the series; `maxima`: whether evaluators
-        `with_maxima` will follow; `neighbours`: whether evaluations without series will follow that
-        start on the orbits of their neighbours. Return another evaluator, with a contact map sized
-        for the design."""
+        `with_maxima` will follow. Return another evaluator, with a contact map sized for the
+        design."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now = self._sized(design)
         pair, tangents, _ = _build.result_shape(now.scene, design)
@@ -320,7 +332,7 @@ class Evaluator:
         _motion.prepare(pair, tangents, state, now.scene.pitch_radius, solver, then=then)
         _build.prepare(now.scene, design)
         built = Built(pair, tangents, now.scene.pitch_radius, solver)
-        if neighbours and built.continues:
+        if now._continues(built):
             orbits.prepare(built)
         if series:
             count = pair.lobes * solver.samples

@@ -1,6 +1,7 @@
 """The protocol of all evaluators, and the base class of evaluators that wrap another evaluator."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from numpy.typing import ArrayLike, NDArray
@@ -46,19 +47,12 @@ class Evaluates(Protocol):
         Arguments: see `__call__`."""
         ...
 
-    def prepare(
-        self,
-        design: Any = None,
-        series: bool = True,
-        maxima: bool = False,
-        neighbours: bool = False,
-    ) -> "Evaluates":
+    def prepare(self, design: Any = None, series: bool = True, maxima: bool = False) -> "Evaluates":
         """Compile the programs for evaluating `design` (d,), in config units, in the background.
 
         `series`: whether the evaluations will compute the series; `maxima`: whether evaluators
-        `with_maxima` will follow; `neighbours`: whether evaluations without series will follow that
-        start on the orbits of their neighbours. Return another evaluator, with a contact map sized
-        for `design`."""
+        `with_maxima` will follow. Return another evaluator, with a contact map sized for
+        `design`."""
         ...
 
     def recall(self, evaluation: Evaluation, again: Callable[[], Any], start: Any) -> None:
@@ -96,6 +90,10 @@ class Evaluates(Protocol):
 
     def with_maxima(self) -> "Evaluates":
         """Return another evaluator that adds all local maxima of the force to an evaluation."""
+        ...
+
+    def from_neighbours(self) -> "Evaluates":
+        """Return another evaluator, for many evaluations that begin on neighbours' orbits."""
         ...
 
     def without_gradient(self) -> "Evaluates":
@@ -144,11 +142,11 @@ class Wrapper:
         """Return the rotor pair of `design` (config units)."""
         return self.single.pair(design)
 
-    def prepare(self: W, design=None, series=True, maxima=False, neighbours=False) -> W:
+    def prepare(self: W, design=None, series=True, maxima=False) -> W:
         """Compile the programs for evaluating a design in the background.
 
         Return another evaluator, sized for the design. Arguments: see `Evaluates.prepare`."""
-        return self._around(self.single.prepare(design, series, maxima, neighbours))
+        return self._around(self.single.prepare(design, series, maxima))
 
     def at_speed(self: W, speed_rpm: float) -> W:
         """Return another evaluator at the speed `speed_rpm`."""
@@ -176,6 +174,10 @@ class Wrapper:
     def with_maxima(self: W) -> W:
         """Return another evaluator that adds all local maxima of the force to an evaluation."""
         return self._around(self.single.with_maxima())
+
+    def from_neighbours(self: W) -> W:
+        """Return another evaluator, for many evaluations that begin on neighbours' orbits."""
+        return self._around(self.single.from_neighbours())
 
     def without_gradient(self: W) -> W:
         """Return an evaluator that skips the gradient, if computing it takes most of the time."""

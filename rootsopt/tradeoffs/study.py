@@ -82,9 +82,12 @@ class Study:
             floor = baseline.geometry["area_efficiency"]
             space = Space.of(config, scene, floor, term_constraints(config, scene))
             return cls(config, aims, Problem(config, baseline, space), None, None, None)
-        exact, baseline = Evaluator.of(reported(config)).fit()
         limits = force_limits(config, scene)
-        if any(_is_cornered(aim) for aim in aims) or any(one.cornered for one in limits):
+        maxima = any(_is_cornered(aim) for aim in aims) or any(one.cornered for one in limits)
+        # A front takes hundreds of evaluations.
+        exact = Evaluator.of(reported(config)).from_neighbours().prepare(maxima=maxima)
+        exact, baseline = exact.fit()
+        if maxima:
             exact = exact.with_maxima()
         fast = exact.at_tolerance(max(1e-6, config.solver.rtol)).surveying()
         floor = baseline.geometry["area_efficiency"]

@@ -144,7 +144,7 @@ def test_orbit_from_a_neighbour_is_that_by_shooting(name):
     """The neighbour was closed by shooting, too. At half the speed, other events occur."""
     config = rootsopt.load_config(f"configs/{name}.yaml")
     assert config.solver.orbit == "auto"
-    evaluator = Evaluator.of(config)
+    evaluator = Evaluator.of(config).from_neighbours()
     fresh = dataclasses.replace(evaluator, orbits=OrbitStore())
     base = evaluator(series=False)
     assert "from_neighbour" not in base.statistics
