@@ -17,8 +17,8 @@ from experiments._common.engines import Scene as PlainScene
 from experiments._common.engines.scipy_nodes import NODES_1E3, ScipyNodes
 from experiments._common.scenes import CIC, SHAKY
 from rootsopt.config import load
-from rootsopt.response.evaluation import Evaluator, _build, _near
-from rootsopt.response.orbits import OrbitStore
+from rootsopt.response.evaluation import Evaluator, _build
+from rootsopt.response.orbits import OrbitStore, _near
 
 Row = dict[str, Any]
 AWAY = 2e-3
@@ -69,7 +69,7 @@ def rows_of(scene: str, repeats: int, say: Callable[[str], None] = lambda text: 
     path, overrides = SCENES[scene]
     config = load(path, [*overrides, "solver.orbit=collocation"])
     own = Evaluator.of(config)
-    shooting = Evaluator.of(load(path, overrides))
+    shooting = Evaluator.of(load(path, [*overrides, "solver.orbit=shooting"]))
     base = np.asarray(config.design, float)
     draw = np.random.default_rng(0)
     design = base * (1 + AWAY * draw.uniform(-1, 1, base.shape))
@@ -80,7 +80,7 @@ def rows_of(scene: str, repeats: int, say: Callable[[str], None] = lambda text: 
         return [{"scene": scene, "tool": f"{neighbour.status.label}, {exact.status.label}"}]
     truth = _numbers(exact)
     alone = dataclasses.replace(own, orbits=OrbitStore())
-    known = own.orbits.near(neighbour.state)
+    known = own.orbits.begin(neighbour.state)
     pair, tangents, _ = _build(own.scene, jnp.asarray(design))
     settings = own.scene.pitch_radius, own.scene.solver
 

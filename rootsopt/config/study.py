@@ -80,8 +80,8 @@ class SolverConfig(Section):
     orbit: Literal["collocation", "shooting", "auto"] = Field(
         "auto",
         description="how periodic orbits are closed: by shooting, by collocation aligned with "
-        "contact events, or auto: in searches by collocation from the orbit of a neighbouring "
-        "design, otherwise by shooting",
+        "contact events, or auto: by collocation from the orbit of a neighbour where hundreds of "
+        "evaluations follow, otherwise by shooting",
     )
     gradient: Literal["forward", "reverse"] = Field(
         "forward", description="differentiation mode; both give the same gradient"

@@ -49,6 +49,8 @@ _SHOULDER = 0.02
 """Difference from the greatest force, as a fraction of that force, above which a shoulder is not
 listed. A shoulder is an instant at which the force almost has a maximum (see the module's
 docstring)."""
+_STEPS = 1024
+"""Number of solver steps for which there is room, times a power of 2 if the orbit needs more."""
 _SHORTEST = 1e-9
 """Minimum time (mesh periods) from the start of a step to a maximum inside it. An earlier maximum
 is moved to this time."""
@@ -79,6 +81,7 @@ def local_maxima(
     the corner, as those of the peak do. A maximum is left out if the force hardly falls (`_DIP`)
     between it and a greater maximum.
     """
+    orbit = _cut(orbit)
     steps = _steps(orbit)
     times, forces = _located(pair, orbit, steps, float(period))
     if not times.size:
@@ -101,9 +104,11 @@ def prepare_maxima(
     def like(*shape: int, dtype: Any = float) -> Any:
         return jax.ShapeDtypeStruct(shape, dtype)
 
-    grid, flow = orbit.flow.grid, orbit.flow
-    steps: Any = Steps(grid, grid, flow.corners, flow.corners, like(dtype=int))
-    times = like(_room(flow.states.shape[0], grid.shape[0]))
+    flow = orbit.flow
+    grid, corners = like(_STEPS), like(_STEPS, flow.corners.shape[1])
+    orbit = orbit._replace(flow=flow._replace(grid=grid, corners=corners))
+    steps: Any = Steps(grid, grid, corners, corners, like(dtype=int))
+    times = like(_room(flow.states.shape[0], _STEPS))
     padded, noise = like(MOST + _BESIDES), like(dtype=flow.depth.dtype)
     _differentiated.prepare(pair, tangents, orbit, padded, noise, integrator)
     _forces.prepare(pair, flow.states, steps, times, like(), like(dtype=int))
@@ -112,6 +117,21 @@ def prepare_maxima(
 def _room(samples: int, steps: int) -> int:
     """Return the number of times that one call of `_forces` takes at most in the first scan."""
     return samples + steps + 1
+
+
+def _cut(orbit: Orbit) -> Orbit:
+    """Return the `orbit` with room for few more steps than it has.
+
+    There are few sizes, so that orbits share programs."""
+    grid, corners = np.asarray(orbit.flow.grid), np.asarray(orbit.flow.corners)
+    used, room = int(np.sum(grid < np.inf)), _STEPS
+    while room < used:
+        room *= 2
+    spare = max(room - len(grid), 0)
+    grid = np.pad(grid[:room], (0, spare), constant_values=np.inf)
+    corners = np.pad(corners[:room], ((0, spare), (0, 0)))
+    flow: Any = orbit.flow._replace(grid=grid, corners=corners)
+    return orbit._replace(flow=flow)
 
 
 def _steps(orbit: Orbit) -> Steps:
@@ -156,7 +176,7 @@ def _located(
         best = np.where(better, around[row, column], best)
         top = np.where(better, tried[row, column], top)
         reach *= 2.0 / (_CLOSER - 1)
-    even = force(width * np.arange(states.shape[0]))
+    even = forces[np.searchsorted(places, width * np.arange(states.shape[0]))]
     beside = shoulders(even)[:_BESIDES]
     return np.append(best, width * beside), np.append(top, even[beside])
 

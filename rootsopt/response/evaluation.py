@@ -147,8 +147,8 @@ class Evaluator:
     `reference`: response by which forces are divided when coexisting motions are compared;
     `fitted`: whether the contact map has been fitted to a motion; `map_error`: error of the contact
     map, relative to the static penetration, NaN if unknown; `maxima`: whether to compute all local
-    maxima of the force, with their gradients; `neighbours`: see `from_neighbours`; `orbits`: orbits known from former evaluations, which
-    all evaluators made from this one share.
+    maxima of the force, with their gradients; `neighbours`: see `from_neighbours`; `orbits`: orbits
+    known from former evaluations, which all evaluators made from this one share.
     """
 
     config: Config
@@ -266,8 +266,8 @@ class Evaluator:
             # An orbit that is reported with its series is closed anew, and confirmed.
             built = Built(pair, tangents, now.scene.pitch_radius, now.scene.solver)
             # An orbit that is reported with its series is closed anew, and confirmed.
-            found = None
-            if now._continues(built) and not series:
+            continues, found = now._continues(built), None
+            if continues and not series:
                 found = self.orbits.near(built, start)
             if found is None:
                 found = jax.device_get(now.motion(pair, tangents, state))
@@ -276,7 +276,7 @@ class Evaluator:
                 break
             if float(other.scene.deepest) < float(now.scene.deepest):
                 other = other._sized(design)
-        if now._continues(built):
+        if continues:
             self.orbits.keep(found, built)
         report = now._report(design, (pair, shape), found, began, series)
         if self.maxima and report.usable:

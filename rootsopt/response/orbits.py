@@ -98,22 +98,31 @@ class OrbitStore:
     def near(self, built: Built, state: NDArray[np.float64] | None) -> Steady | None:
         """Return the motion of `built` near the known orbit with this scaled `state` at φ1 = 0.
 
-        The result is `None` if there is no such orbit, or if the motion is not accepted."""
-        if state is None or not built.continues:
+        `built` must be such that `Built.continues`. The result is `None` if there is no such orbit,
+        or if the motion is not accepted."""
+        found = self.begin(state)
+        if found is None or jax.tree.structure(found[1]) != jax.tree.structure(built.pair):
             return None
-        with self._lock:
-            found = self._recalled(_key(state))
-            known = None if found is None else self._adopted(_key(state), *found)
-        if found is None or known is None:
-            return None
-        if jax.tree.structure(found[1].pair) != jax.tree.structure(built.pair):
-            return None
-        motion = _closed(built, known, found[1].pair)
+        motion = _closed(built, *found)
         return motion if Status.of(motion.status) is Status.PERIODIC else None
 
+    def begin(self, state: NDArray[np.float64] | None) -> tuple[Known, RotorPair] | None:
+        """Return the orbit with this scaled `state` at φ1 = 0, and its pair.
+
+        The result is `None` if no such orbit is known, or if collocation cannot close it."""
+        if state is None:
+            return None
+        key = _key(state)
+        with self._lock:
+            found = self._recalled(key)
+            known = None if found is None else self._adopted(key, *found)
+        return None if found is None or known is None else (known, found[1].pair)
+
     def keep(self, found: Steady, built: Built) -> None:
-        """Remember the orbit of the motion `found` of `built`, if it is periodic."""
-        if Status.of(found.status) is Status.PERIODIC and built.continues:
+        """Remember the orbit of the motion `found` of `built`, if it is periodic.
+
+        `built` must be such that `Built.continues`."""
+        if Status.of(found.status) is Status.PERIODIC:
             self._keep(_key(found.orbit.state), (_Closed.of(found), built))
 
     def recall(
@@ -176,7 +185,7 @@ def _adopted(found: _Closed, built: Built) -> Known | None:
     period = np.asarray(found.period)
     start = jax.device_get(_seed(built.pair, found.state, found.steps, period, found.period))
     motion = _closed(built, start, built.pair)
-    if Status.of(motion.status) is not Status.PERIODIC:
+    if motion.known is None or Status.of(motion.status) is not Status.PERIODIC:
         return None
     forces = np.asarray(motion.orbit.response[:3])
     same = np.abs(forces - found.forces) <= _SAME * np.abs(found.forces)

@@ -257,8 +257,11 @@ class _Place(NamedTuple):
         return self.name in self.store
 
 
+_ARRAYS = jax.Array, np.ndarray, np.generic, jax.ShapeDtypeStruct
+
+
 def _is_array(leaf: Any) -> bool:
-    return isinstance(leaf, jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct)
+    return isinstance(leaf, _ARRAYS)
 
 
 def _outline(leaf: Any) -> Any:

@@ -90,18 +90,19 @@ class Elements(NamedTuple):
         number = jnp.arange(self.state.shape[0])
         return self.state[jnp.where(number + 1 < self.mesh.used, number + 1, 0)]
 
-    def motion(self, tau: Float[Array, ""]) -> Float[Array, " n"]:
-        """Return the scaled state at the time `tau` (mesh periods), continued periodically."""
+    def motion(self, tau: Float[Array, "*m"]) -> Float[Array, "*m n"]:
+        """Return the scaled state at the times `tau` (mesh periods), continued periodically."""
         mesh = self.mesh
         begin = mesh.ends[0]
         tau = mesh.times[0] + jnp.mod(tau - mesh.times[0], mesh.period)
-        k = jnp.clip(jnp.searchsorted(begin, tau, side="right") - 1, 0, mesh.used - 1)
-        return self.inside(k, tau)
+        used = jnp.arange(begin.shape[0]) < mesh.used
+        k = jnp.sum(used & (begin <= tau[..., None]), axis=-1) - 1
+        return self.inside(jnp.maximum(k, 0), tau)
 
-    def inside(self, k: Int[Array, ""], tau: Float[Array, ""]) -> Float[Array, " n"]:
-        """Return the scaled state at the time `tau` (mesh periods), from the polynomial of element
-        `k`."""
+    def inside(self, k: Int[Array, "*m"], tau: Float[Array, "*m"]) -> Float[Array, "*m n"]:
+        """Return the scaled state at the times `tau` (mesh periods), from the polynomials of the
+        elements `k`."""
         length = self.mesh.lengths[k]
         share = (tau - self.mesh.ends[0][k]) / jnp.where(length > 0, length, 1.0)
-        rise = jnp.sum(GAUSS.integrated(share)[:, None] * self.slopes[k], axis=0)
-        return self.state[k] + length * rise
+        rise = jnp.sum(GAUSS.integrated(share)[..., None] * self.slopes[k], axis=-2)
+        return self.state[k] + length[..., None] * rise

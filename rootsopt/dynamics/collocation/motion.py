@@ -13,7 +13,7 @@ from rootsopt.dynamics.collocation.equation import CollocatedEquation
 from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.collocation.mesh import sizes
-from rootsopt.dynamics.collocation.sampled import as_flow
+from rootsopt.dynamics.collocation.sampled import PARTS, as_flow
 from rootsopt.dynamics.collocation.seed import seeded
 from rootsopt.dynamics.flow import Flow, flow
 from rootsopt.dynamics.integrator import Integrator
@@ -86,8 +86,8 @@ def collocated(
     )
     tolerance = integrator.tolerance(state.dtype)
     equation = CollocatedEquation(pair, measures, pair.force_scale)
-    start = Known.unaligned(elements)
-    closed = close(equation, tangents, start, pair, _ACCURACY * tolerance)
+    begun = Known.unaligned(elements)
+    closed = close(equation, tangents, begun, pair, _ACCURACY * tolerance)
     found = closed.found
     length, peak = period.astype(state.dtype), found.response[2]
     top = jnp.where(peak > 0, peak, pair.force_scale)
@@ -112,7 +112,7 @@ def _repeats(found: OrbitForces, period: Int[Array, ""], longest: int) -> Bool[A
 
     `longest`: longest period of an orbit (mesh periods)."""
     shorter = jnp.arange(1, max(longest // 2, 1) + 1)
-    states = jax.vmap(found.elements.motion)(shorter.astype(found.state.dtype))
+    states = found.elements.motion(shorter.astype(found.state.dtype))
     same = jnp.max(jnp.abs(states - found.state), axis=1) < _REPEATS
     return jnp.any(same & (shorter < period) & (period % shorter == 0))
 
@@ -127,8 +127,8 @@ def near_orbit(
 ) -> Collocated:
     """Close the orbit near that of a similar pair, without a transient or integration.
 
-    `start`: the known orbit, and its pair; `integrator`: sets accuracy and room for steps; for the
-    other arguments, see `collocated`."""
+    `start`: the known orbit, and its pair; `integrator`: sets the accuracy; for the other
+    arguments, see `collocated`."""
     known, neighbour = start
     tolerance = integrator.tolerance(pair.angle_scale.dtype)
     equation = CollocatedEquation(pair, measures, lax.stop_gradient(pair.force_scale))
@@ -139,7 +139,7 @@ def near_orbit(
     verified &= ~_repeats(found, period, sizes_of[1])
     # Newton's method converges quadratically: what is left is far below the last correction.
     residual = jnp.where(sound, found.correction**2, jnp.inf)
-    out = as_flow(found, sizes_of[0], integrator.max_steps)
+    out = as_flow(found, sizes_of[0], PARTS * known.elements.state.shape[0])
     orbit = _as_orbit(found, out, residual, closed.drift, closed.steps)
     return Collocated(orbit, sound, verified & out.solved, _known(closed, verified))
 

@@ -1,6 +1,5 @@
 """A motion on elements, sampled like an integrated one."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -8,7 +7,7 @@ from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.forces import OrbitForces, origin
 from rootsopt.dynamics.flow import Flow
 
-_PARTS = 4
+PARTS = 4
 """Number of steps into which an element is divided. A step of an explicit method of the order of
 the elements is then at least as accurate as the element."""
 
@@ -17,7 +16,7 @@ def as_flow(found: OrbitForces, samples: int, steps: int) -> Flow:
     """Return the orbit `found` as a `Flow` over its period, with zeros for the derivatives.
 
     `samples`: number of uniform samples of the state; `steps`: room for steps. Each element is
-    divided into `_PARTS` steps. `Flow.solved` is False if there is no room for them."""
+    divided into `PARTS` steps. `Flow.solved` is False if there is no room for them."""
     elements, response = found.elements, found.response
     mesh, dtype = elements.mesh, found.state.dtype
     grid, corners = _steps(elements, steps)
@@ -32,11 +31,11 @@ def as_flow(found: OrbitForces, samples: int, steps: int) -> Flow:
         peak=response[2],
         peak_time=jnp.mod(begin + found.peak.share * length, mesh.period),
         depth=found.depth,
-        states=jax.vmap(elements.motion)(uniform),
+        states=elements.motion(uniform),
         grid=grid,
         corners=corners,
         steps=jnp.zeros((), int),
-        solved=_PARTS * mesh.used <= steps,
+        solved=PARTS * mesh.used <= steps,
         strain=jnp.zeros((), dtype),
         others=response[3:],
         slope=jnp.zeros((rows, columns), dtype),
@@ -48,21 +47,21 @@ def _steps(elements: Elements, room: int) -> tuple[Float[Array, " steps"], Float
 
     `room`: size of the returned arrays; unused ends are inf."""
     mesh = elements.mesh
-    number = jnp.arange(min(room, _PARTS * mesh.left.shape[0]))
-    place, part = number // _PARTS, number % _PARTS + 1
+    number = jnp.arange(min(room, PARTS * mesh.left.shape[0]))
+    place, part = number // PARTS, number % PARTS + 1
     first = origin(elements)
     used = jnp.maximum(mesh.used, 1)
     k = jnp.mod(first + place, used)
     begin, length = mesh.ends[0], mesh.lengths
-    tau = begin[k] + length[k] * part / _PARTS
+    tau = begin[k] + length[k] * part / PARTS
     # Elements before φ1 = 0 come last. The last step ends after exactly one period.
     turns = jnp.where(first + place >= used, mesh.period, 0.0)
-    last = _PARTS * mesh.used - 1
+    last = PARTS * mesh.used - 1
     ends = jnp.where(number == last, mesh.period, tau + turns - begin[first])
     ends = jnp.where(number <= last, ends, jnp.inf)
-    states = jnp.where((number <= last)[:, None], jax.vmap(elements.inside)(k, tau), 0.0)
+    states = jnp.where((number <= last)[:, None], elements.inside(k, tau), 0.0)
     spare = (0, room - number.size)
     return jnp.pad(ends, spare, constant_values=jnp.inf), jnp.pad(states, (spare, (0, 0)))
 
 
-__all__ = ["as_flow"]
+__all__ = ["PARTS", "as_flow"]
