@@ -77,6 +77,7 @@ class BearingSet(eqx.Module):
     @classmethod
     def of(cls, scene: Scene, design: Float[Array, " d"]) -> "BearingSet":
         """Return the set of a `design` (d,) in config units; the scene must have `bearings`."""
+        scene = scene.at(design)
         pair, shape = scene.pair_and_shape(design)
         found, half = scene.bearings, scene.length / 2
         assert found is not None

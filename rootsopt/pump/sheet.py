@@ -109,7 +109,7 @@ KEYS = (
 
 @Program
 def _flow(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
-    profile = scene.profile(design)
+    scene, profile = scene.at(design), scene.profile(design)
     shape = geometry(profile)
     lines = flow.flow_lines(profile, shape, LINES)
     if scene.helix is not None:

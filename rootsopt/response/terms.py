@@ -215,9 +215,9 @@ def values_of(
     `forces` (3,): mean, peak and RMS force (N); `slopes` (3, d): their gradients."""
 
     def every(design, forces):
-        profile = scene.profile(design)
+        here, profile = scene.at(design), scene.profile(design)
         shape = geometry(profile)
-        found = [term.value(scene, profile, shape, Forces(*forces)) for term in terms]
+        found = [term.value(here, profile, shape, Forces(*forces)) for term in terms]
         return jnp.stack([jnp.asarray(one, float) for one in found])
 
     by_design, by_forces = jax.jacfwd(every, (0, 1))(design, forces)
@@ -247,8 +247,8 @@ def needs_forces(scene: Scene, term: Term, design: Float[Array, " d"]) -> bool:
     The term is traced once for a `design` (d,) in config units, and nothing is computed."""
 
     def value(design):
-        profile = scene.profile(design)
-        return jnp.asarray(term.value(scene, profile, geometry(profile), _NoForces()), float)  # pyright: ignore[reportArgumentType]
+        here, profile = scene.at(design), scene.profile(design)
+        return jnp.asarray(term.value(here, profile, geometry(profile), _NoForces()), float)  # pyright: ignore[reportArgumentType]
 
     try:
         jax.eval_shape(value, design)

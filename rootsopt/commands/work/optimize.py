@@ -32,7 +32,6 @@ from rootsopt.response.tolerances import nominal_of
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.timing import CompileClock
 from rootsopt.scene import Scene, check_geometry, outline_mm
-from rootsopt.scene.families import with_design
 
 
 def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
@@ -299,8 +298,7 @@ def _write(folder, config, options, result, choice, sheets, compiled, ran) -> No
 
 def _designed(config: Config, evaluation) -> Config:
     """Return `config` with the design of an `evaluation`."""
-    profile = with_design(config.profile, list(evaluation.design.values()))
-    return config.model_copy(update={"profile": profile})
+    return config.with_design([*evaluation.design.values()])
 
 
 def _write_robustness(folder, config, options, robustness) -> None:
