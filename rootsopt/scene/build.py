@@ -287,7 +287,8 @@ class Scene(eqx.Module):
         torque = jnp.where(jnp.isnan(motor.torque), load.total, motor.torque)
         return eqx.tree_at(lambda m: (m.speed, m.torque), motor, (self.speed, torque))
 
-    def _load(self, profile: Profile, shape: Geometry) -> Load:
+    def load(self, profile: Profile, shape: Geometry) -> Load:
+        """Return the load on the rotors: a constant torque, or that of the gas."""
         if self.pressure is None:
             return ConstantLoad(self.load_torque)
         across = self.pressure * self.length
@@ -357,7 +358,7 @@ class Scene(eqx.Module):
                 angle = angle + part.play
         # These are units for scaling, not physical quantities, so results do not depend on them.
         force, angle = jax.lax.stop_gradient((force, angle))
-        load = self._load(profile, shape)
+        load = self.load(profile, shape)
         context = Context(
             inertia=inertia,
             mass=self.mass(shape),
