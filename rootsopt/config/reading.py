@@ -280,6 +280,19 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
+    def _twisting(self):
+        scene = self.scene
+        gas = scene.load.pressure_difference_Pa is not None
+        if self.twist_free and gas and scene.supports is not None and scene.bearings is not None:
+            raise ValueError(
+                "`optimizer.bounds.helix_deg` must be absent with elastic `scene.supports`, "
+                "`scene.bearings` and a load `pressure_difference_Pa`: the twist moves the instant "
+                "at which a pocket opens and the axes are pushed, which gradients leave out; "
+                "remove one of the four"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _searched_family(self):
         family, own = self.optimizer.family, self.profile.family
         if not self.profile.from_file and family not in (NEAREST, own):

@@ -204,7 +204,7 @@ class _Pieces(NamedTuple):
 
 
 def _pieces(
-    grid: Float[Array, " steps"], ends: Float[Array, " steps"], corners: Float[Array, " k"], period
+    grid: Float[Array, " steps"], ends: Float[Array, " ends"], corners: Float[Array, " k"], period
 ) -> _Pieces:
     """Return the steps of `grid` (mesh periods), divided at `ends` and at the `corners` of loads.
 
@@ -301,12 +301,25 @@ def orbit_loads(
 
         return linearized(run, equation.start(before[of], pair.free), dynamic, moved, count)
 
+    opened, delay = _openings(dynamic, static, moved) if scene.twist_free else (None, None)
+
+    def opening(k, state):
+        """Return what is added to slopes because the jump inside piece `k`, if any, moves."""
+        begin, end = pieces.begin[k], pieces.end[k]
+        away = (begin + end) / 2 - opened
+        inside = (jnp.abs(away - jnp.round(away)) < _ASIDE / 2) & (end - begin < 3 * _ASIDE)
+        before, after = (equation.rates(time, state, None, dynamic) for time in (begin, end))
+        lapse = pair.lapse(state) if pair.free else 1.0
+        return jnp.outer(lapse * (before - after), inside @ delay)
+
     def advance(carry, job):
         moved, total, slopes, peaks = carry
-        wanted, last, end, found = job
+        wanted, last, end, found, jumps = job
         after = found.by_state @ moved + found.by_parameters
         new = total + found.value[count:], slopes + after[count:]
         total, slopes = jax.tree.map(lambda x, y: jnp.where(wanted, x, y), new, (total, slopes))
+        if jumps is not None:
+            slopes = slopes.at[:4].add(jnp.where(wanted, jumps, 0.0))
         here = wanted & (tau[latest] == end)
         peaks = jnp.where(here[:, None, None], after[:count], peaks)
         return (jnp.where(wanted & last, after[:count], moved), total, slopes, peaks), None
@@ -316,7 +329,8 @@ def orbit_loads(
         place = number * _CHUNK + lanes
         at = jnp.minimum(place, taken - 1)
         found = jax.vmap(linear_piece)(at)
-        jobs = place < taken, pieces.last[at], pieces.end[at], found
+        jumps = None if opened is None else jax.vmap(opening)(at, found.value[:, :count])
+        jobs = place < taken, pieces.last[at], pieces.end[at], found, jumps
         sums, _ = lax.scan(advance, sums, jobs)
         return number + 1, sums
 
@@ -349,6 +363,21 @@ def orbit_loads(
     )
     greatest = jnp.max(sizes, axis=0)
     return OrbitLoads(equivalent, factor[:, None] * slopes, series, greatest, rises)
+
+
+def _openings(dynamic, static, moved) -> tuple[Array | None, Array | None]:
+    """Return the times (2,) at which a pocket opens, and their derivatives (2, d) along `moved`.
+
+    Times are in mesh periods, from 0 to 1. Without gas, both are `None`. `dynamic`, `static`: arrays and rest of a `BearingSet`. The times move with the twist only."""
+
+    def times(dynamic):
+        bearings = eqx.combine(dynamic, static)
+        return bearings.loads.gas.openings() * bearings.pair.lobes / (2 * jnp.pi)
+
+    if eqx.combine(dynamic, static).loads.gas is None:
+        return None, None
+    slopes = jax.vmap(lambda along: jax.jvp(times, (dynamic,), (along,))[1])(moved)
+    return times(dynamic), slopes.T
 
 
 def _channels(loads: BearingLoads, scene: Scene) -> Float[Array, "*n k"]:
