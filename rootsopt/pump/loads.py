@@ -183,6 +183,10 @@ class _LoadEquation(Equation):
 
     def rates(self, tau, state, contact, dynamic):
         del contact
+        return self.sizes(tau, state, dynamic)
+
+    def sizes(self, tau, state, dynamic):
+        """Return the bearing loads to the power of the exponent (4,), in units of the force."""
         bearings = eqx.combine(dynamic, self.static)
         size = bearings.at(tau, state).sizes / self.force_unit
         # The root of a load that vanishes has no derivative.
@@ -301,14 +305,16 @@ def orbit_loads(
 
         return linearized(run, equation.start(before[of], pair.free), dynamic, moved, count)
 
-    opened, delay = _openings(dynamic, static, moved) if scene.twist_free else (None, None)
+    openings = _openings(dynamic, static, moved) if scene.twist_free else None
 
     def opening(k, state):
         """Return what is added to slopes because the jump inside piece `k`, if any, moves."""
+        assert openings is not None
+        opened, delay = openings
         begin, end = pieces.begin[k], pieces.end[k]
         away = (begin + end) / 2 - opened
         inside = (jnp.abs(away - jnp.round(away)) < _ASIDE / 2) & (end - begin < 3 * _ASIDE)
-        before, after = (equation.rates(time, state, None, dynamic) for time in (begin, end))
+        before, after = (equation.sizes(time, state, dynamic) for time in (begin, end))
         lapse = pair.lapse(state) if pair.free else 1.0
         return jnp.outer(lapse * (before - after), inside @ delay)
 
@@ -329,7 +335,7 @@ def orbit_loads(
         place = number * _CHUNK + lanes
         at = jnp.minimum(place, taken - 1)
         found = jax.vmap(linear_piece)(at)
-        jumps = None if opened is None else jax.vmap(opening)(at, found.value[:, :count])
+        jumps = None if openings is None else jax.vmap(opening)(at, found.value[:, :count])
         jobs = place < taken, pieces.last[at], pieces.end[at], found, jumps
         sums, _ = lax.scan(advance, sums, jobs)
         return number + 1, sums
@@ -365,17 +371,18 @@ def orbit_loads(
     return OrbitLoads(equivalent, factor[:, None] * slopes, series, greatest, rises)
 
 
-def _openings(dynamic, static, moved) -> tuple[Array | None, Array | None]:
+def _openings(dynamic, static, moved) -> tuple[Array, Array] | None:
     """Return the times (2,) at which a pocket opens, and their derivatives (2, d) along `moved`.
 
-    Times are in mesh periods, from 0 to 1. Without gas, both are `None`. `dynamic`, `static`: arrays and rest of a `BearingSet`. The times move with the twist only."""
+    Times are in mesh periods, from 0 to 1. `None` without gas. `dynamic`, `static`: arrays
+    and rest of a `BearingSet`. The times move with the twist only."""
 
     def times(dynamic):
         bearings = eqx.combine(dynamic, static)
         return bearings.loads.gas.openings() * bearings.pair.lobes / (2 * jnp.pi)
 
     if eqx.combine(dynamic, static).loads.gas is None:
-        return None, None
+        return None
     slopes = jax.vmap(lambda along: jax.jvp(times, (dynamic,), (along,))[1])(moved)
     return times(dynamic), slopes.T
 

@@ -52,17 +52,20 @@ def play(
     clearance: Float[Array, ""],
     center_distance: Float[Array, ""] | None = None,
     phi: Float[Array, " n"] | None = None,
+    radial: Float[Array, ""] | None = None,
 ) -> Play:
     """Return the play of rotor 2 over the rotation.
 
     `clearance` (m): distance added to every flank gap, along the normal. `center_distance` (m): by
     default that of perfect rolling, 2r. `phi` (n,): angles of rotor 1 (rad), by default `POSES` of
-    them over one lobe pitch."""
+    them over one lobe pitch. `radial` (m): radius by which both rotors are smaller everywhere."""
     lobes, r = profile.lobes, profile.pitch_radius
     distance = 2 * r if center_distance is None else center_distance
     if phi is None:
         phi = 2 * jnp.pi / lobes * jnp.arange(POSES) / POSES
     flank = flank_points(profile, POINTS)
+    if radial is not None:
+        flank = flank._replace(point=flank.point * (1 - radial / jnp.abs(flank.point)))
     lobe = both_flanks(flank)
     # The whole clearance is taken off rotor 1.
     reduced = lobe.point - clearance * lobe.normal

@@ -20,8 +20,7 @@ from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
 from rootsopt.pump.leakage import leakage
 from rootsopt.pump.loads import still_loads
-from rootsopt.pump.play import play
-from rootsopt.pump.sheet import MRAD, UM, center_distance, ripple_of
+from rootsopt.pump.sheet import MRAD, UM, play_of, ripple_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 from rootsopt.scene.medium import Medium
@@ -119,7 +118,7 @@ class BacklashTerm(Term):
 
     def value(self, scene, profile, shape, forces):
         del shape, forces
-        return play(profile, scene.clearance, center_distance(scene)).gear_backlash / MM
+        return play_of(scene, profile).gear_backlash / MM
 
 
 class PlayTerm(Term):
@@ -127,7 +126,7 @@ class PlayTerm(Term):
 
     def value(self, scene, profile, shape, forces):
         del shape, forces
-        return jnp.min(play(profile, scene.clearance, center_distance(scene)).total) / MRAD
+        return jnp.min(play_of(scene, profile).total) / MRAD
 
 
 class GapTerm(Term):
