@@ -1,4 +1,4 @@
-"""What do contact force, leakage and flow ripple cost in terms of each other, over all families?
+"""What do contact force, leakage and flow ripple cost in terms of each other, over families?
 
 Writes pump_front.csv (a row per best compromise of every family) and pump_front.png.
 """

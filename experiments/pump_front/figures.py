@@ -1,5 +1,7 @@
 """Figure of the fronts of all families, pair by pair of terms."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -45,7 +47,7 @@ def fronts(rows: list[Row]) -> Figure:
         Line2D([], [], color=color, marker=mark, linestyle="", label=name.replace("_", " "))
         for name, (color, mark) in styles.items()
     ]
-    plain = {"color": GREY, "marker": "o", "linestyle": ""}
+    plain: dict[str, Any] = {"color": GREY, "marker": "o", "linestyle": ""}
     entries.append(Line2D([], [], label="best of all families", **plain))
     entries.append(Line2D([], [], label="best of its family", markerfacecolor="none", **plain))
     made.legend(handles=entries, loc="outside lower center", ncols=5, frameon=False)
