@@ -441,7 +441,9 @@ def _check_parameter(parameter: Parameter) -> None:
         )
 
 
-_RESERVED = ("family", "lobes", "pitch_radius_mm", "outline_file", "outline_smoothing_mm")
+_RESERVED = (
+    *("family", "lobes", "pitch_radius_mm", "outline_file", "outline_smoothing_mm", "helix_deg"),
+)
 
 
 def _wrong(argument: str, wanted: str, found: Any) -> ValueError:

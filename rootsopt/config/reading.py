@@ -1,6 +1,6 @@
 """The complete config, and the functions that read it from YAML."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,10 @@ _MOST_PARTS = 8
 """
 
 
+TWIST = "helix_deg"
+"""Key of the twist, in the section `rotor` and among the design parameters."""
+
+
 class Config(Section):
     """The settings of a run: all sections of a config."""
 
@@ -85,13 +89,31 @@ class Config(Section):
 
     @property
     def design(self) -> NDArray[np.float64]:
-        """Design parameters as an array (d,), in the units of `design_keys`."""
-        return self.profile.design
+        """Design parameters as an array (d,), in the units of `design_keys`.
+
+        They are those of the profile, and the twist if it is free."""
+        twist = [self.rotor.helix_deg] if self.twist_free else []
+        return np.append(self.profile.design, twist)
 
     @property
     def design_keys(self) -> tuple[str, ...]:
         """Names of the entries of `design`; the entries of a list are numbered from 1."""
-        return self.profile.design_keys
+        return self.profile.design_keys + ((TWIST,) if self.twist_free else ())
+
+    @property
+    def twist_free(self) -> bool:
+        """Whether the twist of the rotors is the last design parameter.
+
+        A rotor from a file has no design parameters; the one fitted to it has the twist."""
+        return self.optimizer.bounds.helix_deg is not None and not self.profile.from_file
+
+    def with_design(self, design: Sequence[float] | NDArray[np.float64]) -> "Config":
+        """Return a copy of the config with another `design` (d,), without checking it."""
+        values, found = [float(value) for value in design], self
+        if self.twist_free:
+            *values, twist = values
+            found = _with(found, f"rotor.{TWIST}", twist)
+        return found.model_copy(update={"profile": found.profile.with_design(values)})
 
     def replaced(self, values: Mapping[str, Any]) -> "Config":
         """Return a copy of the config in which some `values` are replaced.
@@ -153,7 +175,7 @@ class Config(Section):
         section, _, entry = key.partition(".")
         name, _, number = entry.rpartition("_")
         single = entry in self.profile.parameters
-        if section != "profile" or entry not in self.design_keys or single:
+        if section != "profile" or entry not in self.profile.design_keys or single:
             return "", 0
         return name, int(number) - 1
 
@@ -168,7 +190,7 @@ class Config(Section):
         `values`: new numbers by dotted key, as `scatterable` lists them. Design parameters are
         replaced as well."""
         data: Config = self
-        design = {f"profile.{key}": k for k, key in enumerate(self.design_keys)}
+        design = {f"profile.{key}" for key in self.profile.design_keys}
         for key, value in values.items():
             if key not in design:
                 data = _with(data, key, value)
@@ -199,6 +221,7 @@ class Config(Section):
             "scene.heat": self.scene.heat,
             "contact.wear": self.contact.wear,
             "rotor.helix_deg": self.rotor.helix_deg or None,
+            "optimizer.bounds.helix_deg": self.optimizer.bounds.helix_deg,
             "scene.center_distance_error_mm": self.scene.center_distance_error_mm,
             "profile.outline_file": self.profile.outline_file,
         }
@@ -253,6 +276,19 @@ class Config(Section):
             raise ValueError(
                 f"`solver.fidelity` must be search (or auto) with `{self.needs_search[0]}`, which "
                 f"no other fidelity supports, but is {fidelity}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _twisting(self):
+        scene = self.scene
+        gas = scene.load.pressure_difference_Pa is not None
+        if self.twist_free and gas and scene.supports is not None and scene.bearings is not None:
+            raise ValueError(
+                "`optimizer.bounds.helix_deg` must be absent with elastic `scene.supports`, "
+                "`scene.bearings` and a load `pressure_difference_Pa`: the twist moves the instant "
+                "at which a pocket opens and the axes are pushed, which gradients leave out; "
+                "remove one of the four"
             )
         return self
 

@@ -1,5 +1,6 @@
 """Config sections that define what is simulated: profile, rotor, contact, scene."""
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -82,6 +83,14 @@ class ProfileConfig(Section):
             numbers = range(1, 1 + len(value)) if isinstance(value, tuple) else ()
             names += [f"{key}_{number}" for number in numbers] or [key]
         return tuple(names)
+
+    def with_design(self, design: Sequence[float]) -> "ProfileConfig":
+        """Return a copy with other design parameters (d,), in the units of `design_keys`."""
+        family = family_of(self.family)
+        values = zip(family.parameters, family.split([*design]), strict=True)
+        return self.model_copy(
+            update={one.key: tuple(v) if one.count is not None else v for one, v in values}
+        )
 
     @property
     def from_file(self) -> bool:

@@ -361,7 +361,13 @@ class ConstraintsConfig(Section):
 class BoundsConfig(Section):
     """Bounds (low, high) of each design parameter in an optimisation.
 
-    The keys are the parameters of all registered families."""
+    Further keys are the parameters of all registered families."""
+
+    helix_deg: tuple[float, float] | None = Field(
+        None,
+        description="bounds of `rotor.helix_deg`, from -360 to 360, which make the twist a design "
+        "parameter; absent: the twist is fixed",
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -379,13 +385,22 @@ class BoundsConfig(Section):
                     f"[{least:g}, {most:g}], but is {shown([*pair])}"
                     + hint(key, pair[0], least, most)
                 )
+        twist = self.helix_deg
+        if twist is not None and not -360 <= twist[0] < twist[1] <= 360:
+            raise ValueError(
+                "`optimizer.bounds.helix_deg` must be two increasing numbers in [-360, 360], but "
+                f"is {shown([*twist])}"
+            )
         return self
+
+
+_BOUNDS = dict(BoundsConfig.model_fields)
 
 
 def _derive() -> None:
     """Set the fields of `BoundsConfig` from the table of families."""
     made = {key: parameter.bounds_field() for key, parameter in parameters().items()}
-    replace_fields(BoundsConfig, made)
+    replace_fields(BoundsConfig, made | _BOUNDS)
 
 
 _derive()

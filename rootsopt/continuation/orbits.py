@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config, parse
+from rootsopt.config.reading import TWIST
 from rootsopt.config.units import MM, RPM
 from rootsopt.continuation.arclength import (
     End,
@@ -40,7 +41,6 @@ from rootsopt.scene import (
     check_geometry,
     design_keys,
     design_vector,
-    families,
     integrators,
 )
 
@@ -126,6 +126,8 @@ def value_of(config: Config, parameter: str) -> float:
 
 def place_of(parameter: str) -> str:
     """Return the dotted config key of a parameter."""
+    if parameter == TWIST:
+        return f"rotor.{TWIST}"
     return PLACES.get(parameter, f"profile.{parameter}")
 
 
@@ -144,8 +146,7 @@ def _with_design(config: Config, parameter: str, value: float) -> Config:
     """Return `config` with another value of a design parameter, without any check."""
     design = np.asarray(design_vector(config)).copy()
     design[design_keys(config).index(parameter)] = value
-    profile = families.with_design(config.profile, design)
-    return config.model_copy(update={"profile": profile})
+    return config.with_design(design)
 
 
 def _check(config: Config, parameter: str) -> None:

@@ -17,7 +17,8 @@ def bounds_of(config: Config) -> list[tuple[float, float]]:
         values = getattr(config.profile, parameter.key)
         count = len(values) if isinstance(values, tuple) else 1
         found += [_pair(config, parameter)] * count
-    return found
+    twist = config.optimizer.bounds.helix_deg
+    return [*found, twist] if config.twist_free and twist is not None else found
 
 
 def widened(config: Config) -> tuple[Config, tuple[str, ...]]:

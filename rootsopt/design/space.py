@@ -165,6 +165,8 @@ class Space(eqx.Module):
 
         `values` (d,): the design. Values and ranges are in config units."""
         radius = self.scene.pitch_radius / MM
+        if self.scene.twist_free:
+            values = values[:-1]
         named = dict(zip(self.family.keys, self.family.split(values), strict=True))
         return dict(self.family.dependent(self.scene.lobes, radius, **named))
 
@@ -191,7 +193,8 @@ class Space(eqx.Module):
         profile = self.scene.profile(design)
         shape = geometry(profile)
         found = margins(profile) if any(c.margin for c in self.constraints) else None
-        every = (c.slack_of(self.scene, profile, shape, found) for c in self.constraints)
+        scene = self.scene.at(design)
+        every = (c.slack_of(scene, profile, shape, found) for c in self.constraints)
         return jnp.stack([*every])
 
     def prepare(self) -> None:

@@ -199,7 +199,7 @@ class Search:
     best objective so far). `stop`: event that another thread can set to end the search early.
     `checkpoint`: file that stores every evaluation and supplies those of an interrupted search.
 
-    Raises `InputError` if the profile family has no design parameters, or if the optimisation
+    Raises `InputError` if there is no design parameter, or if the optimisation
     method does not suit the objective."""
 
     first = 0
@@ -221,11 +221,12 @@ class Search:
                     "`objective.motion` must not be ensemble for a rotor from a file, because it "
                     "has no design parameters; choose another motion"
                 )
-        if not FAMILY_KEYS[config.profile.family]:
+        if not config.design_keys:
             valid = ", ".join(family for family, keys in FAMILY_KEYS.items() if keys)
             raise InputError(
                 f"`profile.family` must be one of {valid} to be optimised, but is "
-                f"{config.profile.family}: it has no design parameter; use `simulate` for it"
+                f"{config.profile.family}: it has no design parameter; use `simulate` for it, "
+                "or make the twist one with `optimizer.bounds.helix_deg`"
             )
         self.config = config
         self.settings = config.optimizer

@@ -34,7 +34,7 @@ class Leakage(NamedTuple):
     `mesh`: between the rotors, mean over the rotation; `tips`: between both rotors and the housing;
     `ends`: across the end faces. `gap`: the gap over the mesh. `efficiency`: volumetric efficiency,
     1 minus leakage over theoretical flow. `knudsen`: mean free path at suction pressure divided by
-    the least gap; 0 for a liquid."""
+    the least gap that is open; 0 for a liquid, or without an open gap."""
 
     mesh: Float[Array, ""]
     tips: Float[Array, ""]
@@ -104,7 +104,9 @@ def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> 
     knudsen = zero
     if medium.gas is not None:
         path = gas.mean_free_path(medium.gas.inlet_pressure, medium.viscosity, medium.gas)
-        knudsen = path / jnp.min(jnp.stack(heights))
+        each = jnp.stack(heights)
+        # Nothing flows through a closed gap.
+        knudsen = path / jnp.min(jnp.where(each > 0, each, jnp.inf))
     return Leakage(mesh, tips, ends, found, 1 - (mesh + tips + ends) / ideal, knudsen)
 
 

@@ -20,9 +20,10 @@ from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import AxisLoads
-from rootsopt.dynamics.parts.resultants import MIRROR
+from rootsopt.dynamics.parts.resultants import MIRROR, GasResultant
 from rootsopt.dynamics.switches import with_switches
 from rootsopt.dynamics.tangent import linearized
+from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump.bearings import equivalent_load
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
@@ -58,6 +59,14 @@ class BearingLoads(NamedTuple):
         size = jnp.sqrt(jnp.sum(self.radial**2, axis=-1))
         return size.reshape(*size.shape[:-2], 4)
 
+    @property
+    def axial_sizes(self) -> Float[Array, "*n 4"]:
+        """Magnitudes of the axial forces (N) on both rotors, then of their tilting moments (N·m).
+
+        All are 0 for straight rotors."""
+        moments = jnp.sqrt(jnp.sum(self.tilting**2, axis=-1))
+        return jnp.concatenate([jnp.abs(self.axial), moments], axis=-1)
+
 
 class BearingSet(eqx.Module):
     """A pair with its bearings, ready to compute their loads.
@@ -77,6 +86,7 @@ class BearingSet(eqx.Module):
     @classmethod
     def of(cls, scene: Scene, design: Float[Array, " d"]) -> "BearingSet":
         """Return the set of a `design` (d,) in config units; the scene must have `bearings`."""
+        scene = scene.at(design)
         pair, shape = scene.pair_and_shape(design)
         found, half = scene.bearings, scene.length / 2
         assert found is not None
@@ -94,7 +104,7 @@ class BearingSet(eqx.Module):
         slices = pair.contact.slices
         places = np.zeros(1) if slices is None else slices.places
         forces, moments, axial = self._from_flanks(pushes, self.length * jnp.asarray(places))
-        more = self._from_gas(motion.phi)
+        more = _from_gas(self.loads.gas, self.length, self.twist, motion.phi)
         forces, moments, axial = (
             a + b for a, b in zip((forces, moments, axial), more, strict=True)
         )
@@ -127,24 +137,25 @@ class BearingSet(eqx.Module):
         first = heights[:, None, None, None] * forces - place * axial[..., None]
         return forces.sum((0, 1)), first.sum((0, 1)), axial.sum((0, 1))
 
-    def _from_gas(self, phi):
-        """Return the same as `_from_flanks` for the gas, at φ1 = `phi` (rad).
 
-        The axial force of the gas is taken to act at the middle of the chord."""
-        gas = self.loads.gas
-        if gas is None:
-            return jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros(2)
-        forces = gas.slice_forces(phi)
-        heights = self.length * jnp.asarray(gas.places)
-        first, axial = heights[:, None, None] * forces, jnp.zeros(forces.shape[:2])
-        if self.twist is not None:
-            contact, tip = gas.chords(phi)
-            against = jnp.sum(tip**2 - contact**2, axis=-1) / 2
-            weights = jnp.asarray(gas.weights)[:, None]
-            axial = self.twist / self.length * gas.pressure_length * weights * against
-            middle = (contact + tip) / 2 * np.stack([np.ones(2), MIRROR])
-            first = first - middle * axial[..., None]
-        return forces.sum(0), first.sum(0), axial.sum(0)
+def _from_gas(gas: GasResultant | None, length, twist, phi):
+    """Return forces and first moments (rotor, x and y) and axial forces (rotor) of the gas.
+
+    `length` (m); `twist` (rad) over it, or `None`; `phi`: φ1 (rad). The axial force of the gas is
+    taken to act at the middle of the chord."""
+    if gas is None:
+        return jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros(2)
+    forces = gas.slice_forces(phi)
+    heights = length * jnp.asarray(gas.places)
+    first, axial = heights[:, None, None] * forces, jnp.zeros(forces.shape[:2])
+    if twist is not None:
+        contact, tip = gas.chords(phi)
+        against = jnp.sum(tip**2 - contact**2, axis=-1) / 2
+        weights = jnp.asarray(gas.weights)[:, None]
+        axial = twist / length * gas.pressure_length * weights * against
+        middle = (contact + tip) / 2 * np.stack([np.ones(2), MIRROR])
+        first = first - middle * axial[..., None]
+    return forces.sum(0), first.sum(0), axial.sum(0)
 
 
 class OrbitLoads(NamedTuple):
@@ -152,12 +163,14 @@ class OrbitLoads(NamedTuple):
 
     `equivalent` (4,): equivalent dynamic load (N) of every bearing, those of rotor 1 first;
     `slopes` (4, d): its derivatives along the orbit's directions; `series`: loads at the orbit's
-    samples; `greatest` (4,): greatest load (N) of every bearing, among the samples."""
+    samples. `greatest` (k,): greatest load (N) of every bearing among the samples, and for twisted
+    rotors that of each of `BearingLoads.axial_sizes`; `greatest_slopes` (k, d): its derivatives."""
 
     equivalent: Float[Array, "4"]
     slopes: Float[Array, "4 d"]
     series: BearingLoads
-    greatest: Float[Array, "4"]
+    greatest: Float[Array, " k"]
+    greatest_slopes: Float[Array, "k d"]
 
 
 class _LoadEquation(Equation):
@@ -170,6 +183,10 @@ class _LoadEquation(Equation):
 
     def rates(self, tau, state, contact, dynamic):
         del contact
+        return self.sizes(tau, state, dynamic)
+
+    def sizes(self, tau, state, dynamic):
+        """Return the bearing loads to the power of the exponent (4,), in units of the force."""
         bearings = eqx.combine(dynamic, self.static)
         size = bearings.at(tau, state).sizes / self.force_unit
         # The root of a load that vanishes has no derivative.
@@ -191,7 +208,7 @@ class _Pieces(NamedTuple):
 
 
 def _pieces(
-    grid: Float[Array, " steps"], ends: Float[Array, " steps"], corners: Float[Array, " k"], period
+    grid: Float[Array, " steps"], ends: Float[Array, " ends"], corners: Float[Array, " k"], period
 ) -> _Pieces:
     """Return the steps of `grid` (mesh periods), divided at `ends` and at the `corners` of loads.
 
@@ -261,7 +278,15 @@ def orbit_loads(
     ends = with_switches(
         lax.stop_gradient(marked), orbit.flow, period.astype(dtype), tolerance, orbit.flow.grid
     )
-    pieces = _pieces(orbit.flow.grid, ends, loads_corners(bearings), period)
+    samples = orbit.flow.states.shape[0]
+    tau = period * jnp.arange(samples, dtype=dtype) / samples
+    series = lax.map(lambda at: bearings.at(*at), (tau, orbit.flow.states))
+    sizes = _channels(series, scene)
+    latest = jnp.argmax(sizes, axis=0)
+    # The motion is known at the ends of pieces: one ends at the instant of each greatest load.
+    pieces = _pieces(
+        orbit.flow.grid, jnp.append(ends, tau[latest]), loads_corners(bearings), period
+    )
     before = jnp.concatenate([orbit.state[None], orbit.flow.corners[:-1]])
     taken, lanes = jnp.sum(pieces.end < jnp.inf), jnp.arange(_CHUNK)
 
@@ -280,26 +305,46 @@ def orbit_loads(
 
         return linearized(run, equation.start(before[of], pair.free), dynamic, moved, count)
 
+    openings = _openings(dynamic, static, moved) if scene.twist_free else None
+
+    def opening(k, state):
+        """Return what is added to slopes because the jump inside piece `k`, if any, moves."""
+        assert openings is not None
+        opened, delay = openings
+        begin, end = pieces.begin[k], pieces.end[k]
+        away = (begin + end) / 2 - opened
+        inside = (jnp.abs(away - jnp.round(away)) < _ASIDE / 2) & (end - begin < 3 * _ASIDE)
+        before, after = (equation.sizes(time, state, dynamic) for time in (begin, end))
+        lapse = pair.lapse(state) if pair.free else 1.0
+        return jnp.outer(lapse * (before - after), inside @ delay)
+
     def advance(carry, job):
-        moved, total, slopes = carry
-        wanted, last, found = job
+        moved, total, slopes, peaks = carry
+        wanted, last, end, found, jumps = job
         after = found.by_state @ moved + found.by_parameters
         new = total + found.value[count:], slopes + after[count:]
         total, slopes = jax.tree.map(lambda x, y: jnp.where(wanted, x, y), new, (total, slopes))
-        return (jnp.where(wanted & last, after[:count], moved), total, slopes), None
+        if jumps is not None:
+            slopes = slopes.at[:4].add(jnp.where(wanted, jumps, 0.0))
+        here = wanted & (tau[latest] == end)
+        peaks = jnp.where(here[:, None, None], after[:count], peaks)
+        return (jnp.where(wanted & last, after[:count], moved), total, slopes, peaks), None
 
     def chunk(carry):
         number, sums = carry
         place = number * _CHUNK + lanes
         at = jnp.minimum(place, taken - 1)
         found = jax.vmap(linear_piece)(at)
-        sums, _ = lax.scan(advance, sums, (place < taken, pieces.last[at], found))
+        jumps = None if openings is None else jax.vmap(opening)(at, found.value[:, :count])
+        jobs = place < taken, pieces.last[at], pieces.end[at], found, jumps
+        sums, _ = lax.scan(advance, sums, jobs)
         return number + 1, sums
 
     size = room.count + pair.free
-    start = orbit.moved, jnp.zeros(size, dtype), jnp.zeros((size, orbit.moved.shape[1]), dtype)
-    begin = jnp.zeros((), int), start
-    _, (_, total, slopes) = lax.while_loop(lambda now: now[0] * _CHUNK < taken, chunk, begin)
+    peaks = jnp.broadcast_to(orbit.moved, (len(latest), *orbit.moved.shape))
+    totals = jnp.zeros(size, dtype), jnp.zeros((size, orbit.moved.shape[1]), dtype)
+    begin = jnp.zeros((), int), (orbit.moved, *totals, peaks)
+    _, (_, total, slopes, peaks) = lax.while_loop(lambda now: now[0] * _CHUNK < taken, chunk, begin)
     duration, drift = period.astype(dtype), jnp.zeros(orbit.moved.shape[1], dtype)
     if pair.free:
         duration, drift = total[-1], slopes[-1]
@@ -308,11 +353,45 @@ def orbit_loads(
     root = 1 / bearings.exponent
     equivalent = unit * mean**root
     factor = equivalent * root / jnp.where(mean > 0, mean, jnp.inf)
-    samples = orbit.flow.states.shape[0]
-    tau = period * jnp.arange(samples, dtype=dtype) / samples
-    series = lax.map(lambda at: bearings.at(*at), (tau, orbit.flow.states))
-    greatest = jnp.max(series.sizes, axis=0)
-    return OrbitLoads(equivalent, factor[:, None] * slopes, series, greatest)
+
+    def rise(channel, tau, state, along_state, along):
+        def one(state, dynamic):
+            found = eqx.combine(dynamic, static).at(tau, state)
+            return _channels(found, scene)[channel]
+
+        return jax.jvp(one, (state, dynamic), (along_state, along))[1]
+
+    # At a sample, time does not move with the design.
+    each = jax.vmap(rise, (None, None, None, 1, 0))
+    channels = jnp.arange(len(latest))
+    rises = jax.vmap(each, (0, 0, 0, 0, None))(
+        channels, tau[latest], orbit.flow.states[latest], peaks, moved
+    )
+    greatest = jnp.max(sizes, axis=0)
+    return OrbitLoads(equivalent, factor[:, None] * slopes, series, greatest, rises)
+
+
+def _openings(dynamic, static, moved) -> tuple[Array, Array] | None:
+    """Return the times (2,) at which a pocket opens, and their derivatives (2, d) along `moved`.
+
+    Times are in mesh periods, from 0 to 1. `None` without gas. `dynamic`, `static`: arrays
+    and rest of a `BearingSet`. The times move with the twist only."""
+
+    def times(dynamic):
+        bearings = eqx.combine(dynamic, static)
+        return bearings.loads.gas.openings() * bearings.pair.lobes / (2 * jnp.pi)
+
+    if eqx.combine(dynamic, static).loads.gas is None:
+        return None
+    slopes = jax.vmap(lambda along: jax.jvp(times, (dynamic,), (along,))[1])(moved)
+    return times(dynamic), slopes.T
+
+
+def _channels(loads: BearingLoads, scene: Scene) -> Float[Array, "*n k"]:
+    """Return all quantities whose greatest value is reported."""
+    if scene.straight:
+        return loads.sizes
+    return jnp.concatenate([loads.sizes, loads.axial_sizes], axis=-1)
 
 
 @Program
@@ -320,24 +399,34 @@ def static_loads(scene: Scene, design: Float[Array, " d"]) -> tuple[Array, Array
     """Return (equivalent, greatest) loads (4,) in N of the bearings if the gear carries the load.
 
     The flanks do not touch, and nothing oscillates. `design` (d,): in config units."""
-    bearings = BearingSet.of(scene, design)
-    pair, loads = bearings.pair, bearings.loads
+    profile = scene.profile(design)
+    return still_loads(scene.at(design), profile, geometry(profile))
+
+
+def still_loads(scene: Scene, profile: Profile, shape: Geometry) -> tuple[Array, Array]:
+    """Return the same as `static_loads` for the `profile` and `shape` of a design.
+
+    JAX can differentiate it. The scene must have `bearings`."""
+    found, half = scene.bearings, scene.length / 2
+    assert found is not None
+    load = scene.load(profile, shape)
+    loads = scene.axis_loads(found, load, scene.gear, scene.mass(shape))
 
     def size(phi):
-        forces, first, _ = bearings._from_gas(phi)
-        across = pair.load.torque2(phi) / loads.radius
+        forces, first, _ = _from_gas(loads.gas, scene.length, scene.helix, phi)
+        across = load.torque2(phi) / loads.radius
         teeth = jnp.stack([jnp.abs(across) * jnp.tan(loads.tooth_angle), across])
-        teeth = jnp.stack([-teeth, teeth]) if pair.gear is not None else jnp.zeros((2, 2))
-        forces, first = forces + teeth, first + bearings.gear * teeth
+        teeth = jnp.stack([-teeth, teeth]) if scene.gear is not None else jnp.zeros((2, 2))
+        forces, first = forces + teeth, first + (half + found.gear_distance) * teeth
         if loads.weight is not None:
             forces = forces - loads.weight * np.array([[0.0, 1.0], [0.0, 1.0]])
-        share = first / (2 * bearings.bearing)
+        share = first / (2 * (half + found.distance))
         radial = jnp.stack([forces / 2 + share, forces / 2 - share], axis=1)
         return BearingLoads(radial, jnp.zeros(2), first).sizes
 
-    phi = 2 * jnp.pi / pair.lobes * (jnp.arange(POSES) + 0.5) / POSES
+    phi = 2 * jnp.pi / scene.lobes * (jnp.arange(POSES) + 0.5) / POSES
     sizes = jax.vmap(size)(phi)
-    return equivalent_load(sizes.T, bearings.exponent), jnp.max(sizes, axis=0)
+    return equivalent_load(sizes.T, found.exponent), jnp.max(sizes, axis=0)
 
 
-__all__ = ["BearingLoads", "BearingSet", "OrbitLoads", "orbit_loads", "static_loads"]
+__all__ = ["BearingLoads", "BearingSet", "OrbitLoads", "orbit_loads", "static_loads", "still_loads"]

@@ -1,7 +1,7 @@
 """The pump sheet: what a designer weighs beside the contact force, at one glance."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
 from rootsopt.pump.leakage import leakage
 from rootsopt.pump.loads import static_loads
-from rootsopt.pump.play import play
+from rootsopt.pump.play import Play, play
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.medium import Medium
@@ -36,6 +36,10 @@ NOTE = (
     "efficiency eta given, no other shape of the flank changes it; a twist lowers it."
 )
 """What limits the ripple, for the user."""
+
+
+SLIP, MOLECULAR = 0.01, 1.0
+"""Knudsen numbers above which gas slips at the walls, and above which the flow is molecular."""
 
 
 def sheet(scene: Scene, design: Float[Array, " d"]) -> dict[str, Any]:
@@ -66,6 +70,50 @@ def sheet(scene: Scene, design: Float[Array, " d"]) -> dict[str, Any]:
     if scene.medium is not None:
         found |= _leaking(scene, scene.medium, design)
     return {key: found[key] for key in KEYS if key in found}
+
+
+def warnings(rows: Mapping[str, Any]) -> list[str]:
+    """Return sentences on what in a sheet cannot be taken at face value.
+
+    `rows`: the sheet."""
+    found = []
+    if rows.get("volumetric_efficiency", 1.0) <= 0:
+        found.append(
+            "More fluid leaks back than the rotors displace: the pump delivers nothing. Reduce the "
+            "clearances or `pump.pressure_difference_Pa`, or raise `scene.speed_rpm`."
+        )
+    knudsen = rows.get("knudsen_number", 0.0)
+    if knudsen > MOLECULAR:
+        found.append(
+            f"The flow through the gaps is molecular (Knudsen number {knudsen:.2g} > 1): the "
+            "leakage and the volumetric efficiency above do not hold."
+        )
+    elif knudsen > SLIP:
+        found.append(
+            f"Gas slips at the walls of the gaps (Knudsen number {knudsen:.2g} > 0.01): more leaks "
+            "than reported."
+        )
+    return found
+
+
+def missing(rows: Mapping[str, Any]) -> str:
+    """Return a sentence on which keys add further rows to a sheet, "" if it is complete.
+
+    `rows`: the sheet."""
+    absent = []
+    if "gear_backlash_max_mm" not in rows:
+        absent.append("play (`contact.clearance_mm`)")
+    if "volumetric_efficiency" not in rows:
+        absent.append("leakage (section `pump`)")
+    else:
+        absent += [
+            f"{place} leakage (`pump.{place}_clearance_mm`)"
+            for place in ("tip", "end")
+            if f"{place}_leakage_l_min" not in rows
+        ]
+    if "static_bearing_load_max_N" not in rows:
+        absent.append("bearing loads (section `scene.bearings`)")
+    return f"Not in this sheet, for lack of input: {', '.join(absent)}." if absent else ""
 
 
 def check_clearances(config: Config) -> None:
@@ -109,7 +157,7 @@ KEYS = (
 
 @Program
 def _flow(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
-    profile = scene.profile(design)
+    scene, profile = scene.at(design), scene.profile(design)
     shape = geometry(profile)
     lines = flow.flow_lines(profile, shape, LINES)
     if scene.helix is not None:
@@ -133,18 +181,29 @@ def ripple_of(scene: Scene, profile: Profile, shape: Geometry) -> Float[Array, "
 def _has_play(scene: Scene) -> bool:
     """Return whether rotor 2 has play between its flanks, or the rotors may overlap."""
     odd = scene.outline is not None or scene.center_distance_error is not None
-    return odd or float(scene.clearance) > 0
+    return odd or float(scene.clearance) > 0 or float(radial_allowance(scene)) != 0
 
 
 @Program
 def _play(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
     profile = scene.profile(design)
-    found = play(profile, scene.clearance, center_distance(scene))
+    found = play_of(scene, profile)
     return {
         "angular_play_min_mrad": jnp.min(found.total) / MRAD,
         "angular_play_max_mrad": jnp.max(found.total) / MRAD,
         "gear_backlash_max_mm": found.gear_backlash / MM,
     }
+
+
+def play_of(scene: Scene, profile: Profile) -> Play:
+    """Return the play in a `scene`, with all its clearances."""
+    return play(profile, scene.clearance, center_distance(scene), radial=radial_allowance(scene))
+
+
+def radial_allowance(scene: Scene) -> Float[Array, ""]:
+    """Return the radius (m) by which both rotors are smaller everywhere."""
+    medium = scene.medium
+    return jnp.zeros_like(scene.clearance) if medium is None else medium.radial_allowance
 
 
 def center_distance(scene: Scene) -> Float[Array, ""]:
@@ -162,11 +221,12 @@ def _leaking(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[s
             f"the flanks must not overlap in perfect rolling, but overlap by {-least / UM:.3g} um; "
             "raise `contact.clearance_mm`, `scene.center_distance_error_mm` or "
             "`pump.radial_allowance_mm` by more than that"
+            + ("" if medium.strain is None else ", or warm the rotors less (`scene.heat`)")
         )
     absent = {
         "tip_leakage_l_min": medium.tip_clearance is None,
         "end_leakage_l_min": medium.end_clearance is None,
-        "knudsen_number": medium.gas is None,
+        "knudsen_number": not float(rows["knudsen_number"]) > 0,
     }
     return {key: value.tolist() for key, value in rows.items() if not absent.get(key)}
 

@@ -30,9 +30,8 @@ from rootsopt.dynamics.steady import (
 from rootsopt.dynamics.window import Window, lyapunov
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import OrbitLoads, orbit_loads
-from rootsopt.response import orbits
-from rootsopt.response.orbits import Built, OrbitStore
-from rootsopt.response.terms import EQUIVALENT, terms_of, values_of
+from rootsopt.response.orbits import Built, OrbitStore, prepare_near
+from rootsopt.response.terms import BEARING, EQUIVALENT, terms_of, values_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_keys, design_vector
 from rootsopt.status import Status
@@ -333,7 +332,7 @@ class Evaluator:
         _build.prepare(now.scene, design)
         built = Built(pair, tangents, now.scene.pitch_radius, solver)
         if now._continues(built):
-            orbits.prepare(built)
+            prepare_near(built)
         if series:
             count = pair.lobes * solver.samples
             times = jax.ShapeDtypeStruct((count,), float)
@@ -428,12 +427,12 @@ class Evaluator:
             statistics |= _orbit_statistics(found)
             motion = _orbit_series(pair, orbit, period) if series else None
             state = np.asarray(orbit.state, np.float64)
-            if self.scene.bearings is not None and (series or EQUIVALENT in self._names):
+            if self.scene.bearings is not None and (series or {*BEARING} & {*self._names}):
                 loads = jax.device_get(self._bearing_loads(design, found))
-                response |= bearing_record(self.scene, loads)
-                if gradient:
-                    slope = loads.slopes[np.argmax(loads.equivalent)]
-                    gradient[EQUIVALENT] = dict(zip(self.keys, map(float, slope), strict=True))
+                for name, (value, slope) in bearing_record(loads).items():
+                    response[name] = value
+                    if gradient:
+                        gradient[name] = dict(zip(self.keys, map(float, slope), strict=True))
                 if motion is not None:
                     turns = len(motion.time) // len(loads.series.sizes), 1
                     each = np.tile(np.asarray(loads.series.sizes, np.float64), turns)
@@ -550,19 +549,23 @@ def _reached(pair: RotorPair, found: Steady) -> float:
     return scale * abs(float(found.settled.state[0]))
 
 
-def bearing_record(scene: Scene, loads: OrbitLoads) -> dict[str, float]:
-    """Return the result file's entries for the loads on the bearings over an orbit."""
-    record = {
-        EQUIVALENT: float(np.max(loads.equivalent)),
-        "bearing_load_max_N": float(np.max(loads.greatest)),
+def bearing_record(loads: OrbitLoads) -> dict[str, tuple[float, NDArray[np.float64]]]:
+    """Return the result file's entries for the loads on the bearings over an orbit.
+
+    Each is (value, its derivatives (d,)): those of the most loaded bearing or rotor."""
+    greatest, slopes = loads.greatest, loads.greatest_slopes
+    groups = {
+        EQUIVALENT: (loads.equivalent, loads.slopes),
+        "bearing_load_max_N": (greatest[:4], slopes[:4]),
+        "axial_force_max_N": (greatest[4:6], slopes[4:6]),
+        "tilting_moment_max_N_m": (greatest[6:], slopes[6:]),
     }
-    if scene.straight:
-        return record
-    moment = np.hypot(*np.moveaxis(np.asarray(loads.series.tilting), -1, 0))
-    return record | {
-        "axial_force_max_N": float(np.max(np.abs(loads.series.axial))),
-        "tilting_moment_max_N_m": float(np.max(moment)),
-    }
+    record = {}
+    for name, (values, rows) in groups.items():
+        if len(values):
+            worst = int(np.argmax(values))
+            record[name] = float(values[worst]), np.asarray(rows[worst], np.float64)
+    return record
 
 
 def _orbit_statistics(found: Steady) -> dict[str, int | float]:

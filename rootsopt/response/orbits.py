@@ -198,7 +198,7 @@ def _closed(built: Built, known: Known, neighbour: RotorPair) -> Steady:
     return jax.device_get(_near(built.pair, built.tangents, start, built.radius, built.solver))
 
 
-def prepare(built: Built) -> None:
+def prepare_near(built: Built) -> None:
     """Compile the programs for orbits of one mesh period in the background.
 
     In `built`, `jax.ShapeDtypeStruct` may replace arrays."""
@@ -222,4 +222,4 @@ def _key(state) -> bytes:
 _near = Program(near_motion)
 _seed = Program(seed)
 
-__all__ = ["Built", "OrbitStore", "prepare"]
+__all__ = ["Built", "OrbitStore", "prepare_near"]

@@ -19,10 +19,11 @@ from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
 from rootsopt.pump.leakage import leakage
-from rootsopt.pump.play import play
-from rootsopt.pump.sheet import center_distance, ripple_of
+from rootsopt.pump.loads import still_loads
+from rootsopt.pump.sheet import MRAD, UM, play_of, ripple_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
+from rootsopt.scene.medium import Medium
 
 _CM = 1e-2
 """Length of a centimetre (m)."""
@@ -33,8 +34,8 @@ _LITRE_PER_MINUTE = 1e-3 / 60
 class Forces(NamedTuple):
     """Mean, peak and RMS of the contact force (N), in the fields `mean`, `peak`, `rms`.
 
-    `bearing` (N): greatest equivalent load of a bearing. An evaluation integrates it along the
-    motion itself, so that it is NaN here."""
+    `bearing`: loads of the bearings and axial forces, which an evaluation takes from the motion
+    itself, so that it is NaN here."""
 
     mean: Float[Array, ""]
     peak: Float[Array, ""]
@@ -117,7 +118,31 @@ class BacklashTerm(Term):
 
     def value(self, scene, profile, shape, forces):
         del shape, forces
-        return play(profile, scene.clearance, center_distance(scene)).gear_backlash / MM
+        return play_of(scene, profile).gear_backlash / MM
+
+
+class PlayTerm(Term):
+    """A term whose value is the least angular play (mrad) of rotor 2 over the rotation."""
+
+    def value(self, scene, profile, shape, forces):
+        del shape, forces
+        return jnp.min(play_of(scene, profile).total) / MRAD
+
+
+class GapTerm(Term):
+    """A term whose value is the least gap (um) of the flanks over the mesh, or its `mean`.
+
+    The scene must have a section `pump`. A negative least gap is an overlap."""
+
+    sense: ClassVar[Literal["min", "max"]] = "max"
+    mean: bool = eqx.field(static=True)
+
+    def value(self, scene, profile, shape, forces):
+        del forces
+        name = "mean" if self.mean else "min"
+        medium = _medium(scene, f"flank_gap_{name}_um")
+        gaps = leakage(scene, medium, profile, shape).gap.least
+        return (jnp.mean(gaps) if self.mean else jnp.min(gaps)) / UM
 
 
 class LossTerm(Term):
@@ -127,12 +152,17 @@ class LossTerm(Term):
 
     def value(self, scene, profile, shape, forces):
         del forces
-        if scene.medium is None:
-            raise InputError(
-                "the term `leakage_fraction` needs the section `pump`; add it with "
-                "`pump.viscosity_mPa_s` and `pump.pressure_difference_Pa`"
-            )
-        return 1 - leakage(scene, scene.medium, profile, shape).efficiency
+        medium = _medium(scene, "leakage_fraction")
+        return 1 - leakage(scene, medium, profile, shape).efficiency
+
+
+def _medium(scene: Scene, name: str) -> Medium:
+    if scene.medium is None:
+        raise InputError(
+            f"the term `{name}` needs the section `pump`; add it with `pump.viscosity_mPa_s` and "
+            "`pump.pressure_difference_Pa`"
+        )
+    return scene.medium
 
 
 class InertiaTerm(Term):
@@ -154,22 +184,53 @@ class ForceTerm(Term):
 
 
 class BearingTerm(Term):
-    """A term whose value is the greatest equivalent dynamic load (N) of the four bearings.
+    """A term from the loads on the bearings along the motion, under the `name` of a response.
 
-    The scene must have a section `scene.bearings`."""
+    The scene must have a section `scene.bearings`; for a `twisted` one, also a helix."""
+
+    name: str = eqx.field(static=True)
+    twisted: bool = eqx.field(static=True, default=False)
 
     def value(self, scene, profile, shape, forces):
         del profile, shape
-        if scene.bearings is None:
+        _need_bearings(scene, self.name)
+        if self.twisted and scene.straight:
             raise InputError(
-                f"the term `{EQUIVALENT}` needs the section `scene.bearings`; add it, as in "
-                "`scene.bearings={}`"
+                f"the term `{self.name}` needs twisted rotors, because it is 0 for straight ones; "
+                "set `rotor.helix_deg`, or make the twist a design parameter with "
+                "`optimizer.bounds.helix_deg`"
             )
         return forces.bearing
 
 
+class StaticBearingTerm(Term):
+    """A term whose value is a load (N) of the bearings while the timing gear carries the load.
+
+    It is the greatest one of the four bearings, or the greatest `equivalent` load. Nothing is
+    simulated. The scene must have a section `scene.bearings`."""
+
+    equivalent: bool = eqx.field(static=True)
+
+    def value(self, scene, profile, shape, forces):
+        del forces
+        name = "equivalent" if self.equivalent else "max"
+        _need_bearings(scene, f"static_bearing_load_{name}_N")
+        equivalent, greatest = still_loads(scene, profile, shape)
+        return jnp.max(equivalent if self.equivalent else greatest)
+
+
+def _need_bearings(scene: Scene, name: str) -> None:
+    if scene.bearings is None:
+        raise InputError(
+            f"the term `{name}` needs the section `scene.bearings`; add it, as in "
+            "`scene.bearings={}`"
+        )
+
+
 EQUIVALENT = "bearing_load_equivalent_N"
 """Name of the greatest equivalent dynamic load of the bearings."""
+BEARING = (*(EQUIVALENT, "bearing_load_max_N", "axial_force_max_N", "tilting_moment_max_N_m"),)
+"""Names of the terms that an evaluation takes from the bearing loads along the motion."""
 _terms: dict[str, Term] = {}
 
 
@@ -215,9 +276,9 @@ def values_of(
     `forces` (3,): mean, peak and RMS force (N); `slopes` (3, d): their gradients."""
 
     def every(design, forces):
-        profile = scene.profile(design)
+        here, profile = scene.at(design), scene.profile(design)
         shape = geometry(profile)
-        found = [term.value(scene, profile, shape, Forces(*forces)) for term in terms]
+        found = [term.value(here, profile, shape, Forces(*forces)) for term in terms]
         return jnp.stack([jnp.asarray(one, float) for one in found])
 
     by_design, by_forces = jax.jacfwd(every, (0, 1))(design, forces)
@@ -247,8 +308,8 @@ def needs_forces(scene: Scene, term: Term, design: Float[Array, " d"]) -> bool:
     The term is traced once for a `design` (d,) in config units, and nothing is computed."""
 
     def value(design):
-        profile = scene.profile(design)
-        return jnp.asarray(term.value(scene, profile, geometry(profile), _NoForces()), float)  # pyright: ignore[reportArgumentType]
+        here, profile = scene.at(design), scene.profile(design)
+        return jnp.asarray(term.value(here, profile, geometry(profile), _NoForces()), float)  # pyright: ignore[reportArgumentType]
 
     try:
         jax.eval_shape(value, design)
@@ -279,7 +340,12 @@ def _own() -> dict[str, Any]:
         "flow_ripple": RippleTerm(),
         "gear_backlash_max_mm": BacklashTerm(),
         "leakage_fraction": LossTerm(),
-        EQUIVALENT: BearingTerm(),
+        "angular_play_min_mrad": PlayTerm(),
+        "flank_gap_min_um": GapTerm(mean=False),
+        "flank_gap_mean_um": GapTerm(mean=True),
+        "static_bearing_load_max_N": StaticBearingTerm(equivalent=False),
+        "static_bearing_load_equivalent_N": StaticBearingTerm(equivalent=True),
+        **{name: BearingTerm(name, name in BEARING[2:]) for name in BEARING},
     }
 
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rootsopt.config import Config
+from rootsopt.config.units import DEG
 from rootsopt.contact.gap import Contact
 from rootsopt.contact.law import ContactLaw
 from rootsopt.contact.linear import LinearContact
@@ -49,7 +50,7 @@ from rootsopt.runtime.precision import check_precision
 from rootsopt.scene import families, reading
 from rootsopt.scene.bearings import GRAVITY, Bearings, bearings_of
 from rootsopt.scene.medium import Medium, medium_of
-from rootsopt.scene.slicing import slices_needed
+from rootsopt.scene.slicing import greatest_twist, slices_needed
 
 
 class Scene(eqx.Module):
@@ -58,7 +59,8 @@ class Scene(eqx.Module):
     Physical quantities are arrays, and responses are differentiable with respect to them. Choices
     are static fields, so that one compiled program serves all scenes with the same choices.
 
-    `family`, `lobes`, `pitch_radius` (m): profile; `design_size`: number d of its parameters.
+    `family`, `lobes`, `pitch_radius` (m): profile; `design_size`: number d of design parameters.
+    `twist_free`: whether the last one of them is the twist (°), which then replaces `helix`.
     `fidelity`, `map_size`, `nodes`: contact model and its resolution.
     `precision`: number type of the integration; `solver`: solver for the steady motion. `slices`:
     number of slices of twisted rotors, 0 for straight ones.
@@ -83,6 +85,7 @@ class Scene(eqx.Module):
     nodes: int = eqx.field(static=True)
     slices: int = eqx.field(static=True)
     design_size: int = eqx.field(static=True)
+    twist_free: bool = eqx.field(static=True)
     pitch_radius: Float[Array, ""]
     length: Float[Array, ""]
     density: Float[Array, ""]
@@ -129,6 +132,7 @@ class Scene(eqx.Module):
             nodes=config.solver.nodes,
             slices=config.solver.slices or 0,
             design_size=len(reading.design_keys(config)),
+            twist_free=config.twist_free,
             deepest=jnp.asarray(deepest),
             solver=reading.solver_of(config),
             outline=families.outline(config.profile),
@@ -146,7 +150,7 @@ class Scene(eqx.Module):
             found.law,
             found.clearance,
             jnp.asarray(found.static_depth),
-            float(found.helix),
+            greatest_twist(config) * DEG,
             config.solver.slice_error,
         )
         return dataclasses.replace(found, slices=count)
@@ -170,7 +174,17 @@ class Scene(eqx.Module):
         """Return the profile of a design (d,) in config units."""
         if self.outline is not None:
             return self.outline
+        if self.twist_free:
+            design = design[:-1]
         return families.profile_of(self.family, self.lobes, self.pitch_radius, design)
+
+    def at(self, design: Float[Array, " d"]) -> "Scene":
+        """Return this scene with what a `design` (d,), in config units, sets beside the profile.
+
+        This is the twist if it is a design parameter. Otherwise, the scene is returned as it is."""
+        if not self.twist_free:
+            return self
+        return dataclasses.replace(self, helix=design[-1] * DEG)
 
     @property
     def straight(self) -> bool:
@@ -273,7 +287,8 @@ class Scene(eqx.Module):
         torque = jnp.where(jnp.isnan(motor.torque), load.total, motor.torque)
         return eqx.tree_at(lambda m: (m.speed, m.torque), motor, (self.speed, torque))
 
-    def _load(self, profile: Profile, shape: Geometry) -> Load:
+    def load(self, profile: Profile, shape: Geometry) -> Load:
+        """Return the load on the rotors: a constant torque, or that of the gas."""
         if self.pressure is None:
             return ConstantLoad(self.load_torque)
         across = self.pressure * self.length
@@ -326,6 +341,7 @@ class Scene(eqx.Module):
         """Return (rotor pair, geometry of one rotor) for a design (d,) in config units.
 
         Raises `InputError` if the contact cannot be simulated in this scene."""
+        self = self.at(design)
         profile = self.profile(design)
         shape = geometry(profile)
         inertia = self.inertia(shape)
@@ -342,7 +358,7 @@ class Scene(eqx.Module):
                 angle = angle + part.play
         # These are units for scaling, not physical quantities, so results do not depend on them.
         force, angle = jax.lax.stop_gradient((force, angle))
-        load = self._load(profile, shape)
+        load = self.load(profile, shape)
         context = Context(
             inertia=inertia,
             mass=self.mass(shape),

@@ -55,12 +55,7 @@ def design_of(config: ProfileConfig) -> Float[Array, " d"]:
 
 def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:
     """Return a copy of a profile's config with the given `design` (d,) in config units."""
-    given = [float(value) for value in np.asarray(design)]
-    family = family_of(config.family)
-    values = zip(family.parameters, family.split(given), strict=True)
-    return config.model_copy(
-        update={one.key: tuple(v) if one.count is not None else v for one, v in values}
-    )
+    return config.with_design([float(value) for value in np.asarray(design)])
 
 
 def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, float]:

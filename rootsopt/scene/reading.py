@@ -14,7 +14,6 @@ from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.parts import Friction, MotorDrive, Supports, TimingGear
 from rootsopt.dynamics.steady import Solver
-from rootsopt.scene import families
 
 _ORBIT_STEPS = 4
 """Limit on the number of solver steps for a whole orbit, as a multiple of the number that the
@@ -25,12 +24,12 @@ _ROLLS, _RELATIVES = 384, 16
 
 def design_vector(config: Config) -> Float[Array, " d"]:
     """Return the config's design parameters (d,) in config units; d = 3 for CIC, 0 for EE."""
-    return families.design_of(config.profile)
+    return jnp.asarray(config.design)
 
 
 def design_keys(config: Config) -> tuple[str, ...]:
     """Return the names of the design parameters, in the order of `design_vector`."""
-    return families.keys_of(config.profile)
+    return config.design_keys
 
 
 def quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
@@ -52,7 +51,7 @@ def quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
         "load_torque": jnp.asarray(config.load_torque),
         "gear_damping_ratio": jnp.asarray(0.0 if gear is None else gear.damping_ratio),
         "bore_radius": _optional(rotor.bore_mm, MM / 2),
-        "helix": _optional(rotor.helix_deg or None, DEG),
+        "helix": _optional(rotor.helix_deg if config.twist_free else rotor.helix_deg or None, DEG),
         "wear": None if wear is None else jnp.asarray(wear.depth_mm * MM),
         "pressure": _optional(scene.load.pressure_difference_Pa),
         "center_distance_error": _optional(error, MM),

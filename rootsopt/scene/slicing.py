@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from rootsopt.config import Config
 from rootsopt.contact.law import ContactLaw
 from rootsopt.contact.search import SearchContact
 from rootsopt.profiles import Profile
@@ -19,6 +20,12 @@ _POSES = 720
 """Number of angles of rotor 1, evenly over a mesh period, at which the section is evaluated."""
 _REFERENCE = 400
 """Number of slices of the reference, which are evenly spaced."""
+
+
+def greatest_twist(config: Config) -> float:
+    """Return the greatest magnitude (°) of the twist of a `config`, within its bounds if free."""
+    bounds = config.optimizer.bounds.helix_deg if config.twist_free else None
+    return max(map(abs, (config.rotor.helix_deg, *(bounds or ()))))
 
 
 def slices_needed(

@@ -13,7 +13,6 @@ from rootsopt.config import Config
 from rootsopt.optimize.infeasible import Infeasible
 from rootsopt.optimize.optimality import RESIDUAL
 from rootsopt.response.evaluation import Evaluation
-from rootsopt.scene.families import with_design
 from rootsopt.status import Status
 from rootsopt.tradeoffs.aims import Aim
 
@@ -218,8 +217,7 @@ class Front:
 
     def config_of(self, point: FrontPoint) -> Config:
         """Return the config of the run with the design of a `point`."""
-        profile = with_design(self.config.profile, [*point.design.values()])
-        return self.config.model_copy(update={"profile": profile})
+        return self.config.with_design([*point.design.values()])
 
     def record(self) -> dict[str, Any]:
         """Return the entries of the result file."""

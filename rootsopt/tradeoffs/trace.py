@@ -78,7 +78,7 @@ class Tracer:
     `progress`: function called after each local search with (searches done, searches expected);
     `stop`: event that another thread can set to end the tracing early.
 
-    Raises `InputError` if the profile family has no design parameters."""
+    Raises `InputError` if there is no design parameter."""
 
     def __init__(
         self,
@@ -86,11 +86,12 @@ class Tracer:
         progress: Progress | None = None,
         stop: threading.Event | None = None,
     ):
-        if not FAMILY_KEYS[config.profile.family]:
+        if not config.design_keys:
             valid = ", ".join(family for family, found in FAMILY_KEYS.items() if found)
             raise InputError(
                 f"`profile.family` must be one of {valid} for a trade-off, but is "
-                f"{config.profile.family}: it has no design parameter; use `simulate` for it"
+                f"{config.profile.family}: it has no design parameter; use `simulate` for it, "
+                "or make the twist one with `optimizer.bounds.helix_deg`"
             )
         self.config = config
         self.progress = progress or (lambda done, expected: None)

@@ -19,7 +19,7 @@ from rootsopt.pump import gas
 from rootsopt.pump.gap import Allowances, mesh_gap, relative_curvature
 from rootsopt.pump.laminar import parabolic_length, slot_flow
 from rootsopt.pump.leakage import leakage, tip_length
-from rootsopt.pump.sheet import sheet
+from rootsopt.pump.sheet import KEYS, missing, sheet, warnings
 from rootsopt.response.terms import terms_of
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.medium import Gas
@@ -261,6 +261,24 @@ def test_sheet_has_the_rows_of_its_inputs():
     )
     assert whole["flank_gap_min_um"] == pytest.approx(60)
     assert "knudsen_number" not in whole
+
+
+def test_sheet_says_what_it_lacks_and_what_does_not_hold():
+    assert missing({}).count("(") == 3
+    whole = dict.fromkeys(KEYS, 0.5)
+    assert missing(whole) == ""
+    del whole["tip_leakage_l_min"]
+    assert "`pump.tip_clearance_mm`" in missing(whole)
+    assert warnings({}) == warnings({"volumetric_efficiency": 0.9, "knudsen_number": 1e-3}) == []
+    found = [warnings({"knudsen_number": number})[0] for number in (0.1, 2.0)]
+    assert "slips" in found[0]
+    assert "molecular" in found[1]
+    assert "delivers nothing" in warnings({"volumetric_efficiency": -1.0})[0]
+    # Closed flanks: the number is that of the gap at the end faces.
+    scene = scene_of(BLOWER[0], *BLOWER[2:])
+    rows = sheet(scene, jnp.asarray(load_config("configs/cic.yaml").design))
+    path = gas.mean_free_path(scene.medium.gas.inlet_pressure, scene.medium.viscosity, AIR)
+    assert rows["knudsen_number"] == pytest.approx(float(path) / 5e-5, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from matplotlib.path import Path
 
 from rootsopt.contact.nodes import pair_gap, place_pair
 from rootsopt.profiles import CIC, EE
+from rootsopt.pump.gap import Allowances, mesh_gap
 from rootsopt.pump.play import play
 from tests.conformance.families import LOBES, R, made, outline_of
 from tests.measured.test_outline import bulged, points_of, profile_of
@@ -88,6 +89,17 @@ def test_overlap_is_negative():
     """A centre distance that is too small."""
     found = of("cic", -2e-4)
     assert float(found.gear_backlash) < 0
+
+
+def test_smaller_rotors_have_the_play_of_their_gap():
+    """A radius that is smaller everywhere: the gap of the flanks, over the lever r cos ψ."""
+    profile, nothing = made("cic"), jnp.zeros(())
+    found = jax.jit(play)(profile, nothing, radial=jnp.asarray(C))
+    gap = jax.jit(mesh_gap)(profile, Allowances(nothing, nothing, jnp.asarray(C)))
+    lever = R * np.cos(profile.addendum(profile.normal_at(gap.roll)).psi)
+    expected = 2 * R * np.min(np.asarray(gap.least) / lever)
+    assert float(found.gear_backlash) == pytest.approx(expected, rel=2e-2)
+    assert expected > C
 
 
 def test_slope_is_that_of_differences():

@@ -223,6 +223,22 @@ def test_sweeps(tmp_path, programs):
 
 
 @pytest.mark.long
+def test_pump_front(tmp_path, programs):
+    """Fronts of two families: the ripple follows from radius and area efficiency alone."""
+    run("pump_front", tmp_path, programs)
+    rows = rows_of(tmp_path / "pump_front.csv")
+    assert {row["family"] for row in rows} == {"ee", "arc_involute", "arc"}
+    ratio, eta = (np.array(numbers(rows, key)) for key in ("radius_ratio", "area_efficiency"))
+    ripple = (ratio - 1) ** 2 / (eta * ratio**2)
+    np.testing.assert_allclose(numbers(rows, "flow_ripple"), ripple, rtol=1e-9)
+    np.testing.assert_allclose(numbers(rows, "sampled_ripple"), ripple, rtol=1e-5)
+    volumes = np.array(numbers(rows, "displaced_volume_cm3"))
+    assert np.min(volumes) >= volumes[0] * (1 - 1e-6)
+    assert "True" in {row["best_of_all"] for row in rows}
+    assert is_picture(tmp_path / "pump_front.png")
+
+
+@pytest.mark.long
 def test_twist(tmp_path, programs):
     """A twist evens the flow by its closed form, and lowers the peak of the force."""
     run("twist", tmp_path, programs)

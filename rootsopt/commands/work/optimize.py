@@ -26,13 +26,12 @@ from rootsopt.optimize.checkpoint import Checkpoint, aside, set_aside
 from rootsopt.optimize.robust import search_of
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
-from rootsopt.pump.sheet import check_clearances, record_of
+from rootsopt.pump.sheet import check_clearances, record_of, warnings
 from rootsopt.response.speeds import at_speeds
 from rootsopt.response.tolerances import nominal_of
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.timing import CompileClock
 from rootsopt.scene import Scene, check_geometry, outline_mm
-from rootsopt.scene.families import with_design
 
 
 def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
@@ -84,6 +83,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
             out.print(tables.comparison_table(result.baseline, result.optimized, *numbers))
             named = zip(("baseline", "optimised"), sheets.values(), strict=True)
             out.print(tables.pump_table(dict(named)))
+            for note in warnings(sheets["optimized"]["pump"]):
+                out.print(f"optimised: {note}", soft_wrap=True, highlight=False)
             if baseline:
                 optimized = result.optimized.record()["speeds"]
                 out.print(tables.speeds_table(baseline, optimized, result.objective_by_speed))
@@ -299,8 +300,7 @@ def _write(folder, config, options, result, choice, sheets, compiled, ran) -> No
 
 def _designed(config: Config, evaluation) -> Config:
     """Return `config` with the design of an `evaluation`."""
-    profile = with_design(config.profile, list(evaluation.design.values()))
-    return config.model_copy(update={"profile": profile})
+    return config.with_design([*evaluation.design.values()])
 
 
 def _write_robustness(folder, config, options, robustness) -> None:

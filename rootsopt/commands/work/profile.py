@@ -16,7 +16,7 @@ from rootsopt.measured import report as outline_report
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.profiles import Profile, geometry
-from rootsopt.pump.sheet import NOTE, sheet
+from rootsopt.pump.sheet import NOTE, missing, sheet, warnings
 from rootsopt.response.evaluation import geometry_record
 from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, outline_mm
 from rootsopt.scene.families import free_form_of, margins_of
@@ -59,8 +59,10 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     def show(out: Console) -> None:
         out.print(tables.geometry_table(record))
-        if "flow_ripple" in record["pump"]:
-            out.print(NOTE, soft_wrap=True, highlight=False)
+        rows = record["pump"]
+        for note in (*warnings(rows), NOTE, missing(rows)):
+            if note:
+                out.print(note, soft_wrap=True, highlight=False)
         outline_report.say(config, out)
         if alike:
             out.print(tables.likeness_table(alike, "This profile resembles"))

@@ -12,7 +12,7 @@ from rootsopt.figures import runs
 from rootsopt.measured import report as outline_report
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
-from rootsopt.pump.sheet import record_of
+from rootsopt.pump.sheet import check_clearances, record_of, warnings
 from rootsopt.response.choice import resolve
 from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.speeds import alone
@@ -25,6 +25,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
     formats = chosen(options.export)
     check_geometry(config)
+    check_clearances(config)
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
         config, choice = resolve(config)
         evaluation = evaluator_for(alone(config))()
@@ -45,6 +46,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         out.print(tables.evaluation_table(evaluation))
         if weighed:
             out.print(tables.pump_table({"value": data}))
+            for note in warnings(data["pump"]):
+                out.print(note, soft_wrap=True, highlight=False)
         outline_report.say(config, out)
 
     return cli.Outcome(cli.OK if evaluation.usable else cli.NO_RESULT, show)

@@ -102,12 +102,17 @@ class GasResultant(eqx.Module):
         weights = jnp.asarray(self.weights)
         return self.pressure_length * weights[:, None, None] * turned
 
+    def openings(self) -> Float[Array, "2"]:
+        """Return the angles φ1 (rad), each in one mesh period, at which a pocket opens."""
+        pitch = 2 * jnp.pi / self.profile.lobes
+        opening = -jnp.pi / 2 - self.port - self._ahead - pitch / 2 * np.arange(2)
+        return jnp.mod(opening, pitch)
+
     def corners(self) -> Float[Array, " k"]:
         """Return the angles φ1 (rad, in one mesh period) at which the forces are not smooth.
 
         Pockets open there, or the contact of a slice passes the end of a segment."""
         pitch = 2 * jnp.pi / self.profile.lobes
-        opening = -jnp.pi / 2 - self.port - self._ahead - pitch / 2 * np.arange(2)
         rolls = [jnp.zeros(1), pitch / 4 * jnp.ones(1)]
         for segment in self.profile.segments():
             ends = self.profile.roll_angle(jnp.stack([segment.start, segment.stop]))
@@ -116,7 +121,7 @@ class GasResultant(eqx.Module):
         each = jnp.concatenate([roll, -roll, pitch / 2 - roll, roll - pitch / 2])
         if self.slices is not None:
             each = (each[:, None] - self.slices.offsets).ravel()
-        return jnp.mod(jnp.concatenate([opening, each]), pitch)
+        return jnp.mod(jnp.concatenate([self.openings(), each]), pitch)
 
     def passed(self, phi: Float[Array, ""]) -> Bool[Array, "4"]:
         """Return flags that change where a pocket opens, a tip passes the line of centres, or the

@@ -1,0 +1,140 @@
+"""Fronts of contact force, leakage and flow ripple, for every profile family in the same pump.
+
+The pump has pitch radius, length and gear of `configs/cic.yaml`, and delivers air against 0.5 bar.
+The load is the mean torque of the gas, which is the same for all rotors of one displacement. Every
+design displaces at least the volume of the EE rotor. Area efficiency and seal width have no limits:
+displacement and leakage take their place.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from experiments._common.scenes import shipped
+from experiments._common.simulation import profile_of
+from rootsopt.config import Config
+from rootsopt.config.families import family_of
+from rootsopt.errors import InputError
+from rootsopt.profiles import geometry
+from rootsopt.pump import relative_flow
+from rootsopt.pump.sheet import sheet
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.scene import Scene, design_vector
+from rootsopt.tradeoffs.trace import pareto_front
+
+Row = dict[str, Any]
+TERMS = "mean_force_N", "leakage_fraction", "flow_ripple"
+"""Terms of the trade-off; less of each is better."""
+REFERENCE = "ee"
+"""Family without design parameters, whose volume all designs displace."""
+DIVISIONS = 3
+"""Steps between two ends of a front: 10 points."""
+FAMILIES = "cic", "arc_involute", "five_arcs", "ellipse"
+QUICK = ("arc_involute", "arc")
+"""Families of a reduced run."""
+_PUMP = (
+    "contact.clearance_mm=0.02",
+    "scene.load={torque_N_m: 2.0}",
+    "pump={viscosity_mPa_s: 0.018, pressure_difference_Pa: 5.0e4, tip_clearance_mm: 0.08, "
+    "end_clearance_mm: 0.05, gas: {inlet_pressure_Pa: 1.0e5}}",
+    "optimizer={iterations: 30, starts: 1, screening: 8, seed: 0}",
+    "constraints={area_efficiency_min: 0.0, undercut_margin_min_mm: 0.0, seal_width_min_mm: 0.0}",
+    f"pareto.terms=[{', '.join(TERMS)}]",
+    "pareto.refinements=0",
+)
+_POSES = 4096
+"""Number of angles of rotor 1 at which the flow is sampled."""
+
+
+def config_of(family: str, divisions: int = DIVISIONS) -> Config:
+    """Return the config of a `family`; `divisions`: steps between two ends of its front."""
+    values = {
+        key: [*v] if isinstance(v, tuple) else v for key, v in family_of(family).example.items()
+    }
+    profile = {"family": family, "lobes": 3, "pitch_radius_mm": 33.0} | values
+    return shipped("cic", f"profile={profile!r}", *_PUMP, f"pareto.divisions={divisions}")
+
+
+def sampled_ripple(config: Config) -> float:
+    """Return the ripple of the flow of a design, from samples of the flow over a lobe pitch."""
+    profile = profile_of(config)
+    phi = 2 * jnp.pi / profile.lobes * jnp.arange(_POSES) / _POSES
+    flow = np.asarray(relative_flow(profile, geometry(profile), phi))
+    return float(np.ptp(flow))
+
+
+def row_of(config: Config, terms: dict[str, float], geometry_of: dict[str, float]) -> Row:
+    """Return the columns that every row has, for the design of a `config`.
+
+    `terms`, `geometry_of`: its terms, and its geometry with the keys of the result file."""
+    found = sheet(Scene.from_config(config), design_vector(config))
+    shape = {key: geometry_of[key] for key in ("area_efficiency", "seal_width_mm")}
+    ratio = geometry_of["outer_radius_mm"] / config.profile.pitch_radius_mm
+    return (
+        terms
+        | {"displaced_volume_cm3": found["displaced_volume_cm3"], "radius_ratio": ratio}
+        | shape
+        | {"sampled_ripple": sampled_ripple(config)}
+    )
+
+
+def front_of(family: str, volume: float, divisions: int, say: Callable[[str], None]) -> list[Row]:
+    """Return the rows of the best compromises of a `family`.
+
+    `volume`: least volume (cm³) displaced per revolution; `say`: function that reports progress.
+    The list is empty for a family that cannot displace it."""
+    config = config_of(family, divisions).replaced(
+        {"constraints.terms": {"displaced_volume_cm3": {"min": volume}}}
+    )
+    front = pareto_front(config)
+    say(f"{family}: {front.searches} searches, {front.evaluations} designs. {front.message}")
+    rows = []
+    for point in front.points:
+        one = front.config_of(point)
+        peak = {"peak_force_N": point.evaluation.response["peak_force_N"]}
+        row = {"family": family, "point": point.number, "status": point.standing.label}
+        rows.append(row | row_of(one, point.terms, point.evaluation.geometry) | peak | point.design)
+    return rows
+
+
+def reference() -> Row:
+    """Return the row of the reference, which is a single design."""
+    config = config_of(REFERENCE)
+    found = Evaluator.of(config.replaced({"objective.terms": dict.fromkeys(TERMS[1:], 0.1)}))()
+    terms = {name: found.response[name] for name in TERMS}
+    row = {"family": REFERENCE, "point": 1, "status": found.status.label}
+    return (
+        row
+        | row_of(config, terms, found.geometry)
+        | {"peak_force_N": found.response["peak_force_N"]}
+    )
+
+
+def mark_best(rows: Sequence[Row]) -> None:
+    """Set `best_of_all` in every row: whether no design of any family is better in all terms.
+
+    Rows that are equal in a term count as equal, not as better."""
+    values = np.array([[row[name] for name in TERMS] for row in rows])
+    for row, own in zip(rows, values, strict=True):
+        beaten = np.all(values <= own, axis=1) & np.any(values < own, axis=1)
+        row["best_of_all"] = not bool(beaten.any())
+
+
+def run(quick: bool, say: Callable[[str], None] = lambda text: None) -> list[Row]:
+    """Trace the fronts of all `FAMILIES`.
+
+    A reduced run has two families, and as few points as a front of three terms can have."""
+    rows = [reference()]
+    volume = rows[0]["displaced_volume_cm3"]
+    say(f"{REFERENCE}: {volume:.4g} cm³ per revolution")
+    for family in QUICK if quick else FAMILIES:
+        try:
+            found = front_of(family, volume, 2 if quick else DIVISIONS, say)
+        except InputError as error:
+            say(f"{family}: {error}")
+            continue
+        rows += found
+    mark_best(rows)
+    return rows

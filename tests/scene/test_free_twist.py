@@ -1,0 +1,127 @@
+"""The twist as a design parameter: keys, bounds, gradients, and nothing where it is fixed."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rootsopt
+from rootsopt import InputError, Scene
+from rootsopt.config.units import DEG
+from rootsopt.continuation.orbits import place_of, with_value
+from rootsopt.design.bounds import bounds_of
+from rootsopt.design.space import Space
+from rootsopt.optimize.search import Search
+from rootsopt.pump.sheet import sheet
+from rootsopt.response.terms import terms_of, values_of
+
+FREE = "optimizer.bounds.helix_deg=[0, 90]", "rotor.helix_deg=20", "solver.slices=2"
+GAS = "scene.load={pressure_difference_Pa: 5e4}", "scene.bearings={weight: true}"
+
+
+def scene_of(name: str, *changes: str) -> tuple[Scene, jnp.ndarray]:
+    config = rootsopt.load_config(name, changes)
+    return Scene.from_config(config), jnp.asarray(config.design)
+
+
+@pytest.mark.parametrize("name", ["cic", "ee", "free"])
+def test_twist_is_the_last_parameter(name):
+    """Behind those of any family: none, single numbers, or a list."""
+    fixed, free = rootsopt.load_config(name), rootsopt.load_config(name, FREE)
+    assert free.design_keys == (*fixed.design_keys, "helix_deg")
+    np.testing.assert_array_equal(free.design, [*fixed.design, 20.0])
+    moved = free.with_design([*(fixed.design * 0.99), 33.0])
+    np.testing.assert_array_equal(moved.design, [*(fixed.design * 0.99), 33.0])
+    assert moved.rotor.helix_deg == 33.0
+    assert fixed.with_design(fixed.design) == fixed
+    assert bounds_of(free) == [*bounds_of(fixed), (0.0, 90.0)]
+    space = Space.of(free, Scene.from_config(free), 0.3)
+    point = np.append(np.linspace(0.3, 0.6, len(fixed.design)), 0.25)
+    design = space.design(jnp.asarray(point))
+    assert float(design[-1]) == pytest.approx(22.5)
+    np.testing.assert_allclose(space.point(design), point, atol=1e-12)
+
+
+def test_orbits_can_be_followed_over_the_twist():
+    config = rootsopt.load_config("cic", FREE)
+    assert with_value(config, "helix_deg", 50.0).rotor.helix_deg == 50.0
+    assert place_of("helix_deg") == "rotor.helix_deg"
+
+
+def test_derivatives_are_those_of_the_scene():
+    """The pair's derivatives along the last parameter are those with respect to `scene.helix`."""
+    free, design = scene_of("ee", *GAS, *FREE)
+    pair, tangents, _ = free.pair_and_tangents(design)
+    # What depends on the twist alone, and only on it.
+    np.testing.assert_allclose(tangents.contact.twist, [DEG], rtol=1e-12)
+    offsets = np.asarray(pair.load.offsets) / float(free.at(design).helix)
+    np.testing.assert_allclose(tangents.load.offsets[0], offsets * DEG, rtol=1e-12)
+    assert free.at(design).helix == pytest.approx(20 * DEG)
+
+
+def test_terms_and_sheet_follow_the_twist():
+    """EE: one line of the flow, whose ripple 2/13 falls with sin(NΦ)/(NΦ)."""
+    scene, _ = scene_of("ee", *FREE)
+    nothing = jnp.zeros(3), jnp.zeros((3, 1))
+    for degrees in (30.0, 50.0):
+        design = jnp.asarray([degrees])
+        values, slopes = values_of(scene, terms_of(["flow_ripple"]), design, *nothing)
+        turn = 3 * degrees * DEG
+        share, rise = np.sin(turn) / turn, (np.cos(turn) - np.sin(turn) / turn) / degrees
+        assert float(values[0]) == pytest.approx(2 / 13 * share, rel=1e-9)
+        assert float(slopes[0, 0]) == pytest.approx(2 / 13 * rise, rel=1e-9)
+        assert sheet(scene, design)["flow_ripple"] == pytest.approx(2 / 13 * share, rel=1e-9)
+
+
+def test_slices_suffice_for_the_greatest_twist():
+    scene, _ = scene_of("ee", FREE[0], FREE[1])
+    assert scene.slices == scene_of("ee", "rotor.helix_deg=90")[0].slices
+    assert scene.slices > scene_of("ee", FREE[1])[0].slices
+
+
+def test_a_fixed_twist_costs_nothing():
+    for changes in ((), FREE[1:]):
+        scene, design = scene_of("cic", *changes)
+        assert scene.at(design) is scene
+        assert not scene.twist_free
+    # A rotor from a file has no design parameters.
+    outline = "profile={family: outline, lobes: 3, pitch_radius_mm: 33, outline_file: x.csv}"
+    assert not rootsopt.load_config("cic", [outline, FREE[0]]).twist_free
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("optimizer.bounds.helix_deg=[30, 20]", "two increasing numbers"),
+        ("optimizer.bounds.helix_deg=[0, 400]", r"in \[-360, 360\]"),
+        ("optimizer.bounds.helix_deg=30", "helix_deg"),
+    ],
+)
+def test_impossible_bounds_are_refused(change, words):
+    with pytest.raises(InputError, match=words):
+        rootsopt.load_config("cic", [change])
+
+
+def test_other_fidelities_and_no_parameters_are_refused():
+    with pytest.raises(InputError, match=r"with `optimizer.bounds.helix_deg`"):
+        rootsopt.load_config("cic", [FREE[0], "solver.fidelity=map"])
+    with pytest.raises(InputError, match=r"or make the twist one with `optimizer.bounds.helix_d"):
+        Search(rootsopt.load_config("ee"))
+
+
+@pytest.mark.long
+def test_gradients_against_differences():
+    """Forces and loads of the bearings, greatest ones included, of twisted CIC rotors."""
+    changes = (*GAS, *FREE, "rotor.helix_deg=40", "solver.rtol=1e-10")
+    config = rootsopt.load_config("cic", changes)
+    evaluator = rootsopt.response.evaluation.Evaluator.of(config)
+    here = evaluator()
+    assert here.status is rootsopt.Status.PERIODIC
+    for key, step in (("helix_deg", 2e-3), ("pressure_angle_deg", 1e-3)):
+        move = step * (np.array(config.design_keys) == key)
+        ahead, behind = (evaluator(config.design + k * move).response for k in (1, -1))
+        for name in (
+            *("mean_force_N", "rms_force_N", "bearing_load_equivalent_N", "bearing_load_max_N"),
+            *("axial_force_max_N", "tilting_moment_max_N_m"),
+        ):
+            slope = (ahead[name] - behind[name]) / (2 * step)
+            assert here.gradient[name][key] == pytest.approx(slope, rel=1e-3), (key, name)
