@@ -30,6 +30,32 @@ class OrbitStore:
     def __len__(self) -> int:
         return len(self._known)
 
+    def __getstate__(self) -> OrderedDict[bytes, tuple[Known, RotorPair]]:
+        with self._lock:
+            return self._known.copy()
+
+    def __setstate__(self, known: OrderedDict[bytes, tuple[Known, RotorPair]]) -> None:
+        self._known, self._lock = known, threading.Lock()
+
+    def part(self, start: NDArray[np.float64] | None) -> "OrbitStore":
+        """Return another store, with the orbits that begin at the states in `start`.
+
+        `start`: as in `Evaluates.__call__`: a state (n,), or rows that end with a state, behind
+        the indices of the part that it belongs to."""
+        found = OrbitStore()
+        for row in () if start is None else np.atleast_2d(start):
+            for first in range(len(row)):
+                known = self.near(row[first:])
+                if known is not None:
+                    found._known[_key(row[first:])] = known
+                    break
+        return found
+
+    def add(self, other: "OrbitStore") -> None:
+        """Remember the orbits of another store as well."""
+        for key, one in other.__getstate__().items():
+            self._keep(key, one)
+
     def near(self, state: NDArray[np.float64] | None) -> tuple[Known, RotorPair] | None:
         """Return the orbit with this scaled `state` (n,) at φ1 = 0, and its pair.
 
@@ -57,8 +83,11 @@ class OrbitStore:
         cut = trimmed(known, period) if bool(known.sound) else None
         if cut is None:
             return
+        self._keep(_key(state), (cut, pair))
+
+    def _keep(self, key: bytes, one: tuple[Known, RotorPair]) -> None:
         with self._lock:
-            self._known[_key(state)] = cut, pair
+            self._known[key] = one
             while len(self._known) > _MOST:
                 self._known.popitem(last=False)
 

@@ -1,0 +1,179 @@
+"""Evaluations of a search in real processes: the same results, whatever happens to a process."""
+
+import pickle
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from rootsopt.commands import optimize, pareto
+from rootsopt.config import load
+from rootsopt.errors import InputError
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.evaluators import evaluator_for
+from rootsopt.response.orbits import OrbitStore
+from rootsopt.response.runs import HERE, Runs
+from rootsopt.sweeps import evaluations
+from rootsopt.sweeps.cluster import Cluster
+from rootsopt.sweeps.evaluations import ClosedError, Elsewhere, evaluating
+from rootsopt.sweeps.worker import Settings, single_of, with_orbits
+from tests.sweeps.test_cluster import IMPORT, kill_a_worker, no_workers
+from tests.sweeps.workers import DEADLY, force
+
+
+def test_a_killed_worker_loses_and_duplicates_no_design(monkeypatch):
+    monkeypatch.setenv("TEST_SECONDS", "0.1")
+    evaluator = Evaluator.of(load("cic"))
+    designs = np.random.default_rng(0).uniform(1.0, 40.0, (40, 3))
+    ended, killed, lock = [], [], threading.Lock()
+
+    def evaluated(number):
+        found = runs.evaluated(evaluator, designs[number])
+        with lock:
+            ended.append(number)
+            if len(ended) >= 4 and not killed:
+                killed.append(number)
+                kill_a_worker()
+        return found
+
+    with (
+        Cluster(2, imports=(IMPORT,)).evaluations() as runs,
+        ThreadPoolExecutor(runs.slots) as pool,
+    ):
+        assert isinstance(runs, Runs)
+        found = list(pool.map(evaluated, range(40)))
+    assert killed
+    assert sorted(ended) == [*range(40)]
+    for design, one in zip(designs, found, strict=True):
+        assert one.response["mean_force_N"] == force(design)
+        assert one.state.tobytes() == design.tobytes()
+    assert no_workers()
+
+
+@pytest.mark.long
+def test_a_design_that_kills_its_process_ends_the_search(monkeypatch):
+    monkeypatch.setenv("TEST_SECONDS", "0.01")
+    evaluator = Evaluator.of(load("cic", [f"scene.speed_rpm={DEADLY}"]))
+    with (
+        Cluster(1, imports=(IMPORT,)).evaluations() as runs,
+        pytest.raises(InputError, match=r"several times.*--resume"),
+    ):
+        runs.evaluated(evaluator, np.ones(3))
+
+
+class Client:
+    """Stands in for a Dask client whose workers never answer."""
+
+    status = "running"
+
+    def __init__(self):
+        self.futures = []
+        self.asked = threading.Event()
+
+    def nthreads(self):
+        return {"a": 2, "b": 1}
+
+    def submit(self, function, *arguments, pure):
+        self.futures.append(Future())
+        self.asked.set()
+        return self.futures[-1]
+
+
+class Future:
+    """Stands in for a future that never ends."""
+
+    cancelled = False
+
+    def add_done_callback(self, call):
+        pass
+
+    def cancel(self):
+        self.cancelled = True
+
+
+def test_threads_that_wait_end_with_the_search(monkeypatch):
+    monkeypatch.setattr(evaluations, "_POLL", 0.01)
+    client = Client()
+    runs = Elsewhere(None, client, Settings(()))
+    assert runs.slots == 6
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(runs.evaluated, Evaluator.of(load("cic")), np.ones(3))
+        assert client.asked.wait(10)
+        runs.close()
+        with pytest.raises(ClosedError):
+            waiting.result(10)
+    assert client.futures[0].cancelled
+    with pytest.raises(ClosedError):
+        runs.evaluated(Evaluator.of(load("cic")), np.ones(3))
+
+
+def test_a_lost_connection_is_named(monkeypatch):
+    monkeypatch.setattr(evaluations, "_POLL", 0.01)
+    monkeypatch.setattr(Client, "status", "closed")
+    with pytest.raises(InputError, match="connection to the scheduler was lost"):
+        Elsewhere(None, Client(), Settings(())).evaluated(Evaluator.of(load("cic")), np.ones(3))
+
+
+def test_orbits_travel_with_the_states_that_name_them():
+    store, state = OrbitStore(), np.array([0.1, 1 / 3])
+    store._known[state.tobytes()] = "orbit", "pair"
+    store._known[np.array([0.2, 0.0]).tobytes()] = "another", "pair"
+    for start in (state, np.array([[0.0, *state], [1.0, 5.0, 6.0]]), np.array([[2.0, 1.0, *state]])):
+        part = pickle.loads(pickle.dumps(store.part(start)))
+        assert [*part._known.items()] == [(state.tobytes(), ("orbit", "pair"))]
+    assert len(store.part(None)) == len(store.part(np.array([7.0, 8.0]))) == 0
+
+
+@pytest.mark.parametrize("motion", ["reached", "worst", "ensemble"])
+def test_every_evaluator_travels(motion):
+    config = load("cic", [f"objective.motion={motion}"])
+    store = OrbitStore()
+    sent = with_orbits(evaluator_for(config), store)
+    assert single_of(sent).orbits is store
+    found = pickle.loads(pickle.dumps(sent))
+    assert type(found) is type(sent)
+    assert found.config == config
+    assert float(found.scene.speed) == float(sent.scene.speed)
+
+
+def test_without_workers_evaluations_run_here():
+    with evaluating() as runs:
+        assert runs is HERE
+
+
+@pytest.mark.parametrize("command", [optimize, pareto])
+def test_commands_refuse_both_kinds_of_workers(command, tmp_path, capsys):
+    options = ["--workers", "2", "--scheduler", "tcp://127.0.0.1:1", "-o", str(tmp_path / "run")]
+    assert command.main(["configs/cic.yaml", *options]) == 2
+    assert "exclude each other" in capsys.readouterr().err
+    assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("command", "options", "file"),
+    [
+        ("optimize", ["optimizer.screening=4", "optimizer.starts=2"], "history.csv"),
+        ("pareto", ["pareto.points=3", "pareto.refinements=0"], "front.csv"),
+        (
+            "optimize",
+            [
+                "tolerances={over: {scene.speed_rpm: {normal: 30}}, samples: 4, check_samples: 8}",
+                "optimizer.screening=4",
+                "optimizer.starts=1",
+            ],
+            "tolerances.csv",
+        ),
+    ],
+    ids=["starts", "points of a front", "samples"],
+)
+def test_workers_find_the_same_to_the_last_bit(command, options, file, tmp_path):
+    sets = [part for option in options for part in ("--set", option)]
+    for name, more in (("here", []), ("there", ["--workers", "2"])):
+        run = [sys.executable, "-m", "rootsopt", command, "configs/cic.yaml", *sets, *more]
+        subprocess.run([*run, "--no-figures", "-o", str(tmp_path / name)], check=True)
+    here, there = ((tmp_path / name / file).read_bytes() for name in ("here", "there"))
+    assert here == there
