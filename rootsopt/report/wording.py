@@ -50,11 +50,31 @@ def asked(run: Run) -> list[str]:
         if keys:
             shown = _joined(keys) if len(keys) <= _FEW else f"{len(keys)} numbers"
             sentences.append(f"The design should be best while these scatter: {shown}.")
+    if run.rows:
+        sentences.append(_over(run.rows))
     aims = run.result.get("terms")
     if run.command == "pareto" and aims:
         words = [f"{name_and_unit(aim['name'])[0]} ({_sense(aim['sense'])})" for aim in aims]
         sentences.append(f"The quantities are {_joined(words)}.")
     return sentences
+
+
+def _over(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a sentence on the values that differ between the scenes of a sweep."""
+    parts = []
+    for key in varied(rows):
+        name, text = name_and_unit(last_part(key))
+        found = [*dict.fromkeys(row.get(key) for row in rows)]
+        numbers = [x for x in found if isinstance(x, int | float)]
+        if len(found) <= _FEW:
+            shown = [quantity(x, text) if x in numbers else in_words(str(x)) for x in found]
+            parts.append(f"{name}: {_joined(shown)}")
+        elif len(numbers) == len(found):
+            ends = f"{brief(min(numbers))} to {quantity(max(numbers), text)}"
+            parts.append(f"{name}: {len(found)} values from {ends}")
+        else:
+            parts.append(f"{name}: {len(found)} values")
+    return f"Between the scenes, these differ: {'; '.join(parts)}."
 
 
 def scene(config: Config) -> str:
@@ -71,6 +91,8 @@ def scene(config: Config) -> str:
         parts.append(f"a timing gear with {brief(gear.backlash_mm)} mm backlash")
     if data.motor is not None:
         parts.append("a motor whose speed gives way")
+    if config.rotor.helix_deg:
+        parts.append(f"rotors twisted by {quantity(config.rotor.helix_deg, 'deg')}")
     if config.contact.friction is not None:
         parts.append("friction between the flanks")
     if data.supports is not None:

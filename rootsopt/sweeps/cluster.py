@@ -13,7 +13,6 @@ import os
 import queue
 import tempfile
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -22,7 +21,7 @@ from rootsopt.config.words import shown
 from rootsopt.errors import InputError
 from rootsopt.runtime.versions import versions
 from rootsopt.status import Status
-from rootsopt.sweeps.evaluations import Elsewhere, gone, refusal
+from rootsopt.sweeps.evaluations import Elsewhere, Watch, gone, refusal
 from rootsopt.sweeps.local import divided
 from rootsopt.sweeps.plan import Plan
 from rootsopt.sweeps.points import Row, lost
@@ -43,7 +42,13 @@ _ANSWER = 10.0
 _WORKERS = 60.0
 """Time (s) within which a scheduler must have a worker."""
 _POLL = 0.5
-"""Time (s) after which the number of workers and a request to stop are noticed."""
+"""Time (s) after which a request to stop is noticed."""
+_SETTINGS = {
+    "distributed.worker.multiprocessing-method": "spawn",
+    "distributed.deploy.lost-worker-timeout": "1h",
+}
+"""Dask's settings for processes started here. By default, Dask gives up a process that was killed
+unless its successor is ready in 15 s. On a busy machine, it takes longer to import everything."""
 
 
 class Cluster:
@@ -133,7 +138,7 @@ class Cluster:
 
         with (
             tempfile.TemporaryDirectory(prefix="rootsopt-") as scratch,
-            settings.set({"distributed.worker.multiprocessing-method": "spawn"}),
+            settings.set(_SETTINGS),
             self._dask.LocalCluster(
                 n_workers=self.workers,
                 threads_per_worker=threads,
@@ -159,18 +164,18 @@ class _Collection:
         self._config = config.plain()
         self._done: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._running: dict[Any, list[int]] = {}
-        self._slots, self._asked = 1, -_POLL
+        self._watch = Watch(client)
 
     def of(self, numbers: Sequence[int], stop: threading.Event) -> Iterator[list[tuple[int, Row]]]:
         """Yield the points with these `numbers`, as they are done."""
         waiting = [*divided(numbers, self._size(numbers))][::-1]
         while (waiting or self._running) and not stop.is_set():
-            while waiting and len(self._running) < _AHEAD * self._count():
+            while waiting and len(self._running) < _AHEAD * self._watch.count():
                 self._submit(waiting.pop())
             try:
                 future = self._done.get(timeout=_POLL)
             except queue.Empty:
-                self._look()
+                self._watch.check()
                 continue
             chunk = self._running.pop(future)
             found = self._result(future, chunk)
@@ -181,26 +186,14 @@ class _Collection:
         self._client.cancel([*self._running])
 
     def _size(self, numbers: Sequence[int]) -> int:
-        share = -(-len(numbers) // (_CHUNKS * self._count()))
+        share = -(-len(numbers) // (_CHUNKS * self._watch.count()))
         return min(max(share, min(self._settings.threads, len(numbers))), _LARGEST)
-
-    def _count(self) -> int:
-        """Return the number of chunks that the workers can process at a time."""
-        if time.monotonic() - self._asked > _POLL:
-            self._asked = time.monotonic()
-            self._slots = max(1, sum(self._client.nthreads().values()))
-        return self._slots
 
     def _submit(self, chunk: list[int]) -> None:
         points = [(number, self._plan.at(number)) for number in chunk]
         future = self._client.submit(work, self._settings, self._config, points, pure=False)
         self._running[future] = chunk
         future.add_done_callback(self._done.put)
-
-    def _look(self) -> None:
-        """Raise `InputError` if the connection to the scheduler is lost."""
-        if self._client.status != "running":
-            raise gone()
 
     def _result(self, future: Any, chunk: list[int]) -> list[tuple[int, Row]] | None:
         """Return the points of a chunk, or `None` if they must be tried one by one."""

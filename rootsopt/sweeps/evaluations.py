@@ -6,6 +6,7 @@ for an orbit closed by collocation). It returns the evaluation, and the orbit th
 worker dies, the scheduler gives its evaluation to another one, with the same result."""
 
 import contextlib
+import math
 import pickle
 import threading
 import time
@@ -26,6 +27,10 @@ _POLL = 0.5
 """Time (s) after which a lost connection and the end of the search are noticed."""
 
 
+_DESERTED = 600.0
+"""Time (s) after which a scheduler without workers is given up: a new one takes 10 to 60 s."""
+
+
 class ClosedError(Exception):
     """Raised in threads that still wait for an evaluation when the search has ended."""
 
@@ -37,16 +42,12 @@ class Elsewhere:
 
     def __init__(self, dask: Any, client: Any, settings: Settings):
         self._dask, self._client, self._settings = dask, client, settings
-        self._closed = threading.Event()
-        self._slots, self._asked = 1, -_POLL
+        self._closed, self._watch = threading.Event(), Watch(client)
 
     @property
     def slots(self) -> int:
         """Twice the number of evaluations that the workers can run at a time."""
-        if time.monotonic() - self._asked > _POLL:
-            self._asked = time.monotonic()
-            self._slots = max(1, sum(self._client.nthreads().values()))
-        return 2 * self._slots
+        return 2 * self._watch.count()
 
     def evaluated(
         self, evaluator: Evaluates, design: Any, start: NDArray | None = None
@@ -63,8 +64,7 @@ class Elsewhere:
             if self._closed.is_set():
                 future.cancel()
                 raise ClosedError
-            if self._client.status != "running":
-                raise gone()
+            self._watch.check()
         found: tuple[Evaluation, OrbitStore] = pickle.loads(self._result(future))
         known.add(found[1])
         return found[0]
@@ -90,6 +90,37 @@ class Elsewhere:
     def close(self) -> None:
         """End all waiting threads; nothing can be evaluated any more."""
         self._closed.set()
+
+
+class Watch:
+    """Keeps an eye on the workers of a Dask `client`. Threads can share an instance."""
+
+    def __init__(self, client: Any):
+        self._client, self._lock = client, threading.Lock()
+        self._count, self._asked = 1, -math.inf
+        self._seen = time.monotonic()
+
+    def count(self) -> int:
+        """Return the number of tasks that the workers can run at a time, at least 1."""
+        with self._lock:
+            now = time.monotonic()
+            if now - self._asked > _POLL:
+                self._asked = now
+                found = sum(self._client.nthreads().values())
+                self._seen = now if found else self._seen
+                self._count = max(1, found)
+            return self._count
+
+    def check(self) -> None:
+        """Raise `InputError` if the connection is lost, or if there has been no worker for long."""
+        if self._client.status != "running":
+            raise gone()
+        self.count()
+        if time.monotonic() - self._seen > _DESERTED:
+            raise InputError(
+                f"there has been no worker for {_DESERTED:g} s; what was done is kept: start "
+                "workers, and run the same command again with `--resume` if it has that option"
+            )
 
 
 def gone() -> InputError:
@@ -131,4 +162,4 @@ def evaluating(
         yield found
 
 
-__all__ = ["ClosedError", "Elsewhere", "evaluating", "gone", "refusal"]
+__all__ = ["ClosedError", "Elsewhere", "Watch", "evaluating", "gone", "refusal"]

@@ -11,11 +11,13 @@ import pytest
 
 from rootsopt.commands import optimize, pareto
 from rootsopt.config import load
+from rootsopt.dynamics.collocation.nearby import Known
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.evaluation import Evaluator, _build
 from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.orbits import OrbitStore
 from rootsopt.response.runs import HERE, Runs
+from rootsopt.scene import Scene, design_vector
 from rootsopt.sweeps import evaluations
 from rootsopt.sweeps.cluster import Cluster
 from rootsopt.sweeps.evaluations import ClosedError, Elsewhere, evaluating
@@ -117,14 +119,35 @@ def test_a_lost_connection_is_named(monkeypatch):
         Elsewhere(None, Client(), Settings(())).evaluated(Evaluator.of(load("cic")), np.ones(3))
 
 
+def test_a_scheduler_without_workers_is_given_up(monkeypatch):
+    monkeypatch.setattr(evaluations, "_POLL", 0.01)
+    monkeypatch.setattr(evaluations, "_DESERTED", 0.05)
+    monkeypatch.setattr(Client, "nthreads", lambda self: {})
+    with pytest.raises(InputError, match=r"no worker for 0\.05 s"):
+        Elsewhere(None, Client(), Settings(())).evaluated(Evaluator.of(load("cic")), np.ones(3))
+
+
 def test_orbits_travel_with_the_states_that_name_them():
-    store, state = OrbitStore(), np.array([0.1, 1 / 3])
-    store._known[state.tobytes()] = "orbit", "pair"
-    store._known[np.array([0.2, 0.0]).tobytes()] = "another", "pair"
-    for start in (state, np.array([[0.0, *state], [1.0, 5.0, 6.0]]), np.array([[2.0, 1.0, *state]])):
-        part = pickle.loads(pickle.dumps(store.part(start)))
-        assert [*part._known.items()] == [(state.tobytes(), ("orbit", "pair"))]
+    config = load("cic")
+    pair, *_ = _build.result_shape(Scene.from_config(config), design_vector(config))
+    one, other = Known.empty((1, 2), 2, 2), Known.empty((3, 2), 2, 2)
+    store, state, far = OrbitStore(), np.array([0.1, 1 / 3]), np.array([0.2, 0.0])
+    store._keep(state.tobytes(), (one, pair))
+    store._keep(far.tobytes(), (other, pair))
+    for start in (
+        state,
+        np.array([[0.0, *state], [1.0, 5.0, 6.0]]),
+        np.array([[2.0, 1.0, *state]]),
+    ):
+        part = store.part(start)
+        assert len(part) == 1
+        assert part.near(state)[0] is one
     assert len(store.part(None)) == len(store.part(np.array([7.0, 8.0]))) == 0
+    again = pickle.loads(pickle.dumps(store.part(far)))
+    back = OrbitStore()
+    back.add(again)
+    assert back.near(far)[0].elements.mesh.interval.shape == (3,)
+    assert back.near(state) is None
 
 
 @pytest.mark.parametrize("motion", ["reached", "worst", "ensemble"])
