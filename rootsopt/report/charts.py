@@ -174,8 +174,8 @@ def _scenes(
 ) -> dict[str, Any]:
     """Return the trace of the force `key` over the quantity `across`.
 
-    `place`: index of the scenes in the chart, which chooses the colour; `joined`: whether a line joins
-    its points."""
+    `place`: index of the scenes in the chart, which chooses the colour; `joined`: whether a line
+    joins its points."""
     drawn = [row for row in rows if row.get(key) is not None and row.get(across) is not None]
     if joined and all(isinstance(row[across], int | float) for row in drawn):
         drawn.sort(key=lambda row: row[across])

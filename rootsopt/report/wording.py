@@ -114,7 +114,7 @@ def came_out(run: Run) -> list[str]:
     makers = {"optimize": _optimised, "pareto": _traced, "attractors": _coexisting}
     status = in_words(str(run.result.get("status", ""))).capitalize()
     first, rest = _message(run)
-    words = " ".join([first, *rest]) if run.usable else first
+    words = " ".join([first, *rest]) if run.usable or _stopped(run) else first
     sentences = [f"{status}: {words}" if words else f"{status}."] if status else []
     if run.command in makers:
         return sentences + makers[run.command](run)
@@ -130,6 +130,8 @@ def _message(run: Run) -> tuple[str, list[str]]:
 def what_next(run: Run) -> list[str]:
     """Return sentences on what to do next."""
     command = shlex.quote(str(run.path / "config.yaml"))
+    if _stopped(run):
+        return _after_stop(run)
     if not run.usable:
         advice = _message(run)[1]
         baseline = run.result.get("baseline") or {}
@@ -161,6 +163,20 @@ def what_next(run: Run) -> list[str]:
             f"`rootsopt optimize {command} --set objective.motion=worst`."
         ]
     return [f"Optimise the design: `rootsopt optimize {command}`."]
+
+
+def _stopped(run: Run) -> bool:
+    """Return whether the user has stopped the run."""
+    return run.result.get("status") in (Status.INTERRUPTED.label, Status.NOT_SIMULATED.label)
+
+
+def _after_stop(run: Run) -> list[str]:
+    """Return a sentence on how to go on with a run that was stopped."""
+    again = f"rootsopt {run.command} {run.source}"
+    if run.command not in ("optimize", "sweep"):
+        return [f"Run it again, from its beginning: `{again}`."]
+    resume = "" if "--resume" in run.source else " --resume"
+    return [f"Go on from where it stopped: `{again}{resume}`."]
 
 
 def _after_optimum(run: Run) -> list[str]:

@@ -136,8 +136,8 @@ def _interval(key: str, item: str) -> Any:
     match = _RANGE.fullmatch(item.replace(" ", ""))
     if match is None and _MEANT.fullmatch(item.replace(" ", "")):
         raise InputError(
-            f"`{key}`: a range must be from:to:count, with :log at the end for a logarithmic scale, "
-            f"but is {shown(item)}; write it as in 300:6000:39"
+            f"`{key}`: a range must be from:to:count, with :log at the end for a logarithmic "
+            f"scale, but is {shown(item)}; write it as in 300:6000:39"
         )
     if match is None:
         return item

@@ -227,6 +227,26 @@ def test_numbers_stay_with_their_units(tmp_path):
     assert "5\N{NO-BREAK SPACE}N at 3000\N{NO-BREAK SPACE}rpm and 2 Newtons" in page
 
 
+@pytest.mark.parametrize(
+    ("command", "source", "advice"),
+    [
+        (
+            "optimize",
+            "cic -o run",
+            "Go on from where it stopped: rootsopt optimize cic -o run --resume.",
+        ),
+        ("sweep", "cic --resume", "Go on from where it stopped: rootsopt sweep cic --resume."),
+        ("pareto", "cic", "Run it again, from its beginning: rootsopt pareto cic."),
+    ],
+)
+def test_stopped_run_says_how_to_go_on(command, source, advice, tmp_path):
+    message = "The search was stopped after 2 designs. The best of them is reported."
+    given = result_of(command, status="interrupted", message=message)
+    text = words_of(report_text(run_of(tmp_path, given, source=source, usable=False)))
+    assert f"Interrupted: {message}" in text
+    assert advice in text
+
+
 def test_stopped_run_has_a_report(tmp_path):
     """A run stopped before anything was known has neither design nor numbers."""
     given = {"baseline": None, "optimized": None, "status": "interrupted", "versions": {}}
@@ -264,7 +284,7 @@ def test_optimum_is_reported_in_the_users_words(tmp_path):
         "residual 2 × 10⁻¹¹, at most 0.0001 required",
         "About 100 % of further starts",
         "displaced volume (cm³) 541.70 541.70 0.00 %",
-        "flow lines 0.080000, 0.010000",
+        "flow lines, 2 of 2 0.010000",
     ):
         assert words in text
 
