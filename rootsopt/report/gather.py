@@ -48,7 +48,7 @@ class Run:
 
     `command`: name of the command; `source`: its arguments as the user gave them; `path`: final
     path of the result folder; `config`: resolved config, with its YAML as `yaml`; `result`: content
-    of the result file; `cases`: designs and motions; `rows`: rows of a sweep's table, one per scene;
+    of the result file; `cases`: designs and motions; `rows`: rows of a sweep's table;
     `figures`: content of each PNG file by name; `usable`: whether the run ended with a usable
     result (exit code 0)."""
 
