@@ -55,9 +55,11 @@ class Elsewhere:
         """Return `evaluator(design, start, series=False)`, computed by a worker.
 
         Raises `InputError` if the workers cannot be used; `ClosedError` after `close`."""
+        import cloudpickle  # Comes with distributed; takes classes of a script or notebook along.
+
         known = single_of(evaluator).orbits
         task = with_orbits(evaluator, known.part(start)), np.asarray(design, float), start
-        future = self._submit(pickle.dumps(task))
+        future = self._submit(cloudpickle.dumps(task))
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
         while not done.wait(_POLL):

@@ -1,5 +1,6 @@
 """Evaluations of a search in real processes: the same results, whatever happens to a process."""
 
+import os
 import pickle
 import subprocess
 import sys
@@ -160,6 +161,36 @@ def test_every_evaluator_travels(motion):
     assert type(found) is type(sent)
     assert found.config == config
     assert float(found.scene.speed) == float(sent.scene.speed)
+
+
+def test_classes_of_a_script_travel(tmp_path):
+    """A contact law that a script defines is part of its scene, and unknown to another process."""
+    script, task = tmp_path / "script.py", tmp_path / "task"
+    script.write_text(
+        "import sys\n"
+        "from rootsopt.runtime import environment\n"
+        "environment.use_float64()\n"
+        "import numpy as np\n"
+        "from rootsopt.config import load\n"
+        "from rootsopt.response.evaluation import Evaluator\n"
+        "from rootsopt.sweeps.evaluations import Elsewhere\n"
+        "from rootsopt.sweeps.worker import Settings\n"
+        "class Own(Evaluator):\n"
+        "    answer = 42\n"
+        "config = load('cic')\n"
+        "own = Own(config, Evaluator.of(config).scene)\n"
+        "class Client:\n"
+        "    status = 'running'\n"
+        "    def submit(self, function, settings, task, pure):\n"
+        f"        open({str(task)!r}, 'wb').write(task)\n"
+        "        sys.exit(0)\n"
+        "Elsewhere(None, Client(), Settings(())).evaluated(own, np.ones(3))\n"
+    )
+    subprocess.run([sys.executable, str(script)], check=True, env={**os.environ, "PYTHONPATH": "."})
+    evaluator, design, start = pickle.loads(task.read_bytes())
+    assert type(evaluator).answer == 42
+    assert design.tolist() == [1.0, 1.0, 1.0]
+    assert start is None
 
 
 def test_without_workers_evaluations_run_here():
