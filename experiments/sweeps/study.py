@@ -11,20 +11,24 @@ import os
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from experiments._common.scenes import CIC
 from rootsopt.config import Config, load
 from rootsopt.sweeps.journal import Journal
+from rootsopt.sweeps.local import divided
 from rootsopt.sweeps.plan import Plan, plan_of
-from rootsopt.sweeps.scenes import complete, header, runner
+from rootsopt.sweeps.points import simulated_together
+from rootsopt.sweeps.scenes import Run, complete, header, runner
 
 Row = dict[str, Any]
 ROUNDS = 2
 """Number of times that everything is measured; the fastest round counts."""
 SPEED, ANGLE = "scene.speed_rpm", "profile.pressure_angle_deg"
+TOGETHER = 16
+"""Number of points that are stepped together as arrays (`vmap`), to compare with one by one."""
 INVALID = (5.0, 10.0)
 """Pressure angles (°) with which the shipped CIC profile is not sound."""
 
@@ -41,6 +45,11 @@ def run(quick: bool, say: Callable[[str], None]) -> tuple[list[Row], list[Row]]:
         best = _best(config, plan, count, 1 if quick else ROUNDS)
         ways.append({"way": _name(count)} | best)
         say(f"{_name(count)}: {best['points_per_second']:.3g} points per second")
+    if not quick:
+        plan = plan_of({SPEED: f"1000:4000:{4 * TOGETHER}"})
+        name = f"this process, {TOGETHER} at a time (vmap)"
+        ways.append({"way": name} | _timed(config, plan, None, _together))
+        say(f"{name}: {ways[-1]['points_per_second']:.3g} points per second")
     first = ways[0]["points_per_second"]
     for row in ways:
         row["relative_to_one_process"] = row["points_per_second"] / first
@@ -65,9 +74,18 @@ def _best(config: Config, plan: Plan, workers: int | None, rounds: int) -> Row:
     return max(found, key=lambda row: row["points_per_second"])
 
 
-def _timed(config: Config, plan: Plan, workers: int | None) -> Row:
+def _together(config: Config, plan: Plan, numbers: Sequence[int], stop: threading.Event) -> Any:
+    """Simulate points as an accelerator would: those of a chunk are stepped together."""
+    del stop
+    for some in divided([*numbers], TOGETHER):
+        rows = simulated_together(config, [plan.at(number) for number in some])
+        yield [*zip(some, rows, strict=True)]
+
+
+def _timed(config: Config, plan: Plan, workers: int | None, run: Run | None = None) -> Row:
     """Run a sweep with its file; return start-up time (s), total time (s) and rate.
 
+    `run`: how to simulate the points, by default as a sweep does with this number of `workers`.
     `cpu_ms_per_point` is the processor time of this process alone: with workers, that of scheduler
     and collector."""
     arrivals: list[tuple[float, float, int]] = []
@@ -78,8 +96,8 @@ def _timed(config: Config, plan: Plan, workers: int | None) -> Row:
 
     with tempfile.TemporaryDirectory() as folder:
         journal = Journal(Path(folder) / "points", header(config, plan))
-        run = runner(workers)
-        rows = complete(config, plan, run, journal, progress, threading.Event())
+        way = run or runner(workers)
+        rows = complete(config, plan, way, journal, progress, threading.Event())
         journal.close()
     assert len(rows) == plan.count
     (first, used, had), (last, spent, done) = arrivals[1], arrivals[-1]

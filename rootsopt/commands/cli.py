@@ -8,6 +8,7 @@ import argparse
 import contextlib
 import importlib
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -155,6 +156,7 @@ def run(
         arguments = parser(command, purpose)
         add_options(arguments)
         options = arguments.parse_args(argv)
+        options.given = [*(sys.argv[1:] if argv is None else argv)]
         for name in options.imports:  # Only the whole parser knows abbreviated options.
             import_named(name)
         if options.output is None:
@@ -210,7 +212,7 @@ def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) 
     from rootsopt.report.html import report_text
 
     try:
-        run = Run.of(folder, folder.result, str(options.config), outcome.code == door.OK)
+        run = Run.of(folder, folder.result, shlex.join(options.given), outcome.code == door.OK)
         text = report_text(run)
     except Exception as error:
         words = f"{type(error).__name__}: {error}"

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from rootsopt.commands import door
+from rootsopt.commands import door, parallel
 
 if TYPE_CHECKING:
     import argparse
@@ -29,6 +29,7 @@ def options(parser: "argparse.ArgumentParser") -> None:
         help="go on with a run into the same folder that was stopped or killed, from its "
         "checkpoint; the result is that of an uninterrupted run",
     )
+    parallel.add_options(parser)
 
 
 def _run(argv: Sequence[str] | None) -> int:

@@ -1,8 +1,9 @@
 """`rootsopt pareto CONFIG`: trace the best compromises between two or three terms."""
 
+import argparse
 from collections.abc import Sequence
 
-from rootsopt.commands import door
+from rootsopt.commands import door, parallel
 
 PURPOSE = (
     "Trace the best compromises between two or three terms, such as peak force and area "
@@ -17,7 +18,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     return door.through("pareto", lambda: _run(argv), own=argv is None)
 
 
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the command's own options to a `parser`."""
+    parallel.add_options(parser)
+
+
 def _run(argv: Sequence[str] | None) -> int:
     from rootsopt.commands import cli
 
-    return cli.run("pareto", PURPOSE, argv)
+    return cli.run("pareto", PURPOSE, argv, options)

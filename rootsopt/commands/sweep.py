@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Sequence
 
-from rootsopt.commands import door
+from rootsopt.commands import door, parallel
 
 PURPOSE = (
     "Simulate one config at many values of any of its keys (--over), each from rest: contact "
@@ -65,19 +65,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         help="name of the dataset in the result folder; its suffix chooses the format: .nc "
         "(netCDF) or .zarr (Zarr, needs rootsopt[zarr]); default: sweep.nc",
     )
-    group.add_argument(
-        "--workers",
-        type=int,
-        metavar="N",
-        help="start N processes on this machine (needs rootsopt[cluster]); default: this process, "
-        "with one thread per core",
-    )
-    group.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="use the workers of a running Dask scheduler, for example tcp://10.0.0.1:8786 (needs "
-        "rootsopt[cluster])",
-    )
+    parallel.add_options(group)
     group.add_argument(
         "--resume",
         action="store_true",

@@ -29,6 +29,7 @@ _UNITS: dict[str, tuple[str, dict[str, float]]] = {
     "_mm": ("mm", {"metres": 1e3, "micrometres": 1e-3}),
     "_deg": ("°", {"radians": 180 / math.pi}),
     "_Pa": ("Pa", {}),
+    "_per_K": ("1/K", {}),
     "_K": ("K", {}),
 }
 

@@ -7,15 +7,21 @@ from rootsopt.optimize.robust import search_of
 from rootsopt.optimize.search import Optimization
 from rootsopt.response.choice import resolve
 from rootsopt.scene import check_geometry
+from rootsopt.sweeps.evaluations import evaluating
 
 
 def optimize_design(
-    config: Config, progress: Callable[[int, int, float], None] | None = None
+    config: Config,
+    progress: Callable[[int, int, float], None] | None = None,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
 ) -> Optimization:
     """Find the design that minimises the objective of a `config`, and compare it with the baseline.
 
     `progress`: function called after each evaluation with (evaluations done, evaluations expected,
-    best objective so far).
+    best objective so far). `workers`, `scheduler`: where the designs are simulated, as in
+    `sweep_scenes`; by default in this process, on all cores.
 
     Return an `Optimization`. Its main fields are `baseline`, `optimized` (`None` if no better
     design was confirmed), `improvement`, `constraints`, `history` and `status`.
@@ -26,4 +32,5 @@ def optimize_design(
     >>> found = rootsopt.optimize_design(rootsopt.load_config("configs/cic.yaml"))
     >>> found.optimized.design, found.improvement["mean_force_N"]"""
     check_geometry(config)
-    return search_of(resolve(config)[0], progress).run()
+    with evaluating(workers, scheduler) as runs:
+        return search_of(resolve(config)[0], progress, runs=runs).run()

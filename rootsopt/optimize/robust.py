@@ -6,7 +6,6 @@ simulated in every scene of a fixed sample, and a rule combines the objectives. 
 baseline, nominal optimum and robust optimum are simulated in many fresh scenes."""
 
 import dataclasses
-import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +24,7 @@ from rootsopt.optimize.risk import combine
 from rootsopt.optimize.robust_problem import RobustProblem
 from rootsopt.optimize.search import Optimization, Progress, Search, sensitivity_rows
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
+from rootsopt.response.runs import HERE, Runs
 from rootsopt.response.scatter import Shift, draw, shifts
 from rootsopt.response.tolerances import (
     ToleranceEvaluation,
@@ -138,12 +138,18 @@ class RobustSearch(Search):
         progress: Progress | None = None,
         stop: threading.Event | None = None,
         checkpoint: Checkpoint | None = None,
+        runs: Runs = HERE,
     ):
-        super().__init__(config, progress, stop, checkpoint)
+        super().__init__(config, progress, stop, checkpoint, runs)
         self.nominal, self.first = nominal, self.settings.starts
         self.settings = self.settings.model_copy(update={"screening": 0})
-        self.exact = ToleranceEvaluator.of(config, self.exact.from_neighbours())
+        single = self.exact.from_neighbours()
+        self.exact = ToleranceEvaluator.of(config, single, runs)
         self._shares: dict[int, NDArray[np.float64]] = {}
+
+    def _simulated(self, evaluator: Evaluates, design, orbit) -> Evaluation:
+        """Return the evaluation of a `design` (d,), whose evaluator distributes its sample."""
+        return evaluator(design, orbit, series=False)
 
     def _problem(self, scene: Scene, baseline: Evaluation) -> Problem:
         return RobustProblem.of(self.config, scene, baseline)
@@ -206,13 +212,14 @@ class TolerantSearch:
         progress: Progress | None = None,
         stop: threading.Event | None = None,
         checkpoint: Checkpoint | None = None,
+        runs: Runs = HERE,
     ):
-        self.config, self.checkpoint = config, checkpoint
+        self.config, self.checkpoint, self.runs = config, checkpoint, runs
         self.progress = progress or (lambda done, expected, best: None)
         self.stop = threading.Event() if stop is None else stop
         self._done, self._expected = 0, 0
         self._nominal: Optimization | None = None
-        self._stage: Search = Search(without(config), self._report, self.stop, checkpoint)
+        self._stage: Search = Search(without(config), self._report, self.stop, checkpoint, runs)
 
     def run(self) -> Optimization:
         """Run both stages and the comparison. Return the outcome of the second stage.
@@ -225,7 +232,8 @@ class TolerantSearch:
             return nominal
         self._done, self._expected = len(nominal.history), self._stage.expected
         self._nominal = nominal
-        stage = RobustSearch(self.config, nominal, self._report, self.stop, self.checkpoint)
+        how = self._report, self.stop, self.checkpoint, self.runs
+        stage = RobustSearch(self.config, nominal, *how)
         self._stage = stage
         found = stage.run()
         if found.problem is None:
@@ -280,7 +288,8 @@ class TolerantSearch:
                     self.progress(before + ended[0] // per, expected, best)
             return self.stop.is_set()
 
-        fresh = compare(single, found.problem, designs, shifts(self.config, drawn), tick)
+        scenes = shifts(self.config, drawn)
+        fresh = compare(single, found.problem, designs, scenes, tick, self.runs)
         if self.stop.is_set():
             return {}, {}
         keys = [one.key for one in self.config.scatters]
@@ -293,6 +302,7 @@ def compare(
     designs: Mapping[str, Evaluation],
     scenes: Sequence[Shift],
     tick: Callable[[], bool] = lambda: False,
+    runs: Runs = HERE,
 ) -> dict[str, Scattered]:
     """Simulate designs in many scenes, and return each design's `Scattered` by name.
 
@@ -308,7 +318,7 @@ def compare(
         if twin is not None:
             found[name] = found[twin]
             continue
-        one = _scattered(evaluator, problem, nominal, scenes, tick)
+        one = _scattered(evaluator, problem, nominal, scenes, tick, runs)
         if not found:
             reference = one.combined
         found[name] = dataclasses.replace(one, combined=one.combined / reference)
@@ -321,6 +331,7 @@ def _scattered(
     nominal: Evaluation,
     scenes: Sequence[Shift],
     tick: Callable[[], bool],
+    runs: Runs,
 ) -> Scattered:
     """Simulate one design in many scenes. Arguments: see `compare`."""
     design = np.array(list(nominal.design.values()))
@@ -333,12 +344,12 @@ def _scattered(
     def at(shift: Shift) -> tuple[str, list[float]]:
         if tick():
             return "interrupted", [float("nan")] * len(COMPARED)
-        one = in_scene(evaluator, shift, design, begun).evaluation
+        one = in_scene(evaluator, shift, design, begun, runs).evaluation
         forces = [one.response.get(name, float("nan")) for name in RESPONSES]
         values = [problem.objective(one), *forces] if one.usable else [float("nan")] * len(COMPARED)
         return one.status.label, values
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(runs.slots) as pool:
         rows = list(pool.map(at, scenes))
     labels = [label for label, _ in rows]
     columns = np.array([values for _, values in rows]).T
@@ -366,6 +377,7 @@ def search_of(
     progress: Progress | None = None,
     stop: threading.Event | None = None,
     checkpoint: Checkpoint | None = None,
+    runs: Runs = HERE,
 ) -> Search | TolerantSearch:
     """Return the search that a `config` needs: with `tolerances`, a `TolerantSearch`.
 
@@ -379,7 +391,7 @@ def search_of(
             "then optimise the `optimized.yaml` of that run with `tolerances`"
         )
     kind = Search if config.tolerances is None else TolerantSearch
-    return kind(config, progress, stop, checkpoint)
+    return kind(config, progress, stop, checkpoint, runs)
 
 
 __all__ = [

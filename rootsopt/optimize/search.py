@@ -12,7 +12,6 @@ far, unless the objective is an average over an ensemble."""
 
 import dataclasses
 import operator
-import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -37,6 +36,7 @@ from rootsopt.optimize.problem import FEASIBLE, Problem, needs_maxima
 from rootsopt.optimize.sqp import Found, Stops, descend
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.evaluators import evaluator_for
+from rootsopt.response.runs import HERE, Runs
 from rootsopt.response.sensitivity import by_scene, quantities
 from rootsopt.response.wrapper import Evaluates
 from rootsopt.runtime.programs import Program
@@ -197,7 +197,8 @@ class Search:
 
     `progress`: function called after each evaluation with (evaluations done, evaluations expected,
     best objective so far). `stop`: event that another thread can set to end the search early.
-    `checkpoint`: file that stores every evaluation and supplies those of an interrupted search.
+    `checkpoint`: file that stores every evaluation and supplies those of an interrupted search;
+    `runs`: where screening and local searches evaluate designs.
 
     Raises `InputError` if there is no design parameter, or if the optimisation
     method does not suit the objective."""
@@ -211,7 +212,9 @@ class Search:
         progress: Progress | None = None,
         stop: threading.Event | None = None,
         checkpoint: Checkpoint | None = None,
+        runs: Runs = HERE,
     ):
+        self.runs = runs
         self.beginning = beginning(config)
         self.given = config = limited(config)
         if self.beginning is not None:
@@ -373,7 +376,7 @@ class Search:
 
         The trials are in the order of the tasks. If `stop` is set before all tasks end, return an
         empty list at once: evaluations that are still running are not waited for."""
-        pool = ThreadPoolExecutor(os.cpu_count())
+        pool = ThreadPoolExecutor(self.runs.slots)
         tasks = tasks if not self.stop.is_set() else []
         done = [pool.submit(work, *task) for task in tasks]
         try:
@@ -520,7 +523,7 @@ class Search:
         key = (start, iteration) if key is None else key
         kept = None if self.checkpoint is None else self.checkpoint.known(key, point)
         if kept is None:
-            evaluation = evaluator(self.problem.design(point), start=orbit, series=False)
+            evaluation = self._simulated(evaluator, self.problem.design(point), orbit)
             if self.checkpoint is not None:
                 self.checkpoint.add(key, point, evaluation)
         else:
@@ -538,6 +541,10 @@ class Search:
                 self._best = float(np.fmin(self._best, objective))
             self.progress(len(self._trials), self.expected, self._best)
         return trial
+
+    def _simulated(self, evaluator: Evaluates, design, orbit) -> Evaluation:
+        """Return the evaluation of a `design` (d,), where this search runs its evaluations."""
+        return self.runs.evaluated(evaluator, design, orbit)
 
     def _verify(self, trials: list[Trial]) -> tuple[Evaluation | None, dict[str, Any]]:
         """Simulate the best designs again, from rest at a tight tolerance, until one is confirmed.

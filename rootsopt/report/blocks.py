@@ -134,14 +134,26 @@ def pump_block(run: Run) -> Block | None:
     compared = names[:1] == ["baseline"] and len(names) == 2
     rows = []
     for key in dict.fromkeys(key for sheet in sheets.values() for key in sheet):
-        numbers = [sheet.get(key) for sheet in sheets.values()]
-        row = [label(key), *map(value, numbers)]
-        if compared:
-            row.append(percent(*numbers))
-        rows.append(row)
+        for name, numbers in _apart(label(key), [sheet.get(key) for sheet in sheets.values()]):
+            row = [name, *map(value, numbers)]
+            if compared:
+                row.append(percent(*numbers))
+            rows.append(row)
     heads += ["change"] if compared else []
     note = "Numbers without a unit are fractions."
     return block("Pump sheet", heads, [("", rows)], note)
+
+
+def _apart(name: str, given: Sequence[Any]) -> list[tuple[str, Sequence[Any]]]:
+    """Return (name, values) of each row for a quantity: several rows if its values are lists."""
+    if not any(isinstance(one, list | tuple) for one in given):
+        return [(name, given)]
+    lists = [one if isinstance(one, list | tuple) else [one] for one in given]
+    count = max(map(len, lists))
+    return [
+        (f"{name}, {k + 1} of {count}", [one[k] if k < len(one) else None for one in lists])
+        for k in range(count)
+    ]
 
 
 def list_block(title: str, rows: Sequence[Mapping[str, Any]], note: str = "") -> Block | None:

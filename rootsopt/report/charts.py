@@ -29,6 +29,8 @@ _MOST_CURVES = 8
 """Number of lines above which a chart of a sweep shows single points instead."""
 _SYMBOLS = {True: "circle", False: "x"}
 _MARKS = "circle", "diamond", "square", "triangle-up"
+_MEANS = "mean_force_N", "rms_force_N"
+"""Forces that are drawn as dotted lines, to tell them from the peak."""
 _DASHES = "solid", "dash", "dot", "dashdot"
 
 
@@ -152,13 +154,13 @@ def scenes_chart(groups: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str,
             lines.setdefault(tuple(row.get(key) for key in axes[1:]), []).append(row)
         if len(lines) > _MOST_CURVES:  # A sample without a grid: single points.
             lines = {(): list(rows)}
-        for others, scenes in lines.items():
+        for place, (others, scenes) in enumerate(lines.items(), start=len(traces) // 2):
             words = [f"{label(key)} {_short(x)}" for key, x in zip(axes[1:], others, strict=False)]
             title = ", ".join(([name] if name else []) + words)
             joined = bool(others) or len(axes) == 1
             for key in ("mean_force_N", "peak_force_N"):
                 shown = f"{title}: {label(key)}" if title else label(key)
-                traces.append(_scenes(scenes, axes[0], key, shown, len(traces), joined))
+                traces.append(_scenes(scenes, axes[0], key, shown, place, joined))
     traces = [trace for trace in traces if trace["x"]]
     if not traces:
         return None
@@ -172,7 +174,8 @@ def _scenes(
 ) -> dict[str, Any]:
     """Return the trace of the force `key` over the quantity `across`.
 
-    `place`: index of the trace in its chart; `joined`: whether a line joins its points."""
+    `place`: index of the scenes in the chart, which chooses the colour; `joined`: whether a line
+    joins its points."""
     drawn = [row for row in rows if row.get(key) is not None and row.get(across) is not None]
     if joined and all(isinstance(row[across], int | float) for row in drawn):
         drawn.sort(key=lambda row: row[across])
@@ -184,7 +187,7 @@ def _scenes(
         "text": [html.escape(in_words(str(row.get("status", "")))) for row in drawn],
         "name": html.escape(name),
         "mode": "lines+markers" if joined else "markers",
-        "line": {"color": color, "width": 1.5, "dash": _DASHES[place % len(_DASHES)]},
+        "line": {"color": color, "width": 1.5, "dash": "dot" if key in _MEANS else "solid"},
         "marker": {"color": color, "size": 8, "symbol": [_SYMBOLS[x] for x in steady]},
         "hovertemplate": "%{y:.5g} N at %{x}, %{text}<extra>%{fullData.name}</extra>",
     }

@@ -46,9 +46,9 @@ class Case:
 class Run:
     """A run as its files describe it.
 
-    `command`: name of the command; `source`: config as the user named it; `path`: final path of
-    the result folder; `config`: resolved config, with its YAML as `yaml`; `result`: content of the
-    result file; `cases`: designs and motions; `rows`: rows of a sweep's table, one per scene;
+    `command`: name of the command; `source`: its arguments as the user gave them; `path`: final
+    path of the result folder; `config`: resolved config, with its YAML as `yaml`; `result`: content
+    of the result file; `cases`: designs and motions; `rows`: rows of a sweep's table;
     `figures`: content of each PNG file by name; `usable`: whether the run ended with a usable
     result (exit code 0)."""
 

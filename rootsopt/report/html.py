@@ -33,6 +33,8 @@ _CAPTIONS = {
 }
 """Captions of the figures by file name; other figures are named after their file."""
 _CODE = re.compile(r"`([^`]*)`")
+_UNIT = re.compile(r"(?<=\d) (?=(?:N·m|N|%|mm|µm|ms|rpm|bar|Pa|kPa|mrad|l/min)(?![\w/]))")
+"""Spaces between a number and its unit, where a line must not break."""
 
 
 def report_text(run: Run) -> str:
@@ -42,7 +44,8 @@ def report_text(run: Run) -> str:
     from plotly import offline
 
     def coded(text: str) -> markupsafe.Markup:
-        """Return a sentence with `commands` set as code."""
+        """Return a sentence with `commands` set as code, and numbers beside their units."""
+        text = _UNIT.sub("\N{NO-BREAK SPACE}", text)
         return markupsafe.Markup(_CODE.sub(r"<code>\1</code>", str(markupsafe.escape(text))))
 
     environment = jinja2.Environment(
@@ -62,6 +65,7 @@ def report_text(run: Run) -> str:
         version=rootsopt.__version__,
         day=datetime.date.today().isoformat(),
         status=blocks.status_cell(str(run.result.get("status", ""))),
+        good=run.usable and blocks.status_cell(str(run.result.get("status", ""))).good is not False,
         asked=wording.asked(run),
         came_out=wording.came_out(run),
         what_next=wording.what_next(run),

@@ -50,11 +50,31 @@ def asked(run: Run) -> list[str]:
         if keys:
             shown = _joined(keys) if len(keys) <= _FEW else f"{len(keys)} numbers"
             sentences.append(f"The design should be best while these scatter: {shown}.")
+    if run.rows:
+        sentences.append(_over(run.rows))
     aims = run.result.get("terms")
     if run.command == "pareto" and aims:
         words = [f"{name_and_unit(aim['name'])[0]} ({_sense(aim['sense'])})" for aim in aims]
         sentences.append(f"The quantities are {_joined(words)}.")
     return sentences
+
+
+def _over(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a sentence on the values that differ between the scenes of a sweep."""
+    parts = []
+    for key in varied(rows):
+        name, text = name_and_unit(last_part(key))
+        found = [*dict.fromkeys(row.get(key) for row in rows)]
+        numbers = [x for x in found if isinstance(x, int | float)]
+        if len(found) <= _FEW:
+            shown = [quantity(x, text) if x in numbers else in_words(str(x)) for x in found]
+            parts.append(f"{name}: {_joined(shown)}")
+        elif len(numbers) == len(found):
+            ends = f"{brief(min(numbers))} to {quantity(max(numbers), text)}"
+            parts.append(f"{name}: {len(found)} values from {ends}")
+        else:
+            parts.append(f"{name}: {len(found)} values")
+    return f"Between the scenes, these differ: {'; '.join(parts)}."
 
 
 def scene(config: Config) -> str:
@@ -71,6 +91,8 @@ def scene(config: Config) -> str:
         parts.append(f"a timing gear with {brief(gear.backlash_mm)} mm backlash")
     if data.motor is not None:
         parts.append("a motor whose speed gives way")
+    if config.rotor.helix_deg:
+        parts.append(f"rotors twisted by {quantity(config.rotor.helix_deg, 'deg')}")
     if config.contact.friction is not None:
         parts.append("friction between the flanks")
     if data.supports is not None:
@@ -92,7 +114,7 @@ def came_out(run: Run) -> list[str]:
     makers = {"optimize": _optimised, "pareto": _traced, "attractors": _coexisting}
     status = in_words(str(run.result.get("status", ""))).capitalize()
     first, rest = _message(run)
-    words = " ".join([first, *rest]) if run.usable else first
+    words = " ".join([first, *rest]) if run.usable or _stopped(run) else first
     sentences = [f"{status}: {words}" if words else f"{status}."] if status else []
     if run.command in makers:
         return sentences + makers[run.command](run)
@@ -108,6 +130,8 @@ def _message(run: Run) -> tuple[str, list[str]]:
 def what_next(run: Run) -> list[str]:
     """Return sentences on what to do next."""
     command = shlex.quote(str(run.path / "config.yaml"))
+    if _stopped(run):
+        return _after_stop(run)
     if not run.usable:
         advice = _message(run)[1]
         baseline = run.result.get("baseline") or {}
@@ -139,6 +163,20 @@ def what_next(run: Run) -> list[str]:
             f"`rootsopt optimize {command} --set objective.motion=worst`."
         ]
     return [f"Optimise the design: `rootsopt optimize {command}`."]
+
+
+def _stopped(run: Run) -> bool:
+    """Return whether the user has stopped the run."""
+    return run.result.get("status") in (Status.INTERRUPTED.label, Status.NOT_SIMULATED.label)
+
+
+def _after_stop(run: Run) -> list[str]:
+    """Return a sentence on how to go on with a run that was stopped."""
+    again = f"rootsopt {run.command} {run.source}"
+    if run.command not in ("optimize", "sweep"):
+        return [f"Run it again, from its beginning: `{again}`."]
+    resume = "" if "--resume" in run.source else " --resume"
+    return [f"Go on from where it stopped: `{again}{resume}`."]
 
 
 def _after_optimum(run: Run) -> list[str]:

@@ -18,6 +18,8 @@ from rootsopt.status import Status
 
 _MOST = 4096
 """Number of orbits above which the least recently used one is forgotten."""
+_INDICES = 2
+"""Greatest number of indices before the state in a row of the argument `start` (scene, speed)."""
 _SAME = 1e-4
 """Relative difference between the forces of an orbit closed by shooting and those of the same orbit
 closed by collocation, above which the latter is not used."""
@@ -94,6 +96,39 @@ class OrbitStore:
 
     def __len__(self) -> int:
         return len(self._found)
+
+    def __getstate__(self) -> tuple[Any, Any]:
+        with self._lock:
+            found = {k: v for k, v in self._found.items() if not isinstance(v, _Recipe)}
+            return found, dict(self._known)
+
+    def __setstate__(self, state: tuple[Any, Any]) -> None:
+        self._found, self._known = OrderedDict(state[0]), state[1]
+        self._lock = threading.RLock()
+
+    def part(self, start: NDArray[np.float64] | None) -> "OrbitStore":
+        """Return another store, with the orbits that begin at the states in `start`.
+
+        `start`: as in `Evaluates.__call__`."""
+        found = OrbitStore()
+        for row in () if start is None else _rows(start):
+            key = _key(row)
+            with self._lock:
+                entry = self._recalled(key)
+                if entry is not None:
+                    found._found[key] = entry
+                    if key in self._known:
+                        found._known[key] = self._known[key]
+        return found
+
+    def add(self, other: "OrbitStore") -> None:
+        """Remember the orbits of another store as well."""
+        found, known = other.__getstate__()
+        with self._lock:
+            for key, entry in found.items():
+                if key not in self._found or isinstance(self._found[key], _Recipe):
+                    self._keep(key, entry)
+            self._known |= {key: one for key, one in known.items() if key in self._found}
 
     def near(self, built: Built, state: NDArray[np.float64] | None) -> Steady | None:
         """Return the motion of `built` near the known orbit with this scaled `state` at φ1 = 0.
@@ -207,12 +242,12 @@ def prepare_near(built: Built) -> None:
 
 
 def _rows(start: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return the scaled states in the argument `start` of an evaluation.
+    """Return what may be scaled states in the argument `start` of an evaluation.
 
-    In that of several motions, an index precedes the state in each row: both readings are
-    returned."""
+    In that of several motions, indices of parts precede the state in each row. All readings are
+    returned; only those of known orbits count."""
     rows = np.atleast_2d(np.asarray(start, np.float64))
-    return [*rows, *rows[:, 1:]]
+    return [row[first:] for row in rows for first in range(min(_INDICES + 1, rows.shape[1]))]
 
 
 def _key(state) -> bytes:

@@ -4,7 +4,6 @@ The scenes of a sample differ only in the values of arrays, so they share compil
 """
 
 import dataclasses
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.response.evaluation import RESPONSES, Evaluation
+from rootsopt.response.runs import HERE, Runs
 from rootsopt.response.scatter import Shift, draw, shifts
 from rootsopt.response.wrapper import Evaluates, Wrapper
 from rootsopt.scene import design_vector
@@ -75,19 +75,20 @@ class ToleranceEvaluator(Wrapper):
     """Evaluates designs in the nominal scene and in every scene of a fixed sample.
 
     `single`: the evaluator used in each scene; `shifts`: how far the scenes and their designs are
-    from the nominal ones. The response is reported in the nominal scene. A design is usable only
-    if it is usable in every scene.
+    from the nominal ones; `runs`: where the sample is simulated. The response is reported in the
+    nominal scene. A design is usable only if it is usable in every scene.
     """
 
     shifts: tuple[Shift, ...] = ()
+    runs: Runs = dataclasses.field(default=HERE, compare=False, repr=False)
 
     @classmethod
-    def of(cls, config: Config, single: Evaluates) -> "ToleranceEvaluator":
+    def of(cls, config: Config, single: Evaluates, runs: Runs = HERE) -> "ToleranceEvaluator":
         """Return the evaluator over the fixed sample of `tolerances` in a `config`.
 
-        `single`: evaluator of the config's nominal scene."""
+        `single`: evaluator of the config's nominal scene; `runs`: where the sample is simulated."""
         assert config.tolerances is not None
-        return cls(single, shifts(config, draw(config, config.tolerances.samples)))
+        return cls(single, shifts(config, draw(config, config.tolerances.samples)), runs)
 
     def relative_to(self, baseline: Evaluation) -> "ToleranceEvaluator":
         """Return another evaluator that compares coexisting motions in each scene by their forces
@@ -108,22 +109,26 @@ class ToleranceEvaluator(Wrapper):
 
         def at(number: int) -> AtSample:
             shift = self.shifts[number - 1]
-            return in_scene(now, shift, nominal, _rows(start, number))
+            return in_scene(now, shift, nominal, _rows(start, number), self.runs)
 
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
+        with ThreadPoolExecutor(self.runs.slots) as pool:
             parts = tuple(pool.map(at, range(1, 1 + len(self.shifts))))
         return fitted, together((AtSample({}, head), *parts))
 
 
 def in_scene(
-    evaluator: Evaluates, shift: Shift, design: Any, start: NDArray[np.float64] | None
+    evaluator: Evaluates,
+    shift: Shift,
+    design: Any,
+    start: NDArray[np.float64] | None,
+    runs: Runs = HERE,
 ) -> AtSample:
     """Evaluate a `design` (d,) in a scene that differs from the nominal one by `shift`.
 
-    `evaluator`: that of the nominal scene; `start`: as in `Evaluates.__call__`."""
+    `evaluator`: that of the nominal scene; `start`: as in `Evaluates.__call__`; `runs`: where."""
     if shift.scene is not None:
         evaluator = evaluator.shifted(shift.scene)
-    return AtSample(shift.values, evaluator(design + shift.design, start, series=False))
+    return AtSample(shift.values, runs.evaluated(evaluator, design + shift.design, start))
 
 
 def together(parts: Sequence[AtSample]) -> ToleranceEvaluation:

@@ -17,6 +17,8 @@ from rootsopt.errors import InputError
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER}):({_NUMBER})(?::(\d+))?(:log)?")
+_MEANT = re.compile(r"[-+\d.][-+\d.eE]*:[-+\d.eE:]*[-+\d.eE:](?:log)?")
+"""Texts that are meant to be a range."""
 _MOST = 1_000_000
 """Number of values above which a range is rejected."""
 
@@ -132,6 +134,11 @@ def _interval(key: str, item: str) -> Any:
     """Return the interval that the text `item` describes, or `item` itself if it is another
     value."""
     match = _RANGE.fullmatch(item.replace(" ", ""))
+    if match is None and _MEANT.fullmatch(item.replace(" ", "")):
+        raise InputError(
+            f"`{key}`: a range must be from:to:count, with :log at the end for a logarithmic "
+            f"scale, but is {shown(item)}; write it as in 300:6000:39"
+        )
     if match is None:
         return item
     low, high = float(match[1]), float(match[2])

@@ -1,5 +1,7 @@
 """Simulates points of a sweep in other processes and on other machines, by Dask distributed.
 
+The same workers evaluate designs of a search (`rootsopt.sweeps.evaluations`).
+
 Points travel in small chunks. Only the process that collects them writes them down, and it knows
 each point by its number. If a worker dies, the scheduler gives its chunks to another one; a chunk
 that ends several workers is divided into its points, and a point that does so is a status.
@@ -11,7 +13,6 @@ import os
 import queue
 import tempfile
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -20,6 +21,7 @@ from rootsopt.config.words import shown
 from rootsopt.errors import InputError
 from rootsopt.runtime.versions import versions
 from rootsopt.status import Status
+from rootsopt.sweeps.evaluations import Elsewhere, Watch, gone, refusal
 from rootsopt.sweeps.local import divided
 from rootsopt.sweeps.plan import Plan
 from rootsopt.sweeps.points import Row, lost
@@ -40,7 +42,13 @@ _ANSWER = 10.0
 _WORKERS = 60.0
 """Time (s) within which a scheduler must have a worker."""
 _POLL = 0.5
-"""Time (s) after which the number of workers and a request to stop are noticed."""
+"""Time (s) after which a request to stop is noticed."""
+_SETTINGS = {
+    "distributed.worker.multiprocessing-method": "spawn",
+    "distributed.deploy.lost-worker-timeout": "1h",
+}
+"""Dask's settings for processes started here. By default, Dask gives up a process that was killed
+unless its successor is ready in 15 s. On a busy machine, it takes longer to import everything."""
 
 
 class Cluster:
@@ -81,14 +89,28 @@ class Cluster:
 
         `stop`: event after which no further points are awaited. Raises `InputError` if the
         scheduler cannot be used, or if a worker has other versions."""
-        with self._client() as client:
+        with self._client(1) as client:
             yield from _Collection(self._dask, client, self._settings, (config, plan)).of(
                 numbers, stop
             )
 
     @contextlib.contextmanager
-    def _client(self) -> Iterator[Any]:
-        """Yield a client of the scheduler, with at least one worker."""
+    def evaluations(self) -> Iterator[Elsewhere]:
+        """Yield what runs the evaluations of a search on the workers.
+
+        Raises `InputError` if the scheduler cannot be used."""
+        with self._client(self._settings.threads) as client:
+            found = Elsewhere(self._dask, client, self._settings)
+            try:
+                yield found
+            finally:
+                found.close()
+
+    @contextlib.contextmanager
+    def _client(self, threads: int) -> Iterator[Any]:
+        """Yield a client of the scheduler, with at least one worker.
+
+        `threads`: number of tasks at a time of each worker started here."""
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
         option, advice = f"`--workers` {self.workers}", "choose fewer workers"
         if self.scheduler is not None:
@@ -100,7 +122,7 @@ class Cluster:
         with contextlib.ExitStack() as stack:
             address = self.scheduler
             if address is None:
-                address = stack.enter_context(self._started())
+                address = stack.enter_context(self._started(threads))
             try:
                 client = stack.enter_context(self._dask.Client(address, timeout=_ANSWER))
                 client.wait_for_workers(1, timeout=_WORKERS)
@@ -110,16 +132,16 @@ class Cluster:
             yield client
 
     @contextlib.contextmanager
-    def _started(self) -> Iterator[Any]:
+    def _started(self, threads: int) -> Iterator[Any]:
         """Start workers on this machine, reachable from this machine only; yield their cluster."""
         from dask import config as settings
 
         with (
             tempfile.TemporaryDirectory(prefix="rootsopt-") as scratch,
-            settings.set({"distributed.worker.multiprocessing-method": "spawn"}),
+            settings.set(_SETTINGS),
             self._dask.LocalCluster(
                 n_workers=self.workers,
-                threads_per_worker=1,
+                threads_per_worker=threads,
                 processes=True,
                 host="127.0.0.1",
                 dashboard_address="127.0.0.1:0",
@@ -142,18 +164,18 @@ class _Collection:
         self._config = config.plain()
         self._done: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._running: dict[Any, list[int]] = {}
-        self._slots, self._asked = 1, -_POLL
+        self._watch = Watch(client)
 
     def of(self, numbers: Sequence[int], stop: threading.Event) -> Iterator[list[tuple[int, Row]]]:
         """Yield the points with these `numbers`, as they are done."""
         waiting = [*divided(numbers, self._size(numbers))][::-1]
         while (waiting or self._running) and not stop.is_set():
-            while waiting and len(self._running) < _AHEAD * self._count():
+            while waiting and len(self._running) < _AHEAD * self._watch.count():
                 self._submit(waiting.pop())
             try:
                 future = self._done.get(timeout=_POLL)
             except queue.Empty:
-                self._look()
+                self._watch.check()
                 continue
             chunk = self._running.pop(future)
             found = self._result(future, chunk)
@@ -164,15 +186,8 @@ class _Collection:
         self._client.cancel([*self._running])
 
     def _size(self, numbers: Sequence[int]) -> int:
-        share = -(-len(numbers) // (_CHUNKS * self._count()))
+        share = -(-len(numbers) // (_CHUNKS * self._watch.count()))
         return min(max(share, min(self._settings.threads, len(numbers))), _LARGEST)
-
-    def _count(self) -> int:
-        """Return the number of chunks that the workers can process at a time."""
-        if time.monotonic() - self._asked > _POLL:
-            self._asked = time.monotonic()
-            self._slots = max(1, sum(self._client.nthreads().values()))
-        return self._slots
 
     def _submit(self, chunk: list[int]) -> None:
         points = [(number, self._plan.at(number)) for number in chunk]
@@ -180,33 +195,17 @@ class _Collection:
         self._running[future] = chunk
         future.add_done_callback(self._done.put)
 
-    def _look(self) -> None:
-        """Raise `InputError` if the connection to the scheduler is lost."""
-        if self._client.status != "running":
-            raise self._gone()
-
-    def _gone(self) -> InputError:
-        return InputError(
-            "the connection to the scheduler was lost; the points that were done are kept: run the "
-            "sweep again with `--resume`"
-        )
-
     def _result(self, future: Any, chunk: list[int]) -> list[tuple[int, Row]] | None:
         """Return the points of a chunk, or `None` if they must be tried one by one."""
         if future.status == "cancelled" or future.status == "lost":
-            raise self._gone()
+            raise gone()
         error = future.exception()
         if error is None:
             return future.result()
         if isinstance(error, self._dask.KilledWorker):
             why = "the process that simulated it ended, several times; it may need more memory"
             return None if len(chunk) > 1 else [(chunk[0], lost(Status.FAILED, why))]
-        if isinstance(error, InputError):
-            raise error
-        raise InputError(
-            f"a worker cannot simulate points: {type(error).__name__}: {error}; install the same "
-            "version of rootsopt on all machines"
-        ) from error
+        raise refusal(error)
 
 
 __all__ = ["Cluster"]

@@ -1,6 +1,8 @@
-"""Simulates points of a sweep in a process that another process has started."""
+"""Simulates points of a sweep, and designs of a search, in a process that another one started."""
 
+import dataclasses
 import functools
+import pickle
 import signal
 import threading
 from collections.abc import Sequence
@@ -9,6 +11,9 @@ from typing import Any, NamedTuple
 from rootsopt.config import Config
 from rootsopt.config.families import import_named
 from rootsopt.errors import InputError
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.orbits import OrbitStore
+from rootsopt.response.wrapper import Evaluates, Wrapper
 from rootsopt.runtime import environment, programs
 from rootsopt.runtime.versions import versions
 from rootsopt.sweeps.local import at_once
@@ -41,6 +46,35 @@ def work(
     return at_once(Config.model_validate(config), points, settings.threads)
 
 
+def evaluate(settings: Settings, task: bytes) -> bytes:
+    """Evaluate a design; return the evaluation, and all orbits that are then known.
+
+    `task`: evaluator, design (d,) and start, as in `Evaluates.__call__`. It travels as bytes, as
+    does the result: its arrays need double precision, and its types may need an import. Raises
+    `InputError` if this worker has other versions than the search."""
+    with _one:
+        _prepare(settings)
+    evaluator, design, start = pickle.loads(task)
+    found = evaluator(design, start, series=False)
+    return pickle.dumps((found, single_of(evaluator).orbits))
+
+
+def single_of(evaluator: Evaluates) -> Evaluator:
+    """Return the innermost of the evaluators that an evaluator wraps; without a wrapper, itself."""
+    while isinstance(evaluator, Wrapper):
+        evaluator = evaluator.single
+    assert isinstance(evaluator, Evaluator)
+    return evaluator
+
+
+def with_orbits(evaluator: Evaluates, orbits: OrbitStore) -> Evaluates:
+    """Return another evaluator that knows the given orbits only."""
+    if isinstance(evaluator, Wrapper):
+        return dataclasses.replace(evaluator, single=with_orbits(evaluator.single, orbits))
+    assert isinstance(evaluator, Evaluator)
+    return dataclasses.replace(evaluator, orbits=orbits)
+
+
 def dask_setup(worker: Any) -> None:
     """Ignore Ctrl-C, which reaches all processes of a terminal: the sweep's own process reacts.
 
@@ -70,4 +104,4 @@ def _prepare(settings: Settings) -> None:
         import_named(name)
 
 
-__all__ = ["Settings", "dask_setup", "work"]
+__all__ = ["Settings", "dask_setup", "evaluate", "single_of", "with_orbits", "work"]

@@ -14,6 +14,7 @@ from rootsopt.optimize.local import Group
 from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.profiles import geometry
 from rootsopt.response.evaluation import Evaluation, Evaluator, geometry_record
+from rootsopt.response.runs import HERE, Runs
 from rootsopt.response.terms import terms_of, values_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_vector
@@ -60,7 +61,7 @@ class Study:
 
     `config`: config of the study; `aims`: its k terms; `problem`: unit box and constraints, with
     the evaluated baseline; `fast`, `sharp`, `exact`: evaluators for screening, search and report.
-    All three are `None` if no term depends on forces."""
+    All three are `None` if no term depends on forces. `runs`: where they run."""
 
     config: Config
     aims: tuple[Aim, ...]
@@ -68,10 +69,13 @@ class Study:
     fast: Evaluator | None
     sharp: Evaluator | None
     exact: Evaluator | None
+    runs: Runs = HERE
 
     @classmethod
-    def of(cls, config: Config) -> "Study":
+    def of(cls, config: Config, runs: Runs = HERE) -> "Study":
         """Return the study of a `config`; evaluate its own design as the baseline.
+
+        `runs`: where other designs are evaluated.
 
         Raises `InputError` for unknown terms, or for a scene that cannot be simulated."""
         aims = aims_of(config)
@@ -81,7 +85,7 @@ class Study:
             baseline = geometry_of(scene, config, design_vector(config))
             floor = baseline.geometry["area_efficiency"]
             space = Space.of(config, scene, floor, term_constraints(config, scene))
-            return cls(config, aims, Problem(config, baseline, space), None, None, None)
+            return cls(config, aims, Problem(config, baseline, space), None, None, None, runs)
         limits = force_limits(config, scene)
         maxima = any(_is_cornered(aim) for aim in aims) or any(one.cornered for one in limits)
         # A front takes hundreds of evaluations.
@@ -93,7 +97,7 @@ class Study:
         floor = baseline.geometry["area_efficiency"]
         space = Space.of(config, exact.scene, floor, term_constraints(config, exact.scene))
         problem = Problem(config, baseline, space, limits)
-        return cls(config, aims, problem, fast, exact.surveying(), exact)
+        return cls(config, aims, problem, fast, exact.surveying(), exact, runs)
 
     @property
     def usable(self) -> bool:
@@ -118,7 +122,7 @@ class Study:
         if self.fast is None:
             sample = self._still(point)
             return None if sample is None else sample.evaluation
-        found = self.fast.without_gradient()(self.problem.design(point), series=False)
+        found = self.runs.evaluated(self.fast.without_gradient(), self.problem.design(point))
         return found if found.usable else None
 
     def sample(self, point: NDArray[np.float64], orbit: NDArray | None = None) -> Sample | None:
@@ -127,7 +131,7 @@ class Study:
         `orbit`: first guess of the orbit. Return `None` without a usable steady state."""
         if self.sharp is None:
             return self._still(point)
-        return self._moving(point, self.sharp(self.problem.design(point), orbit, series=False))
+        return self._moving(point, self._simulated(self.sharp, point, orbit))
 
     def verified(self, point: NDArray[np.float64]) -> Sample | None:
         """Return the terms at a `point` (d,), simulated from rest at the tight tolerance.
@@ -135,7 +139,12 @@ class Study:
         Return `None` without a usable steady state."""
         if self.exact is None:
             return self._still(point)
-        return self._moving(point, self.exact(self.problem.design(point), series=False))
+        return self._moving(point, self._simulated(self.exact, point))
+
+    def _simulated(
+        self, evaluator: Evaluator, point: NDArray[np.float64], orbit: NDArray | None = None
+    ) -> Evaluation:
+        return self.runs.evaluated(evaluator, self.problem.design(point), orbit)
 
     def _moving(self, point: NDArray[np.float64], evaluation: Evaluation) -> Sample | None:
         if not evaluation.usable:

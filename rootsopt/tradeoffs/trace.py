@@ -8,16 +8,19 @@ intersection, SIAM Journal on Optimization 8 (1998) 631-657. That method require
 lie on the normal through the reference point; here, it may lie beside the normal.
 
 The optima are found in order. Each search starts from a prediction: the secant through two
-neighbours already found, or the nearest one. A second pass runs in the opposite order. Several
-local optima can exist side by side, so the better of the two results counts. Two kinds of designs
-evaluated earlier start further searches: one that is better than the result, and the best one that
-lies far from it. Finally, neighbours that lie far apart are bisected."""
+neighbours already found, or the nearest one. A second chain of searches runs beside it in the
+opposite order. Several local optima can exist side by side, so the better of the two results
+counts. Two kinds of designs evaluated earlier start further searches: one that is better than the
+result, and the best one that lies far from it. Finally, neighbours that lie far apart are bisected.
 
-import os
+Searches that do not need each other's results run side by side: those of the ends, both chains, the
+further searches of all points, those of one bisection. Each has its own `Course`, so that the
+result does not depend on which ends first, or where designs are evaluated (`Runs`)."""
+
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +35,11 @@ from rootsopt.optimize.optimality import RESIDUAL
 from rootsopt.optimize.problem import FEASIBLE
 from rootsopt.optimize.sqp import Stops, descend
 from rootsopt.response.choice import resolve
+from rootsopt.response.runs import HERE, Runs
 from rootsopt.scene import check_geometry
+from rootsopt.sweeps.evaluations import evaluating
 from rootsopt.tradeoffs.assembly import Node, gaps_of, points_of, selected, spacing_of
+from rootsopt.tradeoffs.course import Course, Seen
 from rootsopt.tradeoffs.front import Front, Standing
 from rootsopt.tradeoffs.gaps import Bisections, Edge, Pair, Spacing, divides
 from rootsopt.tradeoffs.lattice import Key, corners, directions, keys, links
@@ -60,23 +66,17 @@ _HOLDS_UP = 0.01
 _SAME_ENDS = 1e-6
 """Range of a term over the ends (relative to its scale) below which the terms do not conflict."""
 
+Task, Done = TypeVar("Task"), TypeVar("Done")
 Progress = Callable[[int, int], None]
 """Type of a progress callback, with arguments (searches done, searches expected)."""
-
-
-class _Seen(NamedTuple):
-    """A feasible design evaluated earlier: `point` (d,), its terms `values` (k,), its `orbit`."""
-
-    point: NDArray[np.float64]
-    values: NDArray[np.float64]
-    orbit: NDArray | None
 
 
 class Tracer:
     """Traces the front of one config.
 
     `progress`: function called after each local search with (searches done, searches expected);
-    `stop`: event that another thread can set to end the tracing early.
+    `stop`: event that another thread can set to end the tracing early; `runs`: where designs are
+    evaluated.
 
     Raises `InputError` if there is no design parameter."""
 
@@ -85,6 +85,7 @@ class Tracer:
         config: Config,
         progress: Progress | None = None,
         stop: threading.Event | None = None,
+        runs: Runs = HERE,
     ):
         if not config.design_keys:
             valid = ", ".join(family for family, found in FAMILY_KEYS.items() if found)
@@ -93,7 +94,7 @@ class Tracer:
                 f"{config.profile.family}: it has no design parameter; use `simulate` for it, "
                 "or make the twist one with `optimizer.bounds.helix_deg`"
             )
-        self.config = config
+        self.config, self.runs = config, runs
         self.progress = progress or (lambda done, expected: None)
         self.stop = threading.Event() if stop is None else stop
         self._study: Study | None = None
@@ -102,7 +103,7 @@ class Tracer:
         self._gaps = Bisections([])
         self._spacing = Spacing(np.inf, np.inf)
         self._scale: Scale | None = None
-        self._seen: list[_Seen] = []
+        self._course = Course()
         self._lock = threading.Lock()
         self._searches = self._evaluations = 0
         self._expected = 0
@@ -125,7 +126,7 @@ class Tracer:
         Return the front. If `stop` is set, the front has the points found so far.
 
         Raises `InputError` for unknown terms, or for a scene that cannot be simulated."""
-        study = self._study = Study.of(self.config)
+        study = self._study = Study.of(self.config, self.runs)
         if not study.usable or self.stop.is_set():
             return self._front([])
         points = self._feasible()
@@ -133,7 +134,7 @@ class Tracer:
             reason = explain(study.problem, self._sample[:_EXPLAINED])
             return self._front([], infeasible=reason)
         self._screen(points)
-        if self._seen and self._ends(points[0]):
+        if self._course.seen and self._ends(points[0]):
             self._trace()
             self._bisect()
         return self._front(self._verified(self._all()))
@@ -164,23 +165,28 @@ class Tracer:
 
     def _screen(self, points: Sequence[NDArray[np.float64]]) -> None:
         """Evaluate `points`, keep their terms, and set the scale for the ends."""
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            found = list(pool.map(self._screened, points))
+        found = self._side_by_side(self._screened, points)
         signs = np.array([aim.sign for aim in self.study.aims])
         names = [aim.name for aim in self.study.aims]
         # Designs beyond a limit of a force serve as starts only if there are no others.
-        beyond: list[_Seen] = []
+        inside: list[Seen] = []
+        beyond: list[Seen] = []
         for point, evaluation in zip(points, found, strict=True):
             if evaluation is not None:
                 values = signs * [evaluation.response[name] for name in names]
-                seen = _Seen(point, values, evaluation.state)
+                seen = Seen(point, values, evaluation.state)
                 kept = self.study.problem.excess(evaluation) <= FEASIBLE
-                (self._seen if kept else beyond).append(seen)
-        self._seen = self._seen or beyond
+                (inside if kept else beyond).append(seen)
+        self._course = Course(inside or beyond)
         self._evaluations += len(points)
         baseline = signs * [self.study.problem.baseline.response[name] for name in names]
-        every = np.array([one.values for one in self._seen]).reshape(-1, len(names))
+        every = np.array([one.values for one in self._course.seen]).reshape(-1, len(names))
         self._scale = end_scale(baseline, every)
+
+    def _side_by_side(self, work: Callable[[Task], Done], tasks: Iterable[Task]) -> list[Done]:
+        """Return `work(task)` for all tasks, in their order; they run side by side."""
+        with ThreadPoolExecutor(self.runs.slots) as pool:
+            return list(pool.map(work, tasks))
 
     def _screened(self, point: NDArray[np.float64]):
         return None if self.stop.is_set() else self.study.screened(point)
@@ -195,12 +201,13 @@ class Tracer:
         if self.study.sharp is None:
             starts = max(starts, _CHEAP_STARTS)
         self._expected = count * starts + 3 * (len(keys(count, self._divisions)) - count)
+        scalars = [Scalar(self.scale, np.zeros(count), (number,)) for number in range(count)]
+        begins = [self._apart(scalar, starts, first) for scalar in scalars]
+        found = self._solved_from(
+            [(number, one) for number in range(count) for one in begins[number]], scalars
+        )
         for number, key in enumerate(corners(count, self._divisions)):
-            scalar = Scalar(self.scale, np.zeros(count), (number,))
-            best: Node | None = None
-            for one in self._apart(scalar, starts, first):
-                best = self._solved(scalar, one.point, one.orbit, best)
-            best = self._again(scalar, best)
+            best = self._again(scalars[number], found[number], self._course)
             if best is None:
                 return False
             with self._lock:
@@ -212,17 +219,35 @@ class Tracer:
             self._scale = Scale(np.min(ends, axis=0), width)
         return conflict and not self.stop.is_set()
 
-    def _apart(self, scalar: Scalar, count: int, first: NDArray[np.float64]) -> list[_Seen]:
+    def _solved_from(
+        self, starts: Sequence[tuple[int, Seen]], scalars: Sequence[Scalar]
+    ) -> list[Node | None]:
+        """Search from several `starts` side by side; return the best node for each of `scalars`.
+
+        `starts`: (index of the objective, design to begin from)."""
+
+        def solve(task: tuple[int, Seen]) -> tuple[Course, Node | None]:
+            course, (number, one) = self._course.branch(), task
+            return course, self._solved(scalars[number], one.point, one.orbit, None, course)
+
+        done = self._side_by_side(solve, starts)
+        self._course.join([course for course, _ in done])
+        best: list[Node | None] = [None] * len(scalars)
+        for (number, _), (_, node) in zip(starts, done, strict=True):
+            best[number] = _better(best[number], node)
+        return best
+
+    def _apart(self, scalar: Scalar, count: int, first: NDArray[np.float64]) -> list[Seen]:
         """Return up to `count` designs evaluated earlier that are distant from each other.
 
         They are in order of the objective `scalar`, the best first. Without such designs, return
         the point `first` (d,)."""
-        chosen: list[_Seen] = []
-        for one in sorted(self._seen, key=lambda one: scalar.value(one.values)):
+        chosen: list[Seen] = []
+        for one in sorted(self._course.seen, key=lambda one: scalar.value(one.values)):
             apart = all(np.linalg.norm(one.point - other.point) > _APART for other in chosen)
             if apart and len(chosen) < count:
                 chosen.append(one)
-        return chosen or [_Seen(first, np.zeros(0), None)]
+        return chosen or [Seen(first, np.zeros(0), None)]
 
     # The points between the ends.
 
@@ -238,60 +263,83 @@ class Tracer:
         return np.array(key) / self._divisions @ self.scale.of(np.array(ends))
 
     def _trace(self) -> None:
-        """Solve all points between the ends, in two passes."""
-        count = len(self.study.aims)
-        inner = [key for key in keys(count, self._divisions) if key not in self._nodes]
-        everything = tuple(range(count))
-        for order in (inner, inner[::-1]):
-            for key in order:
-                if self.stop.is_set():
-                    return
-                scalar = Scalar(self.scale, self._reference(key), everything)
-                before = self._nodes.get(key)
-                best = before
-                for start, orbit in self._predictions(key, ahead=order is inner):
-                    best = self._solved(scalar, start, orbit, best)
-                best = self._again(scalar, best)
-                if order is not inner:
-                    best = self._elsewhere(scalar, best)
-                if best is not None:
-                    with self._lock:
-                        self._nodes[key] = best
+        """Solve all points between the ends, by two chains and by further searches."""
+        inner = [k for k in keys(len(self.study.aims), self._divisions) if k not in self._nodes]
+        ends = dict(self._nodes)
+        chains = self._side_by_side(lambda ahead: self._chain(inner, ends, ahead), (True, False))
+        self._course.join(chains)
 
-    def _predictions(self, key: Key, ahead: bool):
-        """Yield (start (d,), orbit) for a `key` of the grid, from its solved neighbours.
+        def finish(key: Key) -> Course:
+            course, scalar = self._course.branch(), self._scalar(key)
+            if not self.stop.is_set():
+                best = self._again(scalar, self._nodes.get(key), course)
+                self._keep(key, self._elsewhere(scalar, best, course))
+            return course
 
-        `ahead`: whether this is the first pass; the second runs in the opposite order. The first
-        start is the secant through two neighbours in line. If there is only one neighbour, or if
-        the search from the secant fails at once, the start is the nearest neighbour."""
+        self._course.join(self._side_by_side(finish, inner))
+
+    def _scalar(self, key: Key) -> Scalar:
+        """Return the objective of a point between the ends."""
+        return Scalar(self.scale, self._reference(key), tuple(range(len(key))))
+
+    def _chain(self, inner: Sequence[Key], ends: Mapping[Key, Node], ahead: bool) -> Course:
+        """Solve the points `inner` from neighbour to neighbour, and return the course.
+
+        `ends`: nodes to begin from; `ahead`: whether in the order given, or in the opposite one."""
+        course, nodes = self._course.branch(), {**ends}
+        for key in inner if ahead else inner[::-1]:
+            if self.stop.is_set():
+                break
+            scalar, best = self._scalar(key), None
+            for start, orbit in self._predictions(key, ahead, nodes, course):
+                best = self._solved(scalar, start, orbit, best, course)
+            best = self._again(scalar, best, course)
+            if best is not None:
+                nodes[key] = best
+                self._keep(key, best)
+        return course
+
+    def _keep(self, key: Key, node: Node | None) -> None:
+        """Keep a `node` for a `key` of the grid, if it is better than the one known."""
+        with self._lock:
+            best = _better(self._nodes.get(key), node)
+            if best is not None:
+                self._nodes[key] = best
+
+    def _predictions(self, key: Key, ahead: bool, nodes: Mapping[Key, Node], course: Course):
+        """Yield (start (d,), orbit) for a `key` of the grid, from its neighbours among the `nodes`.
+
+        `ahead`: as in `_chain`; `course`: the searches from these starts. The first start is the
+        secant through two neighbours in line. If there is only one neighbour, or if the search from
+        the secant fails at once, the start is the nearest neighbour."""
         steps = directions(len(key))
         for step in steps if ahead else [tuple(-x for x in one) for one in steps]:
-            near = self._nodes.get(tuple(a - b for a, b in zip(key, step, strict=True)))
+            near = nodes.get(tuple(a - b for a, b in zip(key, step, strict=True)))
             if near is None:
                 continue
-            far = self._nodes.get(tuple(a - 2 * b for a, b in zip(key, step, strict=True)))
-            before = self._evaluations
+            far = nodes.get(tuple(a - 2 * b for a, b in zip(key, step, strict=True)))
+            before = course.evaluations
             if far is not None and np.max(np.abs(near.point - far.point)) < 2 * _APART:
                 secant = np.clip(2 * near.point - far.point, 0.0, 1.0)
                 yield secant, near.sample.evaluation.state
-                if self._evaluations > before + 1:  # The start had a steady state.
+                if course.evaluations > before + 1:  # The start had a steady state.
                     return
             yield near.point, near.sample.evaluation.state
             return
 
-    def _again(self, scalar: Scalar, best: Node | None) -> Node | None:
-        """Search from the best design evaluated earlier, if it beats `best`.
+    def _again(self, scalar: Scalar, best: Node | None, course: Course) -> Node | None:
+        """Search from the best design seen in the `course`, if it beats `best`.
 
         Return the better one of the outcome and `best`."""
-        seen = min(self._seen, key=lambda one: scalar.value(one.values), default=None)
+        seen = min(course.seen, key=lambda one: scalar.value(one.values), default=None)
         if seen is None or self.stop.is_set():
             return best
         if best is None or scalar.value(seen.values) < best.objective - _BETTER:
-            return self._solved(scalar, seen.point, seen.orbit, best)
+            return self._solved(scalar, seen.point, seen.orbit, best, course)
         return best
 
-    def _elsewhere(self, scalar: Scalar, best: Node | None) -> Node | None:
-        """Search from the best design evaluated earlier that is distant from `best`.
+    def _elsewhere(self, scalar: Scalar, best: Node | None, course: Course) -> Node | None:
+        """Search from the best design seen in the `course` that is distant from `best`.
 
         Return the better one of the outcome and `best`. With a single start (`optimizer.starts`),
         or if that design is much worse than `best` (`_PROMISING`), return `best`."""
@@ -300,18 +348,26 @@ class Tracer:
         limit = best.objective + _PROMISING
         others = [
             one
-            for one in self._seen
+            for one in course.seen
             if np.linalg.norm(one.point - best.point) > _APART and scalar.value(one.values) < limit
         ]
         found = min(others, key=lambda one: scalar.value(one.values), default=None)
-        return best if found is None else self._solved(scalar, found.point, found.orbit, best)
+        if found is None:
+            return best
+        return self._solved(scalar, found.point, found.orbit, best, course)
 
     def _solved(
-        self, scalar: Scalar, start: NDArray[np.float64], orbit: NDArray | None, best: Node | None
+        self,
+        scalar: Scalar,
+        start: NDArray[np.float64],
+        orbit: NDArray | None,
+        best: Node | None,
+        course: Course,
     ) -> Node | None:
         """Search from `start` (d,) for the optimum of a `scalar` objective.
 
-        `orbit`: first guess of the orbit. Return the better one of the outcome and `best`."""
+        `orbit`: first guess of the orbit; `course`: what the search adds its designs to. Return the
+        better one of the outcome and `best`."""
         if self.stop.is_set():
             return best
         samples: dict[bytes, Sample] = {}
@@ -319,28 +375,36 @@ class Tracer:
 
         def look(point: NDArray[np.float64]) -> Local | None:
             sample = self.study.sample(point, last[0])
-            self._evaluations += 1
+            course.evaluations += 1
+            self._count(evaluations=1)
             if sample is None:
                 return None
             last[0] = sample.evaluation.state
             samples[point.tobytes()] = sample
             if sample.feasible:
-                self._seen.append(_Seen(sample.point, sample.values, sample.evaluation.state))
+                course.seen.append(Seen(sample.point, sample.values, sample.evaluation.state))
             return scalar.local(sample)
 
         limit = self.config.optimizer.iterations + 1
         if self.study.sharp is None:
             limit = max(limit, _CHEAP_EVALUATIONS)
         found = descend(look, start, Stops(evaluations=limit, asked=self.stop.is_set))
-        self._searches += 1
-        self.progress(self._searches, max(self._expected, self._searches))
+        self._count(searches=1)
         if found.local is None or found.certificate is None:
             return best
         if found.local.violation > FEASIBLE:
             return best
         sample = samples[found.point.tobytes()]
         node = Node(scalar, sample, found.certificate, found.reason)
-        return node if best is None or node.objective < best.objective else best
+        return _better(best, node)
+
+    def _count(self, evaluations: int = 0, searches: int = 0) -> None:
+        """Count designs and searches, of all courses together, and report progress."""
+        with self._lock:
+            self._evaluations += evaluations
+            self._searches += searches
+            if searches:
+                self.progress(self._searches, max(self._expected, self._searches))
 
     # Gaps.
 
@@ -383,13 +447,10 @@ class Tracer:
         values = [self.scale.of(node.sample.values) for node in ends]
         middle = np.mean(values, axis=0)
         scalar = Scalar(self.scale, middle, tuple(range(len(middle))))
-        best: Node | None = None
-        starts = [node.sample.point for node in ends]
-        orbits = [node.sample.evaluation.state for node in ends]
-        starts.append(np.mean(starts, axis=0))
-        for start, orbit in zip(starts, [*orbits, orbits[0]], strict=True):
-            best = self._solved(scalar, start, orbit, best)
-        best = self._again(scalar, best)
+        starts = [(node.sample.point, node.sample.evaluation.state) for node in ends]
+        starts.append((np.mean([point for point, _ in starts], axis=0), starts[0][1]))
+        begins = [(0, Seen(point, np.zeros(0), orbit)) for point, orbit in starts]
+        best = self._again(scalar, self._solved_from(begins, [scalar])[0], self._course)
         if self.stop.is_set():
             return
         gaps = self._gaps
@@ -418,7 +479,8 @@ class Tracer:
             reference = limit - np.where(np.arange(2) == lead, 0.0, _SHARP * apart)
             node = self._all()[moving]
             scalar = Scalar(self.scale, reference, (0, 1), direction)
-            best = self._solved(scalar, node.point, node.sample.evaluation.state, None)
+            orbit = node.sample.evaluation.state
+            best = self._solved(scalar, node.point, orbit, None, self._course)
             if best is None or self.stop.is_set():
                 continue
             found = self.scale.of(best.sample.values)
@@ -442,18 +504,17 @@ class Tracer:
         remaining nodes keep their standing."""
         if not nodes:
             return nodes
-        kept = set(selected(nodes, self.scale).kept)
-        found = [*nodes]
-        for k in sorted(kept):
-            if self.stop.is_set():
-                break
-            found[k] = self._checked(nodes[k])
-        return found
+        kept = sorted({*selected(nodes, self.scale).kept})
+        checked = self._side_by_side(lambda k: self._checked(nodes[k]), kept)
+        known = dict(zip(kept, checked, strict=True))
+        return [known.get(k, node) for k, node in enumerate(nodes)]
 
     def _checked(self, node: Node) -> Node:
-        """Return a node after its design has been simulated again from rest."""
+        """Return a node after its design has been simulated again from rest, unless stopped."""
+        if self.stop.is_set():
+            return node
         sample = self.study.verified(node.sample.point)
-        self._evaluations += 1
+        self._count(evaluations=1)
         if sample is None:
             return node._replace(standing=Standing.NOT_HELD_UP)
         before = node.sample.values
@@ -499,10 +560,25 @@ class Tracer:
         )
 
 
-def pareto_front(config: Config, progress: Progress | None = None) -> Front:
+def _better(best: Node | None, other: Node | None) -> Node | None:
+    """Return the node with the lower objective; `best` if both are equally good."""
+    if best is None or (other is not None and other.objective < best.objective):
+        return other
+    return best
+
+
+def pareto_front(
+    config: Config,
+    progress: Progress | None = None,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> Front:
     """Trace the front of best compromises between the terms of `config.pareto`.
 
     `progress`: function called after each local search with (searches done, searches expected).
+    `workers`, `scheduler`: where the designs are simulated, as in `sweep_scenes`; by default in
+    this process, on all cores.
 
     Return a `Front`. Its main fields are `points` (each with `terms`, `design`, `rates` and
     `standing`), `gaps`, `dropped`, `baseline_terms` and `status`.
@@ -513,7 +589,8 @@ def pareto_front(config: Config, progress: Progress | None = None) -> Front:
     >>> front = rootsopt.pareto_front(rootsopt.load_config("configs/cic.yaml"))
     >>> [(point.terms, point.design) for point in front.points]"""
     check_geometry(config)
-    return Tracer(resolve(config)[0], progress).run()
+    with evaluating(workers, scheduler) as runs:
+        return Tracer(resolve(config)[0], progress, runs=runs).run()
 
 
 __all__ = ["Tracer", "pareto_front"]

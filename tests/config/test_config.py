@@ -9,6 +9,7 @@ import yaml
 
 from rootsopt.config import Config, describe_keys, load, parse
 from rootsopt.config.section import Section
+from rootsopt.config.units import unit_of
 from rootsopt.errors import InputError
 from rootsopt.scene import check_geometry
 
@@ -56,6 +57,12 @@ def refusal(text, *overrides):
 
 
 # What loads
+
+
+def test_units_of_names():
+    """The longest ending counts: an expansion per kelvin is no temperature."""
+    known = {"rotor_warming_K": "K", "rotor_expansion_per_K": "1/K", "x_J_per_kg_K": "J/(kg·K)"}
+    assert {name: unit_of(name) for name in known} == known
 
 
 def test_minimal_config_loads_with_its_values_and_defaults():

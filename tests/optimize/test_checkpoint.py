@@ -80,7 +80,7 @@ def test_the_command_keeps_its_checkpoint_until_the_run_is_in_place(tmp_path, mo
     kept, older = (tmp_path / f".run.checkpoint{end}" for end in ("", ".old"))
     kept.write_text("of an earlier run")
 
-    def searched(config, progress, stop, checkpoint):
+    def searched(config, progress, stop, checkpoint, runs):
         checkpoint.add((0, 0), np.zeros(1), evaluation(0.1))
         return config, {}, None
 

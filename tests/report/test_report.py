@@ -17,6 +17,7 @@ from rootsopt.commands import pareto, profile
 from rootsopt.config import load
 from rootsopt.output.files import ResultFolder, response_columns
 from rootsopt.report import charts
+from rootsopt.report.blocks import pump_block
 from rootsopt.report.gather import Run
 from rootsopt.report.html import report_text
 from rootsopt.report.names import label
@@ -201,6 +202,51 @@ def test_names_that_are_no_text_are_shown(tmp_path):
     assert "with friction between the flanks, without a timing gear" in words_of(page)
 
 
+@pytest.mark.parametrize(
+    ("status", "usable", "mark"),
+    [("periodic", True, "good"), ("not_converged", True, "bad"), ("chaotic", False, "bad")],
+)
+def test_header_marks_a_result_that_is_not_to_be_trusted(status, usable, mark, tmp_path):
+    page = report_text(run_of(tmp_path, result_of(status=status), usable=usable))
+    assert f'<span class="status {mark}">' in page
+
+
+def test_lists_of_a_pump_sheet_have_a_row_for_each_number(tmp_path):
+    given = result_of("profile") | {"pump": {"flow_lines": [0.5, 0.25], "x_mm": 1.0}}
+    rows = pump_block(run_of(tmp_path, given)).groups[0][1]
+    shown = [[cell.text for cell in row] for row in rows]
+    assert shown == [
+        ["flow lines, 1 of 2", "0.50000"],
+        ["flow lines, 2 of 2", "0.25000"],
+        ["x (mm)", "1.0000"],
+    ]
+
+
+def test_numbers_stay_with_their_units(tmp_path):
+    page = report_text(run_of(tmp_path, result_of(message="It has 5 N at 3000 rpm and 2 Newtons.")))
+    assert "5\N{NO-BREAK SPACE}N at 3000\N{NO-BREAK SPACE}rpm and 2 Newtons" in page
+
+
+@pytest.mark.parametrize(
+    ("command", "source", "advice"),
+    [
+        (
+            "optimize",
+            "cic -o run",
+            "Go on from where it stopped: rootsopt optimize cic -o run --resume.",
+        ),
+        ("sweep", "cic --resume", "Go on from where it stopped: rootsopt sweep cic --resume."),
+        ("pareto", "cic", "Run it again, from its beginning: rootsopt pareto cic."),
+    ],
+)
+def test_stopped_run_says_how_to_go_on(command, source, advice, tmp_path):
+    message = "The search was stopped after 2 designs. The best of them is reported."
+    given = result_of(command, status="interrupted", message=message)
+    text = words_of(report_text(run_of(tmp_path, given, source=source, usable=False)))
+    assert f"Interrupted: {message}" in text
+    assert advice in text
+
+
 def test_stopped_run_has_a_report(tmp_path):
     """A run stopped before anything was known has neither design nor numbers."""
     given = {"baseline": None, "optimized": None, "status": "interrupted", "versions": {}}
@@ -238,7 +284,7 @@ def test_optimum_is_reported_in_the_users_words(tmp_path):
         "residual 2 × 10⁻¹¹, at most 0.0001 required",
         "About 100 % of further starts",
         "displaced volume (cm³) 541.70 541.70 0.00 %",
-        "flow lines 0.080000, 0.010000",
+        "flow lines, 2 of 2 0.010000",
     ):
         assert words in text
 
@@ -280,7 +326,12 @@ def test_sweep_over_two_quantities(tmp_path):
     assert traces[3]["y"] == pytest.approx([200, 400, 600])
     assert traces[3]["marker"]["symbol"] == ["circle", "circle", "x"]
     assert "backlash (mm) 0.2" in traces[3]["name"]
-    assert "3 of 6 scenes have a steady state." in words_of(page)
+    colors = [trace["line"]["color"] for trace in traces]
+    assert colors[0] == colors[1] != colors[2] == colors[3]
+    assert [trace["line"]["dash"] for trace in traces] == ["dot", "solid", "dot", "solid"]
+    text = words_of(page).replace("\N{NO-BREAK SPACE}", " ")
+    assert "3 of 6 scenes have a steady state." in text
+    assert "these differ: speed: 1000 rpm, 3000 rpm and 2000 rpm; backlash: 0.1 mm and 0.2" in text
 
 
 @pytest.fixture(scope="module")

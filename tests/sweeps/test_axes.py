@@ -50,6 +50,9 @@ def test_python_values():
         ("1:2,5", "cannot be mixed"),
         ("[1", "not valid YAML"),
         ("1:1e999:3", "finite"),
+        ("1:2:-3", "from:to:count"),
+        ("1:2:3:4", "from:to:count"),
+        ("1:2:3.5", "from:to:count"),
     ],
 )
 def test_wrong_texts(text, words):

@@ -55,10 +55,10 @@ def test_a_killed_worker_loses_and_duplicates_nothing(tmp_path, monkeypatch):
     assert len((tmp_path / "points").read_bytes().splitlines()) == 1 + 40
     for number, row in rows.items():
         assert row["message"].endswith(f"at {100 * (number + 1)}")
-    assert not psutil.Process().children(recursive=True) or _no_workers()
+    assert not psutil.Process().children(recursive=True) or no_workers()
 
 
-def _no_workers() -> bool:
+def no_workers() -> bool:
     found = psutil.Process().children(recursive=True)
     return not any("spawn_main" in " ".join(one.cmdline()) for one in found)
 

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 import jax.numpy as jnp
 from rich.console import Console
 
-from rootsopt.commands import cli, door
+from rootsopt.commands import cli, door, parallel
 from rootsopt.commands.work.searching import nothing_known, progress_bar, searched
 from rootsopt.config import Config, sources
 from rootsopt.config.families import family_of
@@ -47,11 +47,12 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     with (
         clock,
         door.patience(promise) as stop,
+        parallel.chosen(options) as runs,
         _progress(Console(stderr=True)) as progress,
     ):
         checkpoint = _checkpoint(config, options, folder)
         try:
-            config, choice, result = _searched(config, progress, stop, checkpoint)
+            config, choice, result = _searched(config, progress, stop, checkpoint, runs)
         except BaseException:
             checkpoint.close(remove=checkpoint.empty)
             raise
@@ -134,13 +135,15 @@ def _checkpoint(config: Config, options: argparse.Namespace, folder: RunFolder):
     return Checkpoint(path, header, options.resume)
 
 
-def _searched(config: Config, progress, stop: threading.Event, checkpoint):
+def _searched(config: Config, progress, stop: threading.Event, checkpoint, runs):
     """Run the search; return (config, settings chosen for `auto`, result).
 
     In the returned config, the chosen settings replace `auto`. The result is `None` if the search
     was stopped before the baseline was simulated. `progress`: function as from `_progress`, or
-    `None`; `stop`: event that stops the search; `checkpoint`: file for the evaluations."""
-    return searched(config, lambda given: search_of(given, progress, stop, checkpoint), stop)
+    `None`; `stop`: event that stops the search; `checkpoint`: file for the evaluations; `runs`:
+    where they run."""
+    how = progress, stop, checkpoint, runs
+    return searched(config, lambda given: search_of(given, *how), stop)
 
 
 def _contradiction(config: Config, folder: RunFolder, result) -> cli.Outcome:

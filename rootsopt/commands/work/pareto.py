@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from rootsopt.commands import cli, door
+from rootsopt.commands import cli, door, parallel
 from rootsopt.commands.work.searching import nothing_known, progress_bar, searched
 from rootsopt.config import Config
 from rootsopt.figures import page
@@ -31,8 +31,13 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     check_geometry(config)
     clock = CompileClock()
     promise = "keeping the points found so far and writing the files"
-    with clock, door.patience(promise) as stop, _progress(Console(stderr=True)) as progress:
-        config, choice, front = _traced(config, progress, stop)
+    with (
+        clock,
+        door.patience(promise) as stop,
+        parallel.chosen(options) as runs,
+        _progress(Console(stderr=True)) as progress,
+    ):
+        config, choice, front = _traced(config, progress, stop, runs)
     if front is None:
         return nothing_known(config, folder, "evaluated", {"points": []})
     ran = time.perf_counter() - began
@@ -67,12 +72,12 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
 
 
-def _traced(config: Config, progress, stop) -> "tuple[Config, dict[str, Any], Front | None]":
+def _traced(config: Config, progress, stop, runs) -> "tuple[Config, dict[str, Any], Front | None]":
     """Trace the front; return (config, settings chosen for `auto`, front).
 
     In the returned config, the chosen settings replace `auto`. The front is `None` if the search
     was stopped before the baseline was evaluated."""
-    return searched(config, lambda given: Tracer(given, progress, stop), stop)
+    return searched(config, lambda given: Tracer(given, progress, stop, runs), stop)
 
 
 def _progress(console) -> "AbstractContextManager[Callable[..., None] | None]":

@@ -1,0 +1,36 @@
+"""The options `--workers` and `--scheduler`, which `sweep`, `optimize` and `pareto` share."""
+
+import argparse
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rootsopt.response.runs import Runs
+
+
+def add_options(parser: "argparse.ArgumentParser | argparse._ArgumentGroup") -> None:
+    """Add the options to a `parser`, or to a group of its options."""
+    parser.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="start N processes on this machine (needs rootsopt[cluster]); default: this process, "
+        "with one thread per core",
+    )
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="use the workers of a running Dask scheduler, for example tcp://10.0.0.1:8786 (needs "
+        "rootsopt[cluster])",
+    )
+
+
+def chosen(options: argparse.Namespace) -> "AbstractContextManager[Runs]":
+    """Return a context manager for what runs the evaluations of a search with these `options`."""
+    from rootsopt.sweeps.evaluations import evaluating
+
+    cache = not options.no_cache
+    return evaluating(options.workers, options.scheduler, options.imports, cache)
+
+
+__all__ = ["add_options", "chosen"]

@@ -1,0 +1,237 @@
+"""Evaluations of a search in real processes: the same results, whatever happens to a process."""
+
+import os
+import pickle
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from rootsopt.commands import optimize, pareto
+from rootsopt.config import load
+from rootsopt.dynamics.collocation.known import Known
+from rootsopt.errors import InputError
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.evaluators import evaluator_for
+from rootsopt.response.orbits import Built, OrbitStore, _Closed
+from rootsopt.response.runs import HERE, Runs
+from rootsopt.sweeps import evaluations
+from rootsopt.sweeps.cluster import Cluster
+from rootsopt.sweeps.evaluations import ClosedError, Elsewhere, evaluating
+from rootsopt.sweeps.worker import Settings, single_of, with_orbits
+from tests.sweeps.test_cluster import IMPORT, kill_a_worker, no_workers
+from tests.sweeps.workers import DEADLY, force
+
+
+def test_a_killed_worker_loses_and_duplicates_no_design(monkeypatch):
+    monkeypatch.setenv("TEST_SECONDS", "0.1")
+    evaluator = Evaluator.of(load("cic"))
+    designs = np.random.default_rng(0).uniform(1.0, 40.0, (40, 3))
+    ended, killed, lock = [], [], threading.Lock()
+
+    def evaluated(number):
+        found = runs.evaluated(evaluator, designs[number])
+        with lock:
+            ended.append(number)
+            if len(ended) >= 4 and not killed:
+                killed.append(number)
+                kill_a_worker()
+        return found
+
+    with (
+        Cluster(2, imports=(IMPORT,)).evaluations() as runs,
+        ThreadPoolExecutor(runs.slots) as pool,
+    ):
+        assert isinstance(runs, Runs)
+        found = list(pool.map(evaluated, range(40)))
+    assert killed
+    assert sorted(ended) == [*range(40)]
+    for design, one in zip(designs, found, strict=True):
+        assert one.response["mean_force_N"] == force(design)
+        assert one.state.tobytes() == design.tobytes()
+    assert no_workers()
+
+
+@pytest.mark.long
+def test_a_design_that_kills_its_process_ends_the_search(monkeypatch):
+    monkeypatch.setenv("TEST_SECONDS", "0.01")
+    evaluator = Evaluator.of(load("cic", [f"scene.speed_rpm={DEADLY}"]))
+    with (
+        Cluster(1, imports=(IMPORT,)).evaluations() as runs,
+        pytest.raises(InputError, match=r"several times.*--resume"),
+    ):
+        runs.evaluated(evaluator, np.ones(3))
+
+
+class Client:
+    """Stands in for a Dask client whose workers never answer."""
+
+    status = "running"
+
+    def __init__(self):
+        self.futures = []
+        self.asked = threading.Event()
+
+    def nthreads(self):
+        return {"a": 2, "b": 1}
+
+    def submit(self, function, *arguments, pure):
+        self.futures.append(Future())
+        self.asked.set()
+        return self.futures[-1]
+
+
+class Future:
+    """Stands in for a future that never ends."""
+
+    cancelled = False
+
+    def add_done_callback(self, call):
+        pass
+
+    def cancel(self):
+        self.cancelled = True
+
+
+def test_threads_that_wait_end_with_the_search(monkeypatch):
+    monkeypatch.setattr(evaluations, "_POLL", 0.01)
+    client = Client()
+    runs = Elsewhere(None, client, Settings(()))
+    assert runs.slots == 6
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(runs.evaluated, Evaluator.of(load("cic")), np.ones(3))
+        assert client.asked.wait(10)
+        runs.close()
+        with pytest.raises(ClosedError):
+            waiting.result(10)
+    assert client.futures[0].cancelled
+    with pytest.raises(ClosedError):
+        runs.evaluated(Evaluator.of(load("cic")), np.ones(3))
+
+
+def test_a_lost_connection_is_named(monkeypatch):
+    monkeypatch.setattr(evaluations, "_POLL", 0.01)
+    monkeypatch.setattr(Client, "status", "closed")
+    with pytest.raises(InputError, match="connection to the scheduler was lost"):
+        Elsewhere(None, Client(), Settings(())).evaluated(Evaluator.of(load("cic")), np.ones(3))
+
+
+def test_a_scheduler_without_workers_is_given_up(monkeypatch):
+    monkeypatch.setattr(evaluations, "_POLL", 0.01)
+    monkeypatch.setattr(evaluations, "_DESERTED", 0.05)
+    monkeypatch.setattr(Client, "nthreads", lambda self: {})
+    with pytest.raises(InputError, match=r"no worker for 0\.05 s"):
+        Elsewhere(None, Client(), Settings(())).evaluated(Evaluator.of(load("cic")), np.ones(3))
+
+
+def test_orbits_travel_with_the_states_that_name_them():
+    built = Built(None, None, None, None)  # pyright: ignore[reportArgumentType]
+    store, state, far = OrbitStore(), np.array([0.1, 1 / 3]), np.array([0.2, 0.0])
+    for number, place in enumerate((state, far), 1):
+        known = Known.empty((number, 2), 2, 2)
+        store._keep(place.tobytes(), (_Closed(place, 1, np.ones(3), None, known), built))
+    store.recall([np.array([0.3, 0.0])], lambda: None, None)
+    for start in (
+        state,
+        np.array([[0.0, *state], [1.0, 5.0, 6.0]]),
+        np.array([[2.0, 1.0, *state]]),
+    ):
+        part = store.part(start)
+        assert len(part) == 1
+        found = part.begin(state)
+        assert found is not None
+        assert found[0].elements.state.shape[0] == 1
+    assert len(store.part(None)) == len(store.part(np.array([7.0, 8.0]))) == 0
+    again = pickle.loads(pickle.dumps(store.part(far)))
+    back = OrbitStore()
+    back.add(again)
+    found = back.begin(far)
+    assert found is not None
+    assert found[0].elements.state.shape[0] == 2
+    assert back.begin(state) is None
+    assert len(pickle.loads(pickle.dumps(store))) == 2
+
+
+@pytest.mark.parametrize("motion", ["reached", "worst", "ensemble"])
+def test_every_evaluator_travels(motion):
+    config = load("cic", [f"objective.motion={motion}"])
+    store = OrbitStore()
+    sent = with_orbits(evaluator_for(config), store)
+    assert single_of(sent).orbits is store
+    found = pickle.loads(pickle.dumps(sent))
+    assert type(found) is type(sent)
+    assert found.config == config
+    assert float(found.scene.speed) == float(sent.scene.speed)
+
+
+def test_classes_of_a_script_travel(tmp_path):
+    """A contact law that a script defines is part of its scene, and unknown to another process."""
+    script, task = tmp_path / "script.py", tmp_path / "task"
+    script.write_text(
+        "import sys\n"
+        "from rootsopt.runtime import environment\n"
+        "environment.use_float64()\n"
+        "import numpy as np\n"
+        "from rootsopt.config import load\n"
+        "from rootsopt.response.evaluation import Evaluator\n"
+        "from rootsopt.sweeps.evaluations import Elsewhere\n"
+        "from rootsopt.sweeps.worker import Settings\n"
+        "class Own(Evaluator):\n"
+        "    answer = 42\n"
+        "config = load('cic')\n"
+        "own = Own(config, Evaluator.of(config).scene)\n"
+        "class Client:\n"
+        "    status = 'running'\n"
+        "    def submit(self, function, settings, task, pure):\n"
+        f"        open({str(task)!r}, 'wb').write(task)\n"
+        "        sys.exit(0)\n"
+        "Elsewhere(None, Client(), Settings(())).evaluated(own, np.ones(3))\n"
+    )
+    subprocess.run([sys.executable, str(script)], check=True, env={**os.environ, "PYTHONPATH": "."})
+    evaluator, design, start = pickle.loads(task.read_bytes())
+    assert type(evaluator).answer == 42
+    assert design.tolist() == [1.0, 1.0, 1.0]
+    assert start is None
+
+
+def test_without_workers_evaluations_run_here():
+    with evaluating() as runs:
+        assert runs is HERE
+
+
+@pytest.mark.parametrize("command", [optimize, pareto])
+def test_commands_refuse_both_kinds_of_workers(command, tmp_path, capsys):
+    options = ["--workers", "2", "--scheduler", "tcp://127.0.0.1:1", "-o", str(tmp_path / "run")]
+    assert command.main(["configs/cic.yaml", *options]) == 2
+    assert "exclude each other" in capsys.readouterr().err
+    assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("command", "options", "file"),
+    [
+        ("optimize", ["optimizer.screening=4", "optimizer.starts=2"], "history.csv"),
+        ("pareto", ["pareto.points=3", "pareto.refinements=0"], "front.csv"),
+        (
+            "optimize",
+            [
+                "tolerances={over: {scene.speed_rpm: {normal: 30}}, samples: 4, check_samples: 8}",
+                "optimizer.screening=4",
+                "optimizer.starts=1",
+            ],
+            "tolerances.csv",
+        ),
+    ],
+    ids=["starts", "points of a front", "samples"],
+)
+def test_workers_find_the_same_to_the_last_bit(command, options, file, tmp_path):
+    sets = [part for option in options for part in ("--set", option)]
+    for name, more in (("here", []), ("there", ["--workers", "2"])):
+        run = [sys.executable, "-m", "rootsopt", command, "configs/cic.yaml", *sets, *more]
+        subprocess.run([*run, "--no-figures", "-o", str(tmp_path / name)], check=True)
+    here, there = ((tmp_path / name / file).read_bytes() for name in ("here", "there"))
+    assert here == there
