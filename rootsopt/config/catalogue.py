@@ -65,6 +65,7 @@ INVOLUTE_LENGTH = _Dependent(
     "involute parameter u",
     *(1e-9, 1e4),
     bounds_note="default: 10 % to 100 % of the longest involute",
+    floor=0.1,
 )
 TIP_ARC_ANGLE = _LandAngle(
     "tip_arc_angle_deg",

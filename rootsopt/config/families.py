@@ -70,6 +70,8 @@ class Parameter:
     `bounds_limits`: limits of the bounds, if they are narrower than `lowest` and `highest`.
     `bounds_note`: text for `--help` that replaces the generated description of the default bounds.
     `count`: least and greatest number of entries, if the key holds a list. `None`: a single number.
+    `floor`: default lower bound of a parameter in `Family.ranges`, as a fraction of the upper end
+    of its range. Bounds in the config replace it.
     """
 
     key: str
@@ -83,6 +85,7 @@ class Parameter:
     bounds_limits: Pair | None = None
     bounds_note: str = ""
     count: tuple[int, int] | None = None
+    floor: float = 0.0
 
     @property
     def argument(self) -> str:
@@ -186,8 +189,8 @@ class Family:
     are not checked.
 
     `ranges`: function of `lobes`, `pitch_radius_mm` and all parameters by key. It returns (low,
-    high) by key for parameters whose range depends on the others. The optimiser searches such a
-    parameter as a fraction of this range, within its bounds.
+    high) by key for parameters whose range depends on the others: all values of sound profiles. The
+    optimiser searches such a parameter as a fraction of this range, within its bounds.
 
     A subclass may override `make`, `check` and `dependent` instead of providing functions."""
 

@@ -380,10 +380,13 @@ class BoundsConfig(Section):
             pair = getattr(self, key)
             least, most = parameter.bounds_limits or (parameter.lowest, parameter.highest)
             if pair is not None and not least <= pair[0] < pair[1] <= most:
+                advice = hint(key, pair[0], least, most)
+                if pair[0] == pair[1]:
+                    near = pair[0] + 1e-3 * (abs(pair[0]) or 1.0)
+                    advice = f"; to hold it, give a narrow range, such as [{pair[0]:g}, {near:g}]"
                 raise ValueError(
                     f"`optimizer.bounds.{key}` must be two increasing numbers in "
-                    f"[{least:g}, {most:g}], but is {shown([*pair])}"
-                    + hint(key, pair[0], least, most)
+                    f"[{least:g}, {most:g}], but is {shown([*pair])}{advice}"
                 )
         twist = self.helix_deg
         if twist is not None and not -360 <= twist[0] < twist[1] <= 360:

@@ -46,6 +46,11 @@ def si_unit(key: str) -> float:
     return 1e-3 if key.endswith("_mm") else 1.0
 
 
+def words(key: str) -> str:
+    """Return a design parameter's name in words: `edge_radius_mm` gives "edge radius"."""
+    return key.removesuffix("_mm").removesuffix("_deg").replace("_", " ")
+
+
 def hint(key: object, value: float, low: float, high: float) -> str:
     """Return the end of a message that asks whether an out-of-range `value` is in another unit.
 

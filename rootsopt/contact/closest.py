@@ -56,11 +56,6 @@ _DONE = 16
 # between neighbouring minima that have a flag of their own.
 _MINIMA = 8
 _FLAGS = 3
-# ε (rad) below which a converged Newton search from perfect rolling is not trusted. Down to this ε,
-# and at the nominal centre distance, tests show that Newton finds the closest approach and no other
-# common normal. The exception is a fraction of the flank, about √|ε|, next to a cusp at the pitch
-# crossing.
-_USUAL = -5e-3
 # Distance of ν2 (rad) before the cusp at the pitch crossing below which a contact counts as the
 # minimum beyond the cusp. The two minima of the gap are several |ε| apart, and this limit lies
 # between them.
@@ -344,7 +339,7 @@ class FlankPair(eqx.Module):
         low, high = self.nodes.normal[0], self.nodes.normal[-1]
         absent = roll < contact_begins(relative)
         rolling = (low, high), jnp.clip(self.profile.normal_at(roll), low, high), ~absent, ~absent
-        usual = (relative <= 0) & (relative >= _USUAL)
+        usual = (relative <= 0) & (relative >= -self.profile.single_turn)
         if self.profile.cusp:
             usual &= roll < (1 - 5 * jnp.sqrt(jnp.abs(relative))) * self.profile.half_pitch
 

@@ -21,6 +21,19 @@ def bounds_of(config: Config) -> list[tuple[float, float]]:
     return [*found, twist] if config.twist_free and twist is not None else found
 
 
+def floors_of(config: Config) -> tuple[float, ...]:
+    """Return the default lower bound of each design parameter, as a fraction of its range's end.
+
+    It is 0 for parameters that have bounds in the config, or whose range depends on no other."""
+    found: list[float] = []
+    for parameter in family_of(config.profile.family).parameters:
+        values = getattr(config.profile, parameter.key)
+        count = len(values) if isinstance(values, tuple) else 1
+        given = getattr(config.optimizer.bounds, parameter.key) is not None
+        found += [0.0 if given else parameter.floor] * count
+    return (*found, 0.0) if config.twist_free else tuple(found)
+
+
 def widened(config: Config) -> tuple[Config, tuple[str, ...]]:
     """Return (config whose bounds hold its own design, keys of the widened bounds).
 

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.families import Family, family_of
-from rootsopt.config.units import DEG, MM
-from rootsopt.design.bounds import bounds_of
+from rootsopt.config.units import DEG, MM, si_unit, unit_of, words
+from rootsopt.design.bounds import bounds_of, floors_of
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.profiles.validity import ProfileMargins, margins
 from rootsopt.runtime.programs import Program
@@ -38,6 +38,9 @@ _SOUND = (
 )
 """Constraints that keep a profile sound, in addition to the constraint on the undercut margin. The
 columns are name, margin, unit, limit, scale and factor (see `Constraint`)."""
+
+_NARROW = 0.999
+"""Greatest lower bound of a parameter in `Space.ranges`, as a fraction of its upper bound."""
 
 
 class Constraint(eqx.Module):
@@ -75,24 +78,41 @@ class Constraint(eqx.Module):
         return self.sign * (value - self.limit) / self.scale
 
     def slack_of(
-        self, scene: Scene, profile: Profile, shape: Geometry, found: ProfileMargins | None
+        self,
+        space: "Space",
+        design: Float[Array, " d"],
+        profile: Profile,
+        shape: Geometry,
+        found: ProfileMargins | None,
     ) -> Float[Array, ""]:
-        """Return the slack of a design in a `scene`, given its `profile`; see `slack`."""
-        del scene, profile
+        """Return the slack of a `design` (d,) of a `space`, given its `profile`; see `slack`."""
+        del space, design, profile
         return self.slack(shape, found)
+
+
+class RangeConstraint(Constraint):
+    """A lower bound that the upper end of a parameter's range must reach.
+
+    The range depends on the other parameters; `quantity` is the parameter's key."""
+
+    def slack_of(self, space, design, profile, shape, found):
+        del profile, shape, found
+        return self.scaled(_NARROW * space.ranges(design)[self.quantity][1] * self.factor)
 
 
 class Space(eqx.Module):
     """The unit box of d design parameters, with m constraints.
 
     `scene`: builds profiles from designs; `lower`, `upper` (d,): bounds in config units;
-    `constraints`: the m constraints.
+    `constraints`: the m constraints; `floors` (d,): lower bounds as fractions of the upper end of a
+    range that depends on the other parameters, 0 where there is none.
     """
 
     scene: Scene
     lower: Float[Array, " d"]
     upper: Float[Array, " d"]
     constraints: tuple[Constraint, ...]
+    floors: tuple[float, ...] = eqx.field(static=True)
 
     @classmethod
     def of(
@@ -134,7 +154,9 @@ class Space(eqx.Module):
             rows_of = [row for row in _SOUND if row[1] not in family.inherent]
             constraints += tuple(_constraint(*row, margin=True) for row in rows_of)
         lower, upper = np.array(rows, dtype=float).T
-        return cls(scene, jnp.asarray(lower), jnp.asarray(upper), constraints + further)
+        constraints += tuple(_reaching(config)) + further
+        bounds = jnp.asarray(lower), jnp.asarray(upper)
+        return cls(scene, *bounds, constraints, floors_of(config))
 
     @property
     def family(self) -> Family:
@@ -145,7 +167,7 @@ class Space(eqx.Module):
         """Return the design (d,) in config units at `point` (d,) of the unit box."""
         limits = zip(self.lower, self.upper, point, strict=True)
         values = [low + (high - low) * share for low, high, share in limits]
-        for place, least, most in self._within(values):
+        for place, least, most in self.within(values):
             values[place] = least + (most - least) * point[place]
         return jnp.stack(values)
 
@@ -156,7 +178,7 @@ class Space(eqx.Module):
         values = jnp.clip(design, self.lower, self.upper)
         limits = zip(self.lower, self.upper, values, strict=True)
         shares = [(value - low) / (high - low) for low, high, value in limits]
-        for place, least, most in self._within(values):
+        for place, least, most in self.within(values):
             shares[place] = (values[place] - least) / (most - least)
         return jnp.clip(jnp.stack(shares), 0.0, 1.0)
 
@@ -170,14 +192,15 @@ class Space(eqx.Module):
         named = dict(zip(self.family.keys, self.family.split(values), strict=True))
         return dict(self.family.dependent(self.scene.lobes, radius, **named))
 
-    def _within(self, values):
+    def within(self, values):
         """Yield (index, low, high) of each parameter in `ranges`, with the range cut to its bounds.
 
         `values` (d,): the design. The index is that in the design; ranges are in config units."""
         for key, (least, most) in self.ranges(values).items():
             place = self.family.keys.index(key)
+            least = jnp.maximum(least, self.floors[place] * most)
             most = jnp.minimum(most, self.upper[place])
-            least = jnp.minimum(jnp.maximum(self.lower[place], least), 0.999 * most)
+            least = jnp.minimum(jnp.maximum(self.lower[place], least), _NARROW * most)
             yield place, least, most
 
     def slacks(self, point: Float[Array, " d"]) -> Float[Array, " m"]:
@@ -193,8 +216,7 @@ class Space(eqx.Module):
         profile = self.scene.profile(design)
         shape = geometry(profile)
         found = margins(profile) if any(c.margin for c in self.constraints) else None
-        scene = self.scene.at(design)
-        every = (c.slack_of(scene, profile, shape, found) for c in self.constraints)
+        every = (c.slack_of(self, design, profile, shape, found) for c in self.constraints)
         return jnp.stack([*every])
 
     def prepare(self) -> None:
@@ -217,6 +239,19 @@ def slacks_and_slopes(space: Space, point):
 
     (design_slope, slack_slope), (design, slack) = jax.jacfwd(both, has_aux=True)(point)
     return design, design_slope, slack, slack_slope
+
+
+def _reaching(config: Config):
+    """Yield a constraint for each lower bound in a `config` of a parameter in `Space.ranges`."""
+    family, profile = family_of(config.profile.family), config.profile
+    values = [jnp.asarray(getattr(profile, key)) for key in family.keys]
+    named = dict(zip(family.keys, values, strict=True))
+    for key in family.dependent(profile.lobes, jnp.asarray(profile.pitch_radius_mm), **named):
+        given = getattr(config.optimizer.bounds, key)
+        if given is not None:
+            factor, name = si_unit(key), f"greatest {words(key)}"
+            limit = jnp.asarray(given[0] * factor)
+            yield RangeConstraint(name, key, unit_of(key), limit, factor, factor)
 
 
 def _constraint(

@@ -54,7 +54,12 @@ def plot_prices(ax: Axes, constraints: Sequence[Mapping[str, Any]]) -> Axes:
         name, step = row["name"], f"{row['relaxed_by']:+g} {row['unit']}".strip()
         short = name if len(name) <= _WIDEST else f"{name[:_WIDEST]}…"
         names.append(f"{short}, {step}")
-    ax.barh(names, [-row["relaxed_objective_percent"] for row in rows], color=BLUE)
+    gains = [-row["relaxed_objective_percent"] for row in rows]
+    # Names may repeat, so that bars are placed by number.
+    bars = ax.barh(range(len(rows)), gains, color=BLUE)
+    ax.bar_label(bars, [f"{gain:.2g} %" for gain in gains], padding=3)
+    ax.set_yticks(range(len(rows)), names)
+    ax.margins(x=0.2)
     if not rows:
         ax.text(0.5, 0.5, "no limit holds the optimum", ha="center", transform=ax.transAxes)
         ax.set_yticks([])

@@ -46,11 +46,13 @@ class Infeasible(NamedTuple):
 
     `violation`: least possible value of the greatest scaled violation; `conflicts`: the constraints
     in conflict; `design`: design of least violation, in config units by key. If no design could be
-    evaluated, `violation` is NaN and the others are empty."""
+    evaluated, `violation` is NaN and the others are empty. `simulated`: whether limits of forces
+    count, so that few designs could be tried."""
 
     violation: float
     conflicts: tuple[Conflict, ...]
     design: dict[str, float]
+    simulated: bool = False
 
     @property
     def message(self) -> str:
@@ -69,8 +71,14 @@ class Infeasible(NamedTuple):
                 "Relaxing one of them is not enough. Relax all of them to their values in the "
                 "design of least violation, or widen optimizer.bounds."
             )
+        if self.simulated:
+            advice += (
+                " Limits of forces are searched for locally: optimizer.starts and "
+                "optimizer.screening look further."
+            )
+        found = "was found that" if self.simulated else "within optimizer.bounds"
         return (
-            "No design within optimizer.bounds satisfies all constraints. In conflict: "
+            f"No design {found} satisfies all constraints. In conflict: "
             f"{'; '.join(lines)}. {advice}"
         )
 
@@ -105,7 +113,7 @@ def explain(
 
     best = _best([descend(greatest, start, stops) for start in starts])
     if best is None or best.certificate is None or best.local is None:
-        return Infeasible(float("nan"), (), {})
+        return Infeasible(float("nan"), (), {}, look is not None)
     kinds = best.local.groups[0].tags[:, 0].astype(int)
     shares = np.bincount(kinds, best.certificate.shares[0])
     conflicts = []
@@ -115,7 +123,7 @@ def explain(
         conflicts.append(_conflict((*problem.space.constraints, *limits)[k], excess, alone))
     names = problem.config.design_keys
     design = dict(zip(names, map(float, problem.design(best.point)), strict=True))
-    return Infeasible(best.local.objective, tuple(conflicts), design)
+    return Infeasible(best.local.objective, tuple(conflicts), design, look is not None)
 
 
 def _geometry(problem: Problem, point: NDArray[np.float64]) -> Local | None:

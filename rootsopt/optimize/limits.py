@@ -28,10 +28,10 @@ class TermConstraint(Constraint):
 
     term: Term = eqx.field(kw_only=True)
 
-    def slack_of(self, scene, profile, shape, found):
+    def slack_of(self, space, design, profile, shape, found):
         del found
         nothing = Forces(*[jnp.asarray(jnp.nan)] * 3)
-        return self.scaled(self.term.value(scene, profile, shape, nothing))
+        return self.scaled(self.term.value(space.scene.at(design), profile, shape, nothing))
 
 
 class ForceLimit(NamedTuple):

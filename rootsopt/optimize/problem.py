@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from rootsopt.config import Config
-from rootsopt.config.units import unit_of
-from rootsopt.design.space import Space, slacks_and_slopes
+from rootsopt.config.units import unit_of, words
+from rootsopt.design.space import RangeConstraint, Space, slacks_and_slopes
 from rootsopt.dynamics.measures import line_name
 from rootsopt.errors import InputError
 from rootsopt.optimize.certificate import NEAR, Certificate
@@ -62,10 +62,11 @@ def _nearest(space: Space, design):
 
 @Program
 def _ranges(space: Space, design):
-    """Return {key: (low, high)} for the parameters whose range depends on other parameters.
+    """Return {key: (high, least, most)} for the parameters whose range depends on others.
 
-    The bounds in the config do not affect the result."""
-    return space.ranges(design)
+    `high`: upper end of the range, whatever the bounds; `least`, `most`: ends within the bounds."""
+    within = {space.family.keys[place]: ends for place, *ends in space.within(design)}
+    return {key: (high, *within[key]) for key, (_, high) in space.ranges(design).items()}
 
 
 _slacks_of = Program(Space.slacks_of)
@@ -435,7 +436,7 @@ class Problem:
         always = self._always(optimized)
         for k, c in enumerate(self.space.constraints):
             limit = float(c.limit) / c.factor
-            if c.margin:
+            if c.margin or isinstance(c, RangeConstraint):
                 before, after = (self._margin(one, k) for one in (self.baseline, optimized))
             elif isinstance(c, TermConstraint):
                 before, after = (one.response[c.quantity] for one in (self.baseline, optimized))
@@ -521,12 +522,12 @@ class Problem:
         low, high = (np.array(x) for x in (self.space.lower, self.space.upper))
         limited = dict.fromkeys(names, False)
         rows = []
-        for key, (least, most) in ranges.items():
+        for key, (end, least, most) in ranges.items():
             place = names.index(key)
-            before, after, limit = self.baseline.design.get(key), optimized.design[key], float(most)
+            before, after, limit = self.baseline.design.get(key), optimized.design[key], float(end)
             row = _row(words(key), before, after, limit, unit_of(key), limit - after, "<=")
             limited[key] = limit <= high[place]
-            low[place], high[place] = max(low[place], float(least)), min(high[place], limit)
+            low[place], high[place] = float(least), float(most)
             if certificate is not None:
                 width = max(high[place] - low[place], 1e-300)
                 per_unit = certificate.upper[place] / width if limited[key] else 0.0
@@ -546,6 +547,8 @@ class Problem:
                 slack = (design[place] - limit) / width * (1 if sense == ">=" else -1)
                 before, after = self.baseline.design.get(key), float(design[place])
                 name, unit = f"{side} bound of {words(key)}", unit_of(key)
+                if side == "lower" and self.space.floors[place]:
+                    name += f" ({100 * self.space.floors[place]:g} %)"
                 row = _row(name, before, after, float(limit), unit, slack, sense)
                 rows.append(row | self._multiplier(row, multiplier / width, optimized))
         return rows
@@ -600,11 +603,6 @@ def _step(unit: str, limit: float) -> float:
     return 10.0 ** (round(math.log10(abs(limit))) - 2)
 
 
-def words(key: str) -> str:
-    """Return a design parameter's name in words: `edge_radius_mm` gives "edge radius"."""
-    return key.removesuffix("_mm").removesuffix("_deg").replace("_", " ")
-
-
 def _row(name, before, after, limit, unit, slack, sense) -> dict:
     return {
         "name": name,
@@ -618,4 +616,4 @@ def _row(name, before, after, limit, unit, slack, sense) -> dict:
     }
 
 
-__all__: Sequence[str] = ["FEASIBLE", "Problem", "words"]
+__all__: Sequence[str] = ["FEASIBLE", "Problem"]

@@ -40,6 +40,9 @@ _STATISTICS = {
 }
 _WIDEST_DESIGN = 5
 """Number of design parameters above which the table of a front leaves out the designs."""
+_UNSURE = 0.5
+"""Estimated share of further starts with a new optimum above which the table recommends more
+starts."""
 _Rows = Iterable[tuple[str | Text, ...]]
 
 
@@ -206,7 +209,10 @@ def _optima(optimality: Mapping[str, Any]) -> list[tuple[str, ...]]:
         rows.append((f"optimum {number}", times, _number(one["objective"])))
     share = optimality["unseen"]["share_of_starts"]
     if rows and share is not None:
-        rows.append(("further starts that would find a new one", f"{100 * share:.3g} %", ""))
+        name = "chance that a further start finds a new one"
+        if share > _UNSURE:
+            name += " (few starts: raise optimizer.starts)"
+        rows.append((name, f"{100 * share:.3g} %", ""))
     return rows
 
 

@@ -226,6 +226,15 @@ class Profile(eqx.Module):
         return True
 
     @property
+    def single_turn(self) -> float:
+        """Relative rotation (rad) below which the gap is trusted to have no second, deeper minimum.
+
+        Down to ε = -`single_turn`, and at the nominal centre distance, the contact search accepts
+        the minimum near the point of perfect rolling, if Newton's method converges to it. A
+        fraction of the flank next to a cusp, about √|ε|, is excluded. Tests confirm the value."""
+        return 1e-3
+
+    @property
     def wavy(self) -> bool:
         """Whether the gap may have any number of minima, because the curvature may rise and fall.
 

@@ -143,6 +143,10 @@ class CIC(Profile):
         return jnp.where(nu > self.arc_end, involute, arc)
 
     @property
+    def single_turn(self) -> float:
+        return 5e-3
+
+    @property
     def cusp(self) -> bool:
         return False
 

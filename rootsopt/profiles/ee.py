@@ -39,6 +39,10 @@ class EE(Profile):
         return self.pitch_radius / self.lobes * jnp.sin(beyond_pitch)
 
     @property
+    def single_turn(self) -> float:
+        return 5e-3
+
+    @property
     def turn_ratio(self) -> float:
         return self.lobes / (1 + self.lobes)
 

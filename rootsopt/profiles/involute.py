@@ -26,9 +26,8 @@ their points touch nothing on the other rotor."""
 _LEAST_INVOLUTE = 0.002
 """Involute length (fraction of the longest) below which a config is rejected. A shorter involute
 has no effect, and its length was probably given in metres."""
-_SHORTEST = 0.1
-"""Least involute length (fraction of the longest) that a search tries. The bounds in a config can
-only raise this limit."""
+_INSIDE = 1 + 1e-6
+"""Factor by which a search stays away from the lower limits of a config."""
 
 
 def ranges(
@@ -38,7 +37,7 @@ def ranges(
     involute_length_mm: Float[Array, ""],
     tip_arc_angle_deg: Float[Array, ""] | float = 0.0,
 ) -> dict[str, tuple[Float[Array, ""], Float[Array, ""]]]:
-    """Return {"involute_length_mm": (shortest, longest)}, the range (mm) in which a search stays.
+    """Return {"involute_length_mm": (shortest, longest)}, the range (mm) that `check` accepts.
 
     The range follows from the number of lobes `lobes`, the pitch radius `pitch_radius_mm`, the
     pressure angle `pressure_angle_deg` and half the tip land's angle, `tip_arc_angle_deg`.
@@ -46,8 +45,11 @@ def ranges(
     u_max holds by construction."""
     del involute_length_mm
     half = jnp.pi / (2 * lobes)
-    longest = pitch_radius_mm * jnp.sin(pressure_angle_deg * DEG) * (half - tip_arc_angle_deg * DEG)
-    return {_LENGTH: (_SHORTEST * longest, longest)}
+    base = pitch_radius_mm * jnp.sin(pressure_angle_deg * DEG)
+    longest = base * (half - tip_arc_angle_deg * DEG)
+    touching = longest - base * 2 * pressure_angle_deg * DEG + _CLEAR * pitch_radius_mm
+    shortest = _INSIDE * jnp.maximum(_LEAST_INVOLUTE * longest, touching)
+    return {_LENGTH: (shortest, longest)}
 
 
 def check(profile: "ProfileConfig") -> None:

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rootsopt.config.units import words
 from rootsopt.optimize.certificate import Certificate
-from rootsopt.optimize.problem import words
 from rootsopt.tradeoffs.front import FrontPoint, Gap, Standing, dominated, ordered, repeated
 from rootsopt.tradeoffs.gaps import Bisections, Edge, Pair, Spacing, along, among, measured
 from rootsopt.tradeoffs.scalar import Scalar, Scale, rates

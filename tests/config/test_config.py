@@ -334,6 +334,12 @@ def test_bounds_are_two_increasing_numbers(value):
     assert "optimizer.bounds.involute_length_mm" in message
 
 
+def test_equal_bounds_are_refused_with_a_narrow_range():
+    """A parameter is held by a narrow range, which the message suggests."""
+    message = refusal(MINIMAL, "optimizer.bounds.tip_arc_angle_deg=[4, 4]")
+    assert "to hold it, give a narrow range, such as [4, 4.004]" in message
+
+
 # Ranges, units, choices
 
 

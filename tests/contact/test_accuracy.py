@@ -11,17 +11,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rootsopt.config import load
+from rootsopt.config import load, parse
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.map import MapContact
 from rootsopt.contact.nodes import pair_gap
 from rootsopt.contact.size import RELATIVES, ROLLS, size_map
 from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, FreeForm
+from rootsopt.profiles.validity import margins
 from rootsopt.response import choice
 from rootsopt.response.batch import coarse, respond_many
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
+from rootsopt.scene.families import check, profile_of
 from rootsopt.status import Status
 
 R = 0.033
@@ -180,6 +182,40 @@ def test_deepest_of_several_minima_is_found_on_a_wavy_flank(seed):
         # The contact jumps once, from the first minimum to the second.
         assert np.abs(np.diff(found.normal2[-100:])).max() > 0.15
         assert np.sum(np.diff(found.rank[-100:]) != 0) >= 1
+
+
+@pytest.mark.parametrize(
+    ("family", "design"),
+    [
+        ("four_arcs", (23.964, 20.659, 34.22)),
+        pytest.param("five_arcs", (42.343, 10.22, 22.498, 12.356), marks=pytest.mark.long),
+    ],
+)
+def test_deeper_minimum_away_from_rolling_is_found(family, design):
+    """On a sound profile whose gap has two minima, the search finds the deeper one.
+
+    Newton's method from perfect rolling converges to the other one. For less relative rotation than
+    `Profile.single_turn`, it need not be suspected."""
+    profile = profile_of(family, 3, jnp.asarray(R), jnp.asarray(design))
+    assert all(float(value) >= -1e-9 for value in margins(profile))
+    rng = np.random.default_rng(0)
+    roll = jnp.asarray(np.append(rng.uniform(0.1, 0.3, 100), rng.uniform(-0.05, 0.5, 100)))
+    turn = np.append(rng.uniform(2e-3, 5e-3, 100), 10 ** rng.uniform(-5, -2.4, 100))
+    sampled = _sampled(FlankPair.of(profile), roll, jnp.asarray(-turn))
+    deepest, count, found = jax.tree.map(np.asarray, sampled)
+    touching = found.found & (deepest < -1e-7) & (deepest > -1e-3)
+    assert np.sum(touching & (count > 1)) > 5
+    np.testing.assert_allclose(found.gap[touching], deepest[touching], rtol=0, atol=5e-8)
+
+
+def test_ellipse_that_turns_back_is_refused():
+    """An ellipse whose contact turns back, and whose gap has several minima, is not sound."""
+    with open("configs/cic.yaml", encoding="utf-8") as file:
+        rest = file.read().split("\nrotor:")[1]
+    keys = "family: ellipse, lobes: 3, pitch_radius_mm: 33.0, ellipse_center_mm: 30.55"
+    settings = parse(f"profile: {{{keys}, ellipse_height_mm: 18.90}}\nrotor:{rest}")
+    with pytest.raises(InputError, match="move the centre, or change the height"):
+        check(settings.profile)
 
 
 @pytest.mark.parametrize("name", ["paper", "short", "epicycloid"])

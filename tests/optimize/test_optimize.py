@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from rootsopt.config import parse
-from rootsopt.design.space import sobol
+from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
 from rootsopt.optimize.infeasible import explain
 from rootsopt.optimize.problem import Problem
@@ -25,6 +25,7 @@ from rootsopt.optimize.search import Search, until_stopped
 from rootsopt.profiles import geometry
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.scene import Scene
+from rootsopt.scene.families import check, with_design
 from rootsopt.status import Status
 
 SCENE = """
@@ -39,6 +40,9 @@ scene:
   timing_gear: {stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.5, backlash_mm: 0.1}
 constraints: {seal_width_min_mm: 2.0}
 """
+
+
+INVOLUTE, ANGLE = "optimizer.bounds.involute_length_mm", "optimizer.bounds.pressure_angle_deg"
 
 
 def config(*overrides):
@@ -86,6 +90,44 @@ def test_involute_never_exceeds_its_longest(problem):
         design = problem.space.design(jnp.asarray(point))
         longest = problem.space.scene.profile(design).longest_involute
         assert float(design[1]) <= float(longest) * 1e3 * (1 + 1e-12)
+
+
+def space_of(*overrides):
+    settings = config(*overrides)
+    return settings, Space.of(settings, Scene.from_config(settings), 0.3)
+
+
+def test_bounds_of_the_involute_replace_its_default_floor():
+    """By default, the shortest involute is a tenth of the longest. A bound may be below this."""
+    point = jnp.array([0.5, 0.0, 0.5])
+    for overrides, share, least in (([], 0.1, 0.0), ([f"{INVOLUTE}=[0.3, 30]"], 0.0, 0.3)):
+        _, space = space_of(*overrides)
+        design = space.design(point)
+        longest = 1e3 * float(space.scene.profile(design).longest_involute)
+        assert longest > 5
+        assert float(design[1]) == pytest.approx(max(share * longest, least), rel=1e-12)
+    settings, space = space_of(f"{INVOLUTE}=[0.001, 30]", f"{ANGLE}=[14, 45]")
+    for angle in (0.0, 0.1, 1.0):
+        for tip in (0.0, 1.0):
+            design = space.design(jnp.array([angle, 0.0, tip]))
+            check(with_design(settings.profile, design))  # no shorter one would be sound
+
+
+def test_bound_above_the_longest_involute_is_a_constraint():
+    """Where the longest involute is below its lower bound, the design is infeasible."""
+    settings = config(f"{INVOLUTE}=[11, 30]")
+    problem = Problem.of(settings, Scene.from_config(settings), baseline(settings))
+    names = [one.name for one in problem.space.constraints]
+    place = names.index("greatest involute length")
+    met = 0
+    for point in sobol(16, 5):
+        slack = problem.look(point)[2][place]
+        longest = 1e3 * float(problem.space.scene.profile(problem.design(point)).longest_involute)
+        assert slack == pytest.approx(0.999 * longest - 11, abs=1e-9)
+        moved = problem.project(point)
+        met += problem.feasible(moved)
+        assert not problem.feasible(moved) or float(problem.design(moved)[1]) >= 11 - 1e-5
+    assert met > 0
 
 
 def test_projection_makes_feasible_and_keeps_feasible_points(problem):

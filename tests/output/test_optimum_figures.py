@@ -5,7 +5,7 @@ import pytest
 
 from rootsopt.config import load
 from rootsopt.figures.comparison import plot_departure, plot_forces_together
-from rootsopt.figures.optimum import plot_starts
+from rootsopt.figures.optimum import plot_prices, plot_starts
 from rootsopt.figures.style import figure
 from rootsopt.response.evaluation import Series
 from rootsopt.scene import outline_mm
@@ -51,6 +51,18 @@ def test_forces_begin_at_the_same_rotation():
     assert ax.get_xlim() == pytest.approx((0, 120))
     there = np.interp(second[:, 0], *first.T)
     np.testing.assert_allclose(there, second[:, 1], atol=1e-3)
+
+
+def test_every_price_has_a_bar_with_its_number():
+    """Prices of limits with the same name have bars of their own, the dearest on top."""
+    row = {"name": "peak force", "unit": "N", "relaxed_by": 1.0, "multiplier": -1.0}
+    rows = [row | {"relaxed_objective_percent": gain} for gain in (-2.0, -0.003)]
+    rows.append(row | {"relaxed_objective_percent": -5.0, "multiplier": 0.0})
+    _, axes = figure(6, 4)
+    ax = plot_prices(axes[0, 0], rows)
+    assert [bar.get_width() for bar in ax.patches] == [0.003, 2.0]
+    assert [text.get_text() for text in ax.texts] == ["0.003 %", "2 %"]
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["peak force, +1 N"] * 2
 
 
 def test_ends_of_searches_are_drawn_with_their_optima():

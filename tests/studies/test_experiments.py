@@ -357,6 +357,16 @@ def test_landscape(tmp_path, programs):
 
 
 @pytest.mark.long
+def test_prices(tmp_path, programs):
+    """The price of a limit is the slope of the optimal objective, found again on either side."""
+    run("prices", tmp_path, programs)
+    (row,) = rows_of(tmp_path / "prices.csv")
+    assert row["limit"] == "area efficiency"
+    assert float(row["price"]) > 0
+    assert float(row["by_moving"]) == pytest.approx(float(row["price"]), rel=0.02)
+
+
+@pytest.mark.long
 def test_geometry(tmp_path, programs):
     """Area and inertia are those of the polygons, in every family of the reduced run."""
     run("geometry", tmp_path, programs)

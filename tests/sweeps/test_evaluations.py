@@ -14,7 +14,7 @@ from rootsopt.commands import optimize, pareto
 from rootsopt.config import load
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.evaluation import Evaluator, _build
 from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.orbits import Built, OrbitStore, _Closed
 from rootsopt.response.runs import HERE, Runs
@@ -128,7 +128,9 @@ def test_a_scheduler_without_workers_is_given_up(monkeypatch):
 
 
 def test_orbits_travel_with_the_states_that_name_them():
-    built = Built(None, None, None, None)  # pyright: ignore[reportArgumentType]
+    config = load("cic")
+    pair, *_ = _build.result_shape(Scene.from_config(config), design_vector(config))
+    built = Built(pair, pair, None, None)  # pyright: ignore[reportArgumentType]
     store, state, far = OrbitStore(), np.array([0.1, 1 / 3]), np.array([0.2, 0.0])
     for number, place in enumerate((state, far), 1):
         known = Known.empty((number, 2), 2, 2)
