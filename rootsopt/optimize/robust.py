@@ -273,7 +273,8 @@ class TolerantSearch:
         expected, lock, ended = before + total // per, threading.Lock(), [0]
 
         def tick() -> bool:
-            # A design of the search needs `per` simulations: count so many as one evaluation.
+            # A design of the search needs `per` simulations, so count `per` simulations as one
+            # evaluation.
             with lock:
                 ended[0] += 1
                 if ended[0] % per == 0:
