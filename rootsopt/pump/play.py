@@ -15,11 +15,11 @@ from rootsopt.profiles import Profile
 from rootsopt.pump.section import both_flanks, flank_points, half_valley
 
 POINTS = 1000
-"""Number of points per segment of a flank. The angles are then exact to some 1e-6 of a radian, and
-mostly to 1e-8."""
+"""Number of points per segment of a flank. The angles are then accurate to about 1e-6 rad, and
+mostly to 1e-8 rad."""
 POSES = 96
-"""Number of angles of rotor 1 over one lobe pitch, a multiple of 4: the poses in which the pitch
-crossings touch are among them."""
+"""Number of angles of rotor 1 over one lobe pitch. It is a multiple of 4, so that the poses in
+which the pitch crossings touch are included."""
 
 
 class Play(eqx.Module):
@@ -81,8 +81,9 @@ def play(
 
 
 def _least(values: Float[Array, "k n"]) -> Float[Array, ""]:
-    """Return the least of the `values` along k smooth curves, with the parabola through its
-    neighbours."""
+    """Return the least of `values`, refined by a parabola through it and its two neighbours.
+
+    `values` (k, n): n samples on each of k smooth curves."""
     fixed = lax.stop_gradient(values)
     row, column = jnp.unravel_index(jnp.argmin(fixed), fixed.shape)
     column = jnp.clip(column, 1, values.shape[1] - 2)
