@@ -389,7 +389,7 @@ def _solved_by_diffrax(
     samples: int,
     adjoint: diffrax.AbstractAdjoint,
 ) -> _Recorded:
-    """Return the same as `_solved`, differentiable in reverse mode by the diffrax `adjoint`."""
+    """Return the results of `_solved`, differentiable in reverse mode by the diffrax `adjoint`."""
     dtype = start.dtype
     solution = diffrax.diffeqsolve(
         _over_unit(equation, periods),

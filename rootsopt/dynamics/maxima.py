@@ -42,7 +42,8 @@ _CLOSER, _ROUNDS = 16, 10
 _CHUNK = 32
 """Number of steps linearised together, as arrays."""
 _DIP = 1e-6
-"""Fall of the force between two maxima (fraction of the lower one) below which they are one."""
+"""Fall of the force between two maxima (fraction of the lower one) below which they count as one
+maximum."""
 _LEAST = 1e-3
 """Fraction of the greatest force below which a maximum is left out."""
 _SHOULDER = 0.02
@@ -110,7 +111,7 @@ def prepare_maxima(
 
 
 def _room(samples: int, steps: int) -> int:
-    """Return the number of times that one call of `_forces` takes at most in the first scan."""
+    """Return the maximum number of times that one call of `_forces` gets in the first scan."""
     return samples + steps + 1
 
 

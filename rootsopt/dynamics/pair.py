@@ -51,9 +51,8 @@ class FlankForce(NamedTuple):
     of the gap (see `Edges`) and its rate (rad/s), None for a contact whose gap is continuous.
 
     For twisted rotors, forces, torques and `push` are sums over the slices, and the levers are
-    means. `edges` then holds the mean of what each slice has, or of its penetration (m) and rate
-    (m/s): a jump in one slice is a kink of this mean.
-    """
+    means. `edges` then holds the mean of the slices' edges, or of their penetrations (m) and rates
+    (m/s). A jump in one slice is a kink of this mean."""
 
     drive: Float[Array, "*n"]
     coast: Float[Array, "*n"]
@@ -120,10 +119,9 @@ class Margins(NamedTuple):
     `values` (s,): one *margin* for each flag of `RotorPair.switches`, positive where the flag is
     set. With a `NearContact`, each margin is zero at the instant at which its flag changes, and
     smooth around this instant. `counts` (s,): whether each flag matters. The flags of a flank
-    matter where the flank transmits a force. `places`: `Approach.place` of the flanks that can
-    touch, or of drive and coast flanks if both can touch; `pushes` (sides,): whether these flanks
-    transmit a force.
-    """
+    matter where the flank transmits a force. `places`: `Approach.place` of each flank that can
+    touch (two if drive and coast flanks both can). `pushes` (sides,): whether these flanks transmit
+    a force."""
 
     values: Float[Array, " s"]
     counts: Bool[Array, " s"]

@@ -339,7 +339,8 @@ class _Attempts(eqx.Module):
         return jnp.where(jnp.any(fits), periods[jnp.argmax(fits)], 0)
 
     def _unsettled(self, window: Window) -> Int[Array, ""]:
-        """Return the status code of a motion that has not settled, judged by a `window` of it."""
+        """Return the status code of the motion, judged by a `window` of it, as `window_status`
+        does."""
         if not self.solver.windows:
             return jnp.asarray(Status.NOT_SETTLED.code)
         return window_status(self.pair, window)

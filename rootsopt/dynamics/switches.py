@@ -48,8 +48,8 @@ _GRADES = 8.0, 64.0
 around it. They keep the neighbouring steps short, in case the switch occurs slightly outside its
 short step."""
 _HOLDS = 2.5
-"""Length of a step (multiples of the greatest half length of a short step around a switch) below
-which the step is never halved, because it may be such a short step."""
+"""Length of a step below which the step is never halved, in multiples of the greatest half length
+of a short step around a switch. The step may be such a short step."""
 _APART = 1e-10
 """Distance (mesh periods) below which two step ends are merged."""
 
