@@ -365,13 +365,12 @@ class Evaluator:
         return dataclasses.replace(self, scene=scene, map_error=wanted.error / depth)
 
     def _refitted(self, pair: RotorPair, found: Steady) -> "Evaluator | None":
-        """Return another evaluator whose contact map fits the motion `found`, or None if the
-        present map fits.
+        """Return another evaluator whose contact map fits the motion `found`; None if the present
+        map fits.
 
         A map must cover the motion. If the motion uses only a small part of the map, resolution is
         wasted, and the map is replaced. This is done only once, so that neighbouring designs share
-        a map.
-        """
+        a map."""
         status, reached = Status.of(found.status), _reached(pair, found)
         return self.reaching(reached, status is Status.PERIODIC, pair.angle_limit)
 
