@@ -9,7 +9,7 @@ from rootsopt.config.words import shown
 
 
 class ParetoConfig(Section):
-    """The terms that `rootsopt pareto` trades against each other, and how finely."""
+    """The terms that `rootsopt pareto` trades against each other, and the number of points."""
 
     terms: tuple[str, ...] = Field(
         ("peak_force_N", "area_efficiency"),

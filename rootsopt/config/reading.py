@@ -48,8 +48,8 @@ from rootsopt.config.words import named, placed, sentence, shown
 from rootsopt.errors import InputError
 
 _MOST_PARTS = 8
-"""Number of dotted parts in a key above which an override is rejected. Config keys have at most 3.
-"""
+"""Number of dotted parts in a key above which an override is rejected. Config keys have at most
+three parts."""
 
 
 class Config(Section):
@@ -148,8 +148,10 @@ class Config(Section):
         return data
 
     def _entry(self, key: str) -> tuple[str, int]:
-        """Return (name, place) of the entry of a list that a `key` such as
-        `profile.coefficients_3` names; ("", 0) for any other key."""
+        """Return (name, place) of the list entry that a `key` such as `profile.coefficients_3`
+        names.
+
+        For any other key, return ("", 0)."""
         section, _, entry = key.partition(".")
         name, _, number = entry.rpartition("_")
         single = entry in self.profile.parameters
@@ -165,8 +167,8 @@ class Config(Section):
     def moved(self, values: Mapping[str, float]) -> "Config":
         """Return a copy in which some numbers are replaced, without checking them.
 
-        `values`: new numbers by dotted key, as `scatterable` lists them. Design parameters are
-        replaced as well."""
+        `values`: new numbers by dotted key. The keys, design parameters included, are those that
+        `scatterable` lists."""
         data: Config = self
         design = {f"profile.{key}": k for k, key in enumerate(self.design_keys)}
         for key, value in values.items():

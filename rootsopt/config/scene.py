@@ -222,7 +222,7 @@ def _none_for_auto(value: Any) -> Any:
 
 
 class WearConfig(Section):
-    """Metal that the flanks have lost, or gained by a coating, since they were drawn."""
+    """Material that the flanks have lost since they were drawn, or gained by a coating."""
 
     offset_mm: Annotated[float, Field(ge=-1, le=1)] = Field(
         0.0, description="normal offset that each rotor has lost everywhere; negative: gained"
@@ -308,7 +308,8 @@ class SupportsConfig(Section):
 
 
 class BearingsConfig(Section):
-    """The rotors' bearings and what loads them beside the flanks: gas, gear teeth, weight.
+    """The rotors' bearings, and their loads other than those of the flanks: gas, gear teeth,
+    weight.
 
     With `scene.supports`, these forces also move the axes."""
 
@@ -331,7 +332,7 @@ class BearingsConfig(Section):
 
 
 class HeatConfig(Section):
-    """Thermal growth of rotors and housing, each at one temperature, since they were measured."""
+    """Thermal growth of rotors and housing since they were measured. Each has one temperature."""
 
     rotor_warming_K: Annotated[float, Field(ge=-200, le=500)] = Field(
         0.0, description="rise of the rotors' temperature"
@@ -348,7 +349,7 @@ class HeatConfig(Section):
 
     @property
     def strain(self) -> float:
-        """Growth of the housing over that of the rotors, as a fraction of every length."""
+        """Growth of the housing minus that of the rotors, as a fraction of any length."""
         housing = self.housing_expansion_per_K * self.housing_warming_K
         return housing - self.rotor_expansion_per_K * self.rotor_warming_K
 
