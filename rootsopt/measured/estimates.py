@@ -1,7 +1,6 @@
 """Estimates of an outline's scatter, centre and unit from its points alone.
 
-The estimates are offered in messages and reported. None is used unless the config asks for it.
-"""
+Messages and results state the estimates. No estimate is used unless the config asks for it."""
 
 import dataclasses
 import math
@@ -148,7 +147,7 @@ class Estimates:
 
 
 def _two(length: float) -> str:
-    """Format a length (mm) as text in micrometres, with two digits."""
+    """Format a length (mm) as text in micrometres, with two significant digits."""
     return f"{float(f'{length * 1e3:.2g}'):g}"
 
 
