@@ -17,7 +17,7 @@ from typing import Any
 OK, BAD_INPUT, NO_RESULT = 0, 2, 3
 _NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 _GONE = (errno.EPIPE, errno.EBADF, errno.ESHUTDOWN)
-"""Numbers of the errors that mean that nobody reads a stream. They do not change the exit code."""
+"""Error numbers (errno) that mean that nobody reads a stream. They do not change the exit code."""
 _WAITING = "rootsopt signals"
 _SHOW_CURSOR = "\x1b[?25h"
 
@@ -185,7 +185,7 @@ class _Stream:
 
 
 def _nowhere(number: int) -> None:
-    """Redirect the file descriptor `number` to the null device."""
+    """Redirect the file descriptor `number` to the null device, which discards all output."""
     with contextlib.suppress(OSError):
         null = os.open(os.devnull, os.O_RDWR)
         if null != number:
