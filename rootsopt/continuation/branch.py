@@ -42,7 +42,7 @@ count as equal. A branch whose steps have become too small there ends at an orbi
 (`End.HALVED`)."""
 _SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
 """Distances (unit of `StepSizes`) from a period doubling at which the orbit of twice the period is
-searched for, in this order."""
+tried, in this order."""
 
 
 class Kind(enum.Enum):
