@@ -110,7 +110,7 @@ def likeness(profile: Profile, family: str) -> Likeness | None:
     found = [_fitted(look, sample[k], high - low) for k in np.argsort(faults)[:_STARTS]]
     if not family_of(family).by_limits:
         return _best(look, profile, found)
-    # The limits in closed form also admit profiles with slightly negative margins.
+    # The closed-form limits also allow profiles with slightly negative margins.
     free = _Look(profile, family, limited=False)
     return _best(free, profile, [*found, *(_fitted(free, one, high - low) for one in found)])
 

@@ -45,9 +45,8 @@ class Constraint(eqx.Module):
 
     `name`: name in reports; `quantity`: name of the limited field of `Geometry`, or of
     `ProfileMargins` if `margin` is true; `limit`: limit in SI units; `scale`: divisor (SI) that
-    brings the slack to the order of one; `unit`: unit in reports; `factor`: SI value of one
-    such unit.
-    """
+    makes slacks comparable, about the size of the limit; `unit`: unit in reports; `factor`: SI
+    value of one such unit."""
 
     name: str = eqx.field(static=True)
     quantity: str = eqx.field(static=True)
@@ -77,7 +76,7 @@ class Constraint(eqx.Module):
     def slack_of(
         self, scene: Scene, profile: Profile, shape: Geometry, found: ProfileMargins | None
     ) -> Float[Array, ""]:
-        """Return the slack of a design in a `scene`, given its `profile`; see `slack`."""
+        """Return the scaled slack of a design in a `scene`, given its `profile` (see `slack`)."""
         del scene, profile
         return self.slack(shape, found)
 
