@@ -1,4 +1,4 @@
-"""What a sweep shows and writes beside its dataset: rows, a summary, tables for the terminal."""
+"""Rows, summary and terminal tables of a sweep, which are written beside its dataset."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -18,9 +18,9 @@ from rootsopt.sweeps.table import is_numeric, written
 
 _SHOWN = ("mean_force_N", "peak_force_N", "rms_force_N")
 _FEW = 40
-"""Number of points above which the terminal shows a summary only."""
+"""Number of points above which the terminal shows only a summary."""
 _NARROW = 3
-"""Number of keys above which the terminal shows a summary only."""
+"""Number of keys above which the terminal shows only a summary."""
 
 
 def rows_of(plan: Plan, records: Mapping[int, Row]) -> list[dict[str, Any]]:

@@ -31,7 +31,7 @@ _SHEET_FORCES = (
     "axial_force_max_N",
     "tilting_moment_max_N_m",
 )
-"""Forces in the pump sheet."""
+"""Keys of the forces that the pump sheet shows."""
 _STATISTICS = {
     "mean": "mean",
     "sigma": "standard deviation",
