@@ -11,9 +11,9 @@ from rootsopt.status import Status
 from rootsopt.tradeoffs.front import Standing
 
 _WIDEST = 6
-"""Number of cases above which the numbers of each case are left out."""
+"""Number of cases above which the table omits the numbers of each case."""
 _MOST_ROWS = 200
-"""Number of scenes above which a table of a sweep is cut off."""
+"""Number of scenes above which the table of a sweep is truncated."""
 _GOOD = {"satisfied", "active", "met by all", "certified", "converged", "geometry_only"}
 
 
@@ -145,7 +145,8 @@ def pump_block(run: Run) -> Block | None:
 
 
 def list_block(title: str, rows: Sequence[Mapping[str, Any]], note: str = "") -> Block | None:
-    """Return a table of rows {key: value} with one column per key that has a value somewhere."""
+    """Return a table of rows {key: value}, with one column for each key that has a value in some
+    row."""
     keys = [key for key in dict.fromkeys(key for row in rows for key in row)
             if any(fitting(row).get(key) is not None for row in rows)]  # fmt: skip
     if not keys:
