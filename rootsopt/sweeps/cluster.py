@@ -1,9 +1,9 @@
 """Simulates points of a sweep in other processes and on other machines, by Dask distributed.
 
 Points travel in small chunks. Only the process that collects them writes them down, and it knows
-each point by its number. If a worker dies, the scheduler gives its chunks to another one; a chunk
-that ends several workers is divided into its points, and a point that does so is a status.
-Processes are spawned, never forked, because JAX has threads."""
+each point by its number. If a worker dies, the scheduler gives its chunks to another one. A chunk
+that ends several workers is divided into its points. A point that ends several workers gets a
+status of its own. Processes are spawned, never forked, because JAX has threads."""
 
 import contextlib
 import logging
@@ -32,7 +32,7 @@ _MISSING = (
 _CHUNKS = 8
 """Number of chunks per worker into which a sweep is divided, so that all workers end together."""
 _LARGEST = 32
-"""Greatest number of points in a chunk: a killed worker loses at most these."""
+"""Maximum number of points in a chunk. A worker that is killed loses at most this many."""
 _AHEAD = 3
 """Number of chunks per worker that are with the scheduler at a time."""
 _ANSWER = 10.0
@@ -40,14 +40,14 @@ _ANSWER = 10.0
 _WORKERS = 60.0
 """Time (s) within which a scheduler must have a worker."""
 _POLL = 0.5
-"""Time (s) after which the number of workers and a request to stop are noticed."""
+"""Interval (s) at which the number of workers and a request to stop are checked."""
 
 
 class Cluster:
     """Workers on this machine, or those of a running scheduler.
 
-    `workers`: number of processes to start; `scheduler`: address of a scheduler; one of both.
-    `imports`, `cache`: see `Settings`.
+    `workers`: number of processes to start; `scheduler`: address of a scheduler. Give one of the
+    two. `imports`, `cache`: see `Settings`.
 
     Raises `InputError` if both are given, or if the package distributed is not installed."""
 
@@ -181,7 +181,7 @@ class _Collection:
         future.add_done_callback(self._done.put)
 
     def _look(self) -> None:
-        """Raise `InputError` if the connection to the scheduler is lost."""
+        """Check the connection; raise `InputError` if that to the scheduler is lost."""
         if self._client.status != "running":
             raise self._gone()
 

@@ -33,7 +33,7 @@ _SCALARS = {
     "floquet_multiplier": ("1", "greatest modulus of the Floquet multipliers"),
     "lyapunov_exponent_per_mesh_period": ("1", "Lyapunov exponent per mesh period"),
 }
-"""Unit and long name of the numbers taken from `steady_state`."""
+"""Unit and long name of each number that is taken from `steady_state`."""
 _OWN_UNITS = {"_N": "N", "_mm2": "mm2", "_kg_m2": "kg m2", "_deg": "deg", "_cm3": "cm3"}
 _PLAIN = str.maketrans({"·": " ", "°": "deg", "²": "2", "³": "3"})
 
@@ -98,7 +98,7 @@ class _Grid:
         return (*self.dims, *last), array.reshape(shape), {"units": units, "long_name": long}
 
     def words(self, values: Sequence[str], long: str) -> tuple:
-        """Return a variable of texts, as objects: most of them are the same long message."""
+        """Return a variable of texts, with the type object: many points share one long message."""
         return self.dims, np.array(values, dtype=object).reshape(self.shape), {"long_name": long}
 
 
