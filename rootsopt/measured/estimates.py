@@ -23,8 +23,8 @@ _CLEAR = 8.0
 """Ratio of the distance between neighbours to the scatter below which farther neighbours are used.
 Points that are closer together do not lie in order along the curve."""
 _FEWEST = 48
-"""Number of distances between neighbours around the outline below which the distance is not
-doubled again."""
+"""Number of points left around the outline below which the stride between neighbours is not doubled
+again."""
 _MOST = 20_000
 """Number of points above which estimates use only every second, third ... point."""
 _MEDIAN = 1.4826

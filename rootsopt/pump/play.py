@@ -1,10 +1,9 @@
 """Angular play of rotor 2 between its flank contacts, while rotor 1 is held.
 
-A turn of rotor 2 moves its points on circles about its axis. It touches where the angle between the
-two outlines, seen from this axis, is used up at one radius. This holds for any outline that does
+A turn of rotor 2 moves its points on circles about its axis. It ends where the angle between the
+two outlines, seen from this axis, becomes zero at some radius. This holds for any outline that does
 not fold back as seen from the axis, conjugate or not, and for turns of any size. `docs/play.md`
-derives the closed forms.
-"""
+derives the closed forms."""
 
 import equinox as eqx
 import jax.numpy as jnp

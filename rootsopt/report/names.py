@@ -38,7 +38,7 @@ def last_part(key: str) -> str:
 
 
 def value(given: Any) -> str:
-    """Return a value as it is printed: numbers with five significant digits, truth values as words."""
+    """Return a value as it is printed: numbers with five digits, truth values as `yes` or `no`."""
     if isinstance(given, bool):
         return "yes" if given else "no"
     if isinstance(given, list | tuple):

@@ -23,8 +23,8 @@ MIRROR = np.array([-1.0, 1.0])
 def contact_place(profile: Profile, phi: Float[Array, ""]) -> Float[Array, "2"]:
     """Return the place (m) where the rotors touch in perfect rolling, x and y from rotor 1's axis.
 
-    `phi`: φ1 (rad). Where a whole arc touches at once, the place moves along it over a short
-    angle, as the torque of `GasLoad` does."""
+    `phi`: φ1 (rad). Where a whole arc touches at once, the place moves along it while φ1 changes by
+    a short angle. `GasLoad` spreads the jump of its torque over the same angle."""
     half = profile.half_pitch
     centred = phi - 4 * half * jnp.round(phi / (4 * half))
     roll = jnp.abs(centred)
