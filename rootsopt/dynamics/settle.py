@@ -19,7 +19,7 @@ from rootsopt.dynamics.pair import RotorPair
 BLOCK = 4
 """Number of mesh periods integrated between two checks of whether the motion repeats."""
 _MEMORY = 20
-"""Number of stroboscopic states stored: more than twice the longest cycle searched for."""
+"""Number of stroboscopic states stored: more than twice the longest cycle that is recognised."""
 _PATIENCE = 32, 1e-5
 """Number of mesh periods after which a transient continues with a finer tolerance, and the greatest
 value of that tolerance. The noise of coarser steps can hide that the motion repeats."""

@@ -1,8 +1,7 @@
 """Where the search begins if the baseline is a rotor from a file.
 
-Such a rotor has no design parameters. It stays the baseline as it is. The search varies the
-parameters of a family, and begins at the member of this family that is nearest to the outline.
-"""
+Such a rotor has no design parameters. It remains the baseline. The search varies the parameters of
+a family, and begins at the member of this family that is nearest to the outline."""
 
 import dataclasses
 from pathlib import Path

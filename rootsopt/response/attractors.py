@@ -30,7 +30,7 @@ from rootsopt.scene import design_vector
 from rootsopt.status import Status
 
 _LONGEST = 8
-"""Longest cycle searched for, in mesh periods."""
+"""Maximum length of a cycle (mesh periods) that the search recognises."""
 _APART = 0.3
 """Scaled distance above which two motions always count as different."""
 _TRIES = 24

@@ -1,4 +1,4 @@
-"""The rotors' bearings: where they sit, and what loads them beside the flanks."""
+"""The rotors' bearings: their places, and their loads other than those of the flanks."""
 
 import equinox as eqx
 import jax.numpy as jnp

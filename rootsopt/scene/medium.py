@@ -1,4 +1,4 @@
-"""Fluid, pressures and clearances of a pump: what leakage needs beyond a simulation."""
+"""Fluid, pressures and clearances of a pump: the quantities on which only leakage depends."""
 
 import equinox as eqx
 import jax.numpy as jnp

@@ -46,9 +46,9 @@ def dataset_of(
 ) -> xarray.Dataset:
     """Return the dataset of a sweep.
 
-    `config`: config of all that is not swept; `plan`: the points; `rows`: record of each point by
-    its number, where a point without one has the status `not_simulated`; `attributes`: further
-    attributes of the dataset."""
+    `config`: config of the sweep; `plan`: the points; `rows`: record of each point by its number,
+    where a point without one has the status `not_simulated`; `attributes`: further attributes of
+    the dataset."""
     missing = lost(Status.NOT_SIMULATED)
     found = [rows.get(number, missing) for number in range(plan.count)]
     grid = _Grid(plan)
