@@ -18,7 +18,7 @@ from rootsopt.export.drawing import Drawing
 from rootsopt.export.pieces import polyline
 from rootsopt.figures.style import BLUE, GREY, ORANGE, SKY, VERMILION, figure
 from rootsopt.profiles import Profile
-from rootsopt.response.evaluation import Series
+from rootsopt.response.series import Series
 from rootsopt.runtime.programs import Program
 
 _MM = 1e3

@@ -188,7 +188,7 @@ def front_block(run: Run) -> Block | None:
 
 
 def likeness_block(run: Run) -> Block | None:
-    """Return the family members nearest to the profile, or None if the run did not search for them."""
+    """Return the family members nearest to the profile, or None without a search for them."""
     found = run.result.get("resembles")
     found = found or (run.result.get("beginning") or {}).get("considered")
     rows = [

@@ -13,7 +13,7 @@ from rootsopt.figures.style import BLUE, COLORS, GREY, VERMILION
 from rootsopt.output.labels import in_words
 from rootsopt.report.gather import Case, Run, varied
 from rootsopt.report.names import label
-from rootsopt.response.evaluation import Series
+from rootsopt.response.series import Series
 
 _MOST_TURNS = 4
 """Number of revolutions above which the chart of a motion shows only a part at first."""

@@ -13,7 +13,7 @@ import numpy as np
 from rootsopt.config import Config, load
 from rootsopt.output.files import ResultFolder
 from rootsopt.output.fronts import design_file
-from rootsopt.response.evaluation import Series
+from rootsopt.response.series import Series
 
 _COLUMNS = {
     "time": "time_s",

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from rootsopt.config import Config
 from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import RESPONSES
+from rootsopt.response.records import RESPONSES
 
 _LINE = re.compile(r"line_(\d+(?:\.\d+)?)_force_N")
 _UNITS = {

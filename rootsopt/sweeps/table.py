@@ -11,7 +11,7 @@ import rootsopt
 from rootsopt.config import Config
 from rootsopt.config.explain import field_of
 from rootsopt.config.units import unit_of
-from rootsopt.response.evaluation import RESPONSES
+from rootsopt.response.records import RESPONSES
 from rootsopt.status import Status
 from rootsopt.sweeps.plan import Plan
 from rootsopt.sweeps.points import Row, lost
