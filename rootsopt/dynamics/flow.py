@@ -10,9 +10,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.dynamics.flanks import FlankForce
 from rootsopt.dynamics.integrator import Integrator, StepGrid
 from rootsopt.dynamics.measures import Measures
-from rootsopt.dynamics.pair import FlankForce, RotorPair
+from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, Steps, locate_peak, one_sided
 from rootsopt.dynamics.saltation import MARKS, marks, saltation
 from rootsopt.dynamics.stepping import integrated

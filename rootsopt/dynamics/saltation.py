@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from rootsopt.dynamics.pair import FlankForce
+from rootsopt.dynamics.flanks import FlankForce
 
 LONGEST = 4e-6
 """Length of a step (mesh periods) above which the step is not checked for a jump. In double

@@ -44,6 +44,7 @@ _OF = {
     "dynamics/measures": "measures extremes",
     "dynamics/orbit": "orbit measures steady gradients extremes",
     "dynamics/timescales": "extremes dynamics",
+    "dynamics/flanks": "pair drive dynamics scene steady",
     "dynamics/pair": "pair drive dynamics scene steady",
     "dynamics/peak": "flow extremes steady gradients",
     "dynamics/saltation": "gradients steady",

@@ -6,7 +6,7 @@ import pytest
 
 from rootsopt.config import load
 from rootsopt.contact.size import MapSize
-from rootsopt.dynamics.pair import FlankForce
+from rootsopt.dynamics.flanks import FlankForce
 from rootsopt.output import files
 from rootsopt.response import evaluation, series
 from rootsopt.response.evaluation import Evaluator
