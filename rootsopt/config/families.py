@@ -292,7 +292,7 @@ def users_of(key: str) -> list[str]:
     return [family.name for family in _families.values() if key in family.keys]
 
 
-def follow(update: Callable[[], None]) -> None:
+def on_change(update: Callable[[], None]) -> None:
     """Register a function `update` to be called after each change to the table of families.
 
     Functions are called in the order in which they were registered."""

@@ -16,7 +16,7 @@ from rootsopt.config.families import (
     families,
     family_of,
     find_installed,
-    follow,
+    on_change,
     replace_fields,
 )
 from rootsopt.config.pareto import ParetoConfig
@@ -335,7 +335,7 @@ class Config(Section):
         return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
 
 
-follow(lambda: replace_fields(Config, dict(Config.model_fields)))
+on_change(lambda: replace_fields(Config, dict(Config.model_fields)))
 
 
 _FOLLOWING = (("contact", "smoothing_mm"), ("pump", "pressure_difference_Pa"))

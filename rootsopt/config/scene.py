@@ -10,7 +10,7 @@ from rootsopt.config import catalogue as _catalogue  # noqa: F401  (fills the ta
 from rootsopt.config.families import (
     families,
     family_of,
-    follow,
+    on_change,
     parameters,
     replace_fields,
     users_of,
@@ -176,7 +176,7 @@ def _derive() -> None:
 
 
 _derive()
-follow(_derive)
+on_change(_derive)
 
 
 class RotorConfig(Section):

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.families import families, follow, parameters, replace_fields
+from rootsopt.config.families import families, on_change, parameters, replace_fields
 from rootsopt.config.section import Order, Section, Speed, Weight, between, number, tuples
 from rootsopt.config.units import hint
 from rootsopt.config.words import named, shown
@@ -388,7 +388,7 @@ def _derive() -> None:
 
 
 _derive()
-follow(_derive)
+on_change(_derive)
 
 
 class OptimizerConfig(Section):
@@ -427,4 +427,4 @@ def _derive_optimizer() -> None:
 
 
 _derive_optimizer()
-follow(_derive_optimizer)
+on_change(_derive_optimizer)

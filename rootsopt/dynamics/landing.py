@@ -85,6 +85,7 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
     def wrap(self, direction):
         return self
 
+    # diffrax prescribes the parameters of `init` and `adapt_step_size`.
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         # Without `dt0`, diffrax adds no check of it. The check would be a callback to Python, and
         # programs with callbacks cannot be cached.

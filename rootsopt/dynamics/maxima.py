@@ -233,7 +233,7 @@ def _forces(pair: RotorPair, states, steps: Steps, times, width, count):
     return lax.while_loop(lambda carry: carry[0] * _LANES < count, look, start)[1]
 
 
-class _Pieces(NamedTuple):
+class _StepSlopes(NamedTuple):
     """Several linearised steps: state and force after each step, and their derivatives.
 
     `value` (jobs, n + 1); `by_state` (jobs, n + 1, n): with respect to the state before the step;
@@ -277,7 +277,7 @@ def _differentiated(
             lambda y, dynamic: equation.with_force(begin, end, y, dynamic), y, dynamic, moved, count
         )
         rows = jnp.append(jnp.arange(count), jnp.arange(y.shape[0], found.value.shape[0]))
-        return jax.tree.map(lambda x: x[rows], _Pieces(*found))
+        return jax.tree.map(lambda x: x[rows], _StepSlopes(*found))
 
     # One loop linearises the steps of the orbit, then those up to the maxima, then those beside
     # the maxima, so that the linearised step is compiled once.
@@ -325,7 +325,7 @@ def _differentiated(
     return unit * values, unit * jnp.einsum("ksf,ksfd->kd", weights, slopes)
 
 
-def _after(pieces: _Pieces, before: Float[Array, "jobs n d"]) -> Float[Array, "jobs rows d"]:
+def _after(pieces: _StepSlopes, before: Float[Array, "jobs n d"]) -> Float[Array, "jobs rows d"]:
     """Return the derivatives of the values after the steps `pieces`.
 
     `before`: derivatives of the state before each step."""
@@ -333,7 +333,7 @@ def _after(pieces: _Pieces, before: Float[Array, "jobs n d"]) -> Float[Array, "j
     return moved + pieces.by_parameters
 
 
-def _along(kept: _Pieces, start: Float[Array, "n d"], taken: Int[Array, ""]) -> Any:
+def _along(kept: _StepSlopes, start: Float[Array, "n d"], taken: Int[Array, ""]) -> Any:
     """Return the derivatives (steps, n, d) of the state at the start of each step of an orbit.
 
     `kept`: the linearised steps; `start` (n, d): derivatives at the start of the orbit; `taken`:

@@ -72,7 +72,7 @@ def summary(plan: Plan, records: Mapping[int, Row]) -> dict[str, Any]:
     }
 
 
-def shown(plan: Plan, records: Mapping[int, Row], dataset: xarray.Dataset) -> RenderableType:
+def tables_of(plan: Plan, records: Mapping[int, Row], dataset: xarray.Dataset) -> RenderableType:
     """Return the tables of a sweep for the terminal: its points if they are few, and a summary."""
     parts: list[RenderableType] = []
     rows = rows_of(plan, records)
@@ -111,4 +111,4 @@ def _ranges(plan: Plan, dataset: xarray.Dataset, usable: np.ndarray) -> Renderab
     return table
 
 
-__all__ = ["outcome", "rows_of", "shown", "summary"]
+__all__ = ["outcome", "rows_of", "summary", "tables_of"]

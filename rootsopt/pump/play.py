@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rootsopt.profiles import Profile
-from rootsopt.pump.section import both_flanks, flank_points, half_valley
+from rootsopt.pump.section import both_flanks, half_valley, sampled_flank
 
 POINTS = 1000
 """Number of points per segment of a flank. The angles are then accurate to about 1e-6 rad, and
@@ -61,7 +61,7 @@ def play(
     distance = 2 * r if center_distance is None else center_distance
     if phi is None:
         phi = 2 * jnp.pi / lobes * jnp.arange(POSES) / POSES
-    flank = flank_points(profile, POINTS)
+    flank = sampled_flank(profile, POINTS)
     lobe = both_flanks(flank)
     # The whole clearance is taken off rotor 1.
     reduced = lobe.point - clearance * lobe.normal

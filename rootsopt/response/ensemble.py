@@ -321,7 +321,7 @@ class _Outcome:
     @property
     def reached(self) -> float:
         """Largest |ε| (rad) in all motions."""
-        return max(float(np.max(run.reach)) for run in self.runs)
+        return max(float(np.max(run.max_relative)) for run in self.runs)
 
 
 def neighbours(

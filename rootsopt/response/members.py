@@ -34,16 +34,15 @@ class Members(NamedTuple):
 
     `means` (m, 3): mean force (N), mean square (N²) and mean of the peaks of all mesh periods (N);
     `drift`: mean force in the second half of the window minus that in the first (N); `greatest`:
-    greatest force (N); `reach`: greatest |ε| (rad); `depth`: greatest penetration (m; negative:
-    least gap); `states` (m, n): last scaled states; `repeats` (m, 8): whether the last states
-    repeat after 1 … 8 mesh periods; `lost`, `stalled`: see `RotorPair`; `solved`: whether the
-    solver succeeded.
-    """
+    greatest force (N); `max_relative`: greatest |ε| (rad); `depth`: greatest penetration (m;
+    negative: least gap); `states` (m, n): last scaled states; `repeats` (m, 8): whether the last
+    states repeat after 1 … 8 mesh periods; `lost`, `stalled`: see `RotorPair`; `solved`: whether
+    the solver succeeded."""
 
     means: Float[Array, "m 3"]
     drift: Float[Array, " m"]
     greatest: Float[Array, " m"]
-    reach: Float[Array, " m"]
+    max_relative: Float[Array, " m"]
     depth: Float[Array, " m"]
     states: Float[Array, "m n"]
     repeats: Bool[Array, "m 8"]
@@ -192,7 +191,7 @@ def member(
         means=means / periods,
         drift=drift / jnp.maximum(half, 1),
         greatest=greatest,
-        reach=pair.angle_scale * reach,
+        max_relative=pair.angle_scale * reach,
         depth=depth,
         states=end,
         repeats=apart < _REPEATS,

@@ -131,12 +131,12 @@ class Scene(eqx.Module):
             design_size=len(reading.design_keys(config)),
             deepest=jnp.asarray(deepest),
             solver=reading.solver_of(config),
-            outline=families.outline(config.profile),
+            outline=families.profile_from_file(config.profile),
             medium=medium_of(config),
             bearings=bearings_of(config),
             law=reading.law_of(config),
             gear=reading.gear_of(config),
-            **reading.quantities(config),
+            **reading.physical_quantities(config),
             **reading.parts_of(config),
         )
         if found.helix is None or found.slices:
@@ -162,7 +162,7 @@ class Scene(eqx.Module):
             bearings=bearings_of(config),
             law=reading.law_of(config),
             gear=reading.gear_of(config),
-            **reading.quantities(config),
+            **reading.physical_quantities(config),
             **reading.parts_of(config),
         )
 

@@ -33,7 +33,7 @@ def design_keys(config: Config) -> tuple[str, ...]:
     return families.keys_of(config.profile)
 
 
-def quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
+def physical_quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
     """Return the physical quantities of a config in SI units, keyed by `Scene` field names."""
     rotor, scene, gear = config.rotor, config.scene, config.scene.timing_gear
     wear, heat, error = config.contact.wear, scene.heat, scene.center_distance_error_mm

@@ -64,7 +64,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         folder.overwrite = False  # An earlier result is more valuable than this one.
 
     def show(out: Console) -> None:
-        out.print(sweeps.shown(plan, records, dataset))
+        out.print(sweeps.tables_of(plan, records, dataset))
         out.print(f"{record['status']}: {record['message']}", soft_wrap=True, markup=False)
         rate = statistics["points_per_second"]
         out.print(f"{len(records) - known} points in {seconds:.1f} s, {rate:.3g} per second")
