@@ -224,7 +224,7 @@ def loads_corners(bearings: BearingSet) -> Float[Array, " k"]:
 
 
 @Program
-def orbit_loads(
+def orbit_loads(  # 90 lines: the functions of its two loops share the linearised equation.
     scene: Scene,
     design: Float[Array, " d"],
     orbit: Orbit,
