@@ -269,8 +269,8 @@ def _code(command: str, code: int, out: _Stream) -> int:
 def leave(code: int) -> None:
     """End the process with the exit code `code`, even if a signal arrives in the meantime.
 
-    Threads that are still running are not waited for. If Python shut down while they run, the
-    process could abort with a different exit code."""
+    The process does not wait for threads that are still running. If Python shut down while they
+    run, the process could abort with a different exit code."""
     for number in _NAMES:
         with contextlib.suppress(ValueError, OSError):
             signal.signal(number, lambda *_: os._exit(code))

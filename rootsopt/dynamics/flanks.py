@@ -55,8 +55,7 @@ class Sliding(NamedTuple):
     """Data of a contact that only friction and supports need.
 
     `point`: position of the contact; `speed` (m/s) at which rotor 1 slides on rotor 2; `normal` and
-    `tangent`: unit vectors (x, y), None if no part lets the axes move.
-    """
+    `tangent`: unit vectors (x, y), None if no part lets the axes move."""
 
     point: ContactPoint
     speed: Float[Array, ""]
@@ -70,8 +69,7 @@ class Touch(NamedTuple):
 
     `depth`: penetration (m); `closing`: rate of `depth` (m/s); `roll`: roll coordinate (rad);
     `approach`: gap and levers from the contact; `sliding`: data of the contact point, None if no
-    part needs them.
-    """
+    part needs them."""
 
     depth: Float[Array, ""]
     closing: Float[Array, ""]
@@ -85,8 +83,7 @@ class Pushes(NamedTuple):
 
     `force` (slices, sides, x and y): on rotor 2 (N), friction included; on rotor 1 it is the
     opposite. `place` (slices, sides, x and y): of the contact, from the axis of rotor 1 (m).
-    `torque` (slices, sides, rotor): of the normal force, in the rotor's sense of rotation (N·m).
-    """
+    `torque` (slices, sides, rotor): of the normal force, in the rotor's sense of rotation (N·m)."""
 
     force: Float[Array, "slices sides xy"]
     place: Float[Array, "slices sides xy"]
@@ -116,8 +113,7 @@ def touches_of(pair: "RotorPair", motion: Motion) -> tuple[Float[Array, "*sides"
     A pair that is not two-sided has the nominal centre distance and no negative clearance. Then
     only the drive flank can touch when ε < 0, and only the coast flank when ε > 0. One search
     for the gap is therefore enough. Otherwise, both results have a leading axis for the sides.
-    With twisted rotors, an axis for the slices stands before it.
-    """
+    With twisted rotors, an axis for the slices stands before it."""
     slices = pair.contact.slices
     if slices is None:
         return _section_touches(pair, motion)
@@ -224,8 +220,7 @@ def touch_of(
     +90°. Rotor 1 slides along rotor 2 at the speed ω1 h1 - ω2 h2 + (v1 - v2)·t. The coast side
     is the mirror image. Let θ be the angle of the displaced line of centres. A pair with
     displaced axes is equivalent to a pair at another centre distance with the angles φ1 - θ and
-    φ2 + θ.
-    """
+    φ2 + θ."""
     contact, line, relative = pair.contact.on_side(side), None, motion.relative
     if motion.shift is not None:
         x, y = motion.shift[1] - motion.shift[0]

@@ -188,8 +188,8 @@ class Equation(eqx.Module):
     def with_force(self, begin, end, y, dynamic) -> Float[Array, " rows"]:
         """Return y after one step from `begin` to `end` (mesh periods), and the contact force.
 
-        If the contact may jump, the first of the `marks` stands between them. The force is in
-        `force_unit`."""
+        The force is in `force_unit`, and is the last entry. If the contact may jump, the first of
+        the `marks` precedes it."""
         after, slope = self.advanced(begin, end, y, dynamic)
         pair = self.pair(dynamic)
         force = slope[self.states]

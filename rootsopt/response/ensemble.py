@@ -385,7 +385,7 @@ _pair = Program(Scene.pair_and_shape)
 
 @Program
 def _point(space: Space, design):
-    """Return the point of the unit box nearest to a design."""
+    """Return the point (d,) of the unit box nearest to a design (d,) in config units."""
     return space.point(design)
 
 

@@ -22,8 +22,7 @@ class Series:
     (rad); `rate`: dε/dt (rad/s); `drive_force`, `coast_force`: normal force (N) on each flank;
     `depth`: greatest penetration (m; negative: gap); `bearing_loads` (samples, 4): loads (N) on the
     bearings, None without `scene.bearings` or without an orbit. The bearings are that of rotor 1 at
-    the timing gear's end, its other one, and those of rotor 2.
-    """
+    the timing gear's end, its other one, and those of rotor 2."""
 
     time: NDArray[np.float64]
     rotation: NDArray[np.float64]

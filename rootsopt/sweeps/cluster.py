@@ -34,7 +34,7 @@ _CHUNKS = 8
 _LARGEST = 32
 """Maximum number of points in a chunk. A worker that is killed loses at most this many."""
 _AHEAD = 3
-"""Number of chunks per worker that are with the scheduler at a time."""
+"""Number of chunks per worker that are sent to the scheduler in advance."""
 _ANSWER = 10.0
 """Time (s) within which a scheduler must answer."""
 _WORKERS = 60.0
