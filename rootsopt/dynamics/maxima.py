@@ -189,7 +189,7 @@ def candidates(
 
 
 def shoulders(forces: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the indices (k,) of shoulders among uniform samples (m,) of one cycle.
+    """Return the indices (k,) of shoulders among uniform samples `forces` (m,) of one cycle.
 
     A shoulder is a sample at which the slope of the force comes closest to 0, without a change of
     sign. Only shoulders close to the greatest force count (`_SHOULDER`). The shoulder with the

@@ -64,11 +64,11 @@ def settle(
 ) -> Transient:
     """Integrate from the scaled `state` (n,) until the stroboscopic states repeat with a period k.
 
-    The motion has settled if the last k + 1 states differ from the states k periods earlier by less
-    than `tolerance` (scaled). For large states, the noise of the steps replaces `tolerance` if it
-    is greater. k is the smallest such period, at most `max_orbit` ≤ 8. Steps become finer after
-    `_PATIENCE`. The transient ends unsettled after `max_periods` mesh periods.
-    """
+    `integrator`: method and steps, with the tolerance at the start. The motion has settled if the
+    last k + 1 states differ from the states k periods earlier by less than `tolerance` (scaled).
+    For large states, the noise of the steps replaces `tolerance` if it is greater. k is the
+    smallest such period, at most `max_orbit` ≤ 8. Steps become finer after `_PATIENCE`. The
+    transient ends unsettled after `max_periods` mesh periods."""
     orders = jnp.arange(1, max_orbit + 1)
     age = jnp.arange(_MEMORY)[::-1]
 

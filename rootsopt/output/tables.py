@@ -370,7 +370,8 @@ def likeness_table(
 ) -> RenderableType:
     """Return a table of the designs of several families that are nearest to a profile.
 
-    `rows`: one per profile family, as in the entry `resembles` of the result file."""
+    `title`: that of the table; `rows`: one per profile family, as in the entry `resembles` of the
+    result file."""
     distances = "largest distance, um", "RMS distance, um"
     table = _table(title, *distances, "nearest member")
     for row in rows:

@@ -50,7 +50,8 @@ class Leakage(NamedTuple):
 
 
 def tip_length(profile: Profile, shape: Geometry, height: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the length (m) of a slot with the same laminar flow as the gap at a tip.
+    """Return the length (m) of a slot with the same laminar flow as the gap at a tip of a
+    `profile`.
 
     It is the width of the land, plus h³ ∫ dl / d³ along the addendum on both of its sides. d is the
     distance from the bore of the housing, h its least value, the clearance `height` (m)."""
@@ -66,10 +67,10 @@ def tip_length(profile: Profile, shape: Geometry, height: Float[Array, ""]) -> F
 
 
 def end_shape(shape: Geometry) -> Float[Array, ""]:
-    """Return width over length of the strip that stands for an end face, 4 r_a² / A.
+    """Return the width over the length of the strip that represents an end face, 4 r_a² / A.
 
-    The strip is as wide as the rotor, 2 r_a, and as long as its mean chord, A / 2r_a. By Jensen's
-    inequality, parallel strips of unequal chords leak more."""
+    `shape`: geometry of the rotor. The strip is as wide as the rotor, 2 r_a, and as long as its
+    mean chord, A / 2r_a. By Jensen's inequality, parallel strips of unequal chords leak more."""
     return 4 * shape.outer_radius**2 / shape.area
 
 

@@ -49,8 +49,8 @@ def whole_valley(flank: Flank, lobes: int) -> Flank:
 def half_valley(flank: Flank, lobes: int, radius: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Return half the angle (rad) of the space between two lobes at a `radius` (m) from the axis.
 
-    `lobes`: N. Beyond the tip, the result is infinite, because there is no lobe. Below the root, it
-    is negative."""
+    `flank`: points from tip to root; `lobes`: N. Beyond the tip, the result is infinite, because
+    there is no lobe. Below the root, it is negative."""
     away, across = jnp.abs(flank.point[::-1]), jnp.angle(flank.point[::-1])
     free = jnp.pi / lobes - jnp.interp(radius, away, across)
     free = jnp.where(radius > away[-1], jnp.inf, free)

@@ -44,7 +44,9 @@ def block(
     groups: Iterable[tuple[str, Iterable[Sequence[Cell | str]]]],
     note: str = "",
 ) -> Block:
-    """Return a table without its empty groups; cells may be text."""
+    """Return a table with this `title`, without its empty groups.
+
+    `heads`: headings of the columns; `note`: text below the table. Cells may be given as text."""
     found = []
     for heading, rows in groups:
         cells = tuple(

@@ -119,10 +119,9 @@ def run_members(
 ) -> list[Members]:
     """Return the `Members` of each of `pairs`, all from the same scaled `states` (m, n).
 
-    `settle`: mesh periods before the window; `periods`: mesh periods of the window. On CPUs one
-    thread per core simulates a few members at a time, so that few members wait for a slower one. On
-    other devices all members are stepped together.
-    """
+    `integrator` of the motions; `settle`: mesh periods before the window; `periods`: mesh periods
+    of the window. On CPUs one thread per core simulates a few members at a time, so that few
+    members wait for a slower one. On other devices all members are stepped together."""
     states = np.asarray(states, pairs[0].angle_scale.dtype)
     counts = np.asarray(settle), np.asarray(periods)
     if jax.default_backend() != "cpu":
@@ -151,8 +150,9 @@ def member(
 ) -> Members:
     """Simulate one motion from the scaled `state` (n,) and return its result.
 
-    `settle`: mesh periods before the window; `periods`: mesh periods of the window. The fields of
-    the result lack the leading axis of `Members`. This is a pure function."""
+    `settle`: mesh periods before the window; `periods`: mesh periods of the window. `integrator` of
+    the motion. The fields of the result lack the leading axis of `Members`. This is a pure
+    function."""
     dtype = state.dtype
     one, none, low = jnp.ones((), dtype), jnp.zeros((), dtype), jnp.full((), -jnp.inf, dtype)
 

@@ -116,7 +116,8 @@ def row_of(evaluation: Evaluation) -> Row:
 
 
 def lost(status: Status, why: str = "") -> Row:
-    """Return the record of a point without an evaluation; `why`: what happened there."""
+    """Return the record of a point without an evaluation, with its `status`; `why`: what happened
+    there."""
     message = f"{status.value} {sentence(why)}" if why else status.value
     none: Row = {name: {} for name in ("response", "gradient", "steady_state", "geometry")}
     return {"status": status.label, "message": message, **none}

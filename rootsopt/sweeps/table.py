@@ -92,7 +92,9 @@ class _Grid:
         self.dims, self.shape = tuple(one.name for one in plan.dimensions), plan.shape
 
     def numbers(self, values: Sequence[Any], units: str, long: str, *last: str) -> tuple:
-        """Return a variable of numbers, `None` as NaN; `last`: names of further dimensions."""
+        """Return a variable of numbers, one of `values` per point, with `None` as NaN.
+
+        `units`, `long`: its unit and long name; `last`: names of further dimensions."""
         array = np.array(values, dtype=float)
         shape = (*self.shape, *array.shape[1:])
         return (*self.dims, *last), array.reshape(shape), {"units": units, "long_name": long}

@@ -11,7 +11,8 @@ Key = tuple[int, ...]
 
 
 def keys(count: int, divisions: int) -> list[Key]:
-    """Return all keys for `count` terms, beginning with the end of the first term.
+    """Return all keys for `count` terms, beginning with the end of the first term. `divisions`:
+    number of steps from one end to another.
 
     Subtract one of the `directions` from a key to get a neighbour that comes before it."""
     every = itertools.product(range(divisions, -1, -1), repeat=count)
@@ -19,12 +20,13 @@ def keys(count: int, divisions: int) -> list[Key]:
 
 
 def corners(count: int, divisions: int) -> list[Key]:
-    """Return the keys of the ends of the front, in the order of the terms."""
+    """Return the keys of the ends of the front, in the order of the `count` terms."""
     return [tuple(divisions * (i == k) for i in range(count)) for k in range(count)]
 
 
 def directions(count: int) -> list[Key]:
-    """Return the differences between a key and those neighbours that come after it in `keys`."""
+    """Return the steps from a key to those neighbours that come after it in `keys`, for `count`
+    terms."""
     pairs = itertools.combinations(range(count), 2)
     return [tuple((k == j) - (k == i) for k in range(count)) for i, j in pairs]
 
