@@ -167,8 +167,8 @@ def _dearest(rows: Sequence[Mapping[str, Any]]) -> str:
     step = quantity(abs(row["relaxed_by"]), row.get("unit", ""))
     percent = abs(row["relaxed_objective_percent"])
     return (
-        f"The dearest limit is {in_words(row['name'])}: relaxed by {step}, it lowers the objective "
-        f"by {percent:.3g} %."
+        f"The limit with the highest price is {in_words(row['name'])}: relaxed by {step}, it "
+        f"lowers the objective by {percent:.3g} %."
     )
 
 
