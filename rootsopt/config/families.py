@@ -59,16 +59,18 @@ Hook = Callable[..., Any] | str
 class Parameter:
     """A design parameter in the config, shared by all families that use its key.
 
-    `key`: name in the config; it ends in the unit, `_mm` or `_deg`, if there is one. `help`:
-    meaning, in a few words. `lowest`, `highest`: least and greatest value in a config. `below`:
-    whether values must be less than `highest`, rather than at most `highest`. `radii`: the same
-    limits in pitch radii, for a length that scales with the rotor. `usual`: usual range, in pitch
-    radii if `radii` is given; also the default bounds of an optimisation. `None`: the default
-    bounds are 0.5 to 1.5 times the config's own value. `default_bounds`: default bounds that
-    replace `usual` and are written out in every config. `bounds_limits`: limits of the bounds, if
-    they are narrower than `lowest` and `highest`. `bounds_note`: text for `--help` that replaces
-    the generated description of the default bounds. `count`: least and greatest number of entries,
-    if the key holds a list. `None`: a single number."""
+    `key`: name in the config; it ends in the unit, `_mm` or `_deg`, if there is one.
+    `help`: meaning, in a few words.
+    `lowest`, `highest`: least and greatest value in a config.
+    `below`: whether values must be less than `highest`, rather than at most `highest`.
+    `radii`: least and greatest value in pitch radii, for a length that scales with the rotor.
+    `usual`: usual range, in pitch radii if `radii` is given; also the default bounds of an
+    optimisation. `None`: the default bounds are 0.5 to 1.5 times the config's own value.
+    `default_bounds`: default bounds that replace `usual` and are written out in every config.
+    `bounds_limits`: limits of the bounds, if they are narrower than `lowest` and `highest`.
+    `bounds_note`: text for `--help` that replaces the generated description of the default bounds.
+    `count`: least and greatest number of entries, if the key holds a list. `None`: a single number.
+    """
 
     key: str
     help: str

@@ -76,7 +76,7 @@ class Constraint(eqx.Module):
     def slack_of(
         self, scene: Scene, profile: Profile, shape: Geometry, found: ProfileMargins | None
     ) -> Float[Array, ""]:
-        """Return the scaled slack of a design in a `scene`, given its `profile` (see `slack`)."""
+        """Return the slack of a design in a `scene`, given its `profile`; see `slack`."""
         del scene, profile
         return self.slack(shape, found)
 

@@ -33,8 +33,8 @@ _LITRE_PER_MINUTE = 1e-3 / 60
 class Forces(NamedTuple):
     """Mean, peak and RMS of the contact force (N), in the fields `mean`, `peak`, `rms`.
 
-    `bearing` (N): greatest equivalent load of a bearing. It is NaN here, because an evaluation
-    integrates it along the motion."""
+    `bearing` (N): greatest equivalent load of a bearing. An evaluation integrates it along the
+    motion itself, so that it is NaN here."""
 
     mean: Float[Array, ""]
     peak: Float[Array, ""]
