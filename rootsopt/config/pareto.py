@@ -33,7 +33,7 @@ class ParetoConfig(Section):
         "points",
     )
     refinements: Annotated[int, Field(ge=0, le=100)] = Field(
-        12, description="further points that may be spent on places where neighbours lie far apart"
+        12, description="greatest number of further points where neighbours lie far apart"
     )
 
     @model_validator(mode="before")

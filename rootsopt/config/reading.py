@@ -75,7 +75,7 @@ class Config(Section):
     pump: PumpConfig | None = Field(None, description="absent: no leakage is reported")
     tolerances: TolerancesConfig | None = Field(None, description="absent: nothing scatters")
     drawing: DrawingConfig | None = Field(
-        None, description="absent: the title block states what follows from the rest"
+        None, description="absent: the title block states only what follows from the other sections"
     )
 
     @model_validator(mode="before")

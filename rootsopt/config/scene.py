@@ -225,10 +225,10 @@ class WearConfig(Section):
     """Material that the flanks have lost since they were drawn, or gained by a coating."""
 
     offset_mm: Annotated[float, Field(ge=-1, le=1)] = Field(
-        0.0, description="normal offset that each rotor has lost everywhere; negative: gained"
+        0.0, description="thickness that each rotor has lost everywhere; negative: a coating"
     )
     depth_mm: Annotated[float, between(0, 1)] = Field(
-        0.0, description="greatest wear of both flanks together, distributed after Archard"
+        0.0, description="greatest wear of both flanks together; Archard's law distributes it"
     )
 
 
@@ -236,15 +236,19 @@ class ContactConfig(Section):
     """The IMPACT contact law, clearance and friction of the flanks."""
 
     stiffness_N_per_mm_e: Annotated[float, between(1, 1e11)] = Field(
-        description="K of K·δ^e, δ in mm"
+        description="stiffness K of the force K·δ^e, penetration δ in mm"
     )
-    exponent: Annotated[float, Field(ge=1, le=5)] = Field(description="e")
+    exponent: Annotated[float, Field(ge=1, le=5)] = Field(
+        description="exponent e of the penetration"
+    )
     max_damping_N_s_per_mm: Annotated[float, between(0, 1e4)] = Field(
-        description="C, reached at full depth"
+        description="damping coefficient, reached at full_damping_depth_mm"
     )
-    full_damping_depth_mm: Annotated[float, between(1e-7, 10)] = Field(description="d")
+    full_damping_depth_mm: Annotated[float, between(1e-7, 10)] = Field(
+        description="penetration at which the damping is full"
+    )
     clearance_mm: Annotated[float, between(0, 10)] = Field(
-        0.0, description="added to every flank gap"
+        0.0, description="clearance, added to every flank gap"
     )
     smoothing_mm: Annotated[
         Annotated[float, between(0, 1)] | None, BeforeValidator(_none_for_auto)
@@ -316,7 +320,7 @@ class BearingsConfig(Section):
     gear_pressure_angle_deg: Annotated[float, Field(ge=0, le=45)] = Field(
         20.0, description="pressure angle of the timing gear's teeth"
     )
-    weight: bool = Field(False, description="whether the rotors' weight counts, downwards")
+    weight: bool = Field(False, description="whether the rotors' weight acts, downwards")
     port_deg: Annotated[float, Field(ge=-90, le=90)] = Field(
         0.0, description="angle before the bore's lowest point at which a pocket opens"
     )
@@ -377,7 +381,7 @@ class SceneConfig(Section):
     drive: Literal["prescribed", "torque"] = Field(
         "prescribed", description="how rotor 1 is driven: at constant speed, or by scene.motor"
     )
-    motor: MotorConfig | None = Field(None, description="belongs to drive torque")
+    motor: MotorConfig | None = Field(None, description="only with drive: torque")
     load: LoadConfig
     timing_gear: TimingGearConfig | None = Field(None, description="absent: no timing gear")
     supports: SupportsConfig | None = Field(None, description="absent: rigid bearings")

@@ -34,7 +34,7 @@ class SolverConfig(Section):
         1e-3, description="relative error of mean and peak force that auto accepts"
     )
     nodes: Annotated[int, Field(ge=16, le=20_000)] = Field(
-        400, description="nodes per whole flank of fidelity nodes"
+        400, description="number of nodes per flank for fidelity nodes"
     )
     map_error: Annotated[float, Field(ge=1e-6, le=0.1)] = Field(
         1e-4, description="error of the map's penetration, relative to the static penetration"
@@ -86,7 +86,8 @@ class SolverConfig(Section):
         "forward", description="differentiation mode; both give the same gradient"
     )
     precision: Literal["float64", "float32"] = Field(
-        "float64", description="of the integration; float32 reaches tolerances down to 2e-6"
+        "float64",
+        description="precision of the integration; float32 reaches tolerances down to 2e-6",
     )
 
     @model_validator(mode="before")
@@ -233,10 +234,10 @@ class AttractorsConfig(Section):
     """Grid of initial states for `rootsopt attractors`, which finds coexisting motions."""
 
     relatives: Annotated[int, Field(ge=1, le=1000)] = Field(
-        12, description="initial relative rotations tried"
+        12, description="number of initial relative rotations"
     )
     rates: Annotated[int, Field(ge=1, le=1000)] = Field(
-        9, description="initial relative speeds tried"
+        9, description="number of initial relative speeds"
     )
     relative_range_mrad: _Milliradians | None = Field(
         None, description="(low, high) of the relative rotation; absent: backlash and contact"
