@@ -288,7 +288,7 @@ def switches_of(pair: "RotorPair", motion: Motion):
     return flags, counts
 
 
-def margins_of(pair: "RotorPair", motion: Motion, acting, touches: Any) -> Margins:
+def kink_margins(pair: "RotorPair", motion: Motion, acting, touches: Any) -> Margins:
     """Return the `Margins` at a `motion`.
 
     `acting`: list of (part, its own states in SI units); `touches`: result of `touches_of`.

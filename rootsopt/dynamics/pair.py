@@ -24,7 +24,7 @@ from rootsopt.dynamics.flanks import (
     Margins,
     Pushes,
     force_of,
-    margins_of,
+    kink_margins,
     pushes_of,
     sum_of,
     switches_of,
@@ -276,7 +276,7 @@ class RotorPair(eqx.Module):
     def margins(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> Margins:
         """Return the `Margins` at rotation `tau` (mesh periods) and scaled `state`."""
         motion, acting = self._moving(tau, state)
-        return margins_of(self, motion, acting, touches_of(self, motion))
+        return kink_margins(self, motion, acting, touches_of(self, motion))
 
     @eqx.filter_jit
     def derivative(
@@ -295,7 +295,7 @@ class RotorPair(eqx.Module):
         motion, acting = self._moving(tau, state)
         touches = touches_of(self, motion)
         slope, contact = self._slope(state, motion, acting, touches)
-        return slope, contact, margins_of(self, motion, acting, touches)
+        return slope, contact, kink_margins(self, motion, acting, touches)
 
     @eqx.filter_jit
     def contact_and_margins(
@@ -304,7 +304,7 @@ class RotorPair(eqx.Module):
         """Return the results of `contact_at` and `margins`, with one evaluation of the contact."""
         motion, acting = self._moving(tau, state)
         touches = touches_of(self, motion)
-        return force_of(self, motion, touches), margins_of(self, motion, acting, touches)
+        return force_of(self, motion, touches), kink_margins(self, motion, acting, touches)
 
     def _slope(self, state, motion: Motion, acting, touches: Any):
         """Return d(state)/dτ and the flank contact at the scaled `state`.
