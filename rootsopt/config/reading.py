@@ -345,7 +345,7 @@ _FOLLOWING = (("contact", "smoothing_mm"), ("pump", "pressure_difference_Pa"))
 def _followed(section: Any, key: str, value: Any) -> Any:
     """Return a copy of a section with the default `value` of a key that follows other keys.
 
-    The key is not in `model_fields_set`, so that it can be told from one that the user gave."""
+    The key is not in `model_fields_set`, which therefore holds only keys that the user gave."""
     copy = section.model_copy(update={key: value})
     copy.model_fields_set.discard(key)
     return copy

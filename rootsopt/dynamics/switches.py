@@ -209,11 +209,10 @@ def _rank(chosen: Bool[Array, "lanes s"]) -> Int[Array, "lanes s"]:
 
 
 def halved(grid: Float[Array, " steps"]) -> Float[Array, " steps"]:
-    """Return `grid` with its steps halved; if there is no room for all, only the longest are.
+    """Return `grid` with its steps halved, or only the longest of them if there is no room for all.
 
     The short steps around switches are not halved. A switch lies in the middle of such a step, and
-    rounding would decide on which side of the switch the derivatives are taken.
-    """
+    rounding would decide on which side of the switch the derivatives are taken."""
     lengths, whole = _lengths(grid)
     taken = grid < jnp.inf
     begins = jnp.concatenate([jnp.zeros_like(grid[:1]), grid[:-1]])

@@ -38,9 +38,8 @@ class Dimension:
 class Plan:
     """All points of a sweep, numbered from 0 in row-major order.
 
-    `dimensions`: in the order given; `method`: `grid`, `random`, `sobol` or
-    `tolerances`; `seed` of the samples,
-    `None` for a grid."""
+    `dimensions`: the sweep's dimensions, in the order given; `method`: `grid`, `random`, `sobol` or
+    `tolerances`; `seed` of the samples, `None` for a grid."""
 
     dimensions: tuple[Dimension, ...]
     method: str = "grid"
