@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rootsopt.tradeoffs.front import Front as Front
     from rootsopt.tradeoffs.trace import pareto_front as pareto_front
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _PUBLIC = {
     "COMPILER_OPTIONS": "rootsopt.runtime.programs:COMPILER_OPTIONS",

@@ -32,7 +32,8 @@ from experiments.paper.scene import (
 )
 from rootsopt.dynamics.window import PERIODS
 from rootsopt.response import attractors
-from rootsopt.response.evaluation import lyapunov_program, unsettled, unsettled_status
+from rootsopt.response.evaluation import lyapunov_program, unsettled_status
+from rootsopt.response.records import unsettled
 from rootsopt.scene import design_vector
 from rootsopt.status import Status
 

@@ -1,7 +1,7 @@
 """Measures how fast sweeps run: in this process, and over processes started by Dask.
 
 All points are those of the shipped CIC pair over speed, with gradients. Programs are compiled
-beforehand, so that each process only loads them. Two times are told apart: until the first points
+beforehand, so that each process only loads them. Two times are measured: until the first points
 arrive (a process starts, imports and loads programs), and the rate from there on. The collector is
 measured with points that fail before anything is simulated: what remains is reading the config,
 travelling to a worker and back, and the file. Its processor time per point limits a large cluster.

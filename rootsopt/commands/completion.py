@@ -62,7 +62,7 @@ def command_parser(name: str) -> argparse.ArgumentParser:
 
 
 def _complete(parser: argparse.ArgumentParser, file: Mapping, folder: Mapping) -> None:
-    """Say how the values of the arguments are completed.
+    """Set how the shell completes the values of the arguments.
 
     `file`, `folder`: shtab's functions for files and folders, by shell."""
     ways = {

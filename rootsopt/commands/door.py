@@ -17,7 +17,7 @@ from typing import Any
 OK, BAD_INPUT, NO_RESULT = 0, 2, 3
 _NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 _GONE = (errno.EPIPE, errno.EBADF, errno.ESHUTDOWN)
-"""Numbers of the errors that mean that nobody reads a stream. They do not change the exit code."""
+"""Error numbers (errno) that mean that nobody reads a stream. They do not change the exit code."""
 _WAITING = "rootsopt signals"
 _SHOW_CURSOR = "\x1b[?25h"
 
@@ -185,7 +185,7 @@ class _Stream:
 
 
 def _nowhere(number: int) -> None:
-    """Redirect the file descriptor `number` to the null device."""
+    """Redirect the file descriptor `number` to the null device, which discards all output."""
     with contextlib.suppress(OSError):
         null = os.open(os.devnull, os.O_RDWR)
         if null != number:
@@ -269,8 +269,8 @@ def _code(command: str, code: int, out: _Stream) -> int:
 def leave(code: int) -> None:
     """End the process with the exit code `code`, even if a signal arrives in the meantime.
 
-    Threads that are still running are not waited for. If Python shut down while they run, the
-    process could abort with a different exit code."""
+    The process does not wait for threads that are still running. If Python shut down while they
+    run, the process could abort with a different exit code."""
     for number in _NAMES:
         with contextlib.suppress(ValueError, OSError):
             signal.signal(number, lambda *_: os._exit(code))

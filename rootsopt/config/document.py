@@ -46,7 +46,7 @@ def read_document(text: str, source: str) -> Any:
     try:
         loader = _Loader(text)
         return _unshared(loader.get_single_data())
-    # The reader runs only here, so any exception is caused by the text.
+    # Only the reader runs here, so the text causes any exception.
     except Exception as error:
         raise InputError(sentence(f"{source}: is not valid YAML{_told(error)}")) from None
 

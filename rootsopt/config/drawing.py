@@ -19,7 +19,7 @@ class DrawingConfig(Section):
     title: str = Field("Roots rotor", description="title of the drawing")
     number: str | None = Field(None, description="drawing number")
     revision: str | None = Field(None, description="revision of the drawing")
-    drawn_by: str | None = Field(None, description="who has made the drawing")
+    drawn_by: str | None = Field(None, description="author of the drawing")
     date: str | None = Field(None, description="date of the drawing, as text")
     material: str | None = Field(None, description="material, in quotes if it is a number")
     tolerance_mm: Annotated[float, between(1e-4, 10)] | None = Field(
@@ -29,7 +29,7 @@ class DrawingConfig(Section):
         None, description="tolerances of all other dimensions, as ISO 2768-mK"
     )
     points: Annotated[int, Field(ge=9, le=20_001)] = Field(
-        361, description="points over one lobe in rotor_points.csv"
+        361, description="number of points over one lobe in rotor_points.csv"
     )
 
     @model_validator(mode="before")

@@ -100,7 +100,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_real(field: FieldInfo | None) -> bool:
-    """Return whether a key accepts real numbers, not just whole numbers."""
+    """Return whether a key accepts real numbers, not only whole numbers."""
     return field is not None and "float" in str(field.annotation)
 
 
@@ -143,7 +143,7 @@ def _allowed(kind: str, value: Any, context: dict, message: str, field: FieldInf
 
 
 def _advice(place: list, kind: str, value: Any, field: FieldInfo | None) -> str:
-    """Return a guess at what the user meant, as the end of a message; "" without a guess."""
+    """Return a guess at what the user meant, as the end of a message, or "" without a guess."""
     if field is None:
         return ""
     if kind in ("greater_than_equal", "less_than_equal", "less_than") and _is_number(value):

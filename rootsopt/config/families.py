@@ -297,7 +297,7 @@ def users_of(key: str) -> list[str]:
     return [family.name for family in _families.values() if key in family.keys]
 
 
-def follow(update: Callable[[], None]) -> None:
+def on_change(update: Callable[[], None]) -> None:
     """Register a function `update` to be called after each change to the table of families.
 
     Functions are called in the order in which they were registered."""
@@ -306,9 +306,10 @@ def follow(update: Callable[[], None]) -> None:
 
 @contextlib.contextmanager
 def for_a_time() -> Iterator[None]:
-    """Return a context manager that removes the families registered in its `with` block, for tests.
+    """Return a context manager that removes the families registered in its `with` block at its end.
 
-    Programs compiled for these families stay in memory: do not reuse the families' names."""
+    It serves tests. Programs compiled for these families stay in memory: do not reuse the families'
+    names."""
     before = dict(_families)
     try:
         yield

@@ -9,7 +9,7 @@ from rootsopt.config.words import shown
 
 
 class ParetoConfig(Section):
-    """The terms that `rootsopt pareto` trades against each other, and how finely."""
+    """The terms that `rootsopt pareto` trades against each other, and the number of points."""
 
     terms: tuple[str, ...] = Field(
         ("peak_force_N", "area_efficiency"),
@@ -36,7 +36,7 @@ class ParetoConfig(Section):
         "points",
     )
     refinements: Annotated[int, Field(ge=0, le=100)] = Field(
-        12, description="further points that may be spent on places where neighbours lie far apart"
+        12, description="greatest number of further points where neighbours lie far apart"
     )
 
     @model_validator(mode="before")

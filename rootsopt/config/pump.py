@@ -37,7 +37,7 @@ class PumpConfig(Section):
         None, description="gap between rotor tip and housing; absent: no leakage there"
     )
     tips_in_series: Annotated[int, Field(ge=1, le=3)] = Field(
-        1, description="tips of a rotor that seal one behind the other"
+        1, description="number of tips of a rotor that seal in series"
     )
     end_clearance_mm: _Clearance | None = Field(
         None, description="gap between each end face and its cover; absent: no leakage there"

@@ -16,7 +16,7 @@ from rootsopt.config.families import (
     families,
     family_of,
     find_installed,
-    follow,
+    on_change,
     replace_fields,
 )
 from rootsopt.config.pareto import ParetoConfig
@@ -48,8 +48,8 @@ from rootsopt.config.words import named, placed, sentence, shown
 from rootsopt.errors import InputError
 
 _MOST_PARTS = 8
-"""Number of dotted parts in a key above which an override is rejected. Config keys have at most 3.
-"""
+"""Number of dotted parts in a key above which an override is rejected. Config keys have at most
+three parts."""
 
 
 TWIST = "helix_deg"
@@ -79,7 +79,7 @@ class Config(Section):
     pump: PumpConfig | None = Field(None, description="absent: no leakage is reported")
     tolerances: TolerancesConfig | None = Field(None, description="absent: nothing scatters")
     drawing: DrawingConfig | None = Field(
-        None, description="absent: the title block states what follows from the rest"
+        None, description="absent: the title block states only what follows from the other sections"
     )
 
     @model_validator(mode="before")
@@ -170,8 +170,10 @@ class Config(Section):
         return data
 
     def _entry(self, key: str) -> tuple[str, int]:
-        """Return (name, place) of the entry of a list that a `key` such as
-        `profile.coefficients_3` names; ("", 0) for any other key."""
+        """Return (name, place) of the list entry that a `key` such as `profile.coefficients_3`
+        names.
+
+        For any other key, return ("", 0)."""
         section, _, entry = key.partition(".")
         name, _, number = entry.rpartition("_")
         single = entry in self.profile.parameters
@@ -187,8 +189,8 @@ class Config(Section):
     def moved(self, values: Mapping[str, float]) -> "Config":
         """Return a copy in which some numbers are replaced, without checking them.
 
-        `values`: new numbers by dotted key, as `scatterable` lists them. Design parameters are
-        replaced as well."""
+        `values`: new numbers by dotted key. The keys, design parameters included, are those that
+        `scatterable` lists."""
         data: Config = self
         design = {f"profile.{key}" for key in self.profile.design_keys}
         for key, value in values.items():
@@ -369,7 +371,7 @@ class Config(Section):
         return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
 
 
-follow(lambda: replace_fields(Config, dict(Config.model_fields)))
+on_change(lambda: replace_fields(Config, dict(Config.model_fields)))
 
 
 _FOLLOWING = (("contact", "smoothing_mm"), ("pump", "pressure_difference_Pa"))
@@ -379,7 +381,7 @@ _FOLLOWING = (("contact", "smoothing_mm"), ("pump", "pressure_difference_Pa"))
 def _followed(section: Any, key: str, value: Any) -> Any:
     """Return a copy of a section with the default `value` of a key that follows other keys.
 
-    The key is not in `model_fields_set`, so that it can be told from one that the user gave."""
+    The key is not in `model_fields_set`, which therefore holds only keys that the user gave."""
     copy = section.model_copy(update={key: value})
     copy.model_fields_set.discard(key)
     return copy

@@ -11,7 +11,7 @@ from rootsopt.config import catalogue as _catalogue  # noqa: F401  (fills the ta
 from rootsopt.config.families import (
     families,
     family_of,
-    follow,
+    on_change,
     parameters,
     replace_fields,
     users_of,
@@ -185,7 +185,7 @@ def _derive() -> None:
 
 
 _derive()
-follow(_derive)
+on_change(_derive)
 
 
 class RotorConfig(Section):
@@ -231,13 +231,13 @@ def _none_for_auto(value: Any) -> Any:
 
 
 class WearConfig(Section):
-    """Metal that the flanks have lost, or gained by a coating, since they were drawn."""
+    """Material that the flanks have lost since they were drawn, or gained by a coating."""
 
     offset_mm: Annotated[float, Field(ge=-1, le=1)] = Field(
-        0.0, description="normal offset that each rotor has lost everywhere; negative: gained"
+        0.0, description="thickness that each rotor has lost everywhere; negative: a coating"
     )
     depth_mm: Annotated[float, between(0, 1)] = Field(
-        0.0, description="greatest wear of both flanks together, distributed after Archard"
+        0.0, description="greatest wear of both flanks together; Archard's law distributes it"
     )
 
 
@@ -245,15 +245,19 @@ class ContactConfig(Section):
     """The IMPACT contact law, clearance and friction of the flanks."""
 
     stiffness_N_per_mm_e: Annotated[float, between(1, 1e11)] = Field(
-        description="K of K·δ^e, δ in mm"
+        description="stiffness K of the force K·δ^e, penetration δ in mm"
     )
-    exponent: Annotated[float, Field(ge=1, le=5)] = Field(description="e")
+    exponent: Annotated[float, Field(ge=1, le=5)] = Field(
+        description="exponent e of the penetration"
+    )
     max_damping_N_s_per_mm: Annotated[float, between(0, 1e4)] = Field(
-        description="C, reached at full depth"
+        description="damping coefficient, reached at full_damping_depth_mm"
     )
-    full_damping_depth_mm: Annotated[float, between(1e-7, 10)] = Field(description="d")
+    full_damping_depth_mm: Annotated[float, between(1e-7, 10)] = Field(
+        description="penetration at which the damping is full"
+    )
     clearance_mm: Annotated[float, between(0, 10)] = Field(
-        0.0, description="added to every flank gap"
+        0.0, description="clearance, added to every flank gap"
     )
     smoothing_mm: Annotated[
         Annotated[float, between(0, 1)] | None, BeforeValidator(_none_for_auto)
@@ -317,14 +321,15 @@ class SupportsConfig(Section):
 
 
 class BearingsConfig(Section):
-    """The rotors' bearings and what loads them beside the flanks: gas, gear teeth, weight.
+    """The rotors' bearings, and their loads other than those of the flanks: gas, gear teeth,
+    weight.
 
     With `scene.supports`, these forces also move the axes."""
 
     gear_pressure_angle_deg: Annotated[float, Field(ge=0, le=45)] = Field(
         20.0, description="pressure angle of the timing gear's teeth"
     )
-    weight: bool = Field(False, description="whether the rotors' weight counts, downwards")
+    weight: bool = Field(False, description="whether the rotors' weight acts, downwards")
     port_deg: Annotated[float, Field(ge=-90, le=90)] = Field(
         0.0, description="angle before the bore's lowest point at which a pocket opens"
     )
@@ -340,7 +345,7 @@ class BearingsConfig(Section):
 
 
 class HeatConfig(Section):
-    """Thermal growth of rotors and housing, each at one temperature, since they were measured."""
+    """Thermal growth of rotors and housing since they were measured. Each has one temperature."""
 
     rotor_warming_K: Annotated[float, Field(ge=-200, le=500)] = Field(
         0.0, description="rise of the rotors' temperature"
@@ -357,7 +362,7 @@ class HeatConfig(Section):
 
     @property
     def strain(self) -> float:
-        """Growth of the housing over that of the rotors, as a fraction of every length."""
+        """Growth of the housing minus that of the rotors, as a fraction of any length."""
         housing = self.housing_expansion_per_K * self.housing_warming_K
         return housing - self.rotor_expansion_per_K * self.rotor_warming_K
 
@@ -385,7 +390,7 @@ class SceneConfig(Section):
     drive: Literal["prescribed", "torque"] = Field(
         "prescribed", description="how rotor 1 is driven: at constant speed, or by scene.motor"
     )
-    motor: MotorConfig | None = Field(None, description="belongs to drive torque")
+    motor: MotorConfig | None = Field(None, description="only with drive: torque")
     load: LoadConfig
     timing_gear: TimingGearConfig | None = Field(None, description="absent: no timing gear")
     supports: SupportsConfig | None = Field(None, description="absent: rigid bearings")

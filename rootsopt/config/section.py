@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 def between(low: float, high: float) -> Any:
-    """Return a pydantic field for a finite number from `low` to `high`, both included."""
+    """Return a pydantic field for a finite number from `low` to `high`, both ends included."""
     return Field(ge=low, le=high, allow_inf_nan=False)
 
 

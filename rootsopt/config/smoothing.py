@@ -3,16 +3,16 @@
 import math
 
 _LONGEST = 1e-4
-"""Greatest default smoothing length (mm). A limit from `_SHARES` can be smaller."""
+"""Maximum default smoothing length (mm). A limit from `_SHARES` can be smaller."""
 _SHARES = {"twist": 0.05, "depth": 0.02, "damping": 0.1}
-"""Greatest default smoothing length, as a fraction of each of three lengths.
+"""Maximum default smoothing length, as a fraction of each of three lengths.
 
 `twist`: deflection of the timing gear under the full load, at the pitch radius. With a longer
 smoothing length, the gear would work in the rounded edge of its backlash, where its stiffness
 differs. `depth`: penetration of the flanks under the full load. `damping`: penetration at which the
 damping is full."""
 _LEAST = {"float64": 1e-6, "float32": 1e-5}
-"""Least default smoothing length (mm) for each precision.
+"""Minimum default smoothing length (mm) for each precision.
 
 A shorter length would need more solver steps and make the gradient less accurate. In single
 precision, the gap has a rounding error of about 4e-6 mm."""

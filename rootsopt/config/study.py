@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.families import families, follow, parameters, replace_fields
+from rootsopt.config.families import families, on_change, parameters, replace_fields
 from rootsopt.config.section import Order, Section, Speed, Weight, between, number, tuples
 from rootsopt.config.units import hint
 from rootsopt.config.words import named, shown
@@ -34,7 +34,7 @@ class SolverConfig(Section):
         1e-3, description="relative error of mean and peak force that auto accepts"
     )
     nodes: Annotated[int, Field(ge=16, le=20_000)] = Field(
-        400, description="nodes per whole flank of fidelity nodes"
+        400, description="number of nodes per flank for fidelity nodes"
     )
     map_error: Annotated[float, Field(ge=1e-6, le=0.1)] = Field(
         1e-4, description="error of the map's penetration, relative to the static penetration"
@@ -87,7 +87,8 @@ class SolverConfig(Section):
         "forward", description="differentiation mode; both give the same gradient"
     )
     precision: Literal["float64", "float32"] = Field(
-        "float64", description="of the integration; float32 reaches tolerances down to 2e-6"
+        "float64",
+        description="precision of the integration; float32 reaches tolerances down to 2e-6",
     )
 
     @model_validator(mode="before")
@@ -234,10 +235,10 @@ class AttractorsConfig(Section):
     """Grid of initial states for `rootsopt attractors`, which finds coexisting motions."""
 
     relatives: Annotated[int, Field(ge=1, le=1000)] = Field(
-        12, description="initial relative rotations tried"
+        12, description="number of initial relative rotations"
     )
     rates: Annotated[int, Field(ge=1, le=1000)] = Field(
-        9, description="initial relative speeds tried"
+        9, description="number of initial relative speeds"
     )
     relative_range_mrad: _Milliradians | None = Field(
         None, description="(low, high) of the relative rotation; absent: backlash and contact"
@@ -407,7 +408,7 @@ def _derive() -> None:
 
 
 _derive()
-follow(_derive)
+on_change(_derive)
 
 
 class OptimizerConfig(Section):
@@ -446,4 +447,4 @@ def _derive_optimizer() -> None:
 
 
 _derive_optimizer()
-follow(_derive_optimizer)
+on_change(_derive_optimizer)

@@ -17,9 +17,9 @@ _SECTIONS = ("rotor", "contact", "scene")
 _NOT_PHYSICAL = ("rotor.helix_deg", "contact.smoothing_mm")
 """Keys in `_SECTIONS` that cannot scatter: they are not quantities of the simulated pair."""
 _LISTED = "listed"
-"""Kind of a key that `conditions` give."""
+"""Name of the kind of `Scatter` for keys whose values `conditions` list."""
 _MOUNTING = "center_distance_error_mm", "phase_error_mrad"
-"""Errors of mounting in the section `scene`: their nominal value is 0 unless a config gives it."""
+"""Mounting errors in the section `scene`. Their nominal value is 0 unless a config gives it."""
 _PLAIN = {
     "profile_offset": "contact.clearance_mm",
     "clearance": "contact.clearance_mm",
@@ -31,7 +31,7 @@ _PLAIN = {
     "speed": "scene.speed_rpm",
     "friction": "contact.friction.kinetic",
 }
-"""Words for quantities, each with the key that is probably meant."""
+"""Common words for quantities, each with the key that the user probably means."""
 _DEEPEST = 4
 """Number of nested sections above which the keys of `tolerances.over` are rejected."""
 
@@ -104,7 +104,7 @@ class TolerancesConfig(Section):
             name: _dotted(values) if isinstance(values, dict) else values
             for name, values in named_scenes.items()
         }
-        # These scenes are all there are: nothing is drawn.
+        # With `conditions`, no sample is drawn.
         return data | {"conditions": flat, "samples": max(2, len(flat)), "check_samples": 0}
 
     @model_validator(mode="after")
@@ -194,9 +194,10 @@ def scatterable(config: Any) -> dict[str, float]:
 
 
 def mounted(data: Any) -> Any:
-    """Return the plain values of a config with the mounting errors that scatter, 0 where absent.
+    """Return a config's plain values, with 0 for mounting errors that scatter but are absent.
 
-    Return `data` unchanged if it has another form than a config, or if no such error scatters."""
+    Return `data` unchanged if it does not have the form of a config, or if no such error scatters.
+    """
     parts = [data.get(key) for key in ("scene", "tolerances")] if isinstance(data, dict) else []
     over = parts[1].get("over") if parts and isinstance(parts[1], dict) else None
     if not isinstance(over, dict) or not isinstance(parts[0], dict):
@@ -225,7 +226,7 @@ def unknown_key(key: str, valid: Mapping[str, float], known: Mapping[str, Any]) 
 
 
 def _near(word: str, words: Any) -> str:
-    """Return a guess at which of the `words` was meant, as the end of a message, or ""."""
+    """Return a guess at which of the `words` the user meant, as the end of a message, or ""."""
     meant = _PLAIN.get(word.replace("centre", "center"))
     if meant is not None:
         return f"; did you mean `{meant}`?"

@@ -61,5 +61,5 @@ def sentence(text: str) -> str:
 
 
 def near(word: str, known: Sequence[str]) -> str:
-    """Return the one of the `known` words that is most like `word`, or "" if none is like it."""
+    """Return the one of the `known` words that is most similar to `word`, or "" without one."""
     return next(iter(difflib.get_close_matches(word[:_NAME], known, n=1)), "")

@@ -290,7 +290,7 @@ class FlankPair(eqx.Module):
 
         return closest(dynamic, roll, relative)
 
-    def reach(self, normal1, normal2, roll, relative):
+    def supports_along(self, normal1, normal2, roll, relative):
         """Return (support function at rotor 1's point (m), at rotor 2's point (m), cosine).
 
         The cosine is the component of the common normal along the line of centres. `normal1`,

@@ -156,7 +156,7 @@ class Contact(eqx.Module):
         return jnp.where(self.switches(roll, approach), 1.0, -1.0)
 
     def on_side(self, side: Float[Array, ""]) -> "Contact":
-        """Return the contact to use for one side of the flanks; by default, this contact.
+        """Return the contact for one side of the flanks; by default, this contact itself.
 
         `side`: 1 for the drive flanks, -1 for the coast flanks."""
         del side

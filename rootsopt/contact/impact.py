@@ -51,10 +51,9 @@ def balanced_ramp(x: Float[Array, "*n"], width: Float[Array, "*#n"]) -> Float[Ar
 def balanced_step(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Return a C¹ step from 0 to 1 on 0 < x < 1 that has the integral of a sharp step at 0.
 
-    From a motion that crosses the zone 0 < x < 1, a damper with this onset takes the same momentum
-    as one with a sharp onset. The step is never negative, but exceeds 1 inside the zone, by up to
-    half. With `smooth_step`, the damping over half the zone would be missing.
-    """
+    A motion crosses the zone 0 < x < 1. A damper with this onset takes the same momentum from it as
+    one with a sharp onset. The step is never negative, but exceeds 1 inside the zone, by up to
+    half. With `smooth_step`, the damping over half the zone would be missing."""
     t = jnp.clip(x, 0.0, 1.0)
     return t**2 * (18 - 32 * t + 15 * t**2)
 

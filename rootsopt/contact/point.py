@@ -29,7 +29,7 @@ def contact_point(
 
     `pair`: the flanks; `roll`, `relative`: x and ε (rad) at which `found` was computed."""
     folded, mirrored = pair.folded(roll)
-    support1, support2, radial = pair.reach(found.normal1, found.normal2, folded, relative)
+    support1, support2, radial = pair.supports_along(found.normal1, found.normal2, folded, relative)
     return ContactPoint(
         support1=jnp.where(mirrored, support2, support1),
         support2=jnp.where(mirrored, support1, support2),

@@ -1,8 +1,8 @@
 """Contact gap between two flanks as polylines: nodes against straight segments (paper, Eq. 9).
 
-Each flank is a polyline from tip to root. The gap is the least (p - q) · n over the nodes p of one
-flank and the segments (q, n) of the other that face them. The paper tests the nodes of rotor 2
-only. Here, the nodes of each flank are tested against the segments of the other. The result
+Each flank is a polyline from tip to root. The gap is the least (p - q) · n. Here, p is a node of
+one flank, and (q, n) the segment of the other flank that faces it. The paper tests the nodes of
+rotor 2 only. Here, the nodes of each flank are tested against the segments of the other. The result
 therefore does not change when the rotors are exchanged.
 
 A segment faces the nodes between the bisectors at its two ends. On a bisector, the distances to
@@ -15,8 +15,7 @@ Let N be the number of lobes, x the roll coordinate and ε the relative rotation
 E be the vector between the axes, and R(a) the rotation by a. The angle a is x + ε/2 for rotor 1 and
 π/N - x + ε/2 for rotor 2. Let z be a point of a flank in the frame of its own rotor, with a tip on
 +x. In the frame of the other rotor, it lies at R(a) (E - R(-a′) z). Here, a is the angle of the
-other rotor and a′ that of its own. Exchanging the rotors only exchanges a and a′.
-"""
+other rotor and a′ that of its own. Exchanging the rotors only exchanges a and a′."""
 
 import equinox as eqx
 import jax

@@ -1,10 +1,9 @@
 """Finds the size that a contact map needs for a given error.
 
 The gap is computed by search along a few fine lines through the map. For each size in a fixed list,
-the map's spline is fitted to this gap (SciPy, one dimension at a time). The error is that of the
+SciPy fits the map's spline to this gap, one dimension at a time. The error is that of the
 penetration where the flanks overlap. The list is fixed because every size needs its own compiled
-program.
-"""
+program."""
 
 from typing import NamedTuple
 
@@ -23,8 +22,8 @@ RELATIVES = (16, 24, 32, 48)
 _FINE = 3073, 193
 """Number of poses on each line over the roll, and on each line over ε, in `_probe`."""
 _LINES = 5, 33
-"""Number of lines over the roll, each at half the ε of the line before; number of lines over ε, at
-evenly spaced rolls."""
+"""Two numbers: lines over the roll, each at half the ε of the line before; lines over ε, at evenly
+spaced rolls."""
 
 
 class MapSize(NamedTuple):

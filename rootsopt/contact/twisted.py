@@ -13,13 +13,12 @@ class TwistedContact(WrappedContact):
     """The contact of a section, with the Gauss points along the length of twisted rotors.
 
     Gap, levers and point are those of the `section`, an untwisted contact; the rotor pair evaluates
-    it once per slice. `twist` (rad): angle by which the section at the far end of a rotor is turned
-    from that at the near end, positive in the rotor's own sense of rotation. `count`: number of
-    slices.
+    it once per slice. `twist` (rad): angle from the section at the near end of a rotor to that at
+    the far end, positive in the rotor's own sense of rotation. `count`: number n of slices.
 
-    A slice at the share u of the length from the middle, -1/2 ≤ u ≤ 1/2, is in the pose φ1 + Φ u,
-    φ2 + Φ u. Gauss-Legendre quadrature integrates polynomials in u up to the degree 2n - 1 exactly.
-    """
+    Let u be the distance of a slice from the middle, as a share of the length, -1/2 ≤ u ≤ 1/2. Its
+    pose is φ1 + Φ u, φ2 + Φ u, with the twist Φ. Gauss-Legendre quadrature integrates polynomials
+    in u up to the degree 2n - 1 exactly."""
 
     section: Contact
     twist: Float[Array, ""]

@@ -9,18 +9,17 @@ from rootsopt.contact.wrapped import WrappedContact
 from rootsopt.profiles import Profile
 
 LINES = 12
-"""Number of lines, beside the mean, of the series for the wear over the roll coordinate."""
+"""Number of cosine terms in the series of the wear over the roll coordinate, without the mean."""
 _POSES = 512
-"""Number of roll angles for the coefficients of the series."""
+"""Number of roll angles from which the coefficients of the series are computed."""
 
 
 class WornContact(WrappedContact):
     """The contact of flanks that are worn by a depth w which follows the roll coordinate x.
 
     `section`: the contact of new flanks; `coefficients` (k,): of w(x) = Σ a_k cos(2 N k x) in m;
-    `lobes`: N as an array. The gap grows by w, and the levers by what makes the force that of a
-    potential: x = -(φ1 + φ2)/2, so that lever 1 grows by w'/2 and lever 2 falls by it.
-    """
+    `lobes`: N as an array. The gap grows by w. So that the force still has a potential, lever 1
+    grows by w'/2 and lever 2 falls by w'/2, because x = -(φ1 + φ2)/2."""
 
     section: Contact
     coefficients: Float[Array, " k"]
@@ -46,8 +45,8 @@ def series_at(
 def wear_shape(profile: Profile, roll: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Return the relative wear of both flanks together at the roll angle `roll` (rad).
 
-    Archard's law: a line contact under the force F' per length that moves over a surface at the
-    speed v and slides at the speed u wears off a depth proportional to F' u / v. Here u = 2 ω s,
+    Archard's law: a line contact wears off a depth proportional to F' u / v. F' is the force per
+    length, v the speed of the contact over the surface, and u the sliding speed. Here u = 2 ω s,
     and v = ω dl/dβ on each flank: 2 |s| (dβ/dl1 + dβ/dl2), without unit. F' is taken as constant.
     """
     half = profile.half_pitch

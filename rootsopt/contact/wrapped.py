@@ -10,7 +10,7 @@ from rootsopt.contact.point import ContactPoint
 
 
 class WrappedContact(Contact):
-    """A contact that does as its `section` does, except for what a subclass overrides."""
+    """A contact that delegates to its `section`, except for what a subclass overrides."""
 
     section: eqx.AbstractVar[Contact]
 

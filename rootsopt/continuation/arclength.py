@@ -37,8 +37,8 @@ _ASTRAY = 0.5
 """Distance (steps) from the predicted to the corrected point above which the corrected point is
 assumed to lie on another curve."""
 _CORNER = 3e-5, 1e-4, 3e-4, 1e-3
-"""Distances from a corner of the curve (unit of `StepSizes`) at which the curve's continuation is
-searched for, shortest first."""
+"""Distances from a corner of the curve (unit of `StepSizes`) at which the search for the curve's
+continuation is made, shortest first."""
 _SAME = 1e-6
 """Distance (unit of `StepSizes`) below which two points of a curve count as the same."""
 _CLOSING = 8
@@ -243,7 +243,8 @@ def follow_curve(
         spots.append(new)
         if _back_at_first(curve, spots):
             return Path(spots, crossings, End.CLOSED)
-        # The step does not shrink after many looks: near a grazing contact every spot needs many.
+        # Many looks are no reason to shorten the step: near a grazing contact, every spot needs
+        # many.
         if new.tangent @ old.tangent > _STRAIGHT:
             step = min(1.5 * step, steps.greatest)
 

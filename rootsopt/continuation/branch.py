@@ -42,7 +42,7 @@ count as equal. A branch whose steps have become too small there ends at an orbi
 (`End.HALVED`)."""
 _SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
 """Distances (unit of `StepSizes`) from a period doubling at which the orbit of twice the period is
-searched for, in this order."""
+tried, in this order."""
 
 
 class Kind(enum.Enum):
@@ -94,7 +94,8 @@ class Branch:
         """Return all orbits of the branch at one `value` of the parameter (config's unit).
 
         Each orbit is closed again at exactly this value, and left out if that fails. The branch's
-        last point is returned as it is. The list is empty if the branch does not pass the value."""
+        last point is returned unchanged. The list is empty if the branch does not pass the value.
+        """
         orbits = OrbitFamily(self.config, self.parameter, self.period, self.limits)
         found = []
         for old, new in zip(self.points[:-1], self.points[1:], strict=True):
@@ -169,12 +170,11 @@ def follow_doubled(
 ) -> Branch | None:
     """Follow the branch of twice the period that begins at a period doubling of `branch`.
 
-    The first orbit is searched for a little away from the bifurcation, displaced along the
+    The search for its first orbit starts a little away from the bifurcation, displaced along the
     eigenvector of the multiplier -1. `limits`: by default the limits of `branch`. The result is
     None if no orbit of twice the period is found, or if twice the period exceeds 8 mesh periods.
 
-    Raises `ValueError` if `bifurcation` is not a period doubling.
-    """
+    Raises `ValueError` if `bifurcation` is not a period doubling."""
     if bifurcation.kind is not Kind.PERIOD_DOUBLING:
         raise ValueError(
             "Argument `bifurcation` must be a period doubling, but is "

@@ -176,7 +176,7 @@ class _Shot(NamedTuple):
     scale: Float[Array, ""]
 
 
-class _Seen(NamedTuple):
+class _OrbitData(NamedTuple):
     """Data of an orbit in `Linearization.data`, in addition to residual and Jacobian.
 
     `statistics`: mean, peak and RMS force (N); `half_way`: distance (unit of `StepSizes`) between
@@ -272,7 +272,7 @@ class OrbitFamily:
         miss = np.asarray(out.end) - state
         monodromy = np.asarray(out.slope)[:count, :count]
         by_share = out.slope[:count, count] * self.width / SPAN
-        seen = _Seen(
+        seen = _OrbitData(
             monodromy=monodromy,
             state=state * (self.unit / shot.scale),
             statistics=np.array([out.mean, out.peak, np.sqrt(out.mean_square)]),
@@ -314,7 +314,7 @@ class OrbitFamily:
 
     def point(self, spot: Spot) -> BranchPoint:
         """Return the orbit at a `spot` of the curve."""
-        seen: _Seen = spot.look.data
+        seen: _OrbitData = spot.look.data
         mean, peak, rms = map(float, seen.statistics)
         return BranchPoint(
             value=self.value(spot.place),

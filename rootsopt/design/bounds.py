@@ -5,7 +5,8 @@ from rootsopt.config.families import Parameter, family_of
 from rootsopt.errors import InputError
 
 _ROOM = 0.1
-"""Distance beyond a design (fraction of the width of the bounds) to which bounds are widened."""
+"""Distance (fraction of the width of the bounds) from a design to the bounds that are widened for
+it."""
 
 
 def bounds_of(config: Config) -> list[tuple[float, float]]:

@@ -110,7 +110,7 @@ def likeness(profile: Profile, family: str) -> Likeness | None:
     found = [_fitted(look, sample[k], high - low) for k in np.argsort(faults)[:_STARTS]]
     if not family_of(family).by_limits:
         return _best(look, profile, found)
-    # The limits in closed form also admit profiles with slightly negative margins.
+    # The closed-form limits also allow profiles with slightly negative margins.
     free = _Look(profile, family, limited=False)
     return _best(free, profile, [*found, *(_fitted(free, one, high - low) for one in found)])
 
@@ -167,7 +167,7 @@ def _numbered(keys: tuple[str, ...], count: int) -> list[str]:
     return [*alone, *(f"{keys[-1]}_{k}" for k in range(1, count - len(alone) + 1))]
 
 
-class _Seen(NamedTuple):
+class _Comparison(NamedTuple):
     """Comparison of a member of a family with a profile.
 
     `distance` (n,): signed distances between the outlines (pitch radii), from points of the profile
@@ -228,7 +228,7 @@ class _Look:
         return low, high
 
     @functools.lru_cache(maxsize=1024)  # noqa: B019
-    def _at(self, design: tuple[float, ...]) -> _Seen:
+    def _at(self, design: tuple[float, ...]) -> _Comparison:
         values = np.asarray(design, dtype=np.float64)
         found = _member(self.family, self.lobes, self.radius, values)
         line, line_slope, margin, margin_slope = map(np.asarray, found)
@@ -236,7 +236,7 @@ class _Look:
             margin, margin_slope = 0 * margin, 0 * margin_slope
         if not np.all(np.isfinite(line)):
             nothing = np.full(1, np.nan), np.full((1, len(values)), np.nan)
-            return _Seen(nothing[0], margin, nothing[1], margin_slope)
+            return _Comparison(nothing[0], margin, nothing[1], margin_slope)
         # From the profile's points to the member. A nearest point moves along with its segment.
         near, near_slope = beyond(line, self.lobes), beyond(line_slope, self.lobes)
         to = feet(self.target, near, smooth=True)
@@ -247,9 +247,9 @@ class _Look:
         back = feet(line, self.around, smooth=True)
         back_slope = -np.einsum("nk,nkd->nd", back.toward, line_slope)
         distance = np.concatenate([to.away, -back.away])
-        return _Seen(distance, margin, np.concatenate([slope, back_slope]), margin_slope)
+        return _Comparison(distance, margin, np.concatenate([slope, back_slope]), margin_slope)
 
-    def __call__(self, design) -> _Seen:
+    def __call__(self, design) -> _Comparison:
         return self._at(tuple(map(float, design)))
 
 
@@ -263,7 +263,7 @@ def _limits(parameter: Parameter, radius_mm: float) -> tuple[float, float]:
 
 
 def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
-    """Return a design near `start` that locally minimises `_Seen.fault`.
+    """Return a design near `start` that locally minimises `_Comparison.fault`.
 
     The search is a sequence of linear programs. Each finds the step that is best to first order
     within a trust region. `width` (d,): widths of the parameters' usual ranges.
@@ -286,7 +286,7 @@ def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
     return design
 
 
-def _promising(seen: _Seen, width, size: float, room) -> NDArray[np.float64]:
+def _promising(seen: _Comparison, width, size: float, room) -> NDArray[np.float64]:
     """Return the step (d,), in units of `width`, that minimises the fault to first order.
 
     No entry of the step exceeds `size` in magnitude, or leaves the range `room` (low, high), each

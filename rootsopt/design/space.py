@@ -48,9 +48,8 @@ class Constraint(eqx.Module):
 
     `name`: name in reports; `quantity`: name of the limited field of `Geometry`, or of
     `ProfileMargins` if `margin` is true; `limit`: limit in SI units; `scale`: divisor (SI) that
-    brings the slack to the order of one; `unit`: unit in reports; `factor`: SI value of one
-    such unit.
-    """
+    makes slacks comparable, about the size of the limit; `unit`: unit in reports; `factor`: SI
+    value of one such unit."""
 
     name: str = eqx.field(static=True)
     quantity: str = eqx.field(static=True)

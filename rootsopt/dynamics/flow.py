@@ -10,9 +10,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.dynamics.flanks import FlankForce
 from rootsopt.dynamics.integrator import Integrator, StepGrid
 from rootsopt.dynamics.measures import Measures
-from rootsopt.dynamics.pair import FlankForce, RotorPair
+from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, Steps, locate_peak, one_sided
 from rootsopt.dynamics.saltation import MARKS, marks, saltation
 from rootsopt.dynamics.stepping import integrated
@@ -187,8 +188,8 @@ class Equation(eqx.Module):
     def with_force(self, begin, end, y, dynamic) -> Float[Array, " rows"]:
         """Return y after one step from `begin` to `end` (mesh periods), and the contact force.
 
-        If the contact may jump, the first of the `marks` stands between them. The force is in
-        `force_unit`."""
+        The force is in `force_unit`, and is the last entry. If the contact may jump, the first of
+        the `marks` precedes it."""
         after, slope = self.advanced(begin, end, y, dynamic)
         pair = self.pair(dynamic)
         force = slope[self.states]
@@ -279,34 +280,8 @@ def flow(  # Eleven parameters: adaptive steps, repeated steps and reverse mode 
         repeat=jnp.asarray(False if grid is None else repeat),
     )
     how = periods, control, integrator.max_steps, samples
-    # An adjoint of diffrax ignores jumps. Where the contact may jump, differentiate the steps.
-    retraced = pair.jumps and adjoint is not None
-    if adjoint is None or retraced:
-        given = lax.stop_gradient((dynamic, start)) if retraced else (dynamic, start)
-        taken = _solved(equation, *given, *how)
-    else:
-        taken = _solved_by_diffrax(equation, dynamic, start, *how, adjoint)
-    if retraced:
-        taken = _retraced(equation, taken, start, dynamic)
-    # The step that contains the peak is repeated up to the peak. Short steps from there give the
-    # force on both sides.
-    steps = lax.stop_gradient(
-        Steps(
-            taken.begins,
-            taken.grid,
-            taken.before[:, :count],
-            taken.after[:, :count],
-            taken.last + 1,
-        )
-    )
-    peak_time, depth = locate_peak(lax.stop_gradient(pair), taken.states, periods, steps)
-    holds = jnp.clip(jnp.sum(taken.grid < peak_time), 0, taken.last)
-    peak = _Peak(
-        holds=holds,
-        time=jnp.maximum(peak_time, taken.begins[holds] + _SHORTEST),
-        beside=BESIDE_UNIT[dtype.itemsize] * jnp.asarray(BESIDE, dtype),
-        noise=lax.stop_gradient(pair.rounding(depth)),
-    )
+    taken = _taken(equation, dynamic, start, how, adjoint, pair.jumps)
+    steps, peak, depth = _located(pair, taken, periods, count)
     duration = taken.end[-1] if pair.free else periods
     raw = taken.end[count : count + measures.count] / duration
     averages, factors = measures.values(raw, force_unit, top)
@@ -338,6 +313,55 @@ def flow(  # Eleven parameters: adaptive steps, repeated steps and reverse mode 
         others=averages[2:],
         slope=slope,
     )
+
+
+def _taken(
+    equation: Equation,
+    dynamic: Any,
+    start: Float[Array, " m"],
+    how: tuple[Float[Array, ""], StepGrid, int, int],
+    adjoint: diffrax.AbstractAdjoint | None,
+    jumps: bool,
+) -> _Recorded:
+    """Integrate from y = `start` and return all accepted steps.
+
+    `how`: arguments `periods`, `control`, `max_steps` and `samples` of `_solved`. With an
+    `adjoint`, the result is differentiable in reverse mode. An adjoint of diffrax ignores jumps of
+    the contact, so the steps are differentiated instead if there may be `jumps`."""
+    if adjoint is None:
+        return _solved(equation, dynamic, start, *how)
+    if not jumps:
+        return _solved_by_diffrax(equation, dynamic, start, *how, adjoint)
+    taken = _solved(equation, *lax.stop_gradient((dynamic, start)), *how)
+    return _retraced(equation, taken, start, dynamic)
+
+
+def _located(
+    pair: RotorPair, taken: _Recorded, periods: Float[Array, ""], count: int
+) -> tuple[Steps, _Peak, Float[Array, ""]]:
+    """Return the steps `taken`, the instant of the peak force, and the greatest penetration (m).
+
+    The step that contains the peak is repeated up to the peak. Short steps from there give the
+    force on both sides. `count`: number of states."""
+    steps = lax.stop_gradient(
+        Steps(
+            taken.begins,
+            taken.grid,
+            taken.before[:, :count],
+            taken.after[:, :count],
+            taken.last + 1,
+        )
+    )
+    peak_time, depth = locate_peak(lax.stop_gradient(pair), taken.states, periods, steps)
+    holds = jnp.clip(jnp.sum(taken.grid < peak_time), 0, taken.last)
+    dtype = taken.before.dtype
+    peak = _Peak(
+        holds=holds,
+        time=jnp.maximum(peak_time, taken.begins[holds] + _SHORTEST),
+        beside=BESIDE_UNIT[dtype.itemsize] * jnp.asarray(BESIDE, dtype),
+        noise=lax.stop_gradient(pair.rounding(depth)),
+    )
+    return steps, peak, depth
 
 
 def _solved(
@@ -389,7 +413,7 @@ def _solved_by_diffrax(
     samples: int,
     adjoint: diffrax.AbstractAdjoint,
 ) -> _Recorded:
-    """Return the same as `_solved`, differentiable in reverse mode by the diffrax `adjoint`."""
+    """Return the results of `_solved`, differentiable in reverse mode by the diffrax `adjoint`."""
     dtype = start.dtype
     solution = diffrax.diffeqsolve(
         _over_unit(equation, periods),

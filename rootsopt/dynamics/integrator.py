@@ -118,6 +118,7 @@ class StepGrid(diffrax.AbstractAdaptiveStepSizeController):
     def wrap(self, direction):
         return eqx.tree_at(lambda self: self.pid, self, self.pid.wrap(direction))
 
+    # diffrax prescribes the parameters of `init` and `adapt_step_size`.
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         first, state = self.pid.init(terms, t0, t1, y0, dt0, args, func, error_order)
         strain = jnp.zeros((), self.ends.dtype)

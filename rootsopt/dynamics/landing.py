@@ -1,13 +1,12 @@
 """Step size control that ends steps where a flank or the timing gear may begin to touch.
 
-In free flight the motion is a parabola, for which a high-order method estimates no error. Steps
-grow until one of them skips a whole contact between two stages, at any tolerance. Two integrations
-whose steps differ only by rounding then differ by the impulse of that contact.
+In free flight the motion is a parabola, for which a high-order method estimates an error of zero.
+Steps grow until one of them skips a whole contact between two stages, at any tolerance. Two
+integrations whose steps differ only by rounding then differ by the impulse of that contact.
 
 Therefore a step ends where the parabola through the last step reaches an edge of free flight: a
-value of ε at which contact may begin. The next step starts short. A step that has passed an edge
-by too much is repeated.
-"""
+value of ε at which contact may begin. The next step starts short. A step that has passed an edge by
+too much is repeated."""
 
 import diffrax
 import jax.numpy as jnp
@@ -86,6 +85,7 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
     def wrap(self, direction):
         return self
 
+    # diffrax prescribes the parameters of `init` and `adapt_step_size`.
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         # Without `dt0`, diffrax adds no check of it. The check would be a callback to Python, and
         # programs with callbacks cannot be cached.

@@ -69,8 +69,10 @@ def eigenvalues(matrix: Float[Array, "n n"]) -> Complex[Array, " n"]:
     small = float(jnp.finfo(matrix.dtype).eps)
 
     def shift_of(work, size):
-        """Return Wilkinson's shift: the eigenvalue of the active block's last 2 x 2 block that is
-        nearest to its last entry."""
+        """Return Wilkinson's shift for the active block, the first `size` rows of `work`.
+
+        The shift is the eigenvalue of the block's last 2 x 2 block that is nearest to its last
+        entry."""
         low, high = size - 1, jnp.maximum(size - 2, 0)
         a, b, c, d = work[high, high], work[high, low], work[low, high], work[low, low]
         half = (a - d) / 2

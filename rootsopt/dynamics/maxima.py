@@ -42,7 +42,8 @@ _CLOSER, _ROUNDS = 16, 10
 _CHUNK = 32
 """Number of steps linearised together, as arrays."""
 _DIP = 1e-6
-"""Fall of the force between two maxima (fraction of the lower one) below which they are one."""
+"""Fall of the force between two maxima (fraction of the lower one) below which they count as one
+maximum."""
 _LEAST = 1e-3
 """Fraction of the greatest force below which a maximum is left out."""
 _SHOULDER = 0.02
@@ -115,7 +116,7 @@ def prepare_maxima(
 
 
 def _room(samples: int, steps: int) -> int:
-    """Return the number of times that one call of `_forces` takes at most in the first scan."""
+    """Return the maximum number of times that one call of `_forces` gets in the first scan."""
     return samples + steps + 1
 
 
@@ -208,7 +209,7 @@ def candidates(
 
 
 def shoulders(forces: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the indices (k,) of shoulders among uniform samples (m,) of one cycle.
+    """Return the indices (k,) of shoulders among uniform samples `forces` (m,) of one cycle.
 
     A shoulder is a sample at which the slope of the force comes closest to 0, without a change of
     sign. Only shoulders close to the greatest force count (`_SHOULDER`). The shoulder with the
@@ -252,7 +253,7 @@ def _forces(pair: RotorPair, states, steps: Steps, times, width, count):
     return lax.while_loop(lambda carry: carry[0] * _LANES < count, look, start)[1]
 
 
-class _Pieces(NamedTuple):
+class _StepSlopes(NamedTuple):
     """Several linearised steps: state and force after each step, and their derivatives.
 
     `value` (jobs, n + 1); `by_state` (jobs, n + 1, n): with respect to the state before the step;
@@ -296,7 +297,7 @@ def _differentiated(
             lambda y, dynamic: equation.with_force(begin, end, y, dynamic), y, dynamic, moved, count
         )
         rows = jnp.append(jnp.arange(count), jnp.arange(y.shape[0], found.value.shape[0]))
-        return jax.tree.map(lambda x: x[rows], _Pieces(*found))
+        return jax.tree.map(lambda x: x[rows], _StepSlopes(*found))
 
     # One loop linearises the steps of the orbit, then those up to the maxima, then those beside
     # the maxima, so that the linearised step is compiled once.
@@ -344,7 +345,7 @@ def _differentiated(
     return unit * values, unit * jnp.einsum("ksf,ksfd->kd", weights, slopes)
 
 
-def _after(pieces: _Pieces, before: Float[Array, "jobs n d"]) -> Float[Array, "jobs rows d"]:
+def _after(pieces: _StepSlopes, before: Float[Array, "jobs n d"]) -> Float[Array, "jobs rows d"]:
     """Return the derivatives of the values after the steps `pieces`.
 
     `before`: derivatives of the state before each step."""
@@ -352,7 +353,7 @@ def _after(pieces: _Pieces, before: Float[Array, "jobs n d"]) -> Float[Array, "j
     return moved + pieces.by_parameters
 
 
-def _along(kept: _Pieces, start: Float[Array, "n d"], taken: Int[Array, ""]) -> Any:
+def _along(kept: _StepSlopes, start: Float[Array, "n d"], taken: Int[Array, ""]) -> Any:
     """Return the derivatives (steps, n, d) of the state at the start of each step of an orbit.
 
     `kept`: the linearised steps; `start` (n, d): derivatives at the start of the orbit; `taken`:

@@ -137,7 +137,7 @@ class _Closing(NamedTuple):
     checked: Bool[Array, ""]
 
 
-class _Closer(eqx.Module):
+class _Shooting(eqx.Module):
     """The loop of `orbit_or_window`, with the settings of one call.
 
     `start` returns the initial state of the loop, `go_on` whether the loop continues, and `step`
@@ -392,7 +392,7 @@ def orbit_or_window(
     roundings, tolerances, most = _CLOSED
     enough = jnp.minimum(tolerances * tolerance, most)
     enough = jnp.maximum(roundings * float(jnp.finfo(dtype).eps), enough)
-    closer = _Closer(
+    closer = _Shooting(
         pair=pair,
         tangents=tangents,
         period=period,

@@ -14,8 +14,8 @@ _RIVALS, _CLOSER, _ROUNDS = 4, 16, 10
 many among the ends of steps; `_CLOSER`: number of evaluations around each maximum in a round;
 `_ROUNDS`: number of rounds."""
 _INNER = 2 * _RIVALS * _CLOSER - 2
-"""Number of samples or ends of steps scanned in one iteration of the search. The iteration also
-evaluates one neighbour at either end."""
+"""Number of samples, or of ends of steps, that one iteration of the search scans. It also evaluates
+one neighbour at either end."""
 _WIDE = 64
 """Distance of the outermost times in `BESIDE` from the peak, in units of `BESIDE_UNIT`."""
 BESIDE = (0.0, -1.0, -2.0, 1.0, 2.0, -_WIDE, _WIDE)

@@ -17,22 +17,23 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from rootsopt.dynamics.pair import FlankForce
+from rootsopt.dynamics.flanks import FlankForce
 
 LONGEST = 4e-6
-"""Length of a step (mesh periods) above which the step is not checked for a jump. The short steps
-around switches (`rootsopt.dynamics.switches`) are all shorter in double precision."""
+"""Length of a step (mesh periods) above which the step is not checked for a jump. In double
+precision, all short steps around switches (`rootsopt.dynamics.switches`) are shorter."""
 _LONGEST_ROUNDINGS = 320
-"""The same length in rounding errors of one mesh period. It exceeds `LONGEST` only in single
-precision. There, the short steps of an orbit of eight mesh periods have 256 rounding errors."""
+"""Length of a step (rounding errors of one mesh period) above which the step is not checked for a
+jump, if it exceeds `LONGEST`. That is so only in single precision. There, the short steps of an
+orbit of eight mesh periods have 256 rounding errors."""
 _FASTER = 20.0
 """Rate of change of a lever (pitch radii per mesh period) above which the change counts as a jump.
 Along a flank of the EE family the rate is at most 2π, for any number of lobes."""
 _ROUNDINGS = 300
 """Change of a lever (rounding errors) below which the change does not count as a jump."""
 _ALIKE = 0.05
-"""Distance from the levers at a stage to those at the nearer end of the step (fraction of the
-change over the step) above which the change does not count as a jump. If a lever changes fast but
+"""Distance from the levers at a stage to those at the nearer end of the step, as a fraction of the
+change over the step. Above it, the change does not count as a jump: if a lever changes fast but
 continuously, some stages lie in between."""
 MARKS = 4
 """Number of `marks`: further numbers stored with the time derivative of a motion (penetration, its

@@ -19,7 +19,7 @@ from rootsopt.dynamics.pair import RotorPair
 BLOCK = 4
 """Number of mesh periods integrated between two checks of whether the motion repeats."""
 _MEMORY = 20
-"""Number of stroboscopic states stored: more than twice the longest cycle searched for."""
+"""Number of stroboscopic states stored: more than twice the longest cycle that is recognised."""
 _PATIENCE = 32, 1e-5
 """Number of mesh periods after which a transient continues with a finer tolerance, and the greatest
 value of that tolerance. The noise of coarser steps can hide that the motion repeats."""
@@ -64,11 +64,11 @@ def settle(
 ) -> Transient:
     """Integrate from the scaled `state` (n,) until the stroboscopic states repeat with a period k.
 
-    The motion has settled if the last k + 1 states differ from the states k periods earlier by less
-    than `tolerance` (scaled). For large states, the noise of the steps replaces `tolerance` if it
-    is greater. k is the smallest such period, at most `max_orbit` ≤ 8. Steps become finer after
-    `_PATIENCE`. The transient ends unsettled after `max_periods` mesh periods.
-    """
+    `integrator`: method and steps, with the tolerance at the start. The motion has settled if the
+    last k + 1 states differ from the states k periods earlier by less than `tolerance` (scaled).
+    For large states, the noise of the steps replaces `tolerance` if it is greater. k is the
+    smallest such period, at most `max_orbit` ≤ 8. Steps become finer after `_PATIENCE`. The
+    transient ends unsettled after `max_periods` mesh periods."""
     orders = jnp.arange(1, max_orbit + 1)
     age = jnp.arange(_MEMORY)[::-1]
 

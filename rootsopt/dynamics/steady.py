@@ -51,8 +51,8 @@ class Solver(eqx.Module):
     `transient`, `orbit`: integrators of the transient and of the orbit; `measures`: averages of the
     force to compute; `max_periods`: maximum length of the transient (mesh periods); `examine`: 1 to
     integrate a window of a motion that does not settle, 0 to skip the window; `max_orbit`: longest
-    period searched for (mesh periods), at most 8; `precision`: float64 or float32. `max_periods`
-    and `examine` are floats, as are all leaves.
+    period of an orbit to find (mesh periods), at most 8; `precision`: float64 or float32.
+    `max_periods` and `examine` are floats, as are all leaves.
 
     The other settings have defaults. Coarse surveys of many designs use other values. `shots`:
     maximum number of integrations to close an orbit; `closed`: residual (tolerances) at which an
@@ -342,7 +342,8 @@ class _Attempts(eqx.Module):
         return jnp.where(jnp.any(fits), periods[jnp.argmax(fits)], 0)
 
     def _unsettled(self, window: Window) -> Int[Array, ""]:
-        """Return the status code of a motion that has not settled, judged by a `window` of it."""
+        """Return the status code of the motion, judged by a `window` of it, as `window_status`
+        does."""
         if not self.solver.windows:
             return jnp.asarray(Status.NOT_SETTLED.code)
         return window_status(self.pair, window)

@@ -64,7 +64,7 @@ class _State(NamedTuple):
     records: Records | None
 
 
-def integrated(
+def integrated(  # 97 lines: the functions of its loop share the settings of one call.
     term: diffrax.AbstractTerm,
     solver: diffrax.AbstractSolver,
     control: diffrax.AbstractAdaptiveStepSizeController,

@@ -48,8 +48,8 @@ _GRADES = 8.0, 64.0
 around it. They keep the neighbouring steps short, in case the switch occurs slightly outside its
 short step."""
 _HOLDS = 2.5
-"""Length of a step (multiples of the greatest half length of a short step around a switch) below
-which the step is never halved, because it may be such a short step."""
+"""Length of a step below which the step is never halved, in multiples of the greatest half length
+of a short step around a switch. The step may be such a short step."""
 _APART = 1e-10
 """Distance (mesh periods) below which two step ends are merged."""
 
@@ -209,11 +209,10 @@ def _rank(chosen: Bool[Array, "lanes s"]) -> Int[Array, "lanes s"]:
 
 
 def halved(grid: Float[Array, " steps"]) -> Float[Array, " steps"]:
-    """Return `grid` with its steps halved; if there is no room for all, only the longest are.
+    """Return `grid` with its steps halved, or only the longest of them if there is no room for all.
 
     The short steps around switches are not halved. A switch lies in the middle of such a step, and
-    rounding would decide on which side of the switch the derivatives are taken.
-    """
+    rounding would decide on which side of the switch the derivatives are taken."""
     lengths, whole = _lengths(grid)
     taken = grid < jnp.inf
     begins = jnp.concatenate([jnp.zeros_like(grid[:1]), grid[:-1]])

@@ -37,11 +37,11 @@ class Timescales(eqx.Module):
     ) -> "Timescales":
         """Return the timescales of a pair, without derivatives.
 
-        `inertia` (kg·m²) of one rotor; `force` (N): static flank force at the pitch `radius` (m);
-        `clearance` (m) of the flanks. The contact stiffness is taken at the greater of two depths:
-        the static penetration, and the penetration of an impact after free flight through the whole
-        backlash. The energy of this impact is the work of the load.
-        """
+        `law`: contact law; `parts`: all parts of the scene; `inertia` (kg·m²) of one rotor; `force`
+        (N): static flank force at the pitch `radius` (m); `clearance` (m) of the flanks. The
+        contact stiffness is taken at the greater of two depths: the static penetration, and the
+        penetration of an impact after free flight through the whole backlash. The energy of this
+        impact is the work of the load."""
         parts = tuple(parts)
         play = jnp.zeros_like(force)
         for part in parts:

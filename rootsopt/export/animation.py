@@ -18,7 +18,7 @@ from rootsopt.export.drawing import Drawing
 from rootsopt.export.pieces import polyline
 from rootsopt.figures.style import BLUE, GREY, ORANGE, SKY, VERMILION, figure
 from rootsopt.profiles import Profile
-from rootsopt.response.evaluation import Series
+from rootsopt.response.series import Series
 from rootsopt.runtime.programs import Program
 
 _MM = 1e3
@@ -64,11 +64,10 @@ def rolling_contacts(
     `rotation` (n,): rotations φ of rotor 1 (rad); `coast`: whether the contacts are those of the
     coast flanks, not of the drive flanks. A drive flank is in contact while its roll angle β = -φ
     is between 0 and π/N, once in every lobe pitch. At other rotations, the result holds the contact
-    at the nearer end of this range, marked as not present. The contact point is
-    (r + s sin ψ, s cos ψ) and the normal is (sin ψ, cos ψ), with the pitch radius r, the pressure
-    angle ψ and the distance s from the pitch point. The contact of a coast flank is the mirror
-    image in the line of centres, with β = φ.
-    """
+    at the nearer end of this range, marked as not present. The contact point is (r + s sin ψ, s cos
+    ψ), and the normal is (sin ψ, cos ψ). Here, r is the pitch radius, ψ the pressure angle, and s
+    the distance from the pitch point. The contact of a coast flank is the mirror image in the line
+    of centres, with β = φ."""
     half = np.pi / (2 * profile.lobes)
     roll = (rotation if coast else -rotation) - half
     roll = half + roll - 4 * half * np.round(roll / (4 * half))

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from rootsopt.export.pieces import Arc, DrawnPiece
 
 _SAME = 1e-9
-"""Distance along the outline (outline lengths) below which two points are one."""
+"""Distance along the outline (fraction of the outline's length) below which two points count as
+one."""
 
 
 class Coordinates(NamedTuple):
@@ -76,8 +77,8 @@ def _tip(pieces: Sequence[DrawnPiece], ends: NDArray[np.float64]) -> float:
 def widest(pieces: Sequence[DrawnPiece], lobes: int) -> complex:
     """Return the point (mm) on the upper flank of the lobe on +x at which the lobe is widest.
 
-    Its width is twice the point's y coordinate. Where the flank becomes wider and wider down to the
-    root, the point lies on the pitch circle, which is at an angle of π / (2 `lobes`)."""
+    Its width is twice the point's y coordinate. If the lobe widens all the way down to the root,
+    the point is that on the pitch circle, at the angle π / (2 `lobes`)."""
     found = [point for piece in pieces for point in _tops(piece)]
     reach = max(abs(piece.start) for piece in pieces)
     inside = [

@@ -77,7 +77,8 @@ class Drawing:
 
     @property
     def reach(self) -> float:
-        """Distance (mm) from the rotor's axis to the ends of the centre lines."""
+        """Distance (mm) from the rotor's axis to the ends of the centre lines, beyond the outer
+        circle."""
         return 1.08 * self.outer_radius
 
 
@@ -115,7 +116,7 @@ def _block(config: Config) -> tuple[tuple[str, str], ...]:
 
 
 def _scene(config: Config) -> str:
-    """Return the scene that the rotor was designed for, in a few words."""
+    """Return a few words on the scene for which the rotor was designed."""
     scene, load = config.scene, config.scene.load
     words = [f"{scene.speed_rpm:g} rpm"]
     if load.torque_N_m is not None:

@@ -25,7 +25,9 @@ _LETTER = 0.9
 
 
 def add_style(document: Any, drawing: Drawing) -> None:
-    """Add the dimension style to a `document` of ezdxf: sizes that suit the rotor, 0.001 mm."""
+    """Add the dimension style to a `document` of ezdxf, with sizes (mm) that suit the rotor.
+
+    Dimensions are rounded to 0.001 mm."""
     height = letter(drawing)
     document.dimstyles.add(
         STYLE,
@@ -44,10 +46,9 @@ def letter(drawing: Drawing) -> float:
 
 
 def add_dimensions(space: Any, drawing: Drawing) -> None:
-    """Add the dimensions of the rotor: diameters of outer, pitch and root circle and bore, and the
-    width of a lobe.
+    """Add the dimensions of the rotor: diameters of bore and circles, and the width of a lobe.
 
-    `space`: modelspace of ezdxf."""
+    The circles are outer, pitch and root circle. `space`: modelspace of ezdxf."""
     outer = drawing.outer_radius
     for radius in (outer, drawing.root_radius):
         space.add_circle((0, 0), radius, dxfattribs={"layer": CIRCLES})

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from build123d.topology import Shape
 
 CHORD = 0.005
-"""Greatest distance (mm) between a facet of an STL file and the solid."""
+"""Maximum distance (mm) between a facet of an STL file and the solid."""
 TURN = 0.05
-"""Greatest angle (rad) between neighbouring facets of a curved face of an STL file."""
+"""Maximum angle (rad) between neighbouring facets of a curved face of an STL file."""
 _STEP = np.pi / 48
-"""Greatest twist (rad) between adjacent knots of a helical face. With this step, a cubic spline
+"""Maximum twist (rad) between adjacent knots of a helical face. With this step, a cubic spline
 deviates from the rotation by 5e-8 of the radius."""
 _SPANS = 8
 """Minimum number of knot spans of a face along the rotor's axis. A straight rotor would need only

@@ -15,7 +15,8 @@ from rootsopt.export.drawing import Drawing
 from rootsopt.export.dxf import dxf_bytes
 from rootsopt.export.svg import svg_text
 from rootsopt.output.files import ResultFolder
-from rootsopt.response.evaluation import Evaluation, Series
+from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.series import Series
 from rootsopt.scene import Scene
 
 POINTS = "rotor_points.csv"

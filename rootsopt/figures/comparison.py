@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rootsopt.figures.style import BLUE, COLORS, DASHES, GREY
 from rootsopt.profiles.departure import beyond, feet
-from rootsopt.response.evaluation import Series
+from rootsopt.response.series import Series
 
 
 def plot_forces_together(ax: Axes, series: Mapping[str, Series], turn: float) -> Axes:

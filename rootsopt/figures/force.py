@@ -12,7 +12,7 @@ from rootsopt.figures.style import (
     COLORS,
     VERMILION,
 )
-from rootsopt.response.evaluation import Series
+from rootsopt.response.series import Series
 
 _MOST_TURNS = 4  # revolutions in a force panel, at most
 _LINES = 400  # spectral lines above which a curve is drawn instead of single lines

@@ -14,7 +14,7 @@ _WIDEST = 40
 """Number of characters above which the name of a limit is shortened."""
 
 _RANGE = 0.01
-"""Minimum range of the axis of objectives."""
+"""Minimum range of the axis of objectives, so that differences by rounding do not show."""
 
 
 def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: float) -> Axes:

@@ -28,7 +28,7 @@ _BUTTONS = {
     "displaylogo": False,
     "modeBarButtons": [["toImage", "zoom2d", "pan2d", "resetScale2d"]],
 }
-"""Buttons above the figure: those that need no network."""
+"""Buttons above the figure; all of them work without a network."""
 
 
 def available() -> bool:
@@ -62,7 +62,7 @@ def write_page(folder: ResultFolder, front: Front) -> str:
 
 
 def _entry(front: Front, point: FrontPoint) -> dict[str, Any]:
-    """Return what the page shows after a click on a `point`."""
+    """Return the texts and the outline that the page shows after a click on a `point`."""
     config = front.config_of(point)
     outline = outline_mm(config, [*point.design.values()])
     return {

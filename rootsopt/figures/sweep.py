@@ -20,15 +20,15 @@ from rootsopt.sweeps.table import is_numeric, unit, written
 FORCES = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
 _MARKERS = {"periodic": "o", "averaged": "s", "chaotic": "x", "not_settled": "+", "idle": "1"}
 _OTHERS = "v^<>d*Pph2"
-"""Markers of further statuses, in the order of their appearance."""
+"""Markers for statuses without a marker of their own, in the order in which these appear."""
 _FEW = len(COLORS)
-"""Number of values of the second key up to which it is drawn as lines, and not as a map."""
+"""Number of values of the second key above which it is drawn as a map, not as lines."""
 _DENSE = 24
-"""Number of values above which steady motions on a line have no markers."""
+"""Number of values on a line above which steady motions have no markers."""
 
 
 class _Axis:
-    """A key on an axis of a figure: positions, label, and ticks for values that are no numbers."""
+    """A key on an axis of a figure: positions, label, and ticks for values that are not numbers."""
 
     def __init__(self, key: str, values: Sequence[Any]):
         self.key, self.values = key, values
@@ -85,10 +85,10 @@ def _markers(dataset: xarray.Dataset) -> dict[str, str]:
 
 
 def _lines(axes, plan: Plan, dataset: xarray.Dataset, markers) -> Figure:
-    """Draw the forces over one key, a line per value of the other one, if there is one.
+    """Draw the forces over one key, with a line for each value of the other key, if there is one.
 
-    The lines are over the first key, unless the second one has too many values or alone has
-    numbers."""
+    The first key is on the axis, unless the second one has too many values, or only the second one
+    has numbers."""
     across, along = axes[0], axes[1] if len(axes) == 2 else None
     few, numbers = [size <= _FEW for size in plan.shape], [axis.numeric for axis in axes]
     swapped = along is not None and (not few[1] or (few[0] and numbers == [False, True]))

@@ -205,9 +205,9 @@ def _smoothed(points: NDArray[np.complex128], smoothing: float, seen: Estimates)
 
 
 def _parameter(points: NDArray[np.complex128], weight: float) -> NDArray[np.float64]:
-    """Return the parameters (n,) of the points of a smooth piece, starting at 0.
+    """Return the parameters t (n,) of the points of a smooth piece, starting at 0.
 
-    `weight`: length (mm) that contributes as much as a turn of 1 rad."""
+    `weight`: length (mm) that contributes as much to t as a turn of 1 rad."""
     bend, lengths = _curvature(points)
     # Extrapolate the curvature to the ends, as the next piece turns differently.
     first, last = 2 * bend[0] - bend[1], 2 * bend[-1] - bend[-2]

@@ -233,7 +233,9 @@ def _exploded(inserts: list[Any], name: str) -> list[Any]:
                 own = list(insert.virtual_entities(skipped_entity_callback=skipped))
             layer = insert.dxf.layer
             for entity in own:
-                if entity.dxf.layer == "0":  # In CAD, layer 0 means the insert's own.
+                if (
+                    entity.dxf.layer == "0"
+                ):  # In CAD, layer 0 in a block stands for the layer of the insert.
                     entity.dxf.layer = layer
         handled += 1 + len(own)
         if depth > _DEEPEST or repeated != 1 or handled > _ENTITIES:

@@ -1,7 +1,6 @@
 """Estimates of an outline's scatter, centre and unit from its points alone.
 
-The estimates are offered in messages and reported. None is used unless the config asks for it.
-"""
+Messages and results state the estimates. No estimate is used unless the config asks for it."""
 
 import dataclasses
 import math
@@ -24,8 +23,8 @@ _CLEAR = 8.0
 """Ratio of the distance between neighbours to the scatter below which farther neighbours are used.
 Points that are closer together do not lie in order along the curve."""
 _FEWEST = 48
-"""Number of distances between neighbours around the outline below which the distance is not
-doubled again."""
+"""Number of points left around the outline below which the stride between neighbours is not doubled
+again."""
 _MOST = 20_000
 """Number of points above which estimates use only every second, third ... point."""
 _MEDIAN = 1.4826
@@ -148,7 +147,7 @@ class Estimates:
 
 
 def _two(length: float) -> str:
-    """Format a length (mm) as text in micrometres, with two digits."""
+    """Format a length (mm) as text in micrometres, with two significant digits."""
     return f"{float(f'{length * 1e3:.2g}'):g}"
 
 

@@ -35,9 +35,9 @@ _OFF = 0.02
 """Deviation between flanks (pitch radii) above which an outline is rejected. This is also the value
 (pitch radii) above which `profile.outline_smoothing_mm` is rejected."""
 _LAND = 1e-3, 0.5 * np.pi / 180
-"""Two limits for the tip land, which is an arc about the rotor's axis. The first is the moment arm
-of the normal about the axis (pitch radii) above which the land ends. The second is the range of
-normal angles on one flank (rad) below which the land is ignored."""
+"""Two limits for the tip land, an arc about the rotor's axis. First: moment arm of the normal about
+the axis (pitch radii) above which the land ends. Second: range of normal angles on one flank (rad)
+below which the land is ignored."""
 _CORNER = 1e-2
 """Change of the normal's direction (rad) at a joint below which both sides get the mean direction.
 A joint with a larger change is a corner."""
@@ -51,7 +51,8 @@ _WANDER = 8.0
 """Backward run of the outline (multiples of the scatter) above which an outline to be smoothed is
 rejected, in addition to `_FOLD`."""
 _MANY = 20.0
-"""Ratio of the flanks' deviation to the scatter below which a message blames the scatter."""
+"""Ratio of the flanks' deviation to the scatter below which a message names scatter as the cause.
+"""
 _ESTIMATED = "scatter_um", "center_x_mm", "center_y_mm", "center_error_um"
 """Names of the fields of `Checks` that may be NaN."""
 _GAUSS = np.polynomial.legendre.leggauss(12)

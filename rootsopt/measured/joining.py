@@ -16,8 +16,9 @@ from rootsopt.measured.loop import Loop, place, signed_area
 TOGETHER = 1e-3
 """Distance (mm) below which two ends of entities share a vertex."""
 _CROWDED = 50
-"""Mean number of other points within `TOGETHER` of a point, above which a drawing is rejected. The
-points are the ends of all chains, or those of `_quarters`. Points at the same place count once."""
+"""Number of other points within `TOGETHER` of a point, on average, above which a drawing is
+rejected. The points are the ends of all chains, or those of `_quarters`. Points at the same place
+count once."""
 
 
 def joined(chains: list[Loop], layer: str, name: str) -> Loop:
@@ -139,7 +140,7 @@ def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> N
 
 
 def _quarters(points: NDArray[np.complex128], backwards: bool) -> NDArray[np.complex128]:
-    """Return the points (3,) at one quarter, one half and three quarters of a chain's length.
+    """Return the points (3,) at 1/4, 1/2 and 3/4 of a chain's length.
 
     `backwards`: whether the length is measured from the last point."""
     points = points[::-1] if backwards else points

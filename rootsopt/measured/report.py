@@ -1,4 +1,4 @@
-"""What the commands report about an imported outline."""
+"""Entries and notes about an imported outline that the commands report."""
 
 from typing import TYPE_CHECKING, Any
 

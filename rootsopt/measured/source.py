@@ -29,7 +29,7 @@ def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
         found = path.stat()
         stamp = found.st_mtime_ns, found.st_size, found.st_ino
     except (OSError, ValueError):
-        stamp = ()  # `read` reports what is wrong.
+        stamp = ()  # Ignore the error here: `read` reports it.
     smoothing = config.outline_smoothing_mm or 0.0
     place = config.outline_unit, config.outline_center
     return _kept(path, stamp, config.lobes, config.pitch_radius_mm, smoothing, place)

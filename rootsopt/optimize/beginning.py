@@ -1,8 +1,7 @@
 """Where the search begins if the baseline is a rotor from a file.
 
-Such a rotor has no design parameters. It stays the baseline as it is. The search varies the
-parameters of a family, and begins at the member of this family that is nearest to the outline.
-"""
+Such a rotor has no design parameters. It remains the baseline. The search varies the parameters of
+a family, and begins at the member of this family that is nearest to the outline."""
 
 import dataclasses
 from pathlib import Path
@@ -16,7 +15,7 @@ from rootsopt.design.resemblance import Likeness, free_likeness, likeness
 from rootsopt.errors import InputError
 from rootsopt.profiles import Outline
 from rootsopt.response.evaluation import Evaluation
-from rootsopt.scene.families import classical, outline
+from rootsopt.scene.families import classical, profile_from_file
 
 _FAR = 20e-6
 """Distance (m) of the nearest named family above which the message recommends a free form."""
@@ -77,7 +76,7 @@ def beginning(config: Config) -> Beginning | None:
 
     Raises `InputError` if the file holds no usable outline, or if no profile of the family
     `optimizer.family` could be fitted to it."""
-    given = outline(config.profile)
+    given = profile_from_file(config.profile)
     if given is None:
         return None
     wanted = config.optimizer.family

@@ -18,9 +18,9 @@ from rootsopt.optimize.sqp import Found, Stops, descend
 
 _STOPS = Stops(residual=1e-7, feasibility=1e-9, evaluations=300)
 _SIMULATED = Stops(residual=1e-5, feasibility=FEASIBLE, evaluations=60)
-"""The same, if each point must be simulated."""
+"""Criteria for the end of each local search if every point must be simulated."""
 _GOLDEN = 0.6180339887
-"""Difference between the phases of branches at successive speeds, in `_groups`."""
+"""Difference between the phases that `_groups` gives the branches at successive speeds."""
 _PART = 1e-3
 """Share of a constraint in the least violation above which the constraint counts as in conflict.
 The shares of all constraints add up to 1."""
@@ -135,13 +135,15 @@ def _geometry(problem: Problem, point: NDArray[np.float64]) -> Local | None:
 
 
 def _groups(local: Local) -> tuple[Group, ...]:
-    """Return each constraint and wall as a group that must be at most 0; its number is its kind."""
+    """Return all constraints and walls as groups of branches that must be at most 0.
+
+    The index of a constraint or wall is the kind of its branches."""
     found = [
         Group(np.array([[float(k), 0.0]]), np.array([-value]), -row[None, :])
         for k, (value, row) in enumerate(zip(local.slack, local.normals, strict=True))
     ]
     for wall in local.walls:
-        # Speeds and scenes are told apart by their phase.
+        # Shift the phases, so that equal instants at different speeds or scenes stay distinct.
         phases = (wall.tags[:, 1] + wall.tags[:, 0] * _GOLDEN) % 1.0
         kinds = np.full(len(phases), float(len(found)))
         found.append(wall._replace(tags=np.stack([kinds, phases], axis=1)))
@@ -154,10 +156,10 @@ def _alone(
     starts: Sequence[NDArray[np.float64]],
     stops: Stops,
 ) -> float | None:
-    """Return the least excess over constraint `k`, scaled, if all others hold.
+    """Return the least scaled excess over constraint `k` in designs that satisfy all others.
 
-    `parts`: function that returns all constraints at a point; `starts`: points (d,) of the unit
-    box from which to search. Return `None` if the searches find no point that satisfies the other
+    `parts`: function that returns all constraints at a point; `starts`: points (d,) of the unit box
+    from which to search. Return `None` if the searches find no point that satisfies the other
     constraints."""
 
     def look(point: NDArray[np.float64]) -> Local | None:
@@ -175,9 +177,10 @@ def _alone(
 
 
 def _conflict(one: Constraint | ForceLimit, excess: float, alone: float | None) -> Conflict:
-    """Return a conflict in reported units, given the scaled excess over its limit.
+    """Return a conflict in reported units.
 
-    `excess`: in the design of least violation; `alone`: if all others hold."""
+    `excess`: scaled excess over the limit in the design of least violation; `alone`: the same if
+    all other constraints hold."""
     if isinstance(one, ForceLimit):
         sign, sense, limit, size = one.sign, one.sense, one.limit, one.scale
     else:

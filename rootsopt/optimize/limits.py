@@ -65,7 +65,7 @@ class ForceLimit(NamedTuple):
 
     @property
     def scale(self) -> float:
-        """Divisor that brings the distance from the limit to the order of one."""
+        """Divisor for the distance from the limit: the limit's magnitude, or 1 if this is 0."""
         return scale_of(self.limit)
 
     @property
@@ -86,7 +86,7 @@ def scale_of(limit: float) -> float:
 def limited(config: Config) -> Config:
     """Return a copy of a `config` whose evaluations report all quantities of `constraints.terms`.
 
-    Raises `InputError` for a name of no quantity."""
+    Raises `InputError` if a name is not that of a quantity."""
     names = [*config.constraints.terms]
     terms_of([name for name in names if not is_force(config, name, LIMITS)], LIMITS)
     return reporting(config, names, LIMITS) if names else config

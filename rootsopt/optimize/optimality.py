@@ -106,7 +106,7 @@ class Optimality:
 
     @property
     def message(self) -> str:
-        """Explanation of `reason`, with advice for the user."""
+        """Reason why the search stopped (`reason`) in a sentence, with advice for the user."""
         return _REASONS[self.reason]
 
     @property

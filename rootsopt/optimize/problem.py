@@ -46,7 +46,8 @@ _STEPS = {"mm": 0.1, "deg": 1.0, "°": 1.0, "": 0.01}
 """Change of a limit, by the unit of the limit, for which the report states the effect on the
 objective. In other units, it is the power of ten nearest to 1 % of the limit."""
 SCENE_KINDS = 64
-"""Kinds of branches per scene. There are at most 33 speeds, and each is a kind."""
+"""Number of branch kinds reserved for each scene. Each speed is a kind, and there are at most 33
+speeds."""
 _DRAWN = 5
 """Maximum number of times that an infeasible point is moved halfway towards a feasible point."""
 FEASIBLE = 1e-6
@@ -218,11 +219,13 @@ class Problem:
         return Local(smooth, slope @ jacobian, scaled, slack, normals, walls)
 
     def walls(self, evaluation: Evaluation, jacobian: NDArray[np.float64]) -> tuple[Group, ...]:
-        """Return one wall for each of `limits`: by how much an evaluated design exceeds it.
+        """Return one wall for each of `limits`, with the amount by which an evaluated design
+        exceeds it.
 
         `evaluation`: usable, with gradients; `jacobian` (d, d): that of the design with respect to
         the point. Each speed that counts, each coexisting motion and each scene of a sample is a
-        branch. If the peak force has a ceiling, each local maximum of the force is one."""
+        branch. If the peak force has a ceiling, each local maximum of the force is a branch, too.
+        """
         found = []
         for limit in self.limits:
             tags, values, slopes = [], [], []
@@ -244,14 +247,15 @@ class Problem:
         return tuple(found)
 
     def worst(self, evaluation: Evaluation, limit: ForceLimit) -> float:
-        """Return the value of a limited quantity that is nearest to its `limit`, or beyond it most.
+        """Return the worst value of a limited quantity: the one nearest to its `limit`, or farthest
+        beyond it.
 
         `evaluation`: usable. Speeds, motions and scenes are those of `walls`."""
         values = [one.response[limit.key] for _, one in self._limited(evaluation)]
         return float(max(values, key=limit.excess))
 
     def excess(self, evaluation: Evaluation) -> float:
-        """Return by how much an evaluated design exceeds the worst of `limits`; ≤ 0 if by none.
+        """Return by how much an evaluated design exceeds the worst of `limits`; ≤ 0 if all hold.
 
         The excess is scaled. It is 0 if there are no limits, NaN without a usable steady state."""
         if not self.limits:
@@ -587,7 +591,7 @@ class Problem:
 
 
 def check_senses(config: Config) -> None:
-    """Raise `InputError` if the objective of a `config` has a term of which more is better."""
+    """Raise `InputError` if the objective of a `config` has a term that is to be maximised."""
     for name, weight in config.objective.terms.items():
         if weight > 0 and sense_of(name) == "max":
             raise InputError(

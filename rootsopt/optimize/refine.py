@@ -30,7 +30,7 @@ _ROUNDS = 25
 _FALL = 1e-9
 """Predicted decrease of the merit function below which the search ends."""
 _PRICE = 2.0, 5.0
-"""Weight of the violation in the merit function: the sum of a constant and a multiple of the
+"""Weight of the violation in the merit function: the first number plus the second times the
 greatest multiplier."""
 
 Rows = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -40,8 +40,8 @@ Rows = tuple[NDArray[np.float64], NDArray[np.float64]]
 class Models:
     """Quadratic models of all functions of a problem near a point.
 
-    The n functions are the smooth part of the objective, the branches of each maximum, the
-    constraints, and the branches of each wall with the opposite sign, in this order. `point` (d,):
+    The n functions are, in this order: the smooth part of the objective; the branches of each
+    maximum; the constraints; the branches of each wall, with the opposite sign. `point` (d,):
     centre; `local`: the problem there, with the n values and gradients in `rows`; `bends` (n, d,
     d): Hessians."""
 

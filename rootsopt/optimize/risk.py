@@ -51,7 +51,9 @@ def combine(tolerances: TolerancesConfig, values: ArrayLike) -> Combined:
 
 
 def order_weights(count: int, quantile: float) -> NDArray[np.float64]:
-    """Return the weights (count,) of Harrell and Davis for values in ascending order."""
+    """Return the weights (count,) of Harrell and Davis for `count` values in ascending order.
+
+    `quantile`: the quantile q that the weighted mean estimates."""
     edges = np.arange(count + 1) / count
     cumulative = betainc((count + 1) * quantile, (count + 1) * (1 - quantile), edges)
     return np.diff(cumulative)

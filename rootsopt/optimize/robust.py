@@ -51,8 +51,8 @@ class Scattered:
     """One design in n fresh scenes.
 
     `values`: arrays (n,) by the names `COMPARED`, NaN where the motion is not usable; `statuses`:
-    number of scenes by status label; `combined`: the search's combination over the usable scenes,
-    divided by that of the baseline."""
+    number of scenes by status label; `combined`: robust objective over the usable scenes (the rule
+    of the search, relative to the baseline)."""
 
     values: dict[str, NDArray[np.float64]]
     statuses: dict[str, int]
@@ -281,7 +281,8 @@ class TolerantSearch:
         expected, lock, ended = before + total // per, threading.Lock(), [0]
 
         def tick() -> bool:
-            # A design of the search needs `per` simulations: count so many as one evaluation.
+            # A design of the search needs `per` simulations, so count `per` simulations as one
+            # evaluation.
             with lock:
                 ended[0] += 1
                 if ended[0] % per == 0:

@@ -66,11 +66,12 @@ _SHARPER = 0.01
 """Factor on `solver.rtol` for a second evaluation, if the first-order conditions do not hold.
 """
 _MEETS = 1e-4
-"""Scaled excess over a limit of a force in the verification above which the design is rejected."""
+"""Scaled excess over a force limit above which the verification rejects a design."""
 _EXPLAINED = 8
-"""Maximum number of points from which the least violation of the constraints is searched for."""
+"""Maximum number of points at which the search for the least violation of the constraints starts.
+"""
 _SIMULATED = 3
-"""The same, if each point must be simulated."""
+"""Maximum number of these points if each must be simulated."""
 _POLL = 0.05
 """Interval (s) at which a waiting thread checks whether it should stop."""
 
@@ -666,9 +667,10 @@ def sensitivity_rows(
 ) -> list[dict[str, Any]]:
     """Return one row per scene quantity, with its effect on the forces of an optimum.
 
-    `evaluator`, `optimized`: of one motion at one speed; `percent`: function that returns the
-    derivatives of the objective (% per unit, by key) from an evaluation with gradients with respect
-    to the quantities, or {} if they are not known. Return an empty list without such gradients."""
+    `evaluator`, `optimized`: of one motion at one speed; `percent`: function that takes an
+    evaluation with gradients with respect to the quantities, and returns the derivatives of the
+    objective (% per unit, by key), or {} if they are not known. Return an empty list without such
+    gradients."""
     design = np.array(list(optimized.design.values()))
     fitted = evaluator.fit(design, optimized.state, series=False)[0]
     moved = by_scene(fitted, optimized)

@@ -68,7 +68,7 @@ def write_dataset(folder: ResultFolder, name: str, dataset: xarray.Dataset) -> N
 
 
 def _zarr(dataset: xarray.Dataset) -> dict[str, Any]:
-    """Return the files of a dataset in Zarr's format 2, which is the one with texts, by name."""
+    """Return the files of a dataset by name, in Zarr's format 2, which supports texts."""
     found: dict[str, Any] = {}
     memory: Any = importlib.import_module("zarr.storage").MemoryStore(found)
     with warnings.catch_warnings():

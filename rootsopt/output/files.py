@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from rootsopt.config import Config
-    from rootsopt.response.evaluation import Series
+    from rootsopt.response.series import Series
 
 DPI = 150
 """Resolution (dots per inch) of the figures."""

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 DASH = "-"
-"""Text in place of a number that is not known."""
+"""Text in place of an unknown number."""
 _UNITS = {
     "_kg_m2": "kg m^2",
     "_l_min": "l/min",

@@ -60,7 +60,9 @@ class Lock:
             self.held = False
             return
         self._file = file
-        with contextlib.suppress(OSError):  # The lock also works without the number.
+        with contextlib.suppress(
+            OSError
+        ):  # The lock works even if the process's number cannot be written.
             os.ftruncate(file, 0)
             os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
 
@@ -68,7 +70,7 @@ class Lock:
         flags = os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
         try:
             return os.open(self.path, os.O_RDWR | flags, 0o666)
-        except PermissionError:  # the file of another user
+        except PermissionError:  # the file belongs to another user
             return os.open(self.path, os.O_RDONLY)
 
     def _same(self, file: int) -> bool:

@@ -1,4 +1,4 @@
-"""What a sweep shows and writes beside its dataset: rows, a summary, tables for the terminal."""
+"""Rows, summary and terminal tables of a sweep, which are written beside its dataset."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -18,9 +18,9 @@ from rootsopt.sweeps.table import is_numeric, written
 
 _SHOWN = ("mean_force_N", "peak_force_N", "rms_force_N")
 _FEW = 40
-"""Number of points above which the terminal shows a summary only."""
+"""Number of points above which the terminal shows only a summary."""
 _NARROW = 3
-"""Number of keys above which the terminal shows a summary only."""
+"""Number of keys above which the terminal shows only a summary."""
 
 
 def rows_of(plan: Plan, records: Mapping[int, Row]) -> list[dict[str, Any]]:
@@ -72,7 +72,7 @@ def summary(plan: Plan, records: Mapping[int, Row]) -> dict[str, Any]:
     }
 
 
-def shown(plan: Plan, records: Mapping[int, Row], dataset: xarray.Dataset) -> RenderableType:
+def tables_of(plan: Plan, records: Mapping[int, Row], dataset: xarray.Dataset) -> RenderableType:
     """Return the tables of a sweep for the terminal: its points if they are few, and a summary."""
     parts: list[RenderableType] = []
     rows = rows_of(plan, records)
@@ -111,4 +111,4 @@ def _ranges(plan: Plan, dataset: xarray.Dataset, usable: np.ndarray) -> Renderab
     return table
 
 
-__all__ = ["outcome", "rows_of", "shown", "summary"]
+__all__ = ["outcome", "rows_of", "summary", "tables_of"]

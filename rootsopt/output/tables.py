@@ -31,7 +31,7 @@ _SHEET_FORCES = (
     "axial_force_max_N",
     "tilting_moment_max_N_m",
 )
-"""Forces in the pump sheet."""
+"""Keys of the forces that the pump sheet shows."""
 _STATISTICS = {
     "mean": "mean",
     "sigma": "standard deviation",
@@ -376,7 +376,8 @@ def likeness_table(
 ) -> RenderableType:
     """Return a table of the designs of several families that are nearest to a profile.
 
-    `rows`: one per profile family, as in the entry `resembles` of the result file."""
+    `title`: that of the table; `rows`: one per profile family, as in the entry `resembles` of the
+    result file."""
     distances = "largest distance, um", "RMS distance, um"
     table = _table(title, *distances, "nearest member")
     for row in rows:

@@ -104,10 +104,10 @@ class Profile(eqx.Module):
 
     `lobes`: number of lobes N; `pitch_radius`: r (m). A subclass defines `segments`, `roll_angle`
     and `contact_distance` for normal angles 0 ≤ ν ≤ `pitch_normal`. The subclass continues both
-    functions analytically beyond the pitch crossing and, unless the first segment is a land, over
-    the tip (β odd and s even in ν). This class derives everything else. A subclass may override
-    `normal_at`, `lever` and `support` with a closed form, which is faster and more exact.
-    """
+    functions analytically beyond the pitch crossing. Unless the first segment is a land, it also
+    continues them over the tip (β odd and s even in ν). This class derives everything else. A
+    subclass may override `normal_at`, `lever` and `support` with a closed form, which is faster and
+    more exact."""
 
     lobes: eqx.AbstractVar[int]
     pitch_radius: eqx.AbstractVar[Float[Array, ""]]

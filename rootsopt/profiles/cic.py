@@ -97,7 +97,8 @@ class CIC(Profile):
         return c * jnp.cos(turn) - jnp.sqrt(r**2 - (c * jnp.sin(turn)) ** 2)
 
     def _arc_turn(self, nu):
-        """Return the normal angle `nu` (rad), clamped to the arc, minus that of the arc's start."""
+        """Return the angle (rad) from the arc's start to the normal angle `nu` (rad), clamped to
+        the arc."""
         return jnp.clip(nu, self.tip_arc_angle, self.arc_end) - self.tip_arc_angle
 
     def roll_angle(self, nu):

@@ -19,9 +19,10 @@ from rootsopt.runtime.programs import Program
 _NODES = 400
 """Default of `nodes`, the least number of points of a flank on each side of the pitch circle."""
 _BEYOND = 8
-"""Number of points of a neighbouring flank by which a flank is continued beyond its tip or root."""
+"""Number of points of each neighbouring flank that are appended to the ends of a flank."""
 _CORNER = 0.1
-"""Turn (rad) from one segment of a polygonal line to the next above which the line has a corner."""
+"""Angle (rad) between successive segments of a polygonal line above which their joint is a corner.
+"""
 
 
 class Departure(NamedTuple):

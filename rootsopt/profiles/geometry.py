@@ -43,10 +43,9 @@ class Geometry(eqx.Module):
 def geometry(profile: Profile) -> Geometry:
     """Return the `Geometry` of a profile; area and polar moment of area are exact to rounding.
 
-    Both follow from Green's theorem on the roll-angle form. With the support function h = P·n and
-    the arc length element dl, dA = h dl / 2 and ∫r² dA = ∫ |P|² h dl / 4 over the outline. For an
-    `Outline`, return the values computed when its file was read.
-    """
+    Both follow from Green's theorem on the roll-angle form. Let h = P·n be the support function and
+    dl the arc length element. Then dA = h dl / 2 and ∫r² dA = ∫ |P|² h dl / 4 over the outline. For
+    an `Outline`, return the values computed when its file was read."""
     if isinstance(profile, Outline):
         return _given(profile)
     r = profile.pitch_radius

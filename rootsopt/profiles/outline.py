@@ -112,8 +112,8 @@ class Outline(Profile):
         return False
 
     def _rolled(self, direction, mate):
-        """Return, as a `RollPoint`, the point of the outline whose outward normal has the given
-        direction.
+        """Return the point of the outline whose outward normal has the given direction, as a
+        `RollPoint`.
 
         `direction`: polar angle of the normal (rad) from the lobe's axis; `mate`: lever and support
         function of the point (`facing` is not used). If the normal misses the pitch circle, the

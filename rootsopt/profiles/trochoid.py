@@ -12,26 +12,24 @@ def extended_cycloid(
 ) -> Curve:
     """Return an epicycloid traced by a point at varying distance from the rolling circle's centre.
 
-    `lobes`: number of lobes N; `pitch_radius`: r (m). With r_e = r / 2N the curve is
-    P(θ) = e^{iθ} [r + r_e + λ(θ) r_e e^{2iNθ}], from the tip (θ = 0) to the pitch crossing
-    (θ = π/2N). The ratio λ varies from `trochoid_ratio` λ0 at the tip to 1 at the crossing:
-    λ = 1 + (λ0 - 1) u³ (10 - 15 u + 6 u²) with u = 1 - 2Nθ/π. This quintic has zero first and
-    second derivatives at both ends. The idea comes from Hsieh and Hwang (J. Mech. Des. 129 (2007)
-    1278), whose own formulas were not available. λ0 = 1 gives EE. The outer radius is
-    r + (1 + λ0) r_e.
+    `lobes`: number of lobes N; `pitch_radius`: r (m). With r_e = r / 2N the curve is P(θ) = e^{iθ}
+    [r + r_e + λ(θ) r_e e^{2iNθ}]. It runs from the tip (θ = 0) to the pitch crossing (θ = π/2N).
+    The ratio λ varies from `trochoid_ratio` λ0 at the tip to 1 at the crossing: λ = 1 + (λ0 - 1) u³
+    (10 - 15 u + 6 u²) with u = 1 - 2Nθ/π. This quintic has zero first and second derivatives at
+    both ends. The idea comes from Hsieh and Hwang (J. Mech. Des. 129 (2007) 1278), whose own
+    formulas were not available. λ0 = 1 gives EE. The outer radius is r + (1 + λ0) r_e.
 
     The crossing is a cusp: dP/dθ vanishes in proportion to δ = π/2N - θ. The formula of the normal
-    is therefore divided by δ. In the frame turned by θ, with w = e^{-2iNδ}, the normal is (X δ +
-    iY) / M, with M = |X δ + iY| and
+    is therefore divided by δ. In the frame turned by θ, with w = e^{-2iNδ} and M = |X δ + iY|, the
+    normal is (X δ + iY) / M. Here,
 
         X δ + iY = (r + r_e) (1 - λ w) / δ + i r_e w λ′ / δ.
 
     The normal makes the angle η = arctan(X δ / Y) with the tangent of the pitch circle at θ. For a
     constant λ the normal passes through the pitch point at θ, and ψ = η. Otherwise it misses this
-    point by e = r_e² λ′ (cos 2Nδ - λ) / (δ M), and cos ψ = cos η + e / r. Hence
-    sin²(ψ/2) = sin²(η/2) - e / 2r, of second order in δ, and β = θ - η + ψ. These formulas are
-    derived here, not taken from a source.
-    """
+    point by e = r_e² λ′ (cos 2Nδ - λ) / (δ M), and cos ψ = cos η + e / r. Hence sin²(ψ/2) =
+    sin²(η/2) - e / 2r, of second order in δ, and β = θ - η + ψ. These formulas are derived here,
+    not taken from a source."""
     r, ratio = jnp.asarray(pitch_radius), jnp.asarray(trochoid_ratio)
     half, n = jnp.pi / (2 * lobes), lobes
     rolling = r / (2 * lobes)

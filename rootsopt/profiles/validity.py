@@ -9,7 +9,8 @@ from rootsopt.profiles.base import Profile
 from rootsopt.runtime.programs import Program
 
 PURE = ("turning", "rolling", "order")
-"""Names of the margins that are angles or ratios. All others are lengths or lengths per angle."""
+"""Names of the margins that are angles or ratios. All other margins are lengths, or lengths per
+angle."""
 _POINTS = 400
 """Number of points per segment at which margins are evaluated."""
 

@@ -1,4 +1,4 @@
-"""What a pump designer weighs beside the contact force: flow, play, leakage.
+"""Properties of a pump other than the contact force: flow, play, leakage, bearing loads.
 
 All functions are pure, take SI units and can be differentiated by JAX with respect to profile and
 scene. Nothing here enters the simulation."""

@@ -39,7 +39,7 @@ def gas_forces(
 
     `pressure_length`: Δp L (N/m); `phi` (n,): φ1 (rad); `port`: see `PORT`. Discharge pressure acts
     on a rotor's surface between the contact and the tip at the housing that passes the port next.
-    The resultant is Δp L times the chord between the two, turned by a right angle."""
+    The resultant is Δp L times the chord between the two, rotated by a right angle."""
     opening = jnp.asarray(port)
     gas = resultants.GasResultant(pressure_length, profile, shape.outer_radius, opening)
     found = jnp.sum(jax.vmap(gas.slice_forces)(phi), axis=1)
@@ -49,9 +49,11 @@ def gas_forces(
 def gas_moments(
     profile: Profile, shape: Geometry, pressure_length: Float[Array, ""], phi: Float[Array, " n"]
 ) -> Float[Array, "2 n"]:
-    """Return the torques (2, n) in N·m of the gas against both rotors, Δp L (r_a² - ρ²) / 2.
+    """Return the torques (2, n) in N·m with which the gas opposes both rotors, Δp L (r_a² - ρ²) /
+    2.
 
-    `pressure_length`: Δp L (N/m); `phi` (n,): φ1 (rad)."""
+    `pressure_length`: Δp L (N/m); `phi` (n,): φ1 (rad). ρ (m) is the distance of the contact from
+    the rotor's axis."""
     contact = contact_place(profile, phi)
     away = jnp.abs(jnp.stack([contact, contact - 2 * profile.pitch_radius]))
     return pressure_length / 2 * (shape.outer_radius**2 - away**2)

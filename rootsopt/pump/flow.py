@@ -54,10 +54,10 @@ def relative_flow(profile: Profile, shape: Geometry, phi: Float[Array, "*n"]) ->
 def ripple(profile: Profile, shape: Geometry) -> Float[Array, ""]:
     """Return the peak-to-peak ripple of the flow as a fraction of the mean flow.
 
-    s runs from 0 at the pitch crossing to r_a - r at the tip, so the ripple is (r_a - r)² / (η
-    r_a²), with the area efficiency η. At a given r_a / r and η, no shape of the flank changes it.
-    The formula holds for conjugate profiles whose roll angle never turns back; for a measured
-    outline it is as exact as the outline is conjugate."""
+    The distance s is 0 at the pitch crossing and r_a - r at the tip. The ripple is therefore (r_a -
+    r)² / (η r_a²), with the area efficiency η. At a given r_a / r and η, no shape of the flank
+    changes it. The formula holds for conjugate profiles whose roll angle never turns back; for a
+    measured outline it is as exact as the outline is conjugate."""
     return (shape.outer_radius - profile.pitch_radius) ** 2 / _mean(shape)
 
 
@@ -89,9 +89,9 @@ def twisted_lines(
 def twisted_ripple(profile: Profile, shape: Geometry, twist: Float[Array, ""]) -> Float[Array, ""]:
     """Return the peak-to-peak ripple of the flow of rotors with the `twist` Φ (rad).
 
-    By its symmetry, the mean flow over the phases φ - Φ/2 … φ + Φ/2 has its extremes where that of
-    straight rotors has them: at the tip, φ = 0, and at the pitch crossing, φ = π/2N. `_PANELS`
-    panels with four Gauss points each give the two means."""
+    The mean flow over the phases φ - Φ/2 … φ + Φ/2 is symmetric, so its extremes are where those of
+    straight rotors are: at the tip, φ = 0, and at the pitch crossing, φ = π/2N. `_PANELS` panels
+    with four Gauss points each give the two means."""
     nodes, weights = np.polynomial.legendre.leggauss(4)
     places = ((np.arange(_PANELS)[:, None] + (nodes + 1) / 2) / _PANELS - 0.5).ravel()
     shares = jnp.asarray(np.tile(weights / 2, _PANELS) / _PANELS)
@@ -103,8 +103,8 @@ def twisted_ripple(profile: Profile, shape: Geometry, twist: Float[Array, ""]) -
 def greatest_radius_ratio(lobes: int) -> float:
     """Return the limit of r_a / r for symmetric conjugate profiles, 1 + 2 sin(π/4N).
 
-    Beyond it, the dedendum would leave the pitch circle: the flank is undercut, or its roll angle
-    turns back. `lobes`: N."""
+    Beyond this limit, the dedendum would leave the pitch circle: the flank is undercut, or its roll
+    angle turns back. `lobes`: N."""
     return 1 + 2 * math.sin(math.pi / (4 * lobes))
 
 
@@ -117,5 +117,5 @@ def tip_height_share(profile: Profile, shape: Geometry) -> Float[Array, ""]:
 
 
 def _mean(shape: Geometry) -> Float[Array, ""]:
-    """Return the mean flow (m²) per length of the rotor and radian of its rotation, η r_a²."""
+    """Return the mean flow (m²), η r_a², per metre of rotor length and radian of rotation."""
     return shape.area_efficiency * shape.outer_radius**2

@@ -8,27 +8,27 @@ from jaxtyping import Array, Float
 
 from rootsopt.contact.closest import FlankPair
 from rootsopt.profiles import Outline, Profile, RollPoint
-from rootsopt.pump.section import Flank, both_flanks, flank_points, whole_valley
+from rootsopt.pump.section import Flank, both_flanks, sampled_flank, whole_valley
 
 POSES = 48
-"""Number of roll angles, evenly over the quarter of the mesh in which one addendum touches; the
-other quarters are equal to it."""
+"""Number of roll angles, evenly spaced over the quarter of the mesh in which one addendum touches.
+By symmetry, the other quarters have the same gap."""
 _POINTS = 400
-"""Number of points per segment of a flank for the film thickness beside the narrowest place."""
+"""Number of points per segment of a flank at which the gap's width is computed."""
 _TURNED = 0.2
-"""Cosine of the angle between a flank's normal and that of the narrowest place below which points
-of the flank no longer count as part of the gap."""
+"""Cosine of the angle (between a flank's normal and that at the narrowest place) below which a
+point of the flank is no longer part of the gap."""
 
 _NARROWEST = 1e-9
 """Gap (m) below which the shape of the gap is that of a gap of this height."""
 
 
 class Allowances(NamedTuple):
-    """Distances by which a pair is apart (m).
+    """Distances (m) that separate the flanks of a pair.
 
     `normal`: distance added to every flank gap, along the normal; one number, or one per roll angle
-    of `rolls`. `center`: centre distance minus
-    twice the pitch radius. `radial`: radius by which both rotors are smaller everywhere."""
+    of `rolls`. `center`: centre distance minus twice the pitch radius. `radial`: radius by which
+    both rotors are smaller everywhere."""
 
     normal: Float[Array, "*#n"]
     center: Float[Array, ""]
@@ -92,12 +92,13 @@ def _lengths(profile: Profile, nu: Float[Array, " n"], gap: Float[Array, " n"]):
     `nu` (n,): normal angles (rad) of the addendum points there. l is the arc length on rotor 1, and
     d the thickness along its normal: h, plus the distance that the flanks have without clearance.
     """
-    flank = flank_points(profile, _POINTS)
+    flank = sampled_flank(profile, _POINTS)
     lobe, valley = both_flanks(flank), whole_valley(flank, profile.lobes)
     step = jnp.abs(jnp.diff(lobe.point))
 
     def seen(curve: Flank, point: RollPoint):
-        """Return tangential place and depth behind the tangent (m), and the cosine of the turn."""
+        """Return places along the tangent at the contact (m), depths behind it (m), and cosines of
+        the angles between the normals and the contact's normal."""
         beta, psi, s = point
         turn = jnp.exp(1j * beta)
         place = turn * (profile.pitch_radius + s * (jnp.sin(psi) + 1j * jnp.cos(psi)))

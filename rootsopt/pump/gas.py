@@ -1,4 +1,4 @@
-"""Leakage of an ideal gas: nozzle flow, compressible laminar flow, and where both end."""
+"""Leakage of an ideal gas: nozzle flow, compressible laminar flow, and their limits."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -6,7 +6,8 @@ from jaxtyping import Array, Float
 from rootsopt.scene.medium import Gas
 
 CONTINUUM = 0.01
-"""Knudsen number above which gas slips at the walls, and leaks more than the laminar formula says.
+"""Knudsen number above which gas slips at the walls, so that it leaks more than the laminar formula
+states.
 """
 MOLECULAR = 1.0
 """Knudsen number above which molecules meet the walls more often than each other. The formulas of
@@ -25,7 +26,7 @@ def nozzle_flux(
 ) -> Float[Array, "*n"]:
     """Return the mass flow (kg/(s·m²)) per area of an ideal nozzle (Saint-Venant and Wantzel).
 
-    `upstream`, `downstream`: pressures (Pa), the former greater; `gas`: its temperature is that
+    `upstream`, `downstream`: pressures (Pa), the former greater; `gas`: its temperature is the one
     upstream."""
     k = gas.heat_ratio
     ratio = jnp.maximum(downstream / upstream, critical_ratio(k))

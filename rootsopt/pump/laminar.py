@@ -21,6 +21,6 @@ def parabolic_length(
 ) -> Float[Array, "*n"]:
     """Return the length (m) of a slot with the same laminar flow as a parabolic gap.
 
-    h³ ∫ dx / (h + x²/2R)³ = (3π/8) √(2 R h). `height`: least height h (m); `curvature`: 1/R (1/m),
-    greater than 0."""
+    The gap's height is h + x²/2R, and the length is h³ ∫ dx / (h + x²/2R)³ = (3π/8) √(2 R h).
+    `height`: least height h (m); `curvature`: 1/R (1/m), greater than 0."""
     return 3 * jnp.pi / 8 * jnp.sqrt(2 * height / curvature)

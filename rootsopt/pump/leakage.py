@@ -1,9 +1,9 @@
 """Leakage of a pump: mesh, tips, end faces, and the volumetric efficiency.
 
-The mesh leaks along the rotor's whole length, its gap changing over the rotation; both tips leak
-along it, too; the four end faces leak across the rotors. A liquid flows by Reynolds' equation. A
-gas flows at the lesser of two limits, friction (compressible laminar flow) and inertia (an ideal
-nozzle of the gap's height).
+The mesh leaks along the rotor's whole length, with a gap that changes over the rotation. Both tips
+leak along the same length, and the four end faces leak across the rotors. A liquid flows by
+Reynolds' equation. A gas flows at the lesser of two limits, friction (compressible laminar flow)
+and inertia (an ideal nozzle of the gap's height).
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from rootsopt.scene import Scene
 from rootsopt.scene.medium import Medium
 
 FACES = 4
-"""End faces of the two rotors."""
+"""Number of end faces of the two rotors."""
 _NODES, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(64))
 _SHARES = _NODES + 0.5
 """Nodes and weights of the rule of Gauss and Legendre on [0, 1], for the gap beside a tip."""
@@ -50,7 +50,8 @@ class Leakage(NamedTuple):
 
 
 def tip_length(profile: Profile, shape: Geometry, height: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the length (m) of a slot with the same laminar flow as the gap at a tip.
+    """Return the length (m) of a slot with the same laminar flow as the gap at a tip of a
+    `profile`.
 
     It is the width of the land, plus h³ ∫ dl / d³ along the addendum on both of its sides. d is the
     distance from the bore of the housing, h its least value, the clearance `height` (m)."""
@@ -66,18 +67,18 @@ def tip_length(profile: Profile, shape: Geometry, height: Float[Array, ""]) -> F
 
 
 def end_shape(shape: Geometry) -> Float[Array, ""]:
-    """Return width over length of the strip that stands for an end face, 4 r_a² / A.
+    """Return the width over the length of the strip that represents an end face, 4 r_a² / A.
 
-    The strip is as wide as the rotor, 2 r_a, and as long as its mean chord, A / 2r_a. By Jensen's
-    inequality, parallel strips of unequal chords leak more."""
+    `shape`: geometry of the rotor. The strip is as wide as the rotor, 2 r_a, and as long as its
+    mean chord, A / 2r_a. By Jensen's inequality, parallel strips of unequal chords leak more."""
     return 4 * shape.outer_radius**2 / shape.area
 
 
 def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> Leakage:
     """Return the leakage of a pair.
 
-    `profile`, `shape`: of the design. Where the rotors overlap (`gap.least` < 0), the flows mean
-    nothing."""
+    `profile`, `shape`: of the design. Where the rotors overlap (`gap.least` < 0), the flows have no
+    meaning."""
     zero = jnp.zeros_like(scene.clearance)
     error = scene.center_distance_error
     center = zero if error is None else error
@@ -111,7 +112,7 @@ def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> 
 
 
 def _per_width(medium: Medium, height, length, series: int):
-    """Return the flow (m²/s) per width through `series` equal gaps one behind the other.
+    """Return the flow (m²/s) per width through `series` equal gaps in series.
 
     `height`, `length` (m): of one of them. The flow of a gas is that at suction pressure."""
     across = medium.pressure_difference

@@ -32,11 +32,11 @@ from rootsopt.scene.build import along
 _CHUNK = 32
 """Number of steps linearised together, as arrays."""
 _LONGEST = 8
-"""Longest orbit (mesh periods)."""
+"""Maximum length of an orbit (mesh periods)."""
 _EVEN = 128
-"""Least number of pieces per mesh period."""
+"""Minimum number of pieces into which the steps of one mesh period are divided."""
 _ASIDE = 1e-9
-"""Half the length (mesh periods) of the piece around an instant at which a load jumps."""
+"""Half the length (mesh periods) of the short piece around each instant at which a load jumps."""
 POSES = 720
 """Number of angles of rotor 1, over a mesh period, for loads without a motion."""
 
@@ -71,9 +71,10 @@ class BearingLoads(NamedTuple):
 class BearingSet(eqx.Module):
     """A pair with its bearings, ready to compute their loads.
 
-    `pair`; `loads`: forces beside the flanks' push; `length` (m) of the rotors; `twist` (rad) over
-    it, `None` for straight rotors; `bearing`, `gear` (m): distance of each bearing and of the gear
-    from the middle; `exponent` of the equivalent load."""
+    `pair`: rotor pair; `loads`: forces other than those of the flanks; `length` (m) of the rotors;
+    `twist` (rad) over it, `None` for straight rotors; `bearing`, `gear` (m): distance of each
+    bearing and of the gear from the middle; `exponent`: p of the equivalent load, (mean
+    |F|^p)^(1/p)."""
 
     pair: RotorPair
     loads: AxisLoads
@@ -126,8 +127,8 @@ class BearingSet(eqx.Module):
     def _from_flanks(self, pushes, heights):
         """Return forces and first moments (rotor, x and y) and axial forces (rotor) of flanks.
 
-        `heights` (slices,): z of the slices (m). The first moment is ∫ z dF, plus what an axial
-        force aside from the axis adds: its moment is that of the force -P A at the height 1."""
+        `heights` (slices,): z of the slices (m). The first moment is ∫ z dF - P A, where A is the
+        axial force and P the place at which it acts, seen from the rotor's axis."""
         axis = jnp.stack([2 * self.loads.radius, jnp.zeros_like(self.loads.radius)])
         place = jnp.stack([pushes.place, pushes.place - axis], axis=2)
         forces = jnp.stack([-pushes.force, pushes.force], axis=2)
@@ -214,8 +215,7 @@ def _pieces(
 
     `ends`: further ends, unused ones inf; `corners` (k,): in one mesh period; `period` of the orbit
     (mesh periods). Each corner lies in a short piece, so that no load is evaluated right at a jump.
-    The steps are as long as the motion allows; a load to the power of the exponent needs shorter
-    ones."""
+    The power of a load needs shorter steps than the motion."""
     turns = jnp.arange(_LONGEST, dtype=grid.dtype)[:, None, None]
     sides = _ASIDE * jnp.array([-1.0, 1.0], grid.dtype)[:, None]
     even = jnp.arange(_EVEN, dtype=grid.dtype) / _EVEN
@@ -226,9 +226,9 @@ def _pieces(
     starts = jnp.concatenate([jnp.zeros_like(grid[:1]), grid[:-1]])
     used = jnp.sum(grid < jnp.inf)
     step = jnp.clip(jnp.searchsorted(grid, end), 0, used - 1)
-    # A corner beyond the last step, by rounding.
+    # Rounding may put a corner beyond the last step.
     end = jnp.where(end > grid[used - 1], jnp.inf, end)
-    # An end may be there twice; the step ends once.
+    # An end may occur twice. The step ends only at the first one that has a positive length.
     return _Pieces(begin, end, step, starts[step], (end == grid[step]) & (begin < end))
 
 
@@ -241,7 +241,7 @@ def loads_corners(bearings: BearingSet) -> Float[Array, " k"]:
 
 
 @Program
-def orbit_loads(
+def orbit_loads(  # 90 lines: the functions of its two loops share the linearised equation.
     scene: Scene,
     design: Float[Array, " d"],
     orbit: Orbit,
@@ -267,7 +267,8 @@ def orbit_loads(
     dynamic, static = eqx.partition(bearings, eqx.is_inexact_array)
     moved = eqx.filter(tangents, eqx.is_inexact_array)
     unit = lax.stop_gradient(pair.force_scale)
-    # As many integrals as bearings: mean, mean square and one line make four.
+    # Reserve four integrals, one for each bearing: mean, mean square, and cosine and sine of one
+    # line.
     room = Measures(orders=np.ones(1))
     equation = _LoadEquation(
         static, room, unit, jnp.ones_like(unit), count, integrator.solver(dtype)
@@ -297,7 +298,7 @@ def orbit_loads(
 
         def run(y, dynamic):
             def part(y, between):
-                # Only the second part counts in the integrals.
+                # The integrals start again from zero, so that only the second part counts.
                 start = equation.start(y[:count], pair.free)
                 return equation.advanced(between[0], between[1], start, dynamic)[0], None
 

@@ -1,4 +1,4 @@
-"""The pump sheet: what a designer weighs beside the contact force, at one glance."""
+"""The pump sheet: one table of a design's flow, play, leakage and bearing loads."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -28,14 +28,14 @@ MRAD = 1e-3
 UM = 1e-6
 """One micrometre (m)."""
 _ROUNDING = 1e-8
-"""Overlap (m) of the flanks up to which it may be the rounding of a measured outline."""
+"""Overlap (m) of the flanks below which it counts as rounding of a measured outline."""
 LINES = 4
 """Number of lines of the flow in the sheet."""
 NOTE = (
     "The flow ripple is (r_a - r_p)^2 / (eta r_a^2): with the outer radius r_a and the area "
     "efficiency eta given, no other shape of the flank changes it; a twist lowers it."
 )
-"""What limits the ripple, for the user."""
+"""Sentence for the user: what determines the ripple."""
 
 
 SLIP, MOLECULAR = 0.01, 1.0
@@ -55,11 +55,12 @@ def sheet(scene: Scene, design: Float[Array, " d"]) -> dict[str, Any]:
     where the rotors overlap.
 
     With a section `scene.bearings`, there are the greatest load of a bearing and the greatest
-    equivalent load while the timing gear, not the flanks, carries the load, and nothing oscillates.
+    equivalent load. For both, the timing gear carries the load instead of the flanks, and nothing
+    oscillates.
 
-    With a section `pump`, there is the leakage too: least and mean gap of the flanks over the mesh
-    (µm), leakage through mesh, tips and end faces, volumetric efficiency and, for a gas, the
-    Knudsen number. Raises `InputError` if the rotors overlap somewhere."""
+    With a section `pump`, the leakage follows: least and mean gap of the flanks over the mesh (µm),
+    leakage through mesh, tips and end faces, and volumetric efficiency. For a gas, there is also
+    the Knudsen number. Raises `InputError` if the rotors overlap somewhere."""
     found = {key: value.tolist() for key, value in _flow(scene, design).items()}
     if scene.bearings is not None:
         equivalent, greatest = static_loads(scene, design)
@@ -123,9 +124,9 @@ def check_clearances(config: Config) -> None:
 
 
 def record_of(config: Config, design: Sequence[float]) -> dict[str, Any]:
-    """Return the pump sheet of a `design` in config units; where flanks overlap, without leakage.
+    """Return the pump sheet of a `design` in config units, without leakage if the flanks overlap.
 
-    For the end of a search, which an error would leave without its files."""
+    Use it at the end of a search: it raises no error, so the results are still written."""
     scene, values = Scene.from_config(config), jnp.asarray(design, float)
     try:
         return sheet(scene, values)

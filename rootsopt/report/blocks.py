@@ -11,9 +11,9 @@ from rootsopt.status import Status
 from rootsopt.tradeoffs.front import Standing
 
 _WIDEST = 6
-"""Number of cases above which the numbers of each case are left out."""
+"""Number of cases above which the table omits the numbers of each case."""
 _MOST_ROWS = 200
-"""Number of scenes above which a table of a sweep is cut off."""
+"""Number of scenes above which the table of a sweep is truncated."""
 _GOOD = {"satisfied", "active", "met by all", "certified", "converged", "geometry_only"}
 
 
@@ -44,7 +44,9 @@ def block(
     groups: Iterable[tuple[str, Iterable[Sequence[Cell | str]]]],
     note: str = "",
 ) -> Block:
-    """Return a table without its empty groups; cells may be text."""
+    """Return a table with this `title`, without its empty groups.
+
+    `heads`: headings of the columns; `note`: text below the table. Cells may be given as text."""
     found = []
     for heading, rows in groups:
         cells = tuple(
@@ -157,7 +159,8 @@ def _apart(name: str, given: Sequence[Any]) -> list[tuple[str, Sequence[Any]]]:
 
 
 def list_block(title: str, rows: Sequence[Mapping[str, Any]], note: str = "") -> Block | None:
-    """Return a table of rows {key: value} with one column per key that has a value somewhere."""
+    """Return a table of rows {key: value}, with one column for each key that has a value in some
+    row."""
     keys = [key for key in dict.fromkeys(key for row in rows for key in row)
             if any(fitting(row).get(key) is not None for row in rows)]  # fmt: skip
     if not keys:
@@ -199,7 +202,7 @@ def front_block(run: Run) -> Block | None:
 
 
 def likeness_block(run: Run) -> Block | None:
-    """Return the family members nearest to the profile, or None if they were not searched for."""
+    """Return the family members nearest to the profile, or None without a search for them."""
     found = run.result.get("resembles")
     found = found or (run.result.get("beginning") or {}).get("considered")
     rows = [

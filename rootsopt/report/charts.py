@@ -13,10 +13,10 @@ from rootsopt.figures.style import BLUE, COLORS, GREY, VERMILION
 from rootsopt.output.labels import in_words
 from rootsopt.report.gather import Case, Run, varied
 from rootsopt.report.names import label
-from rootsopt.response.evaluation import Series
+from rootsopt.response.series import Series
 
 _MOST_TURNS = 4
-"""Number of revolutions above which the chart of a motion begins zoomed in."""
+"""Number of revolutions above which the chart of a motion shows only a part at first."""
 _MOST_SAMPLES = 20_000
 """Number of samples above which a chart of a motion shows only the extremes of each interval."""
 _HARMONICS = 40
@@ -124,7 +124,9 @@ def _spectrum(
 
 
 def _stems(marks: Mapping[str, Any], floor: float) -> dict[str, Any]:
-    """Return the trace of the lines from the amplitude `floor` (N) up to the `marks`."""
+    """Return the trace of a spectrum's vertical lines, from `floor` (N) up to the `marks`.
+
+    `marks`: trace of the points at the ends of the lines."""
     across, up = [], []
     for x, y in zip(marks["x"], marks["y"], strict=True):
         across += [x, x, None]

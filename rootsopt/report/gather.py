@@ -1,4 +1,4 @@
-"""Reads the files of a run back, as the report shows them."""
+"""Reads the files of a run back into the data that the report shows."""
 
 import csv
 import dataclasses
@@ -13,7 +13,7 @@ import numpy as np
 from rootsopt.config import Config, load
 from rootsopt.output.files import ResultFolder
 from rootsopt.output.fronts import design_file
-from rootsopt.response.evaluation import Series
+from rootsopt.response.series import Series
 
 _COLUMNS = {
     "time": "time_s",
@@ -153,9 +153,9 @@ def _series(place: Path, name: str) -> Series | None:
 
 
 def varied(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the keys of the quantities that vary between scenes, a number first.
+    """Return the keys of the quantities that vary between scenes, beginning with a numeric one.
 
-    They stand before the forces in each row."""
+    These are the keys before the forces in each row."""
     keys = list(itertools.takewhile(lambda key: not key.endswith("_force_N"), rows[0]))
     kept = [key for key in keys if key not in ("status", "point", "message")]
     varied = [key for key in kept if len({row.get(key) for row in rows}) > 1] or kept[:1]

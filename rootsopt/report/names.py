@@ -18,7 +18,7 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def unit(text: str) -> str:
-    """Return a `unit` of the tables in print: µm instead of um, ° instead of deg."""
+    """Return a `unit` of the tables as it is printed: µm instead of um, ° instead of deg."""
     return _UNITS.get(text, text)
 
 
@@ -38,7 +38,7 @@ def last_part(key: str) -> str:
 
 
 def value(given: Any) -> str:
-    """Return a value in print: five significant digits, a minus sign, `yes` and `no`."""
+    """Return a value as it is printed: numbers with five digits, truth values as `yes` or `no`."""
     if isinstance(given, bool):
         return "yes" if given else "no"
     if isinstance(given, list | tuple):
@@ -52,14 +52,14 @@ def value(given: Any) -> str:
 
 
 def brief(given: float, digits: int = 5) -> str:
-    """Return a number for a sentence: at most so many significant `digits`, no zeros at the end."""
+    """Return a number for a sentence: at most `digits` significant digits, no final zeros."""
     shown = f"{given:.{digits}g}"
     power = int(shown.partition("e")[2] or 0)
     return _powered(f"{float(shown):.0f}" if 0 < power < 7 else shown)
 
 
 def quantity(given: float | None, text: str) -> str:
-    """Return a number for a sentence with its unit, given as in the tables' `text`."""
+    """Return a number for a sentence, with the unit `text`, written as in the tables."""
     text = unit(text)
     shown = "–" if given is None else brief(given)
     return f"{shown}{'' if text == '°' else ' '}{text}".strip()
@@ -72,7 +72,7 @@ def signed(given: float, text: str) -> str:
 
 
 def percent(first: Any, second: Any) -> str:
-    """Return the change from `first` to `second` in % of `first`; empty if it has none."""
+    """Return the change from `first` to `second` in % of `first`, or "" if this is not defined."""
     shown = change(first, second)
     if shown == DASH:
         return ""

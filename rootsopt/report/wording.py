@@ -30,7 +30,7 @@ _TITLES = {
     "profile": "Geometry of {pair}",
 }
 _FEW = 6
-"""Number of design parameters above which sentences leave them out."""
+"""Number of design parameters above which sentences do not list them."""
 _SMALL = 0.05
 """Absolute change (%) below which a quantity counts as unchanged."""
 
@@ -42,7 +42,7 @@ def title(run: Run) -> str:
 
 
 def asked(run: Run) -> list[str]:
-    """Return sentences on what the run had to do."""
+    """Return sentences on the task of the run."""
     sentences = [_ASKED.get(run.command, f"Run the command {run.command}."), scene(run.config)]
     if run.command == "optimize":
         sentences.append(_objective(run.config))
@@ -90,7 +90,7 @@ def scene(config: Config) -> str:
     if (gear := data.timing_gear) is not None:
         parts.append(f"a timing gear with {brief(gear.backlash_mm)} mm backlash")
     if data.motor is not None:
-        parts.append("a motor whose speed gives way")
+        parts.append("a motor whose speed falls under load")
     if config.rotor.helix_deg:
         parts.append(f"rotors twisted by {quantity(config.rotor.helix_deg, 'deg')}")
     if config.contact.friction is not None:
@@ -205,8 +205,8 @@ def _dearest(rows: Sequence[Mapping[str, Any]]) -> str:
     step = quantity(abs(row["relaxed_by"]), row.get("unit", ""))
     percent = abs(row["relaxed_objective_percent"])
     return (
-        f"The dearest limit is {in_words(row['name'])}: relaxed by {step}, it lowers the objective "
-        f"by {percent:.3g} %."
+        f"The limit with the highest price is {in_words(row['name'])}: relaxed by {step}, it "
+        f"lowers the objective by {percent:.3g} %."
     )
 
 

@@ -1,1 +1,1 @@
-"""Response of a design in a scene: forces, their derivatives, and how far to trust them."""
+"""Response of a design in a scene: forces, their derivatives, and a status that qualifies them."""

@@ -30,7 +30,7 @@ from rootsopt.scene import design_vector
 from rootsopt.status import Status
 
 _LONGEST = 8
-"""Longest cycle searched for, in mesh periods."""
+"""Maximum length of a cycle (mesh periods) that the search recognises."""
 _APART = 0.3
 """Scaled distance above which two motions always count as different."""
 _TRIES = 24
@@ -248,8 +248,9 @@ class _Sorter:
         return (-1, status.label) if status in _LOST else (number, "")
 
     def _same(self, state) -> int | None:
-        """Return the number of the known cycle that contains `state` (scaled), within the accuracy
-        of a transient; None if no known cycle does."""
+        """Return the number of the known cycle that contains `state` (scaled), or None.
+
+        States are compared to within the accuracy of a transient."""
         tolerance = float(settled_within(self.evaluator.scene.solver.transient.rtol))
         best, number = np.inf, None
         for i in filter(self.periodic, range(len(self.evaluations))):
@@ -272,9 +273,9 @@ def _axes(config: Config, pair: RotorPair) -> tuple[NDArray[np.float64], NDArray
     """Return the axes of the grid: the initial ε (rad) and dε/dt (rad/s).
 
     By default, ε covers the clearance and the backlash, and `_DEPTHS` static penetrations beyond.
-    |dε/dt| ranges up to twice the greater of two speeds: the speed that the load causes across the
-    range of ε, and the speed that crosses this range within a mesh period.
-    """
+    |dε/dt| ranges up to twice the greater of two speeds. The first is the speed that the load
+    causes across the range of ε. The second is the speed that crosses this range within a mesh
+    period."""
     wanted = config.attractors
     radius = config.profile.pitch_radius_mm * MM
     load = max(float(pair.load.torque), 1e-3)

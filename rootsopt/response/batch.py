@@ -62,8 +62,8 @@ def coarse(
     """Return the settings with which a batch finds the steady motions of a `scene`.
 
     `transient`, `orbit`: integrators of the transient and of the orbit; `max_periods`: maximum
-    length of the transient (mesh periods); `max_orbit`: longest period searched for (mesh periods).
-    """
+    length of the transient (mesh periods); `max_orbit`: longest period of an orbit to find (mesh
+    periods)."""
     return dataclasses.replace(
         scene.solver,
         transient=transient,

@@ -66,7 +66,8 @@ def choose(config: Config) -> Choice:
     """
     wanted = config.solver.accuracy
     tried: list[dict[str, Any]] = []
-    # Noise of the steps can excite a motion or keep it from settling: then try a finer tolerance.
+    # Noise of the steps can excite a motion or keep it from settling. In this case, try a finer
+    # tolerance.
     for share in (1e-4, 1e-6):
         reference = _with(config, fidelity="search", rtol=share * wanted)
         truth = _evaluations(reference)

@@ -321,7 +321,7 @@ class _Outcome:
     @property
     def reached(self) -> float:
         """Largest |ε| (rad) in all motions."""
-        return max(float(np.max(run.reach)) for run in self.runs)
+        return max(float(np.max(run.max_relative)) for run in self.runs)
 
 
 def neighbours(
@@ -385,7 +385,7 @@ _pair = Program(Scene.pair_and_shape)
 
 @Program
 def _point(space: Space, design):
-    """Return the point of the unit box nearest to a design."""
+    """Return the point (d,) of the unit box nearest to a design (d,) in config units."""
     return space.point(design)
 
 

@@ -1,7 +1,6 @@
 """One design in one scene, from design vector to steady state, response and gradient."""
 
 import dataclasses
-import functools
 import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config
-from rootsopt.config.units import MM, RPM
+from rootsopt.config.units import RPM
 from rootsopt.contact.size import size_map
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.maxima import Maxima, local_maxima, prepare_maxima
@@ -27,11 +26,22 @@ from rootsopt.dynamics.steady import (
     steady_motion,
     window_status,
 )
-from rootsopt.dynamics.window import Window, lyapunov
+from rootsopt.dynamics.window import lyapunov
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import OrbitLoads, orbit_loads
 from rootsopt.response.orbits import Built, OrbitStore, prepare_near
-from rootsopt.response.terms import BEARING, EQUIVALENT, terms_of, values_of
+from rootsopt.response.records import (
+    RESPONSES,
+    bearing_record,
+    geometry_record,
+    idle_hint,
+    orbit_record,
+    orbit_statistics,
+    unsettled,
+    window_record,
+)
+from rootsopt.response.series import Series, contact_series, orbit_series, window_series
+from rootsopt.response.terms import BEARING, terms_of, values_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_keys, design_vector
 from rootsopt.status import Status
@@ -39,35 +49,8 @@ from rootsopt.status import Status
 if TYPE_CHECKING:
     import xarray
 
-RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 _MAPS = 5
 """Maximum number of contact maps tried for one design."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Series:
-    """Motion, force and penetration over the reported window, as NumPy arrays (samples,).
-
-    `time` (s): uniform unless rotor 1 is free; `rotation` of rotor 1 (rad), uniform; `relative`: ε
-    (rad); `rate`: dε/dt (rad/s); `drive_force`, `coast_force`: normal force (N) on each flank;
-    `depth`: greatest penetration (m; negative: gap); `bearing_loads` (samples, 4): loads (N) on the
-    bearings, None without `scene.bearings` or without an orbit. The bearings are that of rotor 1 at
-    the timing gear's end, its other one, and those of rotor 2.
-    """
-
-    time: NDArray[np.float64]
-    rotation: NDArray[np.float64]
-    relative: NDArray[np.float64]
-    rate: NDArray[np.float64]
-    drive_force: NDArray[np.float64]
-    coast_force: NDArray[np.float64]
-    depth: NDArray[np.float64]
-    bearing_loads: NDArray[np.float64] | None = None
-
-    @property
-    def force(self) -> NDArray[np.float64]:
-        """Contact force (N): sum of the normal forces on both flanks."""
-        return self.drive_force + self.coast_force
 
 
 @dataclasses.dataclass(frozen=True)
@@ -336,7 +319,7 @@ class Evaluator:
         if series:
             count = pair.lobes * solver.samples
             times = jax.ShapeDtypeStruct((count,), float)
-            _contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, pair.states), dtype))
+            contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, pair.states), dtype))
         return now
 
     def sized(self) -> "Evaluator":
@@ -378,13 +361,12 @@ class Evaluator:
         return dataclasses.replace(self, scene=scene, map_error=wanted.error / depth)
 
     def _refitted(self, pair: RotorPair, found: Steady) -> "Evaluator | None":
-        """Return another evaluator whose contact map fits the motion `found`, or None if the
-        present map fits.
+        """Return another evaluator whose contact map fits the motion `found`; None if the present
+        map fits.
 
         A map must cover the motion. If the motion uses only a small part of the map, resolution is
         wasted, and the map is replaced. This is done only once, so that neighbouring designs share
-        a map.
-        """
+        a map."""
         status, reached = Status.of(found.status), _reached(pair, found)
         return self.reaching(reached, status is Status.PERIODIC, pair.angle_limit)
 
@@ -423,9 +405,9 @@ class Evaluator:
         if status in CLOSED:
             named = self.scene.solver.measures.named(orbit.response[:, None], period)
             response = {name: value for name, (value, _) in named.items()}
-            steady = {"kind": "periodic"} | _closed(orbit, period)
-            statistics |= _orbit_statistics(found)
-            motion = _orbit_series(pair, orbit, period) if series else None
+            steady = {"kind": "periodic"} | orbit_record(orbit, period)
+            statistics |= orbit_statistics(found)
+            motion = orbit_series(pair, orbit, period) if series else None
             state = np.asarray(orbit.state, np.float64)
             if self.scene.bearings is not None and (series or {*BEARING} & {*self._names}):
                 loads = jax.device_get(self._bearing_loads(design, found))
@@ -447,15 +429,15 @@ class Evaluator:
             response = dict.fromkeys(names, 0.0)
             if int(found.window.done):
                 hint = idle_hint(self.config, float(found.window.depth))
-                steady |= _of_window(found.window)
-                motion = _window_series(pair, found.window) if series else None
+                steady |= window_record(found.window)
+                motion = window_series(pair, found.window) if series else None
             else:
                 hint = idle_hint(self.config, float(orbit.flow.depth))
                 if found.verdict.steady:
                     # The timing gear holds the pair. A pair that floats can rest anywhere.
-                    steady |= _closed(orbit, period)
+                    steady |= orbit_record(orbit, period)
                     state = np.asarray(orbit.state, np.float64)
-                    motion = _orbit_series(pair, orbit, period) if series else None
+                    motion = orbit_series(pair, orbit, period) if series else None
         elif int(found.window.done):
             steady, response, motion = unsettled(pair, status, found.window, series)
         elif status is Status.SOLVER_FAILED and pair.timescales is not None:
@@ -549,88 +531,6 @@ def _reached(pair: RotorPair, found: Steady) -> float:
     return scale * abs(float(found.settled.state[0]))
 
 
-def bearing_record(loads: OrbitLoads) -> dict[str, tuple[float, NDArray[np.float64]]]:
-    """Return the result file's entries for the loads on the bearings over an orbit.
-
-    Each is (value, its derivatives (d,)): those of the most loaded bearing or rotor."""
-    greatest, slopes = loads.greatest, loads.greatest_slopes
-    groups = {
-        EQUIVALENT: (loads.equivalent, loads.slopes),
-        "bearing_load_max_N": (greatest[:4], slopes[:4]),
-        "axial_force_max_N": (greatest[4:6], slopes[4:6]),
-        "tilting_moment_max_N_m": (greatest[6:], slopes[6:]),
-    }
-    record = {}
-    for name, (values, rows) in groups.items():
-        if len(values):
-            worst = int(np.argmax(values))
-            record[name] = float(values[worst]), np.asarray(rows[worst], np.float64)
-    return record
-
-
-def _orbit_statistics(found: Steady) -> dict[str, int | float]:
-    """Return the result file's statistics of a closed orbit: effort and accuracy."""
-    orbit = found.orbit
-    statistics: dict[str, int | float] = {
-        "newton_steps": int(orbit.newton_steps),
-        "orbit_steps": int(orbit.flow.steps),
-        "orbit_rtol": float(found.rtol),
-        "orbit_defect": float(orbit.defect),
-        "force_rounding": float(found.verdict.rounding),
-    }
-    if bool(found.collocated):
-        statistics["collocated"] = 1
-        if not int(found.used):
-            statistics["from_neighbour"] = 1
-    if np.isfinite(orbit.disagreement):  # Infinite: there was no room for a comparison.
-        statistics["gradient_disagreement"] = float(orbit.disagreement)
-    return statistics
-
-
-def _closed(orbit: Orbit, period: int) -> dict[str, Any]:
-    """Return the result file's entries for a closed orbit."""
-    return {
-        "period": period,
-        "floquet_multiplier": float(orbit.multiplier),
-        "floquet_multipliers": floquet(orbit.monodromy),
-        "residual": float(orbit.residual),
-    }
-
-
-def idle_hint(config: Config, depth: float) -> str:
-    """Return advice for flanks that never touch: which clearance or backlash would let them touch.
-
-    `depth` (m): greatest penetration, the negative of the least gap. The motion does not depend on
-    the clearance as long as nothing touches. Therefore, the flanks touch if the clearance is
-    reduced by more than the least gap. The advice is empty if the gap is not known or too large."""
-    gap, clearance = -depth / MM, config.contact.clearance_mm
-    if not (np.isfinite(gap) and 0 < gap < 0.9 * config.profile.pitch_radius_mm):
-        return ""
-    found = f" The least gap of the flanks is {gap:.4g} mm"
-    if gap < clearance:
-        return f"{found}: they touch with contact.clearance_mm below {clearance - gap:.4g}."
-    if config.scene.timing_gear is not None:
-        backlash = config.scene.timing_gear.backlash_mm
-        return (
-            f"{found}, and the timing gear holds them apart: they touch only with "
-            f"scene.timing_gear.backlash_mm above {backlash + 2 * gap:.4g}."
-        )
-    return f"{found}."
-
-
-def geometry_record(scene: Scene, shape: Geometry) -> dict[str, float]:
-    """Return the geometry as a dict with the keys and units of the result file."""
-    return {
-        "outer_radius_mm": float(shape.outer_radius) / MM,
-        "root_radius_mm": float(shape.root_radius) / MM,
-        "area_mm2": float(shape.area) / MM**2,
-        "area_efficiency": float(shape.area_efficiency),
-        "polar_inertia_kg_m2": float(scene.inertia(shape)),
-        "undercut_margin_mm": float(shape.undercut_margin) / MM,
-        "seal_width_mm": float(shape.seal_width) / MM,
-    }
-
-
 _build = Program(Scene.pair_and_tangents)
 _motion = Program(steady_motion)
 lyapunov_program = Program(lyapunov)
@@ -653,15 +553,6 @@ def objective_weights(config: Config) -> dict[str, float]:
     return {name: share / total for name, share in shares.items() if share}
 
 
-def floquet(monodromy) -> list[list[float]]:
-    """Return the Floquet multipliers as a list of [real, imaginary], greatest modulus first.
-
-    `monodromy` (n, n): its eigenvalues are the Floquet multipliers."""
-    values = np.linalg.eigvals(np.asarray(monodromy, np.float64))
-    ordered = sorted(values, key=lambda z: (-abs(z), -z.imag))
-    return [[float(z.real), float(z.imag)] for z in ordered]
-
-
 @Program
 def _reverse(
     scene: Scene, design, orbit: Orbit, period, integrator: Integrator, measures: Measures
@@ -679,80 +570,10 @@ def _reverse(
     )
 
 
-@Program
-def _contact_series(pair: RotorPair, tau, states):
-    lapse = pair.lapse(states) if pair.free else jnp.ones_like(tau)
-    contact = jax.vmap(pair.contact_at)(tau, states)
-    return pair.mesh_period, lapse, pair.physical(tau, states)[1:], contact
-
-
-def _series(pair: RotorPair, tau, states) -> Series:
-    # Reduce to one turn of the rotor, so that single precision resolves late times as well.
-    turn = np.mod(tau, pair.lobes)
-    period, lapse, (relative, rate), contact = _contact_series(pair, turn, states)
-    time = period * tau
-    if pair.free:
-        from scipy.integrate import cumulative_simpson  # Slow import (0.5 s), only for motors.
-
-        time = period * cumulative_simpson(lapse, x=tau, initial=0.0)
-    double = functools.partial(np.asarray, dtype=np.float64)
-    return Series(
-        time=double(time),
-        rotation=2 * np.pi / pair.lobes * np.asarray(tau, np.float64),
-        relative=double(relative),
-        rate=double(rate),
-        drive_force=double(contact.drive),
-        coast_force=double(contact.coast),
-        depth=double(contact.depth),
-    )
-
-
-def _orbit_series(pair: RotorPair, orbit: Orbit, period: int) -> Series:
-    """Return the series of the orbit, repeated to cover at least one revolution of rotor 1."""
-    samples = orbit.flow.states.shape[0]
-    cycles = -(-pair.lobes // period)
-    tau = period * np.arange(cycles * samples) / samples
-    return _series(pair, tau, np.tile(np.asarray(orbit.flow.states), (cycles, 1)))
-
-
-def unsettled(
-    pair: RotorPair, status: Status, window: Window, series: bool
-) -> tuple[dict[str, Any], dict[str, float], Series | None]:
-    """Return `steady_state`, `response` and `series` for the `Evaluation` of a motion without an
-    orbit.
-
-    `status` of the motion; `window`: a window of the motion; `series`: whether to compute the
-    series. Otherwise, the series is None."""
-    steady = {"kind": _KINDS.get(status, "transient")} | _of_window(window)
-    if status not in (Status.CHAOTIC, Status.NOT_SETTLED, Status.IDLE):
-        return steady, {}, None
-    mean, square, peak = np.asarray(window.forces, np.float64)
-    values = map(float, (mean, peak, np.sqrt(square)))
-    response: dict[str, float] = dict(zip(RESPONSES, values, strict=True))
-    return steady, response, _window_series(pair, window) if series else None
-
-
 _NO_GRADIENT = (
     " The contact force jumps at many places, so that it has no gradient. For a gradient, set "
     "solver.fidelity to search, map or linear."
 )
-_KINDS = {Status.CHAOTIC: "chaotic", Status.IDLE: "idle"}
-
-
-def _of_window(window: Window) -> dict[str, Any]:
-    """Return the result file's entries for a window."""
-    known = bool(np.all(np.isfinite(window.response)) and np.isfinite(window.exponent))
-    return {
-        "lyapunov_exponent_per_mesh_period": float(window.exponent) if known else None,
-        "lyapunov_standard_error": float(window.error) if known else None,
-        "window_mesh_periods": int(window.done),
-    }
-
-
-def _window_series(pair: RotorPair, window: Window) -> Series:
-    states = np.asarray(window.states)
-    periods, samples, count = states.shape
-    return _series(pair, np.arange(periods * samples) / samples, states.reshape(-1, count))
 
 
 def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) -> Evaluation:

@@ -34,16 +34,15 @@ class Members(NamedTuple):
 
     `means` (m, 3): mean force (N), mean square (N²) and mean of the peaks of all mesh periods (N);
     `drift`: mean force in the second half of the window minus that in the first (N); `greatest`:
-    greatest force (N); `reach`: greatest |ε| (rad); `depth`: greatest penetration (m; negative:
-    least gap); `states` (m, n): last scaled states; `repeats` (m, 8): whether the last states
-    repeat after 1 … 8 mesh periods; `lost`, `stalled`: see `RotorPair`; `solved`: whether the
-    solver succeeded.
-    """
+    greatest force (N); `max_relative`: greatest |ε| (rad); `depth`: greatest penetration (m;
+    negative: least gap); `states` (m, n): last scaled states; `repeats` (m, 8): whether the last
+    states repeat after 1 … 8 mesh periods; `lost`, `stalled`: see `RotorPair`; `solved`: whether
+    the solver succeeded."""
 
     means: Float[Array, "m 3"]
     drift: Float[Array, " m"]
     greatest: Float[Array, " m"]
-    reach: Float[Array, " m"]
+    max_relative: Float[Array, " m"]
     depth: Float[Array, " m"]
     states: Float[Array, "m n"]
     repeats: Bool[Array, "m 8"]
@@ -120,10 +119,9 @@ def run_members(
 ) -> list[Members]:
     """Return the `Members` of each of `pairs`, all from the same scaled `states` (m, n).
 
-    `settle`: mesh periods before the window; `periods`: mesh periods of the window. On CPUs one
-    thread per core simulates a few members at a time, so that few members wait for a slower one. On
-    other devices all members are stepped together.
-    """
+    `integrator` of the motions; `settle`: mesh periods before the window; `periods`: mesh periods
+    of the window. On CPUs one thread per core simulates a few members at a time, so that few
+    members wait for a slower one. On other devices all members are stepped together."""
     states = np.asarray(states, pairs[0].angle_scale.dtype)
     counts = np.asarray(settle), np.asarray(periods)
     if jax.default_backend() != "cpu":
@@ -152,8 +150,9 @@ def member(
 ) -> Members:
     """Simulate one motion from the scaled `state` (n,) and return its result.
 
-    `settle`: mesh periods before the window; `periods`: mesh periods of the window. The fields of
-    the result lack the leading axis of `Members`. This is a pure function."""
+    `settle`: mesh periods before the window; `periods`: mesh periods of the window. `integrator` of
+    the motion. The fields of the result lack the leading axis of `Members`. This is a pure
+    function."""
     dtype = state.dtype
     one, none, low = jnp.ones((), dtype), jnp.zeros((), dtype), jnp.full((), -jnp.inf, dtype)
 
@@ -192,7 +191,7 @@ def member(
         means=means / periods,
         drift=drift / jnp.maximum(half, 1),
         greatest=greatest,
-        reach=pair.angle_scale * reach,
+        max_relative=pair.angle_scale * reach,
         depth=depth,
         states=end,
         repeats=apart < _REPEATS,

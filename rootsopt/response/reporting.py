@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from rootsopt.config import Config
 from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import RESPONSES
+from rootsopt.response.records import RESPONSES
 
 _LINE = re.compile(r"line_(\d+(?:\.\d+)?)_force_N")
 _UNITS = {
@@ -21,7 +21,8 @@ _UNITS = {
 
 
 def unit_in(name: str) -> str:
-    """Return the unit of a quantity; empty if it has none or if its name does not tell it."""
+    """Return the unit of a quantity; empty if it has no unit, or if its name does not contain the
+    unit."""
     return next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
 
 
@@ -32,9 +33,10 @@ def in_words(name: str) -> str:
 
 
 def is_force(config: Config, name: str, key: str) -> bool:
-    """Return whether `name` is a measure of the force, and not a registered term.
+    """Return whether `name` is a measure of the force; otherwise, it can only be a registered term.
 
-    `key`: config key that holds the name. Raises `InputError` for a measure that cannot exist."""
+    `key`: config key that holds the name, for the message. Raises `InputError` for a measure that
+    cannot exist."""
     if name == PEAK_NORM and config.objective.peak_norm is None:
         raise InputError(
             f"`{key}` names {PEAK_NORM}, which needs `objective.peak_norm`; set it, or name "

@@ -54,9 +54,9 @@ def quantiles(scatter: Scatter, levels: Float[np.ndarray, " n"]) -> Float[np.nda
 def draw(config: Config, count: int, fresh: bool = False) -> Float[np.ndarray, "n q"]:
     """Return `count` samples of the q keys that scatter, in the order of `config.scatters`.
 
-    With `tolerances.conditions`, these are the rows. `fresh`: whether the sample is pseudo-random
-    and independent of the search's, instead of the fixed Sobol sample of the search. Both follow
-    from `tolerances.seed` alone."""
+    With `tolerances.conditions`, the samples are these conditions. `fresh`: whether the sample is
+    pseudo-random and independent of the search's, instead of the fixed Sobol sample of the search.
+    Both follow from `tolerances.seed` alone."""
     scatters, tolerances = config.scatters, config.tolerances
     assert tolerances is not None
     if tolerances.conditions:

@@ -226,9 +226,8 @@ def sweep(
 
 
 def overall(parts: Sequence[AtSpeed]) -> tuple[Status, str]:
-    """Return status and message of the first part that is not usable.
-
-    If all parts are usable, return those of the first part."""
+    """Return status and message of the first part that is not usable, or of the first part if all
+    are."""
     for part in parts:
         if not part.evaluation.usable:
             return part.evaluation.status, f"At {part.speed_rpm:g} rpm: {part.evaluation.message}"

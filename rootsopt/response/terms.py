@@ -290,7 +290,7 @@ class _UsedError(Exception):
 
 
 class _NoForces:
-    """Stands in for `Forces` to find out whether a term reads them."""
+    """Substitute for `Forces` that raises an error when a term reads a force."""
 
     def __getattr__(self, name: str) -> Any:
         raise _UsedError(name)
@@ -319,7 +319,9 @@ def needs_forces(scene: Scene, term: Term, design: Float[Array, " d"]) -> bool:
 
 
 def sense_of(name: str) -> Literal["min", "max"]:
-    """Return the sense of the term registered under `name`; raise `InputError` if it is unknown."""
+    """Return the sense (`min` or `max`, see `Term`) of the term registered under `name`.
+
+    Raises `InputError` if there is no such term."""
     return terms_of([name])[0].sense
 
 

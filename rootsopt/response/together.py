@@ -19,7 +19,7 @@ from rootsopt.runtime.programs import Program
 
 
 def pays() -> bool:
-    """Return whether the device evaluates many scenes faster together than in turn."""
+    """Return whether this device evaluates many scenes faster together than one after the other."""
     return jax.default_backend() != "cpu"
 
 
@@ -52,7 +52,7 @@ def evaluate_together(evaluators: Sequence[Evaluator]) -> list[Evaluation]:
 
 
 def _kind(arrays: Any, others: Any) -> Hashable:
-    """Return what scenes must share to be stepped together."""
+    """Return a key that is equal for scenes that can be stepped together."""
     leaves, tree = jax.tree.flatten(arrays)
     shapes = tuple((x.shape, str(x.dtype)) for x in leaves)
     return tree, shapes, tuple(jax.tree.leaves(others))

@@ -150,9 +150,8 @@ def together(parts: Sequence[AtSample]) -> ToleranceEvaluation:
 
 
 def overall(parts: Sequence[AtSample]) -> tuple[Status, str]:
-    """Return status and message of the first part that is not usable.
-
-    If all parts are usable, return those of the first part."""
+    """Return status and message of the first part that is not usable, or of the nominal scene if
+    all are."""
     failed = [part for part in parts if not part.evaluation.usable]
     if not failed or failed[0] is parts[0]:
         return parts[0].evaluation.status, parts[0].evaluation.message

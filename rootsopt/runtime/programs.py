@@ -63,7 +63,8 @@ only one of several nested loops."""
 _PACKAGE = Path(__file__).parents[1]
 _store: Store | None = None
 _chosen = False
-"""Whether a cache, or none, has been chosen. If not, the first program chooses the default."""
+"""Whether the cache's folder has been chosen, or the cache turned off. If not, the first program
+chooses the default folder."""
 # Tracing runs in Python, so it is done one function at a time, in the order of requests. The
 # compiler then works in parallel.
 _tracing = threading.RLock()
@@ -237,7 +238,7 @@ class Program:
         name = f"{self.function.__module__}.{self.function.__qualname__}"
         words = [name, *map(repr, kind), *sources, *_machine(), *_versions(), *_settings()]
         if any(" at 0x" in word for word in words):
-            return None  # The text contains an address, which differs in the next process.
+            return None  # The text contains a memory address, which differs in the next process.
         purpose = hashlib.sha256("\0".join(words).encode()).hexdigest()
         return _Place(_store, f"{self.function.__name__}-{purpose[:32]}", purpose)
 
@@ -346,7 +347,7 @@ def _loaded(place: _Place | None) -> _Made | None:
 
 
 def _modules(kind: _Kind) -> set[str]:
-    """Return the names of the modules that define the types of the arguments."""
+    """Return the names of the modules that define the types of the arguments of this `kind`."""
     found = {of.__module__ for of, _ in kind.others}
     trees = [kind.tree]
     while trees:

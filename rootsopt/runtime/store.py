@@ -262,7 +262,7 @@ def _key() -> bytes:
         folder = Folder(path)
         folder.sweep(f"{_KEY_NAME}.")
         for _ in range(_ATTEMPTS):
-            there = _there(folder)  # Checked first: a key that appears afterwards is valid.
+            there = _there(folder)  # Check this first: a key that appears later is valid.
             key = folder.read(_KEY_NAME, _KEY_BYTES, _OTHERS_AT_ALL)
             if key is not None and len(key) == _KEY_BYTES:
                 return key

@@ -1,4 +1,4 @@
-"""The rotors' bearings: where they sit, and what loads them beside the flanks."""
+"""The rotors' bearings: their places, and their loads other than those of the flanks."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,7 +19,8 @@ class Bearings(eqx.Module):
     `tooth_angle` (rad): pressure angle of the timing gear; `port` (rad): angle before the lowest
     point of the bore at which a pocket opens to discharge; `distance` (m): of each bearing from the
     nearer end face; `gear_distance` (m): of the timing gear from the end face at z = L/2;
-    `exponent` of the equivalent load; `heavy`: whether the rotors' weight counts."""
+    `exponent`: p of the equivalent load, (mean |F|^p)^(1/p); `heavy`: whether the rotors' weight
+    counts."""
 
     tooth_angle: Float[Array, ""]
     port: Float[Array, ""]

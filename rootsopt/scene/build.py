@@ -1,4 +1,4 @@
-"""The scene: everything that is simulated except the design. It builds a rotor pair from a design.
+"""The scene: everything in a simulation except the design. It builds a rotor pair from a design.
 
 A design is a vector of the config's design parameters, in the config's own units. Gradients are
 therefore derivatives with respect to config units. A family without parameters (EE) has an empty
@@ -135,12 +135,12 @@ class Scene(eqx.Module):
             twist_free=config.twist_free,
             deepest=jnp.asarray(deepest),
             solver=reading.solver_of(config),
-            outline=families.outline(config.profile),
+            outline=families.profile_from_file(config.profile),
             medium=medium_of(config),
             bearings=bearings_of(config),
             law=reading.law_of(config),
             gear=reading.gear_of(config),
-            **reading.quantities(config),
+            **reading.physical_quantities(config),
             **reading.parts_of(config),
         )
         if found.helix is None or found.slices:
@@ -166,7 +166,7 @@ class Scene(eqx.Module):
             bearings=bearings_of(config),
             law=reading.law_of(config),
             gear=reading.gear_of(config),
-            **reading.quantities(config),
+            **reading.physical_quantities(config),
             **reading.parts_of(config),
         )
 
@@ -305,7 +305,7 @@ class Scene(eqx.Module):
     def axis_loads(
         self, bearings: Bearings, load: Load, gear: TimingGear | None, mass: Float[Array, ""]
     ) -> AxisLoads:
-        """Return the forces on the axes beside the flanks' push.
+        """Return the forces on the axes other than those of the flanks.
 
         `load`, `gear`: those of the pair; `mass` (kg) of a rotor."""
         gas = slices = None

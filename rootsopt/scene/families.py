@@ -86,7 +86,7 @@ def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, floa
     return result, departure(profile, written)
 
 
-def outline(config: ProfileConfig) -> Outline | None:
+def profile_from_file(config: ProfileConfig) -> Outline | None:
     """Return the profile of a config that names an outline file, `None` for any other config.
 
     Raises `InputError` if the file does not hold a usable outline."""
@@ -102,7 +102,7 @@ def check(config: ProfileConfig) -> None:
 
     A profile read from a file is sound if the file holds a usable outline and the flanks face each
     other somewhere in the mesh."""
-    if (given := outline(config)) is not None:
+    if (given := profile_from_file(config)) is not None:
         conjugacy(given)
         return
     family = family_of(config.family)

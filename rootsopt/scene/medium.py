@@ -1,4 +1,4 @@
-"""Fluid, pressures and clearances of a pump: what leakage needs beyond a simulation."""
+"""Fluid, pressures and clearances of a pump: the quantities on which only leakage depends."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ class Medium(eqx.Module):
     `viscosity` (Pa·s); `pressure_difference` (Pa), discharge minus suction. `tip_clearance`,
     `end_clearance` (m), `None`: no leakage there; `tips`: tips that seal in series.
     `radial_allowance` (m): radius by which both rotors are smaller everywhere. `strain`: growth of
-    the housing over that of the rotors, as a fraction of every length, `None`: all at the same
+    the housing minus that of the rotors, as a fraction of any length; `None`: all have the same
     temperature. `gas`: `None` for a liquid."""
 
     viscosity: Float[Array, ""]

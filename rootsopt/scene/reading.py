@@ -32,7 +32,7 @@ def design_keys(config: Config) -> tuple[str, ...]:
     return config.design_keys
 
 
-def quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
+def physical_quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
     """Return the physical quantities of a config in SI units, keyed by `Scene` field names."""
     rotor, scene, gear = config.rotor, config.scene, config.scene.timing_gear
     wear, heat, error = config.contact.wear, scene.heat, scene.center_distance_error_mm
@@ -40,7 +40,8 @@ def quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
     if wear is not None:
         clearance += 2 * wear.offset_mm
     if heat is not None:
-        # A pair that has grown as a whole meshes as before, at a centre distance of its own.
+        # Rotors that grow in proportion mesh as before. Only the housing's growth relative to
+        # theirs matters: it changes the centre distance.
         error = (error or 0.0) + 2 * config.profile.pitch_radius_mm * heat.strain
     return {
         "pitch_radius": jnp.asarray(config.profile.pitch_radius_mm * MM),

@@ -13,13 +13,13 @@ from rootsopt.profiles import Profile
 from rootsopt.runtime.programs import Program
 
 MOST = 32
-"""Greatest number of slices that is chosen without being asked for."""
+"""Maximum number of slices that is chosen automatically."""
 _COUNTS = (*range(2, 13), 14, 16, 20, 24, 28, MOST)
-"""Numbers of slices to try."""
+"""Numbers of slices that are tried, in ascending order."""
 _POSES = 720
-"""Number of angles of rotor 1, evenly over a mesh period, at which the section is evaluated."""
+"""Number of angles of rotor 1, evenly spaced over a mesh period, at which torques are computed."""
 _REFERENCE = 400
-"""Number of slices of the reference, which are evenly spaced."""
+"""Number of evenly spaced slices of the reference."""
 
 
 def greatest_twist(config: Config) -> float:
@@ -40,9 +40,10 @@ def slices_needed(
 
     The torque is that at rest. The rotors are turned towards each other until the `clearance` (m)
     is closed and the penetration at the pitch radius is the static one, `depth` (m). The error is
-    the mean magnitude over a mesh period, as a fraction of the greatest torque. A greatest error
-    would not do: where a whole arc touches at once, the torque of a slice jumps, and no number of
-    slices makes it small. `twist` (rad): over the rotor's length. The result is at most `MOST`."""
+    the mean magnitude over a mesh period, as a fraction of the greatest torque. The greatest error
+    is not used: where a whole arc touches at once, the torque of a slice jumps, and no number of
+    slices makes this error small. `twist` (rad): over the rotor's length. The result is at most
+    `MOST`."""
     torque = np.asarray(_torques(profile, law, clearance, depth))
     wanted = sliced_mean(torque, twist * (np.arange(_REFERENCE) + 0.5) / _REFERENCE, profile.lobes)
     for count in _COUNTS:
@@ -61,7 +62,8 @@ def sliced_mean(
     lobes: int,
     weights: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the mean (n,) over slices of `values` (n,), which are given evenly over a mesh period.
+    """Return the mean (n,) over slices of `values` (n,), which are evenly spaced over a mesh
+    period.
 
     `offsets` (s,): angles of the slices (rad); `weights` (s,): by default equal ones; `lobes`: N.
     Values between those given are interpolated linearly."""

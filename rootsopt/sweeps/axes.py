@@ -156,7 +156,7 @@ def _interval(key: str, item: str) -> Any:
 
 
 def _whole(key: str) -> bool:
-    """Return whether a key takes whole numbers only."""
+    """Return whether a key accepts only whole numbers."""
     field = field_of(Config, key.split("."))
     kind = "" if field is None else str(field.annotation)
     return "int" in kind and "float" not in kind

@@ -3,9 +3,9 @@
 The same workers evaluate designs of a search (`rootsopt.sweeps.evaluations`).
 
 Points travel in small chunks. Only the process that collects them writes them down, and it knows
-each point by its number. If a worker dies, the scheduler gives its chunks to another one; a chunk
-that ends several workers is divided into its points, and a point that does so is a status.
-Processes are spawned, never forked, because JAX has threads."""
+each point by its number. If a worker dies, the scheduler gives its chunks to another one. A chunk
+that ends several workers is divided into its points. A point that ends several workers gets a
+status of its own. Processes are spawned, never forked, because JAX has threads."""
 
 import contextlib
 import logging
@@ -34,9 +34,9 @@ _MISSING = (
 _CHUNKS = 8
 """Number of chunks per worker into which a sweep is divided, so that all workers end together."""
 _LARGEST = 32
-"""Greatest number of points in a chunk: a killed worker loses at most these."""
+"""Maximum number of points in a chunk. A worker that is killed loses at most this many."""
 _AHEAD = 3
-"""Number of chunks per worker that are with the scheduler at a time."""
+"""Number of chunks per worker that are sent to the scheduler in advance."""
 _ANSWER = 10.0
 """Time (s) within which a scheduler must answer."""
 _WORKERS = 60.0
@@ -54,8 +54,8 @@ unless its successor is ready in 15 s. On a busy machine, it takes longer to imp
 class Cluster:
     """Workers on this machine, or those of a running scheduler.
 
-    `workers`: number of processes to start; `scheduler`: address of a scheduler; one of both.
-    `imports`, `cache`: see `Settings`.
+    `workers`: number of processes to start; `scheduler`: address of a scheduler. Give one of the
+    two. `imports`, `cache`: see `Settings`.
 
     Raises `InputError` if both are given, or if the package distributed is not installed."""
 

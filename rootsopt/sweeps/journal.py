@@ -1,4 +1,4 @@
-"""Keeps the points of a sweep in a file as they are done, so that a killed sweep can go on.
+"""Keeps the points of a sweep in a file as they are done, so that a killed sweep can be resumed.
 
 The file has one JSON object per line. JSON preserves every float exactly. The first line, the
 header, states config, points and versions; each further line holds the record of one point. An
@@ -23,8 +23,8 @@ class Journal:
     """A file with the records of one sweep. Only one process may use it at a time.
 
     `path`: path of the file; `header`: everything on which the records depend, as nested mappings
-    of plain values; `resume`: whether to go on with an existing file. `rows`: record of each point
-    by its number.
+    of plain values; `resume`: whether to continue an existing file. `rows`: record of each point by
+    its number.
 
     With `resume`, raises `InputError` if the file does not exist or has another header. Raises
     `OSError` if the file cannot be written."""

@@ -16,7 +16,7 @@ from rootsopt.sweeps.plan import Plan
 from rootsopt.sweeps.points import Row, simulated, simulated_together
 
 _AHEAD = 2
-"""Number of points per thread that wait for a thread."""
+"""Number of points per thread that are queued in advance."""
 _BATCH = 256
 """Number of points that an accelerator steps together."""
 

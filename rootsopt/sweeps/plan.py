@@ -38,9 +38,8 @@ class Dimension:
 class Plan:
     """All points of a sweep, numbered from 0 in row-major order.
 
-    `dimensions`: in the order given; `method`: `grid`, `random`, `sobol` or
-    `tolerances`; `seed` of the samples,
-    `None` for a grid."""
+    `dimensions`: the sweep's dimensions, in the order given; `method`: `grid`, `random`, `sobol` or
+    `tolerances`; `seed` of the samples, `None` for a grid."""
 
     dimensions: tuple[Dimension, ...]
     method: str = "grid"
@@ -137,8 +136,8 @@ def plan_of(
 def scattered(config: Config, count: int) -> tuple[Config, Plan]:
     """Return `count` fresh scenes of the `tolerances` of a config, and the config without them.
 
-    They are those in which `optimize` judges a robust optimum. Raises `InputError` if the config
-    has no `tolerances`."""
+    `optimize` judges a robust optimum in scenes of the same distribution. Raises `InputError` if
+    the config has no `tolerances`."""
     if config.tolerances is None:
         raise InputError(
             "`--tolerances` needs the section `tolerances` in the config, which says what "
@@ -167,7 +166,9 @@ def check_values(config: Config, plan: Plan) -> None:
 
 
 def _telling(values: Sequence[Any]) -> list[Any]:
-    """Return the values to check: the extremes of the numbers, and everything else."""
+    """Return the values that stand for all others in a check.
+
+    They are the extremes of the numbers, and all texts."""
     found: list[Any] = []
     for kind in (int, float):
         numbers = [value for value in values if type(value) is kind]
@@ -178,7 +179,7 @@ def _telling(values: Sequence[Any]) -> list[Any]:
 
 
 def _meant(key: str, message: str) -> str:
-    """Return the end of a message that names the key most like an unknown one."""
+    """Return the end of a message: the known key that is most similar to an unknown one."""
     if "is not a known key" not in message or "did you mean" in message:
         return ""
     known = {one.rpartition(".")[2]: one for one in reversed([*all_keys(Config)])}

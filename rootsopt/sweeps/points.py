@@ -18,16 +18,16 @@ from rootsopt.scene import check_geometry
 from rootsopt.status import Status
 
 Row = dict[str, Any]
-"""Record of one point, as plain values: `status` (label), `message`, `response`, `gradient`,
-`steady_state`, `geometry`. Dictionaries are empty where nothing is known."""
+"""Record of one point as plain values: `status` (label), `message`, `response`, `gradient`,
+`steady_state`, `geometry`. Dictionaries are empty if nothing is known."""
 _FAMILY, _OUTLINE = "profile.family", "profile.outline_file"
 
 
 def prepared(key: str, value: Any) -> Any:
-    """Return a value of an axis as a config needs it.
+    """Return a value of an axis in the form that a config on any worker needs.
 
-    The path of an outline file becomes absolute: workers may run in another folder. A family that
-    an installed package offers is loaded."""
+    The path of an outline file becomes absolute: workers may run in another folder. If the value is
+    a family of an installed package, the package is loaded."""
     if not isinstance(value, str):
         return value
     if key == _OUTLINE:
@@ -55,9 +55,9 @@ def configured(config: Config, values: Mapping[str, Any]) -> Config:
 
 
 def simulated(config: Config, values: Mapping[str, Any]) -> Row:
-    """Return the record of the point with these `values`, whatever happens there.
+    """Return the record of the point with these `values`, even if the point fails.
 
-    A config that is not valid, and an error of the program, are statuses."""
+    An invalid config or an error of the program becomes the point's status."""
     try:
         return row_of(_evaluator(config, values)(series=False))
     except Exception as error:
@@ -96,7 +96,7 @@ def simulated_together(config: Config, points: Sequence[Mapping[str, Any]]) -> l
         found = evaluate_together([*batch.values()])
         rows |= {n: row_of(one) for n, one in zip(batch, found, strict=True)}
     except Exception:
-        batch.clear()  # For example too little memory: one by one then.
+        batch.clear()  # Memory may not suffice, for example. Simulate the points one by one.
     return [
         rows[number] if number in rows else simulated(config, values)
         for number, values in enumerate(points)
@@ -116,7 +116,8 @@ def row_of(evaluation: Evaluation) -> Row:
 
 
 def lost(status: Status, why: str = "") -> Row:
-    """Return the record of a point without an evaluation; `why`: what happened there."""
+    """Return the record of a point without an evaluation, with its `status`; `why`: what happened
+    there."""
     message = f"{status.value} {sentence(why)}" if why else status.value
     none: Row = {name: {} for name in ("response", "gradient", "steady_state", "geometry")}
     return {"status": status.label, "message": message, **none}

@@ -158,7 +158,8 @@ def _digest(path: str) -> str:
 
 
 class Memory:
-    """Takes the place of a `Journal` if nothing is written to disk."""
+    """Keeps the records of a sweep in memory, with the methods of a `Journal`, if no file is
+    wanted."""
 
     def __init__(self) -> None:
         self.rows: dict[int, Row] = {}

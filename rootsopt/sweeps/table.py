@@ -11,7 +11,7 @@ import rootsopt
 from rootsopt.config import Config
 from rootsopt.config.explain import field_of
 from rootsopt.config.units import unit_of
-from rootsopt.response.evaluation import RESPONSES
+from rootsopt.response.records import RESPONSES
 from rootsopt.status import Status
 from rootsopt.sweeps.plan import Plan
 from rootsopt.sweeps.points import Row, lost
@@ -33,7 +33,7 @@ _SCALARS = {
     "floquet_multiplier": ("1", "greatest modulus of the Floquet multipliers"),
     "lyapunov_exponent_per_mesh_period": ("1", "Lyapunov exponent per mesh period"),
 }
-"""Unit and long name of the numbers taken from `steady_state`."""
+"""Unit and long name of each number that is taken from `steady_state`."""
 _OWN_UNITS = {"_N": "N", "_mm2": "mm2", "_kg_m2": "kg m2", "_deg": "deg", "_cm3": "cm3"}
 _PLAIN = str.maketrans({"·": " ", "°": "deg", "²": "2", "³": "3"})
 
@@ -46,9 +46,9 @@ def dataset_of(
 ) -> xarray.Dataset:
     """Return the dataset of a sweep.
 
-    `config`: config of all that is not swept; `plan`: the points; `rows`: record of each point by
-    its number, where a point without one has the status `not_simulated`; `attributes`: further
-    attributes of the dataset."""
+    `config`: config of the sweep; `plan`: the points; `rows`: record of each point by its number,
+    where a point without one has the status `not_simulated`; `attributes`: further attributes of
+    the dataset."""
     missing = lost(Status.NOT_SIMULATED)
     found = [rows.get(number, missing) for number in range(plan.count)]
     grid = _Grid(plan)
@@ -92,13 +92,15 @@ class _Grid:
         self.dims, self.shape = tuple(one.name for one in plan.dimensions), plan.shape
 
     def numbers(self, values: Sequence[Any], units: str, long: str, *last: str) -> tuple:
-        """Return a variable of numbers, `None` as NaN; `last`: names of further dimensions."""
+        """Return a variable of numbers, one of `values` per point, with `None` as NaN.
+
+        `units`, `long`: its unit and long name; `last`: names of further dimensions."""
         array = np.array(values, dtype=float)
         shape = (*self.shape, *array.shape[1:])
         return (*self.dims, *last), array.reshape(shape), {"units": units, "long_name": long}
 
     def words(self, values: Sequence[str], long: str) -> tuple:
-        """Return a variable of texts, as objects: most of them are the same long message."""
+        """Return a variable of texts, with the type object: many points share one long message."""
         return self.dims, np.array(values, dtype=object).reshape(self.shape), {"long_name": long}
 
 

@@ -99,8 +99,8 @@ def selected(nodes: Sequence[Node], scale: Scale) -> Selection:
 def spacing_of(selection: Selection, pairs: Sequence[Pair], ends: int, divisions: int) -> Spacing:
     """Return the typical distances between neighbours before any bisection.
 
-    `ends`: number of ends, which are the first nodes; `divisions`: number of steps between two
-    ends."""
+    `selection`: nodes on the front; `pairs`: as in `Selection.edges`; `ends`: number of ends, which
+    are the first nodes; `divisions`: number of steps between two ends."""
     corners = selection.values[:ends]
     sides = [np.linalg.norm(a - b) for k, a in enumerate(corners) for b in corners[k + 1 :]]
     moves = [edge.design_distance for edge in selection.edges(pairs)]
@@ -112,7 +112,10 @@ def spacing_of(selection: Selection, pairs: Sequence[Pair], ends: int, divisions
 def points_of(
     study: Study, nodes: Sequence[Node], selection: Selection, scale: Scale
 ) -> tuple[list[FrontPoint], list[FrontPoint]]:
-    """Return (points of the front in order, points that were dropped)."""
+    """Return (points of the front in order, points that were dropped) for all `nodes`.
+
+    `study`: evaluates their designs; `selection`: nodes that form the front; `scale`: that of the
+    terms."""
     number = {k: place for place, k in enumerate(selection.kept, start=1)}
     every = [
         _point(study, node, number.get(k, 0), standing, scale)
@@ -127,7 +130,8 @@ def gaps_of(
 ) -> tuple[list[tuple[int, int]], list[Gap]]:
     """Return (pairs of neighbours without a gap between them, the gaps).
 
-    Both refer to points by their numbers on the front (`FrontPoint.number`)."""
+    Both refer to points by their numbers on the front (`FrontPoint.number`). `search`: results of
+    the bisections; `spacing`: typical distances between neighbours."""
     number = {k: place for place, k in enumerate(selection.kept, start=1)}
     edges, gaps = [], []
     for edge in selection.edges(search.pairs):

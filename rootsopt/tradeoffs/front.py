@@ -147,9 +147,10 @@ class Front:
     the best in the first term on. `dropped`: points that are dominated, repeated or not usable.
     `edges`: pairs of point numbers of neighbours without a gap between them; `gaps`: the gaps.
 
-    `floor_dropped`: whether the floor of the area efficiency, the baseline's, was dropped because
-    area efficiency is a term. `searches`, `evaluations`: effort. `interrupted`: whether the search
-    was stopped. `infeasible`: why no design satisfies all constraints, `None` if one does."""
+    `floor_dropped`: whether the default floor of the area efficiency (the baseline's value) was
+    dropped because area efficiency is a term. `searches`, `evaluations`: effort. `interrupted`:
+    whether the search was stopped. `infeasible`: why no design satisfies all constraints, `None` if
+    one does."""
 
     config: Config
     aims: tuple[Aim, ...]
@@ -185,7 +186,7 @@ class Front:
 
     @property
     def message(self) -> str:
-        """What was found, with advice, in a few sentences."""
+        """Sentences for the user: what was found, with advice."""
         if self.interrupted:
             count = len(self.points)
             return (

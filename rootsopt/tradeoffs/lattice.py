@@ -11,20 +11,22 @@ Key = tuple[int, ...]
 
 
 def keys(count: int, divisions: int) -> list[Key]:
-    """Return all keys for `count` terms, beginning with the end of the first term.
+    """Return all keys for `count` terms, beginning with the end of the first term. `divisions`:
+    number of steps from one end to another.
 
-    The neighbours that come before a key differ from it by minus one of the `directions`."""
+    Subtract one of the `directions` from a key to get a neighbour that comes before it."""
     every = itertools.product(range(divisions, -1, -1), repeat=count)
     return [key for key in every if sum(key) == divisions]
 
 
 def corners(count: int, divisions: int) -> list[Key]:
-    """Return the key of each term's end, in the order of the terms."""
+    """Return the keys of the ends of the front, in the order of the `count` terms."""
     return [tuple(divisions * (i == k) for i in range(count)) for k in range(count)]
 
 
 def directions(count: int) -> list[Key]:
-    """Return the differences between a key and those neighbours that come after it in `keys`."""
+    """Return the steps from a key to those neighbours that come after it in `keys`, for `count`
+    terms."""
     pairs = itertools.combinations(range(count), 2)
     return [tuple((k == j) - (k == i) for k in range(count)) for i, j in pairs]
 

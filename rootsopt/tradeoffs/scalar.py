@@ -1,7 +1,7 @@
 """Turns several terms into one objective, whose optimum is one point of the front.
 
 The terms u_i are scaled so that less is better, and so that the ends of the front lie at 0 and 1.
-From a reference point r, the design is sought that goes furthest in all terms at once:
+From a reference point r, the search finds the design that goes furthest in all terms at once:
 
     min over x of   max_i (u_i(x) - r_i) / d_i  +  ρ Σ_i u_i(x),    i in the terms that lead.
 

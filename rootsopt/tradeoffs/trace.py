@@ -60,7 +60,8 @@ end, and of screened designs."""
 _SHARP = 0.01
 """Accuracy (fraction of the gap's width) with which the sides of a gap are located."""
 _EXPLAINED = 8
-"""Maximum number of points from which the least violation of the constraints is searched for."""
+"""Maximum number of points at which the search for the least violation of the constraints starts.
+"""
 _HOLDS_UP = 0.01
 """Relative difference of a term between search and verification above which a point is dropped."""
 _SAME_ENDS = 1e-6

@@ -116,7 +116,10 @@ def _check_power(part, cases, energy, supply, losses):
         taken, given, stored, lost = (float(x) for x in powers(*case))
         scale = abs(taken) + abs(given) + abs(stored) + 1e-12
         assert lost >= 0
-        assert abs(taken - given - stored - lost) < 1e-9 * scale, "power from or to nowhere"
+        assert abs(taken - given - stored - lost) < 1e-9 * scale, (
+            f"power does not balance: {taken:g} W taken in, {given:g} W given to the rotors, "
+            f"{stored:g} W stored, {lost:g} W lost; count absolute speeds in `energy`"
+        )
 
 
 def _check_kinks(part, rng, reach, axes):

@@ -18,7 +18,8 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import geometry
 from rootsopt.response.attractors import Attractor, AttractorEvaluator, Basins, _averaged
-from rootsopt.response.evaluation import Evaluation, Evaluator, idle_hint, unsettled
+from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.records import idle_hint, unsettled
 from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation, overall
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status

@@ -18,7 +18,8 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.window import no_tangents
 from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
-from rootsopt.response.evaluation import Evaluator, floquet, objective_weights
+from rootsopt.response.evaluation import Evaluator, objective_weights
+from rootsopt.response.records import floquet
 
 LIVELY = (
     "scene.speed_rpm=4000",

@@ -25,7 +25,7 @@ from rootsopt.export.drawing import Drawing
 from rootsopt.export.dxf import dxf_bytes
 from rootsopt.export.pieces import Arc, Spline, outline_pieces, polyline
 from rootsopt.profiles import CIC, EE, geometry, outline
-from rootsopt.response.evaluation import Series
+from rootsopt.response.series import Series
 from rootsopt.scene import Scene, check_geometry, design_keys, design_vector
 from rootsopt.scene.families import profile_of
 

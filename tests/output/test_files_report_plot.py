@@ -19,7 +19,8 @@ from rootsopt.figures.history import plot_history
 from rootsopt.figures.runs import optimization_figures, simulation_figures
 from rootsopt.figures.style import figure
 from rootsopt.output import files, tables
-from rootsopt.response.evaluation import Evaluation, Series
+from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.series import Series
 from rootsopt.status import Status
 
 CONFIG = """

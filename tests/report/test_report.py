@@ -21,7 +21,7 @@ from rootsopt.report.blocks import pump_block
 from rootsopt.report.gather import Run
 from rootsopt.report.html import report_text
 from rootsopt.report.names import label
-from rootsopt.response.evaluation import Series
+from rootsopt.response.series import Series
 from rootsopt.status import Status
 
 pytest.importorskip("jinja2")

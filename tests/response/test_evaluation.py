@@ -6,9 +6,9 @@ import pytest
 
 from rootsopt.config import load
 from rootsopt.contact.size import MapSize
-from rootsopt.dynamics.pair import FlankForce
+from rootsopt.dynamics.flanks import FlankForce
 from rootsopt.output import files
-from rootsopt.response import evaluation
+from rootsopt.response import evaluation, series
 from rootsopt.response.evaluation import Evaluator
 from tests.standins import oscillator
 
@@ -24,9 +24,9 @@ def test_series_has_drive_and_coast_where_they_belong(monkeypatch):
     )  # fmt: skip
     physical = 0.2 * one, 0.3 * one
     monkeypatch.setattr(
-        evaluation, "_contact_series", lambda *args: (0.02, np.ones(count), physical, contact)
+        series, "contact_series", lambda *args: (0.02, np.ones(count), physical, contact)
     )
-    columns = files.response_columns(evaluation._series(oscillator(), tau, states))
+    columns = files.response_columns(series.series_of(oscillator(), tau, states))
     expected = {
         "time_s": 0.02 * tau,
         "rotation_deg": 120 * tau,  # three lobes

@@ -42,7 +42,7 @@ def test_averages_of_a_member(monkeypatch):
         assert half == 0 or drift > 0
         assert float(found.greatest) == pytest.approx(np.max(peaks))
         # The trace of `told_flow` holds the state and -2 of it.
-        assert float(found.reach) == pytest.approx(SCALE * 2 * at[-1])
+        assert float(found.max_relative) == pytest.approx(SCALE * 2 * at[-1])
         assert float(found.depth) == pytest.approx(np.max(-window))
         assert float(found.states[0]) == settle + periods
         assert not np.any(found.repeats)

@@ -18,8 +18,8 @@ from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.integrator import METHODS, Integrator
 from rootsopt.errors import InputError
 from rootsopt.optimize.search import method_of
-from rootsopt.response import choice
-from rootsopt.response.evaluation import Evaluator, _series
+from rootsopt.response import choice, series
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.steady import steady_response
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
@@ -58,7 +58,7 @@ TIMES = np.array([0.7, 1.6, 2.2, 1.7, 30_000_001.7])
 
 def series_of(precision, contact):
     pair = pair_of(config_of(precision, contact))
-    return _series(pair, TIMES, STATES.astype(pair.angle_scale.dtype))
+    return series.series_of(pair, TIMES, STATES.astype(pair.angle_scale.dtype))
 
 
 @pytest.mark.parametrize("contact", CONTACTS)

@@ -12,6 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from rootsopt.config import load
+from rootsopt.dynamics.flanks import touch_of
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
@@ -152,7 +153,7 @@ def test_energy_balance_with_all_parts():
         excess = jnp.maximum(abs(motion.relative - gear.offset) - gear.half_backlash, 0)
         elastic += gear.stiffness * excess**2
         for side in sides:
-            depth = jnp.maximum(pair._touch(jnp.asarray(side), motion).depth, 0)
+            depth = jnp.maximum(touch_of(pair, jnp.asarray(side), motion).depth, 0)
             elastic += 2 * law.stiffness * depth ** (law.exponent + 1) / (law.exponent + 1)
         return (kinetic + elastic) / 2
 
@@ -165,11 +166,11 @@ def test_energy_balance_with_all_parts():
         for side, force in zip(sides, (contact.drive, contact.coast), strict=True):
 
             def depth(tau, state, side=side):
-                return pair._touch(jnp.asarray(side), pair.motion(tau, state)).depth
+                return touch_of(pair, jnp.asarray(side), pair.motion(tau, state)).depth
 
             here, growth = jax.jvp(depth, (tau, state), (jnp.ones_like(tau), change))
             flanks += (force - undamped(here, 0.0)) * growth / (timescales * pair.mesh_period)
-            sliding = pair._touch(jnp.asarray(side), motion).sliding.speed
+            sliding = touch_of(pair, jnp.asarray(side), motion).sliding.speed
             rubbing += force * pair.friction(sliding) * sliding
         engaged = abs(motion.relative - gear.offset) > gear.half_backlash
         powers = [

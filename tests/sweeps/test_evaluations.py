@@ -18,6 +18,7 @@ from rootsopt.response.evaluation import Evaluator, _build
 from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.orbits import Built, OrbitStore, _Closed
 from rootsopt.response.runs import HERE, Runs
+from rootsopt.scene import Scene, design_vector
 from rootsopt.sweeps import evaluations
 from rootsopt.sweeps.cluster import Cluster
 from rootsopt.sweeps.evaluations import ClosedError, Elsewhere, evaluating

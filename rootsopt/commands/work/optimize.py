@@ -172,7 +172,7 @@ def _contradiction(config: Config, folder: RunFolder, result) -> cli.Outcome:
 def _alike(config: Config, result) -> dict:
     """Return {"resembles": classical profiles nearest to the optimised one, one row per family}.
 
-    Return {} if the optimised family is itself classical, or if there is no optimised design."""
+    Return {} if the optimised family is classical itself, or without an optimised design."""
     config = _searching(config, result)
     if family_of(config.profile.family).classical or result.optimized is None:
         return {}

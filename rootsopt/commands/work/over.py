@@ -64,7 +64,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         folder.overwrite = False  # An earlier result is more valuable than this one.
 
     def show(out: Console) -> None:
-        out.print(sweeps.shown(plan, records, dataset))
+        out.print(sweeps.tables_of(plan, records, dataset))
         out.print(f"{record['status']}: {record['message']}", soft_wrap=True, markup=False)
         rate = statistics["points_per_second"]
         out.print(f"{len(records) - known} points in {seconds:.1f} s, {rate:.3g} per second")
@@ -74,7 +74,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
 
 def _points(config: Config, options: argparse.Namespace) -> tuple[Config, Plan]:
-    """Return the config of all that is not swept, and the points of the sweep."""
+    """Return the config without the sweep's own values, and the points of the sweep."""
     if options.tolerances is not None:
         for name in ("over", "zip", "zip_keys", "sample", "sobol", "seed"):
             if getattr(options, name) not in (None, False, []):
@@ -119,7 +119,7 @@ def _journal(config: Config, plan: Plan, options: argparse.Namespace, folder: Ru
 
 
 def _silent(done: int, expected: int) -> None:
-    """Take the place of a progress bar where none is shown."""
+    """Do nothing, in place of a progress bar."""
 
 
 __all__ = ["body"]

@@ -26,7 +26,7 @@ In this time, the simulation in progress may end, and the best design may be sim
 class Searches(Protocol[Found]):
     """A search: `run` returns its outcome.
 
-    `so_far` returns what is known before its end, or `None` before the baseline is known."""
+    `so_far` returns the results so far, or `None` before the baseline is known."""
 
     def run(self) -> Found: ...
 
@@ -59,8 +59,8 @@ def nothing_known(
 ) -> cli.Outcome:
     """Write the files of a run that was stopped before the baseline was known.
 
-    `done`: past participle for what had to be done with the baseline; `empty`: entries of the
-    result file that have no value. Return the `Outcome`, with exit code 3."""
+    `done`: past participle for the message, such as "simulated"; `empty`: entries of the result
+    file that have no value. Return the `Outcome`, with exit code 3."""
     status = Status.INTERRUPTED
     message = f"The run was stopped before the baseline had been {done}: there is no result."
     files.write_config(folder, config)

@@ -61,7 +61,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
 
 def refuse_options(options: argparse.Namespace) -> None:
-    """Raise `InputError` if an option for `--over` is given without it."""
+    """Raise `InputError` if an option that needs `--over` is given without `--over`."""
     names = "zip", "zip_keys", "sample", "sobol", "seed", "data", "workers", "scheduler", "resume"
     for name in names:
         if getattr(options, name) not in (None, False, []):

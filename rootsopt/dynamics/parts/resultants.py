@@ -1,4 +1,4 @@
-"""Forces on the axes beside the flanks' push: gas, teeth of the timing gear, weight.
+"""Forces on the axes other than those of the flanks: gas, teeth of the timing gear, weight.
 
 Frame: rotor 1 at the origin, rotor 2 at (2r, 0). Rotor 1 turns counter-clockwise. Gas is carried
 along the housing from suction, above, to discharge, below. `docs/bearings.md` derives the formulas.
@@ -23,8 +23,8 @@ MIRROR = np.array([-1.0, 1.0])
 def contact_place(profile: Profile, phi: Float[Array, ""]) -> Float[Array, "2"]:
     """Return the place (m) where the rotors touch in perfect rolling, x and y from rotor 1's axis.
 
-    `phi`: φ1 (rad). Where a whole arc touches at once, the place moves along it over a short
-    angle, as the torque of `GasLoad` does."""
+    `phi`: φ1 (rad). Where a whole arc touches at once, the place moves along it while φ1 changes by
+    a short angle. `GasLoad` spreads the jump of its torque over the same angle."""
     half = profile.half_pitch
     centred = phi - 4 * half * jnp.round(phi / (4 * half))
     roll = jnp.abs(centred)
@@ -73,8 +73,8 @@ class GasResultant(eqx.Module):
     ) -> tuple[Float[Array, "s rotor xy"], Float[Array, "s rotor xy"]]:
         """Return both ends (m) of the surface under discharge pressure: contact and sealing tip.
 
-        They are given for every slice and rotor, from the rotor's axis; rotor 2 is seen in the
-        mirror. `phi`: φ1 (rad) of the middle. A pocket has one pressure along its length, so it
+        Both are given for every slice and rotor, seen from the rotor's axis; those of rotor 2 are
+        mirrored. `phi`: φ1 (rad) of the middle. A pocket has one pressure along its length, so it
         opens where its leading end passes the port."""
         pitch = 2 * jnp.pi / self.profile.lobes
         offsets = jnp.zeros(1) if self.slices is None else self.slices.offsets
@@ -94,7 +94,8 @@ class GasResultant(eqx.Module):
     def slice_forces(self, phi: Float[Array, ""]) -> Float[Array, "s rotor xy"]:
         """Return the force (N) on every slice and rotor; `phi`: φ1 (rad).
 
-        It is Δp L times the chord, turned by a right angle, times the share of the length."""
+        It is Δp L times the chord, rotated by a right angle, times the slice's share of the length.
+        """
         contact, tip = self.chords(phi)
         chord = contact - tip
         turned = jnp.stack([-chord[..., 1], chord[..., 0]], axis=-1)
@@ -134,11 +135,10 @@ class GasResultant(eqx.Module):
 
 
 class AxisLoads(Part):
-    """Forces on the axes beside the flanks' push: gas, teeth of the timing gear, weight.
+    """Forces on the axes other than those of the flanks: gas, teeth of the timing gear, weight.
 
     `gas`, `gear`: absent if `None`; `tooth_angle` (rad): pressure angle of the gear's teeth;
-    `radius` (m): pitch radius; `weight` (N) of a rotor, downwards, `None`: not counted.
-    """
+    `radius` (m): pitch radius; `weight` (N) of a rotor, downwards, `None`: not counted."""
 
     gas: GasResultant | None
     gear: TimingGear | None

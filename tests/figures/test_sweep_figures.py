@@ -6,7 +6,7 @@ from rich.console import Console
 from rootsopt.config import load
 from rootsopt.figures import sweep as drawing
 from rootsopt.output.files import ResultFolder
-from rootsopt.output.sweeps import outcome, rows_of, shown, summary
+from rootsopt.output.sweeps import outcome, rows_of, summary, tables_of
 from rootsopt.status import Status
 from rootsopt.sweeps.plan import plan_of
 from rootsopt.sweeps.points import lost
@@ -72,7 +72,7 @@ def test_rows_and_outcome():
     part = {0: rows[0]}
     assert summary(plan, part)["statuses"] == {"periodic": 1, "not_simulated": 4}
     console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
-    console.print(shown(plan, rows, data))
+    console.print(tables_of(plan, rows, data))
     text = console.export_text()
     for status in CYCLE:
         assert status.label in text

@@ -7,7 +7,7 @@ from rootsopt.config import load
 from rootsopt.figures.comparison import plot_departure, plot_forces_together
 from rootsopt.figures.optimum import plot_prices, plot_starts
 from rootsopt.figures.style import figure
-from rootsopt.response.evaluation import Series
+from rootsopt.response.series import Series
 from rootsopt.scene import outline_mm
 
 CIC = load("configs/cic.yaml")

@@ -1,0 +1,103 @@
+"""docs/architecture.md is true: what it names exists, and its table has the order of the layers."""
+
+import ast
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from rootsopt.config.families import families
+from tests.docs.blocks import DOCS, ROOT
+
+PAGE = (DOCS / "architecture.md").read_text(encoding="utf-8")
+PACKAGE = ROOT / "rootsopt"
+TABLES = {
+    heading: [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in text.splitlines()
+        if line.startswith("|") and not set(line) <= set("|- ")
+    ][1:]
+    for heading, text in re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.M | re.S)
+}
+PACKAGES = TABLES["The packages"]
+
+
+def code_in(text):
+    """Return the code spans of a text."""
+    return re.findall(r"`([^`]*)`", text)
+
+
+def names_of(path):
+    """Return all names of classes, functions, methods and fields that a source file defines."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            found.add(node.name)
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            found.add(node.target.id)
+    return found
+
+
+def is_module(path):
+    return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
+
+
+def folders():
+    return {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
+
+
+def test_every_folder_has_a_row_in_the_order_of_the_layers():
+    rows = [name for cells in PACKAGES for name in code_in(cells[0])]
+    assert folders() <= set(rows)
+    assert all(is_module(PACKAGE / name) for name in rows)
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    (contract,) = settings["tool"]["importlinter"]["contracts"]
+    layers = [re.findall(r"rootsopt\.(\w+)\b(?!\.__main__)", layer) for layer in contract["layers"]]
+    first = {name: k for k, layer in reversed([*enumerate(layers)]) for name in layer}
+    places = [first[name] for name in rows if name in folders()]
+    assert places == sorted(places)
+
+
+@pytest.mark.parametrize("row", PACKAGES[1:], ids=lambda cells: cells[0].strip("`"))
+def test_modules_of_a_row_exist(row):
+    """A name in a package's row is a module there, or something that a module there defines."""
+    (package,) = code_in(row[0])
+    folder = PACKAGE / package
+    for name in code_in(row[1]):
+        if name.startswith("--") or name in ("constraints.terms", "tolerances"):
+            continue  # An option, or a config key.
+        inside = any(name in names_of(path) for path in folder.rglob("*.py"))
+        below = any(is_module(path / name) for path in [folder, *folder.iterdir()])
+        assert inside or below, f"rootsopt/{package} has no {name}"
+
+
+def test_paths_exist():
+    """A path is inside the package or the repository; one without a folder is beside the last."""
+    folder, found = PACKAGE, 0
+    for path in code_in(PAGE):
+        if not re.fullmatch(r"[\w/]+(\.py|\.toml|/)|docs/\w+|\w+/__main__", path):
+            continue
+        places = [base / path for base in (PACKAGE, ROOT, folder)]
+        there = [one for one in places if one.exists() or one.with_suffix(".py").is_file()]
+        assert there, path
+        folder, found = there[0].parent, found + 1
+    assert found > 15
+
+
+def test_calls_and_attributes_exist():
+    """`Scene.profile(design)` is a method of a class; `config.design` is a property."""
+    defined = set().union(*(names_of(path) for path in PACKAGE.rglob("*.py")))
+    keys = {f"profile.{key}" for one in families().values() for key in one.keys}
+    outside = {"jax.jvp", "scipy.stats", "constraints.terms", "pyproject.toml", "certificate.py"}
+    for text in {*code_in(PAGE)} - keys - outside:
+        if "/" in text or not re.match(r"\w+[.(]|[A-Z]\w+$", text):
+            continue
+        words = re.findall(r"[A-Za-z_]\w+", text.split("(...)")[0])
+        for word in {*words} - {"scene", "config"}:
+            assert word in defined, text
+
+
+def test_pages_of_the_table_exist():
+    for target in re.findall(r"\]\(([^)]+)\)", PAGE):
+        assert (DOCS / target).resolve().exists() or Path(target).is_absolute(), target

@@ -1,0 +1,96 @@
+"""The house is in order: what lies in the package's root, late imports, long functions, rooms."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "rootsopt"
+FILES = sorted(PACKAGE.rglob("*.py"))
+FACE = {"__init__.py", "errors.py", "status.py", "py.typed"}
+DOORS = {"__main__.py", "attractors.py", "pareto.py", "profile.py", "simulate.py", "sweep.py"}
+MOST_LINES, MOST_PARAMETERS = 80, 8
+
+OPTIONAL = {"build123d", "OCP", "dask", "distributed", "ezdxf", "jinja2", "markupsafe", "plotly"}
+OPTIONAL |= {"netCDF4", "shtab", "xarray", "zarr"}
+SLOW = {"rich", "scipy"}
+COMMANDS = {f"commands/{name}.py" for name in (
+    "attractors", "optimize", "pareto", "profile", "simulate", "sweep",
+)}  # fmt: skip
+LATE = {
+    # The work of a command is loaded once its help or its config has asked for it.
+    **{key: {"rootsopt.commands", "rootsopt"} for key in COMMANDS},
+    "commands/cli.py": {
+        "rootsopt.output.runs", "rootsopt.report.gather", "rootsopt.report.html",
+        "rootsopt.runtime",
+    },
+    "commands/completion.py": {"rootsopt.commands"},
+    "commands/console.py": {"rootsopt", "rootsopt.commands", "rootsopt.errors"},
+    "commands/work/sweep.py": {"rootsopt.commands.work"},
+    "optimize/__init__.py": {"rootsopt.commands.optimize"},
+    # Modules that import optional or slow libraries.
+    "export/command.py": {"rootsopt.export.solid"},
+    "measured/reading.py": {"rootsopt.measured.dxf"},
+    "response/evaluation.py": {"rootsopt.response.dataset"},
+    "scene/families.py": {"rootsopt.measured.source"},
+    "sweeps/scenes.py": {"rootsopt.sweeps.cluster"},
+    # Only searches over an ensemble need these.
+    "optimize/search.py": {"rootsopt.optimize", "rootsopt.response.ensemble"},
+    # JAX reads the environment when it is imported; it has no public test for a started backend.
+    "runtime/environment.py": {"jax", "jax._src"},
+}  # fmt: skip
+
+
+def functions_of(path):
+    """Return (function, lines of the source file) for all functions in a file."""
+    text = path.read_text(encoding="utf-8")
+    kinds = ast.FunctionDef | ast.AsyncFunctionDef
+    nodes = [node for node in ast.walk(ast.parse(text)) if isinstance(node, kinds)]
+    return nodes, text.splitlines()
+
+
+def test_root_holds_the_face_and_the_doors():
+    files = {path.name for path in PACKAGE.iterdir() if path.is_file()}
+    assert files == FACE | DOORS
+    for name in DOORS - {"__main__.py"}:
+        assert len((PACKAGE / name).read_text(encoding="utf-8").splitlines()) <= 15
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
+def test_imports_stand_at_the_top(path):
+    """Optional and slow libraries may be imported inside a function, and what `LATE` lists."""
+    allowed = OPTIONAL | SLOW | LATE.get(path.relative_to(PACKAGE).as_posix(), set())
+    for function in functions_of(path)[0]:
+        for node in ast.walk(function):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) else []
+            for name in names:
+                assert name in allowed or name.partition(".")[0] in OPTIONAL | SLOW, (
+                    f"line {node.lineno} imports {name} inside {function.name}"
+                )
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
+def test_long_functions_say_why(path):
+    """A comment on the first line of the definition, or on the line above it, gives the reason."""
+    nodes, lines = functions_of(path)
+    for node in nodes:
+        length = node.end_lineno - node.lineno + 1
+        taken = node.args
+        count = len(taken.posonlyargs + taken.args + taken.kwonlyargs)
+        count += (taken.vararg is not None) + (taken.kwarg is not None)
+        if length <= MOST_LINES and count <= MOST_PARAMETERS:
+            continue
+        first = min([node.lineno, *(one.lineno for one in node.decorator_list)])
+        near = [*lines[first - 2 : first], lines[node.lineno - 1]]
+        prescribed = node.name == "adapt_step_size"  # By diffrax, as beside its `init`.
+        assert prescribed or any("#" in line for line in near), (
+            f"{node.name} has {length} lines and {count} parameters"
+        )
+
+
+def test_every_package_has_a_room_of_tests():
+    packages = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
+    rooms = {path.parent.name for path in (ROOT / "tests").glob("*/test_*.py")}
+    assert packages <= rooms
