@@ -1,9 +1,10 @@
 """Angular play of rotor 2 between its flank contacts, while rotor 1 is held.
 
-A turn of rotor 2 moves its points on circles about its axis. It ends where the angle between the
-two outlines, seen from this axis, becomes zero at some radius. This holds for any outline that does
+A turn of rotor 2 moves its points on circles about its axis. It touches where the angle between the
+two outlines, seen from this axis, is used up at one radius. This holds for any outline that does
 not fold back as seen from the axis, conjugate or not, and for turns of any size. `docs/play.md`
-derives the closed forms."""
+derives the closed forms.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,14 +12,14 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rootsopt.profiles import Profile
-from rootsopt.pump.section import both_flanks, half_valley, sampled_flank
+from rootsopt.pump.section import both_flanks, flank_points, half_valley
 
 POINTS = 1000
-"""Number of points per segment of a flank. The angles are then accurate to about 1e-6 rad, and
-mostly to 1e-8 rad."""
+"""Number of points per segment of a flank. The angles are then exact to some 1e-6 of a radian, and
+mostly to 1e-8."""
 POSES = 96
-"""Number of angles of rotor 1 over one lobe pitch. It is a multiple of 4, so that the poses in
-which the pitch crossings touch are included."""
+"""Number of angles of rotor 1 over one lobe pitch, a multiple of 4: the poses in which the pitch
+crossings touch are among them."""
 
 
 class Play(eqx.Module):
@@ -61,7 +62,7 @@ def play(
     distance = 2 * r if center_distance is None else center_distance
     if phi is None:
         phi = 2 * jnp.pi / lobes * jnp.arange(POSES) / POSES
-    flank = sampled_flank(profile, POINTS)
+    flank = flank_points(profile, POINTS)
     lobe = both_flanks(flank)
     # The whole clearance is taken off rotor 1.
     reduced = lobe.point - clearance * lobe.normal
@@ -80,9 +81,8 @@ def play(
 
 
 def _least(values: Float[Array, "k n"]) -> Float[Array, ""]:
-    """Return the least of `values`, refined by a parabola through it and its two neighbours.
-
-    `values` (k, n): n samples on each of k smooth curves."""
+    """Return the least of the `values` along k smooth curves, with the parabola through its
+    neighbours."""
     fixed = lax.stop_gradient(values)
     row, column = jnp.unravel_index(jnp.argmin(fixed), fixed.shape)
     column = jnp.clip(column, 1, values.shape[1] - 2)

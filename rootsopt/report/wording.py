@@ -70,7 +70,7 @@ def scene(config: Config) -> str:
     if (gear := data.timing_gear) is not None:
         parts.append(f"a timing gear with {brief(gear.backlash_mm)} mm backlash")
     if data.motor is not None:
-        parts.append("a motor whose speed falls under load")
+        parts.append("a motor whose speed gives way")
     if config.contact.friction is not None:
         parts.append("friction between the flanks")
     if data.supports is not None:

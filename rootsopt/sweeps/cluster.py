@@ -40,7 +40,7 @@ _ANSWER = 10.0
 _WORKERS = 60.0
 """Time (s) within which a scheduler must have a worker."""
 _POLL = 0.5
-"""Interval (s) at which the number of workers and a request to stop are checked."""
+"""Time (s) after which the number of workers and a request to stop are noticed."""
 
 
 class Cluster:
@@ -181,7 +181,7 @@ class _Collection:
         future.add_done_callback(self._done.put)
 
     def _look(self) -> None:
-        """Check the connection; raise `InputError` if that to the scheduler is lost."""
+        """Raise `InputError` if the connection to the scheduler is lost."""
         if self._client.status != "running":
             raise self._gone()
 

@@ -17,7 +17,7 @@ from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.profiles import Profile, geometry
 from rootsopt.pump.sheet import NOTE, sheet
-from rootsopt.response.records import geometry_record
+from rootsopt.response.evaluation import geometry_record
 from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, outline_mm
 from rootsopt.scene.families import free_form_of, margins_of
 from rootsopt.status import Status
