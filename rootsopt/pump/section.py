@@ -17,7 +17,7 @@ class Flank(NamedTuple):
     normal: Complex[Array, " n"]
 
 
-def sampled_flank(profile: Profile, count: int) -> Flank:
+def flank_points(profile: Profile, count: int) -> Flank:
     """Return points of a flank: `count` per segment of the addendum, and as many of the dedendum.
 
     They are evenly spaced in the normal angle of the addendum point, and include all joints."""
@@ -49,8 +49,8 @@ def whole_valley(flank: Flank, lobes: int) -> Flank:
 def half_valley(flank: Flank, lobes: int, radius: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Return half the angle (rad) of the space between two lobes at a `radius` (m) from the axis.
 
-    `flank`: points from tip to root; `lobes`: N. Beyond the tip, the result is infinite, because
-    there is no lobe. Below the root, it is negative."""
+    `lobes`: N. Beyond the tip there is no lobe: the result is infinite. Below the root it is
+    negative."""
     away, across = jnp.abs(flank.point[::-1]), jnp.angle(flank.point[::-1])
     free = jnp.pi / lobes - jnp.interp(radius, away, across)
     free = jnp.where(radius > away[-1], jnp.inf, free)
