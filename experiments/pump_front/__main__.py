@@ -32,7 +32,7 @@ def main() -> int:
         "pump_front",
         __doc__,
         body,
-        quick="two families, the ends of their fronts and one point between each two",
+        quick="one family, the ends of its front and one point between each two",
         published=FIGURES,
     )
 

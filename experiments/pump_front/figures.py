@@ -50,7 +50,7 @@ def fronts(rows: list[Row]) -> Figure:
     plain: dict[str, Any] = {"color": GREY, "marker": "o", "linestyle": ""}
     entries.append(Line2D([], [], label="best of all families", **plain))
     entries.append(Line2D([], [], label="best of its family", markerfacecolor="none", **plain))
-    made.legend(handles=entries, loc="outside lower center", ncols=5, frameon=False)
+    made.legend(handles=entries, loc="outside lower center", ncols=6, frameon=False)
     return made
 
 
@@ -63,6 +63,7 @@ def _iso_efficiency(ax: Axes) -> None:
         ax.plot(ratio, ripple, color=GREY, linewidth=0.8, zorder=1)
         inside = np.flatnonzero((ripple > bottom) & (ripple < top))
         if inside.size:
-            place = inside[-1]
-            ax.annotate(f"η = {eta:.2f}", (ratio[place], ripple[place]), fontsize=8, color="0.3")
+            place = inside[int(0.85 * inside.size)]
+            beside = {"textcoords": "offset points", "xytext": (4, -4), "fontsize": 8}
+            ax.annotate(f"η = {eta:.2f}", (ratio[place], ripple[place]), color="0.3", **beside)
     ax.set(xlim=(low, high), ylim=(bottom, top))
