@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from rootsopt.contact.closest import FlankPair
 from rootsopt.profiles import Outline, Profile, RollPoint
-from rootsopt.pump.section import Flank, both_flanks, flank_points, whole_valley
+from rootsopt.pump.section import Flank, both_flanks, sampled_flank, whole_valley
 
 POSES = 48
 """Number of roll angles, evenly spaced over the quarter of the mesh in which one addendum touches.
@@ -92,7 +92,7 @@ def _lengths(profile: Profile, nu: Float[Array, " n"], gap: Float[Array, " n"]):
     `nu` (n,): normal angles (rad) of the addendum points there. l is the arc length on rotor 1, and
     d the thickness along its normal: h, plus the distance that the flanks have without clearance.
     """
-    flank = flank_points(profile, _POINTS)
+    flank = sampled_flank(profile, _POINTS)
     lobe, valley = both_flanks(flank), whole_valley(flank, profile.lobes)
     step = jnp.abs(jnp.diff(lobe.point))
 

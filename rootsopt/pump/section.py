@@ -17,7 +17,7 @@ class Flank(NamedTuple):
     normal: Complex[Array, " n"]
 
 
-def flank_points(profile: Profile, count: int) -> Flank:
+def sampled_flank(profile: Profile, count: int) -> Flank:
     """Return points of a flank: `count` per segment of the addendum, and as many of the dedendum.
 
     They are evenly spaced in the normal angle of the addendum point, and include all joints."""

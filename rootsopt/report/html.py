@@ -46,7 +46,7 @@ def report_text(run: Run) -> str:
     def coded(text: str) -> markupsafe.Markup:
         """Return a sentence with `commands` set as code, and numbers beside their units."""
         text = _UNIT.sub("\N{NO-BREAK SPACE}", text)
-        return markupsafe.Markup(_CODE.sub(r"<code>\1</code>", str(markupsafe.escape(text))))
+        return markupsafe.Markup(_CODE.sub(_command, str(markupsafe.escape(text))))
 
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_TEMPLATE),
@@ -88,6 +88,13 @@ def report_text(run: Run) -> str:
         plotly=markupsafe.Markup(offline.get_plotlyjs()) if drawn else "",
     )
     return text.encode("utf-8", "replace").decode("utf-8")
+
+
+def _command(found: re.Match[str]) -> str:
+    """Return the HTML of a command, whose options are not divided at their hyphens."""
+    words = found[1].split(" ")
+    kept = (f'<span class="word">{x}</span>' if x.startswith("-") else x for x in words)
+    return f"<code>{' '.join(kept)}</code>"
 
 
 def _sections(run: Run) -> list[tuple[str, str, list[Block]]]:
