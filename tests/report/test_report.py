@@ -82,6 +82,7 @@ def page(simulated):
 
 def words_of(page):
     """Return the page's text, without scripts, styles and tags."""
+    page = re.sub(r'<span class="word">(.*?)</span>', r"\1", page)
     bare = re.sub(r"<(script|style).*?</\1>|</?code>", "", page, flags=re.S)
     return " ".join(entities.unescape(re.sub(r"<[^>]*>", " ", bare)).split())
 
