@@ -12,7 +12,17 @@ FACE = {"__init__.py", "errors.py", "status.py", "py.typed"}
 DOORS = {"__main__.py", "attractors.py", "pareto.py", "profile.py", "simulate.py", "sweep.py"}
 MOST_LINES, MOST_PARAMETERS = 80, 8
 
-OPTIONAL = {"build123d", "OCP", "dask", "distributed", "ezdxf", "jinja2", "markupsafe", "plotly"}
+OPTIONAL = {
+    "build123d",
+    "OCP",
+    "cloudpickle",
+    "dask",
+    "distributed",
+    "ezdxf",
+    "jinja2",
+    "markupsafe",
+    "plotly",
+}
 OPTIONAL |= {"netCDF4", "shtab", "xarray", "zarr"}
 SLOW = {"rich", "scipy"}
 COMMANDS = {f"commands/{name}.py" for name in (
@@ -27,6 +37,7 @@ LATE = {
     },
     "commands/completion.py": {"rootsopt.commands"},
     "commands/console.py": {"rootsopt", "rootsopt.commands", "rootsopt.errors"},
+    "commands/parallel.py": {"rootsopt.sweeps.evaluations"},
     "commands/work/sweep.py": {"rootsopt.commands.work"},
     "optimize/__init__.py": {"rootsopt.commands.optimize"},
     # Modules that import optional or slow libraries.
@@ -34,6 +45,7 @@ LATE = {
     "measured/reading.py": {"rootsopt.measured.dxf"},
     "response/evaluation.py": {"rootsopt.response.dataset"},
     "scene/families.py": {"rootsopt.measured.source"},
+    "sweeps/evaluations.py": {"rootsopt.sweeps.cluster"},
     "sweeps/scenes.py": {"rootsopt.sweeps.cluster"},
     # Only searches over an ensemble need these.
     "optimize/search.py": {"rootsopt.optimize", "rootsopt.response.ensemble"},
