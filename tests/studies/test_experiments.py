@@ -235,7 +235,7 @@ def test_pump_front(tmp_path, programs):
     np.testing.assert_allclose(numbers(rows, "sampled_ripple"), ripple, rtol=1e-5)
     volumes = np.array(numbers(rows, "displaced_volume_cm3"))
     assert np.min(volumes) >= volumes[0] * (1 - 1e-6)
-    assert "True" in {row["best_of_all"] for row in rows}
+    assert "true" in {row["best_of_all"] for row in rows}
     assert is_picture(tmp_path / "pump_front.png")
 
 
