@@ -230,11 +230,12 @@ def test_pump_front(tmp_path, programs):
     assert {row["family"] for row in rows} == {"ee", "arc_involute"}
     ratio, eta = (np.array(numbers(rows, key)) for key in ("radius_ratio", "area_efficiency"))
     ripple = (ratio - 1) ** 2 / (eta * ratio**2)
-    np.testing.assert_allclose(numbers(rows, "flow_ripple"), ripple, rtol=1e-9)
+    # The file has ten digits.
+    np.testing.assert_allclose(numbers(rows, "flow_ripple"), ripple, rtol=1e-8)
     np.testing.assert_allclose(numbers(rows, "sampled_ripple"), ripple, rtol=1e-5)
     volumes = np.array(numbers(rows, "displaced_volume_cm3"))
     assert np.min(volumes) >= volumes[0] * (1 - 1e-6)
-    assert "True" in {row["best_of_all"] for row in rows}
+    assert "true" in {row["best_of_all"] for row in rows}
     assert is_picture(tmp_path / "pump_front.png")
 
 
