@@ -42,10 +42,11 @@ def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: floa
     return ax
 
 
-def plot_prices(ax: Axes, constraints: Sequence[Mapping[str, Any]]) -> Axes:
+def plot_prices(ax: Axes, constraints: Sequence[Mapping[str, Any]], converged: bool = True) -> Axes:
     """Draw bars of the gain in the objective (%) from relaxing each limit by one step.
 
-    `constraints`: rows of the result file; those without a multiplier are left out. Return
+    `constraints`: rows of the result file; those without a multiplier are left out. `converged`:
+    whether the design is an optimum; otherwise, the axis says that the gains are rough. Return
     `ax`."""
     rows = [row for row in constraints if abs(row.get("multiplier") or 0.0) > 0]
     rows.sort(key=lambda row: row["relaxed_objective_percent"], reverse=True)
@@ -63,7 +64,8 @@ def plot_prices(ax: Axes, constraints: Sequence[Mapping[str, Any]]) -> Axes:
     if not rows:
         ax.text(0.5, 0.5, "no limit holds the optimum", ha="center", transform=ax.transAxes)
         ax.set_yticks([])
-    ax.set_xlabel("decrease of the objective (%)")
+    rough = "" if converged else ", rough: no optimum"
+    ax.set_xlabel(f"decrease of the objective (%){rough}")
     return ax
 
 

@@ -90,7 +90,7 @@ def certificate_figure(
     result file."""
     made, axes = figure(14, 4.4, 1, 3, gridspec_kw={"width_ratios": [1, 1, 0.8]})
     plot_residual(axes[0, 0], history, optimality["required_residual"])
-    plot_prices(axes[0, 1], constraints)
+    plot_prices(axes[0, 1], constraints, optimality["converged"])
     plot_starts(axes[0, 2], optimality["starts"], optimality["optima"])
     made.suptitle("Certificate of the optimum")
     return _write(folder, "optimum", made)

@@ -17,7 +17,9 @@ _STYLES = {
     "robust": (GREEN, (0, (4, 1.5))),
 }
 _BINS = 50
-"""Number of bins of a histogram."""
+"""Maximum number of bins of a histogram."""
+_PER_BIN = 6
+"""Least average number of scenes per bin, if there are few scenes."""
 PANELS = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
 """Forces that `distributions` draws, with the labels of their axes."""
 
@@ -32,7 +34,9 @@ def plot_distribution(ax: Axes, designs: Mapping[str, ArrayLike], label: str) ->
     known = {name: values[np.isfinite(values)] for name, values in known.items()}
     known = {name: values for name, values in known.items() if values.size}
     every = np.concatenate([np.zeros(0), *known.values()])
-    edges = np.histogram_bin_edges(every, _BINS).tolist()
+    most = max((values.size for values in known.values()), default=0)
+    bins = max(1, min(_BINS, most // _PER_BIN))
+    edges = np.histogram_bin_edges(every, bins).tolist()
     for name, values in known.items():
         color, dashes = _STYLES[name]
         style = {"color": color, "linestyle": dashes}

@@ -117,7 +117,8 @@ def optimality_table(
         ],
     )
     prices = [row for row in constraints if abs(row.get("multiplier", 0.0)) > 0]
-    _group(table, "price of a limit", map(_price, prices))
+    rough = "" if optimality["converged"] else " (rough, because this is no optimum)"
+    _group(table, f"price of a limit{rough}", map(_price, prices))
     held = optimality["held_by"]
     if len(held) > 1:
         _group(table, "branches that hold the optimum (share)", map(_held, held))

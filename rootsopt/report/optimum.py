@@ -26,6 +26,9 @@ def constraint_block(run: Run) -> Block | None:
         "Price: change of the objective if the limit is relaxed by the step, to first order. An "
         "empty price: the limit does not hold the optimum back."
     )
+    found = run.result.get("optimality") or {}
+    if found and not found.get("converged"):
+        note += " The design is no optimum, so prices are rough."
     return block("Constraints", heads, [("", rows)], note)
 
 

@@ -182,11 +182,12 @@ def _after_stop(run: Run) -> list[str]:
 def _after_optimum(run: Run) -> list[str]:
     command = shlex.quote(str(run.path / "optimized.yaml"))
     sentences = []
-    dear = _dearest(run.result.get("constraints") or ())
+    found = run.result.get("optimality") or {}
+    unproven = bool(found) and not found.get("converged")
+    dear = "" if unproven else _dearest(run.result.get("constraints") or ())
     if dear:
         sentences.append(dear)
-    found = run.result.get("optimality") or {}
-    if found and not found.get("converged"):
+    if unproven:
         sentences.append(str(found.get("message", "")))
     sentences += [
         f"Draw the rotor: `rootsopt profile {command} --export dxf,step`.",

@@ -288,6 +288,10 @@ def test_optimum_is_reported_in_the_users_words(tmp_path):
         "flow lines, 2 of 2 0.010000",
     ):
         assert words in text
+    optimality |= {"converged": False, "reason": "evaluations", "message": "Raise iterations."}
+    text = words_of(report_text(run_of(tmp_path, given)))
+    assert "The dearest limit" not in text
+    assert "The design is no optimum, so prices are rough." in text
 
 
 def test_robust_optimum_is_compared_in_fresh_scenes(tmp_path):
