@@ -1,5 +1,6 @@
 """The main task in one function: optimise a design and compare it with the baseline."""
 
+import threading
 from collections.abc import Callable
 
 from rootsopt.config import Config
@@ -10,12 +11,15 @@ from rootsopt.scene import check_geometry
 
 
 def optimize_design(
-    config: Config, progress: Callable[[int, int, float], None] | None = None
+    config: Config,
+    progress: Callable[[int, int, float], None] | None = None,
+    stop: threading.Event | None = None,
 ) -> Optimization:
     """Find the design that minimises the objective of a `config`, and compare it with the baseline.
 
     `progress`: function called after each evaluation with (evaluations done, evaluations expected,
-    best objective so far).
+    best objective so far). `stop`: event that another thread can set to end the search early, with
+    the best design found until then.
 
     Return an `Optimization`. Its main fields are `baseline`, `optimized` (`None` if no better
     design was confirmed), `improvement`, `constraints`, `history` and `status`.
@@ -26,4 +30,4 @@ def optimize_design(
     >>> found = rootsopt.optimize_design(rootsopt.load_config("configs/cic.yaml"))
     >>> found.optimized.design, found.improvement["mean_force_N"]"""
     check_geometry(config)
-    return search_of(resolve(config)[0], progress).run()
+    return search_of(resolve(config)[0], progress, stop).run()

@@ -146,7 +146,8 @@ class Evaluator:
     `reference`: response by which forces are divided when coexisting motions are compared;
     `fitted`: whether the contact map has been fitted to a motion; `map_error`: error of the contact
     map, relative to the static penetration, NaN if unknown; `maxima`: whether to compute all local
-    maxima of the force, with their gradients; `orbits`: orbits known from former evaluations, which
+    maxima of the force, with their gradients; `confirm`: whether an orbit that is reported with its
+    series is closed anew and confirmed, even if it is near a known one; `orbits`: orbits known from former evaluations, which
     all evaluators made from this one share.
     """
 
@@ -157,6 +158,7 @@ class Evaluator:
     fitted: bool = False
     map_error: float = float("nan")
     maxima: bool = False
+    confirm: bool = True
     orbits: OrbitStore = dataclasses.field(default_factory=OrbitStore, compare=False, repr=False)
 
     @classmethod
@@ -212,6 +214,11 @@ class Evaluator:
         """Return another evaluator that adds all local maxima of the force to an evaluation."""
         return dataclasses.replace(self, maxima=True)
 
+    def following(self, orbits: OrbitStore) -> "Evaluator":
+        """Return another evaluator that knows the `orbits` of other scenes, and reports the series
+        of an orbit near a known one without confirming the orbit by an integration."""
+        return dataclasses.replace(self, confirm=False, orbits=orbits)
+
     def without_gradient(self) -> "Evaluator":
         """Return this evaluator unchanged, since its gradient takes little time.
 
@@ -254,8 +261,8 @@ class Evaluator:
             pair, tangents, shape = _build(now.scene, design)
             dtype = pair.angle_scale.dtype
             state = np.zeros(pair.states, dtype) if start is None else np.asarray(start, dtype)
-            # An orbit that is reported with its series is closed anew, and confirmed.
-            found = None if series else now._near(pair, tangents, start)
+            anew = series and self.confirm
+            found = None if anew else now._near(pair, tangents, start)
             if found is None:
                 found = jax.device_get(now.motion(pair, tangents, state))
             other = now._refitted(pair, found)
@@ -317,7 +324,7 @@ class Evaluator:
         # The slowest compilation starts first.
         _motion.prepare(pair, tangents, state, now.scene.pitch_radius, solver, then=then)
         _build.prepare(now.scene, design)
-        if not series and collocates(pair, solver):
+        if not (series and self.confirm) and collocates(pair, solver):
             known = Known.empty(sizes(1), pair.states, 1 + pair.two_sided)
             _near.prepare(pair, tangents, (known, pair), now.scene.pitch_radius, solver)
         if series:
