@@ -1,4 +1,4 @@
-"""The explorer: a local page on which sliders move a design and its scene, and the forces follow."""
+"""The explorer: a local page whose sliders move a design and its scene; the forces follow."""
 
 import importlib.util
 
@@ -11,7 +11,9 @@ LIBRARY = "bokeh"
 def require() -> None:
     """Raise `InputError` unless the library that serves the page is installed."""
     if importlib.util.find_spec(LIBRARY) is None:
-        raise InputError(f"`explore` needs {LIBRARY}; install with `pip install 'rootsopt[explore]'`")
+        raise InputError(
+            f"`explore` needs {LIBRARY}; install with `pip install 'rootsopt[explore]'`"
+        )
 
 
 __all__ = ["require"]

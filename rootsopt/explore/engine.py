@@ -30,9 +30,11 @@ _AGREES = 1e-3
 class Poses:
     """Rotations φ (n,) of rotor 1 (rad) at which the pair is drawn, with the contacts.
 
-    `relative` (n,): ε (rad); `drive`, `coast`: contacts of these flanks; `forces`: largest force
-    (N) on drive and coast flank around each rotation, (n,) each; `None` in perfect rolling."""
+    `time` (n,): time (ms) since the start of the motion; `relative` (n,): ε (rad); `drive`,
+    `coast`: contacts of these flanks; `forces`: largest force (N) on drive and coast flank around
+    each rotation, (n,) each; `None` in perfect rolling."""
 
+    time: NDArray[np.float64]
     rotation: NDArray[np.float64]
     relative: NDArray[np.float64]
     drive: Contacts
@@ -90,7 +92,8 @@ class Engine:
         profile, record = _shape(scene, design_vector(config))
         shown = np.asarray(outline(profile, points=_POINTS)) / MM
         rotation, (drive, coast) = rolling_frames(profile)
-        poses = Poses(rotation, np.zeros_like(rotation), drive, coast, None)
+        zeros = np.zeros_like(rotation)
+        poses = Poses(zeros, rotation, zeros, drive, coast, None)
         return Shape(shown, geometry_record(scene, record), poses, profile)
 
     def near(self, config: Config, start: NDArray[np.float64] | None) -> Evaluation:
@@ -131,7 +134,8 @@ def poses_of(profile: Profile, evaluation: Evaluation) -> Poses | None:
     periods = int(evaluation.steady_state.get("period") or profile.lobes)
     frames = frames_of(series, profile.lobes, periods)
     drive, coast = (rolling_contacts(profile, frames.rotation, one) for one in (False, True))
-    return Poses(frames.rotation, frames.relative, drive, coast, frames.forces)
+    time = 1e3 * (frames.time - series.time[0])
+    return Poses(time, frames.rotation, frames.relative, drive, coast, frames.forces)
 
 
 def cut(series: Series) -> Series:

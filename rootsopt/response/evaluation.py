@@ -147,8 +147,8 @@ class Evaluator:
     `fitted`: whether the contact map has been fitted to a motion; `map_error`: error of the contact
     map, relative to the static penetration, NaN if unknown; `maxima`: whether to compute all local
     maxima of the force, with their gradients; `confirm`: whether an orbit that is reported with its
-    series is closed anew and confirmed, even if it is near a known one; `orbits`: orbits known from former evaluations, which
-    all evaluators made from this one share.
+    series is closed anew and confirmed, even if it is near a known one; `orbits`: orbits
+    known from former evaluations, which all evaluators made from this one share.
     """
 
     config: Config
