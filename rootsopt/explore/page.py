@@ -31,6 +31,8 @@ from rootsopt.explore.session import (
 _TEMPLATE = Path(__file__).with_name("template")
 _SLOW = 1.0
 """Time (s) of a computation above which the page says how long it has been running."""
+_QUICK = 0.2
+"""Time (s) of an evaluation below which the pair is drawn once, with its forces."""
 _TICK = 250
 """Interval (ms) at which the page looks for slow computations, and fades numbers that are late."""
 _FRESH, _FADED = {"opacity": "1"}, {"opacity": "0.35"}
@@ -77,6 +79,7 @@ class Page:
         self.progress: Progress | None = None
         self.cancelled = self.setting = self.closed = self.late = False
         self.before = -1  # number of the motion shown at the last tick
+        self.drawn = -1  # number of the shape of the pair that is drawn
         self._build()
         self.session = Session(engine, self.post)
         document.add_periodic_callback(self._tick, _TICK)
@@ -96,7 +99,7 @@ class Page:
     def _build(self) -> None:
         self.status = text(name="status_text")
         self.search = text(name="search_text")
-        self.latency = text(name="latency_text")
+        self.latency = text(name="latency_text", syncable=False)
         self.mark = Div(text="", visible=False, name="mark")
         self.file = Div(text="", visible=False, name="file")
         self.sliders: dict[str, Slider] = {}
@@ -276,16 +279,17 @@ class Page:
 
     def _take_shape(self, message: NewShape) -> None:
         self.shape, self.problem = message, None
-        radius = self._radius(message.number)
+        radius = self._radius()
         if not self.first[0]:
             self.first = message.shape.record, None
             self.profile.start(message.shape.outline)
         for picture in (self.profile, self.pair):
             picture.dim(False)
         self.profile.draw(message.shape.outline, radius)
-        self.pair.draw(message.shape, radius, self._error())
         if self.motion is None:
             self.pair.move(message.shape.poses)
+        if not self._quick:
+            self._draw_pair()
         self._show_geometry()
 
     def _take_motion(self, motion: NewMotion) -> None:
@@ -294,6 +298,7 @@ class Page:
         self.motion = motion
         self.rest = None if self.rest and self.rest.number != motion.number else self.rest
         found = motion.evaluation
+        self._draw_pair()
         if self.first[1] is None and motion.final:
             self.first = self.first[0], found
             if found.series is not None:
@@ -314,9 +319,21 @@ class Page:
 
     # What is shown
 
-    def _radius(self, _: int) -> float:
-        return float(self.session.values.get("profile.pitch_radius_mm",
-                                             self.config.profile.pitch_radius_mm))  # fmt: skip
+    @property
+    def _quick(self) -> bool:
+        """Whether the motion is likely to follow the shape at once, and the pair with it."""
+        motion = self.motion
+        return motion is not None and motion.evaluation.statistics["seconds"] < _QUICK
+
+    def _draw_pair(self) -> None:
+        shape = self.shape
+        if shape is not None and shape.number != self.drawn:
+            self.drawn = shape.number
+            self.pair.draw(shape.shape, self._radius(), self._error())
+
+    def _radius(self) -> float:
+        key = "profile.pitch_radius_mm"
+        return self.session.values.get(key, self.config.profile.pitch_radius_mm)
 
     def _error(self) -> float:
         key = "scene.center_distance_error_mm"
@@ -354,6 +371,8 @@ class Page:
         late = self.shape is not None and self.problem is None and shown < self.shape.number
         self._fresh(not (late and self.late and shown == self.before))
         self.late, self.before = late, shown
+        if late:
+            self._draw_pair()
         if self.closed or seconds < _SLOW:
             return
         if not self.engine.ready.is_set():

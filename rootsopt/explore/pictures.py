@@ -113,7 +113,7 @@ class ProfilePicture(_Plan):
         self.ends = ColumnDataSource(_corners(-1, 1, 1))
         self.figure = _plan("Profile (dashed: at start)", self.ends)
         self.now, self.before = ColumnDataSource(empty), ColumnDataSource(empty)
-        self.pitch = ColumnDataSource(empty)
+        self.pitch, self._pitch_radius = ColumnDataSource(empty), 0.0
         self.now.name = "outline_now"
         line = {"line_color": "#111111", "line_width": 1.5}
         self.figure.patch("x", "y", source=self.now, fill_color=SKY, fill_alpha=0.35, **line)
@@ -130,7 +130,9 @@ class ProfilePicture(_Plan):
         """Draw an outline (n, 2) with its pitch circle (mm)."""
         self._hold(float(np.max(np.hypot(*outline.T))))
         self.now.data = {"x": outline[:, 0], "y": outline[:, 1]}
-        self.pitch.data = _circle(pitch_radius)
+        if pitch_radius != self._pitch_radius:
+            self._pitch_radius = pitch_radius
+            self.pitch.data = _circle(pitch_radius)
 
 
 class PairPicture(_Plan):
@@ -143,13 +145,17 @@ class PairPicture(_Plan):
         self.outline, self.pitch = ColumnDataSource(empty), ColumnDataSource({"xs": [], "ys": []})
         self.facts = ColumnDataSource({"center": [], "lobes": [], "pitch": [], "longest": []})
         self.poses = ColumnDataSource({"rotation": []}, name="poses")
-        self.rotors = [ColumnDataSource(empty) for _ in range(2)]
+        # What a script computes is not sent back to the server.
+        own: dict[str, Any] = {"syncable": False}
+        self.rotors = [ColumnDataSource(empty, **own) for _ in range(2)]
         for rotor, color in zip(self.rotors, (SKY, ORANGE), strict=True):
             line = {"line_color": "#111111", "line_width": 1.0}
             self.figure.patch("x", "y", source=rotor, fill_color=color, fill_alpha=0.4, **line)
         dashes = {"line_color": GREY, "line_dash": [2, 3]}
         self.figure.multi_line("xs", "ys", source=self.pitch, **dashes)
-        self.arrows = {name: ColumnDataSource(empty | {"ex": [], "ey": []}) for name in _SIDES}
+        self.arrows = {
+            name: ColumnDataSource(empty | {"ex": [], "ey": []}, **own) for name in _SIDES
+        }
         for name, color in _SIDES.items():
             arrow = self.arrows[name]
             self.figure.scatter("x", "y", source=arrow, color=color, size=8)
@@ -165,7 +171,7 @@ class PairPicture(_Plan):
         self.play = Toggle(
             label="Play", width=64, margin=(0, 0, 0, 0), name="play", stylesheets=[_SMALL]
         )
-        self.pose = Div(text="", sizing_mode="stretch_width", margin=0, name="pose")
+        self.pose = Div(text="", sizing_mode="stretch_width", margin=0, name="pose", **own)
         row = Row(self.play, self.turn, sizing_mode="stretch_width", margin=0)
         self.root = Column(self.figure, row, self.pose, sizing_mode="stretch_width", margin=0)
         self._chosen = False
@@ -193,8 +199,9 @@ class PairPicture(_Plan):
         """Draw the rotors of a shape, with `pitch_radius` and centre distance `error` (mm)."""
         center = 2 * pitch_radius + error
         self._hold(float(np.max(np.hypot(*shape.outline.T))), center)
-        circles = [_circle(pitch_radius), _circle(pitch_radius, center)]
-        self.pitch.data = {end: [one[end[0]] for one in circles] for end in ("xs", "ys")}
+        if self.facts.data["center"] != [center] or self.facts.data["pitch"] != [pitch_radius]:
+            circles = [_circle(pitch_radius), _circle(pitch_radius, center)]
+            self.pitch.data = {end: [one[end[0]] for one in circles] for end in ("xs", "ys")}
         longest = self.facts.data["longest"] or [0.0]
         lobes = shape.profile.lobes
         self.facts.data = {
@@ -248,7 +255,7 @@ class ForcePicture:
             line = self.figure.line("time", name, source=self.now, line_color=color, line_width=1.8)
             items.append(LegendItem(label=f"{name} flank", renderers=[line]))
         self.mean = Span(location=0, dimension="width", line_color="#111111", line_dash=[2, 3])
-        self.cursor = Span(location=0, dimension="height", line_color="#8a9aa5")
+        self.cursor = Span(location=0, dimension="height", line_color="#8a9aa5", syncable=False)
         for span in (self.mean, self.cursor):
             span.visible = False
             self.figure.add_layout(span)

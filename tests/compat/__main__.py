@@ -19,8 +19,11 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "build" / "compat"
 VERSIONS = "oldest", "newest"
-EXTRAS = "cad,cluster,completion,explore,pages,zarr"
+EXTRAS = "cluster,completion,explore,pages,zarr"
 """Extras that are installed and tried. The others are for studies, docs and development."""
+CAD = "cad"
+"""A further extra of the jobs with the newest versions: build123d pins what it needs so narrowly
+that it does not go with the oldest versions of the rest."""
 TOOLS = "pytest", "hypothesis", "beartype", "psutil", "hatchling"
 """Packages that only the tests need, always in their newest version."""
 COPIED = "tests", "configs", "experiments", "docs", "pyproject.toml", "README.md", "CHANGELOG.md"
@@ -48,7 +51,7 @@ TESTS = (
     "tests/sweeps/test_journal.py",
 )
 """A few test files per package that take seconds, apart from compiling."""
-IMPORTS = "build123d", "distributed", "zarr", "bokeh", "plotly", "jinja2", "shtab", "h5netcdf"
+IMPORTS = "distributed", "zarr", "bokeh", "plotly", "jinja2", "shtab", "h5netcdf"
 _JOB_SECONDS = 1500
 
 
@@ -97,9 +100,8 @@ def bounds(project: dict) -> list[str]:
     return [f"{name}=={least}" for name, least in pins.items()]
 
 
-def wheel() -> Path:
-    """Build the wheel of this tree and return its path."""
-    folder = FOLDER / "wheel"
+def wheel(folder: Path) -> Path:
+    """Build the wheel of this tree in a `folder`, and return its path."""
     shutil.rmtree(folder, ignore_errors=True)
     build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
     subprocess.run([*build, "--wheel-dir", str(folder), str(ROOT)], check=True)
@@ -107,9 +109,8 @@ def wheel() -> Path:
     return made
 
 
-def tree() -> Path:
-    """Copy tests and what they read, without the package, and return the folder."""
-    folder = FOLDER / "tree"
+def tree(folder: Path) -> Path:
+    """Copy tests and what they read into a `folder`, without the package, and return the folder."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for name in COPIED:
@@ -122,13 +123,13 @@ def tree() -> Path:
 
 
 class Job:
-    """One environment: `versions` is oldest or newest."""
+    """One environment in a `folder`: `versions` is oldest or newest."""
 
-    def __init__(self, python: Python, versions: str):
+    def __init__(self, python: Python, versions: str, folder: Path):
         self.python, self.versions = python, versions
         self.name = f"{versions}-{'.'.join(python.version.split('.')[:2])}"
-        self.folder = FOLDER / self.name
-        self.log = FOLDER / f"{self.name}.log"
+        self.folder = folder / self.name
+        self.log = folder / f"{self.name}.log"
         self.bin = self.folder / ("Scripts" if os.name == "nt" else "bin")
 
     def run(self, package: Path, where: Path, pins: list[str], keep: bool) -> Row:
@@ -144,15 +145,18 @@ class Job:
         return Row(self.name, self.python.version, versions, f"{result} ({seconds / 60:.1f} min)")
 
     def _steps(self, package, where, pins, log, began) -> str:
-        constraints = FOLDER / f"{self.name}.txt"
-        constraints.write_text("\n".join(pins if self.versions == "oldest" else []) + "\n")
+        newest = self.versions == "newest"
+        extras = f"{EXTRAS},{CAD}" if newest else EXTRAS
+        imports = [*IMPORTS, *(["build123d"] if newest else [])]
+        constraints = self.log.with_suffix(".txt")
+        constraints.write_text("\n".join([] if newest else pins) + "\n")
         python, script = str(self.bin / "python"), str(self.bin / "rootsopt")
         install = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
         search = ["--set", "optimizer.starts=1", "--set", "optimizer.screening=0"]
-        checks = f"import rootsopt, {', '.join(IMPORTS)}; print(rootsopt.__file__)"
+        checks = f"import rootsopt, {', '.join(imports)}; print(rootsopt.__file__)"
         steps = {
             "environment": [self.python.path, "-m", "venv", str(self.folder)],
-            "install": [*install, "-c", str(constraints), f"{package}[{EXTRAS}]", *TOOLS],
+            "install": [*install, "-c", str(constraints), f"{package}[{extras}]", *TOOLS],
             "import": [python, "-c", checks],
             "main job": [script, "optimize", "cic", "-o", str(self.folder / "run"), *search],
             "tests": [str(self.bin / "pytest"), "-q", "-x", *TESTS],
@@ -207,6 +211,7 @@ def main() -> int:
     usual = ["python3.11", "python3.12", "python3.13"]
     parser.add_argument("--pythons", nargs="+", default=usual, help="interpreters: names or paths")
     parser.add_argument("--versions", nargs="+", default=VERSIONS, choices=VERSIONS)
+    parser.add_argument("--folder", type=Path, default=FOLDER, help="of environments and logs")
     parser.add_argument("--keep", action="store_true", help="keep the environments")
     options = parser.parse_args()
     pythons, missing = found(options.pythons)
@@ -215,13 +220,14 @@ def main() -> int:
     if not pythons:
         print("no interpreter is left; name some with PYTHONS='/path/to/python3.12 ...'")
         return 1
-    FOLDER.mkdir(parents=True, exist_ok=True)
+    folder = options.folder.resolve()
+    folder.mkdir(parents=True, exist_ok=True)
     pins = bounds(tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"])
-    package, where = wheel(), tree()
+    package, where = wheel(folder / "wheel"), tree(folder / "tree")
     rows = []
     for python in pythons:
         for versions in options.versions:
-            job = Job(python, versions)
+            job = Job(python, versions, folder)
             rows.append(job.run(package, where, pins, options.keep))
             print(f"{rows[-1].job}: {rows[-1].result}; log in {job.log}", flush=True)
     print("\n" + table(rows))

@@ -102,9 +102,9 @@ def test_foreign_pages_may_not_connect(address, origin, status):
 def test_server_listens_on_the_loopback_address_only(address):
     port = int(address.split(":")[2].split("/")[0])
     for family, one in ((socket.AF_INET, "127.0.0.2"), (socket.AF_INET6, "::1")):
-        with socket.socket(family) as probe, pytest.raises(OSError):
+        with socket.socket(family) as probe:
             probe.settimeout(5)
-            probe.connect((one, port))
+            assert probe.connect_ex((one, port)) != 0
 
 
 def test_library_is_named_if_it_is_missing(monkeypatch, capsys):
