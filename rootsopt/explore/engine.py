@@ -2,7 +2,7 @@
 
 import dataclasses
 import threading
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,7 +142,7 @@ def cut(series: Series) -> Series:
     """Return the first revolutions of a long motion."""
     turns = (series.rotation - series.rotation[0]) / (2 * np.pi)
     kept = turns < _TURNS
-    values = {
+    values: dict[str, Any] = {
         field.name: None if (one := getattr(series, field.name)) is None else one[kept]
         for field in dataclasses.fields(series)
     }

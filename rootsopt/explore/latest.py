@@ -13,14 +13,14 @@ class Latest:
 
     def __init__(self, failed: Callable[[Exception], None]):
         self._failed = failed
-        self._job: Callable[[], None] | None = None
+        self._job: Callable[[], object] | None = None
         self._due = 0.0
         self._changed = threading.Condition()
         self._closed = False
         self._began: float | None = None
         threading.Thread(target=self._work, daemon=True).start()
 
-    def submit(self, job: Callable[[], None], delay: float = 0.0) -> None:
+    def submit(self, job: Callable[[], object], delay: float = 0.0) -> None:
         """Run `job` as soon as the present one has ended, but not before `delay` (s).
 
         A newer job within this time replaces it."""
@@ -55,7 +55,7 @@ class Latest:
             finally:
                 self._began = None
 
-    def _next(self) -> Callable[[], None] | None:
+    def _next(self) -> Callable[[], object] | None:
         """Wait for a job that is due and return it; `None` once the thread is to end."""
         with self._changed:
             while not self._closed:

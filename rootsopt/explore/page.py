@@ -1,5 +1,8 @@
 """The page of the explorer: a Bokeh document that shows a session, one per browser tab."""
 
+# The models of Bokeh accept more than their annotations say.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+
 import functools
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,7 +11,7 @@ from typing import Any
 import numpy as np
 from bokeh.core.templates import get_env
 from bokeh.document import Document
-from bokeh.models import Button, ColumnDataSource, CustomJS, Div, NumericInput, Row, Slider
+from bokeh.models import Button, CustomJS, Div, NumericInput, Row, Slider
 from bokeh.models.layouts import Column, LayoutDOM
 
 import rootsopt
@@ -79,6 +82,7 @@ class Page:
         self.progress: Progress | None = None
         self.cancelled = self.setting = self.closed = self.late = False
         self.before = -1  # number of the motion shown at the last tick
+        self.saved = 0  # number of configs handed to the browser
         self.drawn = -1  # number of the shape of the pair that is drawn
         self._build()
         self.session = Session(engine, self.post)
@@ -98,7 +102,7 @@ class Page:
 
     def _build(self) -> None:
         self.status = text(name="status_text")
-        self.search = text(name="search_text")
+        self.search = text(name="search_text", visible=False)
         self.latency = text(name="latency_text", syncable=False)
         self.mark = Div(text="", visible=False, name="mark")
         self.file = Div(text="", visible=False, name="file")
@@ -124,9 +128,7 @@ class Page:
             self.document.add_root(root)
         self.mark.js_on_change("text", script("shown", mark=self.mark, latency=self.latency))
         name = f"{Path(self.source).stem}-explored.yaml"
-        saving = script("save", file=self.file)
-        saving.args = saving.args | {"name": ColumnDataSource({"text": [name]}, name="file_name")}
-        self.file.js_on_change("text", saving)
+        self.file.js_on_change("tags", script("save", file=self.file, name=name))
         heading = f"rootsopt explore {self.source}"
         self.document.title = heading
         self.document.template = get_env().from_string(
@@ -210,6 +212,7 @@ class Page:
     def _optimize(self) -> None:
         self.progress, self.cancelled = None, False
         self.search.text = texts.progress_line(None, False)
+        self.search.visible = True
         self._lock(True)
         self.session.optimize()
 
@@ -260,8 +263,9 @@ class Page:
             if message.values:
                 self._set(dict(message.values))
         elif isinstance(message, Saved):
-            self.file.text = ""
             self.file.text = message.text
+            self.saved += 1
+            self.file.tags = [self.saved]
 
     def _take_problem(self, problem: Problem) -> None:
         if self.problem is not None and problem.number < self.problem.number:
@@ -286,10 +290,10 @@ class Page:
         for picture in (self.profile, self.pair):
             picture.dim(False)
         self.profile.draw(message.shape.outline, radius)
-        if self.motion is None:
-            self.pair.move(message.shape.poses)
         if not self._quick:
             self._draw_pair()
+        if self.motion is None:
+            self.pair.move(message.shape.poses)
         self._show_geometry()
 
     def _take_motion(self, motion: NewMotion) -> None:

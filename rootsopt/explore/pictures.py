@@ -1,5 +1,8 @@
 """The pictures of the explorer: profile, meshing pair, force over time."""
 
+# The models of Bokeh accept more than their annotations say.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -45,7 +48,7 @@ if (cb_obj.active) window.rootsoptPlay = window.setInterval(() => {
 
 def _figure(title: str, height: int, **options: Any) -> Any:
     """Return a figure in the style of the page, without a toolbar."""
-    made = figure(
+    made: Any = figure(
         title=title, height=height, sizing_mode="stretch_width", toolbar_location=None,
         margin=0, min_border_left=52, min_border_right=8, **options,
     )  # fmt: skip
@@ -202,7 +205,7 @@ class PairPicture(_Plan):
         if self.facts.data["center"] != [center] or self.facts.data["pitch"] != [pitch_radius]:
             circles = [_circle(pitch_radius), _circle(pitch_radius, center)]
             self.pitch.data = {end: [one[end[0]] for one in circles] for end in ("xs", "ys")}
-        longest = self.facts.data["longest"] or [0.0]
+        longest = [*self.facts.data["longest"]] or [0.0]
         lobes = shape.profile.lobes
         self.facts.data = {
             "center": [center], "lobes": [lobes], "pitch": [pitch_radius], "longest": longest

@@ -1,5 +1,8 @@
 """Serves the explorer's page on the loopback address, to those who know its secret address."""
 
+# The models of Bokeh accept more than their annotations say.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+
 import logging
 import secrets
 import socket
