@@ -46,7 +46,7 @@ _DIGITS = 12
 """Significant digits of a value that a slider sets."""
 
 
-def script(name: str, **arguments: Any) -> CustomJS:
+def script(name: str, /, **arguments: Any) -> CustomJS:
     """Return the script `name` of the template folder, as a callback with these `arguments`."""
     return CustomJS(args=arguments, code=(_TEMPLATE / f"{name}.js").read_text("utf-8"))
 

@@ -90,15 +90,15 @@ def _circle(radius: float, x: float = 0.0) -> dict[str, NDArray]:
 class _Plan:
     """Base of the pictures of the rotors: dimmed if what they show is not valid any more."""
 
-    figure: Any
+    root: Column
     ends: ColumnDataSource
     _reach = 0.0
 
     def dim(self, dim: bool) -> None:
-        """Fade the picture, or show it again."""
+        """Fade the picture with all that belongs to it, or show it again."""
         styles = {"opacity": "0.3" if dim else "1"}
-        if self.figure.styles != styles:
-            self.figure.styles = styles
+        if self.root.styles != styles:
+            self.root.styles = styles
 
     def _hold(self, outer: float, center: float = 0.0) -> None:
         """Let the ranges hold rotors of this outer radius, without following small changes."""
@@ -205,7 +205,8 @@ class PairPicture(_Plan):
         if self.facts.data["center"] != [center] or self.facts.data["pitch"] != [pitch_radius]:
             circles = [_circle(pitch_radius), _circle(pitch_radius, center)]
             self.pitch.data = {end: [one[end[0]] for one in circles] for end in ("xs", "ys")}
-        longest = [*self.facts.data["longest"]] or [0.0]
+        facts: dict[str, Any] = dict(self.facts.data)
+        longest = [*facts["longest"]] or [0.0]
         lobes = shape.profile.lobes
         self.facts.data = {
             "center": [center], "lobes": [lobes], "pitch": [pitch_radius], "longest": longest
