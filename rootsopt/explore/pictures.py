@@ -146,7 +146,9 @@ class PairPicture(_Plan):
         self.ends = ColumnDataSource(_corners(-1, 1, 1))
         self.figure = _plan("Meshing pair, contact force on rotor 2", self.ends)
         self.outline, self.pitch = ColumnDataSource(empty), ColumnDataSource({"xs": [], "ys": []})
-        self.facts = ColumnDataSource({"center": [], "lobes": [], "pitch": [], "longest": []})
+        self.facts = ColumnDataSource()
+        self._facts = dict.fromkeys(("center", "lobes", "pitch", "longest"), 0.0)
+        self._tell()
         self.poses = ColumnDataSource({"rotation": []}, name="poses")
         # What a script computes is not sent back to the server.
         own: dict[str, Any] = {"syncable": False}
@@ -198,25 +200,25 @@ class PairPicture(_Plan):
         )
         return draw
 
+    def _tell(self, **facts: float) -> None:
+        """Tell the script some `facts` of the pair."""
+        self._facts |= facts
+        self.facts.data = {key: [value] for key, value in self._facts.items()}
+
     def draw(self, shape: Shape, pitch_radius: float, error: float) -> None:
         """Draw the rotors of a shape, with `pitch_radius` and centre distance `error` (mm)."""
         center = 2 * pitch_radius + error
         self._hold(float(np.max(np.hypot(*shape.outline.T))), center)
-        if self.facts.data["center"] != [center] or self.facts.data["pitch"] != [pitch_radius]:
+        if (self._facts["center"], self._facts["pitch"]) != (center, pitch_radius):
             circles = [_circle(pitch_radius), _circle(pitch_radius, center)]
             self.pitch.data = {end: [one[end[0]] for one in circles] for end in ("xs", "ys")}
-        facts: dict[str, Any] = dict(self.facts.data)
-        longest = [*facts["longest"]] or [0.0]
-        lobes = shape.profile.lobes
-        self.facts.data = {
-            "center": [center], "lobes": [lobes], "pitch": [pitch_radius], "longest": longest
-        }  # fmt: skip
+        self._tell(center=center, lobes=shape.profile.lobes, pitch=pitch_radius)
         self.outline.data = {"x": shape.outline[:, 0], "y": shape.outline[:, 1]}
 
     def move(self, poses: Poses) -> None:
         """Take the poses of a motion, or of perfect rolling."""
         longest = 0.0 if poses.forces is None else max(1e-30, *map(np.max, poses.forces))
-        self.facts.data = dict(self.facts.data) | {"longest": [float(longest)]}
+        self._tell(longest=float(longest))
         data: dict[str, Any] = {
             "time": poses.time, "rotation": poses.rotation, "relative": poses.relative
         }  # fmt: skip
