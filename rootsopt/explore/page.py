@@ -381,7 +381,7 @@ class Page:
             return
         if not self.engine.ready.is_set():
             words = (
-                "Compiling the programs for this kind of pair. The first time takes one to three "
+                "Compiling the programs for this kind of pair. The first time takes one to several "
                 f"minutes, later starts some seconds ({seconds:.0f} s so far)."
             )
             self._say(texts.status_line("preparing", "wait", words))

@@ -3,6 +3,7 @@
 A session knows nothing of the page. It tells it what is new by messages, from several threads."""
 
 import dataclasses
+import functools
 import sys
 import threading
 from collections.abc import Callable, Mapping
@@ -124,12 +125,12 @@ class Session:
     def show_from_rest(self) -> None:
         """Show the motion that starts at rest, even if another one is known."""
         number = self.number
-        self._rests.submit(lambda: self._from_rest(number, True))
+        self._rests.submit(lambda: self._refusing(number, lambda: self._from_rest(number, True)))
 
     def save(self) -> None:
         """Make the YAML of the values, and compute their motion from rest, as `simulate` does."""
         number = self.number
-        self._rests.submit(lambda: self._save(number))
+        self._rests.submit(lambda: self._refusing(number, lambda: self._save(number)))
 
     def optimize(self) -> None:
         """Search for the optimum from the present values, in a thread of its own."""
@@ -168,34 +169,28 @@ class Session:
         """Compute shape and motion of the values with this `number`."""
         self._motions.clear()
         self._rests.clear()
-        self._shapes.submit(lambda: self._compute_shape(number))
+        self._shapes.submit(lambda: self._refusing(number, lambda: self._compute_shape(number)))
 
     def _compute_shape(self, number: int) -> None:
-        try:
-            config = self.config()
-            shape = self.engine.shape(config)
-        except InputError as error:
-            self.show(Problem(number, str(error)))
-            return
+        config = self.config()
+        shape = self.engine.shape(config)
         self.show(NewShape(number, shape))
-        self._motions.submit(lambda: self._compute_motion(number, config, shape))
+        work = functools.partial(self._compute_motion, number, config, shape)
+        self._motions.submit(lambda: self._refusing(number, work))
 
     def _compute_motion(self, number: int, config: Config, shape: Shape) -> None:
         self.engine.ready.wait()
         start = self._state
-        try:
-            near = start is not None
-            found = self.engine.near(config, start) if near else self.engine.from_rest(config)
-        except InputError as error:
-            self.show(Problem(number, str(error)))
-            return
+        near = start is not None
+        found = self.engine.near(config, start) if near else self.engine.from_rest(config)
         if found.usable:
             self._state = found.state
         final = found.usable or not near
         self._present(NewMotion(number, found, poses_of(shape.profile, found), near, final))
         if near:
             delay = self.idle if found.usable else 0.0
-            self._rests.submit(lambda: self._from_rest(number, False), delay)
+            work = functools.partial(self._from_rest, number, False)
+            self._rests.submit(lambda: self._refusing(number, work), delay)
 
     def _present(self, motion: NewMotion) -> None:
         self._shown = motion
@@ -210,6 +205,7 @@ class Session:
             return None
         shown, known = self._shown, self._rest
         config = self.config()
+        shape = self.engine.shape(config)  # refuses a profile that is not sound
         if known is not None and known.number == number:
             found = known.evaluation
         else:
@@ -222,18 +218,21 @@ class Session:
         if useless or (forced and not same):
             if found.usable:
                 self._state = found.state
-            poses = poses_of(self.engine.shape(config).profile, found)
+            poses = poses_of(shape.profile, found)
             self._present(NewMotion(number, found, poses, False))
         else:
             self.show(self._rest)
         return found
 
     def _save(self, number: int) -> None:
-        found = None
+        found = self._from_rest(number, True)
+        if found is not None:
+            self.show(Saved(number, self.config().to_yaml(), found))
+
+    def _refusing(self, number: int, work: Callable[[], object]) -> None:
+        """Do `work`; if the values are refused, say so."""
         try:
-            found = self._from_rest(number, True)
-            if found is not None:
-                self.show(Saved(number, self.config().to_yaml(), found))
+            work()
         except InputError as error:
             self.show(Problem(number, str(error)))
 

@@ -88,6 +88,19 @@ def test_values_that_do_not_fit_are_refused_in_words(session):
     assert session.next(NewMotion, number).evaluation.usable
 
 
+def test_refused_values_are_not_saved_or_simulated(session):
+    number = session.move({"profile.involute_length_mm": 17.0})
+    session.next(Problem, number)
+    session.save()
+    session.show_from_rest()
+    assert "involute_length_mm" in session.next(Problem, number).words
+    seen = []
+    time.sleep(0.5)
+    while not session.messages.empty():
+        seen.append(session.messages.get())
+    assert not [one for one in seen if isinstance(one, Saved | NewMotion)]
+
+
 def test_motion_without_a_result_is_final_only_after_rest(session):
     """Under a load that no flank can hold, the status is that of a simulation from rest."""
     number = session.move({LOAD: 1e5})
