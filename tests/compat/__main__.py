@@ -34,7 +34,6 @@ TESTS = (
     "tests/contact/test_closed_forms.py",
     "tests/contact/test_impact.py",
     "tests/design/test_bounds.py",
-    "tests/dynamics/test_measures.py",
     "tests/explore/test_knobs.py",
     "tests/explore/test_latest.py",
     "tests/explore/test_server.py",
